@@ -172,9 +172,9 @@ def _examination(
         from talkcli.doctor.examine import Examination
 
         return Examination(options.socket, silent=silent, interrupt=interrupt)
-    from talkcli.fleet.broker import need_client
+    from talkcli.fleet.broker import require_paho
 
-    need_client()
+    require_paho()
     from talkcli.doctor import broker
 
     return broker.BrokerExamination(robot, os.environ, insecure=options.insecure, interrupt=interrupt)

@@ -221,7 +221,7 @@ def robots(context: click.Context, _: click.Parameter, incomplete: str) -> Items
         return []
     online = [each for _, each in sorted(found.items()) if each.online]
     offered = [(each.name, ", ".join(map(_shorten, each.groups)) or "robot") for each in online]
-    members = Counter(f"@{group}" for each in online for group in {*each.groups} if not topics.fault(group))
+    members = Counter(f"@{group}" for each in online for group in {*each.groups} if not topics.name_fault(group))
     offered += [(name, f"{count} robot{'' if count == 1 else 's'}") for name, count in sorted(members.items())]
     return _items(offered, incomplete)
 

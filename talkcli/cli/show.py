@@ -101,9 +101,9 @@ class CommonOptions:
 
     def broker(self) -> Broker:
         """Return the address and login of the broker; UsageError if a setting or paho-mqtt is missing."""
-        from talkcli.fleet.broker import from_environment, need_client
+        from talkcli.fleet.broker import from_environment, require_paho
 
-        need_client()
+        require_paho()
         return from_environment(os.environ, insecure=self.insecure)
 
     def _connection(self, **options: Any) -> Connection:

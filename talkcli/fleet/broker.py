@@ -1,6 +1,6 @@
-"""Which broker, and who logs in there: read from the environment, and refused where a secret would be given away.
+"""The settings of the connection to the broker, read from environment variables.
 
-Nothing here connects to anything.
+Settings that would expose a secret are refused. Nothing here connects to the broker.
 """
 
 from __future__ import annotations
@@ -28,61 +28,66 @@ PASSWORD_FILE = "TALK_MQTT_PASSWORD_FILE"
 CA = "TALK_MQTT_CA"
 CERT = "TALK_MQTT_CERT"
 KEY = "TALK_MQTT_KEY"
-#: By the URL's scheme: whether it is TLS, and the port that IANA has for it.
+#: For each scheme of the URL: whether it means TLS, and its default port.
 _SCHEMES = {"mqtt": (False, 1883), "mqtts": (True, 8883)}
-#: Bytes of a password file at most: MQTT's limit of a password.
-_LONGEST_PASSWORD = 65_535
+#: Longest password that MQTT allows.
+_MAX_PASSWORD_BYTES = 65_535
 
 
 @frozen
 class Broker:
-    """A broker, and how to log in there."""
+    """The address of a broker, and the login."""
 
     host: str
     port: int
     tls: bool
-    #: None logs in as nobody, or as whoever the certificate names
+    #: None for no user, or for the one that the certificate names
     user: str | None = None
     password: str | None = None
-    #: files of the CA that the broker's certificate is of (None: the system's), of a client's certificate and its key
+    #: file of the CA that signed the broker's certificate; None for the system's CAs
     ca: str | None = None
+    #: files of the client's certificate and its key
     cert: str | None = None
     key: str | None = None
 
     @property
     def url(self) -> str:
-        """Where it is, for people; no secret is in it."""
+        """The broker's address for people, without secrets."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{'mqtts' if self.tls else 'mqtt'}://{host}:{self.port}"
 
-    def context(self) -> ssl.SSLContext | None:
-        """Return what TLS needs, None without TLS; UsageError for a file that can't be read or is none of its kind."""
+    def ssl_context(self) -> ssl.SSLContext | None:
+        """Return the settings for TLS, None without TLS. Raise UsageError if a file is unusable."""
         if not self.tls:
             return None
         try:
             context = ssl.create_default_context(cafile=self.ca)
         except (OSError, ssl.SSLError) as error:
-            raise UsageError(f"{CA}: {_wrong(self.ca, error)}") from error
+            raise UsageError(f"{CA}: {_file_error(self.ca, error)}") from error
         if self.cert:
             try:
                 context.load_cert_chain(self.cert, self.key, password=_no_passphrase)
             except (OSError, ssl.SSLError, UsageError) as error:
-                raise UsageError(f"{CERT} and {KEY}: {_wrong(self.cert, error)}") from error
+                raise UsageError(f"{CERT} and {KEY}: {_file_error(self.cert, error)}") from error
         return context
 
 
 def from_environment(environment: Mapping[str, str], *, insecure: bool = False) -> Broker:
-    """Return the broker that TALK_BROKER names, with what the variables beside it say.
+    """Return the broker that the environment variables describe.
 
-    `insecure`: whether a password may go in clear text to another machine. UsageError for what is wrong, or missing.
+    Args:
+        environment: the variables.
+        insecure: whether a password may go to another machine in clear text.
+
+    Raises:
+        UsageError: a variable is missing or wrong.
     """
     url = environment.get(URL, "")
     if not url:
         raise UsageError(f"which broker? {URL} is not set: export {URL}=mqtts://broker.example")
-    host, port, tls = _parts(url)
-    user, file = environment.get(USER) or None, environment.get(PASSWORD_FILE)
-    ca, cert, key = environment.get(CA) or None, environment.get(CERT) or None, environment.get(KEY) or None
-    password = _password(file) if file else None
+    host, port, tls = _parse_url(url)
+    user, file, ca, cert, key = (environment.get(each) or None for each in (USER, PASSWORD_FILE, CA, CERT, KEY))
+    password = _read_password(file) if file else None
     if password is not None and user is None:
         raise UsageError(f"{PASSWORD_FILE} is set, and {USER} is not: whose password is it?")
     for name, value in ((CA, ca), (CERT, cert), (KEY, key)):
@@ -90,7 +95,7 @@ def from_environment(environment: Mapping[str, str], *, insecure: bool = False) 
             raise UsageError(f"{name} means nothing without TLS: {URL} begins with mqtts:// then")
     if key and not cert:
         raise UsageError(f"{KEY} is set, and {CERT} is not: name the certificate, too")
-    if password is not None and not (tls or insecure or is_here(host)):
+    if password is not None and not (tls or insecure or is_local(host)):
         raise UsageError(
             f"the password would go to {printable(host)} in clear text: write {URL}=mqtts://…, or give "
             "--insecure where nobody can listen"
@@ -98,16 +103,16 @@ def from_environment(environment: Mapping[str, str], *, insecure: bool = False) 
     return Broker(host, port, tls, user, password, ca, cert, key)
 
 
-def need_client() -> None:
-    """Raise UsageError if the MQTT client, paho-mqtt, is not installed."""
+def require_paho() -> None:
+    """Raise UsageError if paho-mqtt is not installed."""
     if find_spec("paho") is None:
         raise UsageError(f"a fleet needs paho-mqtt: {install.command('paho-mqtt')}")
 
 
-def user(broker: Broker) -> str:
-    """Return who asks, as the last level of a topic has it: the broker's user, or else this machine's.
+def client_user(broker: Broker) -> str:
+    """Return the user name for topics: the user of the login, or else the user of this machine.
 
-    UsageError for one that can't be a level of a topic.
+    Raise UsageError if it can't be a level of a topic.
     """
     name = broker.user
     if name is None:
@@ -115,17 +120,20 @@ def user(broker: Broker) -> str:
             name = pwd.getpwuid(os.getuid()).pw_name
         except KeyError:
             name = f"uid-{os.getuid()}"
-    fault = topics.fault(name)
+    fault = topics.name_fault(name)
     if fault:
         raise UsageError(f"the name '{printable(name)}' can't be in a topic, it {fault}: set {USER} to one that can")
     return name
 
 
-def _parts(url: str) -> tuple[str, int, bool]:
-    """Return host, port, and whether it is TLS; what is wrong is said without the URL, which may hold a password."""
+def _parse_url(url: str) -> tuple[str, int, bool]:
+    """Return the host, the port, and whether to use TLS.
+
+    Raise UsageError if the URL is wrong. No message shows the whole URL, because it may contain a password.
+    """
     try:
         parts = urlsplit(url)
-    except ValueError:  # which shows the URL
+    except ValueError:  # its message shows the URL
         raise UsageError(f"{URL} is no URL: write mqtts://HOST or mqtt://HOST") from None
     if parts.scheme not in _SCHEMES:
         raise UsageError(
@@ -133,7 +141,7 @@ def _parts(url: str) -> tuple[str, int, bool]:
         )
     if parts.username is not None or parts.password is not None:
         raise UsageError(f"{URL} holds a user or a password: set {USER} and {PASSWORD_FILE}, and leave them out there")
-    tls, usual = _SCHEMES[parts.scheme]
+    tls, default_port = _SCHEMES[parts.scheme]
     try:
         port = parts.port
     except ValueError:
@@ -142,27 +150,27 @@ def _parts(url: str) -> tuple[str, int, bool]:
         raise UsageError(f"{URL} names no host and port: write {parts.scheme}://HOST or {parts.scheme}://HOST:PORT")
     if parts.path not in ("", "/") or parts.query or parts.fragment:
         raise UsageError(f"{URL} has more than a host and a port: write {parts.scheme}://{printable(parts.netloc)}")
-    return parts.hostname, port or usual, tls
+    return parts.hostname, port or default_port, tls
 
 
-def _password(path: str) -> str:
+def _read_password(path: str) -> str:
     try:
         with open(path, "rb") as file:
-            found = file.read(_LONGEST_PASSWORD + 3).rstrip(b"\r\n")
+            password = file.read(_MAX_PASSWORD_BYTES + 3).rstrip(b"\r\n")
     except OSError as error:
-        raise UsageError(f"{PASSWORD_FILE}: {_wrong(path, error)}") from error
-    if not found or len(found) > _LONGEST_PASSWORD:
+        raise UsageError(f"{PASSWORD_FILE}: {_file_error(path, error)}") from error
+    if not password or len(password) > _MAX_PASSWORD_BYTES:
         raise UsageError(
-            f"{PASSWORD_FILE}: {printable(path)} is {'too long' if found else 'empty'}: it holds the password alone"
+            f"{PASSWORD_FILE}: {printable(path)} is {'too long' if password else 'empty'}: it holds the password alone"
         )
     try:
-        return found.decode()
+        return password.decode()
     except UnicodeDecodeError:
         raise UsageError(f"{PASSWORD_FILE}: {printable(path)} is not UTF-8") from None
 
 
-def is_here(host: str) -> bool:
-    """Whether a host is this machine, so that nobody listens in between."""
+def is_local(host: str) -> bool:
+    """Return whether the host is this machine, so that nobody can listen in between."""
     if host == "localhost":
         return True
     try:
@@ -175,8 +183,8 @@ def _no_passphrase() -> str:
     raise UsageError("the key has a passphrase, and nobody is there to type it: take a key without one")
 
 
-def _wrong(path: str | None, error: Exception) -> str:
-    """Return what is wrong with a file, for people."""
+def _file_error(path: str | None, error: Exception) -> str:
+    """Return a message for people about a file that can't be used."""
     if isinstance(error, ssl.SSLError):
         return f"{printable(str(path))} is not what it should be: {error.reason or error}"
     words = error.strerror if isinstance(error, OSError) else str(error)

@@ -1,7 +1,8 @@
-"""One MQTT connection to the broker, from nothing to its end, by paho. It has no loop and no thread of its own.
+"""A connection to the broker by paho-mqtt, without a loop or a thread of its own.
 
-Whoever has it polls its descriptor, and calls `read`, `write` and `tick`. It is made anew for each connection: paho
-would send what an old one had not acknowledged again, which may be a sentence. Nothing here knows what is said.
+The owner polls its descriptor, and calls `read`, `write` and `tick`. Each connection needs a new `Link`, because paho
+would send the old connection's unacknowledged messages again, and one of them may be a sentence. Nothing here knows
+what messages mean.
 """
 
 from __future__ import annotations
@@ -24,8 +25,9 @@ from paho.mqtt.properties import Properties
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from talkcli.errors import AccessDenied, ProtocolMismatch, RequestRefused, ServerUnavailable, TalkError
-from talkcli.fleet.message import Message
+from talkcli.fleet.payloads import Message
 from talkcli.frozen import frozen
+from talkcli.polling import wait_ready
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
@@ -35,84 +37,97 @@ if TYPE_CHECKING:
 
     from talkcli.fleet.broker import Broker
 
-#: Seconds: the broker counts a client as gone that says nothing for one and a half of these.
-KEEPALIVE = 10
-#: Seconds in which a broker must answer that one is connected; and seconds between two calls of `tick`.
-PATIENCE, TICK = 5.0, 5.0
-#: Bytes of a packet at most: a reply's lines, with room for the topics.
-MAX_PACKET = 256 * 1024
-#: What stands in a packet besides its payload, at most: topics, properties, numbers.
-MAX_HEAD = 1024
-#: Messages of QoS 1 that the broker has not acknowledged yet; more wait here. HiveMQ's cloud takes 10, others more, and
-#: paho can't obey what this one says when it answers.
-_IN_FLIGHT = 10
-#: Messages of QoS 1 that may be on their way to who hears of all robots, the most that MQTT knows. mosquitto by itself
-#: sends 20, has 1,000 more wait for each client, and drops what is past that without a word, of what it keeps, too.
-MANY_AT_ONCE = 65_535
-#: Reasons of MQTT 5 for which one is not let in, and that of another protocol.
-_DENIED = (0x86, 0x87, 0x8A, 0x8C)
-_OTHER_PROTOCOL = 0x84
-#: Reasons of an acknowledgement from which on nothing was taken, and that for who may not publish there.
-REFUSED, NOT_AUTHORIZED = 0x80, 0x87
-#: Discard what is unsent when it is closed: a sentence that waits in a stalled line must not arrive minutes later.
-_DISCARD, _DELIVER = struct.pack("ii", 1, 0), struct.pack("ii", 0, 0)
+    #: Called with the reason code of a PUBACK.
+    OnAcknowledged = Callable[[int], None]
+
+#: The broker drops a client that has sent nothing for one and a half times as long.
+KEEPALIVE_S = 10
+#: Time for the broker to answer the login.
+LOGIN_LIMIT_S = 5.0
+#: Time between two calls of `tick`.
+TICK_EVERY_S = 5.0
+#: Largest packet that this side sends: the lines of a reply, and the header.
+MAX_PACKET_BYTES = 256 * 1024
+#: Room for all of a packet but its payload: topics, properties and numbers.
+MAX_HEADER_BYTES = 1024
+#: Messages of QoS 1 that may be unacknowledged; further ones wait here. HiveMQ's cloud accepts 10, other brokers accept
+#: more, and paho can't follow the limit that a broker announces.
+_MAX_UNACKNOWLEDGED_MESSAGES = 10
+#: The highest receive maximum in MQTT, for a client that hears from all robots. By default, mosquitto sends 20 messages
+#: ahead and queues 1,000. It silently drops all others, even retained ones.
+MAX_RECEIVE_COUNT = 65_535
+# MQTT 5 reason codes: login denied, protocol not supported, the first of those that mean failure, not authorized.
+_REASONS_DENIED = (0x86, 0x87, 0x8A, 0x8C)
+_REASON_UNSUPPORTED_PROTOCOL = 0x84
+REASON_FAILURE, REASON_NOT_AUTHORIZED = 0x80, 0x87
+#: SO_LINGER values for closing. A stalled sentence must not arrive minutes later, so unsent data is usually discarded.
+_LINGER_DISCARD, _LINGER_DELIVER = struct.pack("ii", 1, 0), struct.pack("ii", 0, 0)
 
 
 def boottime() -> float:
-    """Return the seconds since the machine's start, those in which it was suspended among them, where that is known."""
+    """Return the seconds since the machine started, including the time it was suspended if the system counts that."""
     return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
 
 @frozen
 class Will:
-    """What the broker publishes, retained, once this connection has broken."""
+    """A retained message that the broker publishes if the connection breaks."""
 
     topic: str
     payload: bytes
 
 
 class Link:
-    """A connection to the broker. Any thread may call it, `hear` is called by the one that reads."""
+    """A connection to the broker. Any thread may use it; `on_message` is called by the thread that reads."""
 
     def __init__(
         self,
         broker: Broker,
         client_id: str,
-        hear: Callable[[Message], None],
+        on_message: Callable[[Message], None],
         will: Will | None = None,
-        most: int = MAX_PACKET,
-        at_once: int | None = None,
+        max_packet_bytes: int = MAX_PACKET_BYTES,
+        receive_maximum: int | None = None,
     ) -> None:
-        """Make one; it connects with `open`. UsageError where what TLS needs can't be read.
+        """Prepare a connection, which `open` makes.
 
-        `most`: bytes of a packet that may come; `at_once`: messages of QoS 1 that may come before the first of them is
-        acknowledged, None for as many as the broker thinks best.
+        Args:
+            broker: where to connect.
+            client_id: unique name of this connection.
+            on_message: called with each message that comes.
+            will: published if the connection breaks.
+            max_packet_bytes: largest packet that the broker may send.
+            receive_maximum: how many messages of QoS 1 the broker may send before the first is acknowledged. None
+                leaves it to the broker.
+
+        Raises:
+            UsageError: a file for TLS is unusable.
         """
         self._broker = broker
-        self._hear = hear
-        self._most = most
-        self._at_once = at_once
-        #: why nothing more comes, once that is so
+        self._deliver = on_message
+        self._max_packet_bytes = max_packet_bytes
+        self._receive_maximum = receive_maximum
+        #: why the connection has ended; None while it lasts
         self.ended: str | None = None
-        #: bytes that the broker has not taken yet, or not acknowledged
-        self.outstanding = 0
-        #: bytes of a payload that the broker takes
-        self.room = MAX_PACKET - MAX_HEAD
-        self._sizes: dict[int, int] = {}
-        self._acknowledged: dict[int, Callable[[int], None]] = {}
+        #: size of the messages that are unsent or unacknowledged
+        self.outstanding_bytes = 0
+        #: largest payload that the broker accepts
+        self.max_payload_bytes = MAX_PACKET_BYTES - MAX_HEADER_BYTES
+        #: unacknowledged messages: size and callback, by message id
+        self._unacknowledged: dict[int, tuple[int, OnAcknowledged | None]] = {}
+        #: the broker's answer to the login
         self._answer: ReasonCode | None = None
         self._alert = ""
-        #: held while paho is used: TLS can't be read and written at once
-        self._using = threading.RLock()
-        #: whether paho is handing on what has come: it would wait for itself where a write then finds the broker gone
-        self._hearing = False
-        self._tls: ssl.SSLSocket | None = None
+        #: held while paho is used, because TLS can't be read and written at the same time
+        self._lock = threading.RLock()
+        #: set while paho calls `_on_message`. A write from there that found the broker gone would wait for itself.
+        self._delivering = False
         self._socket: socket.socket | None = None
         self._paho = paho.Client(
             CallbackAPIVersion.VERSION2, client_id, protocol=paho.MQTTv5, reconnect_on_failure=False
         )
-        self._paho.max_inflight_messages_set(_IN_FLIGHT)
-        context = broker.context()
+        self._paho.max_inflight_messages_set(_MAX_UNACKNOWLEDGED_MESSAGES)
+        context = broker.ssl_context()
         if context:
             self._paho.tls_set_context(context)
         if broker.user is not None:
@@ -126,73 +141,84 @@ class Link:
         self._paho.on_log = self._on_log
 
     def open(self) -> None:
-        """Connect, log in, and return once the broker has said yes. It waits, and so has a thread to itself.
+        """Connect, log in, and wait for the broker's answer. It blocks, so call it in a thread of its own.
 
-        ServerUnavailable where no broker answers, AccessDenied where it, or its certificate, is not to be trusted or it
-        doesn't let this user in, ProtocolMismatch for one that doesn't speak MQTT 5.
+        Raises:
+            ServerUnavailable: no broker answers.
+            AccessDenied: the broker or its certificate can't be trusted, or it rejects the login.
+            ProtocolMismatch: the broker doesn't speak MQTT 5.
         """
         url = self._broker.url
         properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
         properties.SessionExpiryInterval = 0
-        properties.MaximumPacketSize = self._most
-        if self._at_once is not None:
-            properties.ReceiveMaximum = self._at_once
-        self._paho.connect_timeout = PATIENCE
+        properties.MaximumPacketSize = self._max_packet_bytes
+        if self._receive_maximum is not None:
+            properties.ReceiveMaximum = self._receive_maximum
+        self._paho.connect_timeout = LOGIN_LIMIT_S
         try:
-            self._paho.connect(self._broker.host, self._broker.port, KEEPALIVE, clean_start=True, properties=properties)
+            self._paho.connect(
+                self._broker.host, self._broker.port, KEEPALIVE_S, clean_start=True, properties=properties
+            )
         except ssl.SSLCertVerificationError as error:
             words = f"the broker's certificate is not to be trusted: {error.verify_message} ({url})"
             raise AccessDenied(f"{words}; TALK_MQTT_CA names the file of the CA that it is of") from error
         except ssl.SSLError as error:
             raise ServerUnavailable(f"no TLS with the broker at {url}: {error.reason or error}") from error
-        except (OSError, ValueError) as error:  # ValueError: a host's name that is none
+        except (OSError, ValueError) as error:  # ValueError: an impossible host name
             why = error.strerror if isinstance(error, OSError) else None
             raise ServerUnavailable(f"no broker at {url}: {why or error}") from error
         found = self._paho.socket()
-        if isinstance(found, socket.socket):  # else the broker has hung up before the login was sent
-            self._prepare(found)
-        end = time.monotonic() + PATIENCE
+        if isinstance(found, socket.socket):  # else the broker closed the connection before the login was sent
+            self._socket = found
+            try:
+                found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # Nagle would cost 40 ms per message
+                found.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER_DISCARD)
+            except OSError:
+                pass  # on macOS, if the broker has reset the connection; the first read finds that
+        end = time.monotonic() + LOGIN_LIMIT_S
         while self._answer is None and self.ended is None and (left := end - time.monotonic()) > 0:
-            self._wait(left)
-        fault = self._fault()
+            events = select.POLLIN | (select.POLLOUT if self.wants_write else 0)
+            if self._tls_pending() or wait_ready({self.fileno(): events}, left):
+                self.read()
+        fault = self._login_fault()
         if fault:
             self.close()
             raise fault
 
     def fileno(self) -> int:
-        """Return the descriptor to poll; -1 once it has ended."""
+        """Return the descriptor to poll, -1 once the connection has ended."""
         return -1 if self._socket is None else self._socket.fileno()
 
     @property
     def wants_write(self) -> bool:
-        """Whether something waits until the descriptor can be written."""
+        """Whether unsent data waits for the descriptor to become writable."""
         return self.ended is None and bool(self._paho.want_write())
 
     def read(self) -> None:
-        """Take what has come, and hand it to `hear`; it never waits."""
-        with self._using:
+        """Read what has arrived, without waiting, and pass each message to `on_message`."""
+        with self._lock:
             while self.ended is None:
-                self._hearing = True
+                self._delivering = True
                 try:
                     self._paho.loop_read()
                 finally:
-                    self._hearing = False
+                    self._delivering = False
                 if self.ended is None and self._socket is not None and hasattr(socket, "TCP_QUICKACK"):
-                    # Else the broker's Nagle waits 40 ms for the acknowledgement that this kernel delays as long.
+                    # Else this kernel delays the acknowledgement by 40 ms, and the broker's Nagle waits for it.
                     self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
-                if not (self._tls and self.ended is None and self._tls.pending()):
+                if not self._tls_pending():
                     break
             self.write()
 
     def write(self) -> None:
-        """Send what waits, as far as it goes; it never waits. What `hear` publishes goes once that has returned."""
-        with self._using:
-            if self.wants_write and not self._hearing:
+        """Send as much unsent data as possible without waiting. During `on_message`, it is sent after the return."""
+        with self._lock:
+            if self.wants_write and not self._delivering:
                 self._paho.loop_write()
 
     def tick(self) -> None:
-        """See to the signs of life; every `TICK` seconds."""
-        with self._using:
+        """Send and check keepalive messages. Call it every `TICK_EVERY_S`."""
+        with self._lock:
             if self.ended is None:
                 self._paho.loop_misc()
 
@@ -206,15 +232,22 @@ class Link:
         expiry: float | None = None,
         response: str | None = None,
         correlation: bytes | None = None,
-        acknowledged: Callable[[int], None] | None = None,
+        acknowledged: OnAcknowledged | None = None,
     ) -> bool:
-        """Publish, and return whether that was still possible.
+        """Publish a message, and return whether the connection still accepted it.
 
-        `expiry`: seconds after which the broker need not deliver it any more; `acknowledged`: called, by who reads,
-        with the reason of the broker's acknowledgement, of QoS 1; `NOT_AUTHORIZED` is one.
+        Args:
+            topic: where to publish.
+            payload: the content.
+            qos: 0 or 1.
+            retain: whether the broker keeps the message for later subscribers.
+            expiry: seconds after which the broker need not deliver the message.
+            response: topic for answers.
+            correlation: data for the receiver to repeat in its answers.
+            acknowledged: called by the reading thread with the reason code of the acknowledgement, for QoS 1.
         """
         properties = _properties(expiry, response, correlation)
-        with self._using:
+        with self._lock:
             if self.ended is not None:
                 return False
             info = self._paho.publish(topic, payload, qos, retain, properties)
@@ -222,38 +255,38 @@ class Link:
                 return False
             if not info.is_published():
                 size = len(topic) + len(payload)
-                self._sizes[info.mid] = size
-                self.outstanding += size
-                if acknowledged:
-                    self._acknowledged[info.mid] = acknowledged
+                self._unacknowledged[info.mid] = size, acknowledged
+                self.outstanding_bytes += size
             self.write()
         return True
 
-    def too_long(self, line: bytes, kind: str) -> RequestRefused | None:
-        """Return the error for a request of this kind that is longer than what the broker takes; None where it fits."""
-        if len(line) <= self.room:
+    def size_error(self, line: bytes, kind: str) -> RequestRefused | None:
+        """Return the error if a request of this kind is longer than the broker accepts, else None."""
+        if len(line) <= self.max_payload_bytes:
             return None
-        words = f"{kind} has {len(line):,} bytes, and the broker takes {self.room:,}: nothing was sent"
+        words = f"{kind} has {len(line):,} bytes, and the broker takes {self.max_payload_bytes:,}: nothing was sent"
         return RequestRefused(words, "too_long")
 
-    def subscribe(self, *wanted: str, retained: bool) -> None:
-        """Have messages of these topics come; `retained`: those that the broker keeps, too.
+    def subscribe(self, *topics: str, retained: bool) -> None:
+        """Subscribe to topics.
 
-        Whoever publishes with the flag for that is found out either way: see `Message.retained`.
+        Args:
+            topics: the topics, with wildcards if needed.
+            retained: whether the broker also sends the messages that it keeps. `Message.retained` is right either way.
         """
         handling = SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE if retained else SubscribeOptions.RETAIN_DO_NOT_SEND
         options = SubscribeOptions(qos=1, retainAsPublished=True, retainHandling=handling)
-        with self._using:
+        with self._lock:
             if self.ended is None:
-                self._paho.subscribe([(each, options) for each in wanted])
+                self._paho.subscribe([(each, options) for each in topics])
                 self.write()
 
     def close(self) -> None:
-        """End it, with a goodbye where nothing is on its way; else what the broker has not taken is discarded."""
-        with self._using:
-            let_in = self._answer is not None and not self._answer.is_failure
-            if self.ended is None and self._socket is not None and let_in and not self._sizes:
-                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _DELIVER)
+        """Close the connection: with a DISCONNECT if all messages are acknowledged, else unsent data is discarded."""
+        with self._lock:
+            logged_in = self._answer is not None and not self._answer.is_failure
+            if self.ended is None and self._socket is not None and logged_in and not self._unacknowledged:
+                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER_DELIVER)
                 self._paho.disconnect()
                 self.write()
             self.ended = self.ended or "the connection was closed"
@@ -262,45 +295,34 @@ class Link:
                 self._socket = None
 
     def drop(self) -> None:
-        """Close this process's copy of the descriptor, as a child does: the connection is its parent's."""
+        """Close only this process's copy of the descriptor, in a forked child. The parent keeps the connection."""
         if self._socket is not None:
             os.close(self._socket.detach())
 
     # -- inside
 
-    def _prepare(self, connected: socket.socket) -> None:
-        self._socket = connected
-        self._tls = connected if isinstance(connected, ssl.SSLSocket) else None
-        try:
-            connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # paho leaves Nagle on: 40 ms a message
-            connected.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _DISCARD)
-        except OSError:
-            pass  # macOS: the broker has reset it, which the first read will find
+    def _tls_pending(self) -> bool:
+        """Return whether TLS holds decrypted data, which no poll reports."""
+        return isinstance(self._socket, ssl.SSLSocket) and self._socket.pending() > 0
 
-    def _wait(self, timeout: float) -> None:
-        poll = select.poll()
-        poll.register(self.fileno(), select.POLLIN | (select.POLLOUT if self.wants_write else 0))
-        if (self._tls and self._tls.pending()) or poll.poll(math.ceil(timeout * 1000)):
-            self.read()
-
-    def _fault(self) -> TalkError | None:
-        """Return why the broker doesn't let this client in, None where it does."""
+    def _login_fault(self) -> TalkError | None:
+        """Return why the broker rejected the login, None if it accepted."""
         url, answer = self._broker.url, self._answer
         if answer is None and self._broker.tls and (self._alert or self.ended):
-            # With TLS 1.3 a client is done before the broker has looked at its certificate; what that says then may
-            # be lost with the connection.
+            # With TLS 1.3, the client's side of the handshake is over before the broker checks the client's
+            # certificate. The broker's alert may be lost together with the connection.
             why = self._alert or "it ends the connection before it answers"
             which = "the certificate of this client" if self._broker.cert else "a client without a certificate"
             words = f"the broker at {url} does not let {which} in: {why}"
             return AccessDenied(f"{words}; TALK_MQTT_CERT and TALK_MQTT_KEY name one that it takes")
         if answer is None:
-            why = self.ended or f"nothing in {PATIENCE:g} s"
+            why = self.ended or f"nothing in {LOGIN_LIMIT_S:g} s"
             return ServerUnavailable(f"the broker at {url} does not answer: {why}")
-        if answer.value in _DENIED:
+        if answer.value in _REASONS_DENIED:
             who = "a client without a user" if self._broker.user is None else f"'{printable(self._broker.user)}'"
             words = f"the broker at {url} does not let {who} in: {answer}"
             return AccessDenied(f"{words}; TALK_MQTT_USER and TALK_MQTT_PASSWORD_FILE say who you are")
-        if answer.value == _OTHER_PROTOCOL:
+        if answer.value == _REASON_UNSUPPORTED_PROTOCOL:
             return ProtocolMismatch(f"the broker at {url} does not speak MQTT 5: mosquitto does from 1.6 on")
         if answer.is_failure or self.ended:
             return ServerUnavailable(f"the broker at {url} refuses: {answer if answer.is_failure else self.ended}")
@@ -310,10 +332,10 @@ class Link:
         self, _client: paho.Client, _data: object, _flags: object, code: ReasonCode, properties: Properties | None
     ) -> None:
         self._answer = code
-        # What it logs is of use for a login that fails alone, and takes a tenth of the processor time of each packet.
+        # The log is only useful if the login fails. It takes a tenth of the processor time of each packet.
         self._paho.on_log = None
-        most = getattr(properties, "MaximumPacketSize", MAX_PACKET)
-        self.room = max(0, min(MAX_PACKET, most) - MAX_HEAD)
+        limit = getattr(properties, "MaximumPacketSize", MAX_PACKET_BYTES)
+        self.max_payload_bytes = max(0, min(MAX_PACKET_BYTES, limit) - MAX_HEADER_BYTES)
 
     def _on_disconnect(self, _client: paho.Client, _data: object, flags: object, code: ReasonCode, _: object) -> None:
         said = getattr(flags, "is_disconnect_packet_from_server", False)
@@ -322,7 +344,7 @@ class Link:
 
     def _on_message(self, _client: paho.Client, _data: object, message: paho.MQTTMessage) -> None:
         properties = message.properties
-        self._hear(
+        self._deliver(
             Message(
                 message.topic,
                 bytes(message.payload),
@@ -334,20 +356,20 @@ class Link:
         )
 
     def _on_publish(self, _client: paho.Client, _data: object, mid: int, code: ReasonCode, _: object) -> None:
-        self.outstanding -= self._sizes.pop(mid, 0)
-        acknowledged = self._acknowledged.pop(mid, None)
+        size, acknowledged = self._unacknowledged.pop(mid, (0, None))
+        self.outstanding_bytes -= size
         if acknowledged:
             acknowledged(code.value)
 
     def _on_log(self, _client: paho.Client, _data: object, _level: int, words: str) -> None:
-        # Where TLS 1.3 wants a client's certificate, that comes with the first read, and paho says it here alone.
+        # If TLS 1.3 requires a client's certificate, the alert comes with the first read, and paho only logs it.
         if "ALERT" in words and self._answer is None:
             self._alert = words.rpartition("] ")[2].partition(" (")[0]
 
 
 @lru_cache(maxsize=32)
 def _properties(expiry: float | None, response: str | None, correlation: bytes | None) -> Properties | None:
-    """Return what a message has besides topic and payload, if anything; events have the same, and paho takes time."""
+    """Return the MQTT properties of a message, None if it has none. Cached, because paho is slow at making them."""
     given: dict[str, object] = {}
     if expiry is not None:
         given["MessageExpiryInterval"] = max(1, math.ceil(min(expiry, 2**31)))
@@ -363,22 +385,23 @@ def _properties(expiry: float | None, response: str | None, correlation: bytes |
     return properties
 
 
-class Opening:
-    """A connection to the broker that is being made, by a thread of its own: that waits, and can't be interrupted."""
+class LinkOpener:
+    """Opens a link in a thread of its own, because that blocks and can't be interrupted."""
 
-    def __init__(self, link: Link, wake: Callable[[], None]) -> None:
+    def __init__(self, link: Link, on_done: Callable[[], None]) -> None:
+        """Start to open the link. The thread calls `on_done` at the end, unless `cancel` was called before."""
         self.link = link
         self.error: TalkError | None = None
         self.done = False
-        self._wake = wake
-        self._given_up = False
-        self._ending = threading.Lock()
+        self._on_done = on_done
+        self._canceled = False
+        self._lock = threading.Lock()
         threading.Thread(target=self._open, name="talk: connecting", daemon=True).start()
 
-    def give_up(self) -> None:
-        """Let go of it, whenever it is there."""
-        with self._ending:
-            self._given_up = True
+    def cancel(self) -> None:
+        """Close the link as soon as it is open."""
+        with self._lock:
+            self._canceled = True
             if self.done:
                 self.link.close()
 
@@ -387,11 +410,11 @@ class Opening:
             self.link.open()
         except TalkError as error:
             self.error = error
-        except Exception as error:  # noqa: BLE001 - whoever waits for this thread hears it
+        except Exception as error:  # noqa: BLE001 - reported to the thread that waits
             self.error = ServerUnavailable(f"a bug in the connection to the broker: {type(error).__name__}: {error}")
-        with self._ending:
+        with self._lock:
             self.done = True
-            if self._given_up:
+            if self._canceled:
                 self.link.close()
             else:
-                self._wake()
+                self._on_done()

@@ -1,7 +1,8 @@
-"""The topics of a fleet: what is where on the broker, and who may do what there. Pure: names in, names out.
+"""The topics of a fleet on the broker, and the access rules for them.
 
-Rules for this file: a topic may be added, never renamed or given another meaning; who is asked for something stands in
-the levels before the last, and who asks in the last, since that one an ordinary ACL can tie to a login.
+Pure. Rules for this file: topics may be added, but never renamed or given another meaning. The last level of a topic
+names the client that asks, because a broker's access rules can tie only that level to a login. The levels before it
+name the robot or group that is asked.
 """
 
 from __future__ import annotations
@@ -12,109 +13,115 @@ from talkcli.frozen import frozen
 from talkcli.goals.option import MAX_NAME
 
 PREFIX = "talk"
-#: What stands below it.
-ROBOT, GROUP, REPLY = "robot", "group", "reply"
-#: The group that every robot is in.
-EVERYBODY = "all"
-#: Stands for any level in what is subscribed to.
+ROBOT_LEVEL, _GROUP, _REPLY = "robot", "group", "reply"
+#: The group of all robots.
+ALL_ROBOTS = "all"
+#: Matches any level in a subscription.
 ANY = "+"
-#: What a session's own marker is called, in the place of a robot: no robot can be.
+#: Takes the place of the robot in the topic that a desk publishes to itself. No robot can have this name.
 MARKER = "_"
-#: Characters of a robot's, a group's or a user's name: a bridge calls itself "mqtt:" and that name at its server.
-LONGEST = MAX_NAME - len("mqtt:")
-_NAME = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{LONGEST - 1}}}")
+#: Longest name of a robot, a group or a user: at the server, a remote client is called "mqtt:" and this name.
+MAX_NAME_CHARS = MAX_NAME - len("mqtt:")
+_NAME_PATTERN = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{MAX_NAME_CHARS - 1}}}")
 
-#: What stands under a robot's name, beside its events and its own presence, status and echo: all that one may ask.
-REQUEST, SAY, CANCEL = "request", "say", "cancel"
+# The levels below a robot's name. A client sends to the first three.
+REQUEST, PLAIN_SAY, PLAIN_CANCEL = "request", "say", "cancel"
 PRESENCE, STATUS, EVENT, ECHO = "presence", "status", "event", "echo"
 
-#: What Home Assistant logs in as, and so who asks in the topics that it is told of; and the prefix of its own topics.
+#: Home Assistant's user name at the broker, and the prefix of its own topics.
 HOMEASSISTANT = "homeassistant"
-#: Where it says that it has begun, or that it is gone.
-BIRTH = f"{HOMEASSISTANT}/status"
+#: Where Home Assistant says whether it is running.
+HOMEASSISTANT_STATUS = f"{HOMEASSISTANT}/status"
 
 
-def fault(name: str) -> str | None:
-    """Return what is wrong with a name of a robot, a group or a user, for people; None where it can be one level."""
-    if _NAME.fullmatch(name):
+def name_fault(name: str) -> str | None:
+    """Return why a robot, a group or a user can't have this name, in words for people. None if it can."""
+    if _NAME_PATTERN.fullmatch(name):
         return None
-    return f"must be 1 to {LONGEST} of A-Z a-z 0-9 . _ -, the first of them a letter or a digit"
+    return f"must be 1 to {MAX_NAME_CHARS} of A-Z a-z 0-9 . _ -, the first of them a letter or a digit"
 
 
 def robot(name: str, *levels: str) -> str:
-    """Return a topic of a robot's."""
-    return "/".join((PREFIX, ROBOT, name, *levels))
+    """Return the topic with these levels below a robot's name."""
+    return "/".join((PREFIX, ROBOT_LEVEL, name, *levels))
 
 
 def group(name: str, *levels: str) -> str:
-    """Return a topic of a group's."""
-    return "/".join((PREFIX, GROUP, name, *levels))
+    """Return the topic with these levels below a group's name."""
+    return "/".join((PREFIX, _GROUP, name, *levels))
 
 
-def reply(user: str, session: str, *name: str) -> str:
-    """Return where a robot answers a session of this user's; without a name what stands for any robot."""
-    return "/".join((PREFIX, REPLY, user, session, *name))
+def reply(user: str, session: str, *robot_name: str) -> str:
+    """Return the topic on which a robot answers a session of this user.
+
+    Without a robot's name, it is the response topic that several robots can be given.
+    """
+    return "/".join((PREFIX, _REPLY, user, session, *robot_name))
 
 
-def device(name: str) -> str:
-    """Return where Home Assistant is told of a robot: a topic of each robot's own, in none of whose levels is a dot.
+def homeassistant_device(name: str) -> str:
+    """Return the topic where Home Assistant reads the description of a robot.
 
-    The name is a level of its own, since that alone can an ACL's pattern tie to a login. One with a dot is written in
-    another way, below another level, and no two of these alike.
+    The name is a level of its own, because a pattern in access rules can tie only a whole level to a login. Home
+    Assistant allows no dots in these levels, so a name with a dot is escaped and put below another level.
     """
     if "." not in name:
         return "/".join((HOMEASSISTANT, "device", PREFIX, name, "config"))
-    written = name.replace("_", "__").replace(".", "_d")
-    return "/".join((HOMEASSISTANT, "device", f"{PREFIX}-dots", written, "config"))
+    escaped = name.replace("_", "__").replace(".", "_d")
+    return "/".join((HOMEASSISTANT, "device", f"{PREFIX}-dots", escaped, "config"))
 
 
 @frozen
-class Asked:
-    """What a topic says of a message that asks a robot for something."""
+class RequestTopic:
+    """The parts of a topic on which a client sends requests to a robot."""
 
-    #: REQUEST, or SAY or CANCEL, of which the payload is plain text
+    #: REQUEST, PLAIN_SAY or PLAIN_CANCEL
     kind: str
-    #: who asks, as the broker's ACL lets nobody else write there
+    #: the client's user name at the broker, as far as its access rules check it
     user: str
 
 
-def asked(topic: str) -> Asked | None:
-    """Return what a topic that a robot listens to asks for; None where it asks for nothing."""
+def parse_request(topic: str) -> RequestTopic | None:
+    """Return the parts of a topic for requests, None if it is another topic."""
     prefix, _, rest = topic.partition("/")
     levels = rest.split("/")
-    if prefix != PREFIX or len(levels) != 4 or fault(levels[3]):
+    if prefix != PREFIX or len(levels) != 4 or name_fault(levels[3]):
         return None
-    whose, _, kind, user = levels
-    known = {"robot": (REQUEST, SAY, CANCEL), "group": (REQUEST,)}.get(whose, ())
-    return Asked(kind, user) if kind in known else None
+    receiver, _, kind, user = levels
+    kinds = {ROBOT_LEVEL: (REQUEST, PLAIN_SAY, PLAIN_CANCEL), _GROUP: (REQUEST,)}.get(receiver, ())
+    return RequestTopic(kind, user) if kind in kinds else None
 
 
-def answer(response: str, user: str, name: str) -> str | None:
-    """Return where a robot answers this user, who named this response topic; None where that is not the user's own.
+def checked_reply(response: str, user: str, robot_name: str) -> str | None:
+    """Return the topic on which a robot answers this user, None if the response topic is not the user's own.
 
-    Nobody may have a robot publish anywhere else: not to another user, and not to another robot.
+    So nobody can make a robot publish to another user or to another robot.
     """
     levels = response.split("/")
-    if levels[:3] != [PREFIX, "reply", user] or len(levels) not in (4, 5) or fault(levels[3]):
+    if levels[:3] != [PREFIX, _REPLY, user] or len(levels) not in (4, 5) or name_fault(levels[3]):
         return None
-    return reply(user, levels[3], name) if levels[4:] in ([], [name]) else None
+    return reply(user, levels[3], robot_name) if levels[4:] in ([], [robot_name]) else None
 
 
-def access(operators: tuple[str, ...] = ("OPERATOR",), *, homeassistant: bool = False, name: str | None = None) -> str:
-    """Return what mosquitto's `acl_file` has for all robots, each of which logs in by its own name, and for these.
+def access_rules(
+    operators: tuple[str, ...] = ("OPERATOR",), *, homeassistant: bool = False, name: str | None = None
+) -> str:
+    """Return the content of mosquitto's `acl_file` for a fleet.
 
-    An operator's lines are by name: mosquitto applies its patterns to everybody who logs in, so that with a pattern for
-    operators each robot could command the others. What the patterns for robots give to an operator is a robot of the
-    operator's own name, which there is none of, and to read what groups are asked.
+    Robots are covered by patterns, because each logs in by its own name. Operators are listed by name: mosquitto
+    applies patterns to everybody, so a pattern for operators would let each robot command the others. The robots'
+    patterns give an operator nothing but the topics of a robot that has the operator's name, and what groups are asked.
 
-    `homeassistant`: with what Home Assistant does, and the robots that it is told of; `name`: one of these, which has a
-    line of its own where its name has a dot, since no pattern is for it.
+    Args:
+        operators: the users who may command every robot.
+        homeassistant: whether to add the rules for Home Assistant.
+        name: a robot for Home Assistant. It gets a line of its own if its name has a dot, because no pattern fits.
     """
     lines = [
         "# Robots: each logs in by its own name, %u, and is heard under that alone.",
         f"pattern read {robot('%u', REQUEST, '+')}",
-        f"pattern read {robot('%u', SAY, '+')}",
-        f"pattern read {robot('%u', CANCEL, '+')}",
+        f"pattern read {robot('%u', PLAIN_SAY, '+')}",
+        f"pattern read {robot('%u', PLAIN_CANCEL, '+')}",
         f"pattern read {group('+', REQUEST, '+')}",
         f"pattern readwrite {robot('%u', PRESENCE)}",
         f"pattern readwrite {robot('%u', ECHO)}",
@@ -123,15 +130,15 @@ def access(operators: tuple[str, ...] = ("OPERATOR",), *, homeassistant: bool = 
         f"pattern write {reply('+', '+', '%u')}",
     ]
     if homeassistant:
-        lines += [f"pattern write {device('%u')}", f"pattern read {BIRTH}"]
+        lines += [f"pattern write {homeassistant_device('%u')}", f"pattern read {HOMEASSISTANT_STATUS}"]
     for each in operators:
         lines += [
             "",
             "# An operator, who may ask every robot, and hear what each says: such lines for each login.",
             f"user {each}",
             f"topic write {robot('+', REQUEST, each)}",
-            f"topic write {robot('+', SAY, each)}",
-            f"topic write {robot('+', CANCEL, each)}",
+            f"topic write {robot('+', PLAIN_SAY, each)}",
+            f"topic write {robot('+', PLAIN_CANCEL, each)}",
             f"topic write {group('+', REQUEST, each)}",
             f"topic read {robot('+', PRESENCE)}",
             f"topic read {robot('+', STATUS)}",
@@ -143,13 +150,13 @@ def access(operators: tuple[str, ...] = ("OPERATOR",), *, homeassistant: bool = 
             "",
             "# Home Assistant, which may have every robot speak and be silent; its own topics are its own.",
             f"user {HOMEASSISTANT}",
-            f"topic write {robot('+', SAY, HOMEASSISTANT)}",
-            f"topic write {robot('+', CANCEL, HOMEASSISTANT)}",
+            f"topic write {robot('+', PLAIN_SAY, HOMEASSISTANT)}",
+            f"topic write {robot('+', PLAIN_CANCEL, HOMEASSISTANT)}",
             f"topic read {robot('+', PRESENCE)}",
             f"topic read {robot('+', STATUS)}",
             f"topic readwrite {HOMEASSISTANT}/#",
         ]
     if homeassistant and name is not None and "." in name:
         words = "# A robot of which Home Assistant is told elsewhere: no level of a topic there may have a dot."
-        lines += ["", words, f"user {name}", f"topic write {device(name)}"]
+        lines += ["", words, f"user {name}", f"topic write {homeassistant_device(name)}"]
     return "\n".join(lines)

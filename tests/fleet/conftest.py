@@ -56,7 +56,7 @@ def broker() -> Iterator[Broker]:
 def secure_broker() -> Iterator[Broker]:
     """A broker with TLS, passwords, and the rules that talk prints for its robots and the operator."""
     users = {name: f"password of {name}" for name in (*ROBOTS, *OPERATORS, *OTHERS)}
-    with Broker(secure=True, users=users, acl=topics.access(OPERATORS) + "\n") as result:
+    with Broker(secure=True, users=users, acl=topics.access_rules(OPERATORS) + "\n") as result:
         yield result
 
 

@@ -64,8 +64,8 @@ def test_without_paho_it_says_what_to_install_but_prints_all_the_same(home: str,
 
 
 def test_the_acl_is_printed(home: str) -> None:
-    assert bridge(home, "--print-acl") == (0, topics.access() + "\n", "")
-    rules = topics.access(homeassistant=True, name="r2.d2") + "\n"
+    assert bridge(home, "--print-acl") == (0, topics.access_rules() + "\n", "")
+    rules = topics.access_rules(homeassistant=True, name="r2.d2") + "\n"
     assert bridge(home, "--name", "r2.d2", "--homeassistant", "--print-acl") == (0, rules, "")
 
 

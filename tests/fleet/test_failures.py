@@ -10,7 +10,7 @@ import pytest
 from paho.mqtt import client as paho
 
 from talkcli.fleet import broker as brokers
-from talkcli.fleet.bridge.main import Bridge, Settings
+from talkcli.fleet.bridge.main import Bridge, BridgeSettings
 from talkcli.fleet.broker import from_environment
 from tests.fleet.asker import Asker
 from tests.fleet.conftest import in_loop
@@ -24,7 +24,7 @@ from tests.support.timing import assert_within, limits
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from talkcli.fleet.message import Message
+    from talkcli.fleet.payloads import Message
     from tests.conftest import MakeTalk
     from tests.fleet.conftest import MakeBridge, MakeRobot
     from tests.support.broker import Broker
@@ -89,7 +89,7 @@ async def test_a_connection_that_breaks_under_an_answer_is_made_again(
             await asyncio.sleep(0.01)
 
     asyncio.get_running_loop().set_exception_handler(lambda _loop, told: bugs.append(told))
-    settings = Settings("anna", from_environment(broker.env()), ("say",), socket=scripted.socket)
+    settings = BridgeSettings("anna", from_environment(broker.env()), ("say",), socket=scripted.socket)
     bridge = Bridge(settings, lambda: settings.broker)
     work = asyncio.create_task(bridge.run())
     await asyncio.wait_for(until(lambda: bridge.ready), PATIENCE)

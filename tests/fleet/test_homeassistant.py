@@ -97,7 +97,7 @@ def test_robots_and_home_assistant_work_by_the_printed_access_list(
     make_talk: MakeTalk, make_bridge: MakeBridge
 ) -> None:
     users = {each: f"password of {each}" for each in ("anna", "r2.d2", "homeassistant", "olga")}
-    rules = topics.access(("olga",), homeassistant=True, name="r2.d2")
+    rules = topics.access_rules(("olga",), homeassistant=True, name="r2.d2")
     with Broker(users=users, acl=f"{rules}\n") as broker:
         for name in ("anna", "r2.d2"):
             make_bridge(make_talk(scripted=True), broker, name, "--homeassistant", user=name, observer="olga")

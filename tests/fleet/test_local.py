@@ -1,4 +1,4 @@
-"""The bridge's connection to its server, and the threads that wait for it: nothing is lost or left over."""
+"""The bridge's connection to its server: nothing is lost or left over."""
 
 from __future__ import annotations
 
@@ -6,14 +6,13 @@ import asyncio
 import contextlib
 import gc
 import socket
-import threading
 from typing import TYPE_CHECKING
 
 import pytest
 
 from talkcli import __version__
 from talkcli.errors import Busy, ServerUnavailable
-from talkcli.fleet.bridge.local import apart, dial
+from talkcli.fleet.bridge.local import dial
 from talkcli.protocol.events import busy_greeting, greeting
 from talkcli.protocol.lines import encode
 from tests.fleet.conftest import in_loop
@@ -22,7 +21,7 @@ from tests.support.surroundings import short_directory
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
 
-    from talkcli.fleet.bridge.local import Local
+    from talkcli.fleet.bridge.local import LocalConnection
 
 GREETING = encode(greeting(__version__, 7, "a1b2"))
 PATIENCE = 10.0
@@ -46,16 +45,12 @@ async def accepted(listening: socket.socket) -> socket.socket:
 
 
 @contextlib.asynccontextmanager
-async def greeted(listening: socket.socket) -> AsyncIterator[tuple[Local, socket.socket]]:
+async def greeted(listening: socket.socket) -> AsyncIterator[tuple[LocalConnection, socket.socket]]:
     """A connection, and the server's end of it."""
     dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
     with await accepted(listening) as server:
         server.sendall(GREETING)
         yield await dialing, server
-
-
-def no_more_threads(_: threading.Thread) -> None:
-    raise RuntimeError("can't start new thread")
 
 
 def lines(connected: socket.socket, count: int) -> list[bytes]:
@@ -72,7 +67,7 @@ async def test_a_server_may_greet_at_once_or_later_or_in_pieces(
     dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
     with await accepted(listening) as server:
         for each in parts:
-            await asyncio.sleep(wait)  # 0.2 s are waited for in the loop, and the rest in a thread
+            await asyncio.sleep(wait)
             server.sendall(each)
         local = await dialing
         assert (local.boot, local.pid) == ("a1b2", 7)
@@ -151,24 +146,6 @@ async def test_a_connection_on_which_a_line_can_not_be_sent_has_ended(listening:
         local.close()
 
 
-@pytest.mark.parametrize("given_up", [False, True])
-@in_loop
-async def test_without_threads_nothing_is_left_over(
-    listening: socket.socket, monkeypatch: pytest.MonkeyPatch, given_up: bool
-) -> None:
-    slots = asyncio.Semaphore(1)
-    dialing = asyncio.create_task(dial(listening.getsockname(), "bob", slots=slots))
-    with await accepted(listening) as server:
-        with monkeypatch.context() as patched:
-            patched.setattr(threading.Thread, "start", no_more_threads)
-            if given_up:
-                dialing.cancel()
-            with pytest.raises(asyncio.CancelledError if given_up else RuntimeError):
-                await dialing
-        assert lines(server, 2)[1] == b""
-    assert not slots.locked()
-
-
 @pytest.mark.parametrize("said", [encode(busy_greeting()), b"220 mail\n", b""])
 @in_loop
 async def test_a_refused_connection_raises_busy_or_unavailable(
@@ -211,44 +188,8 @@ async def test_a_dial_without_a_free_descriptor_gives_its_slot_back(
     def none_left(_: str | None) -> None:
         raise OSError("Too many open files")
 
-    monkeypatch.setattr("talkcli.fleet.bridge.local.reach", none_left)
+    monkeypatch.setattr("talkcli.client.connect.reach", none_left)
     slots = asyncio.Semaphore(1)
     with pytest.raises(OSError, match="Too many"):
         await dial(listening.getsockname(), "bob", slots=slots)
     assert not slots.locked()
-
-
-@in_loop
-async def test_the_result_of_cancelled_work_is_undone_once_its_thread_has_ended(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    go = threading.Event()
-    undone, over = asyncio.Event(), asyncio.Event()
-    assert await apart(threading.get_ident) != threading.get_ident()
-    waiting = apart(lambda: go.wait(5), lambda result: undone.set() if result else None, over.set)
-    await asyncio.sleep(0)
-    waiting.cancel()
-    with pytest.raises(asyncio.CancelledError):
-        await waiting
-    assert not over.is_set()
-    go.set()
-    await undone.wait()
-    await over.wait()
-    over.clear()
-    monkeypatch.setattr(threading.Thread, "start", no_more_threads)
-    with pytest.raises(RuntimeError, match="can't start new thread"):
-        await apart(threading.get_ident, finished=over.set)
-    assert over.is_set()
-
-
-def test_the_end_of_the_loop_does_not_wait_for_work_and_the_result_is_undone() -> None:
-    go, undone = threading.Event(), threading.Event()
-
-    async def leave() -> None:
-        work = apart(lambda: go.wait(30), lambda result: undone.set() if result else None)
-        await asyncio.sleep(0)
-        work.cancel()
-
-    asyncio.run(leave())
-    go.set()
-    assert undone.wait(5)

@@ -61,7 +61,7 @@ def test_only_a_valid_certificate_of_the_ca_is_trusted() -> None:
 
 
 def test_a_certificate_is_a_login_for_a_robot_and_for_a_desk(make_talk: MakeTalk, make_bridge: MakeBridge) -> None:
-    rules = topics.access(OPERATORS) + "\n\nuser watcher\ntopic read #\n"
+    rules = topics.access_rules(OPERATORS) + "\n\nuser watcher\ntopic read #\n"
     other, own = stranger().client("olga"), authority().client("olga")
     hint = "TALK_MQTT_CERT and TALK_MQTT_KEY name one that it takes"
     with Broker(certificates=True, acl=rules) as broker:

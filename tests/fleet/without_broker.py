@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 from talkcli.fleet import topics
 from talkcli.fleet.bridge import policy
-from talkcli.fleet.message import Message
+from talkcli.fleet.payloads import Message
 from tests.support.connection import PATIENCE
 from tests.support.surroundings import needs_packages
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from talkcli.fleet.bridge.askers import Askers
+    from talkcli.fleet.bridge.session import RemoteSessions
 
 
 class AskersWithoutBroker:
@@ -24,27 +24,29 @@ class AskersWithoutBroker:
     def __init__(self, socket: str, room: int = 200_000) -> None:
         """`socket`: the server's; `room`: bytes of the largest payload."""
         needs_packages("paho")
-        from talkcli.fleet.bridge.askers import Askers
+        from talkcli.fleet.bridge.session import RemoteSessions
+        from talkcli.fleet.link import boottime
 
         #: the topic and the lines of each message
         self.published: list[tuple[str, list[dict[str, Any]]]] = []
         self._more = asyncio.Event()
+        self._boottime = boottime
         self._policy = policy.Policy("anna", policy.ASKABLE)
-        self.askers: Askers = Askers("anna", socket, self._publish, lambda: room, lambda: None)
+        self.sessions: RemoteSessions = RemoteSessions("anna", socket, self._publish, lambda: room, lambda: None)
 
     def post(self, fields: object, session: str = "s1", *, correlation: bytes | None = None) -> None:
         """Send a request of bob, an object or bytes. b"" is a goodbye."""
         payload = fields if isinstance(fields, bytes) else json.dumps(fields).encode()
         topic, response = "talk/robot/anna/request/bob", f"talk/reply/bob/{session}"
-        asked = topics.asked(topic)
+        asked = topics.parse_request(topic)
         assert asked
         message = Message(topic, payload, response=response, correlation=correlation)
-        found = self._policy.judge(message, asked, self.askers.boottime(), stale=False)
-        if isinstance(found, policy.HungUp):
-            self.askers.hang_up(found.user, found.topic)
+        found = self._policy.judge(message, asked, self._boottime(), stale=False)
+        if isinstance(found, policy.Goodbye):
+            self.sessions.say_goodbye(found.user, found.reply_topic)
         else:
-            assert isinstance(found, policy.Ask), found
-            self.askers.ask(found)
+            assert isinstance(found, policy.RemoteRequest), found
+            self.sessions.submit(found)
 
     def lines(self, session: str = "s1") -> list[dict[str, Any]]:
         return [each for topic, lines in self.published if topic == f"talk/reply/bob/{session}/anna" for each in lines]

@@ -136,7 +136,7 @@ def test_readmes_robot_and_its_desk(tmp_path: Path, place: str) -> None:
     needs_packages("paho")
     operators = ("olga", "ha")
     with contextlib.ExitStack() as stack:
-        broker = stack.enter_context(Broker(secure=True, users=PASSWORDS, acl=topics.access(operators) + "\n"))
+        broker = stack.enter_context(Broker(secure=True, users=PASSWORDS, acl=topics.access_rules(operators) + "\n"))
         for user in PASSWORDS:
             broker.env(user)  # it writes the file of the password
         env = clean_environment(place) | {"TALK_SOCKET": f"{place}/s", "TALK_PLAYER": "null", "TALK_RATE": "450"}

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any, cast
 from talkcli import __version__
 from talkcli.daemon import log
 from talkcli.engine import protocol
-from talkcli.fleet.bridge.main import Bridge, Settings
+from talkcli.fleet.bridge.main import Bridge, BridgeSettings
 from talkcli.fleet.bridge.policy import ASKABLE
 from talkcli.fleet.broker import from_environment
 from talkcli.goals.goal import Sender
@@ -135,7 +135,9 @@ async def run(names: list[str], broker_url: str, directory: str, spoken: TextIO)
         spoken.write(json.dumps({"robot": robot, "id": goal_id, "text": text, "at": time.monotonic()}) + "\n")
 
     servers = [Server(f"{directory}/{name}", lambda *goal, name=name: note(name, *goal), descriptors) for name in names]
-    bridges = [Bridge(Settings(name, broker, ASKABLE, (), f"{directory}/{name}"), lambda: broker) for name in names]
+    bridges = [
+        Bridge(BridgeSettings(name, broker, ASKABLE, (), f"{directory}/{name}"), lambda: broker) for name in names
+    ]
 
     look: asyncio.TimerHandle | None = None
 

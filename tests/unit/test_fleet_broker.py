@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.errors import UsageError
-from talkcli.fleet.broker import Broker, from_environment, user
+from talkcli.fleet.broker import Broker, client_user, from_environment
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -102,7 +102,7 @@ def test_a_certificate_without_tls_is_refused(name: str) -> None:
 
 
 def test_the_user_is_the_login_s_or_else_the_machine_s() -> None:
-    assert user(Broker("broker", 1, tls=True, user="olga")) == "olga"
-    assert user(Broker("broker", 1, tls=True))
+    assert client_user(Broker("broker", 1, tls=True, user="olga")) == "olga"
+    assert client_user(Broker("broker", 1, tls=True))
     with pytest.raises(UsageError, match="TALK_MQTT_USER"):
-        user(Broker("broker", 1, tls=True, user="olga/+"))
+        client_user(Broker("broker", 1, tls=True, user="olga/+"))

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from talkcli.fleet import topics
-from talkcli.fleet.bridge import homeassistant
 from talkcli.fleet.bridge.policy import ASKABLE
+from talkcli.fleet.payloads import homeassistant_device
 from talkcli.goals.states import State
 from tests.fleet.homeassistant import TOPIC, faults, rendered
 
@@ -20,7 +20,7 @@ UNTOLD = {name: each for name, each in ENDED.items() if name != "text"}
 
 
 def announced(name: str = "anna", allow: tuple[str, ...] = ASKABLE) -> dict[str, Any]:
-    topic, payload = homeassistant.device(name, allow, "0.1.0")
+    topic, payload = homeassistant_device(name, allow, "0.1.0")
     assert faults(topic, payload) == []
     found: dict[str, Any] = json.loads(payload)
     return found
@@ -34,7 +34,7 @@ def test_an_announcement_keeps_home_assistants_rules(name: str) -> None:
     }  # fmt: skip
     for key in ("say", "cancel"):
         topic = found["components"][key]["command_topic"]
-        assert topics.asked(topic) == topics.Asked(key, "homeassistant")
+        assert topics.parse_request(topic) == topics.RequestTopic(key, "homeassistant")
         assert topic.startswith(f"talk/robot/{name}/")
         assert not found["components"][key].get("retain")  # retained requests are never spoken
     assert {*found["components"]["last"]["options"]} == {each.name for each in State if each.terminal}
@@ -84,7 +84,7 @@ def test_the_entities_show_the_status(status: dict[str, Any], states: list[str])
 
 def test_each_name_has_a_topic_of_its_own() -> None:
     names = ["a" + "".join(each) for length in range(5) for each in product("._d", repeat=length)]
-    assert len({topics.device(each) for each in names}) == len(names)
-    assert all(TOPIC.fullmatch(topics.device(each)) for each in names)
+    assert len({topics.homeassistant_device(each) for each in names}) == len(names)
+    assert all(TOPIC.fullmatch(topics.homeassistant_device(each)) for each in names)
     for name in ("anna", "A_1", "wh-07"):  # so that an ACL's pattern is enough
-        assert topics.device(name) == topics.device("%u").replace("%u", name)
+        assert topics.homeassistant_device(name) == topics.homeassistant_device("%u").replace("%u", name)

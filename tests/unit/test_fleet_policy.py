@@ -10,8 +10,17 @@ from hypothesis import strategies as st
 
 from talkcli.fleet import topics
 from talkcli.fleet.bridge import policy
-from talkcli.fleet.bridge.policy import Ask, Dropped, Echoes, HungUp, Ids, Policy, Refused, Share
-from talkcli.fleet.message import Message
+from talkcli.fleet.bridge.policy import (
+    EchoTracker,
+    Goodbye,
+    Ignored,
+    Policy,
+    Refusal,
+    RemoteGoals,
+    RemoteRequest,
+    SentIds,
+)
+from talkcli.fleet.payloads import Message
 from talkcli.frozen import replace
 from talkcli.goals.goal import By, Goal, Sender
 from talkcli.goals.option import MAX_NAME, is_clients_id
@@ -24,13 +33,13 @@ NOW = 1000.0
 OWN, PLAIN, CANCEL = (f"talk/robot/anna/{kind}/bob" for kind in ("request", "say", "cancel"))
 REPLY = "talk/reply/bob/s1"
 SAY = {"request": "say", "text": "hello"}
-LONGEST = b"c" * policy.MAX_CORRELATION
+LONGEST = b"c" * policy.MAX_CORRELATION_BYTES
 
-Judged = Ask | Refused | HungUp | Dropped
+Judged = RemoteRequest | Refusal | Goodbye | Ignored
 
 
 def judge(message: Message, *, stale: bool = False, allow: tuple[str, ...] = policy.ASKABLE) -> Judged:
-    asked = topics.asked(message.topic)
+    asked = topics.parse_request(message.topic)
     assert asked
     return Policy("anna", allow).judge(message, asked, NOW, stale=stale)
 
@@ -41,16 +50,12 @@ def request(fields: object = SAY, topic: str = OWN, response: str | None = REPLY
 
 
 def refused(judged: Judged) -> str:
-    assert isinstance(judged, Refused), judged
-    error = judged.answer["error"]
-    assert isinstance(error, dict)
-    assert (error["code"], error["message"]) == (judged.code, judged.words)
-    assert judged.answer["ok"] is False
-    return judged.code
+    assert isinstance(judged, Refusal), judged
+    return judged.error.code
 
 
-def asked(judged: Judged) -> Ask:
-    assert isinstance(judged, Ask), judged
+def asked(judged: Judged) -> RemoteRequest:
+    assert isinstance(judged, RemoteRequest), judged
     return judged
 
 
@@ -61,8 +66,8 @@ def asked(judged: Judged) -> Ask:
 @pytest.mark.parametrize("response", [REPLY, f"{REPLY}/anna"])
 def test_a_request_is_answered_under_the_robots_name(topic: str, response: str) -> None:
     found = asked(judge(request({"seq": 5, **SAY}, topic, response, correlation=b"c")))
-    assert (found.user, found.topic, found.seq, found.correlation) == ("bob", f"{REPLY}/anna", 5, b"c")
-    assert (found.request, found.message, found.until) == (Say("hello"), SAY, None)
+    assert (found.user, found.reply_topic, found.seq, found.correlation) == ("bob", f"{REPLY}/anna", 5, b"c")
+    assert (found.request, found.fields, found.start_by) == (Say("hello"), SAY, None)
 
 
 @pytest.mark.parametrize(
@@ -75,15 +80,15 @@ def test_a_request_is_answered_under_the_robots_name(topic: str, response: str) 
 )
 def test_a_plain_text_is_literal_and_anything_cancels_everything(topic: str, payload: bytes, wanted: object) -> None:
     found = asked(judge(request(payload, topic, None)))
-    assert (found.request, found.topic) == (wanted, None)
-    assert found.size == (0 if topic == CANCEL else len(payload))
+    assert (found.request, found.reply_topic) == (wanted, None)
+    assert found.size_bytes == (0 if topic == CANCEL else len(payload))
     assert not isinstance(found.request, Cancel) or found.request.everything
 
 
 def test_an_empty_request_is_the_goodbye_of_the_session_that_it_names() -> None:
-    assert judge(request(b"")) == HungUp("bob", f"{REPLY}/anna")
+    assert judge(request(b"")) == Goodbye("bob", f"{REPLY}/anna")
     for topic, response in ((OWN, None), (PLAIN, None), (PLAIN, REPLY)):
-        assert isinstance(judge(request(b"", topic, response)), Dropped)
+        assert isinstance(judge(request(b"", topic, response)), Ignored)
 
 
 # What is refused, and in which order
@@ -93,14 +98,14 @@ def test_an_empty_request_is_the_goodbye_of_the_session_that_it_names() -> None:
 @pytest.mark.parametrize("topic", [OWN, PLAIN, CANCEL])
 def test_a_retained_message_is_dropped_before_anything_else(topic: str, payload: bytes) -> None:
     found = judge(request(payload, topic, retained=True), stale=True, allow=())
-    assert isinstance(found, Dropped)
+    assert isinstance(found, Ignored)
     assert found.kind == "retained"
 
 
 @pytest.mark.parametrize("response", ["talk/reply/eve/s1", "talk/robot/berta/say/bob", "elsewhere", ""])
 def test_a_message_with_the_response_topic_of_another_is_dropped(response: str) -> None:
     found = judge(request(response=response))
-    assert isinstance(found, Dropped)
+    assert isinstance(found, Ignored)
     assert found.kind == "response"
 
 
@@ -133,8 +138,8 @@ def test_a_malformed_request_has_the_error_of_the_wire_also_if_it_is_stale_and_n
 @pytest.mark.parametrize("response", [REPLY, None])
 def test_an_error_has_the_number_and_the_correlation_of_its_request(response: str | None) -> None:
     found = judge(request({"seq": 7, "request": "say"}, response=response, correlation=b"c"))
-    assert isinstance(found, Refused)
-    assert (found.answer["seq"], found.correlation, found.topic) == (7, b"c", response and f"{REPLY}/anna")
+    assert isinstance(found, Refusal)
+    assert (found.seq, found.correlation, found.reply_topic) == (7, b"c", response and f"{REPLY}/anna")
 
 
 @pytest.mark.parametrize(
@@ -143,13 +148,13 @@ def test_an_error_has_the_number_and_the_correlation_of_its_request(response: st
 def test_correlation_data_that_are_too_long_are_on_no_answer(fields: object, code: str, seq: int | None) -> None:
     assert asked(judge(request(correlation=LONGEST))).correlation == LONGEST
     found = judge(request(fields, correlation=LONGEST + b"c"), stale=True, allow=())
-    assert isinstance(found, Refused)
-    assert (refused(found), found.correlation, found.answer.get("seq")) == (code, None, seq)
+    assert isinstance(found, Refusal)
+    assert (refused(found), found.correlation, found.seq) == (code, None, seq)
 
 
 def test_each_kind_of_request_can_be_forbidden_but_hello_and_watch() -> None:
-    assert {*policy.ASKABLE, *policy.ALWAYS} == {*KINDS}
-    for kind in policy.ALWAYS:
+    assert {*policy.ASKABLE, *policy.ALWAYS_ALLOWED} == {*KINDS}
+    for kind in policy.ALWAYS_ALLOWED:
         assert asked(judge(request({"request": kind}), allow=())).request.kind == kind
     for kind in policy.ASKABLE:
         fields = {"request": kind, **({"text": "a"} if kind == "say" else {})}
@@ -186,9 +191,9 @@ def test_a_sentence_must_begin_before_its_message_expires(
     ttl: float | None, expiry: int | None, waited: float, left: float | None
 ) -> None:
     found = asked(judge(request({**SAY, **({} if ttl is None else {"ttl": ttl})}, expiry=expiry)))
-    line = found.line(NOW + waited, "x")
+    line = found.to_json(NOW + waited, "x")
     assert (line.get("ttl"), line["id"]) == (left, "x")
-    assert asked(judge(request({"request": "cancel"}, expiry=expiry))).line(NOW, None) == {"request": "cancel"}
+    assert asked(judge(request({"request": "cancel"}, expiry=expiry))).to_json(NOW, None) == {"request": "cancel"}
 
 
 def text(number: int) -> bytes:
@@ -197,90 +202,90 @@ def text(number: int) -> bytes:
 
 
 def test_what_comes_within_six_seconds_of_the_newest_echo_that_came_back_is_taken() -> None:
-    echoes = Echoes(100.0)
-    assert not echoes.stale(106.0)
-    assert echoes.stale(106.01)
-    first, second = echoes.send(104.0), echoes.send(105.0)
-    assert echoes.came(text(first))
-    assert not echoes.stale(110.0)
-    assert echoes.stale(110.01)
-    assert echoes.came(text(second))
-    assert not echoes.stale(111.0)
+    echoes = EchoTracker(100.0)
+    assert not echoes.is_stale(106.0)
+    assert echoes.is_stale(106.01)
+    first, second = echoes.add(104.0), echoes.add(105.0)
+    assert echoes.returned(text(first))
+    assert not echoes.is_stale(110.0)
+    assert echoes.is_stale(110.01)
+    assert echoes.returned(text(second))
+    assert not echoes.is_stale(111.0)
 
 
 @pytest.mark.parametrize("unknown", [b"2", b"0", b"-1", b"", b"1.0", b"one", b"7" * 5000, b"\xb2", b"\xff"])
 def test_an_unknown_echo_tells_nothing(unknown: bytes) -> None:
-    echoes = Echoes(0.0)
-    number = text(echoes.send(10.0))
-    assert not echoes.came(unknown)
-    assert echoes.stale(10.0)
-    assert echoes.came(number)
-    assert not echoes.came(number)  # twice
-    assert not echoes.stale(10.0)
+    echoes = EchoTracker(0.0)
+    number = text(echoes.add(10.0))
+    assert not echoes.returned(unknown)
+    assert echoes.is_stale(10.0)
+    assert echoes.returned(number)
+    assert not echoes.returned(number)  # twice
+    assert not echoes.is_stale(10.0)
 
 
 @given(st.lists(st.tuples(st.sampled_from(["send", "come", "wait"]), st.integers(0, 12)), max_size=60))
 def test_messages_older_than_the_newest_echo_allows_are_refused(steps: list[tuple[str, int]]) -> None:
     """A message that comes with an echo was forwarded by the broker no earlier than that echo was sent."""
-    now, proved, echoes = 0.0, 0.0, Echoes(0.0)
+    now, proved, echoes = 0.0, 0.0, EchoTracker(0.0)
     sent: dict[int, float] = {}
     for what, number in steps:
         if what == "wait":
             now += number
         elif what == "send":
-            sent[echoes.send(now)] = now
-        elif echoes.came(text(number)):
+            sent[echoes.add(now)] = now
+        elif echoes.returned(text(number)):
             proved = max(proved, sent[number])
-        assert echoes.stale(now) == (now - proved > policy.STALE_AFTER)
+        assert echoes.is_stale(now) == (now - proved > policy.STALE_AFTER_S)
 
 
 def test_of_a_thousand_echoes_the_newest_alone_counts() -> None:
-    echoes = Echoes(0.0)
-    numbers = [echoes.send(float(each)) for each in range(1000)]
-    assert sum(echoes.came(text(each)) for each in reversed(numbers)) == 1
-    assert echoes.send(0.0) == 1001
+    echoes = EchoTracker(0.0)
+    numbers = [echoes.add(float(each)) for each in range(1000)]
+    assert sum(echoes.returned(text(each)) for each in reversed(numbers)) == 1
+    assert echoes.add(0.0) == 1001
 
 
 # What was sent before
 
 
 def test_the_last_thousand_ids_are_remembered_with_the_servers_start() -> None:
-    ids = Ids()
+    ids = SentIds()
     for each in range(1200):
-        ids.note(f"goal-{each}", "1a1a")
-    ids.note("goal-200", "2b2b")  # again: now it is the newest
-    ids.note("more", "2b2b")
+        ids.add(f"goal-{each}", "1a1a")
+    ids.add("goal-200", "2b2b")  # again: now it is the newest
+    ids.add("more", "2b2b")
     known = {each: ids.boot_of(each) for each in ("goal-200", "goal-201", "goal-202", "more")}
     assert known == {"goal-200": "2b2b", "goal-201": None, "goal-202": "1a1a", "more": "2b2b"}
-    ids.forget("more")
+    ids.discard("more")
     assert ids.boot_of("more") is None
-    ids.forget("never known")
+    ids.discard("never known")
 
 
 def test_twenty_goals_may_be_pending_whichever_of_reply_and_event_comes_first() -> None:
-    share = Share()
+    share = RemoteGoals()
     for each in range(20):
         assert share.has_room(Say("a"))
-        share.sent(f"g{each}", "battery" if each == 7 else None)
+        share.add(f"g{each}", "battery" if each == 7 else None)
         if each % 2:
-            share.came(f"g{each}", "battery" if each == 7 else None)
+            share.queued(f"g{each}", "battery" if each == 7 else None)
             share.answered(f"g{each}", pending=True)
         elif each:  # the first is still on its way
             share.answered(f"g{each}", pending=True)
-            share.came(f"g{each}", None)
-    assert (len(share), share.pending) == (20, 19)
+            share.queued(f"g{each}", None)
+    assert (len(share), share.pending_count) == (20, 19)
     sentences = [Say("a"), Say("a", key="door"), Say("a", key="battery"), Say("a", flush=True), Say("a", preempt=True)]
     assert [share.has_room(each) for each in sentences] == [False, False, True, True, True]
-    share.left("g3")
+    share.dequeued("g3")
     assert share.has_room(Say("a"))
 
 
 def test_goals_on_their_way_still_count_if_the_server_is_watched_anew() -> None:
-    share = Share()
-    share.sent("on its way", None)
-    share.came("over", None)
-    share.begin([("there", "k")])
-    assert (len(share), share.pending) == (2, 1)
+    share = RemoteGoals()
+    share.add("on its way", None)
+    share.queued("over", None)
+    share.reset([("there", "k")])
+    assert (len(share), share.pending_count) == (2, 1)
     share.clear()
     assert len(share) == 0
 
@@ -291,13 +296,13 @@ def test_goals_on_their_way_still_count_if_the_server_is_watched_anew() -> None:
     )
 )
 def test_the_share_counts_like_a_slow_model(steps: list[tuple[str, int]]) -> None:
-    share = Share()
+    share = RemoteGoals()
     on_way: set[int] = set()
     pending: set[int] = set()
     for what, number in steps:
         name = str(number)
         if what == "sent":
-            share.sent(name, None)
+            share.add(name, None)
             on_way |= {number}
         elif what in ("accepted", "refused"):
             share.answered(name, pending=what == "accepted")
@@ -305,13 +310,13 @@ def test_the_share_counts_like_a_slow_model(steps: list[tuple[str, int]]) -> Non
                 pending |= {number}
             on_way -= {number}
         elif what == "came":
-            share.came(name, None)
+            share.queued(name, None)
             pending |= {number}
         else:
-            assert share.left(name) is (number in on_way | pending)
+            assert share.dequeued(name) is (number in on_way | pending)
             on_way -= {number}
             pending -= {number}
-        assert (len(share), share.pending) == (len(on_way | pending), len(pending))
+        assert (len(share), share.pending_count) == (len(on_way | pending), len(pending))
 
 
 # What a robot says in its server's place
@@ -320,7 +325,7 @@ def test_the_share_counts_like_a_slow_model(steps: list[tuple[str, int]]) -> Non
 @pytest.mark.parametrize(("wait", "feedback"), [(False, False), (True, False), (False, True)])
 def test_a_goal_that_never_reached_the_server_is_told_as_the_server_would(wait: bool, feedback: bool) -> None:
     say = {"seq": 3, **SAY, "wait": wait, "feedback": feedback, "key": "k", "priority": 2}
-    goal, lines = policy.not_taken(
+    goal, lines = policy.end_unsent(
         asked(judge(request(say))), "anna-x1", State.RECALLED, "canceled", "words", 5.0, By(client=Sender(name="x"))
     )
     assert Goal.from_json(lines[0]["goal"]) == goal
@@ -331,9 +336,9 @@ def test_a_goal_that_never_reached_the_server_is_told_as_the_server_would(wait: 
 
 
 def test_the_name_of_a_user_from_afar_fits_and_says_so() -> None:
-    longest = "u" * topics.LONGEST
-    assert policy.sender("bob") == "mqtt:bob"
-    assert policy.sender("bob", "patrol") == "mqtt:bob patrol"
-    assert policy.sender(longest) == f"mqtt:{longest}"
-    assert len(policy.sender(longest)) == len(policy.sender("bob", "n" * MAX_NAME)) == MAX_NAME
+    longest = "u" * topics.MAX_NAME_CHARS
+    assert policy.sender_name("bob") == "mqtt:bob"
+    assert policy.sender_name("bob", "patrol") == "mqtt:bob patrol"
+    assert policy.sender_name(longest) == f"mqtt:{longest}"
+    assert len(policy.sender_name(longest)) == len(policy.sender_name("bob", "n" * MAX_NAME)) == MAX_NAME
     assert is_clients_id(f"{longest[:48]}-x{0:012x}")

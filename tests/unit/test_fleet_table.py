@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.fleet.presence import Presence
-from talkcli.fleet.status import Status
+from talkcli.fleet.payloads import Presence, RobotStatus
 from talkcli.frozen import replace
 from talkcli.goals.states import State
 from talkcli.protocol.events import StateChanged, from_json
@@ -126,7 +125,7 @@ def test_a_robot_with_an_impossible_time_is_shown_all_the_same(moment: float) ->
     goal = {"id": "odd", "state": "SUCCEEDED", "text": "hello", "created_at": moment, "ended_at": moment, "at": moment}
     event = from_json({"event": "state", "id": "odd", "state": "SUCCEEDED", "at": moment, "n": 1, "goal": goal})
     presence = Presence.read("anna", json.dumps({"since": moment}).encode())
-    status = Status.read(json.dumps({"last": goal}).encode())
+    status = RobotStatus.read(json.dumps({"last": goal}).encode())
     assert presence
     assert status
     assert status.last

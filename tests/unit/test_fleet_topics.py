@@ -7,13 +7,13 @@ import re
 import pytest
 
 from talkcli.fleet import topics
-from talkcli.fleet.topics import Asked
+from talkcli.fleet.topics import RequestTopic
 from talkcli.goals.option import MAX_NAME
 
 
 @pytest.mark.parametrize("name", ["a", "anna", "wh-07", "r2.d2", "A_1", "0", "a" * 59])
 def test_a_name_is_one_level_of_a_topic(name: str) -> None:
-    assert topics.fault(name) is None
+    assert topics.name_fault(name) is None
     assert len(f"mqtt:{name}") <= MAX_NAME
 
 
@@ -21,16 +21,16 @@ def test_a_name_is_one_level_of_a_topic(name: str) -> None:
     "name", ["", "_", "-a", ".a", "a/b", "+", "#", "a+", "$SYS", "a b", "ä", "a\n", "a\0", "a" * 60, "%u"]
 )
 def test_a_name_that_would_be_another_topic_is_refused(name: str) -> None:
-    assert topics.fault(name)
+    assert topics.name_fault(name)
 
 
 @pytest.mark.parametrize(
     ("topic", "asked"),
     [
-        ("talk/robot/anna/request/olga", Asked("request", "olga")),
-        ("talk/robot/anna/say/olga", Asked("say", "olga")),
-        ("talk/robot/anna/cancel/olga", Asked("cancel", "olga")),
-        ("talk/group/all/request/olga", Asked("request", "olga")),
+        ("talk/robot/anna/request/olga", RequestTopic("request", "olga")),
+        ("talk/robot/anna/say/olga", RequestTopic("say", "olga")),
+        ("talk/robot/anna/cancel/olga", RequestTopic("cancel", "olga")),
+        ("talk/group/all/request/olga", RequestTopic("request", "olga")),
         ("talk/group/all/say/olga", None),
         ("talk/robot/anna/echo", None),
         ("talk/robot/anna/event/state", None),
@@ -42,8 +42,8 @@ def test_a_name_that_would_be_another_topic_is_refused(name: str) -> None:
         ("", None),
     ],
 )
-def test_a_topic_says_what_is_asked_and_by_whom(topic: str, asked: Asked | None) -> None:
-    assert topics.asked(topic) == asked
+def test_a_topic_says_what_is_asked_and_by_whom(topic: str, asked: RequestTopic | None) -> None:
+    assert topics.parse_request(topic) == asked
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_a_topic_says_what_is_asked_and_by_whom(topic: str, asked: Asked | None)
     ],
 )
 def test_a_robot_answers_nobody_but_the_asker(response: str, answer: str | None) -> None:
-    assert topics.answer(response, "olga", "anna") == answer
+    assert topics.checked_reply(response, "olga", "anna") == answer
 
 
 # The access control list
@@ -103,12 +103,12 @@ def talk(topics_of: str) -> set[str]:
 @pytest.mark.parametrize("way", ["read", "write"])
 def test_each_login_may_use_its_own_topics_and_no_others(way: str) -> None:
     """A robot's name is %u, so a rule with it in the place of the user would let one robot command another."""
-    rules = topics.access(("olga",), name="r2.d2")
+    rules = topics.access_rules(("olga",), name="r2.d2")
     assert may(way, None, rules) == talk(ROBOT[way])
     assert may(way, "olga", rules) == talk(OPERATOR[way])
     assert may(way, "homeassistant", rules) == may(way, "r2.d2", rules) == set()
-    rules = topics.access(("olga",), homeassistant=True, name="r2.d2")
-    own = {"read": topics.BIRTH, "write": "homeassistant/device/talk/%u/config"}
+    rules = topics.access_rules(("olga",), homeassistant=True, name="r2.d2")
+    own = {"read": topics.HOMEASSISTANT_STATUS, "write": "homeassistant/device/talk/%u/config"}
     assert may(way, None, rules) == talk(ROBOT[way]) | {own[way]}
     assert may(way, "olga", rules) == talk(OPERATOR[way])
     assert may(way, "homeassistant", rules) == talk(HOME[way]) | {"homeassistant/#"}
@@ -117,14 +117,14 @@ def test_each_login_may_use_its_own_topics_and_no_others(way: str) -> None:
 
 
 def test_each_operator_has_the_same_lines() -> None:
-    robots, olga, ha = topics.access(("olga", "ha")).split("\n\n")
-    assert f"{robots}\n\n{olga}" == topics.access(("olga",))
+    robots, olga, ha = topics.access_rules(("olga", "ha")).split("\n\n")
+    assert f"{robots}\n\n{olga}" == topics.access_rules(("olga",))
     assert ha == olga.replace("olga", "ha")
 
 
 def test_only_a_name_with_a_dot_has_a_line_of_its_own() -> None:
-    rules = topics.access(("olga",), homeassistant=True, name="anna")
-    assert rules == topics.access(("olga",), homeassistant=True)
-    assert {*topics.access(("olga",), name="r2.d2").splitlines()} < {*rules.splitlines()}
+    rules = topics.access_rules(("olga",), homeassistant=True, name="anna")
+    assert rules == topics.access_rules(("olga",), homeassistant=True)
+    assert {*topics.access_rules(("olga",), name="r2.d2").splitlines()} < {*rules.splitlines()}
     # mosquitto's manual: %u must be the only text of its level.
     assert {each for line in rules.splitlines()[1:] for each in re.findall(r"[^/ ]*%u[^/ ]*", line)} == {"%u"}

@@ -86,26 +86,26 @@ def test_limits_are_those_of_the_code() -> None:
 def test_limits_of_a_fleet_are_those_of_the_code() -> None:
     needs_packages("paho")
     from talkcli.fleet import link
-    from talkcli.fleet.bridge import askers, news, session
     from talkcli.fleet.bridge import main as bridge
+    from talkcli.fleet.bridge import publisher, session
 
     limits = {row[0]: row[1] for row in tables(FLEET.section("Limits"))[0][1:]}
     assert limits["a request"].startswith(f"{MAX_LINE:,} bytes")
-    assert limits["correlation data"] == f"{policy.MAX_CORRELATION} bytes"
-    assert f"past {policy.MAX_CORRELATION} bytes the request" in FLEET.section("Requests and replies")
-    assert f"at most {(link.MAX_PACKET - link.MAX_HEAD) // 1024} KiB" in limits["a reply's payload"]
-    assert limits["goals from afar that are pending"] == str(policy.SHARE)
-    assert limits["askers"].startswith(f"{askers.MAX_SESSIONS}, and {session.MAX_WAITING} requests of each")
-    assert limits["requests that wait"].startswith(f"{session.MAX_HELD >> 20} MiB for all askers")
-    assert limits["an asker that says nothing"] == f"{session.IDLE:g} s"
-    assert limits["ids that are remembered"] == f"{policy.REMEMBERED:,}"
-    assert f"past {bridge.SOFT_OUTPUT // 1024} KiB" in limits["what the broker is slow to take"]
-    assert f"past {bridge.HARD_OUTPUT // 2**20} MiB" in limits["what the broker is slow to take"]
+    assert limits["correlation data"] == f"{policy.MAX_CORRELATION_BYTES} bytes"
+    assert f"past {policy.MAX_CORRELATION_BYTES} bytes the request" in FLEET.section("Requests and replies")
+    assert f"at most {(link.MAX_PACKET_BYTES - link.MAX_HEADER_BYTES) // 1024} KiB" in limits["a reply's payload"]
+    assert limits["goals from afar that are pending"] == str(policy.MAX_REMOTE_GOALS)
+    assert limits["askers"].startswith(f"{session.MAX_SESSIONS}, and {session.MAX_WAITING_REQUESTS} requests of each")
+    assert limits["requests that wait"].startswith(f"{session.MAX_WAITING_BYTES >> 20} MiB for all askers")
+    assert limits["an asker that says nothing"] == f"{session.CLIENT_SILENCE_LIMIT_S:g} s"
+    assert limits["ids that are remembered"] == f"{policy.MAX_REMEMBERED_IDS:,}"
+    assert f"past {bridge.SLOW_BROKER_BYTES // 1024} KiB" in limits["what the broker is slow to take"]
+    assert f"past {bridge.STUCK_BROKER_BYTES // 2**20} MiB" in limits["what the broker is slow to take"]
     section = FLEET.section("Topics")
-    assert f"1 to {topics.LONGEST} of" in section
-    assert f"expires after {bridge.PRESENCE_EXPIRY} s, renewed every {bridge.PRESENCE_EVERY:g} s" in section
-    assert f"expires after {news.EVENT_EXPIRY} s" in section
-    assert f"more than {policy.STALE_AFTER:g} s ago" in " ".join(FLEET.section("What is refused").split())
+    assert f"1 to {topics.MAX_NAME_CHARS} of" in section
+    assert f"expires after {bridge.PRESENCE_EXPIRY_S} s, renewed every {bridge.PRESENCE_EVERY_S:g} s" in section
+    assert f"expires after {publisher.EVENT_EXPIRY_S} s" in section
+    assert f"more than {policy.STALE_AFTER_S:g} s ago" in " ".join(FLEET.section("What is refused").split())
 
 
 def test_places_are_those_of_the_code(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,7 @@
-"""What a robot takes from the broker, and what not: who may ask for what, how old it may be, how much may wait.
+"""What a robot accepts over the broker, and what the bridge remembers to decide that.
 
-Rules for this file: pure, the time comes in as an argument; it decides about messages, never about speech: that is the
-server's. What is refused is refused before anything is sent there. All that it keeps has a limit.
+Pure. It decides about messages, never about speech, which is the server's job. A message is refused before anything is
+sent to the server. Everything that is remembered has a limit.
 """
 
 from __future__ import annotations
@@ -14,151 +14,157 @@ from talkcli.frozen import frozen
 from talkcli.goals.goal import By, Goal, Sender
 from talkcli.goals.option import MAX_NAME
 from talkcli.goals.options import SHOWN, Say
-from talkcli.protocol.events import Result, StateChanged, failure, ok, take_seq
+from talkcli.protocol.events import Result, StateChanged, ok, take_seq
 from talkcli.protocol.lines import MAX_DIGITS, MAX_LINE, decode
 from talkcli.protocol.requests import KINDS, read_request
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
-    from talkcli.fleet.message import Message
+    from talkcli.fleet.payloads import Message
     from talkcli.goals.goal import JsonObject
     from talkcli.goals.states import State
     from talkcli.protocol.requests import Request
 
-#: The code of what is refused because it may be old.
-STALE = "stale"
-#: What may be asked for in any case: who one is, and what can be read from the broker anyway.
-ALWAYS = ("hello", "watch")
-#: What else there is to be asked for.
-ASKABLE = tuple(each for each in KINDS if each not in ALWAYS)
+#: The error code for a message that may be old.
+STALE_CODE = "stale"
+#: Requests that are always allowed. They tell nothing that the broker doesn't publish anyway.
+ALWAYS_ALLOWED = ("hello", "watch")
+#: Requests that the option `--allow` can name.
+ASKABLE = tuple(each for each in KINDS if each not in ALWAYS_ALLOWED)
 
-#: How everybody is called at the server who asks by the broker.
-AFAR = "mqtt:"
-#: Seconds between two echoes that a bridge sends itself, and those after which a message may be as old as the newest of
-#: them that came back: with a second for the way.
-ECHO_EVERY = 5.0
-STALE_AFTER = ECHO_EVERY + 1.0
-#: Echoes on their way that are remembered: those of half a minute, and some that were sent in between.
-_ECHOES = 32
-#: Goals from the broker that may be pending at once: the others' places in the queue (100 usually) are the robot's own.
-SHARE = 20
-#: Ids of goals that are remembered, so that none is spoken twice though the server has forgotten it.
-REMEMBERED = 1_000
-#: Bytes of the correlation data that stand on what answers a request: they go into each packet's head.
-MAX_CORRELATION = 256
-#: Seconds of a time to live that is over, for a goal that has waited here: 0 would be no limit.
-_OVER = 0.001
+#: At the server, the name of a remote client begins with this.
+_REMOTE_PREFIX = "mqtt:"
+#: Time between two echoes that the bridge sends to itself.
+ECHO_EVERY_S = 5.0
+#: A message is stale if the newest echo that returned was sent longer ago: one interval, and a second for the way.
+STALE_AFTER_S = ECHO_EVERY_S + 1.0
+#: How many echoes are remembered until they return: those of half a minute, and some in between.
+_MAX_ECHOES = 32
+#: How many goals of remote clients may be pending. The rest of the queue (usually 100) is for the robot's own goals.
+MAX_REMOTE_GOALS = 20
+#: How many ids of goals are remembered, so that no goal is spoken twice although the server forgot it.
+MAX_REMEMBERED_IDS = 1_000
+#: Longest correlation data. They are repeated in the header of each answer.
+MAX_CORRELATION_BYTES = 256
+#: Time to live of a goal whose time was over before it was sent. Zero would mean no limit.
+_EXPIRED_TTL_S = 0.001
 
 
 @frozen
-class Ask:
-    """A request that may be carried out."""
+class RemoteRequest:
+    """A request from the broker that may be carried out."""
 
     user: str
-    #: where its answers go; None for nowhere
-    topic: str | None
+    #: where to publish the answers; None if nobody wants any
+    reply_topic: str | None
     seq: int | None
     request: Request
-    #: as it came, without its number
-    message: JsonObject
+    #: the request as it came, without `seq`
+    fields: JsonObject
     correlation: bytes | None = None
-    #: bytes that it takes while it waits
-    size: int = 0
-    #: when it must have begun, by the clock that it was judged by; None for no limit
-    until: float | None = None
+    #: size of the payload, which counts while the request waits
+    size_bytes: int = 0
+    #: when its goal must have started, by the clock of `judge`; None for no limit
+    start_by: float | None = None
 
-    def line(self, now: float, goal_id: str | None) -> JsonObject:
-        """Return what the server is asked, without a number; `goal_id`: the goal's, if this is one."""
-        message = dict(self.message)
+    def to_json(self, now: float, goal_id: str | None) -> JsonObject:
+        """Return the request for the server, without `seq`.
+
+        Args:
+            now: the current time by the clock of `judge`.
+            goal_id: the id of the goal to say, None for other requests.
+        """
+        fields = dict(self.fields)
         if goal_id is not None:
-            message["id"] = goal_id
-        if self.until is not None and isinstance(self.request, Say):
-            left = max(_OVER, self.until - now)
-            message["ttl"] = min(self.request.ttl or left, left)
-        return message
+            fields["id"] = goal_id
+        if self.start_by is not None and isinstance(self.request, Say):
+            left = max(_EXPIRED_TTL_S, self.start_by - now)
+            fields["ttl"] = min(self.request.ttl or left, left)
+        return fields
 
 
 @frozen
-class Refused:
-    """A message that is answered with an error, where there is anybody to answer."""
+class Refusal:
+    """A request that is answered with an error."""
 
-    topic: str | None
-    answer: JsonObject
+    reply_topic: str | None
+    seq: int | None
     correlation: bytes | None
-    #: why, for programs and for people
-    code: str
-    words: str
+    error: BadRequest
 
 
 @frozen
-class HungUp:
-    """The asker says goodbye."""
+class Goodbye:
+    """A message that ends a client's session."""
 
     user: str
-    topic: str
+    reply_topic: str
 
 
 @frozen
-class Dropped:
-    """A message that nobody is told of but the log; `kind` says of what kind it is there."""
+class Ignored:
+    """A message that gets no answer, only a line in the log."""
 
+    #: for the log, which limits how often it shows the same kind
     kind: str
     words: str
 
 
 class Policy:
-    """What this robot takes."""
+    """The rules for messages to one robot."""
 
     def __init__(self, name: str, allow: Collection[str]) -> None:
-        """`name`: the robot's; `allow`: the kinds of requests that may be asked for."""
+        """`name` is the robot's name, `allow` the kinds of requests that it accepts."""
         self._name = name
-        self._allow = {*allow, *ALWAYS}
+        self._allow = {*allow, *ALWAYS_ALLOWED}
 
     def judge(
-        self, message: Message, asked: topics.Asked, now: float, *, stale: bool
-    ) -> Ask | Refused | HungUp | Dropped:
-        """Return what is to be done about a message.
+        self, message: Message, topic: topics.RequestTopic, now: float, *, stale: bool
+    ) -> RemoteRequest | Refusal | Goodbye | Ignored:
+        """Decide what to do with a message.
 
-        `asked`: what its topic asks for; `now`: seconds by a clock that goes on while the robot is suspended; `stale`:
-        whether the message may be old.
+        Args:
+            message: the message.
+            topic: the parts of its topic.
+            now: seconds by a clock that goes on while the robot is suspended.
+            stale: whether the message may be old.
         """
         if message.retained:
-            return Dropped("retained", f"a retained message on {message.topic} is dropped: it is no request of now")
-        topic = None
+            return Ignored("retained", f"a retained message on {message.topic} is dropped: it is no request of now")
+        reply_topic = None
         if message.response is not None:
-            topic = topics.answer(message.response, asked.user, self._name)
-            if topic is None:
+            reply_topic = topics.checked_reply(message.response, topic.user, self._name)
+            if reply_topic is None:
                 words = f"its response topic, {message.response}, is not its own"
-                return Dropped("response", f"a message of {asked.user} is dropped: {words}")
-        if not message.payload and asked.kind != topics.CANCEL:
-            if topic is None or asked.kind == topics.SAY:
-                return Dropped("empty", f"an empty message on {message.topic} asks for nothing")
-            return HungUp(asked.user, topic)
+                return Ignored("response", f"a message of {topic.user} is dropped: {words}")
+        if not message.payload and topic.kind != topics.PLAIN_CANCEL:
+            if reply_topic is None or topic.kind == topics.PLAIN_SAY:
+                return Ignored("empty", f"an empty message on {message.topic} asks for nothing")
+            return Goodbye(topic.user, reply_topic)
         seq, correlation = None, _repeatable(message.correlation)
         try:
-            fields = _fields(asked.kind, message.payload)
+            fields = _request_fields(topic.kind, message.payload)
             seq = take_seq(fields)
             if correlation != message.correlation:
-                raise BadRequest(f"correlation data have at most {MAX_CORRELATION} bytes", "bad_field")
+                raise BadRequest(f"correlation data have at most {MAX_CORRELATION_BYTES} bytes", "bad_field")
             request = read_request(fields)
             if request.kind not in self._allow:
                 words = f"this robot takes no {request.kind} from afar: see its --allow"
                 raise BadRequest(words, "not_allowed")
             if stale and isinstance(request, Say):
                 words = "the line to the broker stalled, so this may be old: say it again if it still holds"
-                raise BadRequest(words, STALE)
+                raise BadRequest(words, STALE_CODE)
         except BadRequest as error:
-            answer = failure(seq, error.code, error.message)
-            return Refused(topic, answer, correlation, error.code, error.message)
-        until = None if message.expiry is None else now + message.expiry
-        size = 0 if asked.kind == topics.CANCEL else len(message.payload)
-        return Ask(asked.user, topic, seq, request, fields, correlation, size, until)
+            return Refusal(reply_topic, seq, correlation, error)
+        start_by = None if message.expiry is None else now + message.expiry
+        size = 0 if topic.kind == topics.PLAIN_CANCEL else len(message.payload)
+        return RemoteRequest(topic.user, reply_topic, seq, request, fields, correlation, size, start_by)
 
 
-def _fields(kind: str, payload: bytes) -> JsonObject:
-    """Return the request in a payload as an object; BadRequest where there is none."""
-    if kind == topics.CANCEL:
+def _request_fields(kind: str, payload: bytes) -> JsonObject:
+    """Return the fields of the request in a payload. Raise BadRequest if there is none."""
+    if kind == topics.PLAIN_CANCEL:
         return {"request": "cancel"}
     line = payload.removesuffix(b"\n") if kind == topics.REQUEST else payload
     if len(line) >= MAX_LINE:
@@ -173,80 +179,81 @@ def _fields(kind: str, payload: bytes) -> JsonObject:
 
 
 def _repeatable(correlation: bytes | None) -> bytes | None:
-    """Return correlation data, or None where they are too long to be repeated."""
-    return correlation if len(correlation or b"") <= MAX_CORRELATION else None
+    """Return correlation data, or None if they are too long to be repeated in answers."""
+    return correlation if len(correlation or b"") <= MAX_CORRELATION_BYTES else None
 
 
-class Echoes:
-    """How old a message may be that comes now, by what the robot sent itself through the broker.
+class EchoTracker:
+    """Tells how old a message may be, from the echoes that the bridge sends to itself through the broker.
 
-    Whatever comes after an echo was sent on by the broker after that was. So no clocks are compared.
+    The broker forwards a message later than all echoes that arrived before it. So no clocks are compared.
     """
 
     def __init__(self, now: float) -> None:
-        """`now`: when the connection was made: nothing in it is older."""
-        self._known = now
+        """`now` is when the connection was made. No message on it is older."""
+        self._newest_at = now
         self._sent: dict[int, float] = {}
         self._number = 0
 
-    def send(self, now: float) -> int:
-        """Return the number of an echo that is sent now."""
+    def add(self, now: float) -> int:
+        """Return the number for an echo that is sent now."""
         self._number += 1
         self._sent[self._number] = now
-        while len(self._sent) > _ECHOES:
+        while len(self._sent) > _MAX_ECHOES:
             del self._sent[next(iter(self._sent))]
         return self._number
 
-    def came(self, text: bytes) -> bool:
-        """Note that the echo of this number has come back; return False if it is not one that is awaited."""
-        number = int(text) if text.isdigit() and len(text) <= MAX_DIGITS else 0
+    def returned(self, number_text: bytes) -> bool:
+        """Record that an echo has returned, and return whether it was awaited."""
+        number = int(number_text) if number_text.isdigit() and len(number_text) <= MAX_DIGITS else 0
         sent = self._sent.get(number)
         if sent is None:
             return False
-        self._known = max(self._known, sent)
+        self._newest_at = max(self._newest_at, sent)
         self._sent = {each: at for each, at in self._sent.items() if each > number}
         return True
 
-    def stale(self, now: float) -> bool:
-        """Whether what comes now may be too old."""
-        return now - self._known > STALE_AFTER
+    def is_stale(self, now: float) -> bool:
+        """Return whether a message that comes now may be too old."""
+        return now - self._newest_at > STALE_AFTER_S
 
 
-class Ids:
-    """The ids of the goals that were last sent to a server, each with that server's boot id."""
+class SentIds:
+    """The ids of the goals that were last sent to the server, and to which start of the server."""
 
     def __init__(self) -> None:
-        #: by id: the boot id, and whether the goal takes a place of the share
+        #: boot id of the server, and whether the goal counts for the limit of remote goals, by id
         self._sent: dict[str, tuple[str, bool]] = {}
 
     def boot_of(self, goal_id: str) -> str | None:
-        """Return the boot id of the server that a goal was sent to; None for one that is not known."""
+        """Return the boot id of the server that got this goal, None if the goal is unknown."""
         return self._sent.get(goal_id, (None, False))[0]
 
-    def in_share(self, goal_id: str, boot: str) -> bool:
-        """Whether a goal that is pending at the server of this boot takes a place of the share."""
+    def is_counted(self, goal_id: str, boot: str) -> bool:
+        """Return whether this goal of this start of the server counts for the limit of remote goals."""
         return self._sent.get(goal_id) == (boot, True)
 
-    def note(self, goal_id: str, boot: str, *, in_share: bool = True) -> None:
-        """Note that a goal is sent to this server."""
+    def add(self, goal_id: str, boot: str, *, counted: bool = True) -> None:
+        """Record that a goal is sent to the server with this boot id."""
         self._sent.pop(goal_id, None)
-        self._sent[goal_id] = boot, in_share
-        if len(self._sent) > REMEMBERED:
+        self._sent[goal_id] = boot, counted
+        if len(self._sent) > MAX_REMEMBERED_IDS:
             del self._sent[next(iter(self._sent))]
 
-    def forget(self, goal_id: str) -> None:
-        """Forget a goal that the server did not take: it can't have been spoken."""
+    def discard(self, goal_id: str) -> None:
+        """Forget a goal that the server didn't accept, because it can't have been spoken."""
         self._sent.pop(goal_id, None)
 
 
-class Share:
-    """The goals from the broker that are pending at the server, or on their way there: by their ids, with their keys.
+class RemoteGoals:
+    """The goals of remote clients that are pending at the server, or on their way there.
 
-    Goals that bring `preempt` or `flush` are not counted. A goal's reply and its events come on different connections,
-    so either may be first.
+    Goals with `preempt` or `flush` don't count. A goal's reply and its events come on different connections, so either
+    may be first.
     """
 
     def __init__(self) -> None:
+        # Goals whose reply has not come, and goals that are pending at the server: keys by id.
         self._sent: dict[str, str | None] = {}
         self._pending: dict[str, str | None] = {}
 
@@ -254,60 +261,72 @@ class Share:
         return len(self._sent.keys() | self._pending.keys())
 
     @property
-    def pending(self) -> int:
-        """How many the server says are pending."""
+    def pending_count(self) -> int:
+        """How many goals the server has reported as pending."""
         return len(self._pending)
 
     @staticmethod
     def counts(say: Say) -> bool:
-        """Whether a goal needs a place of the share, or else goes past it."""
+        """Return whether a goal counts for the limit."""
         return not (say.preempt or say.flush)
 
     def has_room(self, say: Say) -> bool:
-        """Whether one more may be sent: also where it is sure to take another's place."""
+        """Return whether this goal may be sent. A goal that will replace another one by its key always has room."""
         keys = (*self._sent.values(), *self._pending.values())
-        return len(self) < SHARE or not self.counts(say) or (say.key is not None and say.key in keys)
+        return len(self) < MAX_REMOTE_GOALS or not self.counts(say) or (say.key is not None and say.key in keys)
 
-    def sent(self, goal_id: str, key: str | None) -> None:
+    def add(self, goal_id: str, key: str | None) -> None:
         """Count a goal that is sent to the server."""
         self._sent[goal_id] = key
 
     def answered(self, goal_id: str, *, pending: bool) -> None:
-        """Note the reply: whether it is pending, unless it has left already. One that nobody waits for is none."""
+        """Record the server's reply to a goal, unless an event has already said that the goal left the queue.
+
+        Args:
+            goal_id: the goal.
+            pending: whether the goal is pending. False also if nobody waits for the reply any more.
+        """
         if goal_id in self._sent:
             key = self._sent.pop(goal_id)
             if pending:
                 self._pending[goal_id] = key
 
-    def came(self, goal_id: str, key: str | None) -> None:
-        """Note that it is pending, as the server tells everybody."""
+    def queued(self, goal_id: str, key: str | None) -> None:
+        """Record an event that says that a goal is pending."""
         self._pending[goal_id] = key
 
-    def left(self, goal_id: str) -> bool:
-        """Note that a goal is pending no more, as the server tells everybody, and return whether it was counted."""
+    def dequeued(self, goal_id: str) -> bool:
+        """Record an event that says that a goal is no longer pending, and return whether the goal was counted."""
         before = len(self)
         self._sent.pop(goal_id, None)
         self._pending.pop(goal_id, None)
         return len(self) < before
 
-    def begin(self, pending: Iterable[tuple[str, str | None]]) -> None:
-        """Begin anew with what is pending now; what is on its way is still."""
+    def reset(self, pending: Iterable[tuple[str, str | None]]) -> None:
+        """Replace the pending goals, given as ids and keys. Goals on their way still count."""
         self._pending = dict(pending)
 
     def clear(self) -> None:
-        """Forget all: the server is gone."""
+        """Forget all goals, because the server is gone."""
         self._sent.clear()
         self._pending.clear()
 
 
-def not_taken(
-    ask: Ask, goal_id: str, state: State, reason: str, words: str, at: float, by: By | None = None
+def end_unsent(
+    request: RemoteRequest, goal_id: str, state: State, reason: str, words: str, at: float, by: By | None = None
 ) -> tuple[Goal, list[JsonObject]]:
-    """Return a goal that never came to the server, and what its asker is told, as the server would tell it.
+    """Return a goal that ends before it reached the server, and what the client is told, as the server would tell it.
 
-    `at`: seconds since 1970 UTC.
+    Args:
+        request: the `say`.
+        goal_id: the goal's id.
+        state: how the goal ends.
+        reason: why, for programs.
+        words: why, for people.
+        at: seconds since 1970 UTC.
+        by: who ended it, if anybody did.
     """
-    say = ask.request
+    say = request.request
     assert isinstance(say, Say)
     goal = Goal(
         goal_id,
@@ -316,19 +335,19 @@ def not_taken(
         reason=reason,
         by=by,
         message=words,
-        client=Sender(name=sender(ask.user)),
+        client=Sender(name=sender_name(request.user)),
         queued_at=at,
         ended_at=at,
         **{name: getattr(say, name) for name in SHOWN},
     )
-    lines = [ok(ask.seq, goal=goal.to_json())]
+    lines = [ok(request.seq, goal=goal.to_json())]
     if say.wait or say.feedback:
         lines += [StateChanged(goal_id, state, at).to_json(), Result(goal).to_json()]
     return goal, lines
 
 
-def unworded(message: JsonObject) -> JsonObject:
-    """Return a line that is longer than the broker takes, without what the goals in it say."""
+def without_texts(message: JsonObject) -> JsonObject:
+    """Return a message without the texts of its goals, for a line that is longer than the broker accepts."""
     nothing = {"text": None, "spoken": None}
     return {
         name: {**each, **nothing} if isinstance(each, dict) and "text" in each else each
@@ -336,6 +355,11 @@ def unworded(message: JsonObject) -> JsonObject:
     }
 
 
-def sender(user: str, name: str | None = None) -> str:
-    """Return what a user from afar is called at the server; `name`: what they call themselves."""
-    return f"{AFAR}{user} {name}"[:MAX_NAME] if name else f"{AFAR}{user}"
+def sender_name(user: str, name: str | None = None) -> str:
+    """Return what a remote client is called at the server: its user, and the name that it gave itself if any."""
+    return f"{_REMOTE_PREFIX}{user} {name}"[:MAX_NAME] if name else f"{_REMOTE_PREFIX}{user}"
+
+
+def is_remote(goal: Goal) -> bool:
+    """Return whether a goal came over the broker."""
+    return goal.client is not None and (goal.client.name or "").startswith(_REMOTE_PREFIX)

@@ -1,20 +1,30 @@
-"""One asker's connection to the robot's server: what it asks goes in, and the server's lines come back, in their order.
+"""The sessions of remote clients: each is one client's connection to the robot's server.
 
-It is a line pump: of what passes it looks at what is a goal, and at what answers what. Whether something may be asked
-is decided before, in `policy`; goals that are too many wait here, or are turned away.
+Requests go in, and the server's lines come back, in their order. `policy` has decided before whether a request is
+accepted at all. Goals that are too many wait here or are rejected.
 """
 
 from __future__ import annotations
 
 import asyncio
 import random
+import time
 from collections import deque
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from talkcli.daemon import log
 from talkcli.errors import BadRequest, Busy, TalkError
 from talkcli.fleet.bridge.local import dial
-from talkcli.fleet.bridge.policy import SHARE, not_taken, sender, unworded
+from talkcli.fleet.bridge.policy import (
+    MAX_REMOTE_GOALS,
+    RemoteGoals,
+    SentIds,
+    end_unsent,
+    is_remote,
+    sender_name,
+    without_texts,
+)
+from talkcli.fleet.link import boottime
 from talkcli.goals.goal import By, Sender
 from talkcli.goals.options import Cancel, Say, Set
 from talkcli.goals.states import State
@@ -23,272 +33,413 @@ from talkcli.protocol.lines import MAX_LINE, decode, encode
 from talkcli.protocol.requests import Hello, Pause, Resume, Status, Wait, Watch
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable
 
-    from talkcli.fleet.bridge.local import Local
-    from talkcli.fleet.bridge.policy import Ask, Ids, Share
+    from talkcli.fleet.bridge.local import LocalConnection
+    from talkcli.fleet.bridge.policy import RemoteRequest
     from talkcli.goals.goal import Goal, JsonObject
+    from talkcli.protocol.events import StateChanged
 
-#: Requests of one asker that may wait: for the connection, for room, for their answers. And bytes of those of all; what
-#: ends them, or tells of them, may be as many beyond.
-MAX_WAITING, MAX_HELD = 64, 4 * 1024 * 1024
-#: Seconds without a line of its own after which an asker is taken to be gone, whatever it waits for: MQTT doesn't tell.
-#: One that lives says hello every 30 s, and two of those may be lost.
-IDLE = 90.0
-#: Seconds in which the server must have taken what an asker wants who has said goodbye.
-_TAKEN = 5.0
-#: What is carried out, whoever hears of it.
-_LASTING = (Say, Cancel, Set, Pause, Resume)
-#: Characters of a robot's name in the ids that it gives: with what follows, an id has 64 at most.
-_OF_NAME = 48
-#: What lines begin with that may be lost on their way.
-_LIGHT = (b'{"event": "word"', b'{"event": "alive"')
-#: What an asker is told last, where the server has ended the connection.
-_GONE = "the robot's talk server ended the connection"
+    #: Publishes lines: topic, payload, QoS, correlation data.
+    Publish = Callable[[str, bytes, int, bytes | None], None]
 
-
-class House(Protocol):
-    """What the sessions of a robot share."""
-
-    #: the robot's name, and the place of its server's socket
-    name: str
-    socket: str | None
-    ids: Ids
-    share: Share
-    #: how many may try at once to get a connection to the server
-    dialing: asyncio.Semaphore
-    #: set while the broker takes what there is
-    flowing: asyncio.Event
-    #: goals that wait until fewer are pending, in their order
-    waiting: list[tuple[Ask, Session]]
-
-    def publish(self, topic: str, payload: bytes, qos: int, correlation: bytes | None) -> None:
-        """Publish lines to an asker."""
-
-    def room(self) -> int:
-        """Return how many bytes the broker takes in one payload."""
-
-    def boottime(self) -> float:
-        """Return seconds by a clock that goes on while the robot is suspended."""
-
-    def now(self) -> float:
-        """Return seconds since 1970 UTC."""
-
-    def held(self) -> int:
-        """Return how many bytes the requests have that wait for anything."""
-
-    def take_back(self, selection: Cancel, by: By) -> list[Goal]:
-        """End the goals that wait and are selected."""
-
-    def look(self) -> None:
-        """Let go, soon, what waits and may go now."""
-
-    def left(self, session: Session) -> None:
-        """Forget a session that has ended."""
+#: How many clients may have a session. Each has a connection to the server, which accepts 256 by default.
+MAX_SESSIONS = 32
+#: How many requests of one client may wait for the connection, for room, or for their answers.
+MAX_WAITING_REQUESTS = 64
+#: How much the waiting requests of all clients may hold. Cancel and status may use as much again.
+MAX_WAITING_BYTES = 4 * 1024 * 1024
+#: A client that sends nothing for this time counts as gone, because MQTT doesn't tell. A client that waits says hello
+#: every 30 s, and two of these messages may be lost.
+CLIENT_SILENCE_LIMIT_S = 90.0
+#: Time for the server to take the requests of a client that said goodbye.
+_GOODBYE_LIMIT_S = 5.0
+#: Longest part of a robot's name in the ids that it gives. With the rest, an id has at most 64 characters.
+_MAX_ID_PREFIX_CHARS = 48
+#: The last message to a client if the server ended the connection.
+_SERVER_GONE = "the robot's talk server ended the connection"
+_ALIVE = b'{"event": "alive"}\n'
+#: Beginnings of lines that may get lost on their way to the client.
+_UNRELIABLE = (b'{"event": "word"', b'{"event": "alive"')
 
 
-class _Open:
-    """A request that the server has, and has not answered."""
+class RemoteSessions:
+    """All sessions, and what they share: the limit for pending goals, the ids of goals, and room for requests."""
 
-    def __init__(self, ask: Ask, goal_id: str | None = None, *, fresh: bool = False) -> None:
-        self.ask = ask
-        #: of a goal: the id that it was sent with, and whether it was never sent before
-        self.goal_id, self.fresh = goal_id, fresh
-        #: of a cancel: what it ended that never came to the server
-        self.taken: list[Goal] = []
+    def __init__(
+        self,
+        name: str,
+        socket: str | None,
+        publish: Publish,
+        max_payload: Callable[[], int],
+        on_change: Callable[[], None],
+    ) -> None:
+        """Start without sessions.
 
-
-class Session:
-    """One asker. All calls are made in the event loop's thread."""
-
-    def __init__(self, house: House, user: str, topic: str | None) -> None:
-        """`topic`: where the answers go; None for nowhere."""
-        self.user, self.topic = user, topic
-        #: when its asker was last heard, by the loop's clock
-        self.used = 0.0
-        self._house = house
+        Args:
+            name: the robot's name.
+            socket: path of the server's socket, None for the usual places.
+            publish: publishes lines to a client.
+            max_payload: returns the largest payload that the broker accepts, in bytes.
+            on_change: called when the number of pending goals may have changed.
+        """
+        self.name, self.socket = name, socket
+        self.publish, self.max_payload = publish, max_payload
+        self.ids, self.goals = SentIds(), RemoteGoals()
+        #: limits how many sessions wait for the server's greeting
+        self.dialing = asyncio.Semaphore(MAX_SESSIONS)
+        #: set while the broker is fast enough for more lines of the server
+        self.may_read = asyncio.Event()
+        self.may_read.set()
+        #: goals that wait until fewer are pending, in their order
+        self.waiting: list[tuple[RemoteRequest, RemoteSession]] = []
+        self._on_change = on_change
         self._loop = asyncio.get_running_loop()
-        self._name = sender(user)
-        self._local: Local | None = None
-        #: what waits for the connection
-        self._queue: deque[Ask] = deque()
-        self._open: dict[int, _Open] = {}
-        self._numbers = 0
-        #: the goals whose results are still to come; whether everything is
-        self._awaited: set[str] = set()
-        self._watches = False
-        self._task: asyncio.Task[None] | None = None
-        #: ends it, where its asker has said goodbye
-        self._leaving: asyncio.TimerHandle | None = None
+        self._sessions: dict[tuple[str, str | None], RemoteSession] = {}
+        self._release_handle: asyncio.Handle | None = None
+        #: who canceled the goals that last left the queue
+        self._canceled_by: By | None = None
 
-    # -- what it is asked
+    # -- from the broker
+
+    def submit(self, request: RemoteRequest) -> None:
+        """Carry out a request in its client's session."""
+        session = self._sessions.get((request.user, request.reply_topic)) or self._new_session(request)
+        if session:
+            session.submit(request)
+        elif request.reply_topic is not None:
+            words = f"{self.name} has as many askers as it takes: {MAX_SESSIONS}"
+            line = encode(failure(request.seq, Busy.code, words))
+            self.publish(request.reply_topic, line, 1, request.correlation)
+
+    def say_goodbye(self, user: str, reply_topic: str) -> None:
+        """End a client's session, once the server has taken the client's requests."""
+        session = self._sessions.get((user, reply_topic))
+        if session:
+            session.say_goodbye()
+
+    def end_all(self) -> None:
+        """End all sessions without a word, because the broker is gone."""
+        for session in list(self._sessions.values()):
+            session.end()
+        self.may_read.set()
+
+    def tick(self) -> None:
+        """End the sessions of silent clients, and send signs of life. Call it every few seconds."""
+        now = self._loop.time()
+        for session in list(self._sessions.values()):
+            if now - session.used_at > CLIENT_SILENCE_LIMIT_S:
+                limit = f"{CLIENT_SILENCE_LIMIT_S:g} s"
+                session.end(f"you have said nothing for {limit}: whoever waits says hello every 30 s")
+            else:
+                session.send_alive()
+
+    def _new_session(self, request: RemoteRequest) -> RemoteSession | None:
+        """Return a new session, None if there are too many and none can be ended.
+
+        For a cancel or a status, any session can be ended.
+        """
+        if len(self._sessions) >= MAX_SESSIONS:
+            sessions = list(self._sessions.values())
+            urgent = isinstance(request.request, Cancel | Status)
+            candidates = [each for each in sessions if each.idle] or (sessions if urgent else [])
+            if not candidates:
+                return None
+            oldest = min(candidates, key=lambda each: each.used_at)
+            oldest.end("the place was needed for another's cancel or status")
+        session = RemoteSession(self, request.user, request.reply_topic)
+        self._sessions[request.user, request.reply_topic] = session
+        return session
+
+    # -- from the sessions
+
+    def forget(self, session: RemoteSession) -> None:
+        """Remove a session that has ended."""
+        self._sessions = {key: each for key, each in self._sessions.items() if each is not session}
+
+    def waiting_bytes(self) -> int:
+        """Return the size of all requests that wait for anything."""
+        in_sessions = sum(each.waiting_bytes for each in self._sessions.values())
+        return in_sessions + sum(request.size_bytes for request, _ in self.waiting)
+
+    def cancel_waiting(self, selection: Cancel, by: By | None) -> list[Goal]:
+        """End the selected goals of those that wait for room, and return them."""
+        says = [request.request for request, _ in self.waiting if isinstance(request.request, Say)]
+        selected = [self.waiting[each] for each in selection.of_waiting(says)]
+        self.waiting = [each for each in self.waiting if not any(each is other for other in selected)]
+        return [session.cancel_waiting(request, by) for request, session in selected]
+
+    def schedule_release(self) -> None:
+        """Schedule a check of the goals that wait for room, after the number of pending goals has changed.
+
+        So all events that came together count before it.
+        """
+        self._on_change()
+        if self.waiting and self._release_handle is None:
+            self._release_handle = self._loop.call_soon(self._release)
+
+    def _release(self) -> None:
+        self._release_handle = None
+        canceled_by, self._canceled_by = self._canceled_by, None
+        if canceled_by and not self.goals.pending_count:
+            # Somebody canceled all pending goals, so the goals that wait for their places are canceled, too.
+            self.cancel_waiting(Cancel(), canceled_by)
+        while self.waiting:
+            request, session = self.waiting[0]
+            if not (isinstance(request.request, Say) and self.goals.has_room(request.request)):
+                break
+            del self.waiting[0]
+            session.release(request)
+
+    # -- from the watch of the server
+
+    def goal_changed(self, event: StateChanged, boot: str) -> None:
+        """Count a goal that became pending or left the queue of the server with this boot id."""
+        goal = event.goal
+        if event.state is not State.PENDING:
+            counted = self.goals.dequeued(event.id)
+            if counted and self.waiting and goal and event.state is State.RECALLED and goal.reason == "canceled":
+                self._canceled_by = goal.by
+        elif self.ids.is_counted(event.id, boot):
+            self.goals.queued(event.id, goal.key if goal else None)
+        self.schedule_release()
+
+    def remember(self, goal: Goal, boot: str) -> None:
+        """Remember the id of a goal that the server knows, if it is remote. An earlier bridge may have sent it.
+
+        It counts for the limit even if it preempted, because a goal doesn't show that.
+        """
+        if is_remote(goal) and self.ids.boot_of(goal.id) != boot:
+            self.ids.add(goal.id, boot)
+
+    def server_came(self, pending: list[Goal], boot: str) -> None:
+        """Count the goals that are pending at a server that is watched now."""
+        self.goals.reset((each.id, each.key) for each in pending if self.ids.is_counted(each.id, boot))
+        self.schedule_release()
+
+    def server_left(self) -> None:
+        """Count no goals, because the server is gone."""
+        self.goals.clear()
+        self.schedule_release()
+
+
+class _Sent:
+    """A request that was sent to the server and not answered yet."""
+
+    def __init__(self, request: RemoteRequest, goal_id: str | None = None, *, fresh: bool = False) -> None:
+        self.request = request
+        #: for a goal: the id that it was sent with, and whether it was never sent before
+        self.goal_id, self.fresh = goal_id, fresh
+        #: for a cancel: the goals that it ended before they reached the server
+        self.canceled: list[Goal] = []
+
+
+class RemoteSession:
+    """One remote client's connection to the server. All methods run in the event loop's thread."""
+
+    def __init__(self, sessions: RemoteSessions, user: str, reply_topic: str | None) -> None:
+        """Start without a connection.
+
+        Args:
+            sessions: the owner.
+            user: the client's user name at the broker.
+            reply_topic: where to publish answers, None for nowhere.
+        """
+        #: when the client was last heard, by the loop's clock
+        self.used_at = 0.0
+        self._sessions = sessions
+        self._user, self._reply_topic = user, reply_topic
+        self._name = sender_name(user)
+        self._loop = asyncio.get_running_loop()
+        self._server: LocalConnection | None = None
+        self._task: asyncio.Task[None] | None = None
+        #: requests that wait for the connection
+        self._queue: deque[RemoteRequest] = deque()
+        self._sent: dict[int, _Sent] = {}
+        self._last_number = 0
+        #: ids of the goals whose results the client is still to get
+        self._awaited: set[str] = set()
+        self._watching = False
+        #: ends the session after a goodbye
+        self._goodbye_timer: asyncio.TimerHandle | None = None
+
+    # -- from the client
 
     @property
     def idle(self) -> bool:
-        """Whether nothing is owed to its asker."""
-        return not (self._queue or self._open or self._awaited or self._watches or self._mine())
+        """Whether the client is waiting for nothing."""
+        return not (self._queue or self._sent or self._awaited or self._watching or self._waiting_for_room())
 
     @property
-    def held(self) -> int:
-        """How many bytes its requests have that wait for the connection or their answers."""
-        return sum(each.size for each in self._queue) + sum(each.ask.size for each in self._open.values())
+    def waiting_bytes(self) -> int:
+        """Size of the requests that wait for the connection or for their answers."""
+        return sum(each.size_bytes for each in (*self._queue, *(sent.request for sent in self._sent.values())))
 
-    def ask(self, ask: Ask) -> None:
-        """Carry out a request, after those that came before it."""
-        self.used = self._loop.time()
-        if self._leaving:  # and has thought better of it
-            self._leaving.cancel()
-            self._leaving, self.topic = None, ask.topic
-        urgent = isinstance(ask.request, Cancel | Status)
-        if len(self._open) + len(self._queue) + len(self._mine()) >= MAX_WAITING:
-            self._refuse(ask, Busy.code, f"{MAX_WAITING} requests of yours are waiting already")
-        elif self._house.held() + ask.size > (2 * MAX_HELD if urgent else MAX_HELD):
-            self._refuse(ask, Busy.code, f"{MAX_HELD >> 20} MiB of requests are waiting already")
-        elif self._local:
-            self._take(ask)
+    def submit(self, request: RemoteRequest) -> None:
+        """Carry out a request after those that came before it."""
+        self.used_at = self._loop.time()
+        if self._goodbye_timer:  # the client has come back
+            self._goodbye_timer.cancel()
+            self._goodbye_timer, self._reply_topic = None, request.reply_topic
+        urgent = isinstance(request.request, Cancel | Status)
+        limit = 2 * MAX_WAITING_BYTES if urgent else MAX_WAITING_BYTES
+        if len(self._sent) + len(self._queue) + len(self._waiting_for_room()) >= MAX_WAITING_REQUESTS:
+            self._refuse(request, Busy.code, f"{MAX_WAITING_REQUESTS} requests of yours are waiting already")
+        elif self._sessions.waiting_bytes() + request.size_bytes > limit:
+            self._refuse(request, Busy.code, f"{MAX_WAITING_BYTES >> 20} MiB of requests are waiting already")
+        elif self._server:
+            self._send_request(request)
         else:
-            self._queue.append(ask)
+            self._queue.append(request)
             if self._task is None:
-                self._task = asyncio.create_task(self._run(urgent))
+                self._task = asyncio.create_task(self._run(urgent=urgent))
 
-    def leave(self) -> None:
-        """Tell the asker nothing more, and end as soon as the server has taken what was asked; goals that wait for room
-        are taken back.
+    def say_goodbye(self) -> None:
+        """Answer nothing more, and end once the server has taken the requests. Cancel goals that wait for room."""
+        self._reply_topic = None
+        self._leave_waiting()
+        self._queue = deque(each for each in self._queue if _outlives_client(each))
+        self._goodbye_timer = self._goodbye_timer or self._loop.call_later(_GOODBYE_LIMIT_S, self.end)
+        self._end_if_done()
+
+    def end(self, why: str | None = None) -> None:
+        """Close the connection, which cancels whatever can still be canceled.
+
+        Args:
+            why: what to tell the client if it waits for anything.
         """
-        self.topic = None
-        self._house.waiting = [each for each in self._house.waiting if each[1] is not self]
-        self._queue = deque(each for each in self._queue if _lasts(each))
-        self._leaving = self._leaving or self._loop.call_later(_TAKEN, self.hang_up)
-        self._leave()
-
-    def hang_up(self, why: str | None = None) -> None:
-        """Take back what can be taken back, and tell the asker nothing more; but `why`, if something is owed to it."""
         if why and not self.idle:
-            self._tell_end(why)
-        self.topic = None
-        if self._leaving:
-            self._leaving.cancel()
+            self._send_gone(why)
+        self._reply_topic = None
+        if self._goodbye_timer:
+            self._goodbye_timer.cancel()
         if self._task:
             self._task.cancel()
-        self._end()
+        self._clean_up()
 
-    def alive(self) -> None:
-        """Tell the asker that the robot lives, where a goal waits here: the server knows nothing of it."""
-        if self._mine():
-            self._tell([(_LIGHT[1] + b"}\n", None)])
+    def send_alive(self) -> None:
+        """Send a sign of life if a goal waits for room, because the server doesn't know about it."""
+        if self._waiting_for_room():
+            self._publish([(_ALIVE, None)])
 
-    def let_go(self, ask: Ask) -> None:
-        """Send a goal that has waited here."""
-        self._say(ask, forced=True)
+    def release(self, request: RemoteRequest) -> None:
+        """Send a goal that has waited for room."""
+        self._send_say(request, has_room=True)
 
-    def end_waiting(self, ask: Ask, by: By | None) -> Goal:
-        """Tell that a goal that has waited here was cancelled."""
-        return self._turn_away(ask, State.RECALLED, "canceled", "canceled before it was spoken", by)
+    def cancel_waiting(self, request: RemoteRequest, by: By | None) -> Goal:
+        """End a goal that has waited for room, because it was canceled."""
+        return self._end_goal(request, State.RECALLED, "canceled", "canceled before it was spoken", by)
 
-    def _mine(self) -> list[Ask]:
-        return [each for each, session in self._house.waiting if session is self]
+    def _waiting_for_room(self) -> list[RemoteRequest]:
+        return [request for request, session in self._sessions.waiting if session is self]
 
-    def _leave(self) -> None:
-        """End, if it is to end and nothing is left to be taken."""
-        if self._leaving and not self._queue and not any(_lasts(each.ask) for each in self._open.values()):
-            self.hang_up()
+    def _leave_waiting(self) -> None:
+        self._sessions.waiting = [each for each in self._sessions.waiting if each[1] is not self]
 
-    def _take(self, ask: Ask) -> None:
-        request = ask.request
-        if isinstance(request, Say):
-            self._say(ask)
-        elif isinstance(request, Cancel):
-            self._cancel(ask, request)
-        elif isinstance(request, Hello):
-            self._name = sender(self.user, request.name)
-            self._send(_Open(ask), {**ask.message, "name": self._name})
+    def _end_if_done(self) -> None:
+        """End the session if the client said goodbye and the server has taken all requests."""
+        sent = (each.request for each in self._sent.values())
+        if self._goodbye_timer and not self._queue and not any(map(_outlives_client, sent)):
+            self.end()
+
+    # -- to the server
+
+    def _send_request(self, request: RemoteRequest) -> None:
+        asked = request.request
+        if isinstance(asked, Say):
+            self._send_say(request)
+        elif isinstance(asked, Cancel):
+            self._send_cancel(request, asked)
+        elif isinstance(asked, Hello):
+            self._name = sender_name(self._user, asked.name)
+            self._send(_Sent(request), {**request.fields, "name": self._name})
         else:
-            self._watches = self._watches or isinstance(request, Watch)
-            self._send(_Open(ask), ask.message)
+            self._watching = self._watching or isinstance(asked, Watch)
+            self._send(_Sent(request), request.fields)
 
-    def _say(self, ask: Ask, *, forced: bool = False) -> None:
-        house, say, local = self._house, ask.request, self._local
+    def _send_say(self, request: RemoteRequest, *, has_room: bool = False) -> None:
+        shared, say, server = self._sessions, request.request, self._server
         assert isinstance(say, Say)
-        assert local
+        assert server
         goal_id = say.id or self._new_id()
-        boot, counts = house.ids.boot_of(goal_id), house.share.counts(say)
-        if boot not in (None, local.boot):
+        boot, counted = shared.ids.boot_of(goal_id), shared.goals.counts(say)
+        if boot not in (None, server.boot):
             words = f"{goal_id} was sent to a server that has ended since: it may have been spoken"
-            self._refuse(ask, "lost", words)
-        elif forced or (house.share.has_room(say) and not (counts and house.waiting)):
-            if self._send(_Open(ask, goal_id, fresh=boot is None), ask.line(house.boottime(), goal_id)):
-                house.ids.note(goal_id, local.boot, in_share=counts)
-                if counts:
-                    house.share.sent(goal_id, say.key)
+            self._refuse(request, "lost", words)
+        elif has_room or (shared.goals.has_room(say) and not (counted and shared.waiting)):
+            if self._send(_Sent(request, goal_id, fresh=boot is None), request.to_json(boottime(), goal_id)):
+                shared.ids.add(goal_id, server.boot, counted=counted)
+                if counted:
+                    shared.goals.add(goal_id, say.key)
         elif say.patient:
-            house.waiting.append((ask, self))
+            shared.waiting.append((request, self))
         else:
-            words = f"{SHARE} goals from afar are waiting already"
-            self._turn_away(ask, State.REJECTED, "queue_full", words, None)
+            words = f"{MAX_REMOTE_GOALS} goals from afar are waiting already"
+            self._end_goal(request, State.REJECTED, "queue_full", words, None)
 
-    def _cancel(self, ask: Ask, selection: Cancel) -> None:
-        """Cancel what waits here, and then at the server, which must not be asked for what it has never heard of."""
-        opened = _Open(ask)
-        opened.taken = self._house.take_back(selection, By(client=Sender(name=self._name)))
-        message = dict(ask.message)
-        taken = {each.id for each in opened.taken}
+    def _send_cancel(self, request: RemoteRequest, selection: Cancel) -> None:
+        """Cancel goals that wait for room, then those at the server, which must not be asked for unknown ids."""
+        sent = _Sent(request)
+        sent.canceled = self._sessions.cancel_waiting(selection, By(client=Sender(name=self._name)))
+        fields = dict(request.fields)
+        canceled = {each.id for each in sent.canceled}
         if selection.ids is not None:
-            message["ids"] = [each for each in selection.ids if each not in taken]
-        if selection.before in taken:
-            del message["before"]
-            message.setdefault("ids", [])
-        self._send(opened, message)
+            fields["ids"] = [each for each in selection.ids if each not in canceled]
+        if selection.before in canceled:
+            del fields["before"]
+            fields.setdefault("ids", [])
+        self._send(sent, fields)
 
-    def _send(self, opened: _Open, message: JsonObject) -> bool:
-        """Ask the server, and return whether that was possible."""
-        assert self._local
-        self._numbers += 1
-        line = encode({"seq": self._numbers, **message})
+    def _send(self, sent: _Sent, fields: JsonObject) -> bool:
+        """Send a request to the server, and return whether it is short enough for that."""
+        assert self._server
+        self._last_number += 1
+        line = encode({"seq": self._last_number, **fields})
         if len(line) > MAX_LINE:
-            self._refuse(opened.ask, "line_too_long", f"a request has at most {MAX_LINE} bytes")
+            self._refuse(sent.request, "line_too_long", f"a request has at most {MAX_LINE} bytes")
             return False
-        self._open[self._numbers] = opened
-        self._local.write(line)
+        self._sent[self._last_number] = sent
+        self._server.write(line)
         return True
 
     def _new_id(self) -> str:
-        """Return an id that no server and no other robot gives: each `say` has one, so that it can be counted."""
-        return f"{self._house.name[:_OF_NAME]}-x{random.getrandbits(48):012x}"
+        """Return an id that no server and no other robot gives. Each goal needs one, so that it can be counted."""
+        return f"{self._sessions.name[:_MAX_ID_PREFIX_CHARS]}-x{random.getrandbits(48):012x}"
 
-    # -- what it is told
+    # -- from the server
 
-    async def _run(self, urgent: bool) -> None:
+    async def _run(self, *, urgent: bool) -> None:
         try:
-            await self._serve(urgent)
-        except Exception as error:  # noqa: BLE001 - one asker's must not take the robot from the others
+            await self._serve(urgent=urgent)
+        except Exception as error:  # noqa: BLE001 - a bug in one session must not end the others
             log.bug("a session", error)
-        self._end()
+        self._clean_up()
 
-    async def _serve(self, urgent: bool) -> None:
-        house = self._house
+    async def _serve(self, *, urgent: bool) -> None:
+        shared = self._sessions
         try:
-            self._local = await dial(house.socket, self._name, urgent=urgent, slots=house.dialing)
+            self._server = await dial(shared.socket, self._name, urgent=urgent, slots=shared.dialing)
         except TalkError as error:
             code = Busy.code if isinstance(error, Busy) else "no_server"
             while self._queue:
                 self._refuse(self._queue.popleft(), code, " ".join(str(error).split()))
             return
         while self._queue:
-            self._take(self._queue.popleft())
-        self._leave()
-        while lines := await self._local.read():
-            self._hear(lines)
-            self._leave()
-            await house.flowing.wait()
-        for each in self._mine():
-            self._refuse(each, "no_server", _GONE)
-        self._tell_end(_GONE)
+            self._send_request(self._queue.popleft())
+        self._end_if_done()
+        while lines := await self._server.read():
+            self._receive(lines)
+            await shared.may_read.wait()
+        for request in self._waiting_for_room():
+            self._refuse(request, "no_server", _SERVER_GONE)
+        self._send_gone(_SERVER_GONE)
 
-    def _hear(self, lines: Iterable[bytes]) -> None:
-        told: list[tuple[bytes, bytes | None]] = []
+    def _receive(self, lines: list[bytes]) -> None:
+        """Pass the server's lines on to the client."""
+        answers: list[tuple[bytes, bytes | None]] = []
         for line in lines:
-            if line.startswith(_LIGHT):
-                told.append((line + b"\n", None))
+            if line.startswith(_UNRELIABLE):
+                answers.append((line + b"\n", None))
                 continue
             try:
                 message = decode(line)
@@ -296,114 +447,119 @@ class Session:
                 log.seldom("server", f"what the server says is no line: {error}")
                 continue
             if "seq" in message:
-                told += self._answer(message)
+                answers += self._translate(message)
             elif "event" in message:
                 if message["event"] == "result" and isinstance(goal := message.get("goal"), dict):
                     self._awaited.discard(str(goal.get("id")))
-                told.append((line + b"\n", None))
-        self._tell(told)
+                answers.append((line + b"\n", None))
+        self._publish(answers)
+        self._end_if_done()
 
-    def _answer(self, message: JsonObject) -> list[tuple[bytes, bytes | None]]:
-        """Return a line that answers a request, and what goes before it, as the asker is told it."""
+    def _translate(self, message: JsonObject) -> list[tuple[bytes, bytes | None]]:
+        """Return the lines that answer a client's request, from a reply of the server or an item of its list."""
         number = message.pop("seq")
-        opened = self._open.get(number) if isinstance(number, int) else None
-        if opened is None:
+        sent = self._sent.get(number) if isinstance(number, int) else None
+        if sent is None:
             return []
-        ask = opened.ask
+        request = sent.request
         found: list[JsonObject] = []
         goal = message.get("goal")
         if isinstance(goal, dict):
-            self._note_goal(opened, goal)
+            self._note_awaited(request, goal)
         if "ok" in message:
             assert isinstance(number, int)
-            del self._open[number]
-            self._settle(opened, message)
-            found = [{"canceled": each.to_json()} for each in opened.taken]
+            del self._sent[number]
+            self._count_goal(sent, message)
+            found = [{"canceled": each.to_json()} for each in sent.canceled]
             count = message.get("count")
             if found and isinstance(count, int):
                 message["count"] = count + len(found)
-        numbered = (each if ask.seq is None else {"seq": ask.seq, **each} for each in (*found, message))
-        return [(encode(each), ask.correlation) for each in numbered]
+        numbered = (each if request.seq is None else {"seq": request.seq, **each} for each in (*found, message))
+        return [(encode(each), request.correlation) for each in numbered]
 
-    def _note_goal(self, opened: _Open, goal: JsonObject) -> None:
-        """Note a goal of which the asker will be told more."""
-        request, state = opened.ask.request, State.__members__.get(str(goal.get("state")))
+    def _note_awaited(self, remote: RemoteRequest, goal: JsonObject) -> None:
+        """Note a goal whose result the client will get."""
+        request, state = remote.request, State.__members__.get(str(goal.get("state")))
         waits = isinstance(request, Wait) or (isinstance(request, Say) and (request.wait or request.feedback))
         if waits and state is not None and not state.terminal:
             self._awaited.add(str(goal.get("id")))
 
-    def _settle(self, opened: _Open, reply: JsonObject) -> None:
-        """Count a goal that the server has answered for."""
-        if opened.goal_id is None:
+    def _count_goal(self, sent: _Sent, reply: JsonObject) -> None:
+        """Count a goal by the server's reply."""
+        if sent.goal_id is None:
             return
         goal = reply.get("goal")
         state = goal.get("state") if isinstance(goal, dict) else None
-        self._house.share.answered(opened.goal_id, pending=state == State.PENDING.name)
-        if opened.fresh and state in (None, State.REJECTED.name):
-            self._house.ids.forget(opened.goal_id)
-        self._house.look()
+        self._sessions.goals.answered(sent.goal_id, pending=state == State.PENDING.name)
+        if sent.fresh and state in (None, State.REJECTED.name):
+            self._sessions.ids.discard(sent.goal_id)
+        self._sessions.schedule_release()
 
-    def _refuse(self, ask: Ask, code: str, words: str) -> None:
-        self._tell([(encode(failure(ask.seq, code, words)), ask.correlation)])
+    # -- to the client
 
-    def _turn_away(self, ask: Ask, state: State, reason: str, words: str, by: By | None) -> Goal:
-        say, now = ask.request, self._house.now()
+    def _refuse(self, request: RemoteRequest, code: str, words: str) -> None:
+        self._publish([(encode(failure(request.seq, code, words)), request.correlation)])
+
+    def _end_goal(self, request: RemoteRequest, state: State, reason: str, words: str, by: By | None) -> Goal:
+        """End a goal that was not sent to the server, and tell the client."""
+        say = request.request
         assert isinstance(say, Say)
-        own = say.id if state is State.RECALLED else None  # a goal that was never queued has no id of its sender's
-        goal, lines = not_taken(ask, own or self._new_id(), state, reason, words, now, by)
+        own_id = say.id if state is State.RECALLED else None  # as at the server, where a rejected goal gets a new id
+        goal, lines = end_unsent(request, own_id or self._new_id(), state, reason, words, time.time(), by)
         answer, *events = (encode(each) for each in lines)
-        self._tell([(answer, ask.correlation), *((each, None) for each in events)])
+        self._publish([(answer, request.correlation), *((each, None) for each in events)])
         return goal
 
-    def _tell_end(self, why: str) -> None:
-        self._tell([(encode({"event": "gone", "message": why}), None)])
+    def _send_gone(self, why: str) -> None:
+        self._publish([(encode({"event": "gone", "message": why}), None)])
 
-    def _tell(self, lines: list[tuple[bytes, bytes | None]]) -> None:
-        """Publish lines, as many in one payload as fit: those that answer the same request, or none."""
-        if self.topic is None:
+    def _publish(self, lines: list[tuple[bytes, bytes | None]]) -> None:
+        """Publish lines, each with its correlation data, in as few payloads as possible.
+
+        A payload holds either answers to one request or events.
+        """
+        if self._reply_topic is None:
             return
-        piece, belongs, light, room = b"", None, True, self._house.room()
+        limit = self._sessions.max_payload()
+        payload, current, reliable = b"", None, False
         for whole, correlation in lines:
-            line = whole if len(whole) <= room else self._shortened(whole, room)
-            if piece and (correlation != belongs or len(piece) + len(line) > room):
-                self._publish(piece, belongs, light=light)
-                piece, light = b"", True
-            piece, belongs, light = piece + line, correlation, light and line.startswith(_LIGHT)
-        if piece:
-            self._publish(piece, belongs, light=light)
+            line = whole if len(whole) <= limit else self._shortened(whole, limit)
+            if payload and (correlation != current or len(payload) + len(line) > limit):
+                self._sessions.publish(self._reply_topic, payload, int(reliable), current)
+                payload, reliable = b"", False
+            payload, current = payload + line, correlation
+            reliable = reliable or not line.startswith(_UNRELIABLE)
+        if payload:
+            self._sessions.publish(self._reply_topic, payload, int(reliable), current)
 
-    def _shortened(self, line: bytes, room: int) -> bytes:
-        """Return a line that the broker takes in place of one that is too long for it."""
+    def _shortened(self, line: bytes, limit: int) -> bytes:
+        """Return a line to publish in place of one that is too long for the broker."""
         message = decode(line)
-        shorter = encode(unworded(message))
-        if len(shorter) <= room:
+        shorter = encode(without_texts(message))
+        if len(shorter) <= limit:
             return shorter
-        words = f"this has {len(line):,} bytes, and the broker takes {room:,}"
+        words = f"this has {len(line):,} bytes, and the broker takes {limit:,}"
         if "ok" in message:
             seq = message.get("seq")
             return encode(failure(seq if isinstance(seq, int) else None, "too_long", words))
-        log.seldom("long", f"a line for {self._name} is dropped: {words}")
+        log.seldom("long", f"a line for {self._sessions.name} is dropped: {words}")
         return b""
 
-    def _publish(self, piece: bytes, correlation: bytes | None, *, light: bool) -> None:
-        assert self.topic
-        self._house.publish(self.topic, piece, 0 if light else 1, correlation)
-
-    def _end(self) -> None:
-        """Forget what is not answered: whoever asked has been told, or is gone."""
-        house = self._house
-        house.waiting = [each for each in house.waiting if each[1] is not self]
-        for opened in self._open.values():
-            if opened.goal_id is not None:
-                house.share.answered(opened.goal_id, pending=False)
-        self._open.clear()
-        if self._local:
-            self._local.close()
-        house.left(self)
-        house.look()
+    def _clean_up(self) -> None:
+        """Close the connection and forget unanswered requests."""
+        shared = self._sessions
+        self._leave_waiting()
+        for sent in self._sent.values():
+            if sent.goal_id is not None:
+                shared.goals.answered(sent.goal_id, pending=False)
+        self._sent.clear()
+        if self._server:
+            self._server.close()
+        shared.forget(self)
+        shared.schedule_release()
 
 
-def _lasts(ask: Ask) -> bool:
-    """Whether something is carried out that its asker hears nothing of; a goal that waits for room is taken back."""
-    request = ask.request
-    return isinstance(request, _LASTING) and not (isinstance(request, Say) and request.patient)
+def _outlives_client(remote: RemoteRequest) -> bool:
+    """Return whether a request has an effect without its client. A goal that waits for room has none."""
+    request = remote.request
+    return not request.patient if isinstance(request, Say) else isinstance(request, Cancel | Set | Pause | Resume)

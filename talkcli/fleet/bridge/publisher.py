@@ -1,0 +1,237 @@
+"""What a robot publishes for everybody: its status, retained, and the events of its goals.
+
+It watches the robot's server as long as the bridge runs. If the broker can't keep up, it leaves events out. If a
+payload is too long for the broker, it leaves texts out.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from typing import TYPE_CHECKING
+
+from talkcli.daemon import log
+from talkcli.errors import BadRequest, ServerUnavailable, TalkError
+from talkcli.fleet import topics
+from talkcli.fleet.bridge.local import dial
+from talkcli.frozen import replace
+from talkcli.goals.goal import Goal
+from talkcli.goals.option import MAX_LOG
+from talkcli.goals.states import State
+from talkcli.protocol.events import PausedChanged, ServerStatus, StateChanged, from_json, unfinished
+from talkcli.protocol.lines import decode, encode
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from typing import Protocol
+
+    from talkcli.fleet.bridge.local import LocalConnection
+    from talkcli.fleet.bridge.session import RemoteSessions
+    from talkcli.goals.goal import JsonObject
+
+    class PublishToAll(Protocol):
+        """Publishes a message for everybody if the broker is there."""
+
+        def __call__(self, topic: str, payload: bytes, *, retain: bool = False, expiry: float | None = None) -> None:
+            """Publish the payload; `expiry` is in seconds."""
+
+
+#: How long an event is of use.
+EVENT_EXPIRY_S = 60
+#: Shortest time between two statuses.
+_STATUS_EVERY_S = 1.0
+#: Time from a change to the status that shows it. A canceled goal is PREEMPTING for some milliseconds. If that was
+#: published at once, the end of the goal would follow a second later.
+_STATUS_DELAY_S = 0.1
+#: Longest text in the status. The texts of all pending goals are kept for it.
+_MAX_TEXT_CHARS = 1_000
+#: The server sends a sign of life every 5 s. After this silence it counts as hung.
+_SERVER_SILENCE_LIMIT_S = 15.0
+#: Longest pause before the first try to find the server again, and before later tries. The pause is random.
+_FIRST_RETRY_S, _LAST_RETRY_S = 0.2, 5.0
+# Numbers of the requests: the log, so that goals of an earlier bridge are known, and then the watch.
+_LOG_SEQ, _WATCH_SEQ = 1, 2
+
+
+class Publisher:
+    """Watches the server, and publishes what everybody may know."""
+
+    def __init__(
+        self, sessions: RemoteSessions, publish: PublishToAll, on_server_change: Callable[[], None], *, with_text: bool
+    ) -> None:
+        """Start without a server.
+
+        Args:
+            sessions: are told about all changes of goals.
+            publish: publishes a message for everybody.
+            on_server_change: called when a server has come or gone.
+            with_text: whether everybody may read the texts of goals.
+        """
+        self._sessions = sessions
+        self._publish = publish
+        self._on_server_change = on_server_change
+        self._with_text = with_text
+        #: boot id, pid and version of the server; None if there is none
+        self.server: JsonObject | None = None
+        self._connection: LocalConnection | None = None
+        #: when the server was last heard, by the loop's clock
+        self._heard_at = 0.0
+        #: items of the reply to the watch
+        self._items: list[JsonObject] = []
+        #: texts of the goals that have not ended, and the goal that is being spoken
+        self._texts: dict[str, str | None] = {}
+        self._active: str | None = None
+        self._last: Goal | None = None
+        self._paused = False
+        #: publishes the next status
+        self._timer: asyncio.TimerHandle | None = None
+        #: when the last status was published, by the loop's clock
+        self._published_at = 0.0
+        self._loop = asyncio.get_running_loop()
+
+    async def run(self) -> None:
+        """Watch the server, and try again whenever the connection ends."""
+        self._retry_s = _FIRST_RETRY_S
+        while True:
+            try:
+                self._connection = await dial(self._sessions.socket, "talk bridge")
+                self._heard_at = self._loop.time()
+                self._items.clear()
+                self._connection.write(encode({"seq": _LOG_SEQ, "request": "log", "count": MAX_LOG}))
+                try:
+                    while lines := await self._connection.read():
+                        self._receive(lines)
+                    log.line("the server's connection has ended")
+                finally:
+                    self._connection.close()
+                    self._connection = None
+                    self._server_left()
+            except TalkError as error:
+                log.seldom("server", f"no news of the server: {log.shown(str(error))}")
+            await asyncio.sleep(random.uniform(0, self._retry_s))
+            self._retry_s = min(_LAST_RETRY_S, self._retry_s * 2)
+
+    def schedule_status(self) -> None:
+        """Publish the status soon."""
+        if self._timer is None:
+            due = max(self._loop.time() + _STATUS_DELAY_S, self._published_at + _STATUS_EVERY_S)
+            self._timer = self._loop.call_at(due, self._publish_status)
+
+    def tick(self) -> None:
+        """Close the connection if the server is silent. Call it every few seconds."""
+        server = self._connection
+        if server and self._loop.time() - self._heard_at > _SERVER_SILENCE_LIMIT_S:
+            log.seldom("silence", f"the server at {log.shown(server.path)} says nothing: restart it if it hangs")
+            server.close()
+
+    def close(self) -> None:
+        """Publish nothing more."""
+        if self._timer:
+            self._timer.cancel()
+
+    # -- from the server
+
+    def _receive(self, lines: list[bytes]) -> None:
+        server = self._connection
+        assert server
+        self._heard_at = self._loop.time()
+        for line in lines:
+            try:
+                message = decode(line)
+                if message.get("seq") == _LOG_SEQ:
+                    if "goal" in message:
+                        self._sessions.remember(Goal.from_json(message["goal"]), server.boot)
+                    elif "ok" in message:
+                        server.write(encode({"seq": _WATCH_SEQ, "request": "watch"}))
+                elif message.get("seq") != _WATCH_SEQ:
+                    self._receive_event(server, message, line)
+                elif "ok" not in message:
+                    self._items.append(message)
+                elif message["ok"] is not True:
+                    raise ServerUnavailable(f"the server at {server.path} can't be watched: {message.get('error')}")
+                else:
+                    self._server_came(server, ServerStatus.from_reply(message, self._items))
+                    self._items.clear()
+            except (BadRequest, ValueError) as error:
+                log.seldom("line", f"what the server says can't be read: {log.shown(str(error))}")
+
+    def _server_came(self, server: LocalConnection, status: ServerStatus) -> None:
+        self._retry_s = _FIRST_RETRY_S
+        for each in unfinished(status):
+            self._sessions.remember(each, server.boot)
+        self.server = {"boot": server.boot, "pid": server.pid, "version": status.server.get("version")}
+        self._active = status.active.id if status.active else None
+        self._texts = {each.id: _shown_text(each) for each in unfinished(status)}
+        self._last = status.recent[-1] if status.recent else self._last
+        self._paused = status.server.get("paused") is True
+        self._sessions.server_came(list(status.pending), server.boot)
+        log.line(f"the server at {log.shown(server.path)} is there (pid {server.pid})")
+        self._on_server_change()
+        self.schedule_status()
+
+    def _server_left(self) -> None:
+        self._active = None
+        self._texts.clear()
+        self._paused = False
+        self._sessions.server_left()
+        if self.server:
+            self.server = None
+            self._on_server_change()
+            self.schedule_status()
+
+    def _receive_event(self, server: LocalConnection, message: JsonObject, line: bytes) -> None:
+        event = from_json(message)
+        if isinstance(event, StateChanged):
+            self._note(event)
+            self._sessions.goal_changed(event, server.boot)
+            if event.goal and (not self._with_text or len(line) >= self._sessions.max_payload()):
+                line = encode(replace(event, goal=_without_text(event.goal)).to_json()).removesuffix(b"\n")
+        elif isinstance(event, PausedChanged):
+            self._paused = event.paused
+        else:
+            return
+        topic = topics.robot(self._sessions.name, topics.EVENT, str(message["event"]))
+        self._publish(topic, line + b"\n", expiry=EVENT_EXPIRY_S)
+        self.schedule_status()
+
+    def _note(self, event: StateChanged) -> None:
+        """Note what the status will show of this event."""
+        if event.state is State.PENDING:
+            self._texts[event.id] = _shown_text(event.goal)
+        elif event.state is State.ACTIVE:
+            self._active = event.id
+        elif event.state.terminal:
+            self._texts.pop(event.id, None)
+            self._active = None if self._active == event.id else self._active
+            self._last = event.goal or self._last
+
+    # -- to the broker
+
+    def _publish_status(self) -> None:
+        self._timer, self._published_at = None, self._loop.time()
+        status = self._status(with_text=self._with_text)
+        if len(status) > self._sessions.max_payload():
+            status = self._status(with_text=False)
+        self._publish(topics.robot(self._sessions.name, topics.STATUS), status, retain=True)
+
+    def _status(self, *, with_text: bool) -> bytes:
+        active, last = self._active, self._last
+        status: JsonObject = {"active": active}
+        if with_text:
+            status["text"] = self._texts.get(active) if active else None
+        status |= {"pending": len(self._texts.keys() - {active}), "paused": self._paused, "last": None}
+        if last:
+            text = {"text": _shown_text(last)} if with_text else {}
+            how = {"id": last.id, "state": last.state.name, "reason": last.reason}
+            status["last"] = {**how, **text, "at": last.ended_at}
+        return encode(status)
+
+
+def _shown_text(goal: Goal | None) -> str | None:
+    """Return the beginning of a goal's text, for the status."""
+    return goal.text[:_MAX_TEXT_CHARS] if goal and goal.text else None
+
+
+def _without_text(goal: Goal) -> Goal:
+    """Return a goal without its text. Its message may quote the text, so it is left out, too."""
+    return replace(goal, text=None, spoken=None, message=None)

@@ -1,0 +1,248 @@
+"""The messages of a fleet: presence, status, and the description of a robot for Home Assistant.
+
+Pure. Anybody may have written a payload that is read here, so a field of the wrong form counts as missing.
+
+Rules for `homeassistant_device`: use only keys that Home Assistant documents, and values from presence or status. Write
+templates that Jinja and Python read alike. Never rename a component: Home Assistant would take it for another one.
+"""
+
+from __future__ import annotations
+
+from talkcli.errors import BadRequest
+from talkcli.fleet import topics
+from talkcli.frozen import TYPE_CHECKING, fields, frozen
+from talkcli.goals.goal import Goal, known, seconds
+from talkcli.goals.states import EXIT_CODES, State
+from talkcli.protocol.events import StateChanged
+from talkcli.protocol.lines import decode, encode
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+    from talkcli.goals.goal import JsonObject
+
+
+@frozen
+class Message:
+    """A message that came from the broker."""
+
+    topic: str
+    payload: bytes
+    #: whether the broker keeps it for later subscribers
+    retained: bool = False
+    #: the topic that the sender named for answers
+    response: str | None = None
+    correlation: bytes | None = None
+    #: seconds until the message expires; None if it never does
+    expiry: int | None = None
+
+
+@frozen
+class Presence:
+    """Whether a robot is online, and what its bridge last said about it."""
+
+    name: str
+    online: bool
+    #: random name of this run of the bridge; "" if unknown
+    session: str = ""
+    #: when the bridge started, in seconds since 1970 UTC by the robot's clock; None if it is offline
+    since: float | None = None
+    groups: tuple[str, ...] = ()
+    #: the requests that the robot accepts over the broker
+    allow: tuple[str, ...] = ()
+    #: boot id, pid and version of the robot's server; None if no server runs
+    server: JsonObject | None = None
+    #: version of the bridge; "" if it is offline
+    version: str = ""
+
+    @classmethod
+    def read(cls, name: str, payload: bytes) -> Presence | None:
+        """Return the presence in a retained message, None if it was cleared or can't be read.
+
+        Args:
+            name: the robot's level in the topic. If no robot can have this name, the result is None.
+            payload: the message's payload.
+        """
+        said = _object(payload)
+        if said is None or topics.name_fault(name):
+            return None
+        server = said.get("server")
+        return cls(
+            name,
+            said.get("online") is True,
+            _text(said.get("session")) or "",
+            seconds(said.get("since")),
+            _texts(said.get("groups")),
+            _texts(said.get("allow")),
+            server if isinstance(server, dict) else None,
+            _text(said.get("version")) or "",
+        )
+
+    def to_json(self) -> JsonObject:
+        """Return the presence as an object for programs, without the robot's name."""
+        said = fields(self)
+        del said["name"]
+        return {**said, "groups": list(self.groups), "allow": list(self.allow)}
+
+
+def bridge_rank(presence: Presence | None) -> tuple[float, str] | None:
+    """Return the rank among bridges of the same name: the lowest one stays. None if no bridge is online."""
+    if presence is None or presence.since is None or not (presence.online and presence.session):
+        return None
+    return presence.since, presence.session
+
+
+@frozen
+class LastGoal:
+    """The goal that ended last on a robot."""
+
+    id: str
+    state: State
+    reason: str | None = None
+    #: None if the robot keeps texts private
+    text: str | None = None
+    #: when the goal ended, in seconds since 1970 UTC by the robot's clock
+    at: float | None = None
+
+
+@frozen
+class RobotStatus:
+    """What a robot is speaking, how many goals wait, and which goal ended last."""
+
+    #: id of the goal that is being spoken
+    active: str | None = None
+    #: its text; None if the robot keeps texts private
+    text: str | None = None
+    #: how many goals wait
+    pending: int = 0
+    paused: bool = False
+    last: LastGoal | None = None
+
+    @classmethod
+    def read(cls, payload: bytes) -> RobotStatus | None:
+        """Return the status in a retained message, None if it was cleared or can't be read."""
+        said = _object(payload)
+        if said is None:
+            return None
+        pending, last = said.get("pending"), said.get("last")
+        found = known(LastGoal, last) if isinstance(last, dict) else {}
+        return cls(
+            _text(said.get("active")),
+            _text(said.get("text")),
+            max(0, pending) if isinstance(pending, int) else 0,
+            said.get("paused") is True,
+            LastGoal(**found) if "id" in found and "state" in found else None,
+        )
+
+    def events(self) -> list[StateChanged]:
+        """Return the events that led to this status: the end of the last goal, and the start of the active one."""
+        last, found = self.last, []
+        if last:
+            ended = Goal(last.id, last.state, last.text, last.reason, ended_at=last.at)
+            found.append(StateChanged(last.id, last.state, last.at, goal=ended))
+        if self.active is not None:
+            spoken = Goal(self.active, State.ACTIVE, self.text)
+            found.append(StateChanged(self.active, State.ACTIVE, goal=spoken))
+        return found
+
+    def to_json(self) -> JsonObject:
+        """Return the status as an object for programs."""
+        last = self.last
+        return {**fields(self), "last": None if last is None else {**fields(last), "state": last.state.name}}
+
+
+@frozen
+class RobotInfo:
+    """A robot's presence together with its last status."""
+
+    presence: Presence
+    #: of a robot that is offline, the status before it left; None if there was none
+    status: RobotStatus | None
+
+    def to_json(self) -> JsonObject:
+        """Return both as an object for programs."""
+        status = None if self.status is None else self.status.to_json()
+        return {"robot": self.presence.name, "presence": self.presence.to_json(), "status": status}
+
+
+def _object(payload: bytes) -> JsonObject | None:
+    """Return the JSON object in a payload, None if there is none."""
+    try:
+        return decode(payload.strip())
+    except BadRequest:
+        return None
+
+
+def _text(value: object) -> str | None:
+    return value if isinstance(value, str) else None
+
+
+def _texts(value: object) -> tuple[str, ...]:
+    return tuple(each for each in value if isinstance(each, str)) if isinstance(value, list) else ()
+
+
+# -- Home Assistant
+
+#: What Home Assistant publishes on its status topic when it starts.
+HOMEASSISTANT_ONLINE = b"online"
+
+#: Template for presence: whether a sentence would be spoken now.
+_AVAILABLE = "{{ 'online' if value_json.online and value_json.server else 'offline' }}"
+# Templates for the status. In Home Assistant, the state `None` means unknown.
+_STATE_TEMPLATE = "{{ 'paused' if value_json.paused else 'speaking' if value_json.active else 'idle' }}"
+_SPEAKING_TEMPLATE = "{{ 'ON' if value_json.active and not value_json.paused else 'OFF' }}"
+_PENDING_TEMPLATE = "{{ value_json.pending }}"
+_LAST_TEMPLATE = "{{ value_json.last.state if value_json.last else None }}"
+_LAST_ATTRIBUTES_TEMPLATE = "{{ (value_json.last or {}) | tojson }}"
+
+
+def homeassistant_device(name: str, allow: Collection[str], version: str) -> tuple[str, bytes]:
+    """Return the topic and the payload that make a robot a device in Home Assistant.
+
+    Args:
+        name: the robot's name.
+        allow: the requests that the robot accepts. Components for other requests are described as empty, so that
+            Home Assistant removes them if it had them before.
+        version: the bridge's version.
+    """
+    identifier = f"{topics.PREFIX}-{name}"
+    components = {
+        "say": _command(name, topics.PLAIN_SAY, "notify", None, allowed="say" in allow),
+        "cancel": _command(name, topics.PLAIN_CANCEL, "button", "Cancel", allowed="cancel" in allow),
+        "state": _sensor(name, "State", _STATE_TEMPLATE, device_class="enum", options=["idle", "speaking", "paused"]),
+        "speaking": _sensor(name, "Speaking", _SPEAKING_TEMPLATE, platform="binary_sensor"),
+        "pending": _sensor(name, "Pending", _PENDING_TEMPLATE, state_class="measurement"),
+        "last": _sensor(
+            name,
+            "Last result",
+            _LAST_TEMPLATE,
+            device_class="enum",
+            options=[each.name for each in EXIT_CODES],
+            json_attributes_topic=topics.robot(name, topics.STATUS),
+            json_attributes_template=_LAST_ATTRIBUTES_TEMPLATE,
+        ),
+    }
+    for key, component in components.items():
+        if len(component) > 1:
+            component["unique_id"] = f"{identifier}-{key}"
+    payload: JsonObject = {
+        "device": {"identifiers": [identifier], "name": name, "model": "talk", "sw_version": version},
+        "origin": {"name": "talk", "sw_version": version},
+        "availability": [{"topic": topics.robot(name, topics.PRESENCE), "value_template": _AVAILABLE}],
+        "components": components,
+    }
+    return topics.homeassistant_device(name), encode(payload)
+
+
+def _command(name: str, kind: str, platform: str, shown: str | None, *, allowed: bool) -> JsonObject:
+    """Return a component that sends a request to the robot, or an empty one if the request is not allowed."""
+    if not allowed:
+        return {"platform": platform}
+    topic = topics.robot(name, kind, topics.HOMEASSISTANT)
+    return {"platform": platform, "command_topic": topic, "qos": 1, "name": shown}
+
+
+def _sensor(name: str, shown: str, template: str, platform: str = "sensor", **more: object) -> JsonObject:
+    """Return a component that shows a part of the robot's status."""
+    topic = topics.robot(name, topics.STATUS)
+    return {"platform": platform, "name": shown, "state_topic": topic, "value_template": template, "qos": 1, **more}
