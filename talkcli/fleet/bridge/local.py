@@ -75,7 +75,7 @@ class LocalConnection:
 
     async def _receive(self) -> bytes:
         """Return the next data, nothing if the connection has ended."""
-        await asyncio.sleep(0)  # for the others, if the server says much
+        await asyncio.sleep(0)  # lets other tasks run if the server sends a lot
         while not self._closed:
             try:
                 return self._socket.recv(_READ_BYTES)
@@ -122,7 +122,7 @@ async def dial(
     Args:
         socket: path of the server's socket, None for the usual places.
         name: what the client calls itself.
-        urgent: whether the client only asks for the status or cancels.
+        urgent: whether the client only sends `status` and `cancel`, for which a full server keeps some places.
         slots: limits how many connections wait for a greeting at the same time. A hung server keeps a connection in
             its backlog although the client has closed it, so a cancelled call keeps its slot until the server answers.
 

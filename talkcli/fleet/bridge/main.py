@@ -51,9 +51,9 @@ SLOW_BROKER_BYTES = 256 * 1024
 #: Unsent data above which the connection is closed.
 STUCK_BROKER_BYTES = 4 * 1024 * 1024
 #: Largest packet that the broker may send: the longest request, and some more, so that longer ones get an error. paho
-#: takes seconds for a packet of 250 kB that consists of properties, and a tenth of a second for a quarter of that.
+#: needs several seconds for 250 kB of MQTT properties, and a tenth of a second for a quarter of that.
 _MAX_INPUT_BYTES = MAX_LINE + 8 * 1024
-#: Time over which all robots answer a Home Assistant that has started, so that they don't do it all at once.
+#: A robot answers a Home Assistant that has started after a random delay of at most this time.
 _DEVICE_DELAY_S = 3.0
 #: Time for the broker to take the goodbye.
 _OFFLINE_LIMIT_S = 1.0
@@ -64,7 +64,7 @@ _RIGHTS = "may its user do there what 'talk bridge --print-acl' has for these op
 
 @frozen
 class BridgeSettings:
-    """What the command line and the environment say about a bridge."""
+    """The settings of a bridge, from the command line and the environment."""
 
     #: the robot's name
     name: str
@@ -179,7 +179,7 @@ class Bridge:
         self._ending.set()
 
     def _on_task_done(self, task: asyncio.Task[None]) -> None:
-        """End after a bug in a task that should run for ever. The service manager starts the bridge again."""
+        """End the bridge if a task has failed, so that the service manager starts it again."""
         if not task.cancelled() and (error := task.exception()):
             self.end(error)
 
@@ -240,7 +240,7 @@ class Bridge:
             raise opener.error
 
     def _on_connect(self, link: Link) -> None:
-        """Use a new connection. First find out whether another bridge has this name."""
+        """Start to use a new connection. First find out whether another bridge has this name."""
         self._disconnected.clear()
         self._link, self._descriptor = link, link.fileno()
         self._owns_name, self._rival_seen, self._rival_timer = False, False, None
@@ -250,7 +250,8 @@ class Bridge:
         name = self._settings.name
         link.subscribe(topics.robot(name, topics.PRESENCE), retained=True)
         link.subscribe(topics.robot(name, topics.ECHO), retained=False)
-        # The retained presence of another bridge comes before this question returns, and a living one's answer after.
+        # The broker sends the retained presence of another bridge before this question returns. If that bridge is
+        # still alive, its answer comes after that.
         self._publish(topics.robot(name, topics.ECHO), _RIVAL_QUESTION + self._session.encode())
         self._send_echo()
 
@@ -273,7 +274,7 @@ class Bridge:
         log.line(f"online, at {self._settings.broker.url}")
 
     def _disconnect(self, link: Link) -> None:
-        """Close a connection and end what depends on it. Do nothing if that has been done."""
+        """Close a connection and end all sessions. It may be called again."""
         if self._link is link:
             self._link = None
             self._forget_descriptor()
@@ -414,7 +415,7 @@ class Bridge:
             self._unanswered_since = None
 
     def _handle_presence(self, payload: bytes) -> None:
-        """Handle a presence of this robot, from this bridge, from an ended one, or from a rival."""
+        """Handle a presence message about this robot. It comes from this bridge, an ended one, or a rival."""
         presence = Presence.read(self._settings.name, payload)
         rank = bridge_rank(presence)
         if payload and (presence is None or (presence.online and rank is None)):

@@ -37,9 +37,9 @@ ASKABLE = tuple(each for each in KINDS if each not in ALWAYS_ALLOWED)
 _REMOTE_PREFIX = "mqtt:"
 #: Time between two echoes that the bridge sends to itself.
 ECHO_EVERY_S = 5.0
-#: A message is stale if the newest echo that returned was sent longer ago: one interval, and a second for the way.
+#: If the newest echo that returned was sent longer ago, messages are stale: one interval, and a second for the way.
 STALE_AFTER_S = ECHO_EVERY_S + 1.0
-#: How many echoes are remembered until they return: those of half a minute, and some in between.
+#: How many echoes may be on their way: those of half a minute, and some more.
 _MAX_ECHOES = 32
 #: How many goals of remote clients may be pending. The rest of the queue (usually 100) is for the robot's own goals.
 MAX_REMOTE_GOALS = 20
@@ -47,7 +47,7 @@ MAX_REMOTE_GOALS = 20
 MAX_REMEMBERED_IDS = 1_000
 #: Longest correlation data. They are repeated in the header of each answer.
 MAX_CORRELATION_BYTES = 256
-#: Time to live of a goal whose time was over before it was sent. Zero would mean no limit.
+#: The ttl of a goal whose message expired while the goal waited for room. Zero would mean no limit.
 _EXPIRED_TTL_S = 0.001
 
 
@@ -184,9 +184,10 @@ def _repeatable(correlation: bytes | None) -> bytes | None:
 
 
 class EchoTracker:
-    """Tells how old a message may be, from the echoes that the bridge sends to itself through the broker.
+    """Limits the age of messages, by means of echoes that the bridge sends to itself through the broker.
 
-    The broker forwards a message later than all echoes that arrived before it. So no clocks are compared.
+    The broker forwards messages in order. So a message that comes after an echo was forwarded after the echo was sent,
+    and can't be older than that. No clocks are compared.
     """
 
     def __init__(self, now: float) -> None:
@@ -219,7 +220,7 @@ class EchoTracker:
 
 
 class SentIds:
-    """The ids of the goals that were last sent to the server, and to which start of the server."""
+    """The ids of recent goals, each with the boot id of the server that it was sent to."""
 
     def __init__(self) -> None:
         #: boot id of the server, and whether the goal counts for the limit of remote goals, by id
@@ -253,17 +254,16 @@ class RemoteGoals:
     """
 
     def __init__(self) -> None:
-        # Goals whose reply has not come, and goals that are pending at the server: keys by id.
-        self._sent: dict[str, str | None] = {}
-        self._pending: dict[str, str | None] = {}
+        #: each goal's key, and whether the server has said that the goal is pending, by id
+        self._goals: dict[str, tuple[str | None, bool]] = {}
 
     def __len__(self) -> int:
-        return len(self._sent.keys() | self._pending.keys())
+        return len(self._goals)
 
     @property
     def pending_count(self) -> int:
-        """How many goals the server has reported as pending."""
-        return len(self._pending)
+        """How many goals are known to be pending."""
+        return sum(pending for _, pending in self._goals.values())
 
     @staticmethod
     def counts(say: Say) -> bool:
@@ -272,50 +272,50 @@ class RemoteGoals:
 
     def has_room(self, say: Say) -> bool:
         """Return whether this goal may be sent. A goal that will replace another one by its key always has room."""
-        keys = (*self._sent.values(), *self._pending.values())
-        return len(self) < MAX_REMOTE_GOALS or not self.counts(say) or (say.key is not None and say.key in keys)
+        replaces = say.key is not None and any(key == say.key for key, _ in self._goals.values())
+        return len(self) < MAX_REMOTE_GOALS or not self.counts(say) or replaces
 
     def add(self, goal_id: str, key: str | None) -> None:
         """Count a goal that is sent to the server."""
-        self._sent[goal_id] = key
+        self._goals.setdefault(goal_id, (key, False))
 
     def answered(self, goal_id: str, *, pending: bool) -> None:
-        """Record the server's reply to a goal, unless an event has already said that the goal left the queue.
+        """Record the server's reply to a goal, unless an event has already told more.
 
         Args:
             goal_id: the goal.
             pending: whether the goal is pending. False also if nobody waits for the reply any more.
         """
-        if goal_id in self._sent:
-            key = self._sent.pop(goal_id)
-            if pending:
-                self._pending[goal_id] = key
+        key, is_known = self._goals.get(goal_id, (None, True))
+        if not is_known and pending:
+            self._goals[goal_id] = key, True
+        elif not is_known:
+            del self._goals[goal_id]
 
     def queued(self, goal_id: str, key: str | None) -> None:
         """Record an event that says that a goal is pending."""
-        self._pending[goal_id] = key
+        self._goals[goal_id] = key, True
 
     def dequeued(self, goal_id: str) -> bool:
         """Record an event that says that a goal is no longer pending, and return whether the goal was counted."""
-        before = len(self)
-        self._sent.pop(goal_id, None)
-        self._pending.pop(goal_id, None)
-        return len(self) < before
+        return self._goals.pop(goal_id, None) is not None
 
     def reset(self, pending: Iterable[tuple[str, str | None]]) -> None:
         """Replace the pending goals, given as ids and keys. Goals on their way still count."""
-        self._pending = dict(pending)
+        self._goals = {each: found for each, found in self._goals.items() if not found[1]}
+        self._goals |= {goal_id: (key, True) for goal_id, key in pending}
 
     def clear(self) -> None:
         """Forget all goals, because the server is gone."""
-        self._sent.clear()
-        self._pending.clear()
+        self._goals.clear()
 
 
 def end_unsent(
     request: RemoteRequest, goal_id: str, state: State, reason: str, words: str, at: float, by: By | None = None
 ) -> tuple[Goal, list[JsonObject]]:
-    """Return a goal that ends before it reached the server, and what the client is told, as the server would tell it.
+    """End a goal that was not sent to the server, and return it with the lines for its client.
+
+    The lines are those that the server would send.
 
     Args:
         request: the `say`.

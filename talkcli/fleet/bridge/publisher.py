@@ -14,6 +14,7 @@ from talkcli.daemon import log
 from talkcli.errors import BadRequest, ServerUnavailable, TalkError
 from talkcli.fleet import topics
 from talkcli.fleet.bridge.local import dial
+from talkcli.fleet.payloads import LastGoal, RobotStatus
 from talkcli.frozen import replace
 from talkcli.goals.goal import Goal
 from talkcli.goals.option import MAX_LOG
@@ -62,7 +63,7 @@ class Publisher:
         """Start without a server.
 
         Args:
-            sessions: are told about all changes of goals.
+            sessions: the sessions, which are told about all changes of goals.
             publish: publishes a message for everybody.
             on_server_change: called when a server has come or gone.
             with_text: whether everybody may read the texts of goals.
@@ -216,14 +217,12 @@ class Publisher:
 
     def _status(self, *, with_text: bool) -> bytes:
         active, last = self._active, self._last
-        status: JsonObject = {"active": active}
-        if with_text:
-            status["text"] = self._texts.get(active) if active else None
-        status |= {"pending": len(self._texts.keys() - {active}), "paused": self._paused, "last": None}
-        if last:
-            text = {"text": _shown_text(last)} if with_text else {}
-            how = {"id": last.id, "state": last.state.name, "reason": last.reason}
-            status["last"] = {**how, **text, "at": last.ended_at}
+        text = self._texts.get(active) if active else None
+        ended = last and LastGoal(last.id, last.state, last.reason, _shown_text(last), last.ended_at)
+        status = RobotStatus(active, text, len(self._texts.keys() - {active}), self._paused, ended).to_json()
+        for each in (status, status["last"]):
+            if not with_text and isinstance(each, dict):
+                del each["text"]
         return encode(status)
 
 

@@ -1,7 +1,7 @@
 """The sessions of remote clients: each is one client's connection to the robot's server.
 
 Requests go in, and the server's lines come back, in their order. `policy` has decided before whether a request is
-accepted at all. Goals that are too many wait here or are rejected.
+accepted at all. If too many goals are pending, further ones wait here or are rejected.
 """
 
 from __future__ import annotations
@@ -14,16 +14,8 @@ from typing import TYPE_CHECKING
 
 from talkcli.daemon import log
 from talkcli.errors import BadRequest, Busy, TalkError
+from talkcli.fleet.bridge import policy
 from talkcli.fleet.bridge.local import dial
-from talkcli.fleet.bridge.policy import (
-    MAX_REMOTE_GOALS,
-    RemoteGoals,
-    SentIds,
-    end_unsent,
-    is_remote,
-    sender_name,
-    without_texts,
-)
 from talkcli.fleet.link import boottime
 from talkcli.goals.goal import By, Sender
 from talkcli.goals.options import Cancel, Say, Set
@@ -47,7 +39,7 @@ if TYPE_CHECKING:
 MAX_SESSIONS = 32
 #: How many requests of one client may wait for the connection, for room, or for their answers.
 MAX_WAITING_REQUESTS = 64
-#: How much the waiting requests of all clients may hold. Cancel and status may use as much again.
+#: Total size of the waiting requests of all clients. Cancel and status requests may go to twice as much.
 MAX_WAITING_BYTES = 4 * 1024 * 1024
 #: A client that sends nothing for this time counts as gone, because MQTT doesn't tell. A client that waits says hello
 #: every 30 s, and two of these messages may be lost.
@@ -64,7 +56,7 @@ _UNRELIABLE = (b'{"event": "word"', b'{"event": "alive"')
 
 
 class RemoteSessions:
-    """All sessions, and what they share: the limit for pending goals, the ids of goals, and room for requests."""
+    """The sessions of all remote clients, with the limits that they share."""
 
     def __init__(
         self,
@@ -85,7 +77,7 @@ class RemoteSessions:
         """
         self.name, self.socket = name, socket
         self.publish, self.max_payload = publish, max_payload
-        self.ids, self.goals = SentIds(), RemoteGoals()
+        self.ids, self.goals = policy.SentIds(), policy.RemoteGoals()
         #: limits how many sessions wait for the server's greeting
         self.dialing = asyncio.Semaphore(MAX_SESSIONS)
         #: set while the broker is fast enough for more lines of the server
@@ -170,9 +162,9 @@ class RemoteSessions:
         return [session.cancel_waiting(request, by) for request, session in selected]
 
     def schedule_release(self) -> None:
-        """Schedule a check of the goals that wait for room, after the number of pending goals has changed.
+        """Send goals that wait for room soon, if there is room then.
 
-        So all events that came together count before it.
+        Call it whenever the number of pending goals has changed. Events that came together all count.
         """
         self._on_change()
         if self.waiting and self._release_handle is None:
@@ -209,16 +201,16 @@ class RemoteSessions:
 
         It counts for the limit even if it preempted, because a goal doesn't show that.
         """
-        if is_remote(goal) and self.ids.boot_of(goal.id) != boot:
+        if policy.is_remote(goal) and self.ids.boot_of(goal.id) != boot:
             self.ids.add(goal.id, boot)
 
     def server_came(self, pending: list[Goal], boot: str) -> None:
-        """Count the goals that are pending at a server that is watched now."""
+        """Take over the pending goals of a server that has just been found."""
         self.goals.reset((each.id, each.key) for each in pending if self.ids.is_counted(each.id, boot))
         self.schedule_release()
 
     def server_left(self) -> None:
-        """Count no goals, because the server is gone."""
+        """Forget all pending goals, because the server is gone."""
         self.goals.clear()
         self.schedule_release()
 
@@ -249,7 +241,7 @@ class RemoteSession:
         self.used_at = 0.0
         self._sessions = sessions
         self._user, self._reply_topic = user, reply_topic
-        self._name = sender_name(user)
+        self._name = policy.sender_name(user)
         self._loop = asyncio.get_running_loop()
         self._server: LocalConnection | None = None
         self._task: asyncio.Task[None] | None = None
@@ -351,7 +343,7 @@ class RemoteSession:
         elif isinstance(asked, Cancel):
             self._send_cancel(request, asked)
         elif isinstance(asked, Hello):
-            self._name = sender_name(self._user, asked.name)
+            self._name = policy.sender_name(self._user, asked.name)
             self._send(_Sent(request), {**request.fields, "name": self._name})
         else:
             self._watching = self._watching or isinstance(asked, Watch)
@@ -374,11 +366,11 @@ class RemoteSession:
         elif say.patient:
             shared.waiting.append((request, self))
         else:
-            words = f"{MAX_REMOTE_GOALS} goals from afar are waiting already"
+            words = f"{policy.MAX_REMOTE_GOALS} goals from afar are waiting already"
             self._end_goal(request, State.REJECTED, "queue_full", words, None)
 
     def _send_cancel(self, request: RemoteRequest, selection: Cancel) -> None:
-        """Cancel goals that wait for room, then those at the server, which must not be asked for unknown ids."""
+        """Cancel goals that wait for room, then goals at the server, which doesn't know the ids of the former."""
         sent = _Sent(request)
         sent.canceled = self._sessions.cancel_waiting(selection, By(client=Sender(name=self._name)))
         fields = dict(request.fields)
@@ -391,7 +383,7 @@ class RemoteSession:
         self._send(sent, fields)
 
     def _send(self, sent: _Sent, fields: JsonObject) -> bool:
-        """Send a request to the server, and return whether it is short enough for that."""
+        """Send a request to the server. If it is too long, refuse it and return False."""
         assert self._server
         self._last_number += 1
         line = encode({"seq": self._last_number, **fields})
@@ -403,7 +395,7 @@ class RemoteSession:
         return True
 
     def _new_id(self) -> str:
-        """Return an id that no server and no other robot gives. Each goal needs one, so that it can be counted."""
+        """Return a unique id for a goal that has none. Every goal needs an id, so that it can be counted."""
         return f"{self._sessions.name[:_MAX_ID_PREFIX_CHARS]}-x{random.getrandbits(48):012x}"
 
     # -- from the server
@@ -478,14 +470,14 @@ class RemoteSession:
         return [(encode(each), request.correlation) for each in numbered]
 
     def _note_awaited(self, remote: RemoteRequest, goal: JsonObject) -> None:
-        """Note a goal whose result the client will get."""
+        """Remember a goal if the client waits for its result."""
         request, state = remote.request, State.__members__.get(str(goal.get("state")))
         waits = isinstance(request, Wait) or (isinstance(request, Say) and (request.wait or request.feedback))
         if waits and state is not None and not state.terminal:
             self._awaited.add(str(goal.get("id")))
 
     def _count_goal(self, sent: _Sent, reply: JsonObject) -> None:
-        """Count a goal by the server's reply."""
+        """Update the number of pending goals after the server's reply to a `say`."""
         if sent.goal_id is None:
             return
         goal = reply.get("goal")
@@ -505,7 +497,7 @@ class RemoteSession:
         say = request.request
         assert isinstance(say, Say)
         own_id = say.id if state is State.RECALLED else None  # as at the server, where a rejected goal gets a new id
-        goal, lines = end_unsent(request, own_id or self._new_id(), state, reason, words, time.time(), by)
+        goal, lines = policy.end_unsent(request, own_id or self._new_id(), state, reason, words, time.time(), by)
         answer, *events = (encode(each) for each in lines)
         self._publish([(answer, request.correlation), *((each, None) for each in events)])
         return goal
@@ -514,10 +506,7 @@ class RemoteSession:
         self._publish([(encode({"event": "gone", "message": why}), None)])
 
     def _publish(self, lines: list[tuple[bytes, bytes | None]]) -> None:
-        """Publish lines, each with its correlation data, in as few payloads as possible.
-
-        A payload holds either answers to one request or events.
-        """
+        """Publish lines, each with its correlation data. Lines with the same data share a payload if they fit."""
         if self._reply_topic is None:
             return
         limit = self._sessions.max_payload()
@@ -535,7 +524,7 @@ class RemoteSession:
     def _shortened(self, line: bytes, limit: int) -> bytes:
         """Return a line to publish in place of one that is too long for the broker."""
         message = decode(line)
-        shorter = encode(without_texts(message))
+        shorter = encode(policy.without_texts(message))
         if len(shorter) <= limit:
             return shorter
         words = f"this has {len(line):,} bytes, and the broker takes {limit:,}"
