@@ -388,7 +388,7 @@ def _properties(expiry: float | None, response: str | None, correlation: bytes |
 class LinkOpener:
     """Opens a link in a thread of its own, because that blocks and can't be interrupted."""
 
-    def __init__(self, link: Link, on_done: Callable[[], None]) -> None:
+    def __init__(self, link: Link, on_done: Callable[[], object]) -> None:
         """Start to open the link. The thread calls `on_done` at the end, unless `cancel` was called before."""
         self.link = link
         self.error: TalkError | None = None

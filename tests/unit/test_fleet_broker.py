@@ -92,7 +92,7 @@ def test_a_login_that_is_incomplete_or_unreadable_is_refused(
     named = {each: str(tmp_path / each) for each in [*files, "nothing"]}
     given = {name: value.format(**named) for name, value in variables.items()}
     with pytest.raises(UsageError, match=words):
-        from_environment({"TALK_BROKER": "mqtts://broker", **given}).context()
+        from_environment({"TALK_BROKER": "mqtts://broker", **given}).ssl_context()
 
 
 @pytest.mark.parametrize("name", ["TALK_MQTT_CA", "TALK_MQTT_CERT", "TALK_MQTT_KEY"])

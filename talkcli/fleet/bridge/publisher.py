@@ -218,7 +218,7 @@ class Publisher:
     def _status(self, *, with_text: bool) -> bytes:
         active, last = self._active, self._last
         text = self._texts.get(active) if active else None
-        ended = last and LastGoal(last.id, last.state, last.reason, _shown_text(last), last.ended_at)
+        ended = LastGoal(last.id, last.state, last.reason, _shown_text(last), last.ended_at) if last else None
         status = RobotStatus(active, text, len(self._texts.keys() - {active}), self._paused, ended).to_json()
         for each in (status, status["last"]):
             if not with_text and isinstance(each, dict):
