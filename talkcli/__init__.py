@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from talkcli.client.goal import GoalHandle
     from talkcli.fleet.api import Fleet
     from talkcli.fleet.desk.request import Outcome
-    from talkcli.fleet.presence import Presence
+    from talkcli.fleet.payloads import Presence
     from talkcli.goals.goal import Goal
     from talkcli.goals.states import State
     from talkcli.protocol.events import Canceled, PausedChanged, Result, ServerStatus, Snapshot, StateChanged, WordHeard
@@ -43,10 +43,10 @@ def __getattr__(name: str) -> object:
 
         return getattr(client, name)
     if name in {"Fleet", "Outcome", "Presence"}:
-        from talkcli.fleet import api, presence
+        from talkcli.fleet import api, payloads
         from talkcli.fleet.desk import request
 
-        return {"Fleet": api.Fleet, "Outcome": request.Outcome, "Presence": presence.Presence}[name]
+        return {"Fleet": api.Fleet, "Outcome": request.Outcome, "Presence": payloads.Presence}[name]
     if name in {"Goal", "State"}:
         from talkcli.goals import goal
 

@@ -25,8 +25,7 @@ if TYPE_CHECKING:
     from talkcli.cli.show import CommonOptions
     from talkcli.fleet.broker import Broker
     from talkcli.fleet.desk.watch import FleetEvent
-    from talkcli.fleet.presence import Presence
-    from talkcli.fleet.status import Standing
+    from talkcli.fleet.payloads import Presence, RobotInfo
     from talkcli.goals.goal import JsonObject
 
 
@@ -34,7 +33,7 @@ def bridge(options: CommonOptions, print_unit: str | None, print_acl: bool, **gi
     """Run the bridge, or print its systemd unit or the broker's access rules. Return the exit code."""
     _check_names("--name", [] if given["name"] is None else [given["name"]])
     if print_acl:
-        show(topics.access(homeassistant=given["homeassistant"], name=given["name"]))
+        show(topics.access_rules(homeassistant=given["homeassistant"], name=given["name"]))
         return 0
     groups, allow = _split_list(given["group"]), _split_list(given["allow"])
     _check_names("--group", groups)
@@ -47,10 +46,9 @@ def bridge(options: CommonOptions, print_unit: str | None, print_acl: bool, **gi
         units.print_bridge_unit(options, print_unit, given)
         return 0
     broker = options.broker()
-    from talkcli.fleet.bridge.main import Settings
-    from talkcli.fleet.bridge.run import bridge
+    from talkcli.fleet.bridge.main import BridgeSettings, run_bridge
 
-    settings = Settings(
+    settings = BridgeSettings(
         given["name"],
         broker,
         tuple(allow),
@@ -59,7 +57,7 @@ def bridge(options: CommonOptions, print_unit: str | None, print_acl: bool, **gi
         with_text=not given["no_text"],
         homeassistant=given["homeassistant"],
     )
-    return bridge(settings, options.broker)
+    return run_bridge(settings, options.broker)
 
 
 def _split_list(value: str | None) -> list[str]:
@@ -69,7 +67,7 @@ def _split_list(value: str | None) -> list[str]:
 
 def _check_names(option: str, names: Sequence[str]) -> None:
     for each in names:
-        fault = topics.fault(each)
+        fault = topics.name_fault(each)
         if fault:
             raise UsageError(f"{option}: the name '{printable(each)}' can't be in a topic, it {fault}")
 
@@ -156,7 +154,7 @@ def _show_event(options: CommonOptions, broker: Broker, transcript: FleetTranscr
         note(f"the broker at {broker.url} is back, after {event.after:.1f} s")
 
 
-def _snapshot_object(standing: Standing) -> JsonObject:
+def _snapshot_object(standing: RobotInfo) -> JsonObject:
     return {"robot": standing.presence.name, "event": "snapshot", **standing.to_json()}
 
 
@@ -166,7 +164,7 @@ def _row_without_goals(presence: Presence) -> RobotRow:
     return RobotRow(presence.name, presence.online, server, since=presence.since)
 
 
-def _table_row(standing: Standing) -> RobotRow:
+def _table_row(standing: RobotInfo) -> RobotRow:
     """Return the table row of a robot."""
     row, status = _row_without_goals(standing.presence), standing.status
     if status is None:

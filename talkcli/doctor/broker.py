@@ -23,11 +23,11 @@ from talkcli.doctor.report import ADMITTED, ANSWERED, FAILED, Finding, failed, o
 from talkcli.doctor.server import span, summary
 from talkcli.errors import ServerUnavailable, TalkError, UsageError
 from talkcli.fleet import topics
-from talkcli.fleet.broker import CA, URL, USER, from_environment, is_here, user
+from talkcli.fleet.broker import CA, URL, USER, client_user, from_environment, is_local
 from talkcli.fleet.desk.robot import connect_robot
 from talkcli.fleet.desk.watch import read_presences
-from talkcli.fleet.link import NOT_AUTHORIZED, PATIENCE, Link
-from talkcli.fleet.presence import Presence
+from talkcli.fleet.link import LOGIN_LIMIT_S, REASON_NOT_AUTHORIZED, Link
+from talkcli.fleet.payloads import Presence
 from talkcli.frozen import frozen, replace
 from talkcli.polling import wait_ready
 from talkcli.terminal.text import printable
@@ -37,13 +37,13 @@ if TYPE_CHECKING:
 
     from talkcli.doctor.report import Question
     from talkcli.fleet.broker import Broker
-    from talkcli.fleet.message import Message
+    from talkcli.fleet.payloads import Message
     from talkcli.goals.goal import JsonObject
 
 _Result = TypeVar("_Result")
 
-#: Time limit of each step. The broker must answer within `PATIENCE`, but looking up its host may take longer.
-_STEP_LIMIT_S = 2 * PATIENCE
+#: Time limit of each step. The broker must answer within `LOGIN_LIMIT_S`, but looking up its host may take longer.
+_STEP_LIMIT_S = 2 * LOGIN_LIMIT_S
 #: Time in which a message must come back after the broker has acknowledged it.
 _ECHO_LIMIT_S = 1.0
 #: Content of the message that should come back. It differs from the echoes of a bridge.
@@ -121,7 +121,7 @@ class BrokerExamination:
         Raises:
             UsageError: No robot can have this name.
         """
-        fault = topics.fault(robot)
+        fault = topics.name_fault(robot)
         if fault:
             raise UsageError(f"no robot can be called '{printable(robot)}': a name {fault}")
         self._robot = robot
@@ -141,7 +141,7 @@ class BrokerExamination:
         """Yield each finding as soon as it is known, up to the first failure that prevents other checks."""
         try:
             broker = from_environment(self._environment, insecure=self._insecure)
-            name, context = user(broker), broker.context()
+            name, context = client_user(broker), broker.ssl_context()
         except UsageError as error:
             yield judge_settings(error.message, named=bool(self._environment.get(URL)))
             return
@@ -152,7 +152,7 @@ class BrokerExamination:
         yield judge_connection(broker, connection)
         if connection.trouble is not None:
             return
-        yield from judge_certificate(broker, connection, time.time(), near=is_here(broker.host))
+        yield from judge_certificate(broker, connection, time.time(), near=is_local(broker.host))
         if connection.untrusted is not None:
             return
         try:
@@ -209,7 +209,7 @@ class BrokerExamination:
         for topic, payload in tested.items():
             link.publish(topic, payload, acknowledged=partial(codes.__setitem__, topic))
         now = time.monotonic()
-        end = now + PATIENCE
+        end = now + LOGIN_LIMIT_S
         is_acknowledged = is_back = False
         presence: Presence | None = None
         while link.ended is None and now < end and not (is_acknowledged and is_back and presence):
@@ -224,7 +224,7 @@ class BrokerExamination:
             now = time.monotonic()
             if not is_acknowledged and len(codes) == len(tested):
                 is_acknowledged, end = True, min(end, now + _ECHO_LIMIT_S)
-        unwritten = tuple(each for each in tested if codes.get(each) == NOT_AUTHORIZED)
+        unwritten = tuple(each for each in tested if codes.get(each) == REASON_NOT_AUTHORIZED)
         missing = [each for each in tested if each not in codes]
         trouble = link.ended or (f"it has acknowledged nothing of {missing[0]}" if missing else None)
         return AccessRights(presence, unwritten, () if is_back or echo in unwritten else (echo,), trouble)
@@ -232,7 +232,7 @@ class BrokerExamination:
     def _known_robots(self, broker: Broker) -> tuple[str, ...]:
         """Return the names of all robots that the broker knows. If the broker doesn't tell, return none."""
         try:
-            return tuple(sorted(self._wait_for(partial(read_presences, broker, PATIENCE))))
+            return tuple(sorted(self._wait_for(partial(read_presences, broker, LOGIN_LIMIT_S))))
         except (TalkError, TimeoutError):
             return ()
 
@@ -241,7 +241,7 @@ class BrokerExamination:
         end = time.monotonic() + _STEP_LIMIT_S
         try:
             connection = connect_robot(
-                self._robot, broker, name="talk doctor", interrupt=self._interrupt, patience=PATIENCE, end=end
+                self._robot, broker, name="talk doctor", interrupt=self._interrupt, patience=LOGIN_LIMIT_S, end=end
             )
             with Client.over(connection) as client:
                 began = time.monotonic()
@@ -283,7 +283,7 @@ def _connect(broker: Broker, context: ssl.SSLContext | None) -> BrokerConnection
     """Connect to the broker, do the TLS handshake, and disconnect."""
     began = time.monotonic()
     try:
-        connection = socket.create_connection((broker.host, broker.port), PATIENCE)
+        connection = socket.create_connection((broker.host, broker.port), LOGIN_LIMIT_S)
     except OSError as error:
         return BrokerConnection(trouble=_trouble(error))
     with connection:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from talkcli.client.client import Client
 from talkcli.client.connect import ANSWER_LIMIT
-from talkcli.fleet.broker import URL, from_environment, need_client
+from talkcli.fleet.broker import URL, from_environment, require_paho
 from talkcli.fleet.desk.request import Selection
 from talkcli.goals.options import Cancel, Say, Set
 from talkcli.protocol.requests import Pause, Resume, Status, Wait
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from talkcli.fleet.desk.several import FleetRequest
-    from talkcli.fleet.presence import Presence
+    from talkcli.fleet.payloads import Presence
     from talkcli.protocol.requests import Request
 
 
@@ -57,7 +57,7 @@ class Fleet:
         Raises:
             UsageError: A setting is wrong or missing, or paho-mqtt is not installed.
         """
-        need_client()
+        require_paho()
         environment = dict(os.environ) if broker is None else {**os.environ, URL: broker}
         self._broker = from_environment(environment, insecure=insecure)
         self._name = name

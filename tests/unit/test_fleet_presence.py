@@ -8,8 +8,7 @@ import pytest
 
 from talkcli.fleet import topics
 from talkcli.fleet.desk.request import Selection, selects_several
-from talkcli.fleet.presence import Presence, rank
-from talkcli.fleet.status import LastGoal, Status
+from talkcli.fleet.payloads import LastGoal, Presence, RobotStatus, bridge_rank
 from talkcli.goals.states import State
 
 SERVER = {"boot": "7r2z", "pid": 4711, "version": "0.1.0"}
@@ -28,8 +27,8 @@ def presence(said: object) -> Presence | None:
     return Presence.read("anna", json.dumps(said).encode() + b"\n")
 
 
-def status(said: object) -> Status | None:
-    return Status.read(json.dumps(said).encode() + b"\n")
+def status(said: object) -> RobotStatus | None:
+    return RobotStatus.read(json.dumps(said).encode() + b"\n")
 
 
 def test_a_presence_is_read_and_told_again() -> None:
@@ -45,7 +44,7 @@ def test_a_presence_is_read_and_told_again() -> None:
 def test_a_status_is_read_and_told_again() -> None:
     found = status({**STATUS, "later": "a field that is not known yet"})
     last = LastGoal("door-17", State.ABORTED, "player", "the door", 1767225601.5)
-    assert found == Status("a-1", "hello", 3, paused=True, last=last)
+    assert found == RobotStatus("a-1", "hello", 3, paused=True, last=last)
     assert found.to_json() == STATUS
 
 
@@ -57,7 +56,7 @@ def test_a_status_is_read_and_told_again() -> None:
     ],
 )
 def test_a_payload_that_is_no_object_is_ignored(payload: bytes) -> None:
-    assert (Presence.read("anna", payload), Status.read(payload)) == (None, None)
+    assert (Presence.read("anna", payload), RobotStatus.read(payload)) == (None, None)
 
 
 @pytest.mark.parametrize("name", ["", "_", "+", "a b", "a" * 60, "\x1b[2J"])
@@ -81,14 +80,14 @@ def test_a_name_that_no_robot_can_have_is_ignored(name: str) -> None:
     ],
 )
 def test_a_malformed_field_counts_as_missing(wrong: dict[str, object]) -> None:
-    assert (presence(wrong), status(wrong)) == (Presence("anna", online=False), Status())
+    assert (presence(wrong), status(wrong)) == (Presence("anna", online=False), RobotStatus())
 
 
 def test_of_a_field_those_values_are_taken_that_can_be_read() -> None:
     assert presence({"groups": ["all", 7, "night"]}) == Presence("anna", online=False, groups=("all", "night"))
     untold = {name: value for name, value in LAST.items() if name not in ("text", "reason", "at")}
-    assert status({"active": "a", "last": untold}) == Status("a", last=LastGoal("door-17", State.ABORTED))
-    assert status({"last": {**untold, "at": True}}) == Status(last=LastGoal("door-17", State.ABORTED))
+    assert status({"active": "a", "last": untold}) == RobotStatus("a", last=LastGoal("door-17", State.ABORTED))
+    assert status({"last": {**untold, "at": True}}) == RobotStatus(last=LastGoal("door-17", State.ABORTED))
 
 
 @pytest.mark.parametrize(
@@ -104,14 +103,14 @@ def test_of_a_field_those_values_are_taken_that_can_be_read() -> None:
 def test_only_a_presence_with_a_time_and_a_session_is_compared_with_other_bridges(
     changed: dict[str, object], found: tuple[float, str] | None
 ) -> None:
-    assert rank(presence(HERE | changed)) == found
+    assert bridge_rank(presence(HERE | changed)) == found
 
 
 # The robots that `--robot` means
 
 
 def robot(name: str, *groups: str, online: bool = True) -> Presence:
-    return Presence(name, online, groups=(topics.EVERYBODY, *groups))
+    return Presence(name, online, groups=(topics.ALL_ROBOTS, *groups))
 
 
 CARL = Presence("carl", online=False)  # which says nothing of its groups

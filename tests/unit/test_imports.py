@@ -34,8 +34,7 @@ FACE = {"", "__main__"}
 PURE = [
     *("errors", "frozen", "client.following", "daemon.quota", "engine.child.words", "engine.child.synthesizers.guard"),
     *("engine.child.synthesizers.phonemes", "engine.child.synthesizers.vits"),
-    *(f"fleet.{each}" for each in ("message", "presence", "status", "topics")),
-    *("fleet.bridge.homeassistant", "fleet.bridge.policy"),
+    *("fleet.payloads", "fleet.topics", "fleet.bridge.policy"),
     "fleet.desk.request",
 ]
 IMPURE = {
@@ -302,7 +301,7 @@ def test_a_client_loads_nothing_heavy(statement: str, without: list[str]) -> Non
 JUDGING = ["machine", "voice", "neural", "sound", "server", "sentence", "broker", "report"]
 #: Modules that the doctor's judgements may call besides each other; a clock's format is all that they read.
 FOR_JUDGING = {
-    *("talkcli.engine.players", "talkcli.fleet.presence", "talkcli.goals.options", "talkcli.goals.states"),
+    *("talkcli.engine.players", "talkcli.fleet.payloads", "talkcli.goals.options", "talkcli.goals.states"),
     *("talkcli.terminal.goals", "talkcli.terminal.text", "talkcli.frozen"),
 }
 

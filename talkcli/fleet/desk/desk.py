@@ -16,15 +16,23 @@ from typing import TYPE_CHECKING, Protocol
 
 from talkcli.errors import AccessDenied, ServerUnavailable, TalkError
 from talkcli.fleet import topics
-from talkcli.fleet.broker import user
-from talkcli.fleet.link import KEEPALIVE, MANY_AT_ONCE, NOT_AUTHORIZED, REFUSED, TICK, Link, Opening
+from talkcli.fleet.broker import client_user
+from talkcli.fleet.link import (
+    KEEPALIVE_S,
+    MAX_RECEIVE_COUNT,
+    REASON_FAILURE,
+    REASON_NOT_AUTHORIZED,
+    TICK_EVERY_S,
+    Link,
+    LinkOpener,
+)
 from talkcli.polling import wait_ready
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from talkcli.fleet.broker import Broker
-    from talkcli.fleet.message import Message
+    from talkcli.fleet.payloads import Message
 
 #: A broker or a robot that is absent for this long counts as gone, and open requests as lost. Bridges come back within
 #: 15 s after their broker, and systemd restarts a bridge after two.
@@ -63,7 +71,7 @@ class DeskLink:
         Raises:
             UsageError: The user's name can't be part of a topic.
         """
-        self.broker, self.user = broker, user(broker)
+        self.broker, self.user = broker, client_user(broker)
         #: part of this desk's topics, to tell it from the user's other desks
         self.session = os.urandom(8).hex()
         #: the current MQTT connection; None while disconnected
@@ -73,7 +81,7 @@ class DeskLink:
         #: when the marker came back, which the broker sends after its retained messages; None if it hasn't
         self.marker_at: float | None = None
         self._inbox: deque[Message] = deque()
-        self._opening: Opening | None = None
+        self._opening: LinkOpener | None = None
         self._failed_attempts = 0
         self._next_attempt_at = self._polled_at = time.monotonic()
         # Unlike a pipe, sockets are closed by the garbage collector if nobody calls `close`.
@@ -99,7 +107,7 @@ class DeskLink:
         """
         link = self.link
         now = time.monotonic()
-        if link is not None and (link.ended or now - self._polled_at > 2 * KEEPALIVE):
+        if link is not None and (link.ended or now - self._polled_at > 2 * KEEPALIVE_S):
             self._disconnect(link)
             link = None
         due = self._maintain(link, now)
@@ -156,13 +164,13 @@ class DeskLink:
     def flush(self, timeout: float) -> None:
         """Wait until the broker has acknowledged everything that was sent."""
         end = time.monotonic() + timeout
-        while self.link is not None and self.link.outstanding and (left := end - time.monotonic()) > 0:
+        while self.link is not None and self.link.outstanding_bytes and (left := end - time.monotonic()) > 0:
             self.poll(left)
 
     def close(self) -> None:
         """Disconnect for good."""
         if self._opening is not None:
-            self._opening.give_up()
+            self._opening.cancel()
         if self.link is not None:
             self.link.close()
         self._close_wake_sockets()
@@ -180,7 +188,7 @@ class DeskLink:
             code: the reason code of the broker's acknowledgement.
             action: what the user is not allowed to do, for people.
         """
-        if code == NOT_AUTHORIZED:
+        if code == REASON_NOT_AUTHORIZED:
             return self._access_error(action)
         return ServerUnavailable(f"nothing was sent: the broker at {self.broker.url} refuses it, reason 0x{code:02x}")
 
@@ -198,18 +206,20 @@ class DeskLink:
         """Connect, or keep the connection alive. Return the seconds until the next call is due."""
         if link is not None:
             link.tick()
-            return TICK if self.marker_at is None or self.has_retained else self.marker_at + RETAINED_GRACE_S - now
+            return (
+                TICK_EVERY_S if self.marker_at is None or self.has_retained else self.marker_at + RETAINED_GRACE_S - now
+            )
         if self._opening is not None and self._opening.done:
             self._end_attempt(self._opening)
             return 0.0
         if self._opening is None and now >= self._next_attempt_at:
             # A thousand robots may answer at once.
             name = f"talk-desk-{self.user}-{self.session}"
-            new = Link(self.broker, name, self._inbox.append, at_once=MANY_AT_ONCE)
-            self._opening = Opening(new, self.wake)
-        return TICK if self._opening else max(0.0, self._next_attempt_at - now)
+            new = Link(self.broker, name, self._inbox.append, receive_maximum=MAX_RECEIVE_COUNT)
+            self._opening = LinkOpener(new, self.wake)
+        return TICK_EVERY_S if self._opening else max(0.0, self._next_attempt_at - now)
 
-    def _end_attempt(self, opening: Opening) -> None:
+    def _end_attempt(self, opening: LinkOpener) -> None:
         """Start to use the new connection. If the attempt failed, schedule the next one."""
         self._opening = None
         if opening.error is not None:
@@ -228,7 +238,7 @@ class DeskLink:
         link.publish(self.reply_topic(topics.MARKER), b"\n", acknowledged=self._on_marker_acknowledged)
 
     def _on_marker_acknowledged(self, code: int) -> None:
-        if code >= REFUSED:
+        if code >= REASON_FAILURE:
             self.failure = self.publish_error(code, f"write to {topics.reply(self.user, '+', '+')}")
 
     def _disconnect(self, link: Link) -> None:

@@ -15,7 +15,7 @@ from talkcli.protocol.events import Canceled, ServerStatus, goal_in
 from talkcli.protocol.requests import Pause, Resume, Status
 
 if TYPE_CHECKING:
-    from talkcli.fleet.presence import Presence
+    from talkcli.fleet.payloads import Presence
     from talkcli.goals.goal import JsonObject
     from talkcli.protocol.requests import Request
 
@@ -49,7 +49,7 @@ class Selection:
         """The reason why no robot can match, for people; None if one can."""
         for kind, name in (("group", self.group), ("robot", self.name)):
             if name is not None:
-                fault = topics.fault(name)
+                fault = topics.name_fault(name)
                 return fault and f"no {kind} can be called '{name}': a name {fault}"
         # An unclosed bracket would match a bracket, which no name has.
         if not _GLOB.fullmatch(self.text) or "[" in re.sub(r"\[!?[^]]+\]", "", self.text):
@@ -59,7 +59,7 @@ class Selection:
     def includes(self, presence: Presence) -> bool:
         """Return whether a robot is selected, online or not."""
         if self.group is not None:
-            return self.group == topics.EVERYBODY or self.group in presence.groups
+            return self.group == topics.ALL_ROBOTS or self.group in presence.groups
         if self._glob is not None:
             return self._glob.match(presence.name) is not None
         return self.text == presence.name

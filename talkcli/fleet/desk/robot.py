@@ -26,7 +26,7 @@ from talkcli.errors import (
 )
 from talkcli.fleet import topics
 from talkcli.fleet.desk.desk import ABSENCE_LIMIT_S, DeskLink
-from talkcli.fleet.link import REFUSED, boottime
+from talkcli.fleet.link import REASON_FAILURE, boottime
 from talkcli.frozen import replace
 from talkcli.goals.option import MAX_NAME
 from talkcli.goals.options import Cancel, Say, Set
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from talkcli.client.connection import OnReply
     from talkcli.fleet.broker import Broker
     from talkcli.fleet.link import Link
-    from talkcli.fleet.message import Message
+    from talkcli.fleet.payloads import Message
     from talkcli.goals.goal import JsonObject
     from talkcli.protocol.requests import Request
 
@@ -97,7 +97,7 @@ class RobotConnection(BaseConnection):
             UsageError: One of the names is not allowed.
         """
         super().__init__(patience)
-        fault = topics.fault(robot)
+        fault = topics.name_fault(robot)
         if fault:
             raise UsageError(f"no robot can be called '{printable(robot)}': a name {fault}")
         self._sender = sender(name)
@@ -168,11 +168,11 @@ class RobotConnection(BaseConnection):
             return False
 
         def on_acknowledged(code: int) -> None:
-            if exchange is not None and code >= REFUSED:
+            if exchange is not None and code >= REASON_FAILURE:
                 exchange.error = self._desk.publish_error(code, f"ask {self._robot} for anything")
 
         line = request_line({"seq": number, **write_request(request)})
-        if (refused := link.too_long(line, request.kind)) is not None:
+        if (refused := link.size_error(line, request.kind)) is not None:
             if exchange is not None:
                 exchange.error = refused
             return False

@@ -21,8 +21,8 @@ from talkcli.fleet import topics
 from talkcli.fleet.desk.desk import DeskLink
 from talkcli.fleet.desk.request import Outcome, cancel_outcomes, failure_outcome, reply_outcomes
 from talkcli.fleet.desk.robot import REQUEST_EXPIRY_S, RobotConnection, new_goal_id
-from talkcli.fleet.link import REFUSED, boottime
-from talkcli.fleet.presence import Presence
+from talkcli.fleet.link import REASON_FAILURE, boottime
+from talkcli.fleet.payloads import Presence
 from talkcli.frozen import replace
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import Cancel, Say, Set, bad_key
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from talkcli.fleet.broker import Broker
     from talkcli.fleet.desk.request import Selection
     from talkcli.fleet.link import Link
-    from talkcli.fleet.message import Message
+    from talkcli.fleet.payloads import Message
     from talkcli.goals.goal import JsonObject
     from talkcli.protocol.requests import Request
 
@@ -223,11 +223,11 @@ class FleetRequest:
             raise ServerUnavailable(f"the broker at {desk.broker.url} went away: nothing was sent")
 
         def on_acknowledged(code: int) -> None:
-            if code >= REFUSED:
+            if code >= REASON_FAILURE:
                 self._refused = desk.publish_error(code, f"ask the group {group} for anything")
 
         line = request_line({"seq": number, **write_request(request)})
-        if (refused := desk.link.too_long(line, request.kind)) is not None:
+        if (refused := desk.link.size_error(line, request.kind)) is not None:
             raise refused
         expiry = (request.ttl or None) if isinstance(request, Say) else REQUEST_EXPIRY_S
         topic, response = topics.group(group, topics.REQUEST, desk.user), topics.reply(desk.user, desk.session)
@@ -278,7 +278,7 @@ class FleetRequest:
     def on_message(self, message: Message) -> None:
         """Process a robot's presence, or lines from its server."""
         _, kind, *_, name, last = message.topic.split("/")
-        if kind != topics.ROBOT:
+        if kind != topics.ROBOT_LEVEL:
             self._on_reply(last, message)
             return
         presence = Presence.read(name, message.payload)
@@ -318,7 +318,7 @@ class FleetRequest:
 
     def _on_reply(self, name: str, message: Message) -> None:
         """Process a robot's lines. A robot that answers a group's request is a member, even if it seemed absent."""
-        if topics.fault(name) or not self._began:
+        if topics.name_fault(name) or not self._began:
             return
         robot = self._robots.get(name)
         if self._selection.group is not None and not (robot and robot.was_asked):

@@ -14,8 +14,7 @@ from talkcli.client.connect import ANSWER_LIMIT
 from talkcli.errors import BadRequest, Lost
 from talkcli.fleet import topics
 from talkcli.fleet.desk.desk import ABSENCE_LIMIT_S, DeskLink
-from talkcli.fleet.presence import Presence
-from talkcli.fleet.status import Standing, Status
+from talkcli.fleet.payloads import Presence, RobotInfo, RobotStatus
 from talkcli.frozen import frozen
 from talkcli.goals.states import State
 from talkcli.protocol.events import PausedChanged, StateChanged, from_json
@@ -27,7 +26,7 @@ if TYPE_CHECKING:
     from talkcli.fleet.broker import Broker
     from talkcli.fleet.desk.request import Selection
     from talkcli.fleet.link import Link
-    from talkcli.fleet.message import Message
+    from talkcli.fleet.payloads import Message
     from talkcli.goals.goal import JsonObject
 
 #: Bridges are back within this time after their broker. A robot without retained presence counts as gone then.
@@ -38,7 +37,7 @@ BRIDGES_BACK_LIMIT_S = 15.0
 class FleetSnapshot:
     """The state of all robots when the watch starts, sorted by name."""
 
-    robots: tuple[Standing, ...]
+    robots: tuple[RobotInfo, ...]
 
 
 @frozen
@@ -63,7 +62,7 @@ class RobotEvent:
 class EventsMissed:
     """The state of a robot whose events were missed for a while, and those events that its state reveals."""
 
-    standing: Standing
+    standing: RobotInfo
     events: tuple[StateChanged, ...]
 
 
@@ -100,7 +99,7 @@ def read_presences(broker: Broker, timeout: float) -> dict[str, Presence]:
     return {name: each for name, found in retained.items() if (each := Presence.read(name, found[topics.PRESENCE]))}
 
 
-def read_standings(broker: Broker, timeout: float, name: str | None = None) -> dict[str, Standing]:
+def read_standings(broker: Broker, timeout: float, name: str | None = None) -> dict[str, RobotInfo]:
     """Return the state of each robot that the broker knows, or only of the robot `name`, by name.
 
     The errors are those of `read_presences`.
@@ -109,7 +108,7 @@ def read_standings(broker: Broker, timeout: float, name: str | None = None) -> d
     for each, found in _read_retained(broker, timeout, name, topics.PRESENCE, topics.STATUS).items():
         presence = Presence.read(each, found.get(topics.PRESENCE, b""))
         if presence:
-            standings[each] = Standing(presence, Status.read(found.get(topics.STATUS, b"")))
+            standings[each] = RobotInfo(presence, RobotStatus.read(found.get(topics.STATUS, b"")))
     return standings
 
 
@@ -212,9 +211,9 @@ class FleetWatch:
             self._on_presence(name, message.payload)
         elif kind == topics.STATUS:
             if self._retained:
-                self._retained.statuses[name] = Status.read(message.payload)
+                self._retained.statuses[name] = RobotStatus.read(message.payload)
             elif name in self._unheard:  # otherwise its events say more
-                self._report_missed(name, Status.read(message.payload))
+                self._report_missed(name, RobotStatus.read(message.payload))
         elif (event := _read_event(name, message.payload)) is not None:
             if self._retained:
                 self._retained.events.append(event)
@@ -273,7 +272,7 @@ class FleetWatch:
         else:
             self._began = True
             self._presences = present
-            robots = (Standing(each, retained.statuses.get(name)) for name, each in present.items())
+            robots = (RobotInfo(each, retained.statuses.get(name)) for name, each in present.items())
             self._events.append(FleetSnapshot(tuple(robots)))
         self._away_since = None
         self._unheard = set(self._presences)
@@ -293,7 +292,7 @@ class FleetWatch:
         if _identity(before) != _identity(now):
             self._events.append(RobotChanged(name, before, now))
 
-    def _report_missed(self, name: str, status: Status | None, coming: Container[str | None] = ()) -> None:
+    def _report_missed(self, name: str, status: RobotStatus | None, coming: Container[str | None] = ()) -> None:
         """Report the events that a robot's status reveals, if they were missed.
 
         Args:
@@ -310,7 +309,7 @@ class FleetWatch:
         if events:  # a bridge that has just started may not know any goals yet
             self._unheard.discard(name)
         if is_known and missed and presence and presence.online:
-            self._events.append(EventsMissed(Standing(presence, status), tuple(missed)))
+            self._events.append(EventsMissed(RobotInfo(presence, status), tuple(missed)))
 
     def _report(self, robot_event: RobotEvent) -> None:
         """Report a robot's event, unless the robot isn't selected."""
@@ -327,13 +326,13 @@ class _Retained:
 
     def __init__(self) -> None:
         self.presences: dict[str, Presence | None] = {}
-        self.statuses: dict[str, Status | None] = {}
+        self.statuses: dict[str, RobotStatus | None] = {}
         self.events: list[RobotEvent] = []
 
 
 def _read_event(name: str, payload: bytes) -> RobotEvent | None:
     """Return the event in a payload; None if it is malformed or of an unknown kind."""
-    if topics.fault(name):
+    if topics.name_fault(name):
         return None
     try:
         message = decode(payload.strip())
