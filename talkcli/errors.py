@@ -1,8 +1,11 @@
-"""The errors of `talk`: one tree, each class with its code on the wire and the exit code of the command.
+"""The exceptions of `talk`. Each class has an error code for programs and an exit code for the command.
 
-Rules for this file: no imports of other modules of `talk`; a class is added where a program has to tell a case from
-another, with a code that is never used again for anything else. Texts are lower-case and name the thing and the next
-step. The exit codes are the table of the README. `limits` ends the sentence of one that comes of too little memory.
+Rules for this file:
+
+- It imports no other module of `talk`.
+- Add a class only if a program has to distinguish the case. Never reuse an error code for something else.
+- Messages are in lower case. They name the thing, the problem and the next step.
+- The README has the same table of exit codes.
 """
 
 from __future__ import annotations
@@ -11,14 +14,14 @@ EXIT_OK = 0
 EXIT_ERROR = 1
 EXIT_USAGE = 2
 EXIT_DIFFER = 13
-EXIT_TIMEOUT = 124  # as timeout(1)
-EXIT_SIGNAL = 128  # plus the signal's number, as a shell reports it
+EXIT_TIMEOUT = 124  # the same as timeout(1)
+EXIT_SIGNAL = 128  # plus the number of the signal, like in a shell
 EXIT_SIGINT = EXIT_SIGNAL + 2
 EXIT_SIGPIPE = EXIT_SIGNAL + 13  # standard output was closed
 
 
 class TalkError(Exception):
-    """Anything that `talk` itself can say is wrong. `code` is for programs, the text for people."""
+    """Base class of all errors that `talk` reports. `code` is for programs, and `message` is for people."""
 
     code = "error"
     exit_code = EXIT_ERROR
@@ -29,60 +32,65 @@ class TalkError(Exception):
 
 
 class UsageError(TalkError):
-    """What was asked for has no meaning: an option's value, a combination."""
+    """The command or call makes no sense: an invalid value, or options that exclude each other."""
 
     code = "usage"
     exit_code = EXIT_USAGE
 
 
 class ServerUnavailable(TalkError):
-    """No server took the request: nothing was sent that it could act on later, so trying again is safe."""
+    """No server accepted the request. Nothing was sent, so it is safe to try again."""
 
     code = "no_server"
     exit_code = 3
 
 
 class AccessDenied(TalkError):
-    """There is a server, or something in its place, and this user may not use it or must not trust it."""
+    """The user may not use this server, or must not trust the process that listens on its socket."""
 
     code = "permission_denied"
     exit_code = 10
 
 
 class Lost(TalkError):
-    """The connection ended after a goal was sent: what became of it is not known, it may still be spoken."""
+    """The connection ended after a goal was sent. The goal may still be spoken."""
 
     code = "lost"
     exit_code = 12
 
 
 class TimedOut(TalkError):
-    """What was asked for had not ended when the time for it was over."""
+    """The goal or request did not finish in time."""
 
     code = "timeout"
     exit_code = EXIT_TIMEOUT
 
 
 class AddressInUse(TalkError):
-    """`serve` cannot serve here: the socket is served already, or its directory is not safe."""
+    """`talk serve` can't use the socket: another server uses it, or its directory is not safe."""
 
     code = "address_in_use"
     exit_code = 11
 
 
 class ProtocolMismatch(TalkError):
-    """Client and server speak different versions of the protocol."""
+    """The client and the server use different versions of the protocol."""
 
     code = "protocol_mismatch"
     exit_code = 9
 
 
 class Unreadable(ProtocolMismatch, ValueError):
-    """What a server sent is no message of the protocol, or has no goal where it should have one."""
+    """The server sent a malformed message."""
 
 
 class RequestRefused(TalkError):
-    """The server answered a request with an error; `code` is the server's, `items` what it listed before."""
+    """The server answered a request with an error.
+
+    Attributes:
+        code: the error code that the server sent.
+        items: the list items that the server sent before the error.
+    """
 
     code = "refused"
 
@@ -93,55 +101,55 @@ class RequestRefused(TalkError):
 
 
 class UnknownGoal(RequestRefused):
-    """No goal of that id is known: it was never sent, or was sent to an earlier server, or is too long ago."""
+    """The server knows no goal with this id: it never existed, belongs to an earlier server, or is too old."""
 
     code = "unknown_goal"
     exit_code = 8
 
 
 class Busy(RequestRefused):
-    """The server has as many clients as it takes."""
+    """The server has reached its limit of clients."""
 
     code = "busy"
     exit_code = 5
 
 
 class BadOption(RequestRefused):
-    """A setting that the server doesn't take: a value out of its range, or a voice that it doesn't have."""
+    """The server refused a setting: its value is out of range, or the voice doesn't exist."""
 
     code = "bad_option"
     exit_code = EXIT_USAGE
 
 
 class BadRequest(RequestRefused):
-    """A line on the wire that is no request. `code` says in which way."""
+    """A client sent an invalid request. `code` gives the problem."""
 
     code = "bad_request"
 
 
 class LineTooLong(BadRequest):
-    """A line past its limit."""
+    """A line is longer than the protocol allows."""
 
     code = "line_too_long"
 
 
-#: Classes that a client raises for an error code of the server's; any other code is a RequestRefused.
-BY_CODE: dict[str, type[RequestRefused]] = {
+#: The exception that a client raises for each of the server's error codes. The default is RequestRefused.
+_ERRORS_BY_CODE: dict[str, type[RequestRefused]] = {
     **{each.code: each for each in (UnknownGoal, Busy, BadOption)},
     "unknown_voice": BadOption,
 }
 
 
 def refusal(code: str, message: str, items: list[dict[str, object]] | None = None) -> RequestRefused:
-    """Return the error that a server's error reply stands for; `items`: what it listed before."""
-    return BY_CODE.get(code, RequestRefused)(message, code, items)
+    """Return the exception for a server's error reply. The arguments become its attributes."""
+    return _ERRORS_BY_CODE.get(code, RequestRefused)(message, code, items)
 
 
-def limits() -> str:
-    """Return what this process is limited to in memory, or where else to look: the end of an error's sentence."""
-    import resource  # no start pays for it
+def memory_limits() -> str:
+    """Return the end of a message about too little memory: the limit of this process, or where to find it."""
+    import resource  # here, so that it doesn't slow down the start of every command
 
-    # What each limit is of, and where it is set: in a shell, in a systemd unit.
+    # Each limit with its unit, and with the shell command and the systemd option that set it.
     for number, what, where in (
         (resource.RLIMIT_DATA, "bytes of memory", "ulimit -d, LimitDATA="),
         (resource.RLIMIT_AS, "bytes of address space", "ulimit -v, LimitAS="),

@@ -1,6 +1,6 @@
 """The command that installs a package into the environment that runs this process.
 
-Messages name this command if a package is missing. Nothing else needs this module.
+Error messages show this command if a package is missing.
 """
 
 from __future__ import annotations
@@ -13,24 +13,24 @@ from talkcli.frozen import TYPE_CHECKING, frozen
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-#: Neither onnxruntime nor espeakng-loader has a 32-bit build. The process decides, because a 64-bit kernel can run a
-#: 32-bit system. On such a system `platform.machine()` names the kernel's architecture.
+#: Whether this process is a 64-bit one. Neither onnxruntime nor espeakng-loader has a 32-bit build. A 32-bit system can
+#: run on a 64-bit kernel, and there `platform.machine()` gives the kernel's architecture.
 IS_64_BIT = sys.maxsize > 2**32
 
 #: The packages that neural voices need.
-NEURAL = ("onnxruntime", "numpy")
+NEURAL_PACKAGES = ("onnxruntime", "numpy")
 
 
 @frozen
 class Environment:
-    """A Python environment, as far as it decides how packages get into it."""
+    """Facts about a Python environment that decide how to install packages into it."""
 
-    python: str  # path of the interpreter
+    python: str  # path to the interpreter
     pipx: str | None = None  # directory of the environment if pipx made it
     user_home: str = ""
     has_pip: bool = True
     made_by_uv: bool = False
-    externally_managed: bool = False  # pip installs nothing into the system's Python without an option
+    externally_managed: bool = False  # pip needs --break-system-packages
     needs_sudo: bool = False
 
 
@@ -38,27 +38,27 @@ def command(*packages: str, again: bool = False) -> str:
     """Return the command that installs packages into the environment of this process.
 
     Args:
-        packages: their names.
-        again: whether to install them even if they are installed.
+        packages: names of the packages.
+        again: reinstall packages that are installed already.
     """
     return command_for(_environment(), packages, again=again)
 
 
 def neural(*more: str, again: bool = False) -> str:
-    """Return the step that makes neural voices work, with more packages if any are named."""
+    """Return the next step that makes neural voices work. The arguments are more packages to install."""
     if not IS_64_BIT:
         return "neural voices need a 64-bit system: choose one of espeak's voices, such as en"
-    return command(*NEURAL, *more, again=again)
+    return command(*NEURAL_PACKAGES, *more, again=again)
 
 
 def espeak_library() -> str:
-    """Return the step that installs libespeak-ng."""
+    """Return the next step that installs libespeak-ng."""
     package = "sudo apt-get install -y libespeak-ng1"
     return f"{package}, or {command('espeakng-loader')}" if IS_64_BIT else package
 
 
 def command_for(environment: Environment, packages: Sequence[str], *, again: bool = False) -> str:
-    """Return the shell command that installs packages into this environment."""
+    """Return the command that installs packages into the given environment, quoted for a shell."""
     from shlex import join, quote
 
     sudo = "sudo " if environment.needs_sudo else ""
@@ -85,7 +85,8 @@ def _environment() -> Environment:
     from importlib.util import find_spec
 
     is_virtual = sys.prefix != sys.base_prefix
-    # A package in a user's own site-packages is beside the system's Python, and so is the checkout that one works on.
+    # Outside a virtual environment, the owner of this file may install packages: it is in a user's own site-packages or
+    # in a checkout.
     owner = os.stat(sys.prefix if is_virtual else os.path.dirname(__file__)).st_uid
     return Environment(
         python=sys.executable or "python3",

@@ -1,8 +1,8 @@
-"""Where the socket is, and the voices, and what is kept of them: the one place for it.
+"""Paths of the socket, the neural voices and the cache.
 
-A client looks in the places of a list that is made without platformdirs, which would double its start; a server takes
-the place that platformdirs gives, after its checks of owner and mode. A test compares the two. cron, sudo, systemd and
-ssh commands run without XDG_RUNTIME_DIR, so both know what to do without it.
+A server takes the socket path that platformdirs gives, which also checks the owner and mode of the directory. Importing
+platformdirs would double the time that a client takes to start, so a client tries a fixed list of paths. A test
+compares the two. Both work without XDG_RUNTIME_DIR, which cron, sudo, systemd and ssh commands don't set.
 """
 
 from __future__ import annotations
@@ -16,65 +16,65 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-#: The name of the socket in its directory.
-SOCKET = "talk.sock"
-#: That of a server for the whole machine, in the directory that systemd makes for `RuntimeDirectory=talk`.
-SYSTEM_SOCKET = f"/run/talk/{SOCKET}"
+#: File name of the socket.
+SOCKET_NAME = "talk.sock"
+#: Socket of a server for the whole machine. systemd makes the directory because of `RuntimeDirectory=talk`.
+SYSTEM_SOCKET = f"/run/talk/{SOCKET_NAME}"
 
-#: What there may be at a place where a client reaches nobody.
-ABSENT = "not there"
-FILE = "a file, and no socket"
-DIRECTORY = "a directory, and no socket"
-STALE = "nobody answers: left over from a server that ended"
-FORBIDDEN = "no permission"
+#: What is at a path if no client can connect to it, for people.
+PLACE_ABSENT = "not there"
+PLACE_FILE = "a file, and no socket"
+PLACE_DIRECTORY = "a directory, and no socket"
+PLACE_STALE = "nobody answers: left over from a server that ended"
+PLACE_FORBIDDEN = "no permission"
 
 
 def named_socket(option: str | None) -> str | None:
-    """Return the socket that the user named, by option or by variable."""
+    """Return the socket given by the option or by TALK_SOCKET, or None."""
     return option or os.environ.get("TALK_SOCKET") or None
 
 
 def named_robot(option: str | None, socket: str | None) -> str | None:
-    """Return the robot of a fleet that the user named, by option or by variable; `socket`: the option for that.
+    """Return the robot given by the option or by TALK_ROBOT, or None.
 
-    What is typed goes before a variable, and of the variables the one for a robot goes first.
+    Both options take precedence over the variables, and TALK_ROBOT over TALK_SOCKET.
     """
     return option or (None if socket else os.environ.get("TALK_ROBOT") or None)
 
 
 def client_sockets(named: str | None) -> list[str]:
-    """Return the places where a client looks for a server, in this order: the one that was named and no other."""
+    """Return the sockets that a client tries, in order: only the named one, or else the usual ones."""
     if named:
         return [named]
     directories = [os.environ.get("XDG_RUNTIME_DIR"), *_runtime_directories(os.getuid())]
-    places = [f"{each.rstrip('/')}/talk/{SOCKET}" for each in directories if each and os.path.isabs(each)]
+    places = [f"{each.rstrip('/')}/talk/{SOCKET_NAME}" for each in directories if each and os.path.isabs(each)]
     return list(dict.fromkeys([*places, SYSTEM_SOCKET]))
 
 
-def found_at(path: str, error: OSError) -> str:
-    """Return what is at a place where a connection failed: one of the words above, else the system's words."""
+def describe_place(path: str, error: OSError) -> str:
+    """Return why a connection to this path failed: one of the PLACE texts, or else the system's error message."""
     try:
         mode = os.stat(path).st_mode
-    except OSError:  # `error` tells why; or it was removed just now
+    except OSError:  # `error` has the reason, unless the file was removed a moment ago
         mode = stat.S_IFSOCK
     if stat.S_ISDIR(mode):
-        return DIRECTORY
+        return PLACE_DIRECTORY
     if not stat.S_ISSOCK(mode):
-        return FILE
+        return PLACE_FILE
     if error.errno in {errno.ENOENT, errno.ENOTDIR}:
-        return ABSENT
+        return PLACE_ABSENT
     if error.errno == errno.ECONNREFUSED:
-        return STALE
+        return PLACE_STALE
     if error.errno in {errno.EACCES, errno.EPERM}:
-        return FORBIDDEN
+        return PLACE_FORBIDDEN
     return error.strerror or str(error)
 
 
 def _runtime_directories(uid: int) -> list[str]:
     if sys.platform == "darwin":
         return [os.path.expanduser("~/Library/Caches/TemporaryItems")]
-    # Without a directory of systemd's, platformdirs falls back to one under the temporary directory, which is the first
-    # of these that can be written; the client can't know which one that was for the server, so it tries them all.
+    # Without systemd's directory, platformdirs uses the first writable one of these temporary directories. A client
+    # can't know which one that was for the server, so it tries all of them.
     temporary = [os.environ.get(name) for name in ("TMPDIR", "TEMP", "TMP")]
     fallbacks = [
         os.path.join(os.path.abspath(each), f"runtime-{uid}") for each in [*temporary, "/tmp", "/var/tmp"] if each
@@ -83,15 +83,19 @@ def _runtime_directories(uid: int) -> list[str]:
 
 
 def sudo_hint() -> str | None:
-    """Return the socket that the user who called sudo would have, if root was reached that way."""
+    """Return the usual socket of the user who called sudo, or None if this process doesn't run under sudo."""
     caller = os.environ.get("SUDO_UID", "")
     if os.getuid() != 0 or not caller.isdecimal():
         return None
-    return f"/run/user/{caller}/talk/{SOCKET}"
+    return f"/run/user/{caller}/talk/{SOCKET_NAME}"
 
 
 def server_socket(named: str | None) -> str:
-    """Return where a server listens, with its directory made; AddressInUse where that directory is not safe."""
+    """Return the socket for a server, and create its directory.
+
+    Raises:
+        AddressInUse: the directory is missing or not safe.
+    """
     from talkcli.errors import AddressInUse
 
     if named:
@@ -102,43 +106,46 @@ def server_socket(named: str | None) -> str:
             raise AddressInUse(words) from error
     given = os.environ.get("RUNTIME_DIRECTORY")
     if given:
-        return os.path.join(given.split(":")[0], SOCKET)
+        return os.path.join(given.split(":")[0], SOCKET_NAME)
     import warnings
 
     import platformdirs
 
     with warnings.catch_warnings():
-        # It warns where XDG_RUNTIME_DIR isn't set; clients know the place that it takes then.
+        # It warns if XDG_RUNTIME_DIR isn't set, but clients know the directory that it uses in that case.
         warnings.simplefilter("ignore", platformdirs.RuntimeDirWarning)
         try:
-            return str(platformdirs.PlatformDirs("talk", appauthor=False).place_runtime_file(SOCKET))
+            return str(platformdirs.PlatformDirs("talk", appauthor=False).place_runtime_file(SOCKET_NAME))
         except OSError as error:
             raise AddressInUse(f"no directory for the socket: {error}; name a socket with --socket PATH") from error
 
 
 def voice_directories(environment: Mapping[str, str] | None = None) -> list[str]:
-    """Return where neural voices are looked for, besides installed packages: in this order, whether there or not.
+    """Return the directories that may contain neural voices, in the order of the search. Some may not exist.
 
-    What TALK_VOICES names, a list like PATH, then the user's own data and the system's. They are platformdirs' places
-    on Linux (a test compares), written down here, as the engine process looks in each of its starts. `environment`:
-    the variables, if not this process's.
+    The directories in TALK_VOICES, a list like PATH, come first. Then come the data directories of the user and of the
+    system, as platformdirs gives them on Linux. A test compares the two. Importing platformdirs would slow down every
+    start of an engine process.
+
+    Args:
+        environment: variables to use instead of those of this process.
     """
     environment = os.environ if environment is None else environment
     named = environment.get("TALK_VOICES", "").split(os.pathsep)
     system = environment.get("XDG_DATA_DIRS") or "/usr/local/share:/usr/share"
-    data = [_own(environment.get("XDG_DATA_HOME"), "~/.local/share"), *system.split(os.pathsep)]
+    data = [_user_directory(environment.get("XDG_DATA_HOME"), "~/.local/share"), *system.split(os.pathsep)]
     places = [*named, *(os.path.join(each, "talk", "voices") for each in data if os.path.isabs(each))]
     return list(dict.fromkeys(os.path.abspath(each) for each in places if each))
 
 
 def cache_directory() -> str:
-    """Return where what can be made again is kept; it need not be there. Platformdirs' place, but for systemd's."""
+    """Return the cache directory, which may not exist yet. It is platformdirs' one, or systemd's for a service."""
     given = os.environ.get("CACHE_DIRECTORY")
     if given:
-        return os.path.realpath(given.split(":")[0])  # a link, for a service with a user of its own (DynamicUser=)
-    return os.path.join(_own(os.environ.get("XDG_CACHE_HOME"), "~/.cache"), "talk")
+        return os.path.realpath(given.split(":")[0])  # with DynamicUser= it is a link
+    return os.path.join(_user_directory(os.environ.get("XDG_CACHE_HOME"), "~/.cache"), "talk")
 
 
-def _own(named: str | None, default: str) -> str:
-    """Return a directory of the user's, by a variable's value; not one that depends on where this runs."""
+def _user_directory(named: str | None, default: str) -> str:
+    """Return the directory that a variable names, or the default if it isn't an absolute path."""
     return named if named and os.path.isabs(named) else os.path.expanduser(default)

@@ -1,7 +1,7 @@
-"""Who is at the other end of a Unix socket, as the kernel tells it. Light: clients import it at every start.
+"""The process at the other end of a Unix socket, and other processes in /proc.
 
-`_socket` is what `socket` is made of, without the enums that the latter makes of all its constants whenever it is
-imported: a tenth of the life of a command that sends one request. It has all that is needed here.
+Every client imports this module when it starts. It uses `_socket` instead of `socket`, because `socket` makes enums of
+all its constants. That takes a tenth of the time of a command that sends one request.
 """
 
 from __future__ import annotations
@@ -9,13 +9,13 @@ from __future__ import annotations
 import _socket
 import sys
 
-#: Characters of a command line that are kept: enough for an interpreter, a script and its first arguments.
-MAX_COMMAND = 200
+#: Length limit for a command line. It leaves room for an interpreter, a script and its first arguments.
+_MAX_COMMAND_LINE_CHARS = 200
 
-#: Programs that start another one and wait for it. The script that called them is above them.
-_STARTERS = frozenset({b"timeout", b"time", b"flock", b"xargs", b"sudo"})
-#: Processes that are looked at above a client, at most.
-_MAX_PARENTS = 8
+#: Programs that run another program and wait for it. Their parent is the interesting process.
+_WRAPPER_PROGRAMS = frozenset({b"timeout", b"time", b"flock", b"xargs", b"sudo"})
+#: How many wrapper programs to skip at most.
+_MAX_WRAPPERS_COUNT = 8
 
 _LOCAL_PEERCRED = 0x001  # <sys/un.h> on macOS
 _LOCAL_PEERPID = 0x002
@@ -23,7 +23,7 @@ _SOL_LOCAL = 0
 
 
 def credentials(peer: _socket.socket) -> tuple[int, int]:
-    """Return process id and user id of whoever connected, or of whoever listened, at that moment."""
+    """Return the process id and user id of the other end, from the moment when it connected or began to listen."""
     if hasattr(_socket, "SO_PEERCRED"):
         found = peer.getsockopt(_socket.SOL_SOCKET, _socket.SO_PEERCRED, 12)  # struct ucred: pid, uid, gid
         return _integer(found[:4]), _integer(found[4:8])
@@ -36,44 +36,50 @@ def _integer(data: bytes) -> int:
     return int.from_bytes(data, sys.byteorder)
 
 
-def command_of(pid: int) -> str | None:
-    """Return the name of the program that runs as this process, or None if it can't be known."""
-    line = contents(f"/proc/{pid}/comm")
+def command_name(pid: int) -> str | None:
+    """Return the name of the program that a process runs, or None if it is unknown."""
+    line = read_proc_file(f"/proc/{pid}/comm")
     return line.decode(errors="replace").rstrip("\n") if line else None
 
 
-def parent_command_of(pid: int) -> str | None:
-    """Return the command line of the process that started this one, or None if it can't be known.
+def parent_command_line(pid: int) -> str | None:
+    """Return the command line of a process's parent, or None if it is unknown.
 
-    `timeout 5 talk say …` and its like are passed over: the script that called them is the sender.
+    Wrapper programs are skipped: of `timeout 5 talk say …`, the result is the script that called `timeout`.
     """
     line = None
-    for _ in range(_MAX_PARENTS):
-        parent = stat_of(pid)[1:2]
+    for _ in range(_MAX_WRAPPERS_COUNT):
+        parent = process_stat(pid)[1:2]
         pid = int(parent[0]) if parent else 0
-        above = contents(f"/proc/{pid}/cmdline")
+        above = read_proc_file(f"/proc/{pid}/cmdline")
         if not above or (line and pid == 1):
             break
         line = above
         program, *arguments = (each.rpartition(b"/")[2] for each in line.split(b"\0"))
-        if program not in _STARTERS or b"talk" not in arguments:
+        if program not in _WRAPPER_PROGRAMS or b"talk" not in arguments:
             break
-    return line.rstrip(b"\0").replace(b"\0", b" ").decode(errors="replace")[:MAX_COMMAND] if line else None
+    return line.rstrip(b"\0").replace(b"\0", b" ").decode(errors="replace")[:_MAX_COMMAND_LINE_CHARS] if line else None
 
 
-def stat_of(pid: int) -> list[bytes]:
-    """Return what /proc says of a process: state, parent, group, session, and more; empty if it can't be known."""
-    stat = contents(f"/proc/{pid}/stat") or b""
-    # Before these is the program's name, in brackets; it may itself hold blanks and brackets.
+def process_stat(pid: int) -> list[bytes]:
+    """Return the fields of /proc/PID/stat from the state on: state, parent, group, session and so on.
+
+    The list is empty if the process is unknown.
+    """
+    stat = read_proc_file(f"/proc/{pid}/stat") or b""
+    # The program's name comes before the state, in brackets. The name can contain blanks and brackets, too.
     return stat.rpartition(b")")[2].split()
 
 
-def contents(path: str, most: int = 4096) -> bytes | None:
-    """Return the start of a file under /proc, at most so many bytes, all of it for -1; None where it isn't there, or
-    is another user's.
+def read_proc_file(path: str, max_bytes: int = 4096) -> bytes | None:
+    """Return the start of a file in /proc, or None if it can't be read.
+
+    Args:
+        path: path to the file.
+        max_bytes: how much to read, or -1 for everything.
     """
     try:
         with open(path, "rb", buffering=0) as file:
-            return file.read(most)
-    except OSError:  # which may come of reading, too: the process is gone by now
+            return file.read(max_bytes)
+    except OSError:  # reading can fail, too, if the process has just ended
         return None

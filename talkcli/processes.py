@@ -35,7 +35,7 @@ def close(*descriptors: int) -> None:
 
 
 def is_held(pipe: int, seconds: float = 0.0) -> bool:
-    """Whether any process still holds the other end of the pipe after this many seconds."""
+    """Return whether any process still holds the other end of the pipe after this many seconds."""
     poll = select.poll()
     poll.register(pipe, 0)  # poll always reports a closed other end
     return not poll.poll(seconds * 1000)

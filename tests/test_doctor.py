@@ -18,7 +18,8 @@ import pytest
 
 from talkcli import Client
 from talkcli.doctor import examine, sentence, sound
-from talkcli.doctor.report import heard
+from talkcli.doctor.report import is_answered_yes
+from talkcli.doctor.voice import SENTENCE_TEXT
 from talkcli.goals.states import State
 from tests.conformance.bareserve import TALK, environment
 from tests.conformance.rawsocket import FakeServer
@@ -104,7 +105,7 @@ def test_if_all_is_well_its_sentence_is_heard_as_its_own_goal(robot: Talk, sink:
     assert "plays to null" in found["sound server"]["message"]
     assert "through the server, pulse" in found["sentence"]["message"]
     goal = logged(robot)[-1]
-    assert (goal["text"], goal["state"], goal["client"]["name"]) == (sentence.TEXT, "SUCCEEDED", "talk doctor")
+    assert (goal["text"], goal["state"], goal["client"]["name"]) == (SENTENCE_TEXT, "SUCCEEDED", "talk doctor")
     assert extent(recording.samples)
 
 
@@ -219,8 +220,8 @@ def test_a_sound_server_that_hangs_is_named(make_talk: MakeTalk, private_sink: C
 def test_a_paused_server_leaves_no_sentence_behind(scripted: Talk) -> None:
     assert scripted.run("pause").code == 0
     with Client(scripted.socket) as client:
-        played = sentence.by_server(client, sentence.TEXT, 10)
-        assert (played.reason, played.words) == ("paused", "speech is paused")
+        played = sentence.speak_by_server(client, SENTENCE_TEXT, 10)
+        assert (played.reason, played.message) == ("paused", "speech is paused")
         assert client.status().pending == ()
 
 
@@ -228,15 +229,15 @@ def test_a_sentence_that_waits_too_long_is_taken_back(scripted: Talk) -> None:
     with Client(scripted.socket) as client:
         goals = [client.say(f"{each} never-ends") for each in ("one", "two", "three", "four")]
         began = time.monotonic()
-        played = sentence.by_server(client, sentence.TEXT, 0.3)
+        played = sentence.speak_by_server(client, SENTENCE_TEXT, 0.3)
         assert time.monotonic() - began < 8
         assert (played.state, played.reason) == (State.RECALLED, "late")
-        assert played.words == "it still waited behind 4 goals after 0.3 s, and was taken back"
+        assert played.message == "it still waited behind 4 goals after 0.3 s, and was taken back"
         assert (goals[0].state, len(client.status().pending)) == (State.ACTIVE, 3)
         client.cancel()
-        played = sentence.by_server(client, "sentence never-ends", 0.5)
+        played = sentence.speak_by_server(client, "sentence never-ends", 0.5)
         assert (played.state, played.reason) == (State.PREEMPTED, "late")
-        assert "begun and not over after 0.5 s" in str(played.words)
+        assert "begun and not over after 0.5 s" in str(played.message)
         assert client.status().active is None
 
 
@@ -244,7 +245,7 @@ def test_a_sentence_preempts_no_goal(make_talk: MakeTalk) -> None:
     talk = make_talk("--preempt", scripted=True)
     with Client(talk.socket) as client:
         first = client.say("sentence length=0.5")
-        assert sentence.by_server(client, sentence.TEXT, 10).state is State.SUCCEEDED
+        assert sentence.speak_by_server(client, SENTENCE_TEXT, 10).state is State.SUCCEEDED
         assert first.wait(10).state is State.SUCCEEDED
 
 
@@ -256,7 +257,7 @@ def await_waiting(client: Client) -> None:
 def test_a_sentence_that_another_client_cancels_says_so(scripted: Talk) -> None:
     with Client(scripted.socket) as client, Client(scripted.socket) as other, ThreadPoolExecutor(1) as beside:
         other.say("sentence never-ends")
-        playing = beside.submit(sentence.by_server, client, sentence.TEXT, LIMIT)
+        playing = beside.submit(sentence.speak_by_server, client, SENTENCE_TEXT, LIMIT)
         await_waiting(other)
         other.cancel()
         played = playing.result(LIMIT)
@@ -321,12 +322,12 @@ def test_programs_that_hang_delay_it_and_no_more(home: str, monkeypatch: pytest.
         write(Path(home, "run", name), "#!/bin/sh\nexec sleep 98\n", 0o755)
     env = environment(home, TALK_SOCKET=f"{home}/s")
     monkeypatch.setattr(os, "environ", {**env, "PATH": f"{home}/run:{env['PATH']}"})
-    monkeypatch.setattr(sound, "LIMIT", 0.3)
-    monkeypatch.setattr(examine, "LIMIT", 0.6)
+    monkeypatch.setattr(sound, "PROGRAM_LIMIT_S", 0.3)
+    monkeypatch.setattr(examine, "SENTENCE_LIMIT_S", 0.6)
     began = time.monotonic()
-    findings = list(examine.Examination(None, silent=False).findings())
+    findings = list(examine.LocalExamination(None, silent=False).findings())
     assert time.monotonic() - began < LIMIT / 2
-    assert not heard(findings)
+    assert not is_answered_yes(findings)
     found = {each.check: each.message for each in findings}
     assert "no answer within 0.3 s" in found["device"]
     assert "does not answer" in found["sound server"]
@@ -345,8 +346,8 @@ def test_a_signal_ends_it_and_its_engine(home: str) -> None:
 
 def test_the_library_stays_out_of_its_own_process(home: str) -> None:
     code = (
-        "import sys\nfrom talkcli.doctor.examine import Examination\n"
-        "found = [each.check for each in Examination(None, silent=True).findings()]\n"
+        "import sys\nfrom talkcli.doctor.examine import LocalExamination\n"
+        "found = [each.check for each in LocalExamination(None, silent=True).findings()]\n"
         "assert found[-1] == 'sentence'\n"
         "print([each for each in ('pyttsx3', 'espeakng_loader', 'asyncio') if each in sys.modules], end='')\n"
         "print('espeak' in open('/proc/self/maps').read() if sys.platform == 'linux' else False)\n"

@@ -16,10 +16,9 @@ import espeakng_loader
 import pytest
 
 from talkcli.client.connection import SocketConnection
-from talkcli.doctor import machine, server, sound, voice
-from talkcli.doctor.machine import Cards, Session
-from talkcli.doctor.report import FAILED
-from talkcli.doctor.sound import Players, SoundServer
+from talkcli.doctor import server, sound, voice
+from talkcli.doctor.report import FAILURE
+from talkcli.doctor.sound import Cards, Players, ProgramOutput, SoundServer, UserSession
 from tests.conformance.bareserve import environment, serving
 from tests.conformance.rawsocket import FakeServer
 from tests.faults.broken import write
@@ -32,8 +31,8 @@ if TYPE_CHECKING:
     from talkcli.doctor.report import Finding
     from tests.conftest import MakeTalk
 
-#: No user of this machine.
-STRANGER = Session(4141, "stranger", groups=("4242",), gids=(4242,))
+#: No user of this sound.
+STRANGER = UserSession(4141, "stranger", groups=("4242",), gids=(4242,))
 PW_NODES = """
 \tid 31, type PipeWire:Interface:Node/3
  \t\tnode.name = "alsa_output.usb"
@@ -63,8 +62,8 @@ def no_server(named: str | None = None) -> Finding:
         patch.setenv("TALK_SOCKET", named or "")
         client, found = server.connect(None, None)
     assert client is None
-    finding = server.judge_places(found)
-    assert finding.state == FAILED
+    finding = server.judge_search(found)
+    assert finding.state == FAILURE
     return finding
 
 
@@ -157,8 +156,10 @@ def unable(directory: Path, named: str | None = None) -> Finding:
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(directory)
         env = environment(str(directory), LD_LIBRARY_PATH=str(directory))
-        found = voice.judge("2.99", voice.look(voice.Setting(voice=named, env=env)), server=None)[-1]
-    assert found.state == FAILED
+        found = voice.judge_engine("2.99", voice.find_engine(voice.EngineOptions(voice=named, env=env)), server=None)[
+            -1
+        ]
+    assert found.state == FAILURE
     return found
 
 
@@ -191,23 +192,23 @@ def env_with(directory: Path, **scripts: str) -> dict[str, str]:
 
 def test_the_output_of_a_program_is_kept_and_its_complaint_is_one_line(tmp_path: Path) -> None:
     env = env_with(tmp_path, good='echo out; echo "$LC_ALL"', bad="echo; echo 'first line' >&2; echo more >&2; exit 3")
-    killed = sound.asked("killed", env=env_with(tmp_path, killed="kill -ILL $$"))
-    assert killed.trouble == "it was killed by SIGILL"
-    good, bad = sound.asked("good", env=env), sound.asked("bad", env=env)
-    assert (good, bad) == (sound.Said(None, "out\nC\n"), sound.Said("first line", "\n"))
-    assert sound.asked("missing", env=env) == sound.Said("missing is not there")
+    killed = sound.run_program("killed", env=env_with(tmp_path, killed="kill -ILL $$"))
+    assert killed.error == "it was killed by SIGILL"
+    good, bad = sound.run_program("good", env=env), sound.run_program("bad", env=env)
+    assert (good, bad) == (ProgramOutput(None, "out\nC\n"), ProgramOutput("first line", "\n"))
+    assert sound.run_program("missing", env=env) == ProgramOutput("missing is not there")
     write(tmp_path / "broken", "#!/no/such/interpreter\n", 0o755)
-    assert "No such file" in str(sound.asked("broken", env=env).trouble)
+    assert "No such file" in str(sound.run_program("broken", env=env).error)
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc is Linux's")
 def test_a_program_that_hangs_is_killed_with_its_children(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sound, "LIMIT", 0.3)
+    monkeypatch.setattr(sound, "PROGRAM_LIMIT_S", 0.3)
     env = env_with(tmp_path, hangs=f"/bin/sleep 98 & echo $! > {tmp_path}/pid; /bin/sleep 98")
     began = time.monotonic()
-    said = sound.asked("hangs", env=env)
-    assert said.late
-    assert said.trouble == "no answer within 0.3 s"
+    said = sound.run_program("hangs", env=env)
+    assert said.timed_out
+    assert said.error == "no answer within 0.3 s"
     assert time.monotonic() - began < 20
     child = int((tmp_path / "pid").read_text())
     end = time.monotonic() + 5
@@ -218,8 +219,8 @@ def test_a_program_that_hangs_is_killed_with_its_children(tmp_path: Path, monkey
 
 def test_a_program_that_leaves_a_child_with_its_output_is_not_waited_for(tmp_path: Path) -> None:
     began = time.monotonic()
-    said = sound.asked("leaves", env=env_with(tmp_path, leaves="echo out; /bin/sleep 2.7 &"))
-    assert (said.out, said.late) == ("out\n", False)
+    said = sound.run_program("leaves", env=env_with(tmp_path, leaves="echo out; /bin/sleep 2.7 &"))
+    assert (said.stdout, said.timed_out) == ("out\n", False)
     assert time.monotonic() - began < 2.7
 
 
@@ -233,9 +234,9 @@ def _runs(pid: int) -> bool:
 
 def test_the_players_that_are_installed_are_found_in_their_order(tmp_path: Path) -> None:
     env = env_with(tmp_path, **dict.fromkeys(("pacat", "aplay", "mine"), "exit 0"))
-    assert sound.players({"PATH": "/nowhere"}, None, None) == Players((), None, runs=False)
-    assert sound.players(env, None, "aplay") == Players(("aplay", "pacat"), None, runs=False, first="aplay")
-    runs = {each: sound.players(env, each, None).runs for each in ("pulse", "mine -x", "theirs", "'")}
+    assert sound.find_players({"PATH": "/nowhere"}, None, None) == Players((), None, runs=False)
+    assert sound.find_players(env, None, "aplay") == Players(("aplay", "pacat"), None, runs=False, first="aplay")
+    runs = {each: sound.find_players(env, each, None).runs for each in ("pulse", "mine -x", "theirs", "'")}
     assert runs == {"pulse": True, "mine -x": True, "theirs": False, "'": False}
 
 
@@ -243,65 +244,65 @@ def test_devices_are_named_as_their_player_names_them(tmp_path: Path) -> None:
     aplay = "printf 'null\\n    Discard\\ndefault\\n    Default\\nplughw:CARD=Device,DEV=0\\n    USB\\n'"
     pactl = "printf '0\\tusb\\tm.c\\ts16le 2ch 44100Hz\\tSUSPENDED\\n1\\thdmi\\tm.c\\ts16le 2ch 44100Hz\\tIDLE\\n'"
     env = env_with(tmp_path, aplay=aplay, pactl=pactl, pw_cli=f"/bin/cat <<'X'{PW_NODES}X")
-    found = {each: sound.devices(env, each, None) for each in ("aplay", "pacat", "pw-cat")}
+    found = {each: sound.find_devices(env, each, None) for each in ("aplay", "pacat", "pw-cat")}
     assert {player: each and each.names for player, each in found.items()} == {
         "aplay": ("default", "plughw:CARD=Device,DEV=0"),
         "pacat": ("usb", "hdmi"),
         "pw-cat": ("alsa_output.usb",),
     }
-    assert sound.devices(env, "my-player", None) is None
-    assert sound.suspended(env) == ("usb",)
+    assert sound.find_devices(env, "my-player", None) is None
+    assert sound.suspended_sinks(env) == ("usb",)
 
 
 def test_programs_that_fail_or_hang_say_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sound, "LIMIT", 0.3)
+    monkeypatch.setattr(sound, "PROGRAM_LIMIT_S", 0.3)
     env = env_with(tmp_path, aplay="exec /bin/sleep 98", pactl="echo Connection refused >&2; exit 1")
-    troubles = [each.trouble for player in ("aplay", "pacat", "pw-cat") if (each := sound.devices(env, player, None))]
-    assert troubles == ["no answer within 0.3 s", "Connection refused", None]
-    assert sound.sound_server(env, STRANGER).hangs is False
-    assert sound.sound_server(env_with(tmp_path, pactl="exec /bin/sleep 98", pw_cli="exit 0"), STRANGER).hangs
+    found = [sound.find_devices(env, player, None) for player in ("aplay", "pacat", "pw-cat")]
+    assert [each and each.error for each in found] == ["no answer within 0.3 s", "Connection refused", None]
+    assert sound.find_sound_server(env, STRANGER).hangs is False
+    assert sound.find_sound_server(env_with(tmp_path, pactl="exec /bin/sleep 98", pw_cli="exit 0"), STRANGER).hangs
 
 
 def test_a_sound_server_is_found_by_its_own_program_or_by_its_socket(tmp_path: Path) -> None:
     for each in ("pulse", "wire", "run/pulse"):
         (tmp_path / each).mkdir(parents=True)
     env = env_with(tmp_path / "pulse", pactl="printf 'Server Name: pulseaudio\\nDefault Sink: usb\\n'")
-    found = sound.sound_server(env, STRANGER)
+    found = sound.find_sound_server(env, STRANGER)
     assert (found.name, found.sink) == ("pulseaudio", "usb")
     env = env_with(tmp_path / "pulse", pactl="echo Connection refused >&2; exit 1", pw_cli="exit 0")
-    found = sound.sound_server(env, STRANGER)
-    assert ("PipeWire" in str(found.name), found.pulse) == (True, False)
+    found = sound.find_sound_server(env, STRANGER)
+    assert ("PipeWire" in str(found.name), found.accepts_pulse) == (True, False)
     native = tmp_path / "run" / "pulse" / "native"
     native.touch()
     alone = {"PATH": "/nowhere", "XDG_RUNTIME_DIR": str(tmp_path / "run")}
-    found = sound.sound_server(alone, STRANGER)
-    assert (found.name, found.trouble, found.sockets) == (None, None, (str(native),))
+    found = sound.find_sound_server(alone, STRANGER)
+    assert (found.name, found.error, found.sockets) == (None, None, (str(native),))
     native.unlink()
     wire = {**alone, **env_with(tmp_path / "wire", pw_cli="exit 0")}
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(str(native))
-        refused = sound.sound_server(wire, STRANGER)
-        assert (refused.name, refused.pulse) == ("PipeWire, without its PulseAudio part", False)
+        refused = sound.find_sound_server(wire, STRANGER)
+        assert (refused.name, refused.accepts_pulse) == ("PipeWire, without its PulseAudio part", False)
         server.listen()
-        assert sound.sound_server(wire, STRANGER) == SoundServer("PipeWire")
-        assert sound.sound_server(alone, STRANGER) == SoundServer(f"one listens on {native}")
+        assert sound.find_sound_server(wire, STRANGER) == SoundServer("PipeWire")
+        assert sound.find_sound_server(alone, STRANGER) == SoundServer(f"one listens on {native}")
 
 
 def test_the_volume_is_read_from_the_mixer_in_charge(tmp_path: Path) -> None:
-    server, cards = SoundServer(name="PipeWire"), Cards(kernel=True, names=("USB",))
+    server, cards = SoundServer(name="PipeWire"), Cards(in_kernel=True, names=("USB",))
     controls = "case $1 in scontrols) echo \"Simple mixer control 'Master',0\";; *) echo 'Mono: 0 [0%] [off]';; esac"
     env = env_with(tmp_path, amixer=controls, wpctl="echo 'Volume: 0.40 [MUTED]'")
-    (alsa,) = sound.levels(env, SoundServer(), cards)
-    assert (alsa.name, alsa.muted, alsa.unmute) == ("Master", True, "amixer sset Master unmute")
-    (wire,) = sound.levels(env, server, cards)
-    assert (wire.muted, wire.percent, wire.unmute) == (True, 40, "wpctl set-mute @DEFAULT_AUDIO_SINK@ 0")
+    (alsa,) = sound.find_levels(env, SoundServer(), cards)
+    assert (alsa.name, alsa.muted, alsa.unmute_command) == ("Master", True, "amixer sset Master unmute")
+    (wire,) = sound.find_levels(env, server, cards)
+    assert (wire.muted, wire.percent, wire.unmute_command) == (True, 40, "wpctl set-mute @DEFAULT_AUDIO_SINK@ 0")
     env = env_with(
         tmp_path, pactl="case $1 in get-sink-mute) echo Mute: no;; *) echo 'Volume: mono: 9 / 30% / x';; esac"
     )
-    (pulse,) = sound.levels(env, server, cards)
-    assert (pulse.muted, pulse.percent, pulse.louder) == (False, 30, "pactl set-sink-volume @DEFAULT_SINK@ 70%")
-    assert sound.levels(env, SoundServer(), Cards(kernel=False)) == ()
-    assert sound.levels(env, SoundServer(hangs=True), cards) == ()
+    (pulse,) = sound.find_levels(env, server, cards)
+    assert (pulse.muted, pulse.percent, pulse.louder_command) == (False, 30, "pactl set-sink-volume @DEFAULT_SINK@ 70%")
+    assert sound.find_levels(env, SoundServer(), Cards(in_kernel=False)) == ()
+    assert sound.find_levels(env, SoundServer(hangs=True), cards) == ()
 
 
 # System files
@@ -314,14 +315,15 @@ def test_a_card_may_be_opened_by_root_by_its_group_or_by_its_mode(tmp_path: Path
     write(kernel / "cards", " 0 [Device         ]: USB-Audio - USB Audio Device\n              C-Media at usb-1\n")
     for name, mode in (("pcmC0D0p", 0o660), ("pcmC0D0c", 0o660), ("pcmC1D0p", 0o666)):
         write(nodes / name, "", mode)
-    found = machine.cards(STRANGER, str(kernel), str(nodes))
+    found = sound.find_cards(STRANGER, str(kernel), str(nodes))
     assert found.names == ("USB Audio Device",)
     assert found.nodes == (f"{nodes}/pcmC0D0p", f"{nodes}/pcmC1D0p")
     assert found.forbidden == (f"{nodes}/pcmC0D0p",), "others may open the second one, by its mode"
-    member = Session(4141, "member", gids=(os.stat(nodes / "pcmC0D0p").st_gid,))
-    for each in (member, Session(0, "root")):
-        assert machine.cards(each, str(kernel), str(nodes)).forbidden == ()
-    assert machine.cards(STRANGER, str(tmp_path / "gone"), str(tmp_path / "gone")) == Cards(kernel=False, group="audio")
+    member = UserSession(4141, "member", gids=(os.stat(nodes / "pcmC0D0p").st_gid,))
+    for each in (member, UserSession(0, "root")):
+        assert sound.find_cards(each, str(kernel), str(nodes)).forbidden == ()
+    gone = str(tmp_path / "gone")
+    assert sound.find_cards(STRANGER, gone, gone) == Cards(in_kernel=False, group="audio")
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc is Linux's")
@@ -330,25 +332,25 @@ def test_a_server_of_the_same_user_is_examined_in_its_own_environment(tmp_path: 
     with subprocess.Popen(["sh", "-c", "sleep 98; :", "--player", "x"], env=env, start_new_session=True) as process:
         try:
             end = time.monotonic() + 5
-            while machine._environment(process.pid) != env:  # the process has ours until its program has started
+            while sound._environment(process.pid) != env:  # the process has ours until its program has started
                 assert time.monotonic() < end
-            found, seen = machine.surroundings(process.pid)
+            found, seen = sound.find_session(process.pid)
             assert seen == env
-            assert (found.server, found.uid, found.runtime) == (process.pid, os.getuid(), str(tmp_path))
+            assert (found.server_pid, found.uid, found.runtime_dir) == (process.pid, os.getuid(), str(tmp_path))
             assert found.runtime_owner == os.getuid()
-            assert "an ssh session" in found.kinds
+            assert "an ssh session" in found.origins
             assert set(found.gids) == {os.getegid(), *os.getgroups()}
-            assert machine.names_a_player(process.pid, {})
+            assert sound.names_a_player(process.pid, {})
         finally:
             os.killpg(process.pid, 9)
 
 
 def test_this_process_is_examined_if_there_is_no_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", f"{tmp_path}/gone")
-    found, seen = machine.surroundings(None)
-    assert (found.server, found.runtime_owner, seen) == (None, None, dict(os.environ))
-    assert f"{tmp_path}/gone, which is not there" in machine.judge_session(found).message
+    found, seen = sound.find_session(None)
+    assert (found.server_pid, found.runtime_owner, seen) == (None, None, dict(os.environ))
+    assert f"{tmp_path}/gone, which is not there" in sound.judge_session(found).message
     monkeypatch.delenv("XDG_RUNTIME_DIR")
-    assert machine.surroundings(None)[0].runtime is None
-    assert machine.names_a_player(os.getpid(), {"TALK_PLAYER": "x"})
-    assert not machine.names_a_player(os.getpid(), {})
+    assert sound.find_session(None)[0].runtime_dir is None
+    assert sound.names_a_player(os.getpid(), {"TALK_PLAYER": "x"})
+    assert not sound.names_a_player(os.getpid(), {})

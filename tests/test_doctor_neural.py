@@ -8,17 +8,17 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import pytest
 
 from talkcli import Client, install
-from talkcli.doctor import examine, neural, voice
-from talkcli.doctor.machine import Session
-from talkcli.doctor.neural import Neural, Tried
-from talkcli.doctor.report import FAILED, OK, WARNING
-from talkcli.doctor.voice import Engine
+from talkcli.doctor import examine, voice
+from talkcli.doctor.report import FAILURE, OK, WARNING
+from talkcli.doctor.sound import UserSession
+from talkcli.doctor.voice import EngineOptions, EngineReport, NeuralVoices, VoiceTrial
 from talkcli.engine.models import NEEDED
+from talkcli.frozen import replace
 from talkcli.polling import Interrupted
 from tests.conformance.bareserve import environment, serving
 from tests.support import tiny_voice
@@ -59,7 +59,8 @@ def _environment(home: str, tmp_path: Path, code: str) -> dict[str, str]:
 
 def _found(used: str | None, env: dict[str, str], limit: float = LIMIT) -> dict[str, Finding]:
     """Return the findings about the voices of this environment, by their checks."""
-    return {each.check: each for each in neural.judge(neural.look(used, env, limit), server=False)}
+    facts = voice.find_neural(used, EngineOptions(env=env), limit)
+    return {each.check: each for each in voice.judge_neural(facts, has_server=False, server_voices={})}
 
 
 def test_the_voice_in_use_is_loaded_and_timed(alone: dict[str, str]) -> None:
@@ -108,7 +109,7 @@ def test_a_voice_that_cannot_speak_says_why(
 ) -> None:
     tiny_voice.put(Path(home) / "v", "bad", model or tiny_voice.model(speakers=speakers))
     found = _found("piper/bad", alone)["neural voice"]
-    assert found.state == FAILED
+    assert found.state == FAILURE
     assert found.message.startswith(f"piper/bad is in use: {home}/v/bad.onnx")
     assert words in found.message
     assert found.next == step
@@ -126,7 +127,7 @@ def test_a_broken_package_is_a_finding(tmp_path: Path, code: str, words: str, st
     package = f"import os\nassert os.environ['ORT_DISABLE_TELEMETRY'] == '1'\n{code}\n"
     (tmp_path / "onnxruntime.py").write_text(package)
     found = _found(used, {**os.environ, "PYTHONPATH": str(tmp_path)})
-    assert found["neural"].state == (FAILED if used else WARNING)
+    assert found["neural"].state == (FAILURE if used else WARNING)
     assert re.match(f"onnxruntime .* cannot be imported: {re.escape(words)}$", found["neural"].message)
     assert str(found["neural"].next).startswith(step)
     assert "neural voice" not in found
@@ -134,7 +135,7 @@ def test_a_broken_package_is_a_finding(tmp_path: Path, code: str, words: str, st
 
 def test_slow_packages_are_not_to_be_installed_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     needs_packages(*NEEDED)
-    monkeypatch.setattr(neural, "_IMPORT_LIMIT_S", 0.2)
+    monkeypatch.setattr(voice, "_IMPORT_LIMIT_S", 0.2)
     (tmp_path / "onnxruntime.py").write_text("import time\ntime.sleep(60)\n")
     found = _found(None, {**os.environ, "PYTHONPATH": str(tmp_path)}, 5.0)["neural"]
     assert (found.state, found.next) == (WARNING, "run talk doctor again when this machine is less busy")
@@ -155,34 +156,38 @@ def test_the_server_s_voice_is_tried_in_its_environment(alone: dict[str, str]) -
 # Whether and how the doctor looks
 
 
-HERE, SERVED = Session(0, "root"), Session(0, "root", server=7)
-ESPEAK, UNKNOWN = Engine("espeak"), Engine(reason="unknown_voice", words="x")
+HERE, SERVED = UserSession(0, "root"), UserSession(0, "root", server_pid=7)
+ESPEAK, UNKNOWN = EngineReport("espeak"), EngineReport(reason="unknown_voice", message="x")
 
 
 def test_only_a_voice_that_is_used_is_tried(home: str, monkeypatch: pytest.MonkeyPatch) -> None:
     tiny_voice.put(Path(home) / "v", "tiny")
     asked: list[str | None] = []
 
-    def look(used: str | None, *_: object) -> Neural:
+    def find_neural(used: str | None, *_: object) -> NeuralVoices:
         asked.append(used)
-        return Neural(None)
+        return NeuralVoices(None)
 
-    monkeypatch.setattr(neural, "look", look)
+    monkeypatch.setattr(voice, "find_neural", find_neural)
 
-    def tried(used: str | None, engine: Engine, here: Session = HERE, **told: object) -> list[str | None]:
+    def tried(used: str | None, engine: EngineReport, here: UserSession = HERE, **told: object) -> list[str | None]:
         env = {"TALK_VOICES": f"{home}/v"} if told.pop("installed", False) else {}
-        examination = examine.Examination(None, silent=True)
-        examination._server = told
+        examination = examine.LocalExamination(None, silent=True)
+        if told:
+            examination._client, examination._server = cast("Client", object()), {"voice": used, **told}
+        else:
+            monkeypatch.setenv("TALK_VOICE", used or "")
+        examination._engine, examination._session, examination._env = engine, here, env
         asked.clear()
-        found = list(examination._neural(used, engine, here, env, running=bool(told)))
+        found = list(examination._check_neural())
         assert bool(found) == bool(asked) or found[0].message == "of the server: piper/a"
         return [*asked]
 
     assert tried(None, ESPEAK) == tried("de", ESPEAK) == []
-    assert tried("piper/ti", Engine("dummy"), driver="dummy") == []
-    assert tried(None, Engine("espeak", neural=1)) == tried(None, ESPEAK, installed=True) == [None]
+    assert tried("piper/ti", EngineReport("dummy"), driver="dummy") == []
+    assert tried(None, EngineReport("espeak", neural_count=1)) == tried(None, ESPEAK, installed=True) == [None]
     assert tried("piper/ti", ESPEAK) == ["piper/ti"]
-    assert tried("ti", Engine("espeak", voice="piper/tiny")) == ["piper/tiny"]
+    assert tried("ti", EngineReport("espeak", neural_voice="piper/tiny")) == ["piper/tiny"]
     assert tried("tiny", UNKNOWN, installed=True) == ["tiny"]
     assert tried("none", UNKNOWN, installed=True) == [None]
     voices = {"piper/a": {"state": "loaded"}}
@@ -193,22 +198,23 @@ def test_only_a_voice_that_is_used_is_tried(home: str, monkeypatch: pytest.Monke
 def test_without_neural_voices_nothing_of_them_is_imported() -> None:
     code = """
 import sys
-from talkcli.doctor import examine, machine, voice
-session = machine.Session(0, "root")
-engine = voice.Engine("espeak", "x", 9)
-assert [*examine.Examination(None, silent=True)._neural("de", engine, session, {}, running=False)] == []
-assert not {"talkcli.doctor.neural", "onnxruntime", "numpy"} & {*sys.modules}, sys.modules.keys()
+from talkcli.doctor import examine
+examination = examine.LocalExamination(None, silent=True)
+examination._env = {}
+assert [*examination._check_neural()] == []
+assert not {"onnxruntime", "numpy"} & {*sys.modules}, sys.modules.keys()
 """
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+    env = {**os.environ, "TALK_VOICE": "de"}
+    subprocess.run([sys.executable, "-c", code], env=env, check=True, timeout=60)
 
 
 # How a voice is tried
 
 
 def test_a_voice_that_takes_too_long_is_given_up(alone: dict[str, str]) -> None:
-    tried = neural.look("piper/tiny", alone, 0.01).tried
+    tried = voice.find_neural("piper/tiny", EngineOptions(env=alone), 0.01).trial
     assert tried
-    assert tried.words == "it was not loaded, and had not spoken, after 0.01 s"
+    assert tried.message == "it was not loaded, and had not spoken, after 0.01 s"
 
 
 def test_a_voice_that_kills_the_engine_process_is_a_fact(home: str, tmp_path: Path) -> None:
@@ -217,9 +223,9 @@ def test_a_voice_that_kills_the_engine_process_is_a_fact(home: str, tmp_path: Pa
     dies = (
         "from talkcli.engine.child.synthesizers import inference\nimport os\ninference.halves = lambda _: os.abort()\n"
     )
-    tried = neural.look("piper/tiny", _environment(home, tmp_path, dies), LIMIT).tried
+    tried = voice.find_neural("piper/tiny", EngineOptions(env=_environment(home, tmp_path, dies)), LIMIT).trial
     assert tried
-    assert "SIGABRT" in (tried.words or "")
+    assert "SIGABRT" in (tried.message or "")
 
 
 def test_a_signal_ends_the_trial(alone: dict[str, str]) -> None:
@@ -227,7 +233,7 @@ def test_a_signal_ends_the_trial(alone: dict[str, str]) -> None:
     os.write(writable, b"x")
     try:
         with pytest.raises(Interrupted):
-            neural.look("piper/tiny", alone, LIMIT, {readable: 1})
+            voice.find_neural("piper/tiny", EngineOptions(env=alone, interrupt={readable: 1}), LIMIT)
     finally:
         os.close(readable)
         os.close(writable)
@@ -240,45 +246,48 @@ FAILED_THEN = {"piper/a": {"state": "loaded", "why": None}, "piper/b": {"state":
 
 
 def test_a_server_s_words_about_its_voices_are_told_if_they_cannot_be_examined() -> None:
-    (found,) = neural.judge_told(FAILED_THEN)
+    (found,) = voice.judge_server_voices(FAILED_THEN)
     assert (found.state, found.message) == (WARNING, "the server cannot speak by piper/b: x is no model")
     assert found.next == "see whether it still is so: talk set --voice piper/b"
-    (found,) = neural.judge_told({"piper/a": FAILED_THEN["piper/a"]})
+    (found,) = voice.judge_server_voices({"piper/a": FAILED_THEN["piper/a"]})
     assert (found.state, found.message) == (OK, "of the server: piper/a")
-    assert neural.judge_told({}) == neural.judge_told(None) == []
+    assert voice.judge_server_voices({}) == []
 
 
 def test_a_voice_that_speaks_here_and_that_the_server_has_given_up_is_a_warning() -> None:
-    facts = Neural(None, used="piper/b", tried=Tried(loaded=0.5, speed=9.0))
-    assert neural.judge(facts, server=True, told=FAILED_THEN)[-1].state == WARNING
-    assert neural.judge(facts, server=True, told={})[-1].state == OK
+    facts = NeuralVoices(None, used="piper/b", trial=VoiceTrial(load_s=0.5, speed=9.0))
+    assert voice.judge_neural(facts, has_server=True, server_voices=FAILED_THEN)[-1].state == WARNING
+    assert voice.judge_neural(facts, has_server=True, server_voices={})[-1].state == OK
 
 
 def _judged(**tried: object) -> Finding:
-    found = neural.judge(Neural(None, used="piper/a", tried=Tried(**tried)), server=False)  # type: ignore[arg-type]
-    return found[-1]
+    trial = VoiceTrial(**tried)  # type: ignore[arg-type]
+    facts = NeuralVoices(None, used="piper/a", trial=trial)
+    return voice.judge_neural(facts, has_server=False, server_voices={})[-1]
 
 
 def test_on_a_slow_machine_another_voice_is_the_next_step() -> None:
-    slow = _judged(loaded=3.04, speed=1.29, memory=250_400_000)
+    slow = _judged(load_s=3.04, speed=1.29, memory_bytes=250_400_000)
     assert slow.state == WARNING
     assert slow.message.startswith(
         "piper/a is in use: loaded in 3.0 s, makes a sentence 1.3 times as fast as it is heard, takes 250 MB"
     )
     assert "quality is low" in (slow.next or "")
-    assert _judged(loaded=3.04, speed=1.31).state == OK
+    assert _judged(load_s=3.04, speed=1.31).state == OK
     assert "MB" not in _judged(speed=2.0).message
 
 
 def test_a_voice_that_fails_is_a_warning_if_a_server_speaks_with_espeak_instead() -> None:
-    facts = Neural(None, used="piper/a", tried=Tried(words="x is no model", step="get it anew"))
-    assert [neural.judge(facts, server=each)[-1].state for each in (False, True)] == [FAILED, WARNING]
-    without = Neural("onnxruntime is missing: install it", used="piper/a")
-    assert [neural.judge(without, server=each)[0].state for each in (False, True)] == [FAILED, WARNING]
-    assert neural.judge(Neural("onnxruntime is missing: install it"), server=False)[0].state == WARNING
+    facts = NeuralVoices(None, used="piper/a", trial=VoiceTrial(message="x is no model", step="get it anew"))
+    without = NeuralVoices("onnxruntime is missing: install it", used="piper/a")
+    for has_server, state in ((False, FAILURE), (True, WARNING)):
+        assert voice.judge_neural(facts, has_server=has_server, server_voices={})[-1].state == state
+        assert voice.judge_neural(without, has_server=has_server, server_voices={})[0].state == state
+    unused = replace(without, used=None)
+    assert voice.judge_neural(unused, has_server=False, server_voices={})[0].state == WARNING
 
 
 def test_a_voice_that_needs_a_missing_package_is_cured_by_installing_it() -> None:
     words = f"the voice piper/a is listed, but it cannot be loaded: numpy is missing: {install.neural()}"
-    found = voice.judge("2.99", Engine(reason="unknown_voice", words=words), server=None)[-1]
+    found = voice.judge_engine("2.99", EngineReport(reason="unknown_voice", message=words), server=None)[-1]
     assert (found.check, found.next) == ("voices", install.neural())

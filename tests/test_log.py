@@ -97,5 +97,5 @@ def test_the_script_is_shown_that_starts_talk_by_way_of_another_program(tmp_path
     with subprocess.Popen(["sh", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as started:
         assert started.stdin
         assert started.stdout
-        assert peers.parent_command_of(int(started.stdout.readline())) == f"sh {script}"
+        assert peers.parent_command_line(int(started.stdout.readline())) == f"sh {script}"
         started.stdin.write("\n")

@@ -144,7 +144,7 @@ def _show_paused(options: CommonOptions, goal: Goal | None, *, paused: bool, wor
 def doctor(options: CommonOptions, silent: bool) -> int:
     """Show the doctor's findings and the next step. Return the exit code."""
     from talkcli.cli.interrupts import Interrupts
-    from talkcli.doctor.report import heard, lines, verdict
+    from talkcli.doctor.report import format_conclusion, format_finding, is_answered_yes
     from talkcli.goals.states import EXIT_CODES, State
 
     findings = []
@@ -152,26 +152,26 @@ def doctor(options: CommonOptions, silent: bool) -> int:
         examination = _examination(options, interrupts.watched, silent=silent)
         for finding in examination.findings():
             findings.append(finding)
-            show_result(options, [finding.to_json()], partial(lines, finding, screen()))
+            show_result(options, [finding.to_json()], partial(format_finding, finding, screen()))
             if interrupts.signal_number is not None:
                 break
     if interrupts.signal_number is not None:
         return interrupts.exit_code
     if not options.json and not options.quiet:
-        note(verdict(findings, screen(), examination.question))
+        note(format_conclusion(findings, screen(), examination.question))
     # A sentence that nobody would hear counts as an aborted goal.
-    return 0 if heard(findings, examination.question) else EXIT_CODES[State.ABORTED]
+    return 0 if is_answered_yes(findings, examination.question) else EXIT_CODES[State.ABORTED]
 
 
 def _examination(
     options: CommonOptions, interrupt: Mapping[int, int], *, silent: bool
-) -> examine.Examination | broker.BrokerExamination:
+) -> examine.LocalExamination | broker.BrokerExamination:
     """Return the examination of this machine, or of the way to a robot in a fleet."""
     robot = named_robot(options.robot, options.socket)
     if robot is None:
-        from talkcli.doctor.examine import Examination
+        from talkcli.doctor.examine import LocalExamination
 
-        return Examination(options.socket, silent=silent, interrupt=interrupt)
+        return LocalExamination(options.socket, silent=silent, interrupt=interrupt)
     from talkcli.fleet.broker import require_paho
 
     require_paho()

@@ -12,7 +12,7 @@ import sys
 import time
 
 from talkcli import __version__, paths
-from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, EXIT_SIGPIPE, ServerUnavailable, TalkError, TimedOut, limits
+from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, EXIT_SIGPIPE, ServerUnavailable, TalkError, TimedOut, memory_limits
 from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -136,7 +136,7 @@ def run_command(command: Callable[[], object], options: CommonOptions) -> int:
     except KeyboardInterrupt:
         return EXIT_SIGINT
     except MemoryError:
-        note(f"there is not enough memory for talk: {limits()}")
+        note(f"there is not enough memory for talk: {memory_limits()}")
         return EXIT_ERROR
     except Exception as error:
         output_code = handle_output_error(error)

@@ -80,7 +80,7 @@ def _print_unit(
     typed = [_assignment(each, given[each.name]) for each in row.options if each.name in options.typed & given.keys()]
     socket = os.path.abspath(options.socket) if options.socket else None
     socket_option = [f"--socket={socket}"] if socket else []
-    usual_socket = paths.SYSTEM_SOCKET if name.startswith("system") else f"%t/talk/{paths.SOCKET}"
+    usual_socket = paths.SYSTEM_SOCKET if name.startswith("system") else f"%t/talk/{paths.SOCKET_NAME}"
     escape = _escape_path if name.endswith("-socket") else printable
     program = _program(sys.argv[0])
     # The files of the program: its script, its interpreter and its package.

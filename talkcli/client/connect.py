@@ -238,8 +238,8 @@ def connect(
 
 def _may_come(begun: Begun) -> bool:
     """Whether a server may still start at one of the places that were tried in vain."""
-    found = (paths.found_at(path, error) for path, error in begun.failures if isinstance(error, OSError))
-    return any(each in {paths.ABSENT, paths.STALE} for each in found)
+    found = (paths.describe_place(path, error) for path, error in begun.failures if isinstance(error, OSError))
+    return any(each in {paths.PLACE_ABSENT, paths.PLACE_STALE} for each in found)
 
 
 def _greet(
@@ -325,10 +325,10 @@ def _nobody(begun: Begun, named: str | None) -> TalkError:
     for path, error in begun.failures:
         words = str(error)
         if isinstance(error, OSError):
-            words = found = paths.found_at(path, error)
-            if found == paths.DIRECTORY:
+            words = found = paths.describe_place(path, error)
+            if found == paths.PLACE_DIRECTORY:
                 words += f": name the one in it, {_inside(path)}"
-        denied = denied or isinstance(error, AccessDenied) or found == paths.FORBIDDEN
+        denied = denied or isinstance(error, AccessDenied) or found == paths.PLACE_FORBIDDEN
         tried += f"  {path}: {words}\n"
     step = _named_step(named, found, denied=denied) if named else f"{_LET_IN}\n{_OWN}" if denied else _START
     hint = paths.sudo_hint()
@@ -346,13 +346,13 @@ def _named_step(named: str, found: str, *, denied: bool) -> str:
     from talkcli.terminal.text import printable
 
     by_variable = named == os.environ.get("TALK_SOCKET")
-    place = shlex.quote(printable(_inside(named) if found == paths.DIRECTORY else named))
+    place = shlex.quote(printable(_inside(named) if found == paths.PLACE_DIRECTORY else named))
     if denied:
         step = _LET_IN if by_variable else f"{_LET_IN}\n{_OWN}"
-    elif found == paths.FILE:
+    elif found == paths.PLACE_FILE:
         step = "name a socket" if by_variable else "name a socket, or leave out --socket"
     elif by_variable:
-        step = f"set TALK_SOCKET to {place}" if found == paths.DIRECTORY else _START
+        step = f"set TALK_SOCKET to {place}" if found == paths.PLACE_DIRECTORY else _START
     else:
         step = f"{_START} --socket {place}"
     return f"{step}\nor unset TALK_SOCKET, which names this place: no other was tried" if by_variable else step
@@ -360,4 +360,4 @@ def _named_step(named: str, found: str, *, denied: bool) -> str:
 
 def _inside(directory: str) -> str:
     """Return the socket in a directory that was named in its place."""
-    return f"{directory.rstrip('/')}/{paths.SOCKET}"
+    return f"{directory.rstrip('/')}/{paths.SOCKET_NAME}"

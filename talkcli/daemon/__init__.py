@@ -1,5 +1,4 @@
-"""What a process that runs for months needs: its log, and signs of life for who started it.
+"""What every long-running process needs: a log, and notifications for the service manager.
 
-It may import terminal, protocol, goals and the ground. It knows no goal, no client and no engine: what the server's log
-says of those is in `talkcli.server.log`. A command that ends by itself has no use for it.
+This package knows nothing about goals, clients or engines. `talkcli.server.log` has the server's log lines about those.
 """

@@ -1,7 +1,7 @@
-"""The log of a process that runs for months: lines on standard error, for people and for journald.
+"""The log of a long-running process: lines on standard error, for people and for journald.
 
-It never blocks and never fails. Nothing that others send can forge a line or reach a terminal raw: all of it goes
-through `printable`. What is said of goals and engines is in `talkcli.server.log`.
+Writing a line never blocks and never fails. Text from other programs must go through `sanitize`, so that it can't forge
+a line or send control characters to a terminal.
 """
 
 from __future__ import annotations
@@ -13,68 +13,90 @@ import time
 import traceback
 from typing import TYPE_CHECKING
 
-from talkcli.daemon.quota import Quota
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from typing import Any
 
-#: Bytes of one line at most: a pipe that poll calls writable takes as many without blocking (PIPE_BUF on Linux).
-_MAX_LINE = 4096
-#: Characters of a text in the log.
-_MAX_TEXT = 200
-#: Seconds between two lines of the same kind, of what may happen many times a second.
-_SELDOM = 60.0
-
-_lost = 0
-_seldom: dict[str, Quota] = {}
+#: The longest line. If poll reports a pipe as writable, this many bytes never block (PIPE_BUF on Linux).
+_MAX_LOG_LINE_BYTES = 4096
+_MAX_LOGGED_TEXT_CHARS = 200
+#: Time between two lines of the same kind, for events that can happen many times a second.
+_REPEAT_AFTER_S = 60.0
 
 
-def line(words: str) -> None:
-    """Write one line; where standard error is closed or its reader is stuck, the line is lost and all else goes on."""
-    global _lost  # noqa: PLW0603
-    if _lost:
-        words = f"{words} ({_lost} lines before this one could not be written)"
-    data = f"talk: {words}\n".encode(errors="backslashreplace")
-    if len(data) > _MAX_LINE:
-        data = data[: _MAX_LINE - 1] + b"\n"
+class RateLimit:
+    """A limit for events that can happen many times a second. The time is an argument."""
+
+    def __init__(self, max_events: int, period_s: float) -> None:
+        self._max_events = max_events
+        self._period_s = period_s
+        self._period_start = float("-inf")
+        self._allowed = 0
+        self._suppressed = 0
+
+    def allow(self, now: float) -> int | None:
+        """Count an event. Return None to suppress it, or else the number of events suppressed before it."""
+        if now >= self._period_start + self._period_s:
+            suppressed, self._suppressed = self._suppressed, 0
+            self._period_start, self._allowed = now, 1
+            return suppressed
+        if self._allowed < self._max_events:
+            self._allowed += 1
+            return 0
+        self._suppressed += 1
+        return None
+
+
+_lost_lines = 0
+_rate_limits: dict[str, RateLimit] = {}
+
+
+def write(message: str) -> None:
+    """Write one line, or drop it if standard error is closed or nobody reads it."""
+    global _lost_lines  # noqa: PLW0603
+    if _lost_lines:
+        message = f"{message} ({_lost_lines} lines before this one could not be written)"
+    data = f"talk: {message}\n".encode(errors="backslashreplace")
+    if len(data) > _MAX_LOG_LINE_BYTES:
+        data = data[: _MAX_LOG_LINE_BYTES - 1] + b"\n"
     try:
         fd = sys.stderr.fileno() if sys.stderr else 2
         poll = select.poll()
         poll.register(fd, select.POLLOUT)
         if not poll.poll(0):
-            _lost += 1
+            _lost_lines += 1
             return
         os.write(fd, data)
-        _lost = 0
+        _lost_lines = 0
     except (OSError, ValueError):
-        _lost += 1
+        _lost_lines += 1
 
 
-def seldom(kind: str, words: str) -> None:
-    """Write a line at most once a minute for each kind; the next one says how often it was not written."""
-    more = _seldom.setdefault(kind, Quota(1, _SELDOM)).take(time.monotonic())
-    if more is not None:
-        line(f"{words} ({more} more of these were not logged)" if more else words)
+def write_limited(kind: str, message: str) -> None:
+    """Write at most one line of each kind per minute. The next line gives the number of lines left out."""
+    suppressed = _rate_limits.setdefault(kind, RateLimit(1, _REPEAT_AFTER_S)).allow(time.monotonic())
+    if suppressed is not None:
+        write(f"{message} ({suppressed} more of these were not logged)" if suppressed else message)
 
 
-def bug(what: str, error: Exception) -> None:
-    """Write a line of a bug, with the place where it is."""
+def write_bug(what: str, error: Exception) -> None:
+    """Write a line about an unexpected exception, with the file and line that raised it."""
     frames = traceback.extract_tb(error.__traceback__)
     place = f" at {os.path.basename(frames[-1].filename)}:{frames[-1].lineno}" if frames else ""
-    line(f"a bug in {what}{place}: {shown(f'{type(error).__name__}: {error}')}")
+    write(f"a bug in {what}{place}: {sanitize(f'{type(error).__name__}: {error}')}")
 
 
-def loop_bug(_loop: object, context: Mapping[str, Any]) -> None:
-    """Write a line of a bug that an event loop has met; its exception handler."""
-    error, words = context.get("exception"), str(context.get("message"))
+def handle_loop_error(_loop: object, context: Mapping[str, Any]) -> None:
+    """Log an error that the event loop caught. This is the loop's exception handler."""
+    error, message = context.get("exception"), str(context.get("message"))
     if isinstance(error, Exception):
-        bug(words, error)
+        write_bug(message, error)
     else:
-        line(shown(words))
+        write(sanitize(message))
 
 
-def shown(words: str) -> str:
-    """Return words that may hold text from elsewhere, fit for one line of the log."""
-    return printable(words, _MAX_TEXT)
+def sanitize(text: str) -> str:
+    """Return text from elsewhere in a form that is safe for the log: escaped, shortened and on one line."""
+    return printable(text, _MAX_LOGGED_TEXT_CHARS)

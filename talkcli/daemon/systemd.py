@@ -1,7 +1,8 @@
-"""What a supervisor is told: that this process is ready, how it is, that its event loop lives, that it ends.
+"""Notifications for the service manager: that the process is ready, works, is alive or is about to end.
 
-The datagrams of sd_notify(3), which systemd and others read. Without NOTIFY_SOCKET nothing happens. It never waits:
-what the supervisor can't take now is told with what follows. Goals' texts are not told: any user may read what is.
+The notifications are datagrams as in sd_notify(3), for systemd and others. Without NOTIFY_SOCKET nothing is sent.
+Sending never waits. If the service manager can't take a notification now, it gets the text with the next one. The
+status contains no text of goals, because every user of the machine can read it.
 """
 
 from __future__ import annotations
@@ -16,51 +17,59 @@ if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable
 
-#: Seconds after a change until it is told, so that a burst of goals is one message.
-STATUS_AFTER = 0.5
-#: Seconds after which what could not be sent is sent again.
-RETRY_AFTER = 0.5
-#: Signs of life in the time after which the supervisor gives the process up: one may come late.
-BEATS = 2.5
+#: Delay between a change and its notification, so that many goals in a row cause only one.
+STATUS_DELAY_S = 0.5
+#: Delay before a failed notification is sent again.
+NOTIFY_RETRY_DELAY_S = 0.5
+#: Watchdog notifications per watchdog timeout. With this many, one can be late.
+_WATCHDOGS_PER_TIMEOUT_COUNT = 2.5
 
 
-class Systemd:
-    """The one that started this process, if it wants to be told. All calls are made in the event loop's thread."""
+class ServiceManager:
+    """The service manager that started this process, if there is one.
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, words: Callable[[], str]) -> None:
-        """`words` returns how the process is, in one line for people."""
+    Call every method in the event loop's thread.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, describe_status: Callable[[], str]) -> None:
+        """Open a socket to the service manager.
+
+        Args:
+            loop: the loop that sends delayed notifications.
+            describe_status: returns the status of the process in one line for people.
+        """
         self._loop = loop
-        self._words = words
-        self._address = _address(os.environ.get("NOTIFY_SOCKET", ""))
+        self._describe_status = describe_status
+        self._address = _notify_address(os.environ.get("NOTIFY_SOCKET", ""))
         self._socket: socket.socket | None = None
-        self._beat = _beat()
-        #: what could not be sent yet; the newest of each kind
+        self._watchdog_interval = _watchdog_interval()
+        #: fields that could not be sent yet, with the newest value of each
         self._unsent: dict[str, str] = {}
         self._status = ""
         self._timers: dict[str, asyncio.TimerHandle] = {}
         if self._address:
-            # Opened once: a process that has used up its descriptors must still give signs of life.
+            # Opened only once: a process without free descriptors must still reach its watchdog.
             self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
             self._socket.setblocking(False)
 
-    def ready(self) -> None:
-        """Say that the process does its work, and begin with the signs of life."""
-        self._status = self._words()
+    def notify_ready(self) -> None:
+        """Report that the process is ready, and start the watchdog notifications."""
+        self._status = self._describe_status()
         self._send(READY="1", STATUS=self._status)
-        self._live()
+        self._notify_watchdog()
 
-    def changed(self) -> None:
-        """Say soon how the process is now."""
-        self._later("status", STATUS_AFTER, self._tell_status)
+    def schedule_status(self) -> None:
+        """Report the status after a short delay."""
+        self._schedule("status", STATUS_DELAY_S, self._notify_status)
 
-    def stopping(self) -> None:
-        """Say that the process ends; the signs of life go on until `close`."""
+    def notify_stopping(self) -> None:
+        """Report that the process is about to end. Watchdog notifications continue until `close`."""
         if self._status != "ending":
             self._status = "ending"
             self._send(STOPPING="1", STATUS=self._status)
 
     def close(self) -> None:
-        """Say nothing more."""
+        """Stop all notifications."""
         for timer in self._timers.values():
             timer.cancel()
         self._timers.clear()
@@ -68,18 +77,18 @@ class Systemd:
             self._socket.close()
             self._socket = None
 
-    def _tell_status(self) -> None:
-        words = self._words()
-        if self._status not in {words, "ending"}:
-            self._status = words
-            self._send(STATUS=words)
+    def _notify_status(self) -> None:
+        status = self._describe_status()
+        if self._status not in {status, "ending"}:
+            self._status = status
+            self._send(STATUS=status)
 
-    def _live(self) -> None:
-        if self._beat:
+    def _notify_watchdog(self) -> None:
+        if self._watchdog_interval:
             self._send(WATCHDOG="1")
-            self._later("beat", self._beat, self._live)
+            self._schedule("watchdog", self._watchdog_interval, self._notify_watchdog)
 
-    def _later(self, name: str, seconds: float, action: Callable[[], None]) -> None:
+    def _schedule(self, name: str, seconds: float, action: Callable[[], None]) -> None:
         if self._socket is None or name in self._timers:
             return
 
@@ -97,25 +106,27 @@ class Systemd:
         try:
             self._socket.sendto(data, self._address)
         except OSError as error:
-            if not isinstance(error, BlockingIOError):  # else it has too much to read at this moment
-                log.seldom("supervisor", f"the supervisor (NOTIFY_SOCKET) can't be told anything: {error.strerror}")
-            self._later("retry", RETRY_AFTER, self._send)
+            if not isinstance(error, BlockingIOError):  # BlockingIOError: its queue is full at the moment
+                log.write_limited(
+                    "supervisor", f"the supervisor (NOTIFY_SOCKET) can't be told anything: {error.strerror}"
+                )
+            self._schedule("retry", NOTIFY_RETRY_DELAY_S, self._send)
         else:
             self._unsent.clear()
 
 
-def _address(name: str) -> str:
-    """Return the address to send to; empty where there is none, or one that no Unix socket has."""
+def _notify_address(name: str) -> str:
+    """Return the socket address in NOTIFY_SOCKET, or "" if it is unset or invalid."""
     if name.startswith("@"):
-        return "\0" + name[1:]  # Linux's abstract sockets, which have no file
+        return "\0" + name[1:]  # an abstract socket of Linux, which has no file
     return name if os.path.isabs(name) else ""
 
 
-def _beat() -> float | None:
-    """Return the seconds between two signs of life; None if nobody counts them."""
-    limit, this = os.environ.get("WATCHDOG_USEC", ""), str(os.getpid())
-    if not (limit.isascii() and limit.isdecimal() and int(limit)):
+def _watchdog_interval() -> float | None:
+    """Return the seconds between two watchdog notifications, or None if there is no watchdog."""
+    timeout, own_pid = os.environ.get("WATCHDOG_USEC", ""), str(os.getpid())
+    if not (timeout.isascii() and timeout.isdecimal() and int(timeout)):
         return None
-    if os.environ.get("WATCHDOG_PID", this) != this:
-        return None  # another process of this unit is watched
-    return int(limit) / 1e6 / BEATS
+    if os.environ.get("WATCHDOG_PID", own_pid) != own_pid:
+        return None  # the watchdog watches another process of this unit
+    return int(timeout) / 1e6 / _WATCHDOGS_PER_TIMEOUT_COUNT

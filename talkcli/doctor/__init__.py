@@ -1,7 +1,10 @@
-"""What `talk doctor` knows: everything between a sentence and a loudspeaker, looked at in order.
+"""The checks of `talk doctor`: everything between a sentence and the loudspeaker, in order.
 
-`machine`, `voice`, `neural`, `sound`, `server` and `sentence` each have one subject: its facts as frozen values, who
-gathers them, and what they mean. A judgement is pure: facts go in, findings come out. A new check is a fact and what it
-means, in the module of its subject, and its place in `examine`. `broker` has both for a robot of a fleet, whose name is
-given. It may import all but `talkcli.server` and the cli.
+- `voice`, `sound`, `server` and `sentence` have the checks of one subject each. Every check consists of facts, a
+  function that finds them, and a `judge_…` function that turns them into findings. Judging is pure.
+- `examine` runs the checks in order.
+- `broker` has all checks of a robot behind an MQTT broker.
+- `report` defines findings and shows them.
+
+To add a check, add its facts and its judgement to the module of its subject, and call both in `examine`.
 """

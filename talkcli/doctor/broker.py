@@ -19,8 +19,8 @@ from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
 from talkcli.client.client import Client
-from talkcli.doctor.report import ADMITTED, ANSWERED, FAILED, Finding, failed, ok, some, warning
-from talkcli.doctor.server import span, summary
+from talkcli.doctor.report import BRIDGE_QUESTION, FAILURE, ROBOT_QUESTION, Finding, failure, join_names, ok, warning
+from talkcli.doctor.server import format_span, summarize_server
 from talkcli.errors import ServerUnavailable, TalkError, UsageError
 from talkcli.fleet import topics
 from talkcli.fleet.broker import CA, URL, USER, client_user, from_environment, is_local
@@ -135,7 +135,7 @@ class BrokerExamination:
     @property
     def question(self) -> Question:
         """The question to answer. It depends on the login: a robot's own login can't send requests to robots."""
-        return ADMITTED if self._is_robot else ANSWERED
+        return BRIDGE_QUESTION if self._is_robot else ROBOT_QUESTION
 
     def findings(self) -> Iterator[Finding]:
         """Yield each finding as soon as it is known, up to the first failure that prevents other checks."""
@@ -170,11 +170,11 @@ class BrokerExamination:
         elif self._is_robot:
             presence_finding = ok("name", f"'{self._robot}' is free: no bridge has it, and none had it")
         else:
-            may = rights_finding.state != FAILED
+            may = rights_finding.state != FAILURE
             presence_finding = judge_unknown(self._robot, self._known_robots(broker) if may else (), name, may=may)
         yield presence_finding
         yield rights_finding
-        if not self._is_robot and FAILED not in (presence_finding.state, rights_finding.state):
+        if not self._is_robot and FAILURE not in (presence_finding.state, rights_finding.state):
             yield self._ask_robot(broker)
 
     def _log_in(self, broker: Broker, on_message: Callable[[Message], None]) -> Link:
@@ -250,7 +250,7 @@ class BrokerExamination:
         except TalkError as error:
             wrong, _, remedy = error.message.partition("; ")
             step = f"see what the bridge's log says, on {self._robot}: journalctl -u talk-bridge"
-            return failed("bridge", wrong, remedy or step)
+            return failure("bridge", wrong, remedy or step)
 
     def _wait_for(self, work: Callable[[], _Result]) -> _Result:
         """Run blocking work in a thread, and return its result.
@@ -316,8 +316,8 @@ def judge_settings(words: str, *, named: bool) -> Finding:
         named: whether TALK_BROKER is set.
     """
     if not named:
-        return failed("broker", f"{URL} is not set", f"export {URL}=mqtts://broker.example")
-    return failed("broker", words, "mend it where it is set: the shell's start file, or EnvironmentFile= of a unit")
+        return failure("broker", f"{URL} is not set", f"export {URL}=mqtts://broker.example")
+    return failure("broker", words, "mend it where it is set: the shell's start file, or EnvironmentFile= of a unit")
 
 
 def judge_connection(broker: Broker, connection: BrokerConnection) -> Finding:
@@ -325,7 +325,7 @@ def judge_connection(broker: Broker, connection: BrokerConnection) -> Finding:
     if connection.trouble is None:
         return ok("broker", f"{broker.url} takes connections, in {connection.took * 1000:.0f} ms")
     step = _UNREACHABLE_STEPS.get(connection.trouble, _UNREACHABLE_STEPS[_NO_ANSWER])
-    return failed("broker", f"{broker.url}: {connection.trouble}", step.format(host=broker.host, port=broker.port))
+    return failure("broker", f"{broker.url}: {connection.trouble}", step.format(host=broker.host, port=broker.port))
 
 
 def judge_certificate(broker: Broker, connection: BrokerConnection, now: float, *, near: bool) -> list[Finding]:
@@ -346,12 +346,12 @@ def judge_certificate(broker: Broker, connection: BrokerConnection, now: float, 
         return [warning(check, words, step)]
     by = f"the CA in {broker.ca}" if broker.ca else "the system's CAs"
     if connection.untrusted is not None:
-        return [failed(check, f"{connection.untrusted} (by {by})", _trust_step(broker, connection, now))]
+        return [failure(check, f"{connection.untrusted} (by {by})", _trust_step(broker, connection, now))]
     if connection.until is None:
         return []
     date = time.strftime("%Y-%m-%d", time.gmtime(connection.until))
     if connection.until - now < _RENEWAL_LIMIT_S:
-        words = f"good until {date}, {span(connection.until - now)} from now; trusted by {by}"
+        words = f"good until {date}, {format_span(connection.until - now)} from now; trusted by {by}"
         return [warning(check, words, f"renew the certificate of {broker.host}, and have mosquitto read it: SIGHUP")]
     return [ok(check, f"trusted by {by}; good until {date}")]
 
@@ -382,7 +382,7 @@ def judge_login(broker: Broker, refusal: str | None) -> Finding:
             step += "; where it wants a certificate, TALK_MQTT_CERT and TALK_MQTT_KEY name it"
         elif not broker.tls:
             step += f"; where port {broker.port} is for TLS: {URL}=mqtts://{broker.host}:{broker.port}"
-        return failed("login", wrong, step)
+        return failure("login", wrong, step)
     how = [words for words, given in (("a password", broker.password), ("a certificate", broker.cert)) if given]
     who = "nobody" if broker.user is None else f"'{broker.user}'"
     return ok("login", f"as {who}, with {' and '.join(how) or 'neither password nor certificate'}")
@@ -401,16 +401,16 @@ def judge_presence(presence: Presence, now: float) -> Finding:
     robot = presence.name
     if not presence.online:
         step = f"see on {robot}: systemctl status talk-bridge; it has lost its network, its power, or its bridge"
-        return failed("name", f"{robot} is offline", step)
+        return failure("name", f"{robot} is offline", step)
     words = f"{robot} is online"
     if presence.since is not None:
-        words += f" for {span(now - presence.since)}"
+        words += f" for {format_span(now - presence.since)}"
     words += f", session {presence.session}"
     if presence.groups:
-        words += f", of {some(presence.groups)}"
+        words += f", of {join_names(presence.groups)}"
     server = presence.server
     if server is None:
-        return failed("name", f"{words}; it has no talk server", f"on {robot}: systemctl status talk; talk doctor")
+        return failure("name", f"{words}; it has no talk server", f"on {robot}: systemctl status talk; talk doctor")
     return ok("name", f"{words}; its server is talk {server.get('version')}, process {server.get('pid')}")
 
 
@@ -427,14 +427,14 @@ def judge_unknown(robot: str, known: tuple[str, ...], name: str, *, may: bool) -
     by_lower = {each.lower(): each for each in known}
     near = [by_lower[each] for each in difflib.get_close_matches(robot.lower(), by_lower)]
     if near:
-        return failed("name", f"{words}; it knows {some(tuple(near))}", f"talk --robot {near[0]} doctor")
+        return failure("name", f"{words}; it knows {join_names(tuple(near))}", f"talk --robot {near[0]} doctor")
     step = f"on the robot: talk bridge --name {robot}"
     if known:
-        return failed("name", f"{words}; it knows {some(known)}", step)
+        return failure("name", f"{words}; it knows {join_names(known)}", step)
     words += f", or does not tell '{name}'"
     if not may:
         return warning("name", words, f"let '{name}' do what an operator does, and ask again")
-    return failed("name", words, f"{step}; or let '{name}' read presence: talk bridge --print-acl")
+    return failure("name", words, f"{step}; or let '{name}' read presence: talk bridge --print-acl")
 
 
 def judge_rights(name: str, rights: AccessRights) -> Finding:
@@ -444,15 +444,15 @@ def judge_rights(name: str, rights: AccessRights) -> Finding:
     parts += [f"read {' and '.join(rights.unread)}"] if rights.unread and rights.trouble is None else []
     if parts:
         words = f"the broker does not let '{name}' {', nor '.join(parts)}"
-        return failed("rights", words, "give the broker's acl_file the lines for that: talk bridge --print-acl")
+        return failure("rights", words, "give the broker's acl_file the lines for that: talk bridge --print-acl")
     if rights.trouble is not None:
-        return failed("rights", f"what '{name}' may do can't be found out: {rights.trouble}", _LOG_STEP)
+        return failure("rights", f"what '{name}' may do can't be found out: {rights.trouble}", _LOG_STEP)
     return ok("rights", f"the broker lets '{name}' do what is needed")
 
 
 def judge_bridge(robot: str, server: JsonObject, took: float) -> Finding:
     """Judge the robot's answer, which took so many seconds."""
-    words = f"{robot} answers in {took * 1000:.0f} ms: {summary(server)}"
+    words = f"{robot} answers in {took * 1000:.0f} ms: {summarize_server(server)}"
     if server.get("paused") is True:
         return warning("bridge", f"speech is paused; {words}", f"talk --robot {robot} resume")
     if server.get("engine") not in {"ready", "starting"}:

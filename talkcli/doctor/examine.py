@@ -1,6 +1,7 @@
-"""All checks, in the order of the way that a sentence takes; what each needs is gathered just before it is judged.
+"""All checks of this machine, in the order in which a sentence passes through them.
 
-It must never hang: whatever is asked has a limit of time. And it changes nothing: its own goal is all that it sends.
+Each check is judged as soon as its facts are known. The examination never hangs, because every question has a time
+limit. It changes nothing: the only thing that it sends is one goal.
 """
 
 from __future__ import annotations
@@ -11,13 +12,15 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
-from talkcli.doctor import machine, sentence, server, sound, voice
-from talkcli.doctor.report import HEARD
+from talkcli.doctor import sentence, server, sound, voice
+from talkcli.doctor.report import SENTENCE_QUESTION
+from talkcli.doctor.voice import SENTENCE_TEXT
 from talkcli.engine import models
 from talkcli.engine.players import PLAYERS, is_silent
 from talkcli.engine.voices import find_voice, is_neural, is_own_driver
 from talkcli.errors import TalkError
 from talkcli.frozen import replace
+from talkcli.goals.reasons import Reason
 from talkcli.goals.states import State
 
 if TYPE_CHECKING:
@@ -27,140 +30,148 @@ if TYPE_CHECKING:
     from talkcli.doctor.report import Finding
     from talkcli.goals.goal import JsonObject
 
-#: Seconds that the sentence may take, its time in the queue included: long enough for one that is being spoken.
-LIMIT = 20.0
+#: Time limit for the sentence, including its time in the queue. A long sentence may be spoken before it.
+SENTENCE_LIMIT_S = 20.0
 
 
-class Examination:
-    """One run of the doctor."""
+class LocalExamination:
+    """One examination of this machine and its server."""
 
-    question = HEARD
+    question = SENTENCE_QUESTION
 
     def __init__(self, socket: str | None, *, silent: bool, interrupt: Mapping[int, int] | None = None) -> None:
-        """`socket`: --socket; `silent`: play the sentence without sound; `interrupt`: what ends it, as in `ready`."""
-        self._option = socket
+        """Prepare an examination.
+
+        Args:
+            socket: the value of --socket.
+            silent: whether to play the sentence without sound.
+            interrupt: descriptors that interrupt any wait, as in `wait_ready`.
+        """
+        self._socket = socket
         self._silent = silent
         self._interrupt = interrupt
-        #: what the server says of itself; empty without one
+        self._client: Client | None = None
+        #: the server's description of itself, or empty without a server
         self._server: JsonObject = {}
-        self._found: list[Finding] = []
-        #: the server's process, where it runs here
-        self._process: int | None = None
-        #: whether the sound server hangs: whoever asks it again waits again
-        self._hangs = False
-        #: the environment of what plays
+        #: the server's process id if it runs on this machine
+        self._server_pid: int | None = None
+        self._engine = voice.EngineReport()
+        #: session and environment of the player
+        self._session = sound.UserSession(0, "")
         self._env: Mapping[str, str] = os.environ
+        #: whether the sound server hangs, so that every question to it takes long
+        self._hangs = False
+        self._findings: list[Finding] = []
 
     def findings(self) -> Iterator[Finding]:
-        """Give each finding as soon as it is known; Interrupted."""
-        client, found = server.connect(self._option, self._interrupt)
+        """Run all checks, and yield each finding at once. May raise Interrupted."""
+        client, search = server.connect(self._socket, self._interrupt)
         with client or contextlib.nullcontext():
-            for each in self._all(client, found):
-                told = sound.installing(each, self._env)
-                self._found.append(told)
-                yield told
+            for each in self._run_checks(client, search):
+                finding = sound.add_pactl_package(each, self._env)
+                self._findings.append(finding)
+                yield finding
 
-    def _all(self, client: Client | None, found: server.Places) -> Iterator[Finding]:
-        itself: list[Finding] = []
+    def _run_checks(self, client: Client | None, search: server.SocketSearch) -> Iterator[Finding]:
+        of_server: list[Finding] = []
         if client is not None:
             try:
-                self._server, log = server.described(client)
-                itself = server.judge(self._server, log, time.time())
+                self._server, log = server.describe_server(client)
+                of_server = server.judge_server(self._server, log, time.time())
             except TalkError as error:
-                client, itself = None, [server.gone(error.message)]
-        named = None if client else os.environ.get("TALK_VOICE") or None
-        engine = voice.look(voice.Setting(voice=named, interrupt=self._interrupt))
-        yield voice.python()
-        yield from voice.judge(voice.pyttsx3(), engine, server=self._told("engine"))
-        process = self._process = server.process_here(client) if client else None
-        here, env = machine.surroundings(process)
-        self._env = env
-        used = self._told("voice") if self._server else named
-        yield from self._neural(used, engine, here, env, running=client is not None)
-        if client is not None and process is None:
-            yield machine.ELSEWHERE
-            yield from sound.judge_silent(self._player(), running=True)
+                client, of_server = None, [server.judge_gone(error.message)]
+        self._client = client
+        self._server_pid = None if client is None else server.local_pid(client)
+        voice_here = None if client else self._setting("voice", "TALK_VOICE")
+        self._engine = voice.find_engine(voice.EngineOptions(voice=voice_here, interrupt=self._interrupt))
+        yield voice.judge_python()
+        pyttsx3 = voice.installed_version("pyttsx3")
+        yield from voice.judge_engine(pyttsx3, self._engine, server=self._setting("engine"))
+        self._session, self._env = sound.find_session(self._server_pid)
+        yield from self._check_neural()
+        if client is not None and self._server_pid is None:
+            yield sound.SESSION_ELSEWHERE
+            yield from sound.judge_silent_player(self._player, by_server=True)
         elif sys.platform.startswith("linux"):
-            yield machine.judge_session(here)
-            yield from self._sound(engine, here, env, running=client is not None)
-        yield server.judge_places(found)
-        yield from itself
-        yield self._sentence(client, engine, here, env)
+            yield sound.judge_session(self._session)
+            yield from self._check_sound()
+        yield server.judge_search(search)
+        yield from of_server
+        yield self._check_sentence()
 
-    def _neural(
-        self, used: str | None, engine: voice.Engine, here: machine.Session, env: Mapping[str, str], *, running: bool
-    ) -> Iterator[Finding]:
-        """Look at neural voices, where something asks for one, or any is there."""
-        told = self._server.get("neural_voices")
-        if used and not is_neural(used):  # the engine knows what a short name means, unless it failed because of that
-            used = used if engine.reason and find_voice(used, models.undescribed(env)) else engine.voice
-        if not is_own_driver(self._told("driver")) or not (used or told or engine.neural or env.get("TALK_VOICES")):
-            return
-        from talkcli.doctor import neural
-
-        if running and here.server is None:  # its files and its Python are another machine's or another user's
-            yield from neural.judge_told(told)
-            return
-        yield from neural.judge(neural.look(used, env, LIMIT, self._interrupt), server=running, told=told)
-
-    def _player(self) -> str | None:
-        """Return the player that is set, by the server or for this process."""
-        return self._told("player") if self._server else os.environ.get("TALK_PLAYER") or None
-
-    def _told(self, setting: str) -> str | None:
-        """Return a setting of the server's; None where it has none, or there is no server."""
-        value = self._server.get(setting)
+    def _setting(self, name: str, variable: str = "") -> str | None:
+        """Return a setting of the server, or the value of a variable if there is no server. None if it isn't set."""
+        value = self._server.get(name) if self._server else os.environ.get(variable)
         return str(value) if value else None
 
-    def _sound(
-        self, engine: voice.Engine, here: machine.Session, env: Mapping[str, str], *, running: bool
-    ) -> Iterator[Finding]:
-        if not is_own_driver(self._told("driver")):
-            return  # it plays by itself
-        wanted, device = self._player(), self._told("device")
-        players = sound.players(env, wanted, None if running else engine.player)
-        cards, found = machine.cards(here), sound.sound_server(env, here)
-        used = wanted or players.first or ("pulse" if found.name and found.pulse else next(iter(players.found), None))
-        devices = None if used == "pulse" and found.hangs else sound.devices(env, used, device)
+    @property
+    def _player(self) -> str | None:
+        return self._setting("player", "TALK_PLAYER")
+
+    def _check_neural(self) -> Iterator[Finding]:
+        """Check neural voices if one is installed or in use."""
+        used, engine, env = self._setting("voice", "TALK_VOICE"), self._engine, self._env
+        reported = self._server.get("neural_voices")
+        server_voices = reported if isinstance(reported, dict) else {}
+        if used and not is_neural(used):
+            # The engine knows the voice that a short name stands for, unless it failed because of this name.
+            used = used if engine.reason and find_voice(used, models.undescribed(env)) else engine.neural_voice
+        needed = used or server_voices or engine.neural_count or env.get("TALK_VOICES")
+        if not needed or not is_own_driver(self._setting("driver")):
+            return
+        if self._client and self._session.server_pid is None:  # the server has its own files and Python
+            yield from voice.judge_server_voices(server_voices)
+            return
+        options = voice.EngineOptions(env=env, interrupt=self._interrupt)
+        facts = voice.find_neural(used, options, SENTENCE_LIMIT_S)
+        yield from voice.judge_neural(facts, has_server=self._client is not None, server_voices=server_voices)
+
+    def _check_sound(self) -> Iterator[Finding]:
+        if not is_own_driver(self._setting("driver")):
+            return  # other drivers of pyttsx3 play on their own
+        env, session, device, by_server = self._env, self._session, self._setting("device"), self._client is not None
+        players = sound.find_players(env, self._player, None if by_server else self._engine.player, by_server=by_server)
+        cards, found = sound.find_cards(session), sound.find_sound_server(env, session)
+        automatic = "pulse" if found.name and found.accepts_pulse else next(iter(players.found), None)
+        used = self._player or players.first or automatic
+        devices = None if used == "pulse" and found.hangs else sound.find_devices(env, used, device)
         self._hangs = found.hangs
-        yield from sound.judge(players, devices, cards, found, here, running=running)
-        if not is_silent(wanted):
-            default = device is None and used in PLAYERS
-            yield from sound.judge_levels(sound.levels(env, found, cards), default=default)
+        yield from sound.judge_sound(players, devices, cards, found, session)
+        if not is_silent(self._player):
+            levels = sound.find_levels(env, found, cards)
+            yield from sound.judge_levels(levels, is_used=device is None and used in PLAYERS)
 
-    def _sentence(
-        self, client: Client | None, engine: voice.Engine, here: machine.Session, env: Mapping[str, str]
-    ) -> Finding:
-        wanted = self._player()
+    def _check_sentence(self) -> Finding:
+        client, engine, player = self._client, self._engine, self._player
         if client is not None and self._silent:
-            if self._process is None:
-                return sentence.ELSEWHERE
-            played = sentence.beside(client, self._setting_of_server(self._process, env), LIMIT)
+            if self._server_pid is None:
+                return sentence.SENTENCE_ELSEWHERE
+            result = sentence.speak_beside_server(client, self._server_options(self._server_pid), SENTENCE_LIMIT_S)
         elif client is not None:
-            played = replace(sentence.by_server(client, sentence.TEXT, LIMIT), served=True)
+            result = replace(sentence.speak_by_server(client, SENTENCE_TEXT, SENTENCE_LIMIT_S), by_server=True)
         elif engine.reason is not None:
-            played = sentence.Played(State.ABORTED, engine.reason, engine.words)
+            result = sentence.SentenceResult(State.ABORTED, engine.reason, engine.message)
         else:
-            setting = voice.Setting(wanted, None, os.environ.get("TALK_VOICE") or None, self._interrupt)
-            played = sentence.by_engine(sentence.TEXT, setting, 0.0 if self._silent else 1.0, LIMIT)
-        custom = sound.is_custom(wanted)
-        behind = sentence.behind(self._found, custom=custom)
-        if self._silent and self._process is not None and here.server is None:
-            # Another user's, from whose surroundings nothing can be played; whose, a /proc with hidepid doesn't tell.
-            owner = machine.owner(f"/proc/{self._process}")
-            behind = behind if owner is None else sentence.AS_OWNER.format(owner)
-        if played.reason == "audio_stalled" and not (self._hangs or custom):
-            played = replace(played, suspended=sound.suspended(env))
-        silent = self._silent or is_silent(wanted)
-        return sentence.judge(played, silent=silent, behind=behind, hangs=self._hangs, device=self._told("device"))
+            used = self._setting("voice", "TALK_VOICE")
+            options = voice.EngineOptions(player, voice=used, interrupt=self._interrupt)
+            result = sentence.speak_by_engine(SENTENCE_TEXT, options, 0.0 if self._silent else 1.0, SENTENCE_LIMIT_S)
+        custom = sound.is_custom(player)
+        step = sentence.find_playback_step(self._findings, custom=custom)
+        if self._silent and self._server_pid is not None and self._session.server_pid is None:
+            # Another user's server: nothing can be played in its environment. With hidepid, /proc hides its owner.
+            owner = sound.file_owner(f"/proc/{self._server_pid}")
+            step = step if owner is None else sentence.RUN_AS_OWNER.format(owner)
+        if result.reason == Reason.AUDIO_STALLED and not (self._hangs or custom):
+            result = replace(result, suspended=sound.suspended_sinks(self._env))
+        silent, device = self._silent or is_silent(player), self._setting("device")
+        return sentence.judge_sentence(result, silent=silent, device=device, playback_step=step, hangs=self._hangs)
 
-    def _setting_of_server(self, process: int, env: Mapping[str, str]) -> voice.Setting:
-        """Return what the server speaks with, for a process that does as it does, without a sound."""
-        player, worked = self._told("player"), None
+    def _server_options(self, server_pid: int) -> voice.EngineOptions:
+        """Return the options that make the doctor's engine play like the server's."""
+        player, first = self._player, None
         if is_silent(player):
-            player = "null"  # a file would get a sentence more, perhaps in the middle of one of the server's
-        elif player in PLAYERS and not machine.names_a_player(process, env):
-            player, worked = None, player  # the server tries that one first, and then the others
-        return voice.Setting(
-            player, self._told("device"), self._told("voice"), self._interrupt, self._told("driver"), worked, env
-        )
+            player = "null"  # the server's output file must not get another sentence
+        elif player in PLAYERS and not sound.names_a_player(server_pid, self._env):
+            player, first = None, player  # the server's automatic choice: it would try the other players, too
+        device, used, driver = map(self._setting, ("device", "voice", "driver"))
+        return voice.EngineOptions(player, device, used, driver, first, self._env, self._interrupt)

@@ -1,13 +1,13 @@
-"""What was found: one finding a check, what all of them mean together, and how both are shown to people.
+"""The findings of the doctor: one per check, the conclusion from all of them, and how to show both.
 
-Pure: the screen comes from the caller.
+This module is pure. The caller passes the screen.
 """
 
 from __future__ import annotations
 
 import textwrap
 
-from talkcli.frozen import TYPE_CHECKING, frozen
+from talkcli.frozen import TYPE_CHECKING, fields, frozen
 from talkcli.goals.states import State
 from talkcli.terminal.text import COLUMN_GAP, Screen, pad, printable
 
@@ -16,117 +16,118 @@ if TYPE_CHECKING:
 
     from talkcli.goals.goal import JsonObject
 
-#: The states of a finding. A warning may be why a sentence is not heard; with a failure it is certain.
-OK, WARNING, FAILED = "ok", "warning", "failed"
-#: The check that sends a sentence all the way.
-SENTENCE = "sentence"
-#: Names that are shown of a long list.
-_SHOWN = 4
-#: Columns of the state, and of the check's name: of the longest of each.
-_STATE, _CHECK = 7, 12
-_INDENT = " " * (_STATE + _CHECK + 2 * len(COLUMN_GAP))
+#: The states of a finding. After a warning, a sentence may be inaudible. After a failure, it certainly is.
+OK, WARNING, FAILURE = "ok", "warning", "failed"
+#: The check that speaks a sentence.
+SENTENCE_CHECK = "sentence"
+#: How many names of a long list to show.
+_SHOWN_NAMES_COUNT = 4
+#: Widths of the first two columns, for the longest state and the longest name of a check.
+_STATE_WIDTH_CHARS, _CHECK_WIDTH_CHARS = 7, 12
+_MESSAGE_INDENT = " " * (_STATE_WIDTH_CHARS + _CHECK_WIDTH_CHARS + 2 * len(COLUMN_GAP))
 _ARROW = "-> "
-#: Before the next step, at the end.
-_STEP = "  "
-#: Which state of a goal has a finding's colour.
-_COLOURS = {OK: State.SUCCEEDED, WARNING: State.PREEMPTED, FAILED: State.ABORTED}
+_FINAL_STEP_INDENT = "  "
+#: The goal state whose colour a finding has.
+_FINDING_COLOURS = {OK: State.SUCCEEDED, WARNING: State.PREEMPTED, FAILURE: State.ABORTED}
 
 
 @frozen
 class Finding:
-    """What one check has found."""
+    """The result of one check."""
 
+    #: name of the check
     check: str
+    #: OK, WARNING or FAILURE
     state: str
-    #: for people; text of others in it is escaped already
+    #: description for people, with text from other programs already escaped
     message: str
-    #: the one thing to do, in plain words; None where nothing is to be done
+    #: what to do next, or None if nothing is wrong
     next: str | None = None
 
     def to_json(self) -> JsonObject:
-        return {"check": self.check, "state": self.state, "message": self.message, "next": self.next}
+        return fields(self)
 
 
 @frozen
 class Question:
-    """What is to be found out."""
+    """The question that an examination answers."""
 
-    #: the check without which nothing is proved
-    proof: str
-    #: the answers, for people
+    #: the check that has to succeed for the answer "yes"
+    check: str
+    #: the two answers, for people
     yes: str
     no: str
 
 
-#: Of a sentence here; of a robot of a fleet; and of that robot, where it asks itself.
-HEARD = Question(SENTENCE, "a sentence is heard, unless the loudspeaker itself is off", "a sentence would not be heard")
-ANSWERED = Question("bridge", "the robot answers", "the robot would not answer")
-ADMITTED = Question(
+SENTENCE_QUESTION = Question(
+    SENTENCE_CHECK, "a sentence is heard, unless the loudspeaker itself is off", "a sentence would not be heard"
+)
+ROBOT_QUESTION = Question("bridge", "the robot answers", "the robot would not answer")
+#: The question if a robot examines its own access to the broker.
+BRIDGE_QUESTION = Question(
     "rights", "the broker takes what this robot's bridge says", "this robot's bridge would not be heard"
 )
 
 
 def ok(check: str, message: str) -> Finding:
-    """Return a finding that all is well."""
+    """Return a finding that nothing is wrong."""
     return Finding(check, OK, printable(message))
 
 
 def warning(check: str, message: str, step: str) -> Finding:
-    """Return a finding of what may be why nothing is heard."""
+    """Return a finding about a possible reason why nothing is heard, with the next step."""
     return Finding(check, WARNING, printable(message), printable(step))
 
 
-def failed(check: str, message: str, step: str) -> Finding:
-    """Return a finding of what lets nothing be heard."""
-    return Finding(check, FAILED, printable(message), printable(step))
+def failure(check: str, message: str, step: str) -> Finding:
+    """Return a finding about a certain reason why nothing is heard, with the next step."""
+    return Finding(check, FAILURE, printable(message), printable(step))
 
 
-def some(names: tuple[str, ...]) -> str:
-    """Return names for people, not all of many."""
-    rest = len(names) - _SHOWN
-    return ", ".join(names) if rest <= 1 else f"{', '.join(names[:_SHOWN])} and {rest} more"
+def join_names(names: tuple[str, ...]) -> str:
+    """Return a list of names for people. A long list is shortened."""
+    hidden = len(names) - _SHOWN_NAMES_COUNT
+    return ", ".join(names) if hidden <= 1 else f"{', '.join(names[:_SHOWN_NAMES_COUNT])} and {hidden} more"
 
 
-def heard(findings: Sequence[Finding], question: Question = HEARD) -> bool:
-    """Tell whether a sentence would be heard, or whatever the question is: it was proved, and nothing failed."""
-    return any(each.check == question.proof for each in findings) and all(each.state != FAILED for each in findings)
+def is_answered_yes(findings: Sequence[Finding], question: Question = SENTENCE_QUESTION) -> bool:
+    """Return whether the check of the question was made and no check failed."""
+    return any(each.check == question.check for each in findings) and all(each.state != FAILURE for each in findings)
 
 
 def next_step(findings: Sequence[Finding]) -> str | None:
-    """Return the one thing to do: for the first that failed."""
-    return next((each.next for each in findings if each.state == FAILED), None)
+    """Return the next step of the first failure, or None if nothing failed."""
+    return next((each.next for each in findings if each.state == FAILURE), None)
 
 
-def lines(finding: Finding, screen: Screen) -> list[str]:
-    """Return a finding as it is shown: in a pipe one line, on a terminal the next step has lines of its own."""
-    state = screen.coloured(pad(finding.state, _STATE), _COLOURS[finding.state])
-    head = COLUMN_GAP.join((state, pad(finding.check, _CHECK), ""))
-    room = screen.columns_left(len(_INDENT))
+def format_finding(finding: Finding, screen: Screen) -> list[str]:
+    """Return the lines that show a finding. In a pipe it is one line; a terminal gets the next step below."""
+    state = screen.coloured(pad(finding.state, _STATE_WIDTH_CHARS), _FINDING_COLOURS[finding.state])
+    head = COLUMN_GAP.join((state, pad(finding.check, _CHECK_WIDTH_CHARS), ""))
+    room = screen.columns_left(len(_MESSAGE_INDENT))
     if room is None:
         return [head + finding.message + ("" if finding.next is None else f" {_ARROW}{finding.next}")]
-    first, *rest = _wrapped(finding.message, room) or [""]
-    steps = _wrapped(finding.next or "", room - len(_ARROW))
-    arrows = (_ARROW if number == 0 else " " * len(_ARROW) for number in range(len(steps)))
-    rest += [arrow + screen.coloured(each, None) for arrow, each in zip(arrows, steps, strict=True)]
-    return [head + first, *(_INDENT + each for each in rest)]
+    first, *rest = _wrap(finding.message, room) or [""]
+    for number, step in enumerate(_wrap(finding.next or "", room - len(_ARROW))):
+        rest.append((" " * len(_ARROW) if number else _ARROW) + screen.coloured(step, None))
+    return [head + first, *(_MESSAGE_INDENT + each for each in rest)]
 
 
-def verdict(findings: Sequence[Finding], screen: Screen, question: Question = HEARD) -> str:
-    """Return what it all means, with the one thing to do next on lines of its own."""
-    if heard(findings, question):
+def format_conclusion(findings: Sequence[Finding], screen: Screen, question: Question = SENTENCE_QUESTION) -> str:
+    """Return the answer to the question, followed by the next step if something failed."""
+    if is_answered_yes(findings, question):
         warned = sum(each.state == WARNING for each in findings)
-        seen = "" if not warned else "; 1 warning" if warned == 1 else f"; {warned} warnings"
-        return f"{question.yes}{seen}"
+        return question.yes + ("" if not warned else "; 1 warning" if warned == 1 else f"; {warned} warnings")
     step = next_step(findings)
     if step is None:
         return question.no
-    room = screen.columns_left(len(_STEP))
-    return "\n".join([f"{question.no}; do this next:", *(_STEP + each for each in _wrapped(step, room))])
+    steps = _wrap(step, screen.columns_left(len(_FINAL_STEP_INDENT)))
+    return "\n".join([f"{question.no}; do this next:", *(_FINAL_STEP_INDENT + each for each in steps)])
 
 
-def _wrapped(text: str, room: int | None) -> list[str]:
-    """Return the text as lines of so many columns; None for one line."""
+def _wrap(text: str, room: int | None) -> list[str]:
+    """Return the text in lines of this width. If `room` is None, it is one line."""
     if room is None:
         return [text]
-    # Paths and commands are copied: they are cut only where a line has no blank at all.
+    # People copy paths and commands, so these are only cut if a line has no blank at all.
     return textwrap.wrap(text, room, break_on_hyphens=False)

@@ -1,6 +1,6 @@
-"""The server: at which place it is or what is there instead, how it describes itself, and what has failed lately.
+"""The server: its socket, its description of itself, and the goals that failed recently.
 
-The doctor asks as any client does, with limits of time.
+The doctor connects like any client, with time limits.
 """
 
 from __future__ import annotations
@@ -13,15 +13,16 @@ import time
 from talkcli import __version__, paths, peers
 from talkcli.client.client import Client
 from talkcli.client.connection import SocketConnection
-from talkcli.doctor.machine import owner
-from talkcli.doctor.report import Finding, failed, ok, warning
-from talkcli.doctor.sentence import remedy
-from talkcli.doctor.voice import WORKING
+from talkcli.doctor.report import Finding, failure, ok, warning
+from talkcli.doctor.sentence import advise
+from talkcli.doctor.sound import file_owner
+from talkcli.doctor.voice import WORKING_STATES
 from talkcli.errors import TalkError
 from talkcli.frozen import TYPE_CHECKING, fields, frozen
 from talkcli.goals.options import told
+from talkcli.goals.reasons import Reason
 from talkcli.goals.states import State
-from talkcli.paths import ABSENT, DIRECTORY, FILE, FORBIDDEN, STALE
+from talkcli.paths import PLACE_ABSENT, PLACE_DIRECTORY, PLACE_FILE, PLACE_FORBIDDEN, PLACE_STALE
 from talkcli.terminal.goals import clock_time
 
 if TYPE_CHECKING:
@@ -29,251 +30,260 @@ if TYPE_CHECKING:
 
     from talkcli.goals.goal import Goal, JsonObject
 
-#: What this client calls itself.
-_NAME = "talk doctor"
-#: How an error begins that names every place: `Places` says that better.
-_NO_SERVER = "no server"
-#: Goals of the log that are looked at for failures, and the check of it.
-_LOG, _RECENT = 100, "recent goals"
-#: Seconds in which an engine should be ready, and between two looks whether it is.
-_STARTING, _PAUSE = 1.0, 0.05
-#: What is found at a place, beside what `found_at` finds where nobody can be reached.
-FOREIGN = "another user's server"
-#: A connection proves no more: the kernel takes it, whatever the process does.
-MUTE = "something listens"
-STOPPED = "a process listens that is stopped"
-SERVER = "the server"
-#: What to do where a server answers and takes no client, by the code of the client's error.
-_ANSWERS = {
+#: The client name that the doctor sends to the server.
+DOCTOR_NAME = "talk doctor"
+#: The start of an error message that lists all places. `SocketSearch` has more details about them.
+_NO_SERVER_PREFIX = "no server"
+#: How many goals of the log to check for failures.
+_LOG_GOALS_COUNT = 100
+_RECENT_CHECK = "recent goals"
+#: Time within which an engine should be ready, and the time between two requests for its state.
+_ENGINE_START_LIMIT_S, _ENGINE_POLL_S = 1.0, 0.05
+#: What is at a path if a connection succeeds. The kernel accepts it even if the process never answers. `paths` has the
+#: texts for failed connections.
+PLACE_FOREIGN = "another user's server"
+PLACE_LISTENING = "something listens"
+PLACE_STOPPED = "a process listens that is stopped"
+PLACE_SERVER = "the server"
+#: The next step if a server answers but accepts no client, by the code of the client's error.
+_REFUSAL_ADVICE = {
     "protocol_mismatch": "install the same talk on both sides, and start the server again",
     "busy": "end some of its clients, or raise the limit that is named: talk serve --max-clients 512, or LimitNOFILE=",
     "permission_denied": "have its owner let you in: talk serve --socket-mode 0660, and join the socket's group",
 }
-#: What to do about what is found, that which is most surely in the way first.
-_STEPS = {
-    FORBIDDEN: "have {whose} let you in: talk serve --socket-mode 0660, and join the socket's group; or start your own",
-    FOREIGN: "remove it, and: talk serve; or if you trust uid {uid}: talk --socket {path} doctor",
-    STOPPED: "let it go on: kill -CONT {pid}",
-    MUTE: "restart the server on {path}; if it is none of talk's, remove that",
-    FILE: "remove {path}, and: talk serve",
-    DIRECTORY: "remove {path}, and: talk serve",
-    STALE: "talk serve (it takes the place of what was left over)",
+#: The next step for each kind of place, the most likely cause first.
+_PLACE_ADVICE = {
+    PLACE_FORBIDDEN: "have {whose} let you in: talk serve --socket-mode 0660, and join the socket's group; "
+    "or start your own",
+    PLACE_FOREIGN: "remove it, and: talk serve; or if you trust uid {uid}: talk --socket {path} doctor",
+    PLACE_STOPPED: "let it go on: kill -CONT {pid}",
+    PLACE_LISTENING: "restart the server on {path}; if it is none of talk's, remove that",
+    PLACE_FILE: "remove {path}, and: talk serve",
+    PLACE_DIRECTORY: "remove {path}, and: talk serve",
+    PLACE_STALE: "talk serve (it takes the place of what was left over)",
 }
-#: By what names a socket: what stands between it and the name, and how it is not named any more.
-_AS = {"TALK_SOCKET": "=", "--socket": " "}
-_OFF: dict[str | None, str] = {"TALK_SOCKET": "unset TALK_SOCKET", "--socket": "leave --socket out"}
-#: Volume below which a server's setting may be why nobody hears it.
-_FAINT_SETTING = 0.2
+#: How to name a socket, and how to stop naming it, by the option or variable that does it.
+_NAMING = {"TALK_SOCKET": "TALK_SOCKET=", "--socket": "--socket "}
+_UNNAMING: dict[str | None, str] = {"TALK_SOCKET": "unset TALK_SOCKET", "--socket": "leave --socket out"}
+#: A lower volume setting may be the reason why nobody hears a server. Volumes are between 0 and 1.
+_FAINT_VOLUME = 0.2
 
 
 @frozen
-class Place:
-    """One path, and what is there."""
+class SocketPlace:
+    """A path where a server may listen, and what is there."""
 
     path: str
+    #: one of the PLACE texts, or the system's error message
     what: str
-    #: who owns what is there: the uid of a server or of a file
+    #: owner of the server or the file, or None if unknown
     uid: int | None = None
-    #: the process that listens or serves, where that is known
+    #: the listening process, or None if unknown
     pid: int | None = None
 
 
 @frozen
-class Places:
-    """All places that are tried, in order; where the server is, none is after that."""
+class SocketSearch:
+    """The result of searching for a server."""
 
-    places: tuple[Place, ...]
-    #: what named the only one: "--socket", "TALK_SOCKET"; None for the list
-    named: str | None = None
-    #: what a client's error says beyond the places, where none was, and its code
-    trouble: str | None = None
+    #: the places tried; if a server was found, it is the last one
+    places: tuple[SocketPlace, ...]
+    #: what named the only place, "--socket" or "TALK_SOCKET", or None if the usual places were tried
+    named_by: str | None = None
+    #: what a client's error says besides the places, or None
+    message: str | None = None
+    #: code of the client's error, or None
     code: str | None = None
-    #: a server of this user at a usual place, though another was named
-    elsewhere: str | None = None
+    #: a server of this user at a usual place, if another place was named
+    usual_server: str | None = None
     #: sockets of other users' servers
-    others: tuple[str, ...] = ()
+    foreign_sockets: tuple[str, ...] = ()
 
 
-def connect(option: str | None, interrupt: Mapping[int, int] | None) -> tuple[Client | None, Places]:
-    """Return a client of the server, if one can be had, and what is at each place; `option`: --socket."""
+def connect(option: str | None, interrupt: Mapping[int, int] | None) -> tuple[Client | None, SocketSearch]:
+    """Connect to the server. Return the client, or None if that failed, and what is at each place.
+
+    Args:
+        option: the value of --socket.
+        interrupt: descriptors that interrupt the wait.
+    """
     named = paths.named_socket(option)
-    by = "--socket" if option else "TALK_SOCKET" if named else None
+    named_by = "--socket" if option else "TALK_SOCKET" if named else None
     tried = paths.client_sockets(named)
-    #: where a client takes any user's server
+    #: places where a client trusts the server of any user
     trusted = {named, paths.SYSTEM_SOCKET}
     try:
-        client = Client.over(SocketConnection(option, name=_NAME, interrupt=interrupt))
+        client = Client.over(SocketConnection(option, name=DOCTOR_NAME, interrupt=interrupt))
     except TalkError as error:
-        found = tuple(_place(each, trusted) for each in tried)
-        trouble = _trouble(error.message.splitlines(), found)
+        found = tuple(_find_place(each, trusted) for each in tried)
         usual = paths.client_sockets(None) if named else []
-        elsewhere = next((each for each in usual if _place(each, set()).what == MUTE), None)
-        # Of other users root sees all, most see none.
-        others = sorted({*glob.glob(f"/run/user/*/talk/{paths.SOCKET}")}.difference(tried))
-        return None, Places(found, by, trouble, error.code, elsewhere, tuple(others))
-    before = tried[: tried.index(client.path)]
-    places = (*(_place(each, trusted) for each in before), Place(client.path, SERVER, pid=client.server_pid))
-    return client, Places(places, by)
+        usual_server = next((each for each in usual if _find_place(each, set()).what == PLACE_LISTENING), None)
+        # Root sees the sockets of all users, but most users see none of the others'.
+        others = sorted({*glob.glob(f"/run/user/*/talk/{paths.SOCKET_NAME}")}.difference(tried))
+        message = _client_message(error.message.splitlines(), found)
+        return None, SocketSearch(found, named_by, message, error.code, usual_server, tuple(others))
+    before = tuple(_find_place(each, trusted) for each in tried[: tried.index(client.path)])
+    place = SocketPlace(client.path, PLACE_SERVER, pid=client.server_pid)
+    return client, SocketSearch((*before, place), named_by)
 
 
-def _trouble(lines: list[str], found: tuple[Place, ...]) -> str | None:
-    """Return what an error says beyond the places: all of it, or why one that answers takes nobody."""
-    if not lines[0].startswith(_NO_SERVER):
+def _client_message(lines: list[str], found: tuple[SocketPlace, ...]) -> str | None:
+    """Return what a client's error message says besides the places, or why a process that listens did not accept it."""
+    if not lines[0].startswith(_NO_SERVER_PREFIX):
         return lines[0]
-    answering = [f"{each.path}: " for each in found if each.what in {MUTE, STOPPED}]
-    told = (line.strip() for line in lines[1:])
-    return next((line.removeprefix(each) for line in told for each in answering if line.startswith(each)), None)
+    listening = [f"{each.path}: " for each in found if each.what in {PLACE_LISTENING, PLACE_STOPPED}]
+    rest = (line.strip() for line in lines[1:])
+    return next((line.removeprefix(each) for line in rest for each in listening if line.startswith(each)), None)
 
 
-def _place(path: str, trusted: Container[str | None]) -> Place:
+def _find_place(path: str, trusted: Container[str | None]) -> SocketPlace:
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         try:
             probe.connect(path)
         except OSError as error:
-            full = isinstance(error, BlockingIOError)  # its backlog
-            uid = owner(path)
-            uid = owner(os.path.dirname(path)) if uid is None else uid
-            return Place(path, MUTE if full else paths.found_at(path, error), uid)
+            backlog_full = isinstance(error, BlockingIOError)
+            uid = file_owner(path)
+            uid = file_owner(os.path.dirname(path)) if uid is None else uid
+            return SocketPlace(path, PLACE_LISTENING if backlog_full else paths.describe_place(path, error), uid)
         pid, uid = peers.credentials(probe)
     if path not in trusted and uid not in {os.getuid(), 0}:
-        return Place(path, FOREIGN, uid, pid)
-    stopped = peers.stat_of(pid)[:1] == [b"T"]  # by Ctrl-Z for one
-    return Place(path, STOPPED if stopped else MUTE, uid, pid)
+        return SocketPlace(path, PLACE_FOREIGN, uid, pid)
+    stopped = peers.process_stat(pid)[:1] == [b"T"]  # for example by Ctrl-Z
+    return SocketPlace(path, PLACE_STOPPED if stopped else PLACE_LISTENING, uid, pid)
 
 
-def described(client: Client) -> tuple[JsonObject, list[Goal]]:
-    """Return how a server describes itself, and the goals that ended last, oldest first; TalkError where it goes away.
+def describe_server(client: Client) -> tuple[JsonObject, list[Goal]]:
+    """Return a server's description of itself and its recently ended goals, oldest first.
 
-    A server that has just been started doesn't know its player yet, and tells nobody when it does.
+    A server that has just started doesn't know its player yet, so this waits a short time for its engine.
     """
-    end = time.monotonic() + _STARTING
-    server, log = client.status().server, client.log(_LOG)
+    end = time.monotonic() + _ENGINE_START_LIMIT_S
+    server, log = client.status().server, client.log(_LOG_GOALS_COUNT)
     while server.get("engine") == "starting" and time.monotonic() < end:
-        time.sleep(_PAUSE)
+        time.sleep(_ENGINE_POLL_S)  # a client gets no event when the engine is ready
         server = client.status().server
     return server, log
 
 
-def process_here(client: Client) -> int | None:
-    """Return the server's process; None where it runs elsewhere, behind a socket that ssh forwards for one.
+def local_pid(client: Client) -> int | None:
+    """Return the server's process id, or None if it runs elsewhere, for example behind a socket forwarded by ssh.
 
-    Of a socket unit's socket the kernel names systemd, which has made it, as the one who listens.
+    If systemd made the socket, the kernel reports systemd as the process that listens.
     """
     pid = client._connection.listener
-    here = pid is not None and (pid == client.server_pid or peers.command_of(pid) == "systemd")
-    return client.server_pid if here else None
+    is_local = pid is not None and (pid == client.server_pid or peers.command_name(pid) == "systemd")
+    return client.server_pid if is_local else None
 
 
-def judge_places(found: Places) -> Finding:
-    """Judge where the server is."""
-    *tried, server = found.places
-    if server.what == SERVER:
-        before = [each for each in tried if each.what != ABSENT]
-        by = f"{found.named}, " if found.named else ""
-        words = f"the server is on {server.path} ({by}process {server.pid})"
-        if before:
-            passed = "; ".join(map(_shown, before))
-            return warning("socket", f"{words}; before it: {passed}", f"remove what is in the way: {before[0].path}")
-        return ok("socket", words)
-    places = "; ".join(map(_shown, found.places))
-    words = f"no server; {'named by ' + found.named if found.named else 'tried'}: {places}"
-    if found.trouble is not None and not any(each.what == STOPPED for each in found.places):
-        words = f"{words}; {found.trouble}"
-    return failed("socket", words, _step(found))
+def judge_search(search: SocketSearch) -> Finding:
+    """Judge whether the server was found, and whether something is in its way."""
+    *before, last = search.places
+    if last.what == PLACE_SERVER:
+        obstacles = [each for each in before if each.what != PLACE_ABSENT]
+        by = f"{search.named_by}, " if search.named_by else ""
+        words = f"the server is on {last.path} ({by}process {last.pid})"
+        if not obstacles:
+            return ok("socket", words)
+        words = f"{words}; before it: {'; '.join(map(_format_place, obstacles))}"
+        return warning("socket", words, f"remove what is in the way: {obstacles[0].path}")
+    tried = f"named by {search.named_by}" if search.named_by else "tried"
+    words = f"no server; {tried}: {'; '.join(map(_format_place, search.places))}"
+    if search.message is not None and not any(each.what == PLACE_STOPPED for each in search.places):
+        words = f"{words}; {search.message}"
+    return failure("socket", words, _search_step(search))
 
 
-def _shown(place: Place) -> str:
-    whose = "" if place.uid is None or place.what not in {FOREIGN, FORBIDDEN} else f" (uid {place.uid})"
+def _format_place(place: SocketPlace) -> str:
+    whose = "" if place.uid is None or place.what not in {PLACE_FOREIGN, PLACE_FORBIDDEN} else f" (uid {place.uid})"
     return f"{place.path}: {place.what}{whose}"
 
 
-def _step(found: Places) -> str:
-    if found.elsewhere is not None:
-        return f"{_OFF[found.named]}: a server is on {found.elsewhere}"
-    place = next((each for what in _STEPS for each in found.places if each.what == what), None)
-    if place is None:
-        return _start(found)
-    if place.what == MUTE and found.code in _ANSWERS:
-        return _ANSWERS[found.code]
-    if found.named is not None and place.what == DIRECTORY:
-        return f"name the socket in it: {found.named}{_AS[found.named]}{place.path.rstrip('/')}/talk.sock"
-    if found.named is not None and place.what == FILE:
-        return f"{_OFF[found.named]}, or name a socket"
+def _search_step(search: SocketSearch) -> str:
+    """Return the next step if no server was found."""
+    named_by = search.named_by
+    if search.usual_server is not None:
+        return f"{_UNNAMING[named_by]}: a server is on {search.usual_server}"
+    place = next((each for what in _PLACE_ADVICE for each in search.places if each.what == what), None)
+    if place is None:  # nothing is in the way of a new server
+        if search.foreign_sockets:
+            return f"talk serve; or use another user's server: talk --socket {search.foreign_sockets[0]} doctor"
+        if named_by is None:
+            return "talk serve"
+        option = f" --socket {search.places[0].path}" if named_by == "--socket" else ""
+        return f"{_UNNAMING[named_by]}, or start a server there: talk serve{option}"
+    if place.what == PLACE_LISTENING and search.code in _REFUSAL_ADVICE:
+        return _REFUSAL_ADVICE[search.code]
+    if named_by is not None and place.what == PLACE_DIRECTORY:
+        return f"name the socket in it: {_NAMING[named_by]}{place.path.rstrip('/')}/talk.sock"
+    if named_by is not None and place.what == PLACE_FILE:
+        return f"{_UNNAMING[named_by]}, or name a socket"
     whose = "its owner" if place.uid is None else f"uid {place.uid}"
-    return _STEPS[place.what].format(whose=whose, **fields(place))
+    return _PLACE_ADVICE[place.what].format(whose=whose, **fields(place))
 
 
-def _start(found: Places) -> str:
-    if found.others:
-        return f"talk serve; or use another user's server: talk --socket {found.others[0]} doctor"
-    if found.named is None:
-        return "talk serve"
-    option = f" --socket {found.places[0].path}" if found.named == "--socket" else ""
-    return f"{_OFF[found.named]}, or start a server there: talk serve{option}"
+def judge_gone(message: str) -> Finding:
+    """Judge a server that accepted the doctor and then did not answer."""
+    return failure("server", message, "look at its log, and start it again: talk serve")
 
 
-def gone(words: str) -> Finding:
-    """Return what is to be said of a server that took this client and then did not answer."""
-    return failed("server", words, "look at its log, and start it again: talk serve")
+def judge_server(server: JsonObject, log: Sequence[Goal], now: float) -> list[Finding]:
+    """Judge a server by its description of itself and by its recently ended goals, oldest first."""
+    return [_judge_state(server), _judge_settings(server), _judge_recent(log, now, server)]
 
 
-def judge(server: JsonObject, log: Sequence[Goal], now: float) -> list[Finding]:
-    """Judge a server by its own description and by the goals that ended last, oldest first."""
-    return [_itself(server), _settings(server), _recent(log, now, server)]
-
-
-def _itself(server: JsonObject) -> Finding:
-    version, engine, words = server.get("version"), server.get("engine"), summary(server)
+def _judge_state(server: JsonObject) -> Finding:
+    version, words = server.get("version"), summarize_server(server)
     if server.get("paused") is True:
-        return failed("server", f"speech is paused; {words}", "talk resume")
-    if engine not in WORKING:
-        return warning("server", words, remedy("engine_failed", words))
+        return failure("server", f"speech is paused; {words}", "talk resume")
+    if server.get("engine") not in WORKING_STATES:
+        return warning("server", words, advise(Reason.ENGINE_FAILED, words))
     if version != __version__:
         step = "start the server again, with the talk that is installed now"
         return warning("server", f"{words}; this is talk {__version__}", step)
     return ok("server", words)
 
 
-def summary(server: JsonObject) -> str:
-    """Return how a server describes itself, for people."""
-    parts = [f"talk {server.get('version')}", f"up {span(server.get('uptime'))}", f"engine {server.get('engine')}"]
+def summarize_server(server: JsonObject) -> str:
+    """Return a server's description of itself in one line for people."""
+    up = format_span(server.get("uptime"))
+    parts = [f"talk {server.get('version')}", f"up {up}", f"engine {server.get('engine')}"]
     parts += [f"{name} {server[name]}" for name in ("synthesizer", "player", "device") if server.get(name)]
     parts.append(f"{server.get('pending')} waiting, {server.get('clients')} of {server.get('max_clients')} clients")
     return "; ".join(parts)
 
 
-def _settings(server: JsonObject) -> Finding:
+def _judge_settings(server: JsonObject) -> Finding:
     volume = server.get("volume")
     lead_in = [f"lead-in {server['lead_in']} ms"] if server.get("lead_in") else []
     words = ", ".join([*told(server), *lead_in])
-    if isinstance(volume, int | float) and volume < _FAINT_SETTING:
-        broken = failed if volume <= 0 else warning
+    if isinstance(volume, int | float) and volume < _FAINT_VOLUME:
+        broken = failure if volume <= 0 else warning
         return broken("settings", words, "talk set --volume 1")
     return ok("settings", words)
 
 
-def _recent(log: Sequence[Goal], now: float, server: JsonObject) -> Finding:
+def _judge_recent(log: Sequence[Goal], now: float, server: JsonObject) -> Finding:
     if not log:
-        return ok(_RECENT, "none yet")
+        return ok(_RECENT_CHECK, "none yet")
     aborted = [each for each in log if each.state is State.ABORTED]
     many = "the last goal" if len(log) == 1 else f"the last {len(log)} goals"
     if not aborted:
-        return ok(_RECENT, f"none of {many} failed" if len(log) > 1 else f"{many} did not fail")
+        return ok(_RECENT_CHECK, f"none of {many} failed" if len(log) > 1 else f"{many} did not fail")
     last = aborted[-1]
-    words = (last.message or "").removeprefix("Talk aborted: ")
-    when = "" if last.ended_at is None else f", {span(now - last.ended_at)} ago ({clock_time(last.ended_at)})"
-    who = f"{many} ABORTED, {last.id}" if len(log) == 1 else f"{len(aborted)} of {many} ABORTED, last {last.id}"
-    told = f"{who}{when}: {last.reason}: {words}"
-    after = [each for each in log[log.index(last) + 1 :] if each.state is State.SUCCEEDED]
-    if after:
-        return ok(_RECENT, f"{told}; {len(after)} succeeded since")
-    step = remedy(last.reason, words, server.get("player"), server.get("device"), last.text)
-    return warning(_RECENT, told, step)
+    message = (last.message or "").removeprefix("Talk aborted: ")
+    when = "" if last.ended_at is None else f", {format_span(now - last.ended_at)} ago ({clock_time(last.ended_at)})"
+    which = f"{many} ABORTED, {last.id}" if len(log) == 1 else f"{len(aborted)} of {many} ABORTED, last {last.id}"
+    words = f"{which}{when}: {last.reason}: {message}"
+    succeeded = sum(each.state is State.SUCCEEDED for each in log[log.index(last) + 1 :])
+    if succeeded:
+        return ok(_RECENT_CHECK, f"{words}; {succeeded} succeeded since")
+    step = advise(last.reason, message, server.get("player"), server.get("device"), last.text)
+    return warning(_RECENT_CHECK, words, step)
 
 
-def span(seconds: object) -> str:
-    """Return a length of time for people, in its largest unit."""
+def format_span(seconds: object) -> str:
+    """Return a duration in its largest unit for people, or "?" if it is no number."""
     if not isinstance(seconds, int | float):
         return "?"
     for unit, length in (("d", 86400), ("h", 3600), ("min", 60)):

@@ -1,136 +1,342 @@
-"""What makes a sound of samples: players, devices, sound servers, and how loud the output is.
+"""The sound: user session, sound cards, players, devices, sound servers and volume.
 
-Programs of others tell it, each with a limit of time and of output: one that is missing or hangs is an answer, too.
-Asking wakes no device. Only a sentence proves that there is sound: what may be in its way is a warning here. Without a
-player it is certain.
+Facts come from files of the kernel and from programs such as pactl, each with a time limit. No device is opened,
+because that would wake it. Only a sentence proves that there is sound, so most findings here are warnings. A missing or
+silent player is a failure.
 """
 
 from __future__ import annotations
 
 import contextlib
+import grp
 import os
+import pwd
 import re
 import shlex
 import socket
+import struct
 import subprocess
 import tempfile
 from typing import TYPE_CHECKING
 
-from talkcli.doctor.machine import judge_access, judge_cards
-from talkcli.doctor.report import Finding, failed, ok, some, warning
-from talkcli.engine.players import DUMMY_SINK, PACKAGES, PLAYERS, is_silent, on_path, sound_server_sockets
+from talkcli.doctor.report import Finding, failure, join_names, ok, warning
+from talkcli.engine.players import (
+    DUMMY_SINK,
+    PACKAGES,
+    PLAYERS,
+    is_silent,
+    on_path,
+    playback_devices,
+    sound_server_sockets,
+)
 from talkcli.frozen import frozen, replace
+from talkcli.peers import command_name, process_stat, read_proc_file
 from talkcli.processes import kill, signal_name
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
+    from typing import Any
 
-    from talkcli.doctor.machine import Cards, Session
+#: The group of sound cards in Debian.
+_AUDIO_GROUP = "audio"
+#: Files that container runtimes create in every container.
+_CONTAINER_FILES = ("/.dockerenv", "/run/.containerenv", "/run/systemd/container")
+#: How many parents of a process to look at. A shell in a script in cron is three levels below cron.
+_MAX_PARENTS_COUNT = 8
+_CRON_PROGRAMS = frozenset({"cron", "crond", "cronie", "anacron"})
+_SSH_PROGRAMS = frozenset({"ssh", "sshd"})
+_CONTAINER, _CRON_JOB, _SYSTEM_SERVICE = "a container", "a cron job", "a system service"
+#: The finding if the server doesn't run on this machine.
+SESSION_ELSEWHERE = ok(
+    "session", "the server runs on another machine or in a container: run talk doctor there to look at its sound"
+)
+#: Tags and permission bits of an access control list in <linux/posix_acl.h>.
+_ACL_USER, _ACL_GROUP, _ACL_READ_WRITE = 2, 8, 6
 
-#: What ALSA lists besides devices: converters, and ways that nobody takes by default.
-_NO_DEVICES = frozenset(
+#: Names in ALSA's list that are no devices: plugins and converters.
+_NOT_DEVICES = frozenset(
     {"null", "lavrate", "samplerate", "speexrate", "jack", "oss", "speex", "upmix", "vdownmix", "usbstream"}
 )
-#: Names of checks.
-_SERVER, _LOUDNESS = "sound server", "loudness"
-#: Per cent below which nobody may hear it across a room.
-_FAINT = 20
-#: ALSA's controls that a loudspeaker hangs on, as `amixer scontrols` names them.
-_CONTROLS = ("Master", "PCM", "Speaker", "Headphone", "Digital")
-#: What a sound server's mixer tells of; and, by its program, what undoes a mute of it and what makes it louder.
-_SINK = "the default sink"
+_SOUND_SERVER_CHECK, _LOUDNESS_CHECK = "sound server", "loudness"
+#: Below this volume, a sentence may be inaudible across a room.
+_FAINT_PERCENT = 20
+#: ALSA's mixer controls for loudspeakers, as `amixer scontrols` shows them.
+_ALSA_CONTROLS = ("Master", "PCM", "Speaker", "Headphone", "Digital")
+#: The name for people of the output that a sound server's mixer controls.
+_DEFAULT_SINK = "the default sink"
+#: For each mixer program, the commands that unmute the default sink and make it louder.
 _PACTL = ("pactl set-sink-mute @DEFAULT_SINK@ 0", "pactl set-sink-volume @DEFAULT_SINK@ 70%")
 _WPCTL = ("wpctl set-mute @DEFAULT_AUDIO_SINK@ 0", "wpctl set-volume @DEFAULT_AUDIO_SINK@ 0.7")
-#: Seconds that a program may take. All of them answer within milliseconds, or wait for a sound server that hangs.
-LIMIT = 3.0
-#: Bytes of its output that are read: the devices of a large machine take a tenth.
-_MOST = 64 * 1024
+#: Time limit for a program. Every program answers within milliseconds, unless the sound server hangs.
+PROGRAM_LIMIT_S = 3.0
+#: How much of a program's output to read. The device list of a large machine is a tenth of this.
+_MAX_OUTPUT_BYTES = 64 * 1024
 
 
 @frozen
-class Said:
-    """What a program said."""
+class UserSession:
+    """The user and environment of a process: this one, or the server."""
 
-    #: why it failed: the first line that it wrote to standard error, for one; None where all went well
-    trouble: str | None
-    out: str = ""
-    #: whether it took too long
-    late: bool = False
+    uid: int
+    user: str
+    #: the server's process id, or None if this describes the current process
+    server_pid: int | None = None
+    #: names and ids of the process's groups
+    groups: tuple[str, ...] = ()
+    gids: tuple[int, ...] = ()
+    #: the user who called sudo, or None if this isn't root under sudo
+    sudo_uid: int | None = None
+    #: what started the process, for people, such as "a system service" or "an ssh session"
+    origins: tuple[str, ...] = ()
+    #: XDG_RUNTIME_DIR, or None if it isn't set
+    runtime_dir: str | None = None
+    #: owner of that directory, or None if it doesn't exist
+    runtime_owner: int | None = None
+    #: the directory that XDG_RUNTIME_DIR usually names, or None if it doesn't exist
+    usual_runtime_dir: str | None = None
+
+
+@frozen
+class Cards:
+    """The sound cards that the kernel knows."""
+
+    #: whether the kernel supports sound, which it may not in a container
+    in_kernel: bool
+    names: tuple[str, ...] = ()
+    #: device files for playback, such as /dev/snd/pcmC0D0p
+    nodes: tuple[str, ...] = ()
+    #: device files that the user may not open
+    forbidden: tuple[str, ...] = ()
+    #: group that owns the device files
+    group: str = _AUDIO_GROUP
+    #: whether the user will be in that group after the next login
+    member_after_login: bool = False
+
+
+@frozen
+class ProgramOutput:
+    """The output of a program, and how it ended."""
+
+    #: why the program failed, or None if it succeeded
+    error: str | None
+    stdout: str = ""
+    timed_out: bool = False
 
 
 @frozen
 class Players:
-    """Which programs can play."""
+    """The installed players, and the one to use."""
 
-    #: those of the programs that `talk` knows that are there, best first
+    #: installed player programs, best first
     found: tuple[str, ...]
-    #: what is to play, by the server's setting or by TALK_PLAYER; None for the first that is there
-    wanted: str | None
-    #: whether a wanted program can be run
+    #: the player set by the server or by TALK_PLAYER, or None for the automatic choice
+    configured: str | None
+    #: whether the configured player can be run
     runs: bool = True
-    #: what an engine process tries first where nothing is wanted; None if that is not known
+    #: the player that the engine tries first in an automatic choice, or None if unknown
     first: str | None = None
+    #: whether a server plays, and not the doctor's own engine
+    by_server: bool = False
 
 
 @frozen
 class Devices:
-    """Where the player can play to, by its own names."""
+    """The devices of a player, by the player's own names."""
 
-    #: the command that lists them, as it is typed
-    listed_by: str
+    #: the command that lists them
+    list_command: str
     names: tuple[str, ...] = ()
-    #: why they can't be listed, in the program's own words
-    trouble: str | None = None
-    #: the one that is set; None for the player's default
-    wanted: str | None = None
-    #: the package of the program that lists them, if that program is not installed
+    #: why they can't be listed, or None
+    error: str | None = None
+    #: the configured device, or None for the player's default
+    configured: str | None = None
+    #: package to install if the program that lists devices is missing, or None
     package: str | None = None
 
 
 @frozen
 class SoundServer:
-    """PulseAudio or PipeWire, as a client of it finds it."""
+    """What a client finds out about PulseAudio or PipeWire."""
 
-    #: "PulseAudio (on PipeWire 0.3.65)", where one answers
+    #: name such as "PulseAudio (on PipeWire 0.3.65)", or None if no sound server answers
     name: str | None = None
-    #: the sink that is played to by default
+    #: the default sink, or None if unknown
     sink: str | None = None
-    #: whether it takes PulseAudio's clients, as the player pulse is one
-    pulse: bool = True
-    #: where none answers: sockets of sound servers that are there all the same, of another user's for one
+    #: whether clients of PulseAudio can connect, such as the player pulse
+    accepts_pulse: bool = True
+    #: existing sockets of sound servers if none answers
     sockets: tuple[str, ...] = ()
-    #: what the client said; None where there is no program that could ask
-    trouble: str | None = None
-    #: whether the client took too long: the server is there and hangs
+    #: why the client failed, or None if no client program is installed
+    error: str | None = None
+    #: whether the sound server accepts connections but doesn't answer
     hangs: bool = False
-    #: PULSE_SERVER, where it is set
-    named: str | None = None
+    #: PULSE_SERVER, or None if it isn't set
+    pulse_server: str | None = None
 
 
 @frozen
-class Level:
-    """A mixer's setting of one output."""
+class MixerLevel:
+    """The volume of one output."""
 
-    #: the sink or the control
+    #: name of the sink or the mixer control
     name: str
     muted: bool
-    #: None where the mixer doesn't say
+    #: the volume, or None if the mixer doesn't report it
     percent: int | None
-    #: the command that undoes a mute, and the one that makes it louder
-    unmute: str
-    louder: str
+    unmute_command: str
+    louder_command: str
 
 
-def asked(program: str, *words: str, env: Mapping[str, str], limit: float | None = None) -> Said:
-    """Run a program to its end, in its own language, and return what it said; `limit`: seconds, if not LIMIT."""
-    limit = LIMIT if limit is None else limit
+def find_session(server_pid: int | None) -> tuple[UserSession, Mapping[str, str]]:
+    """Return the session and environment of the server, because its player makes the sound.
+
+    If there is no server, or its environment can't be read, both describe this process.
+    """
+    environment = None if server_pid is None else _environment(server_pid)
+    if environment is None:
+        server_pid, environment = None, dict(os.environ)
+    uid, gids = os.getuid(), _group_ids(server_pid)
+    caller = environment.get("SUDO_UID", "")
+    runtime = environment.get("XDG_RUNTIME_DIR") or None
+    usual = f"/run/user/{uid}"
+    session = UserSession(
+        uid=uid,
+        user=_name(pwd.getpwuid, uid),
+        server_pid=server_pid,
+        groups=tuple(_name(grp.getgrgid, each) for each in gids),
+        gids=gids,
+        sudo_uid=int(caller) if uid == 0 and caller.isdecimal() else None,
+        origins=tuple(_origins(environment, os.getpid() if server_pid is None else server_pid)),
+        runtime_dir=runtime,
+        runtime_owner=None if runtime is None else file_owner(runtime),
+        usual_runtime_dir=usual if os.path.isdir(usual) else None,
+    )
+    return session, environment
+
+
+def names_a_player(server_pid: int, env: Mapping[str, str]) -> bool:
+    """Return whether a server's command line or environment names a player. It then tries no other player."""
+    return bool(env.get("TALK_PLAYER") or re.search(r"\0--player[=\0]", _read_text(f"/proc/{server_pid}/cmdline")))
+
+
+def file_owner(path: str) -> int | None:
+    """Return the user id of a file's owner, or None if the file doesn't exist.
+
+    The owner of /proc/PID is the user who runs the process.
+    """
+    with contextlib.suppress(OSError):
+        return os.stat(path).st_uid
+    return None
+
+
+def _environment(pid: int) -> dict[str, str] | None:
+    """Return the environment of another process, or None if it belongs to another user."""
+    data = read_proc_file(f"/proc/{pid}/environ", -1)
+    if data is None or file_owner(f"/proc/{pid}") != os.getuid():
+        return None  # root can read it, but may not use another user's sound server
+    pairs = (each.partition("=") for each in os.fsdecode(data).split("\0") if "=" in each)
+    return {name: value for name, _, value in pairs}
+
+
+def _name(look_up: Callable[[int], tuple[Any, ...]], number: int) -> str:
+    """Return the name of a user or a group, or its number if it has no name."""
+    try:
+        return str(look_up(number)[0])
+    except KeyError:
+        return str(number)
+
+
+def _group_ids(pid: int | None) -> tuple[int, ...]:
+    status = "" if pid is None else _read_text(f"/proc/{pid}/status")
+    found = re.search(r"^Gid:\s+\d+\s+(\d+).*?^Groups:([\d \t]*)$", status, re.MULTILINE | re.DOTALL)
+    groups = map(int, " ".join(found.groups()).split()) if found else (os.getegid(), *os.getgroups())
+    return tuple(sorted(set(groups)))
+
+
+def _origins(environment: Mapping[str, str], pid: int) -> Iterable[str]:
+    """Yield what started a process, the most telling first."""
+    if environment.get("container") or any(map(os.path.exists, _CONTAINER_FILES)):
+        yield _CONTAINER
+    unit = re.search(r"system\.slice/(?:[^\n]*/)?([^/\n]+)\.service", _read_text(f"/proc/{pid}/cgroup"))
+    service = unit[1] if unit else ""
+    if service in _CRON_PROGRAMS or any(each.lower() in _CRON_PROGRAMS for each in _parent_names(pid)):
+        yield _CRON_JOB
+    elif service and service not in _SSH_PROGRAMS and environment.get("INVOCATION_ID"):
+        yield _SYSTEM_SERVICE
+    if environment.get("SSH_CONNECTION"):
+        yield "an ssh session"
+
+
+def _parent_names(pid: int) -> Iterable[str]:
+    for _ in range(_MAX_PARENTS_COUNT):
+        parent = process_stat(pid)[1:2]
+        pid = int(parent[0]) if parent else 0
+        if pid == 0:
+            return
+        yield command_name(pid) or ""
+
+
+def find_cards(session: UserSession, kernel: str = "/proc/asound", nodes: str = "/dev/snd") -> Cards:
+    """Return the kernel's sound cards, and which of them the user may open."""
+    # Each card has two lines. The first is " 0 [Device         ]: USB-Audio - USB Audio Device".
+    names = re.findall(r"^\s*\d+ \[[^\]]*\]:.*? - (.*)$", _read_text(f"{kernel}/cards"), re.MULTILINE)
+    playing = playback_devices(nodes)
+    group, forbidden = _AUDIO_GROUP, []
+    for each in playing:
+        with contextlib.suppress(OSError):
+            found = os.stat(each)
+            group = _name(grp.getgrgid, found.st_gid) if found.st_gid else group
+            if not _may_open(found, _access_list(each), session):
+                forbidden.append(each)
+    members: list[str] = []
+    with contextlib.suppress(KeyError):
+        members = grp.getgrnam(group).gr_mem
+    return Cards(
+        in_kernel=os.path.isdir(kernel),
+        names=tuple(each.strip() for each in names),
+        nodes=tuple(playing),
+        forbidden=tuple(forbidden),
+        group=group,
+        member_after_login=session.user in members,
+    )
+
+
+def _may_open(found: os.stat_result, entries: list[tuple[int, int, int]], session: UserSession) -> bool:
+    """Return whether the user may read and write a file, by its mode or by its access control list."""
+    if session.uid == 0:
+        return True
+    if session.uid == found.st_uid:
+        granted = [found.st_mode >> 6]
+    else:
+        own = {(_ACL_USER, session.uid), *((_ACL_GROUP, each) for each in session.gids)}
+        granted = [bits for tag, bits, holder in entries if (tag, holder) in own]  # logind adds an entry for the user
+        granted.append(found.st_mode >> 3 if found.st_gid in session.gids else found.st_mode)
+    return any(bits & _ACL_READ_WRITE == _ACL_READ_WRITE for bits in granted)
+
+
+def _access_list(path: str) -> list[tuple[int, int, int]]:
+    """Return the entries of a file's access control list as tuples of tag, permission bits and user or group id."""
+    with contextlib.suppress(OSError):
+        data = os.getxattr(path, "system.posix_acl_access")
+        return list(struct.iter_unpack("<HHI", data[4 : 4 + (len(data) - 4) // 8 * 8]))
+    return []
+
+
+def _read_text(path: str) -> str:
+    """Return the text of a file in /proc, or "" if it can't be read."""
+    return (read_proc_file(path, -1) or b"").decode(errors="replace")
+
+
+def run_program(program: str, *arguments: str, env: Mapping[str, str], limit: float | None = None) -> ProgramOutput:
+    """Run a program in the C locale until it ends, or until `limit` seconds have passed (default: PROGRAM_LIMIT_S)."""
+    limit = PROGRAM_LIMIT_S if limit is None else limit
     if not on_path(program, env):
-        return Said(f"{program} is not there")
-    # Files, not pipes: what a program leaves running behind it would hold a pipe open.
+        return ProgramOutput(f"{program} is not there")
+    # Files, because a process that the program leaves running would keep a pipe open.
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         try:
             process = subprocess.Popen(
-                [program, *words],
+                [program, *arguments],
                 env={**env, "LC_ALL": "C"},
                 stdin=subprocess.DEVNULL,
                 stdout=out,
@@ -138,309 +344,355 @@ def asked(program: str, *words: str, env: Mapping[str, str], limit: float | None
                 start_new_session=True,
             )
         except OSError as error:
-            return Said(str(error))
+            return ProgramOutput(str(error))
         try:
-            code = process.wait(limit)
+            code: int | None = process.wait(limit)
         except subprocess.TimeoutExpired:
             code = None
         finally:
-            _end(process)
-        said, complaint = _read(out.fileno()), _read(err.fileno())
+            _kill_group(process)
+        stdout, stderr = (os.pread(each.fileno(), _MAX_OUTPUT_BYTES, 0).decode(errors="replace") for each in (out, err))
     if code is None:
-        return Said(f"no answer within {limit:g} s", said, late=True)
+        return ProgramOutput(f"no answer within {limit:g} s", stdout, timed_out=True)
     if code < 0:
-        return Said(f"it was killed by {signal_name(-code)}", said)
-    lines = filter(None, map(str.strip, (complaint or said).splitlines()))
-    return Said(next(lines, "it said nothing") if code else None, said)
+        return ProgramOutput(f"it was killed by {signal_name(-code)}", stdout)
+    lines = filter(None, map(str.strip, (stderr or stdout).splitlines()))
+    return ProgramOutput(next(lines, "it said nothing") if code else None, stdout)
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
+def _kill_group(process: subprocess.Popen[bytes]) -> None:
     if process.returncode is None:
-        kill([-process.pid])  # its group is its own, and it is not reaped: nobody else can be hit
-        with contextlib.suppress(subprocess.TimeoutExpired):  # it hangs in a driver: init will reap it
+        kill([-process.pid])  # its own group, and the id can't have been reused because the process isn't reaped yet
+        with contextlib.suppress(subprocess.TimeoutExpired):  # stuck in a driver: init will reap it
             process.wait(1)
 
 
-def _read(descriptor: int) -> str:
-    return os.pread(descriptor, _MOST, 0).decode("utf-8", "replace")
-
-
 def is_custom(player: str | None) -> bool:
-    """Tell whether a player is a command of the user's own: what another program needs, only its user knows."""
-    program = program_of(player) if player and not is_silent(player) else None
+    """Return whether a player is the user's own command, so that nothing is known about its requirements."""
+    program = _program_of(player) if player and not is_silent(player) else None
     return program is not None and program.rpartition("/")[2] not in PLAYERS
 
 
-def program_of(command: str) -> str | None:
-    """Return the program of a player's command line; None where that can't be read."""
+def _program_of(command: str) -> str | None:
+    """Return the program in a player's command line, or None if the line can't be parsed."""
     try:
         return next(iter(shlex.split(command)), None)
     except ValueError:
         return None
 
 
-def players(env: Mapping[str, str], wanted: str | None, first: str | None) -> Players:
-    """Return which players there are; `wanted`: the setting; `first`: as in `Players`."""
+def find_players(
+    env: Mapping[str, str], configured: str | None, first: str | None = None, *, by_server: bool = False
+) -> Players:
+    """Return which players are installed. The other arguments are fields of the result."""
     found = tuple(each for each in PACKAGES if on_path(each, env))
-    program = program_of(wanted or "")
-    return Players(found, wanted, program == "pulse" or bool(program and on_path(program, env)), first)
+    program = _program_of(configured or "")
+    runs = program == "pulse" or bool(program and on_path(program, env))
+    return Players(found, configured, runs, first, by_server)
 
 
-def devices(env: Mapping[str, str], player: str | None, wanted: str | None) -> Devices | None:
-    """Return where a player can play to; None for one that nobody can ask."""
-    if player not in _LISTING:
+def find_devices(env: Mapping[str, str], player: str | None, configured: str | None) -> Devices | None:
+    """Return the devices of a player, or None if no program lists them."""
+    if player not in _DEVICE_LISTS:
         return None
-    command, names, package = _LISTING[player]
-    program, *words = command.split()
+    command, parse, package = _DEVICE_LISTS[player]
+    program, *arguments = command.split()
     if not on_path(program, env):
-        return Devices(command, wanted=wanted, package=package)
-    found = asked(program, *words, env=env)
-    return Devices(command, tuple(names(found)), found.trouble, wanted)
+        return Devices(command, configured=configured, package=package)
+    output = run_program(program, *arguments, env=env)
+    return Devices(command, tuple(parse(output)), output.error, configured)
 
 
-def _alsa_names(said: Said) -> list[str]:
-    return [each for each in said.out.splitlines() if each and not each[0].isspace() and each not in _NO_DEVICES]
+def _parse_alsa(output: ProgramOutput) -> list[str]:
+    return [each for each in output.stdout.splitlines() if each and not each[0].isspace() and each not in _NOT_DEVICES]
 
 
-def _sinks(said: Said) -> list[tuple[str, str]]:
-    """Return names and states of the sinks: number, name, module, format, state, with tabs between them."""
-    lines = [each.split("\t") for each in said.out.splitlines()]
-    return [(each[1], each[-1].strip()) for each in lines if said.trouble is None and len(each) > 2]
+def _parse_sinks(output: ProgramOutput) -> dict[str, str]:
+    """Return the states of the sinks by name. A line has number, name, module, format and state, separated by tabs."""
+    lines = [] if output.error else [each.split("\t") for each in output.stdout.splitlines()]
+    return {each[1]: each[-1].strip() for each in lines if len(each) > 2}
 
 
-def _sink_names(said: Said) -> list[str]:
-    return [name for name, _ in _sinks(said)]
-
-
-def _node_names(said: Said) -> list[str]:
-    nodes = re.split(r"^\s*id \d+,", said.out, flags=re.MULTILINE)
+def _parse_nodes(output: ProgramOutput) -> list[str]:
+    nodes = re.split(r"^\s*id \d+,", output.stdout, flags=re.MULTILINE)
     found = [re.search(r'node\.name = "([^"]*)"', each) for each in nodes if '"Audio/Sink"' in each]
     return [each[1] for each in found if each]
 
 
-_SINKS = "pactl list short sinks"
-#: How the devices of a player are listed, and read from what that says.
-_LISTING: dict[str | None, tuple[str, Callable[[Said], list[str]], str]] = {
-    "aplay": ("aplay -L", _alsa_names, PACKAGES["aplay"]),
-    "pulse": (_SINKS, _sink_names, PACKAGES["pacat"]),
-    "pacat": (_SINKS, _sink_names, PACKAGES["pacat"]),
-    "pw-cat": ("pw-cli ls Node", _node_names, PACKAGES["pw-cat"]),
+_LIST_SINKS = "pactl list short sinks"
+#: For each player, the command that lists its devices, the parser of its output, and the package of the command.
+_DEVICE_LISTS: dict[str | None, tuple[str, Callable[[ProgramOutput], Iterable[str]], str]] = {
+    "aplay": ("aplay -L", _parse_alsa, PACKAGES["aplay"]),
+    "pulse": (_LIST_SINKS, _parse_sinks, PACKAGES["pacat"]),
+    "pacat": (_LIST_SINKS, _parse_sinks, PACKAGES["pacat"]),
+    "pw-cat": ("pw-cli ls Node", _parse_nodes, PACKAGES["pw-cat"]),
 }
 
 
-def installing(finding: Finding, env: Mapping[str, str]) -> Finding:
-    """Return a finding whose next step also says where to get pactl, if the step needs it and it is missing."""
+def add_pactl_package(finding: Finding, env: Mapping[str, str]) -> Finding:
+    """Add the package of pactl to the next step, if the step needs pactl and it isn't installed."""
     if finding.next is None or "pactl " not in finding.next or on_path("pactl", env):
         return finding
     return replace(finding, next=f"{finding.next} (for pactl: sudo apt-get install -y {PACKAGES['pacat']})")
 
 
-def suspended(env: Mapping[str, str]) -> tuple[str, ...]:
-    """Return the sinks that take no data; while nothing plays, those that are asleep, too."""
-    found = asked(*_SINKS.split(), env=env)
-    return tuple(name for name, state in _sinks(found) if state == "SUSPENDED")
+def suspended_sinks(env: Mapping[str, str]) -> tuple[str, ...]:
+    """Return the sinks that take no data, including sinks that sleep because nothing plays."""
+    sinks = _parse_sinks(run_program(*_LIST_SINKS.split(), env=env))
+    return tuple(name for name, state in sinks.items() if state == "SUSPENDED")
 
 
-def sound_server(env: Mapping[str, str], session: Session) -> SoundServer:
-    """Return the sound server that a player of this session finds."""
-    pulse = asked("pactl", "info", env=env)
-    if pulse.trouble is None:
-        return SoundServer(_field(pulse.out, "Server Name") or "PulseAudio", _field(pulse.out, "Default Sink"))
-    wire = pulse if pulse.late else asked("pw-cli", "info", "0", env=env)
-    # Without pactl only the socket tells whether PulseAudio's clients are served.
-    native = None if on_path("pactl", env) else _listening(env)
-    if wire.trouble is None:
+def find_sound_server(env: Mapping[str, str], session: UserSession) -> SoundServer:
+    """Return the sound server that a player in this session connects to."""
+    pulse = run_program("pactl", "info", env=env)
+    if pulse.error is None:
+        fields = dict(re.findall(r"^\s*([\w ]+): (.*\S)", pulse.stdout, re.MULTILINE))
+        return SoundServer(fields.get("Server Name", "PulseAudio"), fields.get("Default Sink"))
+    pipewire = pulse if pulse.timed_out else run_program("pw-cli", "info", "0", env=env)
+    # Without pactl, only the socket shows whether clients of PulseAudio can connect.
+    native = None if on_path("pactl", env) else _pulse_address(env)
+    if pipewire.error is None:
         name = "PipeWire" if native else "PipeWire, without its PulseAudio part"
-        return SoundServer(name, pulse=native is not None)
+        return SoundServer(name, accepts_pulse=native is not None)
     if native and native.startswith("/"):
         return SoundServer(f"one listens on {native}")
-    answers = {"pactl": pulse, "pw-cli": wire}
-    trouble = next((said.trouble for each, said in answers.items() if on_path(each, env)), None)
-    sockets = sound_server_sockets(env, session.uid, *([session.sudo_uid] if session.sudo_uid is not None else []))
-    named = env.get("PULSE_SERVER") or None
-    return SoundServer(sockets=tuple(sockets), trouble=trouble, hangs=wire.late, named=named)
+    outputs = ("pactl", pulse), ("pw-cli", pipewire)
+    error = next((output.error for program, output in outputs if on_path(program, env)), None)
+    uids = [each for each in (session.uid, session.sudo_uid) if each is not None]
+    sockets, named = tuple(sound_server_sockets(env, *uids)), env.get("PULSE_SERVER") or None
+    return SoundServer(sockets=sockets, error=error, hangs=pipewire.timed_out, pulse_server=named)
 
 
-def _listening(env: Mapping[str, str]) -> str | None:
-    """Return where a server takes PulseAudio's clients of this environment; None if there is none.
+def _pulse_address(env: Mapping[str, str]) -> str | None:
+    """Return the address of a server that accepts clients of PulseAudio, or None if there is none.
 
-    Another machine's is not asked: a sentence shows whether it is there.
+    An address on another machine is returned without a test. The sentence will show whether it works.
     """
     named = env.get("PULSE_SERVER", "").removeprefix("unix:")
     if named and not named.startswith("/"):
         return named
     for path in [named] if named else [each for each in sound_server_sockets(env) if each.endswith("/native")]:
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as probe:
-            probe.settimeout(LIMIT)
+            probe.settimeout(PROGRAM_LIMIT_S)
             probe.connect(path)
             return path
     return None
 
 
-def _field(text: str, name: str) -> str | None:
-    found = re.search(rf"^\s*{name}: (.+)$", text, re.MULTILINE)
-    return found[1].strip() if found else None
-
-
-def levels(env: Mapping[str, str], server: SoundServer, cards: Cards) -> tuple[Level, ...]:
-    """Return how loud the default output is, by the first mixer that tells."""
+def find_levels(env: Mapping[str, str], server: SoundServer, cards: Cards) -> tuple[MixerLevel, ...]:
+    """Return the volume of the default output, from the first mixer program that reports it."""
     if server.hangs:
         return ()
     if server.name is not None:
-        mute = asked("pactl", "get-sink-mute", "@DEFAULT_SINK@", env=env)
-        if mute.trouble is None:
-            volume = asked("pactl", "get-sink-volume", "@DEFAULT_SINK@", env=env)
-            return (level_of(_SINK, mute.out + volume.out, *_PACTL),)
-        whole = asked("wpctl", "get-volume", "@DEFAULT_AUDIO_SINK@", env=env)
-        return (level_of(_SINK, whole.out, *_WPCTL),) if whole.trouble is None else ()
+        mute = run_program("pactl", "get-sink-mute", "@DEFAULT_SINK@", env=env)
+        if mute.error is None:
+            volume = run_program("pactl", "get-sink-volume", "@DEFAULT_SINK@", env=env)
+            return (parse_level(_DEFAULT_SINK, mute.stdout + volume.stdout, *_PACTL),)
+        both = run_program("wpctl", "get-volume", "@DEFAULT_AUDIO_SINK@", env=env)
+        return (parse_level(_DEFAULT_SINK, both.stdout, *_WPCTL),) if both.error is None else ()
     if not cards.names:
         return ()
-    controls = asked("amixer", "scontrols", env=env)
-    names = re.findall(r"control '([^']*)'", controls.out)
-    told = [(each, asked("amixer", "sget", each, env=env)) for each in _CONTROLS if each in names]
+    controls = re.findall(r"control '([^']*)'", run_program("amixer", "scontrols", env=env).stdout)
+    outputs = [(each, run_program("amixer", "sget", each, env=env)) for each in _ALSA_CONTROLS if each in controls]
     return tuple(
-        level_of(name, said.out, f"amixer sset {name} unmute", f"amixer sset {name} 70%")
-        for name, said in told
-        if said.trouble is None
+        parse_level(name, output.stdout, f"amixer sset {name} unmute", f"amixer sset {name} 70%")
+        for name, output in outputs
+        if output.error is None
     )
 
 
-def level_of(name: str, text: str, unmute: str, louder: str) -> Level:
-    """Return what a mixer says of an output: pactl, "Mute: no" and "40%"; wpctl, "Volume: 0.40 [MUTED]"; or amixer.
+def parse_level(name: str, text: str, unmute_command: str, louder_command: str) -> MixerLevel:
+    """Return the volume in a mixer program's output, which is that of the loudest channel.
 
-    The loudest of its channels counts; by amixer, "[40%] [on]", it is muted where none is on.
+    The formats are "Mute: no" and "40%" for pactl, "Volume: 0.40 [MUTED]" for wpctl, and "[40%] [on]" for amixer. In
+    amixer's output, the sound is muted if every channel is off.
     """
     switches = re.findall(r"\[(on|off)\]", text)
     muted = "Mute: yes" in text or "[MUTED]" in text or (bool(switches) and "on" not in switches)
     percents = [int(each) for each in re.findall(r"(\d+)%", text)]
     percents += [round(float(each) * 100) for each in re.findall(r"Volume: (\d+(?:\.\d+)?)", text)]
-    return Level(name, muted, max(percents, default=None), unmute, louder)
+    return MixerLevel(name, muted, max(percents, default=None), unmute_command, louder_command)
 
 
-def judge_silent(player: str | None, *, running: bool) -> list[Finding]:
-    """Judge a player by its name alone: it may be one that makes no sound; `running`: as of `judge`."""
+def judge_session(session: UserSession) -> Finding:
+    """Judge whether players can find the sound server of the user."""
+    who = f"user {session.user} (uid {session.uid})"
+    if session.sudo_uid is not None:
+        who += f" by sudo from uid {session.sudo_uid}"
+    if session.origins:
+        who += f", in {' and '.join(session.origins)}"
+    if session.server_pid is not None:
+        who = f"the server's: {who}"
+    if session.runtime_dir is None:
+        if session.usual_runtime_dir is None:
+            # Without logind, as on many robots, there is no such directory and nothing is wrong.
+            return ok("session", f"{who}; no XDG_RUNTIME_DIR, as there is no session of this user")
+        again = "" if session.server_pid is None else " where the server is started, and start it again"
+        return warning(
+            "session",
+            f"{who}; XDG_RUNTIME_DIR is not set, as under cron, sudo, su and in system services: players find no "
+            "PipeWire or PulseAudio of this user",
+            f"export XDG_RUNTIME_DIR={session.usual_runtime_dir}{again}",
+        )
+    words = f"{who}; XDG_RUNTIME_DIR is {session.runtime_dir}"
+    if session.runtime_owner is None:
+        step = "log in as this user (not by su or sudo), or unset XDG_RUNTIME_DIR"
+        return warning("session", f"{words}, which is not there", step)
+    if session.runtime_owner != session.uid:
+        step = f"run this as the user who owns it: sudo -u '#{session.runtime_owner}' talk doctor"
+        words = f"{words}, which is uid {session.runtime_owner}'s: its sound server takes nobody else"
+        return warning("session", words, step)
+    return ok("session", words)
+
+
+def judge_silent_player(player: str | None, *, by_server: bool) -> list[Finding]:
+    """Judge a configured player by its name alone. The result is empty unless the player makes no sound."""
     if not is_silent(player):
         return []
-    step = "start the server without --player" if running else "unset TALK_PLAYER"
-    return [failed("player", f"{player} ({_by(running)}): it keeps the time and makes no sound", step)]
+    step = "start the server without --player" if by_server else "unset TALK_PLAYER"
+    return [failure("player", f"{player} ({_set_by(by_server)}): it keeps the time and makes no sound", step)]
 
 
-def judge(
-    players: Players, devices: Devices | None, cards: Cards, server: SoundServer, session: Session, *, running: bool
+def judge_sound(
+    players: Players, devices: Devices | None, cards: Cards, server: SoundServer, session: UserSession
 ) -> list[Finding]:
-    """Judge what plays; `running`: whether a talk server runs, which has a player of its own, and set by itself."""
-    served = server.name is not None
-    return judge_silent(players.wanted, running=running) or [
-        _player(players, server, running=running),
-        *([] if devices is None else [_device(devices)]),
-        judge_cards(cards, session, served=served),
-        judge_access(cards, session, served=served),
-        _sound_server(server, cards, session),
+    """Judge everything between samples and loudspeaker, except the volume."""
+    return judge_silent_player(players.configured, by_server=players.by_server) or [
+        _judge_player(players, server),
+        *([] if devices is None else [_judge_device(devices)]),
+        _judge_cards(cards, server, session),
+        _judge_access(cards, server, session),
+        _judge_sound_server(server, cards, session),
     ]
 
 
-def _by(running: bool) -> str:
-    """Return for people by whom a player is set."""
-    return "the server's" if running else "TALK_PLAYER"
+def _set_by(by_server: bool) -> str:
+    return "the server's" if by_server else "TALK_PLAYER"
 
 
-def _player(players: Players, server: SoundServer, *, running: bool) -> Finding:
-    wanted, found = players.wanted, players.found
-    broken = warning if running else failed
-    pulse = players.first == "pulse" if players.first else server.name is not None and server.pulse
-    if wanted is None and pulse:
-        after = f"; then {', '.join(found)}" if found else ""
-        return ok("player", f"pulse is used, by the sound server{after}")
-    if wanted is None and not found:
-        first = next(iter(PACKAGES.values()))
-        return broken("player", f"none is on the PATH: {', '.join(PACKAGES)}", f"sudo apt-get install -y {first}")
-    if wanted is None:
-        after = f"; then {', '.join(found[1:])}" if len(found) > 1 else ""
-        return ok("player", f"{found[0]} is used{after}")
+def _judge_player(players: Players, server: SoundServer) -> Finding:
+    configured, found = players.configured, players.found
+    broken = warning if players.by_server else failure
+    if configured is None:
+        pulse = players.first == "pulse" if players.first else server.name is not None and server.accepts_pulse
+        if not pulse and not found:
+            package = next(iter(PACKAGES.values()))
+            return broken("player", f"none is on the PATH: {', '.join(PACKAGES)}", f"sudo apt-get install -y {package}")
+        used, others = ("pulse is used, by the sound server", found) if pulse else (f"{found[0]} is used", found[1:])
+        return ok("player", used + (f"; then {', '.join(others)}" if others else ""))
     if not players.runs:
-        package = PACKAGES.get(wanted)
-        step = f"sudo apt-get install -y {package}" if package else "name a program that is there, with --player"
-        return broken("player", f"{wanted} ({_by(running)}) is not there", step)
-    others = [each for each in found if each != wanted]
+        known = PACKAGES.get(configured)
+        step = f"sudo apt-get install -y {known}" if known else "name a program that is there, with --player"
+        return broken("player", f"{configured} ({_set_by(players.by_server)}) is not there", step)
+    others = tuple(each for each in found if each != configured)
     also = f"; there {'is' if len(others) == 1 else 'are'} also {', '.join(others)}" if others else ""
-    return ok("player", f"{wanted} ({_by(running)}){also}")
+    return ok("player", f"{configured} ({_set_by(players.by_server)}){also}")
 
 
-def _device(devices: Devices) -> Finding:
-    wanted, names = devices.wanted, devices.names
+def _judge_device(devices: Devices) -> Finding:
+    configured, command, names = devices.configured, devices.list_command, devices.names
+    used = configured or "the default"
     if devices.package is not None:
-        words = f"{wanted or 'the default'}; others cannot be listed: {devices.listed_by.split()[0]} is not installed"
+        words = f"{used}; others cannot be listed: {command.split()[0]} is not installed"
         step = f"sudo apt-get install -y {devices.package}"
-        return ok("device", words) if wanted is None else warning("device", words, step)
-    if devices.trouble is not None:
-        step = f"look at what this says: {devices.listed_by}"
-        return warning("device", f"{devices.listed_by}: {devices.trouble}", step)
+        return ok("device", words) if configured is None else warning("device", words, step)
+    if devices.error is not None:
+        return warning("device", f"{command}: {devices.error}", f"look at what this says: {command}")
     if not names:
         step = "plug in a loudspeaker; in a container, hand the device in"
-        return warning("device", f"{devices.listed_by} lists none", step)
-    # ALSA makes plughw:1,0 of any card; whether it can, the sentence shows.
-    if wanted is None or wanted in names or ":" in wanted:
-        return ok("device", f"{wanted or 'the default'}; {devices.listed_by} lists {some(names)}")
-    return warning(
-        "device",
-        f"{wanted} is not among those that {devices.listed_by} lists: {some(names)}",
-        "start the server with --device and one of these names",
-    )
+        return warning("device", f"{command} lists none", step)
+    # ALSA accepts plughw:1,0 for any card without listing it. The sentence will show whether it works.
+    if configured is None or configured in names or ":" in configured:
+        return ok("device", f"{used}; {command} lists {join_names(names)}")
+    words = f"{configured} is not among those that {command} lists: {join_names(names)}"
+    return warning("device", words, "start the server with --device and one of these names")
 
 
-def _sound_server(server: SoundServer, cards: Cards, session: Session) -> Finding:
-    where = "from here" if session.server is None else f"from the server (process {session.server})"
+def _judge_cards(cards: Cards, server: SoundServer, session: UserSession) -> Finding:
+    if cards.names:
+        return ok("cards", join_names(cards.names))
+    if server.name is not None:
+        return ok("cards", "none of this machine's own; the sound server has what is needed")
+    if _CONTAINER in session.origins:
+        step = "start the container with --device /dev/snd, or with the sound server's socket: see the README"
+        return warning("cards", "none in this container", step)
+    words = "the kernel knows none" if cards.in_kernel else "the kernel has no sound (no /proc/asound)"
+    return warning("cards", words, "plug in a loudspeaker or sound card, and look with: aplay -l")
+
+
+def _judge_access(cards: Cards, server: SoundServer, session: UserSession) -> Finding:
+    group = cards.group
+    if not cards.nodes:
+        return ok("group", f"nothing in /dev/snd to open, so the group {group} is not needed")
+    if not cards.forbidden:
+        member = "in the group {}" if group in session.groups else "not in the group {}, and needs not to be"
+        return ok("group", f"user {session.user} may open the cards ({member.format(group)})")
+    words = f"user {session.user} may not open {join_names(cards.forbidden)}: not in the group {group}"
+    if server.name is not None:
+        return ok("group", f"{words}; the sound server opens them")
+    if cards.member_after_login:
+        step = "log out and in again" if session.server_pid is None else "start the server again, from a new login"
+        return warning("group", f"{words} yet, though it is to be from the next login on", step)
+    return warning("group", words, f"sudo usermod -aG {group} {session.user}, and log in again")
+
+
+def _judge_sound_server(server: SoundServer, cards: Cards, session: UserSession) -> Finding:
+    check = _SOUND_SERVER_CHECK
+    where = "from here" if session.server_pid is None else f"from the server (process {session.server_pid})"
     if server.name is not None and server.sink == DUMMY_SINK:
         step = "plug in a loudspeaker, and look whether it is there: pactl list short sinks"
-        return warning(_SERVER, f"{server.name} has only a dummy output, {DUMMY_SINK}: nobody hears it", step)
+        return warning(check, f"{server.name} has only a dummy output, {DUMMY_SINK}: nobody hears it", step)
     if server.name is not None:
-        sink = f", plays to {server.sink}" if server.sink else ""
-        return ok(_SERVER, f"{server.name}{sink}")
+        return ok(check, server.name + (f", plays to {server.sink}" if server.sink else ""))
     if server.hangs:
         step = "restart it: systemctl --user restart pipewire pipewire-pulse (or: pulseaudio -k)"
-        return warning(_SERVER, f"there is one, but it does not answer {where}", step)
-    if not server.sockets and server.named is None:
-        if session.kinds and not cards.names:
-            return _out_of_reach(server, session, f"none can be reached {where}")
+        return warning(check, f"there is one, but it does not answer {where}", step)
+    if not server.sockets and server.pulse_server is None:
+        if session.origins and not cards.names:
+            return _judge_unreachable(server, session, f"none can be reached {where}")
         alone = "; players use ALSA" if cards.names else ""
-        return ok(_SERVER, f"no PulseAudio or PipeWire runs for user {session.user}{alone}")
-    at = f"at {server.named} (PULSE_SERVER)" if server.named else f"at {some(server.sockets)}"
-    if server.trouble is None:
+        return ok(check, f"no PulseAudio or PipeWire runs for user {session.user}{alone}")
+    at = f"{server.pulse_server} (PULSE_SERVER)" if server.pulse_server else join_names(server.sockets)
+    if server.error is None:
         step = "sudo apt-get install -y pulseaudio-utils"
-        return warning(_SERVER, f"there is one {at}, but no program to ask it: pactl, pw-cli", step)
-    return _out_of_reach(server, session, f"the one {at} cannot be reached {where}: {server.trouble}")
+        return warning(check, f"there is one at {at}, but no program to ask it: pactl, pw-cli", step)
+    return _judge_unreachable(server, session, f"the one at {at} cannot be reached {where}: {server.error}")
 
 
-def _out_of_reach(server: SoundServer, session: Session, words: str) -> Finding:
-    step = "systemctl --user restart pipewire pipewire-pulse (or: pulseaudio --start)"
-    if server.named is not None:
+def _judge_unreachable(server: SoundServer, session: UserSession, words: str) -> Finding:
+    """Return a warning about a sound server that can't be reached, with the most likely cause."""
+    hint, step = "", "systemctl --user restart pipewire pipewire-pulse (or: pulseaudio --start)"
+    if server.pulse_server is not None:
         step = "unset PULSE_SERVER, or start the sound server that it names"
-    elif "a container" in session.kinds:
-        words += "; a container sees only what it is given"
+    elif _CONTAINER in session.origins:
+        hint = "; a container sees only what it is given"
         step = "start the container with the host's socket and PULSE_SERVER: see the README"
-    elif "a system service" in session.kinds:
-        words += "; a system service is in no user's session"
+    elif _SYSTEM_SERVICE in session.origins:
+        hint = "; a system service is in no user's session"
         step = "serve as the user whose sound it is: talk serve --print-unit user"
     elif session.sudo_uid is not None:
-        words += "; a sound server takes its own user only, not root"
+        hint = "; a sound server takes its own user only, not root"
         step = "leave sudo out: run this as the user whose sound it is"
-    elif session.runtime is None and session.usual_runtime is not None:
-        step = f"export XDG_RUNTIME_DIR={session.usual_runtime}"
-    return warning(_SERVER, words, step)
+    elif session.runtime_dir is None and session.usual_runtime_dir is not None:
+        step = f"export XDG_RUNTIME_DIR={session.usual_runtime_dir}"
+    return warning(_SOUND_SERVER_CHECK, words + hint, step)
 
 
-def judge_levels(levels: tuple[Level, ...], *, default: bool) -> list[Finding]:
-    """Judge how loud it is; `default`: whether it is this output that is played to, as far as can be known."""
-    if not levels:
-        return []
-    broken = failed if default else warning
-    for level in levels:
-        if level.muted:
-            return [broken(_LOUDNESS, f"{level.name} is muted", level.unmute)]
-        if level.percent == 0:
-            return [broken(_LOUDNESS, f"{level.name} is at 0%", level.louder)]
-    for level in levels:
-        if level.percent is not None and level.percent < _FAINT:
-            return [warning(_LOUDNESS, f"{level.name} is at {level.percent}%: few will hear it", level.louder)]
+def judge_levels(levels: tuple[MixerLevel, ...], *, is_used: bool) -> list[Finding]:
+    """Judge the volume.
+
+    Args:
+        levels: the mixer's outputs.
+        is_used: whether speech goes to these outputs, as far as is known.
+    """
+    broken = failure if is_used else warning
+    check = _LOUDNESS_CHECK
+    for each in levels:
+        if each.muted or each.percent == 0:
+            fault, step = ("muted", each.unmute_command) if each.muted else ("at 0%", each.louder_command)
+            return [broken(check, f"{each.name} is {fault}", step)]
+    for each in levels:
+        if each.percent is not None and each.percent < _FAINT_PERCENT:
+            return [warning(check, f"{each.name} is at {each.percent}%: few will hear it", each.louder_command)]
     shown = [f"{each.name} at {each.percent}%" if each.percent is not None else f"{each.name} on" for each in levels]
-    return [ok(_LOUDNESS, ", ".join(shown))]
+    return [ok(check, ", ".join(shown))] if levels else []

@@ -1,7 +1,10 @@
-"""What makes sound of a text: Python, pyttsx3, libespeak-ng with its data and voices.
+"""The voice: Python, pyttsx3, libespeak-ng with its data and voices, and neural voices.
 
-An engine process of the doctor's own shows it. What libespeak-ng or a player does to it ends that process and is a fact
-here; this one never loads the library.
+Most facts come from an engine process that the doctor starts for itself. A faulty library or voice can only crash that
+process. The doctor itself never loads any of them.
+
+Neural voices are only examined if one is installed or in use. Only the voice in use is loaded and timed, because
+loading takes memory and some seconds.
 """
 
 from __future__ import annotations
@@ -16,149 +19,359 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
 from talkcli import install
-from talkcli.doctor.report import Finding, failed, ok, warning
-from talkcli.engine import protocol
+from talkcli.doctor.report import Finding, failure, join_names, ok, warning
+from talkcli.doctor.sound import run_program
+from talkcli.engine import models, protocol
 from talkcli.engine.parent.process import EngineFailed, PrivateEngine
-from talkcli.engine.voices import is_neural
+from talkcli.engine.voices import NEURAL, is_neural
 from talkcli.frozen import frozen, replace
+from talkcli.goals.reasons import Reason
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
+    from typing import Any
 
-#: The next step if something is missing.
+#: The sentence that the doctor speaks, and its rate in words per minute.
+SENTENCE_TEXT, SENTENCE_RATE_WPM = "If you hear this, talk works.", 200
+#: The engine states of a server whose engine works.
+WORKING_STATES = ("ready", "starting")
+#: Next steps if something is missing.
 INSTALL_LIBRARY = install.espeak_library()
 _INSTALL_PYTTSX3 = install.command("pyttsx3")
 _INSTALL_NEURAL = install.neural()
-#: A server's words for an engine that works.
-WORKING = ("ready", "starting")
+#: The next step for a library that can't be used. The key is a text in the engine's message, or else the reason.
+_LIBRARY_ADVICE = {
+    "espeak-ng data": "sudo apt-get install -y espeak-ng-data",
+    "libespeak-ng": INSTALL_LIBRARY,
+    Reason.ENGINE_CRASHED: "install it again: sudo apt-get install --reinstall -y libespeak-ng1 espeak-ng-data",
+    # libespeak-ng connects to PulseAudio when it starts, even if it doesn't play anything.
+    Reason.ENGINE_HUNG: "restart the sound server if that hangs (see below): libespeak-ng waits for it at its start",
+}
+_PACKAGES_CHECK, _FILES_CHECK, _NEURAL_CHECK = "neural", "voice files", "neural voice"
+#: A neural voice has to be this many times faster than speech. Otherwise other programs on the machine cause gaps.
+_MIN_REAL_TIME_FACTOR = 1.3
+#: A program that imports a package, but not from the current directory, and prints an error in one line. It runs as
+#: a process of its own, because onnxruntime can crash on an old processor.
+_IMPORT_PROGRAM = "import sys; sys.tracebacklimit = 0; sys.path[:] = filter(None, sys.path); import "
+#: Time limit for an import, which may be from an SD card.
+_IMPORT_LIMIT_S = 10.0
+_IMPORT_TIMED_OUT = f"it takes more than {_IMPORT_LIMIT_S:g} s"
+#: The next step for a package that can't be imported. The key is a text in the message; "" is the default.
+_IMPORT_ADVICE = {
+    _IMPORT_TIMED_OUT: "run talk doctor again when this machine is less busy",
+    "SIGILL": "this processor is too old for that version: install an older one, or use an espeak voice",
+    "": f"install it again: {install.neural(again=True)}",
+}
+_CHOOSE_ESPEAK = "choose one of espeak's: talk set --voice en, or talk serve --voice en"
 
 
 @frozen
-class Engine:
-    """What an engine process said that was started to look."""
-
-    driver: str | None = None
-    #: "eSpeak NG 1.51 (system)"
-    synthesizer: str | None = None
-    #: None where it didn't come to list them
-    voices: int | None = None
-    #: how many of these are neural
-    neural: int = 0
-    #: the player that it would try first; None if there is none, or it is not known
-    player: str | None = None
-    #: id of the neural voice that it was told to speak with; None for any other voice
-    voice: str | None = None
-    #: why it didn't start, for programs and in its own words; None where it did
-    reason: str | None = None
-    words: str = ""
-
-
-@frozen
-class Setting:
-    """What the engine process is to speak with."""
+class EngineOptions:
+    """Options of an engine process that the doctor starts."""
 
     player: str | None = None
     device: str | None = None
     voice: str | None = None
-    #: what ends any waiting with Interrupted, as in `connect.ready`
-    interrupt: Mapping[int, int] | None = None
     driver: str | None = None
-    #: the program that worked last, where no player is named
-    worked: str | None = None
-    #: the environment in which it is to run; None for this process's
+    #: the player to try first if none is given
+    first_player: str | None = None
+    #: environment of the process, or None for a copy of this one's
     env: Mapping[str, str] | None = None
+    #: descriptors that interrupt any wait, as in `wait_ready`
+    interrupt: Mapping[int, int] | None = None
 
 
-def python() -> Finding:
-    """Return which interpreter runs this."""
-    return ok("python", f"Python {platform.python_version()} ({sys.executable})")
+@frozen
+class EngineReport:
+    """What an engine process reported when it started."""
+
+    driver: str | None = None
+    #: name and version of the synthesizer, such as "eSpeak NG 1.51 (system)"
+    synthesizer: str | None = None
+    #: number of voices, or None if the engine did not list them
+    voice_count: int | None = None
+    #: number of neural voices among them
+    neural_count: int = 0
+    #: the player that the engine would try first, or None
+    player: str | None = None
+    #: id of the configured voice if it is a neural one, or None
+    neural_voice: str | None = None
+    #: why the engine did not start: a word for programs and a message, or None if it did
+    reason: str | None = None
+    message: str = ""
 
 
-def pyttsx3() -> str | None:
-    """Return the version of pyttsx3, None where none is installed; it is not imported, as it may be broken."""
+@frozen
+class VoiceTrial:
+    """The result of speaking with the neural voice in use."""
+
+    #: seconds that loading took, or None if the voice was not loaded
+    load_s: float | None = None
+    #: seconds of speech synthesized per second, or None if the voice failed
+    speed: float | None = None
+    #: memory of the engine process afterwards, or None if unknown
+    memory_bytes: int | None = None
+    #: why the voice failed, and the next step if it is known
+    message: str | None = None
+    step: str | None = None
+
+
+@frozen
+class NeuralVoices:
+    """Facts about neural voices and the packages that they need."""
+
+    #: message about a missing package, or None
+    missing: str | None
+    #: installed packages with their versions, such as "onnxruntime 1.23.2"
+    installed: tuple[str, ...] = ()
+    #: ids of the voices whose files look valid
+    valid: tuple[str, ...] = ()
+    #: id, fault and next step of all other voices
+    invalid: tuple[tuple[str, str, str], ...] = ()
+    #: the neural voice in use, as the user wrote it, or None
+    used: str | None = None
+    #: result of speaking with that voice, or None if it was not tried
+    trial: VoiceTrial | None = None
+    #: message about a package that can't be imported, or None
+    import_error: str | None = None
+
+
+def installed_version(package: str) -> str | None:
+    """Return the version of a package without importing it, or None if it is not installed."""
     with contextlib.suppress(PackageNotFoundError):
-        return version("pyttsx3")
+        return version(package)
     return None
 
 
-def look(setting: Setting) -> Engine:
-    """Start an engine process, and return what it says of itself."""
-    found = Engine()
-    try:
-        with conversation(setting) as engine:
-            ready = engine.wait_for(protocol.Ready)
-            found = Engine(ready.driver, ready.version, player=ready.player, voice=ready.voice)
-            voices = engine.wait_for(protocol.VoiceList).voices
-            return replace(found, voices=len(voices), neural=sum(is_neural(each.id) for each in voices))
-    except EngineFailed as error:
-        if found.driver is None or error.reason == "engine_crashed":
-            reason, words = fault(error)
-            return Engine(reason=reason, words=words)
-    return found  # it is ready; that it lists no voices is for who judges
+def start_engine(options: EngineOptions, limit: float = math.inf, output: int | None = None) -> PrivateEngine:
+    """Start an engine process, and return the conversation with it.
 
-
-def conversation(setting: Setting, limit: float = math.inf) -> PrivateEngine:
-    """Return what talks to an engine process of these settings, for at most `limit` seconds."""
+    Args:
+        options: its options.
+        limit: time in seconds for the whole conversation.
+        output: descriptor that gets the sound as a WAV file, instead of a player. Such an engine lists no voices.
+    """
+    given = options.driver, options.player, options.device, options.voice
     configure = protocol.Configure(
-        os.getpid(), setting.driver, setting.player, setting.device, setting.voice, last_player=setting.worked
+        os.getpid(), *given, list_voices=output is None, output_fd=output, last_player=options.first_player
     )
     deadline = time.monotonic() + limit
-    return PrivateEngine(configure, env=setting.env, deadline=deadline, interrupt=setting.interrupt)
+    return PrivateEngine(configure, env=options.env, deadline=deadline, interrupt=options.interrupt)
 
 
-def fault(error: EngineFailed) -> tuple[str, str]:
-    """Return why an engine process failed, for programs and in words; whether it was ready yet makes no difference."""
+def find_engine(options: EngineOptions) -> EngineReport:
+    """Start an engine process, and return what it reports."""
+    report = EngineReport()
+    try:
+        with start_engine(options) as engine:
+            ready = engine.wait_for(protocol.Ready)
+            report = EngineReport(ready.driver, ready.version, player=ready.player, neural_voice=ready.voice)
+            voices = engine.wait_for(protocol.VoiceList).voices
+            neural = sum(is_neural(each.id) for each in voices)
+            return replace(report, voice_count=len(voices), neural_count=neural)
+    except EngineFailed as error:
+        if report.driver is None or error.reason == Reason.ENGINE_CRASHED:
+            reason, message = explain_failure(error)
+            return EngineReport(reason=reason, message=message)
+    return report  # the engine was ready but listed no voices
+
+
+def explain_failure(error: EngineFailed) -> tuple[str, str]:
+    """Return the reason and the message of an engine's failure. Silence counts as `engine_hung`, whenever it occurs."""
     if error.silent_s is not None:
-        return "engine_hung", f"the engine process said nothing for {error.silent_s:g} s"
+        return Reason.ENGINE_HUNG, f"the engine process said nothing for {error.silent_s:g} s"
     return error.reason, str(error)
 
 
-def judge(pyttsx3: str | None, engine: Engine, *, server: str | None) -> list[Finding]:
-    """Judge the voice; `pyttsx3`: its version.
+def judge_python() -> Finding:
+    """Return the finding about the Python interpreter, which is never a fault."""
+    return ok("python", f"Python {platform.python_version()} ({sys.executable})")
 
-    `server`: what a server says of its own engine. If that engine works, findings about this one are warnings.
+
+def judge_engine(pyttsx3: str | None, engine: EngineReport, *, server: str | None) -> list[Finding]:
+    """Judge pyttsx3, libespeak-ng and the voices.
+
+    Args:
+        pyttsx3: version of pyttsx3, or None if it is not installed.
+        engine: the report of the doctor's engine process.
+        server: the engine state that a server reports, or None. If the server's engine works, faults of the doctor's
+            engine are only warnings.
     """
-    broken = warning if server in WORKING else failed
-    if server not in {None, *WORKING} and engine.reason is None:
-        engine = Engine(reason="engine_failed", words=f"the server's engine: {server}")
-    words = _without_step(engine.words)
+    broken = warning if server in WORKING_STATES else failure
+    if server not in {None, *WORKING_STATES} and engine.reason is None:
+        engine = EngineReport(reason=Reason.ENGINE_FAILED, message=f"the server's engine: {server}")
     if engine.reason is None:
-        return [ok("pyttsx3", f"{pyttsx3 or 'of an unknown version'}, driver {engine.driver}"), *_library(engine)]
-    if "pyttsx3 is missing" in words or pyttsx3 is None:
-        return [broken("pyttsx3", words or "pyttsx3 is missing", _INSTALL_PYTTSX3)]
+        words = f"{pyttsx3 or 'of an unknown version'}, driver {engine.driver}"
+        return [ok("pyttsx3", words), *_judge_library(engine)]
+    # The finding shows the next step on its own.
+    message = engine.message.removesuffix(f": {_INSTALL_PYTTSX3}").removesuffix(f": {INSTALL_LIBRARY}")
+    if "pyttsx3 is missing" in message or pyttsx3 is None:
+        return [broken("pyttsx3", message or "pyttsx3 is missing", _INSTALL_PYTTSX3)]
     found = ok("pyttsx3", pyttsx3)
-    if engine.reason == "unknown_voice":
+    if engine.reason == Reason.UNKNOWN_VOICE:
         step = "choose one that 'talk voices' lists, in TALK_VOICE or --voice"
-        if _INSTALL_NEURAL in words:
-            step = _INSTALL_NEURAL
-        return [found, ok("libespeak-ng", "loaded"), broken("voices", words, step)]
-    step = "read what the engine said in the log of talk serve"
-    if "espeak-ng data" in words:
-        step = "sudo apt-get install -y espeak-ng-data"
-    elif "libespeak-ng" in words:
-        step = INSTALL_LIBRARY
-    elif engine.reason == "engine_crashed":
-        words = f"the engine process died while it loaded the library: {words}"
-        step = "install it again: sudo apt-get install --reinstall -y libespeak-ng1 espeak-ng-data"
-    elif engine.reason == "engine_hung":
-        # It asks PulseAudio at its start, though it is to play nothing itself.
-        step = "restart the sound server if that hangs (see below): libespeak-ng waits for it at its start"
-    return [found, broken("libespeak-ng", words, step)]
+        step = _INSTALL_NEURAL if _INSTALL_NEURAL in message else step
+        return [found, ok("libespeak-ng", "loaded"), broken("voices", message, step)]
+    clue = next((each for each in _LIBRARY_ADVICE if each in message or each == engine.reason), "")
+    if clue == Reason.ENGINE_CRASHED:
+        message = f"the engine process died while it loaded the library: {message}"
+    step = _LIBRARY_ADVICE.get(clue, "read what the engine said in the log of talk serve")
+    return [found, broken("libespeak-ng", message, step)]
 
 
-def _without_step(words: str) -> str:
-    """Return an engine's words without the next step, which the finding shows by itself."""
-    for step in (_INSTALL_PYTTSX3, INSTALL_LIBRARY):
-        words = words.removesuffix(f": {step}")
-    return words
-
-
-def _library(engine: Engine) -> list[Finding]:
+def _judge_library(engine: EngineReport) -> list[Finding]:
     name = engine.synthesizer
     found = [] if name is None else [ok("libespeak-ng", f"{name}, with its data")]
-    if engine.voices is None:
+    if engine.voice_count is None:
         return [*found, warning("voices", "the engine listed none in time", "run talk doctor again")]
-    if not engine.voices:
+    if not engine.voice_count:
         step = "sudo apt-get install --reinstall -y espeak-ng-data"
         return [*found, warning("voices", "the engine has none", step)]
-    return [*found, ok("voices", f"{engine.voices}, listed by 'talk voices'")]
+    return [*found, ok("voices", f"{engine.voice_count}, listed by 'talk voices'")]
+
+
+def find_neural(used: str | None, options: EngineOptions, limit: float) -> NeuralVoices:
+    """Check the files of all neural voices, and try the voice in use.
+
+    Args:
+        used: that voice as the user wrote it, or None if no neural voice is in use.
+        options: environment and interrupt of the processes that are started.
+        limit: time in seconds for the trial.
+    """
+    missing = models.missing()
+    valid, invalid = [], []
+    for name, path in models.found(options.env).items():
+        try:
+            models.describe(path)
+            models.open_checked(path).close()
+            valid.append(NEURAL + name)
+        except models.BadFile as error:
+            invalid.append((NEURAL + name, *_split_step(str(error))))
+    import_error = None if missing else _find_import_error(os.environ if options.env is None else options.env)
+    trial = None if used is None or missing or import_error else _try_voice(used, options, limit)
+    installed = tuple(map(_with_version, models.NEEDED))
+    return NeuralVoices(missing, installed, tuple(valid), tuple(invalid), used, trial, import_error)
+
+
+def _find_import_error(env: Mapping[str, str]) -> str | None:
+    """Return a message about the first package that can't be imported, or None if all can be."""
+    env = {**env, **models.NO_TELEMETRY}
+    for package in reversed(models.NEEDED):  # onnxruntime imports numpy, so numpy is first
+        output = run_program(sys.executable, "-c", _IMPORT_PROGRAM + package, env=env, limit=_IMPORT_LIMIT_S)
+        if output.error is not None:
+            error = _IMPORT_TIMED_OUT if output.timed_out else output.error
+            return f"{_with_version(package)} cannot be imported: {error}"
+    return None
+
+
+def _with_version(package: str) -> str:
+    return f"{package} {installed_version(package) or 'of an unknown version'}"
+
+
+def _split_step(message: str) -> tuple[str, str]:
+    """Split a message into the fault and the next step after its last colon. The default step is another voice."""
+    what, colon, step = message.rpartition(": ")
+    return (what, step) if colon else (message, _CHOOSE_ESPEAK)
+
+
+def _try_voice(used: str, options: EngineOptions, limit: float) -> VoiceTrial:
+    """Load the voice and time a sentence. Nothing is played."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        with start_engine(options, limit, nowhere) as engine:
+            engine.wait_for(protocol.Ready)
+            ended, load_s = _speak(engine, used, "a")  # speaking a first text also loads the voice
+            began = time.monotonic()
+            if ended.outcome == protocol.OUTCOME_COMPLETED:
+                ended, _ = _speak(engine, used, SENTENCE_TEXT)
+            if ended.outcome != protocol.OUTCOME_COMPLETED or ended.duration is None:
+                fault = _split_step(ended.message or f"the sentence ended {ended.outcome}")
+                return VoiceTrial(None, None, None, *fault)
+            speed = ended.duration / (time.monotonic() - began)
+            return VoiceTrial(load_s, speed, _memory_of(engine._process.pid))
+    except EngineFailed as error:
+        return VoiceTrial(message=explain_failure(error)[1], step=_CHOOSE_ESPEAK)
+    except TimeoutError:
+        return VoiceTrial(message=f"it was not loaded, and had not spoken, after {limit:g} s", step=_CHOOSE_ESPEAK)
+    finally:
+        os.close(nowhere)
+
+
+def _speak(engine: PrivateEngine, voice: str, text: str) -> tuple[protocol.Ended, float | None]:
+    """Speak a text, and return how it ended and the seconds that loading the voice took, or None."""
+    load_s = None
+    # `voice_only`, so that espeak doesn't speak instead.
+    engine.speak(protocol.Speak(text, text, SENTENCE_RATE_WPM, 1.0, voice, 50, voice_only=True))
+    while True:
+        event = next(engine.events)
+        if isinstance(event, protocol.VoiceLoaded):
+            load_s = event.seconds
+        elif isinstance(event, protocol.Ended):
+            return event, load_s
+
+
+def _memory_of(pid: int) -> int | None:
+    """Return the resident memory of a process in bytes, or None if it is unknown."""
+    with contextlib.suppress(OSError, ValueError, IndexError), open(f"/proc/{pid}/statm") as file:
+        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    return None
+
+
+def judge_server_voices(voices: dict[str, Any]) -> list[Finding]:
+    """Judge the neural voices of a server whose files can't be examined, from its own `neural_voices`."""
+    failed = _failed_voices(voices)
+    loaded = tuple(each for each in voices if each not in failed)
+    for voice, why in failed.items():
+        step = f"see whether it still is so: talk set --voice {voice}"
+        return [warning(_NEURAL_CHECK, f"the server cannot speak by {voice}: {why}", step)]
+    return [ok(_NEURAL_CHECK, f"of the server: {join_names(loaded)}")] if loaded else []
+
+
+def _failed_voices(voices: dict[str, Any]) -> dict[str, str]:
+    """Return the voices that a server could not load, and why."""
+    return {voice: str(each.get("why")) for voice, each in voices.items() if each.get("state") == "failed"}
+
+
+def judge_neural(neural: NeuralVoices, *, has_server: bool, server_voices: dict[str, Any]) -> list[Finding]:
+    """Judge the packages and files of neural voices, and the voice in use.
+
+    Args:
+        neural: the facts.
+        has_server: whether a server runs. It speaks with espeak if a neural voice fails.
+        server_voices: the server's own `neural_voices`, or empty.
+    """
+    trial = neural.trial
+    broken = warning if has_server or neural.used is None else failure
+    if neural.missing is not None:
+        found = [broken(_PACKAGES_CHECK, *_split_step(neural.missing))]
+    elif neural.import_error is not None:
+        step = next(step for clue, step in _IMPORT_ADVICE.items() if clue in neural.import_error)
+        found = [broken(_PACKAGES_CHECK, neural.import_error, step)]
+    else:
+        found = [ok(_PACKAGES_CHECK, ", ".join(neural.installed))]
+    if neural.invalid:
+        (voice, message, step), *others = neural.invalid
+        names = join_names(tuple(each[0] for each in others))
+        more = f"; and something is wrong with {names}" if others else ""
+        found.append(warning(_FILES_CHECK, f"{voice}: {message}{more}", step))
+    elif neural.valid:
+        found.append(ok(_FILES_CHECK, f"as they should be: {join_names(neural.valid)}"))
+    if trial is None:
+        return found
+    if trial.speed is not None and _failed_voices(server_voices):
+        return [*found, *judge_server_voices(server_voices)]  # the voice works here, but the server could not load it
+    return [*found, _judge_trial(neural.used or "", trial, broken)]
+
+
+def _judge_trial(used: str, trial: VoiceTrial, broken: Callable[[str, str, str], Finding]) -> Finding:
+    if trial.speed is None:
+        message = trial.message or "it was not spoken with"
+        return broken(_NEURAL_CHECK, f"{used} is in use: {message}", trial.step or _CHOOSE_ESPEAK)
+    facts = [] if trial.load_s is None else [f"loaded in {trial.load_s:.1f} s"]
+    facts.append(f"makes a sentence {trial.speed:.1f} times as fast as it is heard")
+    facts += [] if trial.memory_bytes is None else [f"takes {trial.memory_bytes / 1e6:.0f} MB with its engine"]
+    words = f"{used} is in use: {', '.join(facts)}"
+    if trial.speed < _MIN_REAL_TIME_FACTOR:
+        step = "choose a voice whose quality is low or x_low, or one of espeak's: talk set --voice en"
+        return warning(_NEURAL_CHECK, f"{words}: this machine is too slow for it, or too busy", step)
+    return ok(_NEURAL_CHECK, words)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from typing import Any
 
 #: The packages that a model needs.
-NEEDED = install.NEURAL
+NEEDED = install.NEURAL_PACKAGES
 #: From version 1.30 on, onnxruntime writes a device id into ~/.cache/Microsoft when it is imported, and contacts a
 #: telemetry host some seconds later. A robot's voice reports to nobody, so a user's own value is overwritten.
 NO_TELEMETRY = {"ORT_DISABLE_TELEMETRY": "1"}

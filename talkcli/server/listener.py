@@ -204,7 +204,7 @@ def _refuse_other_file(path: str) -> None:
     except OSError:
         return
     if stat.S_ISDIR(mode):
-        inside = os.path.join(path, paths.SOCKET)
+        inside = os.path.join(path, paths.SOCKET_NAME)
         raise AddressInUse(f"{path} exists and is no socket but a directory: name one in it, --socket {inside}")
     if not stat.S_ISSOCK(mode):
         step = "remove it, or name another one" if stat.S_ISREG(mode) or stat.S_ISLNK(mode) else "name another one"

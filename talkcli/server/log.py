@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from talkcli.daemon.log import line, shown
+from talkcli.daemon.log import sanitize, write
 from talkcli.engine.players import NO_PLAYER
 from talkcli.engine.voices import is_own_driver
 from talkcli.goals.states import State
@@ -32,26 +32,26 @@ def ended(record: Record, seconds: float) -> None:
     how = f"{record.id} {record.state.name}{took}"
     if record.state is not State.SUCCEEDED:
         how += f" ({record.reason}{_by(record.by)})"
-    detail = f"; {shown(record.message)}" if record.state is State.ABORTED and record.message else ""
-    line(f'{how}: "{shown(record.text or "")}" from {who(record.sender)}{detail}')
+    detail = f"; {sanitize(record.message)}" if record.state is State.ABORTED and record.message else ""
+    write(f'{how}: "{sanitize(record.text or "")}" from {who(record.sender)}{detail}')
 
 
 def ready(engine: Ready, for_player: Sequence[str]) -> None:
     """Write the line of an engine that is ready; `for_player`: the options that were given for a player."""
-    version = f", {shown(engine.version)}" if engine.version else ""
+    version = f", {sanitize(engine.version)}" if engine.version else ""
     sound = sound_of(engine)
     words = f"engine ready: driver {engine.driver}{version}, {sound}"
     if for_player and sound == _BY_ITSELF:
         words += f": {' and '.join(for_player)} {'has' if len(for_player) == 1 else 'have'} no effect"
-    line(words)
+    write(words)
 
 
 def loaded(voice: VoiceLoaded) -> None:
     """Write the line of a neural voice that can be spoken with from now on, or can't."""
     if voice.error is None:
-        line(f"voice {shown(voice.voice)} loaded in {voice.seconds:.1f} s")
+        write(f"voice {sanitize(voice.voice)} loaded in {voice.seconds:.1f} s")
     else:
-        line(f"voice {shown(voice.voice)} cannot be loaded, espeak speaks where it may: {shown(voice.error)}")
+        write(f"voice {sanitize(voice.voice)} cannot be loaded, espeak speaks where it may: {sanitize(voice.error)}")
 
 
 def sound_of(engine: Ready) -> str:

@@ -120,7 +120,7 @@ class Requests:
         except RequestRefused as error:
             call.refuse(error.code, str(error))
         except Exception as error:  # noqa: BLE001 - one client's request must not take the voice from the others
-            log.bug(request.kind, error)
+            log.write_bug(request.kind, error)
             call.refuse("internal_error", f"{request.kind} failed: a bug of talk's, see its log")
         finally:
             self._size -= call.size
@@ -367,7 +367,7 @@ class Requests:
         self._speech.apply(self._scheduler.tick(self._speech.now()))  # who waited for a voice may wait no more
         if changed:
             values = ", ".join(f"{name} {figure(value)}" for name, value in changed.items())
-            log.line(f"set to {log.shown(values)} by {who(call.connection.sender)}")
+            log.write(f"set to {log.sanitize(values)} by {who(call.connection.sender)}")
         call.answer(settings=as_shown(self._scheduler.settings))
 
     def _find(self, goal_id: str) -> Record:

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING
 
 from talkcli import __version__, peers
 from talkcli.daemon import log
-from talkcli.daemon.systemd import Systemd
+from talkcli.daemon.systemd import ServiceManager
 from talkcli.engine import protocol
 from talkcli.engine.parent.supervisor import Supervisor
 from talkcli.engine.protocol import START_LIMIT_S
 from talkcli.engine.voices import is_neural
-from talkcli.errors import EXIT_OK, EXIT_SIGNAL, AddressInUse, TalkError, UsageError, limits
+from talkcli.errors import EXIT_OK, EXIT_SIGNAL, AddressInUse, TalkError, UsageError, memory_limits
 from talkcli.frozen import frozen, replace
 from talkcli.goals.goal import Sender
 from talkcli.goals.options import INITIAL, MAX_CHARACTERS, Say, Set, as_shown
@@ -110,8 +110,8 @@ class Server:
         self.speech = Speech(self._scheduler, settings.for_player, settings.voice_memory * MEGABYTE)
         self.speech.lost = self._end
         self.speech.voices.driver = settings.driver
-        self._systemd = Systemd(self._loop, self.speech.words)
-        self.speech.changed = self._systemd.changed
+        self._systemd = ServiceManager(self._loop, self.speech.words)
+        self.speech.changed = self._systemd.schedule_status
         self._requests = Requests(self.speech, self._describe)
         self.handle, self.owes = self._requests.handle, self._requests.owes
         self.greeting = encode(greeting(__version__, os.getpid(), self._scheduler.boot))
@@ -133,7 +133,7 @@ class Server:
         settings, speech = self._settings, self.speech
         descriptors = make_room(settings.max_clients + DOOR)
         self._acceptor = Acceptor(self._loop, lambda each: Connection(self, speech.streams, each).begin(), descriptors)
-        self._loop.set_exception_handler(log.loop_bug)
+        self._loop.set_exception_handler(log.handle_loop_error)
         for number in self._ended_by:
             self._loop.add_signal_handler(number, self._on_signal, number)
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that goes away doesn't take the voice along
@@ -154,7 +154,7 @@ class Server:
         try:
             speech.engine.thread.start()
         except RuntimeError as error:  # all that Python says of a thread that it can't have
-            raise TalkError(f"the engine's thread cannot be started: {limits()}") from error
+            raise TalkError(f"the engine's thread cannot be started: {memory_limits()}") from error
         try:
             self._acceptor.open(self._listener.socket)
             self._next_look = self._loop.call_later(LOOK_EVERY, self._look_after_socket)
@@ -163,8 +163,8 @@ class Server:
                 with contextlib.suppress(asyncio.TimeoutError):
                     await asyncio.wait_for(speech.engine_known.wait(), START_LIMIT_S)
             if not self._scheduler.closing:
-                self._systemd.ready()
-                log.line(f"ready on {self._listener.path} (pid {os.getpid()})")
+                self._systemd.notify_ready()
+                log.write(f"ready on {self._listener.path} (pid {os.getpid()})")
             if settings.greeting:
                 itself = Sender(os.getpid(), os.getuid(), "talk")
                 speech.apply(self._scheduler.submit(Say(settings.greeting), itself, speech.now()).effects)
@@ -206,14 +206,14 @@ class Server:
             if not (self._listener.passed or may_pass(error)):
                 # Clients find another server, or none; a supervisor that starts this one again will hear why.
                 self._next_look.cancel()
-                log.line(log.shown(f"ending: {error}"))
+                log.write(log.sanitize(f"ending: {error}"))
                 self._end(error)
             elif str(error) != self._unreachable:
                 self._unreachable = str(error)
-                log.line(log.shown(f"clients can't reach this server: {error}"))
+                log.write(log.sanitize(f"clients can't reach this server: {error}"))
             return
         self._unreachable = ""
-        log.line(f"the socket's file or its lock was gone or another: bound again at {self._listener.path}")
+        log.write(f"the socket's file or its lock was gone or another: bound again at {self._listener.path}")
         self._acceptor.open(self._listener.socket)
         if former:
             former.close()
@@ -230,7 +230,7 @@ class Server:
         elif len(self.connections) >= self._settings.max_clients + DOOR:
             refusal = busy_greeting()
         else:
-            connection.sender = Sender(pid or None, uid, peers.command_of(pid), peers.parent_command_of(pid))
+            connection.sender = Sender(pid or None, uid, peers.command_name(pid), peers.parent_command_line(pid))
             if len(self.connections) < self._settings.max_clients:
                 connection.admit()
             self.connections.add(connection)
@@ -281,7 +281,7 @@ class Server:
     def _end(self, fatal: TalkError | None = None) -> None:
         """End every goal, and then the server. `fatal`: what can't be done any more, for whoever started it."""
         self._fatal = fatal or self._fatal
-        self._systemd.stopping()
+        self._systemd.notify_stopping()
         self._requests.shut_down()
 
     async def _say_goodbye(self) -> None:
@@ -294,7 +294,7 @@ class Server:
             connection.stream.abort()
 
     def _on_signal(self, number: signal.Signals) -> None:
-        log.line(f"{signal.Signals(number).name}: ending")
+        log.write(f"{signal.Signals(number).name}: ending")
         for each in self._ended_by:
             # Not by the loop, which may have a long turn to finish: whoever asks twice wants no goodbye.
             signal.signal(each, self._on_second_signal)

@@ -119,7 +119,7 @@ class Speech:
             protocol.OutputChanged: self._output,
             protocol.Held: self._paused,
             protocol.Ended: self._ended,
-            EngineSaid: lambda said: log.line(f"engine: {log.shown(said.line)}"),
+            EngineSaid: lambda said: log.write(f"engine: {log.sanitize(said.line)}"),
             EngineDied: self._died,
             EngineMissing: self._missing,
             ThreadDied: self._thread_died,
@@ -138,7 +138,7 @@ class Speech:
             doing = f"speaking {scheduler.active.id}" if scheduler.active else "idle"
         waiting = f", {scheduler.pending_count} waiting" if scheduler.pending_count else ""
         voice = f"; {ready.version or ready.driver}, {server_log.sound_of(ready)}" if ready else ""
-        return log.shown(doing + waiting + voice)
+        return log.sanitize(doing + waiting + voice)
 
     # -- what is waited for
 
@@ -179,7 +179,7 @@ class Speech:
         if self.voices.neural[voice].state is Readiness.LOADING:
             self.scheduler.loading.begin(voice, elapsed())
         for each in drop:
-            log.line(f"voice {log.shown(each)} dropped, to make room for {log.shown(voice)}")
+            log.write(f"voice {log.sanitize(each)} dropped, to make room for {log.sanitize(voice)}")
             if each in self.voices.neural:
                 self.scheduler.loading.wait_for(each)
         self.engine.load(voice, drop)
@@ -212,13 +212,13 @@ class Speech:
         if is_neural(speaking) and not self.voices.is_loaded(speaking):
             return  # it was dropped, and keeps its memory until it has spoken: then the engine measures again
         for each in self.voices.excess(next(iter(needed), speaking), needed):
-            log.line(f"voice {log.shown(each)} dropped: the voices take more than --voice-memory allows")
+            log.write(f"voice {log.sanitize(each)} dropped: the voices take more than --voice-memory allows")
             if each in self.voices.neural:
                 self.scheduler.loading.wait_for(each)
             self.engine.drop(each)
         words = self.voices.too_large()
         if words:
-            log.line(log.shown(words))
+            log.write(log.sanitize(words))
 
     def _unloaded(self, unloaded: protocol.VoiceUnloaded) -> None:
         self.voices.unloaded(unloaded.voice, self._needed())
@@ -231,7 +231,7 @@ class Speech:
         if active is not None and active.id == speaks.id:
             self.scheduler.spoken_by(speaks.id, speaks.voice)
             if speaks.fallback_reason:
-                log.line(log.shown(f"{speaks.id} is spoken by {speaks.voice}: {speaks.fallback_reason}"))
+                log.write(log.sanitize(f"{speaks.id} is spoken by {speaks.voice}: {speaks.fallback_reason}"))
             self._load_next()  # its own may be dropped now
 
     def for_silence(self, record: Record) -> Place:
@@ -268,7 +268,7 @@ class Speech:
         paused, held_id = self.scheduler.paused, held.id if held else None
         self.news.tell([partial(self.subscribers.paused, held_id, paused=paused, by=by, at=time.time())])
         assert by.client
-        log.line(f"{'paused' if paused else 'resumed'} by {server_log.who(by.client)}")
+        log.write(f"{'paused' if paused else 'resumed'} by {server_log.who(by.client)}")
 
     # -- the scheduler's effects
 
@@ -299,7 +299,7 @@ class Speech:
             try:
                 self._orders[effect.order](effect.record)
             except Exception as error:  # noqa: BLE001 - the effects after it must not be lost: the engine would wait
-                log.bug(effect.order.value, error)
+                log.write_bug(effect.order.value, error)
         if moved:
             self.queue_changed()
         self.news.tell(told)
@@ -382,7 +382,7 @@ class Speech:
                 if take := self._takes.get(type(report)):  # what else the process says is for its thread alone
                     take(report)
             except Exception as error:  # noqa: BLE001 - what comes after it must not be lost
-                log.bug("a report of the engine", error)
+                log.write_bug("a report of the engine", error)
         self._reports_due = True
         self._loop.call_soon(self._take_reports)
 
@@ -394,7 +394,7 @@ class Speech:
         self.scheduler.engine_lost()
         given_up = self.voices.engine_lost(elapsed())
         if given_up:
-            log.line(log.shown(f"voice {given_up} is left alone: {self.voices.failure(given_up)}"))
+            log.write(log.sanitize(f"voice {given_up} is left alone: {self.voices.failure(given_up)}"))
         self._set_timer()
         self._engine_fails(died.message)
 
@@ -425,7 +425,7 @@ class Speech:
 
     def _engine_fails(self, words: str) -> None:
         if words != self.engine_words:
-            log.line(log.shown(words))
+            log.write(log.sanitize(words))
         self.engine_words = words
         go_on(self.for_voices)
         self.changed()

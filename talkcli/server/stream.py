@@ -75,7 +75,9 @@ class Streams:
         while self.waiting > ALL_OUTPUT and self.open:
             most = max(self.open, key=lambda each: each.size + each.held)
             most.abort()
-            log.seldom("output", f"a client that doesn't read is let go: {ALL_OUTPUT >> 20} MiB wait for all together")
+            log.write_limited(
+                "output", f"a client that doesn't read is let go: {ALL_OUTPUT >> 20} MiB wait for all together"
+            )
 
     def add(self, stream: Stream) -> None:
         """Have what was written in this stream sent at the end of this turn."""
@@ -92,7 +94,7 @@ class Streams:
                 stream.flush()
             except Exception as error:  # noqa: BLE001 - one client's must not take the others' answers
                 stream.abort()
-                log.bug("sending to a client", error)
+                log.write_bug("sending to a client", error)
 
 
 class Stream:
@@ -267,7 +269,7 @@ def make_room(clients: int) -> int:
             resource.setrlimit(resource.RLIMIT_NOFILE, (min(wanted, most), limits[1]))
             allowed = min(wanted, most)
     if allowed < wanted:
-        log.line(
+        log.write(
             f"{allowed} files may be open: {max(0, allowed - RESERVE - OWN)} clients fit, not {clients}; "
             f"raise LimitNOFILE= or ulimit -n to {wanted}"
         )
@@ -318,12 +320,12 @@ class Acceptor:
             try:
                 self._serve(connected)
             except Exception as error:  # noqa: BLE001 - one connection must not take the others'
-                log.bug("making a connection", error)
+                log.write_bug("making a connection", error)
                 connected.close()
 
     def _turn_away(self, connected: socket.socket) -> None:
         """Tell a client that the server is full, so that it comes again; the wire's words for it."""
-        log.seldom(
+        log.write_limited(
             "descriptors",
             f"clients are turned away: only {self._descriptors} files may be open (raise LimitNOFILE= or ulimit -n)",
         )
@@ -333,7 +335,7 @@ class Acceptor:
     def _pause(self, listening: socket.socket, error: OSError) -> None:
         """Leave the connections waiting for a while: the loop would ask for them without end."""
         if error.errno not in _USED_UP:
-            log.bug("taking up a connection", error)
-        log.seldom("accept", f"no connection can be taken up: {error.strerror}; they wait until one can")
+            log.write_bug("taking up a connection", error)
+        log.write_limited("accept", f"no connection can be taken up: {error.strerror}; they wait until one can")
         self.close()
         self._retry = self._loop.call_later(RETRY_AFTER, self.open, listening)

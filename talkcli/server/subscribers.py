@@ -200,4 +200,4 @@ class News:
         try:
             telling()
         except Exception as error:  # noqa: BLE001 - those behind it must not wait for ever because of it
-            log.bug("telling clients", error)
+            log.write_bug("telling clients", error)

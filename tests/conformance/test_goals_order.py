@@ -219,7 +219,7 @@ from talkcli.daemon import log
 from talkcli.server.requests import Requests
 from tests.support import scripted_serve
 let_go = Requests._let_go
-Requests._let_go = lambda self: (log.line("looks for room"), let_go(self))
+Requests._let_go = lambda self: (log.write("looks for room"), let_go(self))
 scripted_serve.main()
 """
 

@@ -25,8 +25,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from talkcli.doctor import sentence, voice
-from talkcli.doctor.sentence import Played
-from talkcli.doctor.voice import Engine, Setting
+from talkcli.doctor.sentence import SentenceResult
+from talkcli.doctor.voice import EngineOptions, EngineReport
 from talkcli.engine import protocol
 from talkcli.engine.parent import process
 from talkcli.engine.parent.process import EngineFailed, PrivateEngine, engine_command
@@ -495,19 +495,19 @@ def test_a_deadline_ends_a_conversation_in_which_there_is_much_to_hear() -> None
 @pytest.mark.usefixtures("scripted_process")
 def test_doctor_tells_silence_alike_before_and_after_the_start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(process, "HANG_LIMIT_S", 0.4)
-    hung = Played(State.ABORTED, "engine_hung", "the engine process said nothing for 0.4 s")
-    assert sentence.by_engine("hang", Setting(), 1.0, 20.0) == hung
+    hung = SentenceResult(State.ABORTED, "engine_hung", "the engine process said nothing for 0.4 s")
+    assert sentence.speak_by_engine("hang", EngineOptions(), 1.0, 20.0) == hung
     behaviour = tmp_path / "start"
     behaviour.write_text("hang")
     monkeypatch.setenv("SCRIPTED_START_FILE", str(behaviour))
     monkeypatch.setattr(process, "START_LIMIT_S", 0.3)
     words = "the engine process said nothing for 0.3 s"
-    assert voice.look(Setting()) == Engine(reason="engine_hung", words=words)
+    assert voice.find_engine(EngineOptions()) == EngineReport(reason="engine_hung", message=words)
 
 
 @pytest.mark.usefixtures("scripted_process")
 def test_doctor_tells_how_an_engine_process_died_and_that_a_sentence_takes_too_long() -> None:
-    died = Played(State.ABORTED, "engine_crashed", "it was killed by SIGSEGV")
-    assert sentence.by_engine("silent-start crash", Setting(), 1.0, 20.0) == died
-    late = Played(State.ABORTED, "engine_hung", "it was not over after 0.5 s")
-    assert sentence.by_engine("never-ends", Setting(), 1.0, 0.5) == late
+    died = SentenceResult(State.ABORTED, "engine_crashed", "it was killed by SIGSEGV")
+    assert sentence.speak_by_engine("silent-start crash", EngineOptions(), 1.0, 20.0) == died
+    late = SentenceResult(State.ABORTED, "engine_hung", "it was not over after 0.5 s")
+    assert sentence.speak_by_engine("never-ends", EngineOptions(), 1.0, 0.5) == late

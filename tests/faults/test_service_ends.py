@@ -226,15 +226,15 @@ def test_storm_of_the_same_message_is_a_line_a_minute_with_a_number(
     capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = 1000.0
-    monkeypatch.setattr(log, "_seldom", {})
+    monkeypatch.setattr(log, "_rate_limits", {})
     monkeypatch.setattr("talkcli.daemon.log.time.monotonic", lambda: now)
     with open(2, "w", encoding="utf-8", closefd=False) as stderr:
         monkeypatch.setattr(sys, "stderr", stderr)
         for second in range(600):  # ten minutes, ten times a second
             now = 1000.0 + second
             for number in range(10):
-                log.seldom("descriptors", f"no descriptor {number}")
-        log.seldom("another", "of another kind")
+                log.write_limited("descriptors", f"no descriptor {number}")
+        log.write_limited("another", "of another kind")
     lines = capfd.readouterr().err.splitlines()
     assert len(lines) == 11
     assert lines[0] == "talk: no descriptor 0"

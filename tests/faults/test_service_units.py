@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.daemon.systemd import RETRY_AFTER, STATUS_AFTER
+from talkcli.daemon.systemd import NOTIFY_RETRY_DELAY_S, STATUS_DELAY_S
 from talkcli.engine.models import NEEDED
 from tests.conformance.bareserve import SERVE, TALK, BareServe, environment, run, serving
 from tests.faults.broken import write
@@ -399,7 +399,7 @@ def test_supervisor_that_is_not_there_is_no_obstacle(home: str, address: str) ->
         wire.request("say", text="length=0", wait=True)
         assert wire.receive_event("result")["goal"]["state"] == "SUCCEEDED"
         if address.startswith("/"):
-            time.sleep(RETRY_AFTER + 0.1)  # many signs of life, and another attempt
+            time.sleep(NOTIFY_RETRY_DELAY_S + 0.1)  # many signs of life, and another attempt
     assert server.log.count("NOTIFY_SOCKET") == (1 if address.startswith("/") else 0)
 
 
@@ -411,7 +411,7 @@ def test_supervisor_that_reads_late_is_told_all_the_same_without_a_wait(home: st
             supervisor.wait_for("STATUS", "idle; ")
             supervisor.fill()
             goal = wire.request("say", text="never-ends")["goal"]
-            time.sleep(STATUS_AFTER + 0.2)  # its signs of life, and the news, find no room
+            time.sleep(STATUS_DELAY_S + 0.2)  # its signs of life, and the news, find no room
             began = time.monotonic()
             wire.request("status")
             assert_within(time.monotonic() - began, 0.5, "`status`")

@@ -55,15 +55,15 @@ def needs_no_server() -> None:
 
     A client that names no socket would have that server say the texts of the test aloud.
     """
-    for place in [*paths.client_sockets(None), *glob.glob(f"/run/user/*/talk/{paths.SOCKET}")]:
+    for place in [*paths.client_sockets(None), *glob.glob(f"/run/user/*/talk/{paths.SOCKET_NAME}")]:
         with socket.socket(socket.AF_UNIX) as probe:
             probe.settimeout(1)
             try:
                 probe.connect(place)
                 found = "there is one"
             except OSError as error:
-                found = paths.found_at(place, error)
-        if found != paths.ABSENT:
+                found = paths.describe_place(place, error)
+        if found != paths.PLACE_ABSENT:
             _skip(f"needs a machine on which no talk server runs; {place}: {found}")
 
 

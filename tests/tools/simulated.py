@@ -127,7 +127,7 @@ class Server:
 async def run(names: list[str], broker_url: str, directory: str, spoken: TextIO) -> None:
     """Run robots until SIGTERM."""
     loop = asyncio.get_running_loop()
-    loop.set_exception_handler(log.loop_bug)
+    loop.set_exception_handler(log.handle_loop_error)
     descriptors = make_room(_DESCRIPTORS * len(names))
     broker = from_environment({"TALK_BROKER": broker_url})
 

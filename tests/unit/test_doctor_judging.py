@@ -9,19 +9,18 @@ from typing import TYPE_CHECKING, cast
 import pytest
 
 from talkcli import __version__
-from talkcli.doctor import machine, report, sentence, server, sound, voice
-from talkcli.doctor.examine import Examination
-from talkcli.doctor.machine import Cards, Session
-from talkcli.doctor.report import FAILED, OK, WARNING, Finding, failed, heard, next_step, ok, warning
-from talkcli.doctor.sentence import Played, behind
-from talkcli.doctor.server import Place, Places
-from talkcli.doctor.sound import Devices, Level, Players, SoundServer
-from talkcli.doctor.voice import Engine, Setting
+from talkcli.doctor import report, sentence, server, sound, voice
+from talkcli.doctor.examine import LocalExamination
+from talkcli.doctor.report import FAILURE, OK, WARNING, Finding, failure, is_answered_yes, next_step, ok, warning
+from talkcli.doctor.sentence import SentenceResult, find_playback_step
+from talkcli.doctor.server import SocketPlace, SocketSearch
+from talkcli.doctor.sound import Cards, Devices, MixerLevel, Players, SoundServer, UserSession
+from talkcli.doctor.voice import SENTENCE_TEXT, EngineOptions, EngineReport
 from talkcli.engine.players import DUMMY_SINK
 from talkcli.frozen import replace
 from talkcli.goals.goal import Goal
 from talkcli.goals.states import State
-from talkcli.paths import ABSENT, FORBIDDEN
+from talkcli.paths import PLACE_ABSENT, PLACE_FORBIDDEN
 from talkcli.terminal.text import Screen, width
 from tests.faults.broken import write
 
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
     from talkcli.client.client import Client
 
 MISSING = "libespeak-ng is missing (libespeak-ng.so.1: cannot open): install it"
-ENGINE = Engine("espeak", "eSpeak NG 1.51 (system)", 141)
+ENGINE = EngineReport("espeak", "eSpeak NG 1.51 (system)", 141)
 SPOKEN = Goal("4k7f-1", State.SUCCEEDED, text="x")
 SERVER: dict[str, object] = {
     "pid": 4711, "version": __version__, "engine": "ready", "player": "aplay", "uptime": 100.0, "rate": 200,
@@ -47,10 +46,11 @@ def of(findings: list[Finding], check: str) -> Finding:
 
 def test_a_sentence_is_heard_if_one_was_played_and_nothing_failed() -> None:
     played, group = ok("sentence", "played"), warning("group", "not in audio", "usermod")
-    lost, stuck = failed("socket", "no server", "talk serve"), failed("sentence", "ABORTED", "look at the loudspeaker")
-    assert heard([ok("python", "3"), group, played])
-    assert not heard([lost, played])
-    assert not heard([ok("python", "3")]), "nothing was proved"
+    lost = failure("socket", "no server", "talk serve")
+    stuck = failure("sentence", "ABORTED", "look at the loudspeaker")
+    assert is_answered_yes([ok("python", "3"), group, played])
+    assert not is_answered_yes([lost, played])
+    assert not is_answered_yes([ok("python", "3")]), "nothing was proved"
     assert next_step([ok("python", "3"), group, stuck]) == "look at the loudspeaker"
     assert next_step([group, lost, stuck]) == "talk serve"
     assert next_step([group, played]) is None
@@ -58,52 +58,53 @@ def test_a_sentence_is_heard_if_one_was_played_and_nothing_failed() -> None:
 
 def cured(reason: str, words: str, player: str | None = None, behind: str | None = None) -> str:
     """Return the next step after a sentence that ended so; `behind`: that of the checks before."""
-    played = Played(State.ABORTED, reason, words, player=player)
-    return str(sentence.judge(played, silent=False, behind=behind, device="usb").next)
+    played = SentenceResult(State.ABORTED, reason, words, player=player)
+    return str(sentence.judge_sentence(played, silent=False, playback_step=behind, device="usb").next)
 
 
 def test_the_next_step_for_a_missing_device_is_that_of_its_check() -> None:
     looked = [warning("cards", "none", "plug in"), warning("group", "not in audio", "usermod"), ok("python", "3")]
-    assert behind(looked) == "usermod"
-    assert behind(looked[2:]) is None
+    assert find_playback_step(looked) == "usermod"
+    assert find_playback_step(looked[2:]) is None
     assert cured("audio_device", "aplay: Permission denied", behind="usermod") == "usermod"
     assert cured("audio_lost", "unplugged", behind="usermod") == "usermod"
     assert "another program" in cured("audio_device", "aplay: Device or resource busy", behind="usermod")
     assert "talk set --voice" in cured("nothing_to_say", "nothing", behind="usermod")
-    assert cured("audio_device", "aplay: No such device") == sentence.REMEDIES["audio_device"]
+    assert cured("audio_device", "aplay: No such device") == sentence.ADVICE["audio_device"]
     assert "usermod" in cured("audio_device", "aplay: Operation not permitted")
 
 
 def test_a_custom_player_is_to_be_tried_by_hand_unless_it_names_a_cause() -> None:
     cards = warning("cards", "none in this container", "start the container with --device /dev/snd")
     missing = warning("player", "it is not there", "name a program that is there")
-    assert behind([cards], custom=True) is None
-    assert behind([cards, missing], custom=True) == "name a program that is there"
+    assert find_playback_step([cards], custom=True) is None
+    assert find_playback_step([cards, missing], custom=True) == "name a program that is there"
     stalled = ("audio_stalled", "it took no sound for 5 s")
     by_hand = "try the player by hand, with a second of silence: head -c 44100 /dev/zero | sox -r 22050 -d usb"
     assert cured(*stalled, "sox -r {rate} -d {device}") == by_hand
-    assert cured(*stalled, "aplay -r {rate}") == sentence.REMEDIES["audio_stalled"]
+    assert cured(*stalled, "aplay -r {rate}") == sentence.ADVICE["audio_stalled"]
     assert "another program" in cured("audio_device", "Device or resource busy", "sox")
 
 
-BUSY = Played(State.ABORTED, "audio_device", "aplay: audio open error: Device or resource busy")
+BUSY = SentenceResult(State.ABORTED, "audio_device", "aplay: audio open error: Device or resource busy")
 
 
 def test_a_device_that_is_busy_with_the_server_s_speech_is_well() -> None:
-    found = sentence.judge(replace(BUSY, beside_speech=True), silent=True)
+    found = sentence.judge_sentence(replace(BUSY, beside_speech=True), silent=True, device=None)
     assert (found.state, "busy with what the server speaks" in found.message) == (OK, True)
-    found = sentence.judge(BUSY, silent=True)
-    assert (found.state, "another program holds the device" in str(found.next)) == (FAILED, True)
-    gone = Played(State.ABORTED, "audio_device", "aplay: audio open error: No such device")
-    assert sentence.judge(replace(gone, beside_speech=True), silent=True).state == FAILED
+    found = sentence.judge_sentence(BUSY, silent=True, device=None)
+    assert (found.state, "another program holds the device" in str(found.next)) == (FAILURE, True)
+    gone = SentenceResult(State.ABORTED, "audio_device", "aplay: audio open error: No such device")
+    assert sentence.judge_sentence(replace(gone, beside_speech=True), silent=True, device=None).state == FAILURE
 
 
 def test_whether_the_server_spoke_is_seen_from_its_goals_before_and_after(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sentence, "by_engine", lambda *_: BUSY)
+    monkeypatch.setattr(sentence, "speak_by_engine", lambda *_: BUSY)
 
     def spoke(before: tuple[Goal | None, Sequence[Goal]], after: tuple[Goal | None, Sequence[Goal]]) -> bool:
         told = (SimpleNamespace(active=active, recent=recent) for active, recent in (before, after))
-        played = sentence.beside(cast("Client", SimpleNamespace(status=told.__next__)), Setting(), 1.0)
+        client = cast("Client", SimpleNamespace(status=told.__next__))
+        played = sentence.speak_beside_server(client, EngineOptions(), 1.0)
         assert played == replace(BUSY, beside_speech=played.beside_speech)
         return played.beside_speech
 
@@ -116,26 +117,29 @@ def test_whether_the_server_spoke_is_seen_from_its_goals_before_and_after(monkey
     assert not spoke((None, ()), (None, [replace(SPOKEN, state=State.RECALLED)]))
 
 
-STALLED = Played(State.ABORTED, "audio_stalled", "aplay took no sound for 3 s")
+STALLED = SentenceResult(State.ABORTED, "audio_stalled", "aplay took no sound for 3 s")
 CLIENT = cast("Client", object())
 WARNED = [warning("sound server", "it hangs", "restart it")]
 
 
-def examined(played: Played, client: Client | None = CLIENT, *, silent: bool = False, **facts: object) -> Finding:
-    """Return the finding about a sentence that was played so; `facts`: attributes of the `Examination`."""
-    examination = Examination(None, silent=silent)
-    for name, value in {"process": 7, "found": WARNED, **facts}.items():
+def examined(
+    played: SentenceResult, client: Client | None = CLIENT, *, silent: bool = False, **facts: object
+) -> Finding:
+    """Return the finding about a sentence that ended like this; `facts`: attributes of the examination."""
+    examination = LocalExamination(None, silent=silent)
+    engine = EngineReport(reason=played.reason, message=str(played.message)) if client is None else ENGINE
+    session = UserSession(0, "root", server_pid=7)
+    facts = {"client": client, "engine": engine, "session": session, "findings": WARNED, **facts}
+    for name, value in {"server_pid": 7, "env": {}, **facts}.items():
         setattr(examination, f"_{name}", value)
-    here = Session(0, "root", server=None if facts.get("env") == {} else 7)
-    engine = Engine(reason=played.reason, words=str(played.words)) if client is None else ENGINE
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("beside", "by_server", "by_engine"):
+        for name in ("speak_beside_server", "speak_by_server", "speak_by_engine"):
             patch.setattr(sentence, name, lambda *_: played)
-        patch.setattr(sound, "suspended", lambda _: ("usb",))
-        return examination._sentence(client, engine, here, {})
+        patch.setattr(sound, "suspended_sinks", lambda _: ("usb",))
+        return examination._check_sentence()
 
 
-HUNG = Played(State.ABORTED, "engine_hung", "silence")
+HUNG = SentenceResult(State.ABORTED, "engine_hung", "silence")
 
 
 def test_the_next_step_after_a_sentence_depends_on_the_checks_before() -> None:
@@ -145,21 +149,27 @@ def test_the_next_step_after_a_sentence_depends_on_the_checks_before() -> None:
     assert str(custom.next).startswith("try the player by hand")
     assert examined(HUNG, None, hangs=True).next == "restart it"
     assert str(examined(HUNG, None).next).startswith("run talk doctor again")
-    assert str(examined(STALLED, silent=True, process=None).next).startswith("run talk doctor --silent there")
+    assert str(examined(STALLED, silent=True, server_pid=None).next).startswith("run talk doctor --silent there")
 
 
 def test_another_user_s_server_is_to_be_examined_by_that_user(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    gone = Played(State.ABORTED, "audio_device", "aplay: audio open error: No such device")
-    monkeypatch.setattr(machine, "owner", lambda path: 33 if path == "/proc/7" else None)
-    assert str(examined(gone, silent=True, env={}).next).endswith(": sudo -u '#33' talk doctor --silent")
-    monkeypatch.setattr(machine, "owner", lambda _: None)  # as if /proc were mounted with hidepid
-    assert examined(gone, silent=True, env={}).next == examined(gone, silent=True).next == "restart it"
+    gone = SentenceResult(State.ABORTED, "audio_device", "aplay: audio open error: No such device")
+    monkeypatch.setattr(sound, "file_owner", lambda path: 33 if path == "/proc/7" else None)
+    assert str(examined(gone, silent=True, session=UserSession(0, "root")).next).endswith(
+        ": sudo -u '#33' talk doctor --silent"
+    )
+    monkeypatch.setattr(sound, "file_owner", lambda _: None)  # as if /proc were mounted with hidepid
+    assert (
+        examined(gone, silent=True, session=UserSession(0, "root")).next
+        == examined(gone, silent=True).next
+        == "restart it"
+    )
 
 
 def test_a_player_without_sound_plays_a_sentence_that_is_not_heard() -> None:
-    played = Played(State.SUCCEEDED, duration=1.0, player="null")
+    played = SentenceResult(State.SUCCEEDED, duration=1.0, player="null")
     assert "without sound" in examined(played, server={"player": "null"}).message
     assert "without sound" not in examined(played, server={"player": "aplay"}).message
 
@@ -167,36 +177,38 @@ def test_a_player_without_sound_plays_a_sentence_that_is_not_heard() -> None:
 def test_without_a_server_an_engine_process_plays_by_the_variables(monkeypatch: pytest.MonkeyPatch) -> None:
     given: list[tuple[object, ...]] = []
 
-    def by_engine(*arguments: object) -> Played:
+    def by_engine(*arguments: object) -> SentenceResult:
         given.append(arguments)
         return STALLED
 
-    monkeypatch.setattr(sentence, "by_engine", by_engine)
+    monkeypatch.setattr(sentence, "speak_by_engine", by_engine)
     monkeypatch.setenv("TALK_PLAYER", "pacat")
     monkeypatch.setenv("TALK_VOICE", "de")
     for silent in (False, True):
-        Examination(None, silent=silent)._sentence(None, ENGINE, Session(0, "root"), {})
-    setting = Setting("pacat", None, "de")
-    assert [each[:3] for each in given] == [(sentence.TEXT, setting, 1.0), (sentence.TEXT, setting, 0.0)]
+        LocalExamination(None, silent=silent)._check_sentence()
+    setting = EngineOptions("pacat", None, "de")
+    assert [each[:3] for each in given] == [(SENTENCE_TEXT, setting, 1.0), (SENTENCE_TEXT, setting, 0.0)]
 
 
 def test_silent_plays_with_the_server_s_settings_and_tries_the_same_players(monkeypatch: pytest.MonkeyPatch) -> None:
-    def setting(told: str | None, *, named: bool) -> Setting:
-        monkeypatch.setattr(machine, "names_a_player", lambda *_: named)
-        examination = Examination(None, silent=True)
+    def setting(told: str | None, *, named: bool) -> EngineOptions:
+        monkeypatch.setattr(sound, "names_a_player", lambda *_: named)
+        examination = LocalExamination(None, silent=True)
         examination._server = {"player": told, "device": "usb", "voice": "de", "driver": "espeak"}
-        return examination._setting_of_server(7, {})
+        examination._env = {}
+        return examination._server_options(7)
 
-    rest = ("usb", "de", None, "espeak")
-    assert setting("aplay", named=False) == Setting(None, *rest, "aplay", {})
-    assert setting("aplay", named=True) == Setting("aplay", *rest, None, {})
-    assert setting("mine -x", named=False) == Setting("mine -x", *rest, None, {})
-    assert setting("file:/tmp/x.wav", named=True) == setting("null", named=True) == Setting("null", *rest, None, {})
-    assert setting(None, named=False) == Setting(None, *rest, None, {})
+    rest = ("usb", "de", "espeak")
+    assert setting("aplay", named=False) == EngineOptions(None, *rest, "aplay", {})
+    assert setting("aplay", named=True) == EngineOptions("aplay", *rest, None, {})
+    assert setting("mine -x", named=False) == EngineOptions("mine -x", *rest, None, {})
+    assert setting("file:/tmp/x.wav", named=True) == EngineOptions("null", *rest, None, {})
+    assert setting("null", named=True) == EngineOptions("null", *rest, None, {})
+    assert setting(None, named=False) == EngineOptions(None, *rest, None, {})
 
 
 def test_foreign_text_is_escaped_in_every_finding() -> None:
-    found = failed("device", "aplay: \x1b[2Jred", "remove \u202e it\n")
+    found = failure("device", "aplay: \x1b[2Jred", "remove \u202e it\n")
     assert found.to_json() == {
         "check": "device", "state": "failed", "message": "aplay: \\x1b[2Jred", "next": "remove \\u202e it\\n"
     }  # fmt: skip
@@ -214,28 +226,29 @@ def test_foreign_text_is_escaped_in_every_finding() -> None:
     ],
 )
 def test_a_voice_that_cannot_speak_is_named(reason: str, words: str, check: str, step: str) -> None:
-    engine = Engine(reason=reason, words=words)
-    found = of(voice.judge("2.99", engine, server=None), check)
-    assert found.state == FAILED
+    engine = EngineReport(reason=reason, message=words)
+    found = of(voice.judge_engine("2.99", engine, server=None), check)
+    assert found.state == FAILURE
     assert words in found.message
     assert step in (found.next or "")
-    assert of(voice.judge("2.99", engine, server="ready"), check).state == WARNING, "the server has its own"
+    assert of(voice.judge_engine("2.99", engine, server="ready"), check).state == WARNING, "the server has its own"
 
 
 def test_a_voice_that_can_speak_is_told_with_its_version_and_voices() -> None:
-    found = voice.judge("2.99", ENGINE, server=None)
+    found = voice.judge_engine("2.99", ENGINE, server=None)
     assert [each.check for each in found] == ["pyttsx3", "libespeak-ng", "voices"]
     assert {each.state for each in found} == {OK}
     assert "1.51 (system)" in found[1].message
     assert "141" in found[2].message
     for voices in (None, 0):
-        assert voice.judge("2.99", Engine("espeak", "eSpeak", voices), server="starting")[-1].state == WARNING
+        engine = EngineReport("espeak", "eSpeak", voices)
+        assert voice.judge_engine("2.99", engine, server="starting")[-1].state == WARNING
 
 
 def test_a_library_that_the_server_lacks_comes_before_its_silent_player() -> None:
-    for engine in (ENGINE, Engine(reason="engine_failed", words=MISSING)):
-        found = [*voice.judge("2.99", engine, server=MISSING), *sound.judge_silent("null", running=True)]
-        assert next_step(found) == voice.INSTALL_LIBRARY
+    for engine in (ENGINE, EngineReport(reason="engine_failed", message=MISSING)):
+        judged = voice.judge_engine("2.99", engine, server=MISSING)
+        assert next_step([*judged, *sound.judge_silent_player("null", by_server=True)]) == voice.INSTALL_LIBRARY
 
 
 PATH = "/run/user/1000/talk/talk.sock"
@@ -244,25 +257,33 @@ PATH = "/run/user/1000/talk/talk.sock"
 @pytest.mark.parametrize(
     ("found", "words", "step"),
     [
-        (Places((Place(PATH, FORBIDDEN, 7),)), "no permission (uid 7)", "have uid 7 let you in"),
-        (Places((Place(PATH, ABSENT),), "--socket"), "named by --socket", "leave --socket out, or"),
-        (Places((Place(PATH, server.MUTE),), None, "it does not answer"), "it does not answer", "restart"),
-        (Places((Place(PATH, server.MUTE),), None, "busy", "busy"), "busy", "--max-clients"),
-        (Places((Place(PATH, ABSENT),), others=("/run/user/7/s",)), "not there", "talk --socket /run/user/7/s"),
+        (SocketSearch((SocketPlace(PATH, PLACE_FORBIDDEN, 7),)), "no permission (uid 7)", "have uid 7 let you in"),
+        (SocketSearch((SocketPlace(PATH, PLACE_ABSENT),), "--socket"), "named by --socket", "leave --socket out, or"),
+        (
+            SocketSearch((SocketPlace(PATH, server.PLACE_LISTENING),), None, "it does not answer"),
+            "it does not answer",
+            "restart",
+        ),
+        (SocketSearch((SocketPlace(PATH, server.PLACE_LISTENING),), None, "busy", "busy"), "busy", "--max-clients"),
+        (
+            SocketSearch((SocketPlace(PATH, PLACE_ABSENT),), foreign_sockets=("/run/user/7/s",)),
+            "not there",
+            "talk --socket /run/user/7/s",
+        ),
     ],
 )
-def test_without_a_server_each_place_is_described(found: Places, words: str, step: str) -> None:
-    judgement = server.judge_places(found)
-    assert judgement.state == FAILED
+def test_without_a_server_each_place_is_described(found: SocketSearch, words: str, step: str) -> None:
+    judgement = server.judge_search(found)
+    assert judgement.state == FAILURE
     assert words in judgement.message
     assert step in str(judgement.next)
 
 
 def test_an_obstacle_before_the_server_s_place_is_a_warning() -> None:
-    served = Place(PATH, server.SERVER, pid=4711)
-    found = server.judge_places(Places((Place("/a", ABSENT), served)))
+    served = SocketPlace(PATH, server.PLACE_SERVER, pid=4711)
+    found = server.judge_search(SocketSearch((SocketPlace("/a", PLACE_ABSENT), served)))
     assert (found.state, found.message) == (OK, f"the server is on {PATH} (process 4711)")
-    found = server.judge_places(Places((Place("/a", server.FOREIGN, 7), served)))
+    found = server.judge_search(SocketSearch((SocketPlace("/a", server.PLACE_FOREIGN, 7), served)))
     assert found.state == WARNING
     assert "/a: another user's server (uid 7)" in found.message
 
@@ -271,17 +292,17 @@ def test_an_obstacle_before_the_server_s_place_is_a_warning() -> None:
     ("change", "check", "state", "step"),
     [
         ({}, "server", OK, "None"),
-        ({"paused": True}, "server", FAILED, "talk resume"),
+        ({"paused": True}, "server", FAILURE, "talk resume"),
         ({"version": "0.0.1"}, "server", WARNING, "start the server again"),
         ({"engine": "pyttsx3 is missing"}, "server", WARNING, "install what"),
-        ({"volume": 0.0}, "settings", FAILED, "talk set --volume 1"),
+        ({"volume": 0.0}, "settings", FAILURE, "talk set --volume 1"),
         ({"volume": 0.1}, "settings", WARNING, "talk set --volume 1"),
         ({"ttl": 5.0, "lead_in": 300, "preempt": True}, "settings", OK, "None"),
         ({"volume": 0.1 + 0.2, "ttl": 1.23456789012}, "settings", OK, "None"),
     ],
 )
 def test_a_server_is_judged_by_its_words(change: dict[str, object], check: str, state: str, step: str) -> None:
-    found = of(server.judge({**SERVER, **change}, [], 0.0), check)
+    found = of(server.judge_server({**SERVER, **change}, [], 0.0), check)
     assert (found.state, step in str(found.next)) == (state, True)
     assert not re.search(r"\.\d{5}", found.message)
 
@@ -290,44 +311,46 @@ def test_recent_failures_are_counted_and_the_last_one_is_told() -> None:
     aborted = Goal(
         "4k7f-2", State.ABORTED, reason="audio_device", ended_at=0.0, message="Talk aborted: aplay: device is busy"
     )
-    found = of(server.judge(SERVER, [SPOKEN, aborted], 600.0), "recent goals")
+    found = of(server.judge_server(SERVER, [SPOKEN, aborted], 600.0), "recent goals")
     assert found.state == WARNING
     assert "1 of the last 2 goals ABORTED, last 4k7f-2, 10 min ago" in found.message
     assert "audio_device: aplay: device is busy" in found.message
     assert "another program holds the device" in str(found.next)
-    found = of(server.judge(SERVER, [aborted, SPOKEN], 600.0), "recent goals")
+    found = of(server.judge_server(SERVER, [aborted, SPOKEN], 600.0), "recent goals")
     assert (found.state, "1 succeeded since" in found.message) == (OK, True)
-    assert of(server.judge(SERVER, [SPOKEN], 0.0), "recent goals").message == "the last goal did not fail"
+    assert of(server.judge_server(SERVER, [SPOKEN], 0.0), "recent goals").message == "the last goal did not fail"
 
 
 def test_after_a_text_without_words_the_next_step_is_to_send_words() -> None:
     goal = Goal("4k7f-2", State.ABORTED, text="...", reason="nothing_to_say", message="Talk aborted: nothing")
-    assert of(server.judge(SERVER, [goal], 0.0), "recent goals").next == (
+    assert of(server.judge_server(SERVER, [goal], 0.0), "recent goals").next == (
         "send a text with words: this one has no letters and no digits"
     )
     foreign = replace(goal, text="你好")
-    assert "choose a voice" in str(of(server.judge(SERVER, [foreign], 0.0), "recent goals").next)
+    assert "choose a voice" in str(of(server.judge_server(SERVER, [foreign], 0.0), "recent goals").next)
 
 
 def test_the_end_of_the_sentence_is_told_with_the_next_step() -> None:
-    played = Played(State.SUCCEEDED, duration=1.7, player="aplay", served=True)
-    found = sentence.judge(played, silent=False)
+    played = SentenceResult(State.SUCCEEDED, duration=1.7, player="aplay", by_server=True)
+    found = sentence.judge_sentence(played, silent=False, device=None)
     assert found.state == OK
     assert found.message.endswith("was played to its end through the server, aplay, 1.7 s")
-    assert "without sound" in sentence.judge(played, silent=True).message
-    denied = Played(State.ABORTED, "audio_device", "Talk aborted: aplay: audio open error: Permission denied")
-    found = sentence.judge(denied, silent=False)
+    assert "without sound" in sentence.judge_sentence(played, silent=True, device=None).message
+    denied = SentenceResult(State.ABORTED, "audio_device", "Talk aborted: aplay: audio open error: Permission denied")
+    found = sentence.judge_sentence(denied, silent=False, device=None)
     assert found.message == "ABORTED, audio_device: aplay: audio open error: Permission denied"
     assert "usermod -aG audio" in str(found.next)
-    stalled = Played(State.ABORTED, "audio_stalled", "aplay took no sound for 3 s")
-    found = sentence.judge(replace(stalled, suspended=("usb",)), silent=False)
+    stalled = SentenceResult(State.ABORTED, "audio_stalled", "aplay took no sound for 3 s")
+    found = sentence.judge_sentence(replace(stalled, suspended=("usb",)), silent=False, device=None)
     assert (found.next, "suspended: usb" in found.message) == ("pactl suspend-sink usb 0", True)
-    late = Played(State.RECALLED, "late", "it still waited behind 7 goals after 20 s, and was taken back")
-    found = sentence.judge(late, silent=False)
+    late = SentenceResult(State.RECALLED, "late", "it still waited behind 7 goals after 20 s, and was taken back")
+    found = sentence.judge_sentence(late, silent=False, device=None)
     assert found.message.startswith("not spoken: it still waited behind 7 goals")
     assert "talk status" in str(found.next)
     assert "run talk doctor again" in str(
-        sentence.judge(Played(State.PREEMPTED, "canceled", "Talk preempted"), silent=False).next
+        sentence.judge_sentence(
+            SentenceResult(State.PREEMPTED, "canceled", "Talk preempted"), silent=False, device=None
+        ).next
     )
 
 
@@ -336,15 +359,15 @@ def test_every_reason_of_an_aborted_goal_has_a_remedy_of_its_own() -> None:
         "no_player", "audio_device", "audio_lost", "audio_stalled", "engine_failed", "engine_crashed", "engine_hung",
         "nothing_to_say", "not_silent", "unknown_voice",
     }  # fmt: skip
-    assert reasons <= sentence.REMEDIES.keys()
-    assert "apt-get install -y libespeak-ng1" in sentence.remedy("engine_failed", MISSING)
-    assert sentence.remedy("engine_failed", "no module named pyttsx3") == sentence.REMEDIES["engine_failed"]
+    assert reasons <= sentence.ADVICE.keys()
+    assert "apt-get install -y libespeak-ng1" in sentence.advise("engine_failed", MISSING)
+    assert sentence.advise("engine_failed", "no module named pyttsx3") == sentence.ADVICE["engine_failed"]
 
 
 FOUND = [
     ok("python", "Python 3.11.2"),
     warning("sound server", "one " * 40, "do " * 40),
-    failed("socket", "no server", "talk serve"),
+    failure("socket", "no server", "talk serve"),
 ]
 
 
@@ -352,35 +375,37 @@ FOUND = [
 def test_no_line_is_wider_than_the_terminal(columns: int) -> None:
     screen = Screen(columns, colour=True)
     for finding in FOUND:
-        lines = report.lines(finding, screen)
+        lines = report.format_finding(finding, screen)
         assert max(map(width, lines)) <= columns, lines
         assert all("\x1b" not in each or each.endswith("\x1b[0m") or "\x1b[0m  " in each for each in lines)
         if finding.next is not None:
             assert any("-> " in each for each in lines)
-    assert max(map(len, report.verdict(FOUND, screen).splitlines()), default=0) + len("talk: ") <= columns + 12
+    assert (
+        max(map(len, report.format_conclusion(FOUND, screen).splitlines()), default=0) + len("talk: ") <= columns + 12
+    )
 
 
 def test_in_a_pipe_a_finding_is_one_line_without_colour() -> None:
-    assert [report.lines(each, Screen()) for each in FOUND[::2]] == [
+    assert [report.format_finding(each, Screen()) for each in FOUND[::2]] == [
         ["ok       python        Python 3.11.2"],
         ["failed   socket        no server -> talk serve"],
     ]
-    assert report.verdict(FOUND, Screen()) == "a sentence would not be heard; do this next:\n  talk serve"
+    assert report.format_conclusion(FOUND, Screen()) == "a sentence would not be heard; do this next:\n  talk serve"
     played = [ok("python", "3"), ok("sentence", "played")]
-    assert report.verdict(played, Screen()) == "a sentence is heard, unless the loudspeaker itself is off"
-    assert report.verdict([FOUND[1], *played], Screen()).endswith("; 1 warning")
+    assert report.format_conclusion(played, Screen()) == "a sentence is heard, unless the loudspeaker itself is off"
+    assert report.format_conclusion([FOUND[1], *played], Screen()).endswith("; 1 warning")
 
 
 # Sound
 
 
-PI = Session(1000, "pi", groups=("pi", "audio"), gids=(1000, 29), runtime="/run/user/1000", runtime_owner=1000)
+PI = UserSession(1000, "pi", groups=("pi", "audio"), gids=(1000, 29), runtime_dir="/run/user/1000", runtime_owner=1000)
 PLAYERS = Players(("aplay", "pacat"), None)
 DEVICES = Devices("aplay -L", ("default", "plughw:CARD=Device,DEV=0"))
-CARDS = Cards(kernel=True, names=("USB Audio Device",), nodes=("/dev/snd/pcmC0D0p",), group="audio")
-NO_CARDS = Cards(kernel=True)
-NO_SERVER = SoundServer(trouble="Connection refused")
-WIRE = SoundServer("PipeWire, without its PulseAudio part", pulse=False)
+CARDS = Cards(in_kernel=True, names=("USB Audio Device",), nodes=("/dev/snd/pcmC0D0p",), group="audio")
+NO_CARDS = Cards(in_kernel=True)
+NO_SERVER = SoundServer(error="Connection refused")
+WIRE = SoundServer("PipeWire, without its PulseAudio part", accepts_pulse=False)
 PULSE = SoundServer(name="PulseAudio (on PipeWire 1.2.7)", sink="alsa_output.usb")
 
 
@@ -390,16 +415,17 @@ def judged(
     devices: Devices | None = DEVICES,
     cards: Cards = CARDS,
     server: SoundServer = NO_SERVER,
-    session: Session = PI,
+    session: UserSession = PI,
     *,
-    running: bool = False,
+    by_server: bool = False,
 ) -> Finding:
-    found = sound.judge(players, devices, cards, server, session, running=running)
+    players = replace(players, by_server=by_server)
+    found = sound.judge_sound(players, devices, cards, server, session)
     return next(each for each in found if each.check == check)
 
 
 def test_a_robot_with_a_card_and_nothing_else_is_well() -> None:
-    found = sound.judge(PLAYERS, DEVICES, CARDS, SoundServer(), PI, running=False)
+    found = sound.judge_sound(PLAYERS, DEVICES, CARDS, SoundServer(), PI)
     assert [each.check for each in found] == ["player", "device", "cards", "group", "sound server"]
     assert {each.state for each in found} == {OK}, found
     assert found[0].message == "aplay is used; then pacat"
@@ -409,7 +435,7 @@ def test_a_sound_server_that_answers_needs_no_program() -> None:
     assert judged("player", server=PULSE).message == "pulse is used, by the sound server; then aplay, pacat"
     alone = judged("player", Players((), None), server=PULSE)
     assert (alone.state, alone.message) == (OK, "pulse is used, by the sound server")
-    assert judged("player", Players((), "pulse"), server=PULSE, running=True).message == "pulse (the server's)"
+    assert judged("player", Players((), "pulse"), server=PULSE, by_server=True).message == "pulse (the server's)"
     assert judged("player", server=WIRE).message == "aplay is used; then pacat"
     # The choice of an engine process counts more than the sound server's answer.
     chosen = replace(PLAYERS, first="aplay")
@@ -427,51 +453,51 @@ def test_a_sound_server_with_only_a_dummy_output_is_not_heard() -> None:
 
 def test_a_missing_player_is_named_with_its_package() -> None:
     found = judged("player", Players((), None))
-    assert (found.state, found.next) == (FAILED, "sudo apt-get install -y alsa-utils")
-    assert judged("player", Players((), None), running=True).state == WARNING
+    assert (found.state, found.next) == (FAILURE, "sudo apt-get install -y alsa-utils")
+    assert judged("player", Players((), None), by_server=True).state == WARNING
     found = judged("player", Players(("aplay",), "pw-cat", runs=False))
-    assert (found.state, found.next) == (FAILED, "sudo apt-get install -y pipewire-bin")
+    assert (found.state, found.next) == (FAILURE, "sudo apt-get install -y pipewire-bin")
     found = judged("player", Players(("aplay",), "/opt/play", runs=False))
-    assert (found.state, "/opt/play (TALK_PLAYER)" in found.message) == (FAILED, True)
+    assert (found.state, "/opt/play (TALK_PLAYER)" in found.message) == (FAILURE, True)
 
 
 def test_a_player_without_sound_is_not_heard() -> None:
     for player in ("null", "file:/tmp/x.wav"):
-        found = sound.judge(Players((), player), None, CARDS, PULSE, PI, running=True)
-        assert [each.state for each in found] == [FAILED]
-        assert found == sound.judge_silent(player, running=True)
-    assert sound.judge_silent("aplay", running=True) == []
+        found = sound.judge_sound(Players((), player, by_server=True), None, CARDS, PULSE, PI)
+        assert [each.state for each in found] == [FAILURE]
+        assert found == sound.judge_silent_player(player, by_server=True)
+    assert sound.judge_silent_player("aplay", by_server=True) == []
 
 
 def test_a_device_is_looked_up_in_the_player_s_list() -> None:
     for wanted in ("default", "plughw:1,0"):
-        assert judged("device", devices=replace(DEVICES, wanted=wanted)).state == OK
-    found = judged("device", devices=replace(DEVICES, wanted="robot_speaker"))
+        assert judged("device", devices=replace(DEVICES, configured=wanted)).state == OK
+    found = judged("device", devices=replace(DEVICES, configured="robot_speaker"))
     assert (found.state, "robot_speaker is not among" in found.message) == (WARNING, True)
     assert "plughw:CARD=Device,DEV=0" in found.message
     assert judged("device", devices=Devices("aplay -L")).state == WARNING
-    assert "no answer" in judged("device", devices=Devices("aplay -L", trouble="no answer")).message
+    assert "no answer" in judged("device", devices=Devices("aplay -L", error="no answer")).message
     unlisted = Devices("pactl list short sinks", package="pulseaudio-utils")
     assert judged("device", devices=unlisted).state == OK, "it is a fault only if a device is named"
-    found = judged("device", devices=replace(unlisted, wanted="usb"))
+    found = judged("device", devices=replace(unlisted, configured="usb"))
     assert (found.state, found.next) == (WARNING, "sudo apt-get install -y pulseaudio-utils")
 
 
 def test_a_step_that_needs_pactl_names_its_package(tmp_path: Path) -> None:
-    muted = failed("loudness", "muted", "pactl set-sink-mute @DEFAULT_SINK@ 0")
+    muted = failure("loudness", "muted", "pactl set-sink-mute @DEFAULT_SINK@ 0")
     without = {"PATH": str(tmp_path)}
     step = f"{muted.next} (for pactl: sudo apt-get install -y pulseaudio-utils)"
-    assert sound.installing(muted, without).next == step
-    other = failed("socket", "no server", "talk serve")
-    assert sound.installing(other, without) == other
+    assert sound.add_pactl_package(muted, without).next == step
+    other = failure("socket", "no server", "talk serve")
+    assert sound.add_pactl_package(other, without) == other
     write(tmp_path / "pactl", "", 0o755)
-    assert sound.installing(muted, without) == muted
+    assert sound.add_pactl_package(muted, without) == muted
 
 
 def test_a_missing_device_is_to_be_plugged_in_or_given_to_the_container() -> None:
     found = judged("cards", cards=NO_CARDS)
     assert (found.state, "plug in" in str(found.next)) == (WARNING, True)
-    found = judged("cards", cards=NO_CARDS, session=replace(PI, kinds=("a container",)))
+    found = judged("cards", cards=NO_CARDS, session=replace(PI, origins=("a container",)))
     assert "--device /dev/snd" in str(found.next)
     assert judged("cards", cards=NO_CARDS, server=PULSE).state == OK
 
@@ -483,7 +509,7 @@ def test_no_permission_for_the_device_names_the_group_and_the_user() -> None:
     assert found.state == WARNING
     assert "user pi may not open /dev/snd/pcmC0D0p" in found.message
     assert found.next == "sudo usermod -aG audio pi, and log in again"
-    found = judged("group", cards=replace(forbidden, from_next_login=True), session=stranger)
+    found = judged("group", cards=replace(forbidden, member_after_login=True), session=stranger)
     assert found.next == "log out and in again"
     assert judged("group", cards=forbidden, session=stranger, server=PULSE).state == OK, "it opens them"
 
@@ -491,10 +517,10 @@ def test_no_permission_for_the_device_names_the_group_and_the_user() -> None:
 @pytest.mark.parametrize(
     ("change", "step"),
     [
-        ({"kinds": ("a container",)}, "PULSE_SERVER"),
-        ({"kinds": ("a system service",)}, "--print-unit user"),
+        ({"origins": ("a container",)}, "PULSE_SERVER"),
+        ({"origins": ("a system service",)}, "--print-unit user"),
         ({"uid": 0, "sudo_uid": 1000}, "leave sudo out"),
-        ({"runtime": None, "usual_runtime": "/run/user/1000"}, "export XDG_RUNTIME_DIR=/run/user/1000"),
+        ({"runtime_dir": None, "usual_runtime_dir": "/run/user/1000"}, "export XDG_RUNTIME_DIR=/run/user/1000"),
         ({}, "systemctl --user restart"),
     ],
 )
@@ -509,28 +535,28 @@ def test_the_step_to_a_sound_server_depends_on_the_session(change: dict[str, obj
 def test_a_sound_server_that_hangs_or_is_named_wrongly_or_cannot_be_asked() -> None:
     assert "does not answer" in judged("sound server", server=SoundServer(hangs=True)).message
     assert "unset PULSE_SERVER" in str(
-        judged("sound server", server=SoundServer(named="unix:/x", trouble="refused")).next
+        judged("sound server", server=SoundServer(pulse_server="unix:/x", error="refused")).next
     )
     found = judged("sound server", server=SoundServer(sockets=("/run/user/1000/pipewire-0",)))
     assert found.next == "sudo apt-get install -y pulseaudio-utils"
-    service = judged("sound server", server=SoundServer(), cards=NO_CARDS, session=replace(PI, kinds=("a cron job",)))
+    service = judged("sound server", server=SoundServer(), cards=NO_CARDS, session=replace(PI, origins=("a cron job",)))
     assert service.state == WARNING
 
 
 def test_a_missing_runtime_directory_is_told_with_the_variable_to_set() -> None:
-    found = machine.judge_session(replace(PI, runtime=None, runtime_owner=None, usual_runtime="/run/user/1000"))
+    found = sound.judge_session(replace(PI, runtime_dir=None, runtime_owner=None, usual_runtime_dir="/run/user/1000"))
     assert (found.state, found.next) == (WARNING, "export XDG_RUNTIME_DIR=/run/user/1000")
     assert "cron, sudo" in found.message
-    served = machine.judge_session(replace(PI, runtime=None, usual_runtime="/run/user/1000", server=7))
+    served = sound.judge_session(replace(PI, runtime_dir=None, usual_runtime_dir="/run/user/1000", server_pid=7))
     assert "where the server is started" in str(served.next)
-    assert machine.judge_session(replace(PI, runtime=None)).state == OK
-    assert "not there" in machine.judge_session(replace(PI, runtime_owner=None)).message
-    assert "uid 33's" in machine.judge_session(replace(PI, runtime_owner=33)).message
+    assert sound.judge_session(replace(PI, runtime_dir=None)).state == OK
+    assert "not there" in sound.judge_session(replace(PI, runtime_owner=None)).message
+    assert "uid 33's" in sound.judge_session(replace(PI, runtime_owner=33)).message
 
 
 def test_a_muted_output_is_not_heard() -> None:
-    def level(name: str, text: str) -> Level:
-        return sound.level_of(name, text, f"unmute {name}", f"{name} 70%")
+    def level(name: str, text: str) -> MixerLevel:
+        return sound.parse_level(name, text, f"unmute {name}", f"{name} 70%")
 
     pulse = level("sink", "Mute: yes\nVolume: mono: 65536 / 100% / 0.00 dB\n")
     assert (pulse.muted, pulse.percent) == (True, 100)
@@ -540,13 +566,13 @@ def test_a_muted_output_is_not_heard() -> None:
     alsa = level("Master", "  Front Left: Playback 0 [0%] [-65.25dB] [off]\n  Front Right: 9 [40%] [on]\n")
     assert (alsa.muted, alsa.percent) == (False, 40)
     off = level("Master", "  Mono: Playback 0 [0%] [-65.25dB] [off]\n")
-    assert sound.judge_levels((alsa, off), default=True)[0].next == "unmute Master"
-    assert sound.judge_levels((pulse,), default=True)[0].state == FAILED
-    assert sound.judge_levels((pulse,), default=False)[0].state == WARNING, "another device is played to"
-    assert sound.judge_levels((wire,), default=True)[0].state == WARNING
-    assert sound.judge_levels((replace(wire, percent=0),), default=True)[0].state == FAILED
-    assert sound.judge_levels((alsa,), default=True)[0].state == OK
-    assert sound.judge_levels((), default=True) == []
+    assert sound.judge_levels((alsa, off), is_used=True)[0].next == "unmute Master"
+    assert sound.judge_levels((pulse,), is_used=True)[0].state == FAILURE
+    assert sound.judge_levels((pulse,), is_used=False)[0].state == WARNING, "another device is played to"
+    assert sound.judge_levels((wire,), is_used=True)[0].state == WARNING
+    assert sound.judge_levels((replace(wire, percent=0),), is_used=True)[0].state == FAILURE
+    assert sound.judge_levels((alsa,), is_used=True)[0].state == OK
+    assert sound.judge_levels((), is_used=True) == []
 
 
 def test_a_player_with_an_unknown_program_is_custom() -> None:

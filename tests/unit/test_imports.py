@@ -32,7 +32,7 @@ GROUND = {"errors", "frozen", "install", "paths", "peers", "polling", "processes
 FACE = {"", "__main__"}
 #: What is pure besides all of `goals`, `protocol` and `terminal`.
 PURE = [
-    *("errors", "frozen", "client.following", "daemon.quota", "engine.child.words", "engine.child.synthesizers.guard"),
+    *("errors", "frozen", "client.following", "engine.child.words", "engine.child.synthesizers.guard"),
     *("engine.child.synthesizers.phonemes", "engine.child.synthesizers.vits"),
     *("fleet.payloads", "fleet.topics", "fleet.bridge.policy"),
     "fleet.desk.request",
@@ -298,11 +298,11 @@ def test_a_client_loads_nothing_heavy(statement: str, without: list[str]) -> Non
 
 
 #: The doctor's modules that judge; all but the last gather facts, too.
-JUDGING = ["machine", "voice", "neural", "sound", "server", "sentence", "broker", "report"]
+JUDGING = ["voice", "sound", "server", "sentence", "broker", "report"]
 #: Modules that the doctor's judgements may call besides each other; a clock's format is all that they read.
 FOR_JUDGING = {
     *("talkcli.engine.players", "talkcli.fleet.payloads", "talkcli.goals.options", "talkcli.goals.states"),
-    *("talkcli.terminal.goals", "talkcli.terminal.text", "talkcli.frozen"),
+    *("talkcli.goals.reasons", "talkcli.terminal.goals", "talkcli.terminal.text", "talkcli.frozen"),
 }
 
 

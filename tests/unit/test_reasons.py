@@ -35,9 +35,9 @@ def test_a_reason_is_the_string_that_is_sent(reason: Reason) -> None:
 def test_the_document_has_every_reason_and_the_doctor_advises_on_no_other() -> None:
     documented = [(words(row[0])[0], *row[1:]) for row in tables(WIRE.section("States"))[1][1:]]
     assert documented == [(each.value, ", ".join(map(str, each.states)), each.meaning) for each in Reason]
-    assert sentence.REMEDIES.keys() - OF_THE_DOCTOR <= {*Reason}
+    assert sentence.ADVICE.keys() - OF_THE_DOCTOR <= {*Reason}
     aborted = {each for each in Reason if State.ABORTED in each.states}
-    assert aborted - sentence.REMEDIES.keys() == WITHOUT_ADVICE
+    assert aborted - sentence.ADVICE.keys() == WITHOUT_ADVICE
 
 
 def test_a_goal_with_a_reason_that_is_not_known_here_is_read() -> None:

@@ -168,7 +168,7 @@ class EngineProcess:
             kill([-self.pid])
             # A player has a process group of its own. It dies with the engine process, but the programs of a pipeline
             # started by the player would survive.
-            kill(pid for pid in processes() if peers.stat_of(pid)[3:4] == [b"%d" % self.pid])
+            kill(pid for pid in processes() if peers.process_stat(pid)[3:4] == [b"%d" % self.pid])
             kill_holders(self.liveness)
 
     def describe_exit(self) -> str:

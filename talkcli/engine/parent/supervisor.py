@@ -15,7 +15,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from talkcli.daemon.quota import Quota
+from talkcli.daemon.log import RateLimit
 from talkcli.engine import protocol
 from talkcli.engine.parent.process import EngineProcess
 from talkcli.engine.protocol import HANG_LIMIT_S, HOLD_LIMIT_S, KILL_LIMIT_S, START_LIMIT_S, STOP_LIMIT_S
@@ -247,7 +247,7 @@ class Supervisor:
         self._last_sign_at = 0.0
         #: killed processes that may still be there
         self._dying: list[EngineProcess] = []
-        self._stderr_quota = Quota(MAX_STDERR_LINES, STDERR_PERIOD_S)
+        self._stderr_quota = RateLimit(MAX_STDERR_LINES, STDERR_PERIOD_S)
         self._closing = False
 
     # -- methods for other threads
@@ -490,7 +490,7 @@ class Supervisor:
             self._selector.register(fd, selectors.EVENT_READ, process)
 
     def _report_stderr(self, line: str) -> None:
-        omitted = self._stderr_quota.take(time.monotonic())
+        omitted = self._stderr_quota.allow(time.monotonic())
         if omitted:
             self._post(EngineSaid(f"({omitted} lines were left out)"))
         if omitted is not None:

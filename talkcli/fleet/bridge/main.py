@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from talkcli import __version__
 from talkcli.daemon import log
-from talkcli.daemon.systemd import Systemd
+from talkcli.daemon.systemd import ServiceManager
 from talkcli.errors import EXIT_OK, AddressInUse, TalkError
 from talkcli.fleet import topics
 from talkcli.fleet.bridge.policy import ECHO_EVERY_S, STALE_CODE, EchoTracker, Goodbye, Ignored, Policy, Refusal
@@ -100,10 +100,10 @@ async def _run(settings: BridgeSettings, read_broker: Callable[[], Broker]) -> N
     loop, bridge = asyncio.get_running_loop(), Bridge(settings, read_broker)
 
     def on_signal(number: signal.Signals) -> None:
-        log.line(f"{number.name}: ending")
+        log.write(f"{number.name}: ending")
         bridge.end()
 
-    loop.set_exception_handler(log.loop_bug)
+    loop.set_exception_handler(log.handle_loop_error)
     # A shell without job control starts background programs with SIGINT ignored.
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
         loop.add_signal_handler(signal.SIGINT, on_signal, signal.SIGINT)
@@ -124,9 +124,9 @@ class Bridge:
         self._session = f"{random.getrandbits(64):016x}"
         self._since = time.time()
         self._policy = Policy(settings.name, settings.allow)
-        self._systemd = Systemd(self._loop, self._status_text)
+        self._systemd = ServiceManager(self._loop, self._status_text)
         self._sessions = RemoteSessions(
-            settings.name, settings.socket, self._publish_reply, self._max_payload, self._systemd.changed
+            settings.name, settings.socket, self._publish_reply, self._max_payload, self._systemd.schedule_status
         )
         self._publisher = Publisher(
             self._sessions, self._publish_to_all, self._server_changed, with_text=settings.with_text
@@ -154,14 +154,14 @@ class Bridge:
     async def run(self) -> None:
         """Run until `end` is called."""
         link = self._new_link()
-        log.line(f"robot {self._settings.name}, by the broker at {self._settings.broker.url}")
-        self._systemd.ready()
+        log.write(f"robot {self._settings.name}, by the broker at {self._settings.broker.url}")
+        self._systemd.notify_ready()
         tasks = [asyncio.create_task(each) for each in (self._stay_connected(link), self._publisher.run())]
         for task in tasks:
             task.add_done_callback(self._on_task_done)
         self._tick_timer = self._loop.call_later(ECHO_EVERY_S, self._tick, self._loop.time() + ECHO_EVERY_S)
         await self._ending.wait()
-        self._systemd.stopping()
+        self._systemd.notify_stopping()
         self._tick_timer.cancel()
         self._sessions.end_all()
         self._publisher.close()
@@ -213,10 +213,10 @@ class Bridge:
                 await self._open(link)
                 self._on_connect(link)
                 await self._disconnected.wait()
-                log.line(f"the connection to the broker has ended: {log.shown(str(link.ended))}")
+                log.write(f"the connection to the broker has ended: {log.sanitize(str(link.ended))}")
                 retry_s = _FIRST_RETRY_S if self._owns_name else retry_s
             except TalkError as error:
-                log.seldom("broker", log.shown(str(error)))
+                log.write_limited("broker", log.sanitize(str(error)))
             finally:
                 if link:
                     self._disconnect(link)
@@ -226,7 +226,7 @@ class Bridge:
             try:
                 self._broker = self._read_broker()
             except TalkError as error:
-                log.seldom("settings", f"{log.shown(str(error))}; what was there before is used")
+                log.write_limited("settings", f"{log.sanitize(str(error))}; what was there before is used")
 
     async def _open(self, link: Link) -> None:
         done = asyncio.Event()
@@ -270,8 +270,8 @@ class Bridge:
         self._publish_presence()
         self._publish_device()
         self._publisher.schedule_status()
-        self._systemd.changed()
-        log.line(f"online, at {self._settings.broker.url}")
+        self._systemd.schedule_status()
+        log.write(f"online, at {self._settings.broker.url}")
 
     def _disconnect(self, link: Link) -> None:
         """Close a connection and end all sessions. It may be called again."""
@@ -281,7 +281,7 @@ class Bridge:
             if self._rival_timer:
                 self._rival_timer.cancel()
             self._sessions.end_all()
-            self._systemd.changed()
+            self._systemd.schedule_status()
             self._disconnected.set()
         link.close()
 
@@ -311,7 +311,9 @@ class Bridge:
             return
         if link.ended is None and link.outstanding_bytes > STUCK_BROKER_BYTES:
             mebibytes = STUCK_BROKER_BYTES >> 20
-            log.seldom("output", f"the broker takes nothing: {mebibytes} MiB wait, so the connection is given up")
+            log.write_limited(
+                "output", f"the broker takes nothing: {mebibytes} MiB wait, so the connection is given up"
+            )
             link.close()
         if link.ended is not None:
             # Forget the descriptor now, because another file may get the number. Do the rest later, because the caller
@@ -336,7 +338,7 @@ class Bridge:
             return False
         if len(payload) > link.max_payload_bytes:  # the broker would end the connection
             words = f"{len(payload):,} bytes for {topic} are not published"
-            log.seldom("long", f"{words}: the broker takes {link.max_payload_bytes:,}")
+            log.write_limited("long", f"{words}: the broker takes {link.max_payload_bytes:,}")
             return False
         done = link.publish(topic, payload, qos, **more)
         self._check_link(link)
@@ -354,7 +356,7 @@ class Bridge:
 
     def _check_rights(self, reason: int) -> None:
         if reason == REASON_NOT_AUTHORIZED:
-            log.seldom("rights", f"the broker doesn't let this robot publish all that it says: {_RIGHTS}")
+            log.write_limited("rights", f"the broker doesn't let this robot publish all that it says: {_RIGHTS}")
 
     def _max_payload(self) -> int:
         return self._link.max_payload_bytes if self._link else 0
@@ -365,7 +367,7 @@ class Bridge:
         try:
             self._handle(message)
         except Exception as error:  # noqa: BLE001 - no message may end the robot
-            log.bug("what came from the broker", error)
+            log.write_bug("what came from the broker", error)
 
     def _handle(self, message: Message) -> None:
         name = self._settings.name
@@ -384,7 +386,7 @@ class Bridge:
         now = boottime()
         decision = self._policy.judge(message, topic, now, stale=self._echoes.is_stale(now))
         if isinstance(decision, Ignored):
-            log.seldom(decision.kind, log.shown(decision.words))
+            log.write_limited(decision.kind, log.sanitize(decision.words))
         elif isinstance(decision, Goodbye):
             self._sessions.say_goodbye(decision.user, decision.reply_topic)
         elif isinstance(decision, Refusal):
@@ -397,7 +399,7 @@ class Bridge:
         if refusal.reply_topic is not None:
             line = encode(failure(refusal.seq, code, words))
             self._publish_reply(refusal.reply_topic, line, 1, refusal.correlation)
-        log.seldom(code, f"a request of {user} is refused: {log.shown(words)}")
+        log.write_limited(code, f"a request of {user} is refused: {log.sanitize(words)}")
         if code == STALE_CODE and self._loop.time() - self._echo_at >= _ECHO_PAUSE_S:
             self._send_echo()
 
@@ -420,7 +422,7 @@ class Bridge:
         rank = bridge_rank(presence)
         if payload and (presence is None or (presence.online and rank is None)):
             words = 'it is not a JSON object with "online", "session" and a numeric "since"'
-            log.seldom("presence", f"a message on this robot's presence topic is ignored: {words}")
+            log.write_limited("presence", f"a message on this robot's presence topic is ignored: {words}")
         if rank and rank[1] == self._session:
             return
         if not self._rival_timer and not self._owns_name:
@@ -429,7 +431,7 @@ class Bridge:
             if self._owns_name:
                 self._publish_presence()  # replaces a late will, or an ignored message
         elif rank < (self._since, self._session):
-            words = f"another bridge is '{self._settings.name}' already: session {log.shown(rank[1])}"
+            words = f"another bridge is '{self._settings.name}' already: session {log.sanitize(rank[1])}"
             self.end(AddressInUse(f"{words}; each robot has a name of its own, give another --name"))
         else:
             self._take_name()
@@ -464,7 +466,7 @@ class Bridge:
             self._publish(topic, device, retain=True, acknowledged=self._check_rights)
 
     def _server_changed(self) -> None:
-        self._systemd.changed()
+        self._systemd.schedule_status()
         if self._owns_name:
             self._publish_presence()
 
@@ -490,7 +492,7 @@ class Bridge:
             # If this process itself was stopped, messages that came meanwhile have yet to be read.
             self._unanswered_since += now - due
             if now - self._unanswered_since > _ECHO_LIMIT_S:
-                log.seldom("echo", f"nothing that this robot sends itself comes back: {_RIGHTS}")
+                log.write_limited("echo", f"nothing that this robot sends itself comes back: {_RIGHTS}")
                 self._disconnect(link)
                 return
         self._send_echo()

@@ -102,13 +102,13 @@ class Publisher:
                 try:
                     while lines := await self._connection.read():
                         self._receive(lines)
-                    log.line("the server's connection has ended")
+                    log.write("the server's connection has ended")
                 finally:
                     self._connection.close()
                     self._connection = None
                     self._server_left()
             except TalkError as error:
-                log.seldom("server", f"no news of the server: {log.shown(str(error))}")
+                log.write_limited("server", f"no news of the server: {log.sanitize(str(error))}")
             await asyncio.sleep(random.uniform(0, self._retry_s))
             self._retry_s = min(_LAST_RETRY_S, self._retry_s * 2)
 
@@ -122,7 +122,9 @@ class Publisher:
         """Close the connection if the server is silent. Call it every few seconds."""
         server = self._connection
         if server and self._loop.time() - self._heard_at > _SERVER_SILENCE_LIMIT_S:
-            log.seldom("silence", f"the server at {log.shown(server.path)} says nothing: restart it if it hangs")
+            log.write_limited(
+                "silence", f"the server at {log.sanitize(server.path)} says nothing: restart it if it hangs"
+            )
             server.close()
 
     def close(self) -> None:
@@ -154,7 +156,7 @@ class Publisher:
                     self._server_came(server, ServerStatus.from_reply(message, self._items))
                     self._items.clear()
             except (BadRequest, ValueError) as error:
-                log.seldom("line", f"what the server says can't be read: {log.shown(str(error))}")
+                log.write_limited("line", f"what the server says can't be read: {log.sanitize(str(error))}")
 
     def _server_came(self, server: LocalConnection, status: ServerStatus) -> None:
         self._retry_s = _FIRST_RETRY_S
@@ -166,7 +168,7 @@ class Publisher:
         self._last = status.recent[-1] if status.recent else self._last
         self._paused = status.server.get("paused") is True
         self._sessions.server_came(list(status.pending), server.boot)
-        log.line(f"the server at {log.shown(server.path)} is there (pid {server.pid})")
+        log.write(f"the server at {log.sanitize(server.path)} is there (pid {server.pid})")
         self._on_server_change()
         self.schedule_status()
 

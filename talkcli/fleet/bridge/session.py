@@ -404,7 +404,7 @@ class RemoteSession:
         try:
             await self._serve(urgent=urgent)
         except Exception as error:  # noqa: BLE001 - a bug in one session must not end the others
-            log.bug("a session", error)
+            log.write_bug("a session", error)
         self._clean_up()
 
     async def _serve(self, *, urgent: bool) -> None:
@@ -436,7 +436,7 @@ class RemoteSession:
             try:
                 message = decode(line)
             except BadRequest as error:
-                log.seldom("server", f"what the server says is no line: {error}")
+                log.write_limited("server", f"what the server says is no line: {error}")
                 continue
             if "seq" in message:
                 answers += self._translate(message)
@@ -531,7 +531,7 @@ class RemoteSession:
         if "ok" in message:
             seq = message.get("seq")
             return encode(failure(seq if isinstance(seq, int) else None, "too_long", words))
-        log.seldom("long", f"a line for {self._sessions.name} is dropped: {words}")
+        log.write_limited("long", f"a line for {self._sessions.name} is dropped: {words}")
         return b""
 
     def _clean_up(self) -> None:
