@@ -69,7 +69,7 @@ class Engine:
     def stop(self, _: str) -> None:
         pass
 
-    def follow(self, _: str, followed: bool, by_neural: bool) -> None:
+    def announce_next(self, _: str, next_waits: bool, next_is_neural: bool) -> None:
         """Do nothing."""
 
 
@@ -311,7 +311,7 @@ class _Written:
     def stop(self, _: str) -> None:
         self.written.append("stop")
 
-    def follow(self, _: str, followed: bool, by_neural: bool) -> None:
+    def announce_next(self, _: str, next_waits: bool, next_is_neural: bool) -> None:
         """Do nothing."""
 
 

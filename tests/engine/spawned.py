@@ -34,7 +34,7 @@ _FIRST = """
 import importlib, sys, threading, time
 def wrap(module, path):
     *names, name = path.split(".")
-    owner = importlib.import_module("talkcli.engine." + module)
+    owner = importlib.import_module("talkcli.engine.child." + module)
     for each in names:
         owner = getattr(owner, each)
     original, seen = getattr(owner, name), []
