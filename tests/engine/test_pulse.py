@@ -52,9 +52,9 @@ class Rig:
         self.limit: float | None = None
 
     def wait(self, player: PulsePlayer) -> None:
-        told = player._told
+        told = player._clock_report
         until, end = player.wake_at(), time.monotonic() + (self.limit or PATIENCE)
-        assert player._told is told or until == 0, "it was told the time, and nobody looks at it"
+        assert player._clock_report is told or until == 0, "it was told the time, and nobody looks at it"
         while time.monotonic() < end:
             now = time.monotonic()
             if until is not None and now >= until:

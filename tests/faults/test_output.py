@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import pytest
 
-from talkcli.engine.child.players.pulse import SUSPENDED_FOR
+from talkcli.engine.child.players.pulse import SUSPENDED_LIMIT_S
 from talkcli.engine.players import DUMMY_SINK
 from tests.conformance.hearing import LONG, LOW, assert_aborted, begin, engine_process, send
 from tests.support.census import descendants
@@ -199,7 +199,7 @@ def test_a_suspended_device_ends_the_sentence_within_a_second(talk: Talk, server
         ended = talk.watcher.wait_for(goal, "ABORTED")
         server.pactl("suspend-sink", card.name, "0")
         assert_within(
-            talk.watcher.arrived(ended) - suspended, SUSPENDED_FOR + TOLD, "the end of a goal that stands still"
+            talk.watcher.arrived(ended) - suspended, SUSPENDED_LIMIT_S + TOLD, "the end of a goal that stands still"
         )
         assert_aborted(talk.goal(goal), "audio_stalled", f"the sound server has suspended {card.name}")
         assert talk.run("say", "--wait", "--", LOW).code == 0

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import pytest
 
 from talkcli.engine.child.playback import DRAIN_LIMIT_S, FIRST_SOUND_LIMIT_S, PROGRESS_CHECK_INTERVAL_S, STALL_LIMIT_S
-from talkcli.engine.child.players.pulse import READY_WITHIN, SUSPENDED_FOR
+from talkcli.engine.child.players.pulse import READY_LIMIT_S, SUSPENDED_LIMIT_S
 from tests.conformance.hearing import (
     HOME,
     LONG,
@@ -51,8 +51,8 @@ AGAIN = 10.0
 TOLD = 1.0
 STALLED = STALL_LIMIT_S + PROGRESS_CHECK_INTERVAL_S + 0.2
 NEVER_TAKEN = FIRST_SOUND_LIMIT_S + PROGRESS_CHECK_INTERVAL_S + 0.2
-SUSPENDED = SUSPENDED_FOR + 0.5
-NO_ANSWER = READY_WITHIN + 0.2
+SUSPENDED = SUSPENDED_LIMIT_S + 0.5
+NO_ANSWER = READY_LIMIT_S + 0.2
 
 
 class End(NamedTuple):
@@ -185,7 +185,7 @@ def test_a_sound_server_that_takes_no_stream_is_no_reason_for_silence(
         goal = talk.goal(done.id)
         assert (done.code, goal["output"]) == (0, None)
         assert_same(heard(talk), render_quick([LOW])[0])
-        assert_within(took - goal["duration"], READY_WITHIN * hangs + TOLD, "a sentence by the next player")
+        assert_within(took - goal["duration"], READY_LIMIT_S * hangs + TOLD, "a sentence by the next player")
 
 
 #: Seconds above a limit of the engine in which a goal's end is told.

@@ -1,11 +1,12 @@
-"""libpulse by ctypes: the functions that a player needs, and its main loop, driven by the engine's own wait.
+"""Bindings of libpulse: the functions and structures that a player needs, and a main loop that never blocks.
 
-libpulse brings its loop in three parts, prepare, poll and dispatch, and lets the function that polls be replaced. Ours
-notes what libpulse would wait for, and looks without waiting. So the loop is turned until it has nothing left to do,
-and what was noted last is what the engine waits for: no thread, and no call that blocks.
+libpulse splits an iteration of its main loop into prepare, poll and dispatch, and lets the program replace the poll
+function. Ours notes what libpulse wants to wait for and polls without waiting. The loop is iterated until there is no
+work left. After that, the engine waits for the noted descriptors together with its own. This needs neither a thread nor
+a blocking call.
 
-Nothing here knows what a sentence is; which server is asked is libpulse's to find (PULSE_SERVER, client.conf, the
-user's runtime directory, the system's), with its cookie, over any kind of socket.
+libpulse itself finds the server (PULSE_SERVER, client.conf, the runtime directories of the user and the system) and
+sends the cookie.
 """
 
 from __future__ import annotations
@@ -26,59 +27,59 @@ if TYPE_CHECKING:
 
     from talkcli.engine.child.players.base import Interest
 
-_NAME = "libpulse.so.0"
+_LIBPULSE = "libpulse.so.0"
 
-#: No index, and "as the server likes it": (uint32_t) -1.
-NONE = 0xFFFFFFFF
-#: What is said of volumes: 100 %.
+#: An invalid index, or the server's choice of a size: (uint32_t) -1.
+NO_INDEX = 0xFFFFFFFF
+#: The volume of 100 %.
 NORMAL_VOLUME = 0x10000
 
-# From pulse/def.h and pulse/sample.h; the numbers are part of libpulse's ABI.
+# From pulse/def.h and pulse/sample.h; these numbers are part of libpulse's ABI.
 NO_AUTOSPAWN = 1
 S16LE = 3
 CONTEXT_READY, CONTEXT_FAILED, CONTEXT_TERMINATED = 4, 5, 6
 STREAM_READY, STREAM_FAILED, STREAM_TERMINATED = 2, 3, 4
 AUTO_TIMING_UPDATE, ADJUST_LATENCY = 0x8, 0x2000
 FLAT_VOLUME = 0x40
-ABOUT_SINKS, ABOUT_SINK_INPUTS = 0x1, 0x4
-FACILITY, OF_SINK, OF_SINK_INPUT = 0xF, 0, 2
+MASK_SINK, MASK_SINK_INPUT = 0x1, 0x4
+FACILITY_MASK, EVENT_SINK, EVENT_SINK_INPUT = 0xF, 0, 2
 NO_ENTITY, CONNECTION_REFUSED, INVALID_SERVER = 5, 6, 13
-#: What a size is where there is none: (size_t) -1.
-FAILED = ctypes.c_size_t(-1).value
+#: The size that reports an error: (size_t) -1.
+SIZE_ERROR = ctypes.c_size_t(-1).value
 
 
 class PollDescriptor(Structure):
-    """`struct pollfd`."""
+    """The C structure `pollfd`."""
 
     _fields_ = [("fd", c_int), ("events", c_short), ("revents", c_short)]
 
 
 class SampleSpec(Structure):
-    """`pa_sample_spec`."""
+    """The C structure `pa_sample_spec`: the format, rate and channels of samples."""
 
     _fields_ = [("format", c_int), ("rate", u32), ("channels", u8)]
 
 
 class ChannelMap(Structure):
-    """`pa_channel_map`."""
+    """The C structure `pa_channel_map`: the speaker position of each channel."""
 
     _fields_ = [("channels", u8), ("map", c_int * 32)]
 
 
 class Volume(Structure):
-    """`pa_cvolume`: one volume for each channel."""
+    """The C structure `pa_cvolume`: the volume of each channel."""
 
     _fields_ = [("channels", u8), ("values", u32 * 32)]
 
 
 class BufferSizes(Structure):
-    """`pa_buffer_attr`, in bytes."""
+    """The C structure `pa_buffer_attr`: the sizes of a stream's buffers in bytes."""
 
     _fields_ = [(name, u32) for name in ("maxlength", "tlength", "prebuf", "minreq", "fragsize")]
 
 
 class SinkInfo(Structure):
-    """The beginning of `pa_sink_info`; later versions only add at its end."""
+    """The first fields of the C structure `pa_sink_info`; later versions only add fields at the end."""
 
     _fields_ = [
         ("name", c_char_p),
@@ -98,7 +99,7 @@ class SinkInfo(Structure):
 
 
 class SinkInputInfo(Structure):
-    """The beginning of `pa_sink_input_info`."""
+    """The first fields of the C structure `pa_sink_input_info`, which describes a stream."""
 
     _fields_ = [
         ("index", u32),
@@ -117,23 +118,22 @@ class SinkInputInfo(Structure):
     ]
 
 
-# What libpulse calls. Nothing may be raised through it: ctypes would print it and return what it likes.
-Poll = CFUNCTYPE(c_int, POINTER(PollDescriptor), ctypes.c_ulong, c_int, c_void_p)
-#: of a stream
-Notice = CFUNCTYPE(None, c_void_p, c_void_p)
-#: of a stream or a context: whether it went well
-Success = CFUNCTYPE(None, c_void_p, c_int, c_void_p)
-#: of a context: what has changed, as facility and type, and the index of it
-Changed = CFUNCTYPE(None, c_void_p, c_int, u32, c_void_p)
-SinkTold = CFUNCTYPE(None, c_void_p, POINTER(SinkInfo), c_int, c_void_p)
-SinkInputTold = CFUNCTYPE(None, c_void_p, POINTER(SinkInputInfo), c_int, c_void_p)
+# Types of the callbacks. A callback must not raise: ctypes would print the exception and return garbage.
+PollCallback = CFUNCTYPE(c_int, POINTER(PollDescriptor), ctypes.c_ulong, c_int, c_void_p)
+StreamCallback = CFUNCTYPE(None, c_void_p, c_void_p)
+#: (stream or context, success, data)
+SuccessCallback = CFUNCTYPE(None, c_void_p, c_int, c_void_p)
+#: (context, facility and type of the change, index of the changed object, data)
+ChangeCallback = CFUNCTYPE(None, c_void_p, c_int, u32, c_void_p)
+SinkCallback = CFUNCTYPE(None, c_void_p, POINTER(SinkInfo), c_int, c_void_p)
+SinkInputCallback = CFUNCTYPE(None, c_void_p, POINTER(SinkInputInfo), c_int, c_void_p)
 
-#: Every function that is used: what it returns, and what it takes.
+#: The functions that are used, with their result and argument types.
 _FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "pa_mainloop_new": (c_void_p, []),
     "pa_mainloop_free": (None, [c_void_p]),
     "pa_mainloop_get_api": (c_void_p, [c_void_p]),
-    "pa_mainloop_set_poll_func": (None, [c_void_p, Poll, c_void_p]),
+    "pa_mainloop_set_poll_func": (None, [c_void_p, PollCallback, c_void_p]),
     "pa_mainloop_prepare": (c_int, [c_void_p, c_int]),
     "pa_mainloop_poll": (c_int, [c_void_p]),
     "pa_mainloop_dispatch": (c_int, [c_void_p]),
@@ -143,10 +143,10 @@ _FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "pa_context_unref": (None, [c_void_p]),
     "pa_context_get_state": (c_int, [c_void_p]),
     "pa_context_errno": (c_int, [c_void_p]),
-    "pa_context_set_subscribe_callback": (None, [c_void_p, Changed, c_void_p]),
+    "pa_context_set_subscribe_callback": (None, [c_void_p, ChangeCallback, c_void_p]),
     "pa_context_subscribe": (c_void_p, [c_void_p, c_int, c_void_p, c_void_p]),
-    "pa_context_get_sink_info_by_index": (c_void_p, [c_void_p, u32, SinkTold, c_void_p]),
-    "pa_context_get_sink_input_info": (c_void_p, [c_void_p, u32, SinkInputTold, c_void_p]),
+    "pa_context_get_sink_info_by_index": (c_void_p, [c_void_p, u32, SinkCallback, c_void_p]),
+    "pa_context_get_sink_input_info": (c_void_p, [c_void_p, u32, SinkInputCallback, c_void_p]),
     "pa_strerror": (c_char_p, [c_int]),
     "pa_operation_unref": (None, [c_void_p]),
     "pa_stream_new": (c_void_p, [c_void_p, c_char_p, POINTER(SampleSpec), c_void_p]),
@@ -159,20 +159,26 @@ _FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "pa_stream_is_suspended": (c_int, [c_void_p]),
     "pa_stream_writable_size": (size, [c_void_p]),
     "pa_stream_write": (c_int, [c_void_p, c_char_p, size, c_void_p, i64, c_int]),
-    "pa_stream_drain": (c_void_p, [c_void_p, Success, c_void_p]),
+    "pa_stream_drain": (c_void_p, [c_void_p, SuccessCallback, c_void_p]),
     "pa_stream_get_time": (c_int, [c_void_p, POINTER(u64)]),
-    "pa_stream_set_started_callback": (None, [c_void_p, Notice, c_void_p]),
-    "pa_stream_set_underflow_callback": (None, [c_void_p, Notice, c_void_p]),
-    "pa_stream_set_latency_update_callback": (None, [c_void_p, Notice, c_void_p]),
+    "pa_stream_set_started_callback": (None, [c_void_p, StreamCallback, c_void_p]),
+    "pa_stream_set_underflow_callback": (None, [c_void_p, StreamCallback, c_void_p]),
+    "pa_stream_set_latency_update_callback": (None, [c_void_p, StreamCallback, c_void_p]),
     "pa_stream_update_timing_info": (c_void_p, [c_void_p, c_void_p, c_void_p]),
 }
 
 
 class Library:
-    """The functions, each by its name without the "pa_"; OSError or AttributeError where libpulse isn't what it was."""
+    """The functions of libpulse, as attributes without the prefix "pa_"."""
 
     def __init__(self) -> None:
-        library = ctypes.CDLL(_NAME)
+        """Load the library.
+
+        Raises:
+            OSError: It isn't installed.
+            AttributeError: It lacks a function.
+        """
+        library = ctypes.CDLL(_LIBPULSE)
         for name, (result, arguments) in _FUNCTIONS.items():
             function = getattr(library, name)
             function.restype, function.argtypes = result, arguments
@@ -187,56 +193,60 @@ class Library:
 
 @cache
 def load() -> Library:
-    """Load libpulse, once a process; OSError, in words, where it isn't there or isn't one of those that we know."""
+    """Return libpulse, which is loaded once per process.
+
+    Raises:
+        OSError: It isn't installed, or lacks a function.
+    """
     try:
         return Library()
     except AttributeError as error:
         raise OSError(str(error)) from error
 
 
-class Loop:
-    """A main loop of libpulse's, which waits for nothing by itself."""
+class MainLoop:
+    """A main loop of libpulse that never waits by itself."""
 
     def __init__(self, library: Library) -> None:
         self._library = library
         self._pointer = library.mainloop_new()
-        self._callback = Poll(self._look)
+        self._callback = PollCallback(self._poll)
         library.mainloop_set_poll_func(self._pointer, self._callback, None)
-        self._failed: BaseException | None = None
-        #: what it waits for, and until when
+        self._error: BaseException | None = None
+        #: the descriptors that libpulse wants to wait for, and the monotonic time of its next timer
         self.interests: list[Interest] = []
-        self.due: float | None = None
+        self.wake_at: float | None = None
 
     @property
     def api(self) -> int:
-        """What a context is made with."""
+        """The pointer that a new context takes."""
         return self._library.mainloop_get_api(self._pointer)  # type: ignore[no-any-return]
 
-    def turn(self) -> bool:
-        """Do what can be done now, once; return whether anything was done, after which there may be more."""
+    def iterate(self) -> bool:
+        """Run one iteration without waiting, and return whether it did any work; there may be more then."""
         if self._library.mainloop_prepare(self._pointer, -1) < 0:
             return False
-        self._library.mainloop_poll(self._pointer)  # dispatch without it would abort the process
+        self._library.mainloop_poll(self._pointer)  # without it, dispatch would abort the process
         done = self._library.mainloop_dispatch(self._pointer)
-        if self._failed is not None:
-            raise self._failed
+        if self._error is not None:
+            raise self._error
         return bool(done > 0)
 
     def free(self) -> None:
-        """End it, after all contexts that were made with it."""
+        """Free the loop; its contexts have to be released first."""
         self._library.mainloop_free(self._pointer)
-        self.interests, self.due = [], None
+        self.interests, self.wake_at = [], None
 
-    def _look(self, wanted: Any, count: int, timeout: int, _: object) -> int:
+    def _poll(self, wanted: Any, count: int, timeout: int, _: object) -> int:
         try:
             self.interests = [(wanted[number].fd, wanted[number].events) for number in range(count)]
-            self.due = None if timeout < 0 else time.monotonic() + timeout / 1000
+            self.wake_at = None if timeout < 0 else time.monotonic() + timeout / 1000
             return int(self._library.poll(wanted, count, 0))
-        except BaseException as error:  # noqa: BLE001 - it is raised by `turn`: nothing can be through C
-            self._failed = error
+        except BaseException as error:  # noqa: BLE001 - raised again by `iterate`, because it can't pass through C
+            self._error = error
             return 0
 
 
-def loudness(volume: Volume) -> float:
-    """Return the volume of the loudest channel, 1 for 100 %."""
+def loudest(volume: Volume) -> float:
+    """Return the volume of the loudest channel; 1.0 is 100 %."""
     return float(max(volume.values[: volume.channels], default=0) / NORMAL_VOLUME)

@@ -1,8 +1,8 @@
-"""The player "pulse": a stream at the sound server, PulseAudio's or PipeWire's, from this very process.
+"""The player "pulse": a stream to the sound server (PulseAudio or PipeWire), opened by this process itself.
 
-A connection and a stream for each sentence, and none between two: that takes 1 ms, where a program's start takes 9. The
-server tells what no exit status can: when the stream began, that it was moved, suspended or killed, how much of it is
-heard, and whether anybody can hear it: how loud sink and stream are. It never starts a server.
+Each sentence has a connection and a stream of its own. Opening both takes 1 ms, where starting a program takes 9 ms.
+The server reports what no exit status could: when the stream began, whether it was moved, suspended or killed, how much
+of it has been heard, and how loud the sink and the stream are. The player never starts a server.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from ctypes import byref, c_uint64
 
 from talkcli.engine.child.players import libpulse
 from talkcli.engine.child.players.base import CannotSpeak, Player
-from talkcli.engine.players import DUMMY_SINK, SAMPLE_BYTES
+from talkcli.engine.players import BUFFER_MS, DUMMY_SINK, SAMPLE_BYTES
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.goal import Output
 from talkcli.goals.reasons import Reason
@@ -22,103 +22,104 @@ if TYPE_CHECKING:
 
     from talkcli.engine.child.players.base import Interest
 
-#: Milliseconds of sound that the server holds, as much as a program is asked to: what it holds is said again, or late,
-#: when something stops it, and bridges what a busy machine delays. It begins with as much: with the first piece alone
-#: it would run dry behind that and go back for the second, which not every sink can.
-BUFFER_MS = 60
-#: Milliseconds of room for which it wakes us.
+#: Milliseconds of room at which the server wakes the player.
 REQUEST_MS = 15
 
-#: Seconds after which a stream that has no volume is taken to be turned down: PipeWire makes each so, and gives it the
-#: volume that it is to have a millisecond later.
-SETTLED_AFTER = 0.1
+#: Seconds for which a stream volume of 0 means nothing: PipeWire creates every stream with it, and sets the real volume a
+#: millisecond later.
+VOLUME_SETTLES_S = 0.1
 
-#: Seconds within which the server must have made the stream: it takes 1 to 20 ms. One that hangs is not waited for:
-#: nothing was given to it, and another player may be heard.
-READY_WITHIN = 2.0
+#: Seconds within which the server must create the stream, which takes 1 to 20 ms. A server that hangs is given up: it
+#: has no samples yet, and another player may be heard.
+READY_LIMIT_S = 2.0
 
-#: Seconds for which the sink may be suspended under a stream: one that slept is awake again before the stream begins.
-SUSPENDED_FOR = 0.5
+#: Seconds for which the sink may be suspended under a stream. A sink that slept is awake before the stream begins.
+SUSPENDED_LIMIT_S = 0.5
 
-#: Seconds from an answer to the next question for the time, as long as nothing is heard: a word begins when that ends.
-#: It does after 1 to 10 ms at a near sink, after 200 by Bluetooth.
-ASK_EVERY = 0.002
+#: Seconds between an answer and the next request for the time, until sound is heard: a word begins at that moment. It
+#: takes 1 to 10 ms at a near sink, and 200 ms over Bluetooth.
+TIME_REQUEST_S = 0.002
 
 
 @frozen
-class Loudness:
-    """How loud a sink or a stream is."""
+class Level:
+    """The volume and mute state of a sink or a stream."""
 
-    volume: float  # of its loudest channel; 1 is 100 %, and more is possible
+    volume: float  # of the loudest channel; 1.0 is 100 %, and more is possible
     muted: bool
-    #: of a sink: whether the volumes of its streams are those that are heard, and its own only the loudest of them
+    #: of a sink: whether stream volumes are absolute, and the sink's own volume is just the loudest of them
     flat: bool = False
 
 
 class PulsePlayer(Player):
-    """The stream of one sentence, over a connection of its own."""
+    """Plays a sentence as a stream of the sound server."""
 
     name = "pulse"
     real_time = True
 
     def __init__(self, rate: int, device: str | None = None, audible: bool = False) -> None:
-        """Connect; CannotSpeak (no_player) where no server answers.
+        """Connect to the sound server.
 
-        `device`: a sink's name, None for the server's choice. `audible`: it fails (muted) where it is muted.
+        Args:
+            rate: Samples per second.
+            device: The name of a sink, or None for the server's choice.
+            audible: Whether a muted output fails the sentence (`muted`).
+
+        Raises:
+            CannotSpeak: No server answers (`no_player`).
         """
         self.proven = False
-        #: the sink's name; None until the stream is there
+        #: the name of the sink; None until the stream exists
         self.device: str | None = None
         self._rate = rate
-        self._wanted = device
+        self._wanted_device = device
         self._audible = audible
         self._written = self._heard = 0
-        #: the seconds of the stream that were heard, as the server told last, and when; None before there are any
-        self._told: tuple[float, float] | None = None
-        #: what was written when the server ran dry; None while it plays
+        #: the seconds heard by the server's last report, and its time; None until some sound has been heard
+        self._clock_report: tuple[float, float] | None = None
+        #: the bytes written when the server ran out of samples; None while it plays
         self._dry_at: int | None = None
-        #: when it is asked for the time, as long as it hasn't told any; None while a question is not answered
-        self._ask_at: float | None = 0.0
+        #: when to ask for the time, until the server has reported one; None while a request is pending
+        self._time_request_at: float | None = 0.0
         self._closed = self._draining = self._drained = False
-        self._failed: CannotSpeak | None = None
+        self._error: CannotSpeak | None = None
         self._stream: int | None = None
-        self._index = libpulse.NONE
-        #: until when a volume of 0 means nothing
-        self._settled_at = 0.0
-        self._ready_by = time.monotonic() + READY_WITHIN
+        self._sink_index = libpulse.NO_INDEX
+        #: until when a stream volume of 0 means nothing
+        self._volume_settled_at = 0.0
+        self._ready_by = time.monotonic() + READY_LIMIT_S
         self._suspended_at: float | None = None
-        #: questions about the stream that are not answered
-        self._asked = 0
-        self._of_sink: Loudness | None = None
-        self._of_stream: Loudness | None = None
-        #: whether it was muted at any time, and whether the server won't say how loud it is
-        self._muted = self._untold = False
+        #: the number of unanswered requests for the stream's level
+        self._pending_levels = 0
+        self._sink_level: Level | None = None
+        self._stream_level: Level | None = None
+        #: whether the output was muted at any time, and whether the server refuses to report a level
+        self._muted = self._level_refused = False
         try:
             self._lib = libpulse.load()
         except OSError as error:
             raise CannotSpeak(Reason.NO_PLAYER, f"libpulse cannot be loaded: {error}") from error
-        self._on_started = libpulse.Notice(self._started)
-        self._on_dry = libpulse.Notice(self._ran_dry)
-        self._on_time = libpulse.Notice(self._time_told)
-        self._on_drained = libpulse.Success(self._drain_over)
-        self._on_change = libpulse.Changed(self._changed)
-        self._on_sink = libpulse.SinkTold(self._sink_told)
-        self._on_stream = libpulse.SinkInputTold(self._stream_told)
-        self._loop: libpulse.Loop | None = libpulse.Loop(self._lib)
+        self._started_callback = libpulse.StreamCallback(self._on_started)
+        self._underflow_callback = libpulse.StreamCallback(self._on_underflow)
+        self._time_callback = libpulse.StreamCallback(self._on_time)
+        self._drained_callback = libpulse.SuccessCallback(self._on_drained)
+        self._change_callback = libpulse.ChangeCallback(self._on_change)
+        self._sink_callback = libpulse.SinkCallback(self._on_sink)
+        self._stream_callback = libpulse.SinkInputCallback(self._on_stream)
+        self._loop: libpulse.MainLoop | None = libpulse.MainLoop(self._lib)
         self._context = self._lib.context_new(self._loop.api, b"talk")
         if self._context is None:
             self._loop.free()
             raise CannotSpeak(Reason.NO_PLAYER, "libpulse makes no connection: is there enough memory?")
-        self._lib.context_connect(self._context, None, libpulse.NO_AUTOSPAWN, None)  # its state tells how that went
-        self._go_on()
-        if self._failed is not None:
+        self._lib.context_connect(self._context, None, libpulse.NO_AUTOSPAWN, None)  # the state reports a failure
+        self._run()
+        if self._error is not None:
             self.kill()
-            raise self._failed
+            raise self._error
 
-    # -- as every player
+    # -- the interface of every player
 
     def offer(self, data: memoryview) -> int:
-        """Write what the server has room for."""
         self._check()
         length = min(len(data), self._room())
         if length == 0:
@@ -127,60 +128,56 @@ class PulsePlayer(Player):
             self._fail(Reason.AUDIO_LOST)
             self._check()
         self._written += length
-        self._go_on()
+        self._run()
         return length
 
     def consumed(self) -> int:
-        """Return what is heard by the server's own clock."""
+        """Return the bytes that have been heard by the server's clock."""
         self.heard()
         return self._heard
 
     def heard(self) -> float | None:
-        """Return the seconds of its stream that are heard by now."""
         if self._drained:
             self._heard = self._written
-        elif self._told is not None:
-            seconds, at = self._told
+        elif self._clock_report is not None:
+            seconds, at = self._clock_report
             heard = int((seconds + time.monotonic() - at) * self._rate) * SAMPLE_BYTES
             self._heard = max(self._heard, min(heard, self._written if self._dry_at is None else self._dry_at))
         return self._heard / (self._rate * SAMPLE_BYTES)
 
     def close(self) -> None:
-        """Have what was written played to its end."""
         self._closed = True
         self._check()
 
     def ended(self) -> bool:
-        """Return True when the server has played all of it."""
         self._check()
         return self._drained
 
     def interests(self) -> list[Interest]:
-        """Return what libpulse waits for."""
         return self._loop.interests if self._loop is not None else []
 
     def wake_at(self) -> float | None:
-        """Return when libpulse has something to do, or a suspended sink is given up.
+        """Return when libpulse has work, or a time limit ends.
 
-        At once where there is room, and where the server has told the time in here: words are due by that.
+        This is now if there is room, or if the server has just reported the time, because words may be due.
         """
-        told = self._told
-        self._go_on()
-        if self._failed is not None or self._drained or self._told is not told or self._room():
+        report = self._clock_report
+        self._run()
+        if self._error is not None or self._drained or self._clock_report is not report or self._room():
             return 0.0
-        moments = [self._loop.due if self._loop is not None else None]
-        if self._index == libpulse.NONE:
-            moments.append(self._ready_by)
+        times = [self._loop.wake_at if self._loop is not None else None]
+        if self._sink_index == libpulse.NO_INDEX:
+            times.append(self._ready_by)
         if self._suspended_at is not None:
-            moments.append(self._suspended_at + SUSPENDED_FOR)
-        if self._is_settling():
-            moments.append(self._settled_at)
-        if self.proven and self._told is None:
-            moments.append(self._ask_at)
-        return min((moment for moment in moments if moment is not None), default=None)
+            times.append(self._suspended_at + SUSPENDED_LIMIT_S)
+        if self._volume_settles():
+            times.append(self._volume_settled_at)
+        if self.proven and self._clock_report is None:
+            times.append(self._time_request_at)
+        return min((each for each in times if each is not None), default=None)
 
     def kill(self) -> None:
-        """Close the connection: the server drops the stream with it, and what it held."""
+        """Close the connection; the server drops the stream, and the samples that it holds."""
         if self._loop is None:
             return
         self._lib.context_disconnect(self._context)
@@ -189,166 +186,127 @@ class PulsePlayer(Player):
         self._lib.context_unref(self._context)
         self._loop.free()
         self._loop = self._stream = None
-        self._failed = self._failed or CannotSpeak(Reason.AUDIO_LOST, "the stream was ended")
+        self._error = self._error or CannotSpeak(Reason.AUDIO_LOST, "the stream was ended")
 
     def gone(self) -> bool:
-        """Return True once the connection is closed."""
         return self._loop is None
-
-    # -- what the server says
 
     @property
     def output(self) -> Output | None:
-        """Where the sound goes, and how loud; None until it is known."""
-        sink, stream = self._of_sink, self._of_stream
-        if self.device is None or sink is None or stream is None or self._is_settling():
+        sink, stream = self._sink_level, self._stream_level
+        if self.device is None or sink is None or stream is None or self._volume_settles():
             return None
-        # Where volumes are flat, the stream's is that of the device already (PulseAudio's flat-volumes).
         volume = stream.volume if sink.flat else sink.volume * stream.volume
         return Output(self.name, self.device, round(min(1.0, volume), 2), self._muted)
 
-    def _check(self) -> None:
-        """Take in what the server has said; CannotSpeak if that means the end."""
-        self._go_on()
-        if self._failed is not None and not self._drained:
-            raise self._failed
+    # -- the stream's life
 
-    def _go_on(self) -> None:
-        """Let libpulse do all that it has to do, and what its states ask for."""
-        while self._loop is not None and (self._loop.turn() or self._advance()):
+    def _check(self) -> None:
+        """Process what the server has sent; raise CannotSpeak if the stream has failed."""
+        self._run()
+        if self._error is not None and not self._drained:
+            raise self._error
+
+    def _run(self) -> None:
+        """Run libpulse until it has no more work."""
+        while self._loop is not None and (self._loop.iterate() or self._advance()):
             pass
 
     def _advance(self) -> bool:
-        """Take the next step of the stream's life; return whether libpulse may have something to do for it."""
-        if self._failed is not None or self._drained:
+        """Take the stream's next step, and return whether libpulse may have work because of it."""
+        if self._error is not None or self._drained:
             return False
         state = self._lib.context_get_state(self._context)
         if state in (libpulse.CONTEXT_FAILED, libpulse.CONTEXT_TERMINATED):
             self._fail(Reason.AUDIO_DEVICE if self._written == 0 else Reason.AUDIO_LOST)
             return False
-        if self._index == libpulse.NONE and time.monotonic() >= self._ready_by:
-            self._failed = CannotSpeak(
-                Reason.AUDIO_DEVICE, f"the sound server does not answer within {READY_WITHIN:g} s"
+        if self._sink_index == libpulse.NO_INDEX and time.monotonic() >= self._ready_by:
+            self._error = CannotSpeak(
+                Reason.AUDIO_DEVICE, f"the sound server does not answer within {READY_LIMIT_S:g} s"
             )
             return False
         if self._stream is None:
-            return state == libpulse.CONTEXT_READY and self._open()
+            return state == libpulse.CONTEXT_READY and self._open_stream()
         state = self._lib.stream_get_state(self._stream)
         if state in (libpulse.STREAM_FAILED, libpulse.STREAM_TERMINATED):
             self._fail(Reason.AUDIO_DEVICE if self._written == 0 else Reason.AUDIO_LOST)
         elif state == libpulse.STREAM_READY:
-            asked = self._look_at_sink() or self._ask_time()
-            return asked or (self._closed and not self._draining and self._failed is None and self._drain())
+            asked = self._check_sink() or self._request_time()
+            return asked or (self._closed and not self._draining and self._error is None and self._drain())
         return False
 
-    def _open(self) -> bool:
-        held, asked = (each * self._rate // 1000 * SAMPLE_BYTES for each in (BUFFER_MS, REQUEST_MS))
-        sizes = libpulse.BufferSizes(2 * held, held, held, asked, libpulse.NONE)
+    def _open_stream(self) -> bool:
+        buffered, request = (each * self._rate // 1000 * SAMPLE_BYTES for each in (BUFFER_MS, REQUEST_MS))
+        # It starts to play with a full buffer. With the first piece alone it would run dry before the second one, and
+        # rewind for that, which some sinks can't.
+        sizes = libpulse.BufferSizes(2 * buffered, buffered, buffered, request, libpulse.NO_INDEX)
         spec = libpulse.SampleSpec(libpulse.S16LE, self._rate, 1)
         self._stream = self._lib.stream_new(self._context, b"talk", byref(spec), None)
         if self._stream is None:
             self._fail(Reason.AUDIO_DEVICE)
             return False
-        self._lib.stream_set_started_callback(self._stream, self._on_started, None)
-        self._lib.stream_set_underflow_callback(self._stream, self._on_dry, None)
-        self._lib.stream_set_latency_update_callback(self._stream, self._on_time, None)
+        self._lib.stream_set_started_callback(self._stream, self._started_callback, None)
+        self._lib.stream_set_underflow_callback(self._stream, self._underflow_callback, None)
+        self._lib.stream_set_latency_update_callback(self._stream, self._time_callback, None)
         flags = libpulse.ADJUST_LATENCY | libpulse.AUTO_TIMING_UPDATE
-        wanted = None if self._wanted is None else self._wanted.encode()
-        if self._lib.stream_connect_playback(self._stream, wanted, byref(sizes), flags, None, None) < 0:
+        device = None if self._wanted_device is None else self._wanted_device.encode()
+        if self._lib.stream_connect_playback(self._stream, device, byref(sizes), flags, None, None) < 0:
             self._fail(Reason.AUDIO_DEVICE)
         return True
 
-    def _look_at_sink(self) -> bool:
-        """See which sink it is by now, and whether that takes sound; return whether the server was asked anything."""
+    def _check_sink(self) -> bool:
+        """Check to which sink the stream plays, and whether it is suspended; return whether the server was asked."""
         index = int(self._lib.stream_get_device_index(self._stream))
-        asks = index != self._index
-        if asks:
-            begins, self._index = self._index == libpulse.NONE, index
-            self._settled_at = time.monotonic() + SETTLED_AFTER if begins else self._settled_at
+        changed = index != self._sink_index
+        if changed:
+            begins, self._sink_index = self._sink_index == libpulse.NO_INDEX, index
+            self._volume_settled_at = time.monotonic() + VOLUME_SETTLES_S if begins else self._volume_settled_at
             self.device = (self._lib.stream_get_device_name(self._stream) or b"").decode("utf-8", "replace")
-            if self.device == DUMMY_SINK != self._wanted:
-                self._failed = _dummy(begins)
-            self._ask_sink()
+            if self.device == DUMMY_SINK != self._wanted_device:
+                self._error = _dummy_error(begins)
+            self._request_sink_level()
             if begins:
-                self._lib.context_set_subscribe_callback(self._context, self._on_change, None)
-                mask = libpulse.ABOUT_SINKS | libpulse.ABOUT_SINK_INPUTS
-                self._begin(self._lib.context_subscribe(self._context, mask, None, None))
-                self._ask_stream()
-        self._judge()
+                self._lib.context_set_subscribe_callback(self._context, self._change_callback, None)
+                mask = libpulse.MASK_SINK | libpulse.MASK_SINK_INPUT
+                self._start(self._lib.context_subscribe(self._context, mask, None, None))
+                self._request_stream_level()
+        self._check_mute()
         if not self._lib.stream_is_suspended(self._stream):
             if self._suspended_at is not None:
                 self._suspended_at = None
-                self._begin_time()
-            return asks
+                self._restart_clock()
+            return changed
         now = time.monotonic()
         self._suspended_at = self._suspended_at or now
-        if now >= self._suspended_at + SUSPENDED_FOR:
-            self._failed = CannotSpeak(Reason.AUDIO_STALLED, f"the sound server has suspended {self.device}")
-        return asks
+        if now >= self._suspended_at + SUSPENDED_LIMIT_S:
+            self._error = CannotSpeak(Reason.AUDIO_STALLED, f"the sound server has suspended {self.device}")
+        return changed
 
-    def _ask_time(self) -> bool:
-        """Ask whether it is heard by now; return whether it was time for that."""
-        if not self.proven or self._told or self._ask_at is None or time.monotonic() < self._ask_at:
+    def _request_time(self) -> bool:
+        """Ask for the time until sound is heard, and return whether a request was due."""
+        due = self._time_request_at
+        if not self.proven or self._clock_report or due is None or time.monotonic() < due:
             return False
-        self._ask_at = None
-        self._begin(self._lib.stream_update_timing_info(self._stream, None, None))
+        self._time_request_at = None
+        self._start(self._lib.stream_update_timing_info(self._stream, None, None))
         return True
 
-    def _ask_sink(self) -> None:
-        self._begin(self._lib.context_get_sink_info_by_index(self._context, self._index, self._on_sink, None))
+    def _request_sink_level(self) -> None:
+        index = self._sink_index
+        self._start(self._lib.context_get_sink_info_by_index(self._context, index, self._sink_callback, None))
 
-    def _ask_stream(self) -> None:
-        self._asked += 1
-        number = self._lib.stream_get_index(self._stream)
-        self._begin(self._lib.context_get_sink_input_info(self._context, number, self._on_stream, None))
+    def _request_stream_level(self) -> None:
+        self._pending_levels += 1
+        index = self._lib.stream_get_index(self._stream)
+        self._start(self._lib.context_get_sink_input_info(self._context, index, self._stream_callback, None))
 
-    def _begin(self, operation: int | None) -> None:
-        """Let an operation go on; where it can't begin, the context has failed, and says so."""
+    def _start(self, operation: int | None) -> None:
+        """Let an operation run; if it couldn't be created, the context has failed and its state says so."""
         if operation is not None:
             self._lib.operation_unref(operation)
 
-    def _changed(self, _context: int, event: int, index: int, _data: object) -> None:
-        """Ask how loud it is where that may have changed."""
-        what = event & libpulse.FACILITY
-        if what == libpulse.OF_SINK and index == self._index:
-            self._ask_sink()
-        elif what == libpulse.OF_SINK_INPUT and index == self._lib.stream_get_index(self._stream):
-            self._ask_stream()
-
-    def _sink_told(self, _context: int, found: Any, over: int, _data: object) -> None:
-        if over == 0 and found[0].index == self._index:  # else it is of a sink that it has left
-            flat = bool(found[0].flags & libpulse.FLAT_VOLUME)
-            self._of_sink = Loudness(libpulse.loudness(found[0].volume), bool(found[0].mute), flat)
-            self._judge()
-        elif over < 0:
-            self._untold = True
-
-    def _stream_told(self, _context: int, found: Any, over: int, _data: object) -> None:
-        self._asked -= over != 0
-        if over == 0:
-            self._of_stream = Loudness(libpulse.loudness(found[0].volume), bool(found[0].mute))
-            self._judge()
-        elif over < 0:
-            self._untold = True
-
-    def _is_settling(self) -> bool:
-        """Whether the stream's volume is still to be set."""
-        stream = self._of_stream
-        if stream is None or stream.volume > 0 or stream.muted or self._drained:
-            return False
-        return self._asked > 0 or time.monotonic() < self._settled_at
-
-    def _judge(self) -> None:
-        """Take note of whether it is muted now, for good: what was not heard doesn't become so later."""
-        told = [each for each in (self._of_sink, self._of_stream) if each is not None]
-        if self._drained or self._is_settling() or not any(each.muted or each.volume == 0 for each in told):
-            return
-        self._muted = True
-        if self._audible and self._failed is None:
-            self._failed = CannotSpeak(Reason.MUTED, f"the output is muted: {self.device}", final=True)
-
     def _drain(self) -> bool:
-        operation = self._lib.stream_drain(self._stream, self._on_drained, None)
+        operation = self._lib.stream_drain(self._stream, self._drained_callback, None)
         if operation is None:
             self._fail(Reason.AUDIO_LOST)
             return False
@@ -357,65 +315,105 @@ class PulsePlayer(Player):
         return True
 
     def _room(self) -> int:
-        """Return how many bytes the server has room for, in whole samples."""
-        if self._index == libpulse.NONE or self._closed or self._failed is not None:
+        """Return the bytes of whole samples for which the server has room."""
+        if self._sink_index == libpulse.NO_INDEX or self._closed or self._error is not None:
             return 0
-        if self._audible and not (self._untold or self.output):
-            return 0  # for less than 1 ms
+        if self._audible and not (self._level_refused or self.output):
+            return 0  # the level is known within 1 ms
         room = self._lib.stream_writable_size(self._stream)
-        return 0 if room == libpulse.FAILED else room // SAMPLE_BYTES * SAMPLE_BYTES
+        return 0 if room == libpulse.SIZE_ERROR else room // SAMPLE_BYTES * SAMPLE_BYTES
 
-    def _started(self, *_: Any) -> None:
-        self.proven, self._dry_at = True, None
-        self._begin_time()
+    def _volume_settles(self) -> bool:
+        """Return whether the stream's volume is still to be set by the server."""
+        level = self._stream_level
+        if level is None or level.volume > 0 or level.muted or self._drained:
+            return False
+        return self._pending_levels > 0 or time.monotonic() < self._volume_settled_at
 
-    def _ran_dry(self, *_: Any) -> None:
-        self._dry_at = self._written
+    def _check_mute(self) -> None:
+        """Record whether the output is muted now; once muted, the sentence counts as muted."""
+        levels = [each for each in (self._sink_level, self._stream_level) if each is not None]
+        if self._drained or self._volume_settles() or not any(each.muted or each.volume == 0 for each in levels):
+            return
+        self._muted = True
+        if self._audible and self._error is None:
+            self._error = CannotSpeak(Reason.MUTED, f"the output is muted: {self.device}", final=True)
 
-    def _begin_time(self) -> None:
-        """Ask for the time anew: it stood still, as the stream had not begun, or had run dry, or its sink slept."""
-        self._told, self._ask_at = None, 0.0
-
-    def _time_told(self, *_: Any) -> None:
-        told, now = c_uint64(), time.monotonic()
-        self._ask_at = now + ASK_EVERY
-        # Before it has begun, what is told is the time that the answer took.
-        if self.proven and self._lib.stream_get_time(self._stream, byref(told)) == 0 and told.value:
-            self._told = told.value / 1_000_000, now
-
-    def _drain_over(self, _stream: int, success: int, _data: object) -> None:
-        if success:
-            self._look_at_sink()  # it may have been moved in the same moment
-            self._settled_at = 0.0
-            self._judge()
-            self._drained = self.proven = self._failed is None
-        else:
-            self._fail(Reason.AUDIO_LOST)
+    def _restart_clock(self) -> None:
+        """Ask for the time again after it stood still: before the stream began, after it ran dry, or during a sleep."""
+        self._clock_report, self._time_request_at = None, 0.0
 
     def _fail(self, reason: Reason) -> None:
-        """Take note that it has failed, for the reason that libpulse knows."""
-        if self._failed is not None:
+        """Record a failure, in the words of libpulse's error number."""
+        if self._error is not None:
             return
         number = self._lib.context_errno(self._context)
         words = self._lib.strerror(number).decode("utf-8", "replace")
+        message = f"the sound server ended the stream: {words}"
         if self._stream is None and number in (libpulse.CONNECTION_REFUSED, libpulse.INVALID_SERVER):
-            self._failed = CannotSpeak(Reason.NO_PLAYER, f"no sound server answers: {words}")
+            reason, message = Reason.NO_PLAYER, f"no sound server answers: {words}"
         elif self._stream is None:
-            self._failed = CannotSpeak(reason, f"the sound server lets nobody in: {words}")
-        elif self._index != libpulse.NONE:  # the number may be of a question about a sink that is gone
-            self._failed = CannotSpeak(reason, "the sound server ended the stream")
-        elif number == libpulse.NO_ENTITY and self._wanted is not None:
-            self._failed = CannotSpeak(
-                reason, f'the sound server has no sink "{self._wanted}": see pactl list short sinks'
-            )
+            message = f"the sound server lets nobody in: {words}"
+        elif self._sink_index != libpulse.NO_INDEX:  # the number may belong to a request about a sink that is gone
+            message = "the sound server ended the stream"
+        elif number == libpulse.NO_ENTITY and self._wanted_device is not None:
+            message = f'the sound server has no sink "{self._wanted_device}": see pactl list short sinks'
         elif number == libpulse.NO_ENTITY:
-            self._failed = CannotSpeak(reason, "the sound server has no output")
-        else:
-            self._failed = CannotSpeak(reason, f"the sound server ended the stream: {words}")
+            message = "the sound server has no output"
+        self._error = CannotSpeak(reason, message)
+
+    # -- callbacks of libpulse
+
+    def _on_started(self, *_: Any) -> None:
+        self.proven, self._dry_at = True, None
+        self._restart_clock()
+
+    def _on_underflow(self, *_: Any) -> None:
+        self._dry_at = self._written
+
+    def _on_time(self, *_: Any) -> None:
+        heard, now = c_uint64(), time.monotonic()
+        self._time_request_at = now + TIME_REQUEST_S
+        # Before the stream has begun, the time only shows how long the answer took.
+        if self.proven and self._lib.stream_get_time(self._stream, byref(heard)) == 0 and heard.value:
+            self._clock_report = heard.value / 1_000_000, now
+
+    def _on_drained(self, _stream: int, success: int, _data: object) -> None:
+        if not success:
+            self._fail(Reason.AUDIO_LOST)
+            return
+        self._check_sink()  # it may have been moved at the same moment
+        self._volume_settled_at = 0.0
+        self._check_mute()
+        self._drained = self.proven = self._error is None
+
+    def _on_change(self, _context: int, event: int, index: int, _data: object) -> None:
+        """Ask for a level that may have changed."""
+        facility = event & libpulse.FACILITY_MASK
+        if facility == libpulse.EVENT_SINK and index == self._sink_index:
+            self._request_sink_level()
+        elif facility == libpulse.EVENT_SINK_INPUT and index == self._lib.stream_get_index(self._stream):
+            self._request_stream_level()
+
+    def _on_sink(self, _context: int, found: Any, end: int, _data: object) -> None:
+        if end == 0 and found[0].index == self._sink_index:  # otherwise the stream has left that sink
+            flat = bool(found[0].flags & libpulse.FLAT_VOLUME)
+            self._sink_level = Level(libpulse.loudest(found[0].volume), bool(found[0].mute), flat)
+            self._check_mute()
+        elif end < 0:
+            self._level_refused = True
+
+    def _on_stream(self, _context: int, found: Any, end: int, _data: object) -> None:
+        self._pending_levels -= end != 0
+        if end == 0:
+            self._stream_level = Level(libpulse.loudest(found[0].volume), bool(found[0].mute))
+            self._check_mute()
+        elif end < 0:
+            self._level_refused = True
 
 
-def _dummy(begins: bool) -> CannotSpeak:
-    """Return what is wrong where nobody can hear the stream (any more), and no other player would be heard."""
+def _dummy_error(begins: bool) -> CannotSpeak:
+    """Return the error for a stream on the dummy sink, on which no other player would be heard either."""
     if begins:
         return CannotSpeak(Reason.AUDIO_DEVICE, "the sound server has only a dummy output", final=True)
     return CannotSpeak(Reason.AUDIO_LOST, "the sound server has only a dummy output left", final=True)
