@@ -91,10 +91,10 @@ def voices(options: CommonOptions, language: str | None) -> None:
         found = every = client.voices()
     if language:
         from talkcli.engine.protocol import Voice
-        from talkcli.engine.voices import languages
+        from talkcli.engine.voices import matching_languages
 
         listed = [Voice(str(each.get("id")), _language(each), str(each.get("name"))) for each in every]
-        wanted = languages(language, listed)
+        wanted = matching_languages(language, listed)
         found = [each for each in every if _language(each) in wanted]
         if not found:
             raise TalkError(_no_voice(language, every))

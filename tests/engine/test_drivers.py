@@ -261,12 +261,12 @@ def test_the_wheels_library_serves_if_the_system_has_none() -> None:
 #: A library that has not even talk's own voice.
 WITHOUT_ENGLISH = """
 from talkcli.engine.child.synthesizers import espeak
-load = espeak.load
+load_library = espeak.load_library
 def without_english():
-    library, *more = load()
+    library, *more = load_library()
     library.SetVoiceByName = lambda _: library.EE_OK + 1
     return library, *more
-espeak.load = without_english
+espeak.load_library = without_english
 """
 
 

@@ -32,7 +32,7 @@ def test_a_text_without_suspected_initials_has_none_to_change(text: str) -> None
 
 @given(_TEXTS | st.text())
 def test_words_are_ended_as_if_the_whole_text_had_been_gone_through(text: str) -> None:
-    assert guard._without_endless_words(text) == guard._PIECE.sub(guard._shortened, text)
+    assert guard._without_long_words(text) == guard._WORD_OR_GAP.sub(guard._split_word, text)
 
 
 @pytest.mark.parametrize(

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.engine.child.synthesizers.cache import Cache
-from talkcli.engine.child.synthesizers.inference import AROUND, Model, Run
-from talkcli.engine.models import NEEDED, BadFile, describe
+from talkcli.engine.child.synthesizers.inference import CONTEXT_FRAMES, Model, ModelCache, Run
+from talkcli.engine.models import MODEL_PACKAGES, VoiceFileError, read_description
 from tests.support import tiny_voice
 from tests.support.real_voice import real_voice, silence_noise
 from tests.support.surroundings import needs_packages
@@ -33,7 +32,7 @@ NUMBERS = [1, 0, *(number for sound in range(14, 32) for number in (sound, 0)), 
 
 @pytest.fixture(autouse=True)
 def _needs_the_extra() -> None:
-    needs_packages(*NEEDED)
+    needs_packages(*MODEL_PACKAGES)
 
 
 @pytest.fixture(scope="module")
@@ -44,8 +43,8 @@ def joe(tmp_path_factory: pytest.TempPathFactory) -> Model:
     return _loaded(place / real_voice().name)
 
 
-def _loaded(path: Path, cache: Cache | None = None) -> Model:
-    return Model(str(path), describe(str(path)), cache)
+def _loaded(path: Path, cache: ModelCache | None = None) -> Model:
+    return Model(str(path), read_description(str(path)), cache)
 
 
 def _whole(path: Path, speaker: int | None = None) -> Any:
@@ -93,16 +92,16 @@ def test_pieces_of_a_real_voice_are_the_whole(joe: Model) -> None:
     assert pieces.shape == whole.shape
     assert abs(whole).max() > 0.1
     assert abs(pieces - whole).max() < 1e-4
-    assert AROUND >= 10  # with which that was measured; it is for larger decoders
+    assert CONTEXT_FRAMES >= 10  # with which that was measured; it is for larger decoders
 
 
 def test_a_model_is_loaded_from_its_kept_halves(tmp_path: Path) -> None:
     path = tiny_voice.put(tmp_path / "v", "a")
-    first = _in_pieces(_loaded(path, Cache(str(tmp_path / "c"))))
+    first = _in_pieces(_loaded(path, ModelCache(str(tmp_path / "c"))))
     kept = sorted((tmp_path / "c").iterdir())
     assert len(kept) == 2
     at = [each.stat().st_mtime_ns for each in kept]
-    assert (_in_pieces(_loaded(path, Cache(str(tmp_path / "c")))) == first).all()
+    assert (_in_pieces(_loaded(path, ModelCache(str(tmp_path / "c")))) == first).all()
     assert sorted((tmp_path / "c").iterdir()) == kept
     assert all(each.stat().st_mtime_ns > before for each, before in zip(kept, at, strict=True))
 
@@ -121,7 +120,7 @@ def test_halves_are_read_from_files_that_are_gone_then(tmp_path: Path, monkeypat
     path = tiny_voice.put(tmp_path / "v", "a")
     before = os.listdir("/proc/self/fd")
     _loaded(path)
-    _loaded(path, Cache(str(tmp_path / "c")))
+    _loaded(path, ModelCache(str(tmp_path / "c")))
     assert len(given) == 4
     assert [each for each in given if not isinstance(each, str)] == []
     assert os.listdir("/proc/self/fd") == before
@@ -131,7 +130,7 @@ def test_halves_are_read_from_files_that_are_gone_then(tmp_path: Path, monkeypat
 def test_a_model_is_loaded_even_if_no_file_may_be_written(tmp_path: Path, cached: bool) -> None:
     path = tiny_voice.put(tmp_path / "v", "a")
     usual = _in_pieces(_loaded(path))
-    cache = Cache(str(tmp_path / "c"))
+    cache = ModelCache(str(tmp_path / "c"))
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
     try:
@@ -145,11 +144,11 @@ def test_a_model_is_loaded_even_if_no_file_may_be_written(tmp_path: Path, cached
 @pytest.mark.parametrize("damage", [b"", b"\0" * 100, None])
 def test_kept_halves_that_are_damaged_are_made_anew(tmp_path: Path, damage: bytes | None) -> None:
     path = tiny_voice.put(tmp_path / "v", "a")
-    first = _in_pieces(_loaded(path, Cache(str(tmp_path / "c"))))
+    first = _in_pieces(_loaded(path, ModelCache(str(tmp_path / "c"))))
     kept = next((tmp_path / "c").glob("*.encoder.onnx"))
     whole = kept.read_bytes()
     kept.write_bytes(whole[: len(whole) // 2] if damage is None else damage)
-    assert (_in_pieces(_loaded(path, Cache(str(tmp_path / "c")))) == first).all()
+    assert (_in_pieces(_loaded(path, ModelCache(str(tmp_path / "c")))) == first).all()
     assert kept.read_bytes() == whole
 
 
@@ -173,7 +172,7 @@ def test_kept_halves_that_are_damaged_are_made_anew(tmp_path: Path, damage: byte
 )
 def test_a_bad_model_says_why_and_what_to_do(tmp_path: Path, content: bytes, beside: dict[str, Any], why: str) -> None:
     path = tiny_voice.put(tmp_path / "v", "a", content, tiny_voice.description(**beside))
-    with pytest.raises(BadFile, match=why) as caught:
+    with pytest.raises(VoiceFileError, match=why) as caught:
         _loaded(path)
     assert str(path) in str(caught.value)
     assert "get" in str(caught.value) or "end another program" in str(caught.value)
@@ -183,7 +182,7 @@ def test_a_bad_model_says_why_and_what_to_do(tmp_path: Path, content: bytes, bes
 def test_a_file_that_is_larger_than_any_model_is_not_read(tmp_path: Path) -> None:
     path = tiny_voice.put(tmp_path / "v", "a")
     os.truncate(path, 1 << 40)  # a hole: it takes no room on the disk
-    with pytest.raises(BadFile, match="larger than any of Piper's models: get the voice anew"):
+    with pytest.raises(VoiceFileError, match="larger than any of Piper's models: get the voice anew"):
         _loaded(path)
 
 
@@ -191,16 +190,16 @@ def test_a_file_that_is_larger_than_any_model_is_not_read(tmp_path: Path) -> Non
 _WITH_LITTLE_MEMORY = """
 import resource, sys
 from talkcli.engine.child.synthesizers.inference import Model, Run
-from talkcli.engine.models import BadFile, describe
+from talkcli.engine.models import VoiceFileError, read_description
 sys.argv[1:] = {arguments!r}
-model = Model(sys.argv[1], describe(sys.argv[1]))
+model = Model(sys.argv[1], read_description(sys.argv[1]))
 before = resource.getrlimit(resource.RLIMIT_AS)
 with open("/proc/self/statm") as file:
     used = int(file.read().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (used + 20_000_000, before[1]))
 try:
     model.encode([1, 0, *[14, 0] * 500, 2], 0, 1.0, Run())
-except BadFile as error:
+except VoiceFileError as error:
     print(error)
 resource.setrlimit(resource.RLIMIT_AS, before)
 print(len(model.encode([1, 0, 14, 0, 2], 0, 1.0, Run()).ends))
@@ -223,7 +222,7 @@ def test_a_run_that_is_ended_raises_at_once(joe: Model) -> None:
     def encode() -> None:
         try:
             joe.encode([*NUMBERS[:2], *NUMBERS[2:-1] * 40, NUMBERS[-1]], 0, 1.0, run)  # two seconds of it
-        except BadFile as error:
+        except VoiceFileError as error:
             ended.append((time.monotonic(), error))
 
     thread = threading.Thread(target=encode)

@@ -21,7 +21,7 @@ import pytest
 
 from talkcli import install
 from talkcli.engine import protocol
-from talkcli.engine.models import NEEDED
+from talkcli.engine.models import MODEL_PACKAGES
 from tests.engine.programs import Player, without_silence
 from tests.engine.spawned import SOON, Shared, Spawned, first
 from tests.support import tiny_voice
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 TEXT = "battery low, please come home"
 VOICE = "piper/tiny"
 #: Code that runs in the process first and makes loading slow, as on a slow machine.
-SLOW_TO_LOAD = first("synthesizers.inference:Model._take", "time.sleep(0.8)")
+SLOW_TO_LOAD = first("synthesizers.inference:Model._set_halves", "time.sleep(0.8)")
 #: … that makes all but the first sound of a sentence too late.
 SLOW_TO_SPEAK = first("synthesizers.inference:Model.decode", "time.sleep(0.8 if arguments[2] else 0)")
 #: … that hides packages.
@@ -57,19 +57,16 @@ sys.meta_path.insert(0, Without())
 """
 #: Modules that an engine process without a neural voice has no use for.
 NEURAL_MODULES = [
-    *NEEDED,
+    *MODEL_PACKAGES,
     *("difflib", "hashlib", "queue"),
-    *(
-        f"talkcli.engine.child.synthesizers.{each}"
-        for each in ("cache", "inference", "phonemes", "piper", "vits", "work")
-    ),
+    *(f"talkcli.engine.child.synthesizers.{each}" for each in ("inference", "loader", "phonemes", "piper", "vits")),
 ]
 
 
 @pytest.fixture(scope="module")
 def voices(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a directory with a voice that hums, in some milliseconds."""
-    needs_packages(*NEEDED)
+    needs_packages(*MODEL_PACKAGES)
     path = tmp_path_factory.mktemp("neural") / "voices"
     tiny_voice.put(path, "tiny")
     return path
@@ -198,7 +195,7 @@ atexit.register(lambda: sys.stderr.write(repr([each for each in {NEURAL_MODULES!
         assert engine.errors() == "[]"
 
 
-@pytest.mark.parametrize("package", NEEDED)
+@pytest.mark.parametrize("package", MODEL_PACKAGES)
 def test_without_the_extra_a_voice_says_what_to_install(tmp_path: Path, package: str) -> None:
     tiny_voice.put(tmp_path / "voices", "tiny")
     before = WITHOUT.format(names=[package])
@@ -348,12 +345,12 @@ def test_a_voice_is_held_and_stopped_while_it_is_loaded_and_then_speaks(place: P
 
 
 @limits()
-@pytest.mark.parametrize("asked", ["clauses", "places", "abbreviates"])
+@pytest.mark.parametrize("asked", ["clauses", "word_positions", "ends_with_abbreviation"])
 def test_a_voice_is_stopped_and_held_while_the_sounds_of_a_text_are_looked_up(place: Path, asked: str) -> None:
     """Libespeak-ng needs a tenth of a second at once for a clause of 800 bytes of a script that isn't the voice's."""
     text = "Go. Dr. Who. " + "电池电量低正在返回充电站" * 800
     tells = f"arguments[0] in seen or seen.append(arguments[0]) or print({asked!r}, file=sys.stderr, flush=True)"
-    with _engine(place, before=first(f"synthesizers.espeak:Spelling.{asked}", tells)) as engine:
+    with _engine(place, before=first(f"synthesizers.espeak:EspeakPhonemizer.{asked}", tells)) as engine:
         assert engine.spoken("Go. Go", "g0", voice=VOICE).outcome == protocol.OUTCOME_COMPLETED
         assert engine.errors_line() == asked
         for number in range(1, 5):
@@ -502,7 +499,7 @@ def test_a_real_voice_says_a_sentence_with_its_words_in_time(real: dict[str, str
 
 
 def test_voices_are_loaded_one_at_a_time_beside_the_speech_and_told_once_each(place: Path) -> None:
-    path = "synthesizers.inference:Model._take"
+    path = "synthesizers.inference:Model._set_halves"
     slow = first(path, "seen and sys.exit('two at once') or seen.append(1) or time.sleep(0.3) or seen.clear()")
     tiny_voice.put(place, "second")
     with _engine(place, before=slow) as engine:

@@ -431,8 +431,8 @@ def test_a_text_without_a_sound_is_no_fault_of_the_player(player: Player) -> Non
 def test_a_player_for_another_rate_is_replaced_before_the_first_sample(player: Player) -> None:
     before = """
 from talkcli.engine.child.synthesizers import espeak
-load = espeak.load
-espeak.load = lambda: (*load()[:2], 16_000)
+load_library = espeak.load_library
+espeak.load_library = lambda: (*load_library()[:2], 16_000)
 """
     rates = player.heard.with_name("rates")
     program = player.plays(f"open({str(rates)!r}, 'a').write(sys.argv[2] + ' ')")

@@ -21,9 +21,9 @@ from talkcli.engine.child.players.base import CannotSpeak, Stopped
 from talkcli.engine.child.synthesizers.base import SpeechSettings
 from talkcli.engine.child.synthesizers.combined import CombinedSynthesizer
 from talkcli.engine.child.synthesizers.espeak import Espeak
-from talkcli.engine.child.synthesizers.phonemes import pieces
+from talkcli.engine.child.synthesizers.phonemes import split_text
 from talkcli.engine.child.synthesizers.piper import Piper
-from talkcli.engine.models import NEEDED
+from talkcli.engine.models import MODEL_PACKAGES
 from talkcli.engine.players import SAMPLE_BYTES
 from talkcli.engine.protocol import Voice
 from talkcli.engine.voices import UnknownVoice
@@ -104,7 +104,7 @@ def _espeak() -> Espeak:
 
 def _piper(voice: str = "piper/tiny") -> Synthesizer:
     """Return a synthesizer with this voice; "tiny" hums, in some milliseconds."""
-    needs_packages(*NEEDED)
+    needs_packages(*MODEL_PACKAGES)
     synthesizer = Piper(_espeak())
     synthesizer.load(voice)
     return synthesizer
@@ -117,7 +117,7 @@ def _joe() -> Synthesizer:
 
 
 def _choice() -> Synthesizer:
-    needs_packages(*NEEDED)
+    needs_packages(*MODEL_PACKAGES)
     return CombinedSynthesizer(_espeak())
 
 
@@ -352,8 +352,8 @@ def test_libespeak_speaks_on_as_before_after_it_was_asked_how_another_language_s
     try:
         espeak.load("gmw/de")
         before = _spoken(espeak, "zwanzig Züge", SpeechSettings(rate=300))
-        with espeak.spelling("en-us") as speller:
-            assert speller.places("twenty trains") == [(0, 6), (7, 6)]
+        with espeak.lend("en-us") as speller:
+            assert speller.word_positions("twenty trains") == [(0, 6), (7, 6)]
         _assert_alike(_spoken(espeak, "zwanzig Züge", SpeechSettings(rate=300)), before)
     finally:
         espeak.load(own)
@@ -377,7 +377,7 @@ def test_the_end_of_a_spelling_waits_for_nothing_and_the_next_sentence_for_the_l
             speller.clauses("hello")
         order.append("stopped")
 
-    with espeak.spelling("de") as speller:
+    with espeak.lend("de") as speller:
         library, speller._to_phonemes = speller._to_phonemes, held
         thread = threading.Thread(target=spell)
         thread.start()
@@ -401,8 +401,8 @@ def test_the_end_of_a_spelling_waits_for_nothing_and_the_next_sentence_for_the_l
     ],
 )
 def test_a_sentence_ends_where_libespeak_makes_a_pause(language: str, text: str, ends: list[str]) -> None:
-    with _espeak().spelling(language) as speller:
-        found = list(pieces(speller, text))
+    with _espeak().lend(language) as speller:
+        found = list(split_text(speller, text))
     starts = [each.words[0][1] for each in found]
     sentences = [text[begin:end].rstrip() for begin, end in zip(starts, [*starts[1:], None], strict=True)]
     assert [each.endswith(end) for each, end in zip(sentences, ends, strict=True)] == [True] * len(ends)

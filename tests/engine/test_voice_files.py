@@ -19,9 +19,9 @@ from typing import Any
 import pytest
 
 from talkcli.engine import models
-from talkcli.engine.child.synthesizers import cache as caches
-from talkcli.engine.child.synthesizers.cache import Cache
-from talkcli.engine.models import BadFile, describe, found, open_checked, voices
+from talkcli.engine.child.synthesizers import inference
+from talkcli.engine.child.synthesizers.inference import ModelCache
+from talkcli.engine.models import VoiceFileError, find_models, installed_voices, open_checked, read_description
 from talkcli.engine.protocol import Voice
 from talkcli.paths import cache_directory, voice_directories
 from tests.support import tiny_voice
@@ -79,7 +79,7 @@ def test_a_voice_is_found_in_the_first_of_its_places(home: Path, monkeypatch: py
     for number, place in enumerate(places):
         tiny_voice.put(place, f"v{number}")
         tiny_voice.put(place, "same")
-    assert found() == {
+    assert find_models() == {
         **{f"v{number}": f"{place}/v{number}.onnx" for number, place in enumerate(places)},
         "same": f"{first}/same.onnx",
     }
@@ -90,14 +90,14 @@ def test_only_models_that_can_be_named_are_voices(home: Path) -> None:
         tiny_voice.put(home / "v", name)
     (home / "v" / ".onnx").touch()
     (home / "v" / "notes.txt").touch()
-    assert [*found()] == ["good"]
+    assert [*find_models()] == ["good"]
 
 
 def test_a_voice_is_listed_with_language_quality_and_speakers(home: Path) -> None:
     tiny_voice.put(home / "v", "a", beside=tiny_voice.description(speakers=3, language="de_DE"))
     (home / "v" / "b.onnx").touch()
     tiny_voice.put(home / "v", "c")
-    assert [*voices()] == [
+    assert [*installed_voices()] == [
         Voice("piper/a", "de-de", "tiny, low, 3 speakers", "low", ("p0", "p1", "p2")),
         Voice("piper/b", None, "b"),
         Voice("piper/c", "en-us", "tiny, low", "low"),
@@ -107,7 +107,7 @@ def test_a_voice_is_listed_with_language_quality_and_speakers(home: Path) -> Non
 def test_a_speaker_without_a_name_to_type_goes_by_its_number(home: Path) -> None:
     names = {"amused": 0, "\x1b[31m": 1, "x" * 65: 2, "": 3, "calm": 5, "beyond": 6}
     tiny_voice.put(home / "v", "a", beside=tiny_voice.description(num_speakers=6, speaker_id_map=names))
-    (voice,) = voices()
+    (voice,) = installed_voices()
     assert voice.speakers == ("amused", "1", "2", "3", "4", "calm")
 
 
@@ -116,8 +116,8 @@ def test_a_very_long_name_in_a_json_is_cut_if_it_is_told(home: Path) -> None:
     told["audio"] = {"sample_rate": 8000, "quality": "q" * 1000}
     told["espeak"] = {"voice": "e" * 1000}
     path = tiny_voice.put(home / "v", "a", beside=told)
-    assert describe(str(path)).speller == f"{'e' * 40}…"
-    (voice,) = voices()
+    assert read_description(str(path)).espeak_voice == f"{'e' * 40}…"
+    (voice,) = installed_voices()
     assert voice.name == f"{'d' * 40}…, {'q' * 40}…"
     assert (voice.language, voice.quality) == (f"{'l' * 40}…", f"{'q' * 40}…")
 
@@ -127,7 +127,7 @@ def test_a_file_that_everybody_may_write_is_refused(home: Path, where: str) -> N
     path = tiny_voice.put(home / "up" / "v", "a")
     wrong = {"model": path, "json": beside(path), "directory": path.parent, "above": path.parent.parent}[where]
     wrong.chmod(0o646 if wrong.is_file() else 0o757)
-    with pytest.raises(BadFile, match=f"^{wrong} can be written by others, .*: chmod go-w {wrong}$"):
+    with pytest.raises(VoiceFileError, match=f"^{wrong} can be written by others, .*: chmod go-w {wrong}$"):
         open_checked(str(beside(path)), model=str(path))
     wrong.chmod(0o755)
     open_checked(str(beside(path)), model=str(path)).close()
@@ -138,12 +138,12 @@ def test_all_that_others_may_write_is_named_with_one_command_that_mends_it(home:
     wrong = [beside(path), path.parent, path]
     for each in wrong:
         each.chmod(0o777)
-    with pytest.raises(BadFile) as caught:
-        describe(str(path))
+    with pytest.raises(VoiceFileError) as caught:
+        read_description(str(path))
     names, _, command = str(caught.value).partition(" can be written by others, who could change the voice: ")
     assert names == f"{wrong[0]}, {wrong[1]} and {wrong[2]}"
     subprocess.run(["/bin/sh", "-c", command], check=True)
-    assert describe(str(path)).rate == 22050
+    assert read_description(str(path)).rate == 22050
 
 
 #: A group that nobody has, and so a user's own that could be any.
@@ -194,7 +194,7 @@ def test_a_file_that_only_the_users_own_group_may_write_is_the_users(
     if safe:
         open_checked(str(path)).close()
     else:
-        with pytest.raises(BadFile, match=f"{path} and {path.parent} can be written by others"):
+        with pytest.raises(VoiceFileError, match=f"{path} and {path.parent} can be written by others"):
             open_checked(str(path))
 
 
@@ -213,7 +213,7 @@ def test_an_access_list_is_seen_behind_the_users_own_group(home: Path, monkeypat
         if error.errno != errno.ENOTSUP:
             raise
         pytest.skip("this file system has no access control lists")
-    with pytest.raises(BadFile, match=f"{path} can be written by others"):
+    with pytest.raises(VoiceFileError, match=f"{path} can be written by others"):
         open_checked(str(path))
 
 
@@ -222,7 +222,7 @@ def test_a_directory_that_is_everybodys_may_be_above_if_it_is_sticky_but_not_hol
     (home / "up").chmod(0o1777)
     open_checked(str(path)).close()
     (home / "up" / "v").chmod(0o1777)
-    with pytest.raises(BadFile, match="can be written by others"):
+    with pytest.raises(VoiceFileError, match="can be written by others"):
         open_checked(str(path))
 
 
@@ -240,7 +240,7 @@ def test_no_link_on_the_way_may_be_where_everybody_may_write(home: Path, what: s
     open_checked(str(way)).close()
     wrong = home / where
     wrong.chmod(0o777)
-    with pytest.raises(BadFile, match=f"^{wrong} can be written by others, .*: chmod go-w {wrong}$"):
+    with pytest.raises(VoiceFileError, match=f"^{wrong} can be written by others, .*: chmod go-w {wrong}$"):
         open_checked(str(way))
 
 
@@ -248,11 +248,11 @@ def test_a_link_to_itself_and_a_pipe_are_refused_and_not_waited_for(home: Path) 
     path = tiny_voice.put(home / "v", "a")
     path.unlink()
     path.symlink_to(path)
-    with pytest.raises(BadFile, match=f"^{path} cannot be read: {os.strerror(errno.ELOOP)}$"):
+    with pytest.raises(VoiceFileError, match=f"^{path} cannot be read: {os.strerror(errno.ELOOP)}$"):
         open_checked(str(path))
     path.unlink()
     os.mkfifo(path, 0o600)
-    with pytest.raises(BadFile, match="is no file"):
+    with pytest.raises(VoiceFileError, match="is no file"):
         open_checked(str(path))
 
 
@@ -266,10 +266,10 @@ def test_another_users_file_or_link_is_refused(home: Path) -> None:
     link.symlink_to(path.parent)
     open_checked(str(link / path.name)).close()
     os.chown(link, 4711, -1, follow_symlinks=False)
-    with pytest.raises(BadFile, match=rf"^{link} is another user's \(#4711\)"):
+    with pytest.raises(VoiceFileError, match=rf"^{link} is another user's \(#4711\)"):
         open_checked(str(link / path.name))
     os.chown(path, 4711, -1)
-    with pytest.raises(BadFile, match=r"is another user's \(#4711\)"):
+    with pytest.raises(VoiceFileError, match=r"is another user's \(#4711\)"):
         open_checked(str(path))
 
 
@@ -296,13 +296,13 @@ def test_a_json_of_no_voice_is_refused_in_words(home: Path, beside: bytes | dict
     path = tiny_voice.put(home / "v", "a")
     told = path.parent / "a.onnx.json"
     told.write_bytes(beside if isinstance(beside, bytes) else json.dumps(tiny_voice.description(**beside)).encode())
-    with pytest.raises(BadFile, match=why) as caught:
-        describe(str(path))
+    with pytest.raises(VoiceFileError, match=why) as caught:
+        read_description(str(path))
     assert str(told) in str(caught.value)
     assert "get it anew" in str(caught.value)
     told.unlink()
-    with pytest.raises(BadFile, match=r"a\.onnx\.json is not there: it belongs to the model"):
-        describe(str(path))
+    with pytest.raises(VoiceFileError, match=r"a\.onnx\.json is not there: it belongs to the model"):
+        read_description(str(path))
 
 
 # -- kept halves
@@ -319,7 +319,7 @@ def _kept(directory: Path) -> list[str]:
     return sorted(each.name for each in directory.iterdir())
 
 
-def _keep(cache: Cache, key: str, content: bytes = b"encoder") -> str | None:
+def _keep(cache: ModelCache, key: str, content: bytes = b"encoder") -> str | None:
     """Keep something, and return the path that it was to be written to."""
     given: list[str | None] = []
 
@@ -329,12 +329,12 @@ def _keep(cache: Cache, key: str, content: bytes = b"encoder") -> str | None:
             with open(path, "wb") as file:
                 file.write(content)
 
-    cache.keep(key, write, [b"deco", b"der"])
+    cache.store(key, write, [b"deco", b"der"])
     return given[-1]
 
 
 def test_halves_are_found_again_by_their_key_and_half_of_them_is_nothing(home: Path) -> None:
-    cache = Cache(str(home / "c"))
+    cache = ModelCache(str(home / "c"))
     assert cache.find(KEY) is None
     _keep(cache, KEY)
     encoder = home / "c" / f"{KEY}.encoder.onnx"
@@ -348,13 +348,13 @@ def test_halves_are_found_again_by_their_key_and_half_of_them_is_nothing(home: P
     encoder.unlink()
     assert cache.find(KEY) is None
     _keep(cache, KEY)
-    cache.forget(KEY)
+    cache.remove(KEY)
     assert cache.find(KEY) is None
 
 
 def test_the_oldest_halves_go_past_the_limit_and_no_other_file(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(caches, "LARGEST", 85)
-    cache = Cache(str(home / "c"))
+    monkeypatch.setattr(inference, "MAX_CACHE_BYTES", 85)
+    cache = ModelCache(str(home / "c"))
     others = ["joe.onnx", "notes.new", "x.encoder.onnx", f"{KEY}.txt", "settings"]
     for each in others:
         (home / "c" / each).write_bytes(bytes(200))
@@ -373,7 +373,7 @@ def test_the_oldest_halves_go_past_the_limit_and_no_other_file(home: Path, monke
 
 @pytest.mark.parametrize(("hours", "left"), [(0.9, 1), (1.1, 0)])
 def test_the_unfinished_halves_of_a_writer_go_after_an_hour(home: Path, hours: float, left: int) -> None:
-    cache = Cache(str(home / "c"))
+    cache = ModelCache(str(home / "c"))
     folder = home / "c" / f"{_key('b')}x7f3.new"
     folder.mkdir()
     (folder / "half").write_bytes(bytes(20))
@@ -386,9 +386,9 @@ def test_a_writer_that_fails_keeps_nothing_and_a_cache_that_is_gone_is_done_with
     def fails(_: str | None) -> None:
         raise ValueError("broken")
 
-    cache = Cache(str(home / "c"))
+    cache = ModelCache(str(home / "c"))
     with pytest.raises(ValueError, match="broken"):
-        cache.keep(KEY, fails, [])
+        cache.store(KEY, fails, [])
     assert cache.find(KEY) is None
     assert not [each for each in _kept(home / "c") if each.endswith(".new")]
     os.rename(home / "c", home / "gone")
@@ -400,4 +400,4 @@ def test_a_cache_that_others_may_read_or_write_is_none(home: Path, mode: int) ->
     (home / "c").mkdir()
     (home / "c").chmod(mode)
     with pytest.raises(PermissionError, match="is not this user's alone"):
-        Cache(str(home / "c"))
+        ModelCache(str(home / "c"))

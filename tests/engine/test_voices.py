@@ -15,7 +15,7 @@ import pytest
 from talkcli.engine import protocol
 from talkcli.engine.child.synthesizers import espeak
 from talkcli.engine.protocol import Voice
-from talkcli.engine.voices import find_voice, languages, list_voices, unknown_voice
+from talkcli.engine.voices import find_voice, list_voices, matching_languages, unknown_voice_message
 from tests.engine.spawned import USUAL, Spawned
 from tests.support.reference import Sentence, render
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 SET_ALL = """
 import json, sys
 sys.path[:] = json.loads(sys.argv[1])
-from talkcli.engine.child.synthesizers.espeak import load
-espeak, *_ = load()
+from talkcli.engine.child.synthesizers.espeak import load_library
+espeak, *_ = load_library()
 current = []
 for each in json.load(sys.stdin):
     status = espeak.SetVoiceByName(each.encode())
@@ -217,7 +217,7 @@ def test_a_voice_without_a_language_is_no_languages() -> None:
     ],
 )
 def test_the_languages_that_a_code_or_an_english_name_means(wanted: str, expected: set[str]) -> None:
-    assert languages(wanted, (*listed(), *NEURAL)) == expected
+    assert matching_languages(wanted, (*listed(), *NEURAL)) == expected
 
 
 # -- words about the others
@@ -242,7 +242,7 @@ def test_the_languages_that_a_code_or_an_english_name_means(wanted: str, expecte
     ],
 )
 def test_a_voice_that_is_not_found_says_which_ones_it_could_be(wanted: str, words: str) -> None:
-    assert unknown_voice(wanted, (*listed(), *NEURAL)).startswith(words)
+    assert unknown_voice_message(wanted, (*listed(), *NEURAL)).startswith(words)
 
 
 @pytest.mark.parametrize(
@@ -260,7 +260,7 @@ def test_a_voice_that_is_not_found_says_which_ones_it_could_be(wanted: str, word
     ],
 )
 def test_an_unknown_voice_is_told_what_comes_near(wanted: str, near: str) -> None:
-    told = unknown_voice(wanted, listed())
+    told = unknown_voice_message(wanted, listed())
     assert told.startswith(f'unknown voice "{wanted}": did you mean ')
     assert told.endswith('? "talk voices" lists them')
     assert told.count(" or ") < 3
@@ -270,25 +270,25 @@ def test_an_unknown_voice_is_told_what_comes_near(wanted: str, near: str) -> Non
 def test_a_word_of_any_length_is_answered_shortly() -> None:
     for wanted in ("x" * 60_000, "en-us+" + "y" * 60_000):
         assert find_voice(wanted, listed()) is None
-        assert len(unknown_voice(wanted, listed())) < 200
+        assert len(unknown_voice_message(wanted, listed())) < 200
 
 
 # -- other drivers'
 
 
 def test_of_another_driver_and_another_system_no_neural_voice_is_proposed(monkeypatch: pytest.MonkeyPatch) -> None:
-    told = unknown_voice("piper/en", (*listed(), *NEURAL), "dummy")
+    told = unknown_voice_message("piper/en", (*listed(), *NEURAL), "dummy")
     assert told == '"piper/en" is a neural voice, and the driver "dummy" has none: leave --driver out'
     monkeypatch.setattr(sys, "platform", "darwin")
-    told = unknown_voice("piper/en", (), "nsss")
+    told = unknown_voice_message("piper/en", (), "nsss")
     assert told == '"piper/en" is a neural voice, which only talk on Linux has: choose one that "talk voices" lists'
-    assert "unknown voice" in unknown_voice("anna", (), "nsss")
+    assert "unknown voice" in unknown_voice_message("anna", (), "nsss")
 
 
 def test_the_voices_of_another_driver_may_be_called_after_persons_and_with_a_plus() -> None:
     voices = (Voice("com.apple.Alex", "en_US", "Alex"), Voice("com.apple.Daniel", "en_GB", "Daniel+"))
-    assert "did you mean 'Daniel+'" in unknown_voice("Danel", voices)
-    assert "en_GB" not in unknown_voice("Danel", voices)
+    assert "did you mean 'Daniel+'" in unknown_voice_message("Danel", voices)
+    assert "en_GB" not in unknown_voice_message("Danel", voices)
     assert find_voice("daniel+", voices) == voices[1]
     assert find_voice("alex+f3", voices) is None
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from talkcli.engine.child.synthesizers.phonemes import LONGEST, Piece, pieces
+from talkcli.engine.child.synthesizers.phonemes import MAX_PART_PHONEMES, SpeechPart, split_text
 from tests.support.timing import assert_within, limits
 
 STOPS = {"。": ".", "？": "?", "，": ",", "…": ".", "؟": "?", ";": ";"}
@@ -26,10 +26,10 @@ class Spelt:
         parts = re.findall(r"[^,.!?]*[,.!?]*\s*", text)[:-1]
         return [(each, self._sounds(each)) for each in parts]
 
-    def places(self, clause: str) -> list[tuple[int, int]]:
+    def word_positions(self, clause: str) -> list[tuple[int, int]]:
         return [(each.start(), len(each[0])) for each in re.finditer(r"[^\s,.!?]+", clause)]
 
-    def abbreviates(self, clause: str) -> bool:
+    def ends_with_abbreviation(self, clause: str) -> bool:
         return clause.rstrip().endswith("mr.")
 
     def _sounds(self, clause: str) -> str:
@@ -39,15 +39,15 @@ class Spelt:
 
 
 def _shown(text: str, speller: Spelt | None = None) -> list[str]:
-    return ["".join(each.sounds) for each in pieces(speller or Spelt(), text)]
+    return ["".join(each.phonemes) for each in split_text(speller or Spelt(), text)]
 
 
 def _words(text: str, speller: Spelt | None = None) -> list[tuple[str, str]]:
     """Return each word of the text, and what is spoken from its beginning on."""
     found = []
-    for piece in pieces(speller or Spelt(), text):
+    for piece in split_text(speller or Spelt(), text):
         for at, start, length in piece.words:
-            found.append((text[start : start + length], "".join(piece.sounds[at : at + 3])))
+            found.append((text[start : start + length], "".join(piece.phonemes[at : at + 3])))
     return found
 
 
@@ -66,7 +66,7 @@ def _words(text: str, speller: Spelt | None = None) -> list[tuple[str, str]]:
 )
 def test_a_piece_is_a_sentence_with_its_stops(text: str, said: dict[str, str], shown: list[str]) -> None:
     assert _shown(text, Spelt(said=said)) == shown
-    assert all(each.ends for each in pieces(Spelt(said=said), text))
+    assert all(each.ends_sentence for each in split_text(Spelt(said=said), text))
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,7 @@ def test_a_word_that_is_spelled_begins_once_and_those_behind_it_where_they_are()
     """The library tells the place of a word for each of its letters, and lengths that reach over the next one."""
 
     class Spelling(Spelt):
-        def places(self, clause: str) -> list[tuple[int, int]]:
+        def word_positions(self, clause: str) -> list[tuple[int, int]]:
             assert clause == "go abc bye now"
             return [(0, 7), *[(3, 6)] * 40, (0, 2), (7, 9), (11, 3)]
 
@@ -99,7 +99,7 @@ def test_sounds_of_no_word_are_spoken() -> None:
     """Of some scripts the library names the letters, and tells no place."""
 
     class Placeless(Spelt):
-        def places(self, clause: str) -> list[tuple[int, int]]:
+        def word_positions(self, clause: str) -> list[tuple[int, int]]:
             assert clause == "go on"
             return []
 
@@ -119,27 +119,27 @@ def test_sounds_without_number_are_laid_side_by_side_soon_in_order() -> None:
 
 def test_a_long_sentence_is_parted_at_a_comma_and_without_a_pause() -> None:
     text = ", ".join(["word " * 12] * 6)
-    found = list(pieces(Spelt(), text))
-    assert [each.ends for each in found] == [False, True]
-    assert found[0].sounds[-1] == ","
+    found = list(split_text(Spelt(), text))
+    assert [each.ends_sentence for each in found] == [False, True]
+    assert found[0].phonemes[-1] == ","
 
 
 @given(st.lists(st.sampled_from(["word", "a", "x" * 70, "y" * 600, "in the", "one,", "two.", "?"]), max_size=120))
 @example(["y" * 104, "x" * 70, "x" * 70, "one,"])  # 250 sounds, and then a comma
 def test_no_piece_is_longer_than_its_limit_and_nothing_is_lost(words: list[str]) -> None:
     text = " ".join(words)
-    found = list(pieces(Spelt("in the"), text))
-    assert all(0 < len(each.sounds) <= LONGEST for each in found)
+    found = list(split_text(Spelt("in the"), text))
+    assert all(0 < len(each.phonemes) <= MAX_PART_PHONEMES for each in found)
     spoken = re.sub(r"\W", "", text)
-    assert re.sub(r"\W", "", "".join("".join(each.sounds) for each in found)) == spoken
+    assert re.sub(r"\W", "", "".join("".join(each.phonemes) for each in found)) == spoken
     _assert_in_order(found, text)
 
 
-def _assert_in_order(found: list[Piece], text: str) -> None:
+def _assert_in_order(found: list[SpeechPart], text: str) -> None:
     starts = []
     for piece in found:
         places = [at for at, _, _ in piece.words]
         assert places == sorted(places)
-        assert all(0 <= at < len(piece.sounds) for at in places)
+        assert all(0 <= at < len(piece.phonemes) for at in places)
         starts += [start for _, start, _ in piece.words]
     assert starts == [each.start() for each in re.finditer(r"[^\s,.!?]+", text)]

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from talkcli.engine.child.synthesizers import vits
-from talkcli.engine.child.synthesizers.vits import NotCut, halves
+from talkcli.engine.child.synthesizers.vits import NotSplit, split_model
 from tests.support import tiny_voice
 from tests.support.tiny_voice import field, node, tensor, weight
 
@@ -25,7 +25,7 @@ CONSTANT = field(1, "value") + field(_TENSOR, tensor("t", [1], 1, more=field(14,
 
 def _halves(model: bytes) -> tuple[bytes, bytes]:
     """Return both, the encoder first, whole."""
-    cut = halves(model)
+    cut = split_model(model)
     return b"".join(cut.encoder), b"".join(cut.decoder)
 
 
@@ -92,7 +92,7 @@ def test_a_graph_inside_of_another_keeps_what_it_needs() -> None:
     ],
 )
 def test_what_is_not_to_be_run_is_refused_in_words(model: bytes, why: str) -> None:
-    with pytest.raises(NotCut, match=why.replace("(", r"\(").replace(")", r"\)").replace(".", r"\.")):
+    with pytest.raises(NotSplit, match=why.replace("(", r"\(").replace(")", r"\)").replace(".", r"\.")):
         _halves(model)
 
 
@@ -113,17 +113,17 @@ def test_a_model_of_too_many_parts_is_refused_wherever_they_are(
     monkeypatch: pytest.MonkeyPatch, where: Callable[[bytes], bytes]
 ) -> None:
     """A file of as many bytes as a model may have could hold 100 million: minutes, and 30 GB."""
-    assert vits._MOST_FIELDS == 300_000
-    monkeypatch.setattr(vits, "_MOST_FIELDS", 3_000)
+    assert vits._MAX_FIELDS == 300_000
+    monkeypatch.setattr(vits, "_MAX_FIELDS", 3_000)
     _halves(where(field(3, 1) * 100))
-    with pytest.raises(NotCut, match="it has too many parts"):
+    with pytest.raises(NotSplit, match="it has too many parts"):
         _halves(where(field(3, 1) * 3_000))
 
 
 @given(st.integers(0, len(MODEL) - 1), st.binary(min_size=1, max_size=8))
 def test_whatever_is_wrong_with_a_model_it_is_cut_or_refused(place: int, written: bytes) -> None:
     broken = MODEL[:place] + written + MODEL[place + len(written) :]
-    with contextlib.suppress(NotCut):
+    with contextlib.suppress(NotSplit):
         encoder, decoder = _halves(broken)
         assert encoder
         assert decoder

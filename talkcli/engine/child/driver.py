@@ -173,7 +173,7 @@ class DriverProperties:
             if command.voice_only or not is_neural(command.voice or ""):
                 raise
             fallback_reason = str(error)
-            self._set_language(voices.language_of(command.voice or ""))
+            self._set_language(voices.neural_language(command.voice or ""))
         wanted = fields(command)
         for name, value in self._values.items():
             if wanted[name] != value:
@@ -215,7 +215,7 @@ class DriverProperties:
             found = voices.find_voice(wanted, self._voices)
         if found is None:
             foreign = None if is_own_driver(self._driver) else self._driver
-            raise CannotSpeak(Reason.UNKNOWN_VOICE, voices.unknown_voice(wanted, self._voices, foreign))
+            raise CannotSpeak(Reason.UNKNOWN_VOICE, voices.unknown_voice_message(wanted, self._voices, foreign))
         return found.id
 
     def _set(self, name: str, value: Any, shown: str) -> None:

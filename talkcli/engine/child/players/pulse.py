@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 #: Milliseconds of room at which the server wakes the player.
 REQUEST_MS = 15
 
-#: Seconds for which a stream volume of 0 means nothing: PipeWire creates every stream with it, and sets the real volume a
+#: Seconds for which a stream volume of 0 means nothing: PipeWire creates every stream with it, and sets the real one a
 #: millisecond later.
 VOLUME_SETTLES_S = 0.1
 

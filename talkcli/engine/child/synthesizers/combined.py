@@ -33,7 +33,7 @@ class CombinedSynthesizer:
         self.voice = self._espeak.voice
 
     def voices(self) -> tuple[Voice, ...]:
-        return (*self._espeak.voices(), *models.voices())
+        return (*self._espeak.voices(), *models.installed_voices())
 
     def load(self, voice: str) -> None:
         current: Synthesizer = self._piper() if is_neural(voice) else self._espeak

@@ -1,8 +1,8 @@
-"""Libespeak-ng behind the interface of a synthesizer: loaded, its voices, its words, and the guard before it.
+"""libespeak-ng as a synthesizer, and as the source of phonemes for neural voices.
 
-The library speaks in one call and calls back in the same thread, with some 50 ms of samples each time; an exception
-cannot pass through it, so it is kept until the library has returned. There is one of it in a process. Linux only;
-elsewhere pyttsx3's own drivers find their libraries themselves.
+The library speaks a text in a single call, and calls back in the same thread with about 50 ms of samples at a time. An
+exception can't pass through it, so it is stored until the library has returned. A process has one instance of the
+library. This module is for Linux; pyttsx3's own drivers find their libraries on other systems.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from talkcli.engine.child.synthesizers.base import NotInstalled
 from talkcli.engine.child.words import count_letters
 from talkcli.engine.players import SAMPLE_BYTES, on_path
 from talkcli.engine.protocol import Voice
-from talkcli.engine.voices import VARIANT, UnknownVoice, find_voice
+from talkcli.engine.voices import VARIANT_PREFIX, UnknownVoice, find_voice
 from talkcli.goals.reasons import Reason
 
 TYPE_CHECKING = False
@@ -30,33 +30,34 @@ if TYPE_CHECKING:
 
     from talkcli.engine.child.synthesizers.base import SampleSink, SpeechSettings
 
-_LIBRARY = "libespeak-ng.so.1"
+_LIBESPEAK = "libespeak-ng.so.1"
 
-#: Milliseconds of sound that the library hands over at once. It rounds up to 49 at 22,050 Hz; more would only delay
-#: the first sound.
-_BUFFER_MS = 20
+#: Milliseconds of sound per callback. The library rounds up to 49 ms at 22,050 Hz; more would only delay the first
+#: sound.
+_CALLBACK_MS = 20
 
-#: Without this option the library calls exit() where its data is missing.
+#: Without this option, the library calls exit() if its data is missing.
 _DONT_EXIT = 0x8000
 
-#: English: by its file, which saves the 4 to 40 ms in which the library reads all voices to find it by its language.
-_DEFAULTS = ("gmw/en", "en")
+#: English. The file name saves the 4 to 40 ms in which the library reads all voices to find the language.
+_ENGLISH = ("gmw/en", "en")
 
-#: An event that pyttsx3's binding does not name: the sample rate, before the first samples.
+#: An event that pyttsx3's binding doesn't define: the sample rate, before the first samples.
 _EVENT_SAMPLERATE = 8
 
-#: Words per minute that the library sets itself.
-_USUAL = 175
-#: Samples of a pause behind a clause that are none: behind "Mr." it makes a hundred at most, behind a sentence 6,000.
-_NO_PAUSE = 2000
+#: The library's own default in words per minute.
+_ESPEAK_DEFAULT_WPM = 175
+#: A shorter pause after a clause means an abbreviation: after "Mr." there are up to a hundred samples, and after a
+#: sentence 6,000.
+_PAUSE_SAMPLES = 2000
 
-#: How sounds are to be written: in IPA.
+#: The library's mode for phonemes in IPA.
 _IPA = 2
 
-#: Two of the lists that libespeak-ng gives only when asked by these names, in the place of a language.
+#: Names for two lists of voices, which the library takes in place of a language.
 _VARIANTS, _MBROLA = b"variant", b"mbrola"
-#: Where it looks for the sounds of a voice of MBROLA's, which it can speak only if these and the program are there.
-_MBROLA_PLACES = ("/usr/share/mbrola/{0}", "/usr/share/mbrola/{0}/{0}", "/usr/share/mbrola/voices/{0}")
+#: Where the library looks for the data of MBROLA voices. It can only speak them if the data and the program are there.
+_MBROLA_PATHS = ("/usr/share/mbrola/{0}", "/usr/share/mbrola/{0}/{0}", "/usr/share/mbrola/voices/{0}")
 
 
 class _EspeakEventId(ctypes.Union):
@@ -66,10 +67,10 @@ class _EspeakEventId(ctypes.Union):
 
 
 class _EspeakEvent(ctypes.Structure):
-    """An `espeak_EVENT` of speak_lib.h.
+    """The C structure `espeak_EVENT` of speak_lib.h.
 
-    The structure in pyttsx3's binding has no `id.string`. On a 32-bit system it is therefore 4 bytes too short, and
-    the second of two events cannot be read.
+    The structure in pyttsx3's binding has no `id.string`. On 32-bit systems it is therefore 4 bytes too short, and the
+    second of two events can't be read.
     """
 
     _fields_ = (
@@ -84,23 +85,29 @@ class _EspeakEvent(ctypes.Structure):
     )
 
 
-def _until_terminator(events: Any) -> Iterator[_EspeakEvent]:
-    """Return the events of one callback; an event of type 0 follows the last one."""
-    return itertools.takewhile(lambda each: each.type, iter(ctypes.cast(events, ctypes.POINTER(_EspeakEvent))))
+def _events_of(pointer: Any) -> Iterator[_EspeakEvent]:
+    """Yield the events of a callback; an event of type 0 follows the last one."""
+    return itertools.takewhile(lambda each: each.type, iter(ctypes.cast(pointer, ctypes.POINTER(_EspeakEvent))))
 
 
-def load() -> tuple[Any, str, int]:
-    """Load the system's library where there is one, else the wheel's, and initialise it, once a process.
+def load_library() -> tuple[Any, str, int]:
+    """Load and initialize libespeak-ng: the system's if there is one, or else the one in the package espeakng-loader.
 
-    Return pyttsx3's binding of it, what it is for people, "eSpeak NG 1.51 (system)", and its samples per second until a
-    voice says otherwise. NotInstalled; OSError where it may be loaded later. It must run before anything imports
-    `pyttsx3.drivers._espeak`, which loads the library when it is imported.
+    It must be called once per process, before anything imports `pyttsx3.drivers._espeak`, which loads the library.
+
+    Returns:
+        pyttsx3's binding, the library's name for people ("eSpeak NG 1.51 (system)"), and the samples per second, which
+        a voice may change.
+
+    Raises:
+        NotInstalled: The library or its data is missing.
+        OSError: There is not enough memory or there are not enough descriptors; it may work later.
     """
     origin, data = _preload()
     from pyttsx3.drivers import _espeak
 
-    with _no_sound_server():
-        rate = _espeak.Initialize(_espeak.AUDIO_OUTPUT_SYNCHRONOUS, _BUFFER_MS, data, _DONT_EXIT)
+    with _hidden_sound_server():
+        rate = _espeak.Initialize(_espeak.AUDIO_OUTPUT_SYNCHRONOUS, _CALLBACK_MS, data, _DONT_EXIT)
     if rate <= 0:
         raise NotInstalled("there is no espeak-ng data: sudo apt-get install -y libespeak-ng1 espeak-ng-data")
     version = (_espeak.Info(None) or b"").decode("utf-8", "replace").split(" ")[0]
@@ -108,11 +115,11 @@ def load() -> tuple[Any, str, int]:
 
 
 @contextlib.contextmanager
-def _no_sound_server() -> Iterator[None]:
-    """Let no PulseAudio be found meanwhile.
+def _hidden_sound_server() -> Iterator[None]:
+    """Hide PulseAudio from the library.
 
-    The library connects to one whenever it is initialised, though it is never to play: 7 ms where one answers, and 30 s
-    where one hangs, in which the engine would be given up.
+    It always connects to PulseAudio when it is initialized, although it won't play anything. This takes 7 ms, and 30 s
+    if PulseAudio hangs. By then the server would have given up the engine process.
     """
     before = os.environ.get("PULSE_SERVER")
     os.environ["PULSE_SERVER"] = "unix:/dev/null"
@@ -125,278 +132,284 @@ def _no_sound_server() -> Iterator[None]:
 
 
 def _preload() -> tuple[str, bytes | None]:
-    """Have the library in the process, so that the binding finds it; return its origin and its data's directory."""
+    """Load the library so that the binding finds it; return its origin and the directory of its data."""
     try:
-        ctypes.CDLL(_LIBRARY)
+        ctypes.CDLL(_LIBESPEAK)
         return "system", None
     except OSError as error:
-        if _passes(error):
+        if _is_temporary(error):
             raise
         missing = error
     try:
         import espeakng_loader
 
-        # Global, as the binding asks for the name that the system's library would have, and gets the one that is there.
+        # The binding asks for the system library's name. Loaded globally, this one answers to it.
         ctypes.CDLL(espeakng_loader.get_library_path(), mode=ctypes.RTLD_GLOBAL)
     except (ImportError, OSError) as error:
-        if _passes(error):
+        if _is_temporary(error):
             raise
         raise NotInstalled(f"libespeak-ng is missing ({missing}): {install.espeak_library()}") from error
     return "espeakng-loader", str(espeakng_loader.get_data_path()).encode()
 
 
-def _passes(error: Exception) -> bool:
-    """Tell whether a library that is there could not be loaded for want of memory or descriptors.
-
-    The loader has but words for it, which end in the system's.
-    """
+def _is_temporary(error: Exception) -> bool:
+    """Return whether a library couldn't be loaded for lack of memory or descriptors, by the end of the message."""
     return str(error).endswith(tuple(map(os.strerror, (errno.EMFILE, errno.ENFILE, errno.ENOMEM))))
 
 
 class Espeak:
-    """The library as a synthesizer."""
+    """libespeak-ng as a synthesizer."""
 
     version: str | None
 
     def __init__(self) -> None:
-        """Load the library, as `load`; UnknownVoice if it has no English."""
-        self._espeak, self.version, self._rate = load()
+        """Load the library.
+
+        Raises:
+            NotInstalled, OSError: As in `load_library`.
+            UnknownVoice: The library has no English voice.
+        """
+        self._espeak, self.version, self._rate = load_library()
         espeak = self._espeak
         self._listed: tuple[Voice, ...] = ()
-        #: what its parameters were last set to; they are left alone where they need not be set, so that the first
-        #: sentence of a fresh process is what the library alone would make
-        self._set = {espeak.RATE: _USUAL, espeak.VOLUME: 100, espeak.PITCH: 50}
+        #: the current parameters. They are only set if they change, so that a new process makes the same samples as the
+        #: library on its own.
+        self._parameters = {espeak.RATE: _ESPEAK_DEFAULT_WPM, espeak.VOLUME: 100, espeak.PITCH: 50}
         self._text = ""
-        self._output: SampleSink | None = None
+        self._sink: SampleSink | None = None
         self._raised: BaseException | None = None
-        #: to whom the library was lent last, who may still be at work with it; None where it was taken back
-        self._lent: Spelling | None = None
-        found = (each for each in _DEFAULTS if espeak.SetVoiceByName(each.encode()) == espeak.EE_OK)
+        #: the last borrower of the library, which may still be using it; None once it was taken back
+        self._borrower: EspeakPhonemizer | None = None
+        found = (each for each in _ENGLISH if espeak.SetVoiceByName(each.encode()) == espeak.EE_OK)
         self.voice = next(found, "")
         if not self.voice:
-            raise UnknownVoice(_DEFAULTS[-1])
+            raise UnknownVoice(_ENGLISH[-1])
         espeak.SetSynthCallback(self._on_audio)
 
     def voices(self) -> tuple[Voice, ...]:
-        """Return the library's voices, those of MBROLA's that can be spoken with, and the variants."""
+        """Return the library's voices, the usable MBROLA voices, and the variants."""
         self._take_back()
         espeak = self._espeak
-        return (*_listed(espeak, None), *_mbrola_voices(espeak), *_variants(espeak))
+        return (*_list_voices(espeak, None), *_mbrola_voices(espeak), *_variants(espeak))
 
     def load(self, voice: str) -> None:
-        """Take an id of `voices`, with a variant behind it or without, or what else the library takes for a voice."""
+        """Load a voice by its id with or without a variant, or by another name that the library knows."""
         self._take_back()
-        # Some voices leave their own speed to the next one, up to a third slower, unless the rate is set after it.
-        self._set.clear()
+        # Some voices leave their speed to the next voice, up to a third slower, unless the rate is set again.
+        self._parameters.clear()
         if not voice or self._espeak.SetVoiceByName(voice.encode("utf-8", "replace")) != self._espeak.EE_OK:
-            # A voice that failed half-way (its speech files are missing) is current now, and speaks nothing.
+            # If only a part of a voice is missing, the library has switched to it, and is silent.
             self._espeak.SetVoiceByName(self.voice.encode())
             raise UnknownVoice("part of it is missing")
         self.voice = voice
 
-    def speak(self, text: str, sound: SpeechSettings, output: SampleSink) -> None:
-        """Speak as `Synthesizer` says; with this library the samples differ a little each time."""
+    def speak(self, text: str, settings: SpeechSettings, sink: SampleSink) -> None:
+        """Speak as `Synthesizer` describes; the samples of this library vary slightly from time to time."""
         self._take_back()
-        output.begin(self._rate, self.voice)
+        sink.begin(self._rate, self.voice)
         espeak = self._espeak
-        self._obey(sound)
+        self._set_parameters(settings)
         self._text = guard.guarded(text, self.voice)
-        self._output = output
+        self._sink = sink
         status = espeak.Synth(self._text.encode("utf-8", "replace"), flags=espeak.CHARS_UTF8 | espeak.ENDPAUSE)
-        raised, self._raised, self._output = self._raised, None, None
+        raised, self._raised, self._sink = self._raised, None, None
         if raised is not None:
             raise raised
         if status != espeak.EE_OK:
             raise CannotSpeak(Reason.ENGINE_FAILED, f"espeak_Synth failed with {status}")
 
     def load_language(self, language: str) -> None:
-        """Take a voice of this language, "de-at", or else of its first part, or else English."""
+        """Load a voice of a language such as "de-at", or else of its first part, or else English."""
         self._take_back()
-        self._listed = self._listed or _listed(self._espeak, None)
-        words = (language, language.partition("-")[0], *_DEFAULTS)
-        found = (find_voice(each, self._listed) for each in words)
+        found = (self._find(each) for each in (language, language.partition("-")[0], *_ENGLISH))
         self.load(next((each.id for each in found if each), self.voice))
 
     @contextlib.contextmanager
-    def spelling(self, language: str) -> Iterator[Spelling]:
-        """Lend the library, for what it knows of the sounds of a language, by one of its voices; UnknownVoice.
+    def lend(self, language: str) -> Iterator[EspeakPhonemizer]:
+        """Lend the library as a phonemizer, which another thread may use until the end of the `with` block.
 
-        Until the end of the `with` it speaks nothing else. It may be asked in another thread, in one at a time; what it
-        is asked there at the end, or later, ends with Stopped. The end waits for nothing: what the library does then
-        for that thread ends within milliseconds where it speaks, and in up to 130 where it is asked for sounds, and
-        whatever uses the library next waits for it.
+        The synthesizer must not be used meanwhile. After the block, calls of the phonemizer raise Stopped. The end of
+        the block doesn't wait for a call in progress: it ends within milliseconds, or 130 ms for phonemes, and the next
+        use of the library waits for that.
+
+        Raises:
+            UnknownVoice: The library has no voice of this language.
         """
         self._take_back()
-        self._listed = self._listed or _listed(self._espeak, None)
-        voice = find_voice(language, self._listed)
+        voice = self._find(language)
         if voice is None:
-            raise self._knows_none(language)
-        self._lent = speller = Spelling(self._espeak, voice.id)
+            raise self._no_voice_error(language)
+        self._borrower = phonemizer = EspeakPhonemizer(self._espeak, voice.id)
         try:
             if self._espeak.SetVoiceByName(voice.id.encode()) != self._espeak.EE_OK:
-                raise self._knows_none(language)
-            self._espeak.SetParameter(self._espeak.RATE, _USUAL, 0)
-            yield speller
+                raise self._no_voice_error(language)
+            self._espeak.SetParameter(self._espeak.RATE, _ESPEAK_DEFAULT_WPM, 0)
+            yield phonemizer
         finally:
-            speller.end()
+            phonemizer.end()
 
-    def _knows_none(self, language: str) -> UnknownVoice:
+    def _find(self, word: str) -> Voice | None:
+        self._listed = self._listed or _list_voices(self._espeak, None)
+        return find_voice(word, self._listed)
+
+    def _no_voice_error(self, language: str) -> UnknownVoice:
         return UnknownVoice(f'{self.version} has no voice "{language}", which knows its sounds')
 
     def _take_back(self) -> None:
-        """Have the library as it was before it was lent."""
-        lent, self._lent = self._lent, None
-        if lent is not None:
-            lent.wait()
+        """Restore the library's state from before it was lent."""
+        borrower, self._borrower = self._borrower, None
+        if borrower is not None:
+            borrower.wait()
             self._espeak.SetSynthCallback(self._on_audio)
             self._espeak.SetVoiceByName(self.voice.encode())
-            self._set.clear()
+            self._parameters.clear()
 
-    def _obey(self, sound: SpeechSettings) -> None:
+    def _set_parameters(self, settings: SpeechSettings) -> None:
         espeak = self._espeak
-        wanted = {espeak.RATE: sound.rate, espeak.VOLUME: round(sound.volume * 100), espeak.PITCH: sound.pitch}
+        volume = round(settings.volume * 100)
+        wanted = {espeak.RATE: settings.rate, espeak.VOLUME: volume, espeak.PITCH: settings.pitch}
         for parameter, value in wanted.items():
-            if self._set.get(parameter) != value:
+            if self._parameters.get(parameter) != value:
                 espeak.SetParameter(parameter, value, 0)
-                self._set[parameter] = value
+                self._parameters[parameter] = value
 
     def _on_audio(self, samples: Any, count: int, events: Any) -> int:
-        """Hand on what the library made; 1 ends the synthesis."""
-        if self._output is None or self._raised is not None:
+        """Pass on what the library has made, and return 1 to end the synthesis."""
+        if self._sink is None or self._raised is not None:
             return 1
         try:
-            self._hand_on(self._output, samples, count, events)
+            self._pass_on(self._sink, samples, count, events)
         except BaseException as error:  # noqa: BLE001 - raised again after the library has returned
             self._raised = error
             return 1
         return 0
 
-    def _hand_on(self, output: SampleSink, samples: Any, count: int, events: Any) -> None:
-        for event in _until_terminator(events):
+    def _pass_on(self, sink: SampleSink, samples: Any, count: int, events: Any) -> None:
+        for event in _events_of(events):
             if event.type == _EVENT_SAMPLERATE:
                 if event.id.number != self._rate:
                     self._rate = event.id.number
-                    output.begin(self._rate, self.voice)
+                    sink.begin(self._rate, self.voice)
             elif event.type == self._espeak.EVENT_WORD:
-                word = _place(event, self._text)
-                if word is not None:
-                    output.word(*word, event.sample / self._rate)
+                position = _word_position(event, self._text)
+                if position is not None:
+                    sink.word(*position, event.sample / self._rate)
         if samples and count > 0:
-            output.write(ctypes.string_at(samples, count * SAMPLE_BYTES))
+            sink.write(ctypes.string_at(samples, count * SAMPLE_BYTES))
 
 
-class Spelling:
-    """The library as a `phonemes.Speller`, which makes no sound; the guard is before it here, too."""
+class EspeakPhonemizer:
+    """libespeak-ng as a `phonemes.Phonemizer`: it makes no sound. Texts pass through the guard here too."""
 
     def __init__(self, espeak: Any, voice: str) -> None:
-        """`voice`: the id of the one in force."""
+        """Initialize the phonemizer; `voice` is the id of the library's current voice."""
         import threading
 
         self._espeak = espeak
         self._voice = voice
-        #: held while the library is at work, and whether it is nobody's any more
-        self._at_work = threading.Lock()
-        self._over = False
+        #: held while the library works
+        self._busy = threading.Lock()
+        self._ended = False
         self._text = ""
-        self._places: list[tuple[int, int]] = []
-        self._ends: list[int] = []
+        self._positions: list[tuple[int, int]] = []
+        self._clause_ends: list[int] = []
         self._to_phonemes = espeak.dll.espeak_TextToPhonemes
         self._to_phonemes.restype = ctypes.c_char_p
         espeak.SetSynthCallback(self._on_audio)
 
     def clauses(self, text: str) -> list[tuple[str, str]]:
-        """Return the clauses; all of them, as what it has read ahead is lost when anything else is asked for."""
+        # All clauses are read at once: any other call would make the library forget what it has read ahead.
         raw = ctypes.create_string_buffer(guard.guarded(text, self._voice).encode("utf-8", "replace"))
         base = ctypes.addressof(raw)
         at = ctypes.c_void_p(base)
         found: list[tuple[str, str]] = []
         begin = begin_character = 0
         while at.value:
-            said = self._asked(self._to_phonemes, ctypes.byref(at), self._espeak.CHARS_UTF8, _IPA) or b""
+            ipa = self._call(self._to_phonemes, ctypes.byref(at), self._espeak.CHARS_UTF8, _IPA) or b""
             end = len(raw) - 1 if at.value is None else at.value - base
             clause = raw.raw[begin:end].decode("utf-8", "replace")
-            if at.value and clause and not clause[-1].isspace():  # it has read the first character of the next
+            if at.value and clause and not clause[-1].isspace():  # the first character of the next clause
                 end -= len(clause[-1].encode())
                 clause = clause[:-1]
             end_character = begin_character + len(clause)
-            found.append((text[begin_character:end_character], said.decode("utf-8", "replace")))
+            found.append((text[begin_character:end_character], ipa.decode("utf-8", "replace")))
             begin, begin_character = end, end_character
         return found
 
-    def places(self, clause: str) -> list[tuple[int, int]]:
-        """Return where its words are, by having it spoken to nobody: 1 ms a second of sound."""
+    def word_positions(self, clause: str) -> list[tuple[int, int]]:
+        """Return the positions by speaking the clause without output, which takes 1 ms per second of sound."""
         self._speak(clause)
-        return self._places
+        return self._positions
 
-    def abbreviates(self, clause: str) -> bool:
-        """Tell it by the pause that the library makes behind that word, where another one follows."""
+    def ends_with_abbreviation(self, clause: str) -> bool:
+        """Return whether the library makes no pause after the clause's last word if another word follows."""
         word = clause.rsplit(maxsplit=1)[-1]
         alone = self._speak(word)
-        return self._speak(f"{word} A") - alone < _NO_PAUSE
+        return self._speak(f"{word} A") - alone < _PAUSE_SAMPLES
 
     def end(self) -> None:
-        """Have all that is asked, now or later, end with Stopped; from any thread."""
-        self._over = True
+        """Make the current call and all later ones raise Stopped; any thread may call this."""
+        self._ended = True
 
     def wait(self) -> None:
-        """Wait, once it was ended, until the library does nothing for it any more."""
-        with self._at_work:
+        """Wait until the library has finished its current work; call `end` first."""
+        with self._busy:
             pass
 
-    def _asked(self, function: Any, *arguments: Any, **more: Any) -> Any:
-        with self._at_work:
-            if self._over:
+    def _call(self, function: Any, *arguments: Any, **more: Any) -> Any:
+        with self._busy:
+            if self._ended:
                 raise Stopped
             result = function(*arguments, **more)
-        if self._over:  # and so it may be half of it
+        if self._ended:  # the result may be incomplete
             raise Stopped
         return result
 
     def _speak(self, text: str) -> int:
-        """Have a text spoken to nobody; return where the first clause of it ends, in samples, and keep its words."""
-        self._text, self._places, self._ends = guard.guarded(text, self._voice), [], []
-        self._asked(self._espeak.Synth, self._text.encode("utf-8", "replace"), flags=self._espeak.CHARS_UTF8)
-        return self._ends[0] if self._ends else 0
+        """Speak a text without output, keep its words, and return the end of its first clause in samples."""
+        self._text, self._positions, self._clause_ends = guard.guarded(text, self._voice), [], []
+        self._call(self._espeak.Synth, self._text.encode("utf-8", "replace"), flags=self._espeak.CHARS_UTF8)
+        return self._clause_ends[0] if self._clause_ends else 0
 
     def _on_audio(self, _samples: Any, _count: int, events: Any) -> int:
-        if self._over:
+        if self._ended:
             return 1  # ends the synthesis
-        for event in _until_terminator(events):
-            if event.type == self._espeak.EVENT_WORD and (word := _place(event, self._text)):
-                self._places.append(word)
+        for event in _events_of(events):
+            if event.type == self._espeak.EVENT_WORD and (position := _word_position(event, self._text)):
+                self._positions.append(position)
             elif event.type == self._espeak.EVENT_END:
-                self._ends.append(event.sample)
+                self._clause_ends.append(event.sample)
         return 0
 
 
-def _place(event: _EspeakEvent, text: str) -> tuple[int, int] | None:
-    """Return where in the text the word of an event is, and its length there; None if there is none."""
+def _word_position(event: _EspeakEvent, text: str) -> tuple[int, int] | None:
+    """Return the start and length in the text of an event's word; None if there is no word."""
     start = event.text_position - 1
     length = event.length if event.length > 0 else count_letters(text, start)
     return (start, length) if length else None
 
 
 def _variants(espeak: Any) -> list[Voice]:
-    """Return the variants, whose ids are files: "!v/f3"."""
-    found = [(each.id.rpartition("/")[2], each.name) for each in _listed(espeak, _VARIANTS)]
-    return [Voice(VARIANT + file, None, f"variant {name}") for file, name in found]
+    """Return the variants; the ids in the library's list are files, such as "!v/f3"."""
+    found = [(each.id.rpartition("/")[2], each.name) for each in _list_voices(espeak, _VARIANTS)]
+    return [Voice(VARIANT_PREFIX + file, None, f"variant {name}") for file, name in found]
 
 
 def _mbrola_voices(espeak: Any) -> list[Voice]:
-    """Return those of MBROLA's voices that are installed; libespeak-ng lists all that it knows of."""
+    """Return the MBROLA voices that are installed; the library lists all that it knows."""
     if not on_path("mbrola"):
         return []
-    return [each for each in _listed(espeak, _MBROLA) if _has_sounds(each.id)]
+    return [each for each in _list_voices(espeak, _MBROLA) if _has_mbrola_data(each.id)]
 
 
-def _has_sounds(identifier: str) -> bool:
-    """Tell whether the sounds of "mb/mb-de4-en", which are called "de4", are there."""
-    sounds = identifier.rpartition("/")[2].split("-")[1]
-    return any(os.path.isfile(place.format(sounds)) for place in _MBROLA_PLACES)
+def _has_mbrola_data(identifier: str) -> bool:
+    """Return whether the data of a voice is installed; for "mb/mb-de4-en" it is called "de4"."""
+    name = identifier.rpartition("/")[2].split("-")[1]
+    return any(os.path.isfile(path.format(name)) for path in _MBROLA_PATHS)
 
 
-def _listed(espeak: Any, kind: bytes | None) -> tuple[Voice, ...]:
-    """Return what libespeak-ng lists under a name; its voices under none."""
+def _list_voices(espeak: Any, kind: bytes | None) -> tuple[Voice, ...]:
+    """Return one of the library's lists of voices; None for the normal voices."""
     found = []
     for each in espeak.ListVoices(None if kind is None else espeak.VOICE(languages=kind)):
         # The first byte of the languages is a priority.

@@ -1,13 +1,14 @@
-"""The guard before libespeak-ng: replaces the few characters of a text that are known to kill the library.
+"""Replace the few characters of a text that would crash libespeak-ng.
 
-Pure. One character takes the place of one, so that every offset stays what it was. Ordinary text must come out as it
-went in: a rule looks for a cause, says where its numbers come from, and touches nothing where that cause is not there.
-It makes crashes rare, no more; what is relied upon is that the library runs in a process of its own. And the first
-sound waits for it: a rule that goes through a text character by character, 20 ms for a long one, does so only where a
-quick look has found that it may have to.
+The module is pure. It replaces a character by a single one, so every position in the text stays the same. Ordinary text
+must pass unchanged: a rule looks for a known cause of a crash, states where its numbers come from, and does nothing
+unless that cause is there. The guard only makes crashes rare; what contains them is the engine process.
 
-The numbers are sizes of buffers into which libespeak-ng 1.51 writes without looking (N_WORD_BYTES, N_CLAUSE_WORDS and
-N_TR_SOURCE in its `translate.h`); 1.52 has mended some of them.
+The first sound waits for the guard. A rule that examines every character takes 20 ms for a long text, so it only runs
+after a quick check has found that it may be needed.
+
+The numbers are sizes of buffers that libespeak-ng 1.51 overruns: N_WORD_BYTES, N_CLAUSE_WORDS and N_TR_SOURCE in its
+`translate.h`. Version 1.52 has fixed some of them.
 """
 
 from __future__ import annotations
@@ -16,52 +17,53 @@ import functools
 import re
 import unicodedata
 
-#: Control characters: 0x01 starts a command to the library (another pitch, voice, punctuation), 0x02 behind a "["
-#: phonemes, NUL ends its text. Tab, newline and return are blanks to it already. U+FFFD, for what could not be read, is
-#: as silent to it as a blank, but it would report that as a word, and not the one behind it.
+#: Control characters that become blanks: 0x01 starts a command to the library (a new pitch or voice), 0x02 after a "["
+#: starts phonemes, and NUL ends the text. The library itself treats tabs and line ends as blanks. U+FFFD, which stands
+#: for unreadable bytes, is silent, but the library would report it as a word instead of the next word.
 _BLANKED = {code: " " for code in (*range(0x20), *range(0x7F, 0xA0), 0xFFFD) if chr(code) not in "\t\n\r"}
 
-#: Bytes for letters with dots, "U.S.A.", where they are looked up: each letter and a dot, then the word behind the last
-#: dot whole (N_WORD_BYTES, 160, less its end). 'a.' * 85 and 'a.' + 'b' * 170 are more.
-_LOOKED_UP = 156
-#: Bytes for the same letters where they are spelled: 80. No more than 50 of them are heard anyway.
-_SPELLED = 78
-#: Each of those letters marks up to two words behind it as spoken, in a table of 300 words a clause (N_CLAUSE_WORDS)
-#: without an end that is looked at. So behind this many words there must be none.
-_WORDS = 220
-#: Bytes after which the library ends a clause by itself, behind the next blank (N_TR_SOURCE, 800, less 75).
-_CLAUSE = 725
-#: Bytes of a word where its ending is taken off it: 160 (N_WORD_BYTES), less what is put in its place.
-_LONGEST_WORD = 150
-#: Apostrophes of a word: each "'s" is an ending of its own, whose sounds are collected in 200 bytes; 70 are too many.
-_ENDINGS = 30
+#: The buffer for looking up initials such as "U.S.A.": it holds each letter with its dot, and the whole word after the
+#: last dot (N_WORD_BYTES is 160, including the end). 'a.' * 85 and 'a.' + 'b' * 170 overrun it.
+_LOOKUP_BYTES = 156
+#: The buffer for spelling out initials has 80 bytes. At most 50 letters are heard anyway.
+_SPELLING_BYTES = 78
+#: Each initial marks up to two words after it as spoken, in an unchecked table of 300 words per clause
+#: (N_CLAUSE_WORDS). Therefore no initials may follow this many words.
+_MAX_CLAUSE_WORDS = 220
+#: The library ends a clause after this many bytes, at the next blank (N_TR_SOURCE is 800; 75 are reserved).
+_MAX_CLAUSE_BYTES = 725
+#: The longest word from which the library may remove an ending: N_WORD_BYTES less the replacement.
+_MAX_WORD_BYTES = 150
+#: The most apostrophes in a word. Each "'s" is an ending, whose phonemes share a buffer of 200 bytes; 70 overrun it.
+_MAX_WORD_APOSTROPHES = 30
 
-#: What the library takes for a part of a word: letters, digits, apostrophes, and nearly all that is not ASCII, accents
-#: that stand alone included.
-_WORD = (
+#: The characters that the library treats as parts of a word: letters, digits, apostrophes, and nearly all characters
+#: outside ASCII, including separate accents.
+_WORD_CHARACTER = (
     r"(?:[A-Za-z0-9'’]|(?![\s\u0080-\u00a9\u00ab-\u00b4\u00b6-\u00b9\u00bb-\u00bf\u2000-\u200a\u2010-\u205f\u3000-\u303f"
     r"\uff00-\uff0f])[^\x00-\x7f])"
 )
-_IN_WORD = re.compile(_WORD)
-_PIECE = re.compile(f"({_WORD}+)|((?:(?!{_WORD}).)+)", re.DOTALL)
-#: What may hold a word with more than `_ENDINGS` characters.
-_LONG_RUN = re.compile(rf"\S{{{_ENDINGS + 1},}}")
-#: Signs that the library takes for letters: in circles, Braille.
-_SIGN_LETTERS = frozenset(map(chr, (*range(0x2460, 0x2500), *range(0x2800, 0x2900))))
-#: What ends a clause: the first where a blank, a bracket or nothing follows, the second anywhere.
-_STOP = re.compile(r"[.,;:!?…](?:[\s()\[\]{}<>\"«»“”‘’„]|\Z)|[。、，！？：；︒؟،؛।॥։՝]|\n\s*\n")
-#: The plainest of those ends: where one of these is, a clause ends for certain.
-_PLAIN_STOP = re.compile(r"[,;:!?]\s|\.\s+[A-Z]")
-#: A hyphen behind a sign, before a letter.
+_IN_WORD = re.compile(_WORD_CHARACTER)
+_WORD_OR_GAP = re.compile(f"({_WORD_CHARACTER}+)|((?:(?!{_WORD_CHARACTER}).)+)", re.DOTALL)
+#: A run of characters that may contain a word with too many apostrophes or bytes.
+_LONG_RUN = re.compile(rf"\S{{{_MAX_WORD_APOSTROPHES + 1},}}")
+#: Symbols that the library treats as letters: enclosed characters and Braille.
+_SYMBOL_LETTERS = frozenset(map(chr, (*range(0x2460, 0x2500), *range(0x2800, 0x2900))))
+#: The ends of a clause: Western punctuation if a blank, a bracket or nothing follows, and other punctuation anywhere.
+_CLAUSE_END = re.compile(r"[.,;:!?…](?:[\s()\[\]{}<>\"«»“”‘’„]|\Z)|[。、，！？：；︒؟،؛।॥։՝]|\n\s*\n")
+#: The clearest of those ends; a clause certainly ends here.
+_CERTAIN_CLAUSE_END = re.compile(r"[,;:!?]\s|\.\s+[A-Z]")
+#: A hyphen between a symbol and a letter.
 _HYPHEN = re.compile(r"(?<=[^\w\s]|_)-(?=[^\W\d_])")
-#: Scripts whose characters are words of their own, and the syllables that are taken apart into letters of three bytes.
+#: The first character of the scripts in which each character is a word, and the range of Hangul syllables, which the
+#: library splits into letters of three bytes.
 _IDEOGRAPHS, _HANGUL, _HANGUL_END = "\u2e80", "\uac00", "\ud7a3"
-#: Characters that the language of their script has no word for, by the languages that get along with them all the same.
-#: In any other voice the library loads that language for them, finds nothing, loads English in its place, and goes on
-#: with what it has just freed (`LookupLetter` in its `numbers.c`): what becomes of it depends on who got the memory.
-#: Found in 1.51 by speaking every character in each of the 131 voices with that memory overwritten. None of them is
-#: heard in those voices but the four Greek signs, as names of signs.
-_UNKNOWN_TO_THEIR_SCRIPT = {
+#: Characters that the default language of their script has no name for, by the languages that handle them safely. For
+#: any other voice, the library loads that default language, finds no name, loads English instead, and continues with
+#: memory that it has just freed (`LookupLetter` in its `numbers.c`). They were found in 1.51 by speaking every
+#: character in each of the 131 voices with that memory overwritten. Those voices speak none of them except the four
+#: Greek symbols.
+_UNSAFE_CHARACTERS = {
     ("el", "grc"): "\u0384\u0385\u0387\u03f6",
     ("hy",): "\u055a\u058d-\u058f",
     ("hi", "kok", "mr", "ne", "sd", "ur"): "\u0970",
@@ -75,62 +77,64 @@ _UNKNOWN_TO_THEIR_SCRIPT = {
     ("ka",): "\u10fb",
     ("ko",): "\u1180-\u11a7\u11c3-\u11ff",
 }
-#: Digits of a number, with what separates thousands.
-_NUMBER = re.compile(r"[0-9]+(?:,[0-9]{3})*")
-#: Digits of which the library can't say a number in Cantonese and Shan: its words are more than 200 bytes of sounds
-#: (N_WORD_PHONEMES). Numbers that are longer it says digit by digit. Each of 382 numbers of 6 to 39 digits was spoken
-#: in each of the 131 voices.
-_TOO_LONG_TO_SAY = {"yue": (13, 14), "shn": (13, 14)}
-#: One of these between digits is said by itself in those voices, and so parts a number; two in a row are silent.
-_ALONE = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+#: A number, with or without separators of thousands.
+_DIGITS = re.compile(r"[0-9]+(?:,[0-9]{3})*")
+#: The lengths of numbers, in digits, that crash the Cantonese and Shan voices, because their words have more than 200
+#: bytes of phonemes (N_WORD_PHONEMES). Longer numbers are spoken digit by digit. This was measured by speaking 382
+#: numbers of 6 to 39 digits in each of the 131 voices.
+_UNSAFE_DIGIT_COUNTS = {"yue": (13, 14), "shn": (13, 14)}
+#: Digits that those voices speak separately, so that they split a number. Two of them in a row would be silent.
+_SEPARATE_DIGITS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def guarded(text: str, voice: str = "") -> str:
-    """Return the text with what would kill libespeak-ng replaced; its length is the same.
+    """Return a text of the same length that doesn't crash libespeak-ng.
 
-    The voice is an id as the library has it, "gmw/en-US" or "ko+f3", or empty: of no language.
+    Args:
+        text: The text.
+        voice: The library's id of the voice, such as "gmw/en-US" or "ko+f3"; empty for no language.
     """
     text = text.translate(_BLANKED)
     language = re.split(r"[-+]", voice.rpartition("/")[2], maxsplit=1)[0]
     if not text.isascii():
-        text = _unknown_in(language).sub(" ", text)
-    if language in _TOO_LONG_TO_SAY:
-        text = _NUMBER.sub(lambda found: _parted(found[0], *_TOO_LONG_TO_SAY[language]), text)
+        text = _unsafe_characters(language).sub(" ", text)
+    if language in _UNSAFE_DIGIT_COUNTS:
+        text = _DIGITS.sub(lambda found: _split_number(found[0], *_UNSAFE_DIGIT_COUNTS[language]), text)
     if _may_have_long_initials(text):
         text = _without_long_initials(text)
     if "-" in text:
         text = _without_leading_hyphens(text)
-    return _without_endless_words(text)
+    return _without_long_words(text)
 
 
 @functools.lru_cache(maxsize=8)
-def _unknown_in(language: str) -> re.Pattern[str]:
-    """Return what finds the characters that no voice but those of their script may be given."""
-    found = (signs for languages, signs in _UNKNOWN_TO_THEIR_SCRIPT.items() if language not in languages)
+def _unsafe_characters(language: str) -> re.Pattern[str]:
+    """Return a pattern for the characters that voices of this language must not get."""
+    found = (signs for languages, signs in _UNSAFE_CHARACTERS.items() if language not in languages)
     return re.compile(f"[{''.join(found)}]")
 
 
-def _parted(number: str, least: int, most: int) -> str:
-    """Return a number of so many digits as two, with a digit between them that is said by itself."""
+def _split_number(number: str, least: int, most: int) -> str:
+    """Return a number, split by a digit that is spoken separately if it has `least` to `most` digits."""
     if not least <= sum(map(str.isdigit, number)) <= most:
         return number
     middle = next(place for place in range(len(number) // 2, len(number)) if number[place].isdigit())
-    return number[:middle] + number[middle].translate(_ALONE) + number[middle + 1 :]
+    return number[:middle] + number[middle].translate(_SEPARATE_DIGITS) + number[middle + 1 :]
 
 
 def _may_have_long_initials(text: str) -> bool:
-    """Tell whether there may be more letters with dots in a row, or words before them, than is good. Looks at dots."""
+    """Return whether there may be too many initials in a row, or too many words before them; checks only the dots."""
     dot = text.find(".")
     while dot >= 0 and (behind := _IN_WORD.search(text, dot)):
         start = _initial_before(text, dot)
-        if start is not None and _may_be_long(text, start):
+        if start is not None and _may_be_too_long(text, start):
             return True
         dot = text.find(".", behind.start())
     return False
 
 
 def _initial_before(text: str, dot: int) -> int | None:
-    """Return where the last word before a dot begins if that has no more than one letter."""
+    """Return the start of the last word before a dot if it has at most one letter."""
     end = dot
     while end and not _IN_WORD.match(text[end - 1]):
         end -= 1
@@ -141,18 +145,18 @@ def _initial_before(text: str, dot: int) -> int | None:
     return start if start < end and letters < 2 else None
 
 
-def _may_be_long(text: str, start: int) -> bool:
-    """Tell whether the letters with dots that begin there may be too many, with the word behind them."""
+def _may_be_too_long(text: str, start: int) -> bool:
+    """Return whether the initials that begin at `start` may be too many, together with the word after them."""
     room = 0
-    for piece in _PIECE.finditer(text, start):
+    for piece in _WORD_OR_GAP.finditer(text, start):
         word, between = piece.groups()
         if between is not None:
             if "." not in between:
                 return False
             continue
-        room += (2 * len(word) if word.isascii() else sum(map(_room, word))) + 1
-        before = piece.end() - _WORDS  # there are no more words than characters
-        if room > _SPELLED or (before > 0 and not _PLAIN_STOP.search(text, before, start + 1)):
+        room += (2 * len(word) if word.isascii() else sum(map(_max_bytes, word))) + 1
+        before = piece.end() - _MAX_CLAUSE_WORDS  # there are at least as many characters as words
+        if room > _SPELLING_BYTES or (before > 0 and not _CERTAIN_CLAUSE_END.search(text, before, start + 1)):
             return True
         if sum(map(_is_letter, word)) > 1:
             return False
@@ -160,25 +164,29 @@ def _may_be_long(text: str, start: int) -> bool:
 
 
 def _without_long_initials(text: str) -> str:
-    """Blank the dots between single letters where the library would collect more of them than it has room for."""
+    """Blank the dots after initials that would overrun the library's buffers."""
     result = list(text)
     looked_up = spelled = words = size = 0
     dots: list[int] = []
-    for piece in _PIECE.finditer(text):
+    for piece in _WORD_OR_GAP.finditer(text):
         word, between = piece.groups()
         size += len(piece.group().encode())
         if between is not None:
             words += len("".join(between.split()))
-            if size > _CLAUSE or _ends_clause(text, piece.start(), piece.end()):
+            if size > _MAX_CLAUSE_BYTES or _ends_clause(text, piece.start(), piece.end()):
                 words = size = 0
             dots = [at for at in range(piece.start(), piece.end()) if text[at] == "."]
             if not dots:
                 looked_up = spelled = 0
             continue
-        room = sum(map(_room, word))
+        room = sum(map(_max_bytes, word))
         words += len(word) if word[0] >= _IDEOGRAPHS else 1
         single = sum(map(_is_letter, word)) < 2
-        if looked_up and (looked_up + room > _LOOKED_UP or (single and spelled + room > _SPELLED) or words > _WORDS):
+        if looked_up and (
+            looked_up + room > _LOOKUP_BYTES
+            or (single and spelled + room > _SPELLING_BYTES)
+            or words > _MAX_CLAUSE_WORDS
+        ):
             for at in dots:
                 result[at] = " "
             looked_up = spelled = 0
@@ -187,29 +195,29 @@ def _without_long_initials(text: str) -> str:
 
 
 def _ends_clause(text: str, start: int, end: int) -> bool:
-    """Tell whether a clause ends among these signs; a dot before a small letter is an abbreviation's."""
+    """Return whether a clause ends in a part of a text; a dot before a lower-case letter belongs to an abbreviation."""
     behind = text[end : end + 1]
-    stops = _STOP.finditer(text, start, end + len(behind))
+    stops = _CLAUSE_END.finditer(text, start, end + len(behind))
     return any(text[each.start()] != "." or not behind.islower() for each in stops)
 
 
 def _is_letter(character: str) -> bool:
-    """Tell whether it makes a word longer: not the quotes, joiners and signs around a letter."""
-    return character.isalnum() or character in _SIGN_LETTERS or unicodedata.category(character).startswith("M")
+    """Return whether a character is a letter, not one of the quotes, joiners and symbols around letters."""
+    return character.isalnum() or character in _SYMBOL_LETTERS or unicodedata.category(character).startswith("M")
 
 
-def _room(character: str) -> int:
-    """Return the bytes that a character may need: some voices put other letters in its place."""
+def _max_bytes(character: str) -> int:
+    """Return the bytes that a character may need; some voices replace it by other letters."""
     if _HANGUL <= character <= _HANGUL_END:
         return 9
     return max(2, len(character.encode()), len(character.lower().encode()))
 
 
 def _without_leading_hyphens(text: str) -> str:
-    """Blank a hyphen that joins a word to a sign with which its clause begins, as in "'-o".
+    """Blank a hyphen between a clause's first symbol and a word, as in "'-o".
 
-    The library marks no beginning of that word, and looks for it before the first phoneme of its list: in Vietnamese,
-    Danish, Hindi and others what it finds there kills it. Nor does it report the word.
+    The library doesn't mark the beginning of that word, and searches for the mark before the start of its list of
+    phonemes. This crashes Vietnamese, Danish, Hindi and other voices. The word isn't reported either.
     """
 
     def blanked(found: re.Match[str]) -> str:
@@ -221,17 +229,17 @@ def _without_leading_hyphens(text: str) -> str:
     return _HYPHEN.sub(blanked, text)
 
 
-def _without_endless_words(text: str) -> str:
-    """Have a word that is too much for the library's buffers end earlier: at an apostrophe, or before a capital."""
-    return _LONG_RUN.sub(lambda run: _PIECE.sub(_shortened, run.group()), text)
+def _without_long_words(text: str) -> str:
+    """Split words that would overrun the library's buffers, at an apostrophe or before a capital letter."""
+    return _LONG_RUN.sub(lambda run: _WORD_OR_GAP.sub(_split_word, run.group()), text)
 
 
-def _shortened(piece: re.Match[str]) -> str:
+def _split_word(piece: re.Match[str]) -> str:
     word = piece.group(1)
-    # Where a script has no capitals there is no place but an apostrophe.
+    # Scripts without capital letters can only be split at an apostrophe.
     if word is None or (
-        word.count("'") + word.count("’") <= _ENDINGS
-        and (len(word.encode()) <= _LONGEST_WORD or word.lower() == word.upper())
+        word.count("'") + word.count("’") <= _MAX_WORD_APOSTROPHES
+        and (len(word.encode()) <= _MAX_WORD_BYTES or word.lower() == word.upper())
     ):
         return piece.group()
     result = list(word)
@@ -240,10 +248,10 @@ def _shortened(piece: re.Match[str]) -> str:
         size += len(character.encode())
         endings += character in "'’"
         before, here = result[at - 1].lower(), character.upper()
-        if endings > _ENDINGS:
+        if endings > _MAX_WORD_APOSTROPHES:
             result[at] = " "
             size = endings = 0
-        elif size > _LONGEST_WORD and before.islower() and here.isupper() and len(before) == len(here) == 1:
+        elif size > _MAX_WORD_BYTES and before.islower() and here.isupper() and len(before) == len(here) == 1:
             result[at - 1], result[at] = before, here
             size = len(here.encode())
     return "".join(result)

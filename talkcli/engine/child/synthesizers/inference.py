@@ -1,58 +1,159 @@
-"""A Piper voice's model in onnxruntime, in two halves: from sounds to frames, and from some of these to samples.
+"""Run a Piper voice's model with onnxruntime, in two halves, and cache the halves for the next start.
 
-It runs in whatever thread calls it, and that alone: onnxruntime is told to start none, so that one processor of the
-machine is taken and no other, and none where nobody speaks. Whoever holds the `Run` ends it from another thread within
-milliseconds. onnxruntime and numpy are imported here alone, when a model is loaded. What goes wrong in a model is
-BadFile, with words that name its file.
+The encoder turns phoneme ids into frames, and the decoder turns any part of the frames into samples. A model runs only
+in the thread that calls it: onnxruntime must not start any, so a voice uses one processor, and none while nobody
+speaks. Another thread can end a run within milliseconds. This is the only module that imports onnxruntime. Faults of a
+model are VoiceFileError, with the file's name in the text.
 """
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import hashlib
 import os
+import re
+import shutil
+import stat
+import tempfile
+import time
 
-from talkcli.engine.child.synthesizers.cache import AT_ONCE
-from talkcli.engine.child.synthesizers.vits import NotCut, halves
-from talkcli.engine.models import BEGIN, END, NO_TELEMETRY, PAD, BadFile, open_checked
+from talkcli.engine.child.synthesizers.vits import NotSplit, split_model
+from talkcli.engine.models import BEGIN_SYMBOL, END_SYMBOL, NO_TELEMETRY, PAD_SYMBOL, VoiceFileError, open_checked
 from talkcli.frozen import TYPE_CHECKING, frozen
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from typing import Any
+    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from typing import Any, TypeVar
 
-    from talkcli.engine.child.synthesizers.cache import Cache
     from talkcli.engine.child.synthesizers.vits import Buffer
-    from talkcli.engine.models import Description
+    from talkcli.engine.models import VoiceDescription
+
+    _T = TypeVar("_T")
 
 os.environ.update(NO_TELEMETRY)  # before onnxruntime is imported
 
-#: Frames on either side of some that their samples depend on. Reckoned for the largest of Piper's decoders ("high"),
-#: 13.4; of a "medium" one the samples with 10 are those of the whole to a part in 400,000.
-AROUND = 14
-#: Bytes of a model: Piper's have 15 to 120 million.
-_LARGEST = 1 << 28
-#: Frames that a sound may last on the average, the blanks between them counted as sounds, and the samples of one: of
-#: en_US-joe-medium's they are 4 at most at its own pace, 35 a single one, and each of Piper's has 256 samples. More
-#: would be minutes of one sentence, and gigabytes.
-_MOST_FRAMES, _MOST_SAMPLES = 40, 4096
-#: What onnxruntime says, in the midst of much else, where it got no memory, and what is said of libraries.
-_NO_MEMORY = ("bad_alloc", "bad allocation", "Failed to allocate memory", os.strerror(errno.ENOMEM))
-_NO_MEMORY_FOR_LIBRARIES = "failed to map segment from shared object"
-#: Characters of what onnxruntime says that are handed on.
-_SHOWN = 200
-#: The number of the way in which `vits` cuts: to be raised with it, so that what was kept is made anew.
-_CUT = 1
-#: Names of the model's inputs; the last only where there are several speakers.
-_INPUTS, _SPEAKER = ("input", "input_lengths", "scales"), "sid"
+#: The frames on either side of a part that its samples depend on. The calculation for the largest of Piper's decoders
+#: ("high") gives 13.4. With 10 frames, the samples of a "medium" decoder differ from the whole by 1 in 400,000.
+CONTEXT_FRAMES = 14
+#: The largest model; Piper's have 15 to 120 million bytes.
+_MAX_MODEL_BYTES = 1 << 28
+#: The most frames of a phoneme on average (padding counts as phonemes), and the most samples of a frame. Phonemes of
+#: en_US-joe-medium have 4 frames on average at its own pace and at most 35, and Piper's frames have 256 samples. More
+#: would mean minutes for a sentence, and gigabytes.
+_MAX_MEAN_FRAMES, _MAX_FRAME_SAMPLES = 40, 4096
+#: What onnxruntime and the dynamic linker say among other things if they get no memory.
+_NO_MEMORY = (
+    *("bad_alloc", "bad allocation", "Failed to allocate memory", os.strerror(errno.ENOMEM)),
+    "failed to map segment from shared object",
+)
+#: The longest message of onnxruntime that is passed on.
+_MAX_MESSAGE_CHARS = 200
+#: The version of `vits.split_model` in the keys of the cache. Raise it if that function's result changes.
+_SPLIT_VERSION = 1
+#: The inputs of a model; the second name is there only if it has several speakers.
+_INPUTS, _SPEAKER_INPUT = ("input", "input_lengths", "scales"), "sid"
+
+#: The largest cache, which holds about eight voices; the oldest files are removed.
+MAX_CACHE_BYTES = 500_000_000
+#: Bytes of a half that are written at a time. All other threads wait while they are copied.
+_WRITE_BYTES = 1 << 20
+_ENCODER_SUFFIX, _DECODER_SUFFIX = ".encoder.onnx", ".decoder.onnx"
+#: The suffix of a directory that is being written, which takes seconds, and the age at which its writer is dead.
+_UNFINISHED_SUFFIX, _UNFINISHED_LIMIT_S = ".new", 3600.0
+#: The names of cached files; no other file is ever removed.
+_CACHED_NAME = re.compile(r"[0-9a-f]{64}-.*(\.encoder\.onnx|\.decoder\.onnx|\.new)")
+
+
+class ModelCache:
+    """The halves of models as files, which only this user can read and write.
+
+    The encoder is cached as onnxruntime has optimized it. The cache is never required: if files can't be written or are
+    damaged, the halves are made again. A key starts with 64 hexadecimal digits and a hyphen.
+    """
+
+    def __init__(self, directory: str) -> None:
+        """Open or create the cache; OSError if the directory can't be used."""
+        os.makedirs(os.path.dirname(directory), exist_ok=True)
+        with contextlib.suppress(FileExistsError):
+            os.mkdir(directory, 0o700)
+        status = os.lstat(directory)
+        if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid() or status.st_mode & 0o077:
+            raise PermissionError(f"{directory} is not this user's alone: chmod 0700, or remove it")
+        self._directory = directory
+
+    def find(self, key: str) -> tuple[str, str] | None:
+        """Return the paths of the encoder and the decoder, and mark them as used; None if they aren't cached."""
+        paths = self._path(key, _ENCODER_SUFFIX), self._path(key, _DECODER_SUFFIX)
+        try:
+            for each in paths:
+                os.utime(each)
+        except OSError:
+            return None
+        return paths
+
+    def store(self, key: str, make_encoder: Callable[[str | None], _T], decoder: Iterable[Buffer]) -> _T:
+        """Make the encoder and cache both halves.
+
+        Args:
+            key: The key of the model.
+            make_encoder: Makes the encoder, and writes it to a path. If caching fails, it is called with None instead.
+            decoder: The parts of the decoder's file.
+
+        Returns:
+            The result of `make_encoder`.
+        """
+        try:
+            # Each writer has a directory of its own, because another process may be caching the same model.
+            with tempfile.TemporaryDirectory(_UNFINISHED_SUFFIX, key, self._directory) as folder:
+                unfinished = os.path.join(folder, "half")
+                with open(unfinished, "wb", _WRITE_BYTES) as file:
+                    file.writelines(decoder)
+                os.replace(unfinished, self._path(key, _DECODER_SUFFIX))
+                made = make_encoder(unfinished)
+                os.replace(unfinished, self._path(key, _ENCODER_SUFFIX))
+        except Exception:  # noqa: BLE001 - an error that has nothing to do with writing is raised again below
+            made = make_encoder(None)
+        self._shrink()
+        return made
+
+    def remove(self, key: str) -> None:
+        """Remove both halves of a model."""
+        for each in (_ENCODER_SUFFIX, _DECODER_SUFFIX):
+            with contextlib.suppress(OSError):
+                os.unlink(self._path(key, each))
+
+    def _path(self, key: str, suffix: str) -> str:
+        return os.path.join(self._directory, key + suffix)
+
+    def _shrink(self) -> None:
+        """Remove the oldest files beyond the limit, and what killed writers have left."""
+        size = 0
+        for changed, path in sorted(self._entries(), reverse=True):
+            if path.endswith(_UNFINISHED_SUFFIX):
+                if time.time() - changed > _UNFINISHED_LIMIT_S:
+                    shutil.rmtree(path, ignore_errors=True)
+                continue
+            with contextlib.suppress(OSError):  # another process may have removed it
+                size += os.lstat(path).st_size
+                if size > MAX_CACHE_BYTES:
+                    os.unlink(path)
+
+    def _entries(self) -> Iterator[tuple[float, str]]:
+        """Yield the cached files with the times of their last use."""
+        with contextlib.suppress(OSError), os.scandir(self._directory) as entries:
+            for each in entries:
+                if _CACHED_NAME.fullmatch(each.name):
+                    with contextlib.suppress(OSError):
+                        yield each.stat(follow_symlinks=False).st_mtime, each.path
 
 
 @frozen
 class Frames:
-    """What the encoder makes of some sounds."""
+    """The encoder's output for some phoneme ids."""
 
     values: tuple[Any, ...]
-    #: where among the frames each sound ends
+    #: the frame at which each phoneme ends
     ends: tuple[int, ...]
 
     @property
@@ -61,225 +162,261 @@ class Frames:
 
 
 class Run:
-    """What runs a model for one sentence, until it is ended."""
+    """The model runs of one sentence, which can be ended."""
 
     def __init__(self) -> None:
         import onnxruntime
 
         self.options = onnxruntime.RunOptions()
-        self.options.log_severity_level = 4  # fatal; what else there is to say is raised
+        self.options.log_severity_level = 4  # only fatal errors, because the others are raised as well
 
     def end(self) -> None:
-        """Have what runs now, or later, raise; from any thread."""
+        """Make the current run and all later ones raise an exception; any thread may call this."""
         self.options.terminate = True
 
 
 class Model:
-    """A model that is loaded."""
+    """A loaded model."""
 
-    def __init__(self, path: str, description: Description, cache: Cache | None = None) -> None:
-        """Load it, in 0.3 to 3 s; BadFile. What takes the most of it is kept in the cache."""
+    def __init__(self, path: str, description: VoiceDescription, cache: ModelCache | None = None) -> None:
+        """Load a model, which takes 0.3 to 3 s; most of that is saved if the cache has its halves.
+
+        Raises:
+            VoiceFileError: The model can't be loaded.
+        """
         self.path = path
         self.description = description
         with open_checked(path) as file:
             size = os.fstat(file.fileno()).st_size
-            if size > _LARGEST:
-                raise BadFile(f"{path} is larger than any of Piper's models: get the voice anew")
+            if size > _MAX_MODEL_BYTES:
+                raise VoiceFileError(f"{path} is larger than any of Piper's models: get the voice anew")
             content: bytes = file.read(size)
-        key = f"{hashlib.sha256(content).hexdigest()}-{_CUT}-{_version()}"
-        kept = cache.find(key) if cache is not None else None
-        if cache is not None and kept is not None:
+        key = f"{hashlib.sha256(content).hexdigest()}-{_SPLIT_VERSION}-{_onnxruntime_version()}"
+        cached = cache.find(key) if cache is not None else None
+        if cache is not None and cached is not None:
             try:
-                self._take(*_kept(*kept))
+                self._set_halves(*_load_cached(*cached))
                 return
             except Exception as error:
-                if _lacks_memory(error):
-                    raise _no_memory(path) from error
-                cache.forget(key)  # cut short by a full disk, or whatever: it is made anew, and tells then
-        self._take(*_cut(path, content, cache, key))
+                if _is_out_of_memory(error):
+                    raise _no_memory_error(path) from error
+                cache.remove(key)  # for example truncated by a full disk; a real fault shows below
+        self._set_halves(*_split(path, content, cache, key))
 
-    def _take(self, encoder: Any, decoder: Any) -> None:
-        """Take both halves, if they are what they should be and speak; BadFile."""
-        path, description = self.path, self.description
-        self._encoder, self._decoder = encoder, decoder
-        self._several = _SPEAKER in {each.name for each in self._encoder.get_inputs()}
-        names = {each.name for each in self._encoder.get_inputs()}
-        if names - {_SPEAKER} != {*_INPUTS}:
-            takes = ", ".join(sorted(names))[:_SHOWN]
-            raise BadFile(f"{path} is none of Piper's models (it takes {takes}): get the voice anew")
-        if [each.type for each in decoder.get_outputs()] != ["tensor(float)"]:
-            raise BadFile(f"{path} is none of Piper's models (it makes no samples): get the voice anew")
-        if self._several != (description.speakers > 1):
-            raise self._foreign("one has several speakers, the other has one")
-        self._frames = [each.name for each in self._decoder.get_inputs()]
-        self._hop = self._try_out()
+    def encode(self, ids: Sequence[int], speaker: int, scale: float, run: Run) -> Frames:
+        """Return the frames of some phoneme ids.
 
-    def encode(self, numbers: Sequence[int], speaker: int, pace: float, run: Run) -> Frames:
-        """Return the frames of these sounds, by the model's numbers for them.
+        Args:
+            ids: The model's ids of the phonemes.
+            speaker: The speaker's number, which only matters if there are several.
+            scale: A factor of all durations, on top of the voice's own.
+            run: The run, through which the call can be ended.
 
-        `pace` is what durations are multiplied with, beside the voice's own.
+        Raises:
+            VoiceFileError: The model is faulty, or the run was ended.
         """
         import numpy as np
 
         about = self.description
         feed = {
-            "input": np.array([numbers], np.int64),
-            "input_lengths": np.array([len(numbers)], np.int64),
-            "scales": np.array([about.noise, about.pace * pace, about.noise_of_durations], np.float32),
+            "input": np.array([ids], np.int64),
+            "input_lengths": np.array([len(ids)], np.int64),
+            "scales": np.array([about.noise, about.duration_scale * scale, about.duration_noise], np.float32),
         }
-        if self._several:
-            feed[_SPEAKER] = np.array([speaker], np.int64)
-        *values, durations = self._outputs(self._encoder, feed, run)
+        if self._has_speakers:
+            feed[_SPEAKER_INPUT] = np.array([speaker], np.int64)
+        *values, durations = self._run_half(self._encoder, feed, run)
         durations = durations.reshape(-1)
-        if len(durations) != len(numbers) or not np.isfinite(durations).all() or (durations < 0).any():
-            raise BadFile(f"{self.path} does not tell how long each sound lasts: get the voice anew")
-        most = _MOST_FRAMES * len(numbers) * max(1.0, about.pace * pace)
+        if len(durations) != len(ids) or not np.isfinite(durations).all() or (durations < 0).any():
+            raise VoiceFileError(f"{self.path} does not tell how long each sound lasts: get the voice anew")
+        most = _MAX_MEAN_FRAMES * len(ids) * max(1.0, about.duration_scale * scale)
         if durations.sum() > most:
-            raise BadFile(f"{self.path} makes more than {most:.0f} frames of {len(numbers)} sounds: get the voice anew")
+            raise VoiceFileError(
+                f"{self.path} makes more than {most:.0f} frames of {len(ids)} sounds: get the voice anew"
+            )
         return Frames(tuple(values), tuple(int(each) for each in np.cumsum(durations)))
 
     def decode(self, frames: Frames, begin: int, end: int, run: Run) -> Any:
-        """Return the samples of the frames from `begin` to before `end`, as floats, 1.0 for full scale."""
+        """Return the samples of the frames from `begin` up to `end` as floats, 1.0 for full scale.
+
+        Raises:
+            VoiceFileError: The model is faulty, or the run was ended.
+        """
         import numpy as np
 
-        low, high = max(0, begin - AROUND), min(frames.count, end + AROUND)
-        # What goes for the whole, as who speaks, has no frames.
+        low, high = max(0, begin - CONTEXT_FRAMES), min(frames.count, end + CONTEXT_FRAMES)
+        # Values without a dimension for frames belong to the whole sentence, such as the speaker's.
         parts = {
             name: each[..., low:high] if each.shape[-1:] == (frames.count,) else each
-            for name, each in zip(self._frames, frames.values, strict=True)
+            for name, each in zip(self._frame_inputs, frames.values, strict=True)
         }
-        samples = self._outputs(self._decoder, parts, run)[0].reshape(-1)
+        samples = self._run_half(self._decoder, parts, run)[0].reshape(-1)
         hop, rest = divmod(len(samples), high - low)
-        if rest or not 0 < hop <= _MOST_SAMPLES:
-            made = f"it makes {len(samples)} samples of {high - low} frames"
-            raise BadFile(f"{self.path} is none of Piper's models ({made}): get the voice anew")
+        if rest or not 0 < hop <= _MAX_FRAME_SAMPLES:
+            raise self._not_piper(f"it makes {len(samples)} samples of {high - low} frames")
         part = samples[(begin - low) * hop : (end - low) * hop]
         if not np.isfinite(part).all():
-            raise BadFile(f"{self.path} makes no sound, but what is no number: get the voice anew")
+            raise VoiceFileError(f"{self.path} makes no sound, but what is no number: get the voice anew")
         return part
 
     def seconds(self, frames: int) -> float:
-        """Return how long so many frames are heard."""
-        return frames * self._hop / self.description.rate
+        """Return the duration of a number of frames."""
+        return frames * self._samples_per_frame / self.description.rate
 
-    def _outputs(self, half: Any, feed: dict[str, Any], run: Run) -> list[Any]:
+    def _set_halves(self, encoder: Any, decoder: Any) -> None:
+        """Check both halves, and let them speak a phoneme.
+
+        Raises:
+            VoiceFileError: They are faulty, or don't belong to the description.
+        """
+        self._encoder, self._decoder = encoder, decoder
+        names = {each.name for each in encoder.get_inputs()}
+        self._has_speakers = _SPEAKER_INPUT in names
+        if names - {_SPEAKER_INPUT} != {*_INPUTS}:
+            raise self._not_piper(f"it takes {', '.join(sorted(names))[:_MAX_MESSAGE_CHARS]}")
+        if [each.type for each in decoder.get_outputs()] != ["tensor(float)"]:
+            raise self._not_piper("it makes no samples")
+        if self._has_speakers != (self.description.speakers > 1):
+            raise self._mismatch("one has several speakers, the other has one")
+        self._frame_inputs = [each.name for each in decoder.get_inputs()]
+        self._samples_per_frame = self._try_out()
+
+    def _run_half(self, half: Any, feed: dict[str, Any], run: Run) -> list[Any]:
         try:
             found: list[Any] = half.run(None, feed, run.options)
         except Exception as error:
-            raise _told(self.path, "cannot be run", error) from error
+            raise _load_error(self.path, "cannot be run", error) from error
         return found
 
     def _try_out(self) -> int:
-        """Return the samples of a frame; BadFile if the model doesn't speak, or doesn't know the JSON's sounds."""
-        sounds = self.description.sounds
-        highest = max(each for every in sounds.values() for each in every)
-        numbers = [*sounds[BEGIN], *sounds[PAD], highest, *sounds[PAD], *sounds[END]]
+        """Return the number of samples per frame, after speaking the phoneme with the highest id."""
+        ids = self.description.phoneme_ids
+        highest = max(each for every in ids.values() for each in every)
+        phonemes = [*ids[BEGIN_SYMBOL], *ids[PAD_SYMBOL], highest, *ids[PAD_SYMBOL], *ids[END_SYMBOL]]
         run = Run()
         try:
-            frames = self.encode(numbers, 0, 1.0, run)
-        except BadFile as error:
-            if _lacks_memory(error.__cause__):
+            frames = self.encode(phonemes, 0, 1.0, run)
+        except VoiceFileError as error:
+            if _is_out_of_memory(error.__cause__):
                 raise
-            raise self._foreign(str(error.__cause__ or error)) from error
+            raise self._mismatch(str(error.__cause__ or error)) from error
         if not frames.count:
-            raise BadFile(f"{self.path} speaks nothing: get the voice anew")
+            raise VoiceFileError(f"{self.path} speaks nothing: get the voice anew")
         return len(self.decode(frames, 0, frames.count, run)) // frames.count
 
-    def _foreign(self, why: str) -> BadFile:
-        beside = f"{os.path.basename(self.path)}.json"
-        return BadFile(
-            f"{self.path} and {beside} do not belong together ({why[:_SHOWN]}): get both from the same place"
+    def _not_piper(self, why: str) -> VoiceFileError:
+        return VoiceFileError(f"{self.path} is none of Piper's models ({why}): get the voice anew")
+
+    def _mismatch(self, why: str) -> VoiceFileError:
+        both = f"{self.path} and {os.path.basename(self.path)}.json"
+        return VoiceFileError(
+            f"{both} do not belong together ({why[:_MAX_MESSAGE_CHARS]}): get both from the same place"
         )
 
 
-def _version() -> str:
+def load_libraries(path: str) -> None:
+    """Import numpy and onnxruntime. It takes 0.25 s, and all other threads wait for a tenth of that.
+
+    Args:
+        path: The model that needs them, for the error.
+
+    Raises:
+        VoiceFileError: There is not enough memory.
+        ImportError: They can't be imported.
+    """
+    try:
+        import numpy as np  # noqa: F401 - before onnxruntime, which doesn't say why it fails
+        import onnxruntime  # noqa: F401
+    except Exception as error:
+        if _is_out_of_memory(error):
+            raise _no_memory_error(path) from error
+        raise ImportError(_first_line(error)) from error
+
+
+def _onnxruntime_version() -> str:
     import onnxruntime
 
     return str(onnxruntime.__version__)
 
 
-def _kept(encoder: str, decoder: str) -> tuple[Any, Any]:
-    """Return both halves' sessions from the files of the cache; the first is optimised already."""
+def _load_cached(encoder: str, decoder: str) -> tuple[Any, Any]:
+    """Return the sessions of two cached files; the encoder is already optimized."""
     import onnxruntime
 
     return _session(encoder, onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL), _session(decoder)
 
 
-def _cut(path: str, content: bytes, cache: Cache | None, key: str) -> tuple[Any, Any]:
-    """Return both halves' sessions by cutting the model, and keep the halves in the cache; BadFile."""
-    try:
-        cut = halves(content)
-    except NotCut as error:
-        raise BadFile(f"{path} {error}: get the voice anew, from a source that you trust") from error
-    try:
-        decoder = _session_of(cut.decoder)
-        if cache is None:
-            return _session_of(cut.encoder), decoder
-        return cache.keep(key, lambda place: _session_of(cut.encoder, place), cut.decoder), decoder
-    except Exception as error:
-        raise _told(path, "cannot be loaded", error) from error
+def _split(path: str, content: bytes, cache: ModelCache | None, key: str) -> tuple[Any, Any]:
+    """Split a model, cache the halves, and return their sessions.
 
-
-def _session_of(half: Sequence[Buffer], kept: str | None = None) -> Any:
-    """Return what runs a half.
-
-    It is read from a file in memory, which is gone then: bytes would first be joined, and kept and copied by
-    onnxruntime, 30 to 110 ms each for joe's, in which no other thread of the process runs.
+    Raises:
+        VoiceFileError: The model can't be split or loaded.
     """
     try:
-        with open(os.memfd_create("half"), "wb", AT_ONCE) as file:
+        halves = split_model(content)
+    except NotSplit as error:
+        raise VoiceFileError(f"{path} {error}: get the voice anew, from a source that you trust") from error
+    try:
+        decoder = _session_of(halves.decoder)
+        if cache is None:
+            return _session_of(halves.encoder), decoder
+        return cache.store(key, lambda place: _session_of(halves.encoder, place), halves.decoder), decoder
+    except Exception as error:
+        raise _load_error(path, "cannot be loaded", error) from error
+
+
+def _session_of(half: Sequence[Buffer], optimized_path: str | None = None) -> Any:
+    """Return the session of a half that is in memory.
+
+    onnxruntime reads it from a temporary file in memory. If it got bytes, they would have to be joined first, and
+    onnxruntime would copy and keep them. For joe this takes 30 to 110 ms each, while all other threads wait.
+    """
+    try:
+        with open(os.memfd_create("half"), "wb", _WRITE_BYTES) as file:
             file.writelines(half)
             file.flush()
-            return _session(f"/proc/self/fd/{file.fileno()}", kept=kept)
-    except (OSError, AttributeError):  # a file may not be as long, or this Python knows of none in memory
-        return _session(b"".join(half), kept=kept)
+            return _session(f"/proc/self/fd/{file.fileno()}", optimized_path=optimized_path)
+    except (OSError, AttributeError):  # files are limited in size, or the system has none in memory
+        return _session(b"".join(half), optimized_path=optimized_path)
 
 
-def _session(model: str | bytes, level: Any = None, kept: str | None = None) -> Any:
-    """Return what runs a model, a file's or this; `kept`: the file into which it is written as it was optimised."""
+def _session(model: str | bytes, level: Any = None, optimized_path: str | None = None) -> Any:
+    """Return an onnxruntime session.
+
+    Args:
+        model: The path or the content of a model.
+        level: The level of optimization, or None for the basic one.
+        optimized_path: Where to write the optimized model, or None.
+    """
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 4
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    # It would keep the most that it ever needed, and is no faster with it.
+    # The arena keeps as much memory as was ever needed, and makes nothing faster.
     options.enable_cpu_mem_arena = options.enable_mem_pattern = False
-    # No more than this: the levels above take 0.15 s longer, make nothing faster, and fit one kind of processor only.
+    # Higher levels take 0.15 s longer, make nothing faster, and their result only fits one type of processor.
     options.graph_optimization_level = level or onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
-    if kept is not None:
-        options.optimized_model_filepath = kept
+    if optimized_path is not None:
+        options.optimized_model_filepath = optimized_path
     return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
 
 
-def load_libraries(path: str) -> None:
-    """Import what runs a model, the one at `path`; BadFile where there is no memory, ImportError.
-
-    It takes a quarter of a second, for a tenth of which no other thread of the process runs.
-    """
-    try:
-        import numpy as np  # noqa: F401 - before onnxruntime, which doesn't say why it fails
-        import onnxruntime  # noqa: F401
-    except Exception as error:
-        if _lacks_memory(error):
-            raise _no_memory(path) from error
-        raise ImportError(_first_line(error)) from error
+def _load_error(path: str, what: str, error: Exception) -> VoiceFileError:
+    """Return the error for a model that onnxruntime rejects."""
+    if _is_out_of_memory(error):
+        return _no_memory_error(path)
+    return VoiceFileError(f"{path} {what} ({_first_line(error)}): get the voice anew")
 
 
-def _told(path: str, what: str, error: Exception) -> BadFile:
-    """Return what is said of a model that onnxruntime does not take."""
-    if _lacks_memory(error):
-        return _no_memory(path)
-    return BadFile(f"{path} {what} ({_first_line(error)}): get the voice anew")
+def _no_memory_error(path: str) -> VoiceFileError:
+    return VoiceFileError(f"{path} cannot be spoken with: there is no memory for it; end another program")
 
 
-def _no_memory(path: str) -> BadFile:
-    return BadFile(f"{path} cannot be spoken with: there is no memory for it; end another program")
-
-
-def _lacks_memory(error: BaseException | None) -> bool:
-    return isinstance(error, MemoryError) or any(each in str(error) for each in (*_NO_MEMORY, _NO_MEMORY_FOR_LIBRARIES))
+def _is_out_of_memory(error: BaseException | None) -> bool:
+    return isinstance(error, MemoryError) or any(each in str(error) for each in _NO_MEMORY)
 
 
 def _first_line(error: Exception) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0][:_SHOWN]
+    return (str(error).strip() or type(error).__name__).splitlines()[0][:_MAX_MESSAGE_CHARS]

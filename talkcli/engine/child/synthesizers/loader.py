@@ -1,221 +1,323 @@
-"""Neural voices' models: loaded one at a time beside the speech, and kept in memory until they are to be dropped.
+"""The models of neural voices: loaded one at a time in the background, and kept until they are dropped.
 
-A load is a thread's, as it takes seconds; all else is done by the one thread that calls. What becomes of a load is
-told once, as an event for the server, which decides what is loaded and what is dropped for it. A voice is named here
-by its id without a speaker.
+The server decides which voices are loaded and dropped. A load takes seconds and runs in a thread; a single other thread
+calls everything else. The result of each load is reported once, as an event for the server. Voices are named by their
+ids without a speaker.
 """
 
 from __future__ import annotations
 
 import os
+import threading
 import time
 import traceback
 from collections import deque
+from typing import Generic, TypeVar
 
 from talkcli import install
 from talkcli.engine import models
-from talkcli.engine.child.synthesizers import memory
-from talkcli.engine.child.synthesizers.cache import Cache
-from talkcli.engine.child.synthesizers.inference import Model, load_libraries
-from talkcli.engine.child.synthesizers.work import Work
-from talkcli.engine.models import BadFile
+from talkcli.engine.child.synthesizers.inference import Model, ModelCache, load_libraries
+from talkcli.engine.models import VoiceFileError
 from talkcli.engine.protocol import LOAD_LIMIT_S, VoiceLoaded, VoiceMemory, VoiceUnloaded
-from talkcli.engine.voices import NEURAL
+from talkcli.engine.voices import NEURAL_PREFIX
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.paths import cache_directory
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
-#: Bytes of growth after which freed memory is given back, and the process is measured. Less is left alone, because the
-#: next sentence needs it again.
+#: Bytes of growth after which freed memory is returned to the system and the process is measured. Less is left alone,
+#: because the next sentence needs it again.
 GROWTH_BYTES = 16_000_000
+
+_T = TypeVar("_T")
+
+
+class BackgroundIterator(threading.Thread, Generic[_T]):
+    """Runs an iterator in a thread, some items ahead of the thread that takes them."""
+
+    def __init__(self, items: Iterator[_T], max_ahead: int) -> None:
+        """Start the thread; it pauses while `max_ahead` items wait to be taken."""
+        # A daemon thread would be left inside a C library when the process ends, which aborts then.
+        super().__init__(daemon=False)
+        self._items = items
+        self._room = threading.Semaphore(max_ahead)
+        self._made: deque[_T] = deque()
+        self._error: BaseException | None = None
+        self._finished = False
+        #: held while the thread writes to its descriptor, so that `close` doesn't free the number meanwhile
+        self._lock = threading.Lock()
+        self._closed = False
+        #: readable if an item can be taken, and at the end
+        self.descriptor, self._write_end = os.pipe()
+        self.start()
+
+    def run(self) -> None:
+        """Run the iterator to its end or an error."""
+        try:
+            for item in self._items:
+                self._room.acquire()
+                if self._closed:
+                    return
+                self._made.append(item)
+                self._notify()
+        except BaseException as error:  # noqa: BLE001 - raised again by `take`
+            self._error = error
+        self._finished = True
+        self._notify()
+
+    @property
+    def ready(self) -> bool:
+        """Whether `take` returns at once."""
+        return bool(self._made) or self._finished
+
+    def take(self, wait: Callable[[int], None] | None = None) -> _T | None:
+        """Return the next item, or None at the end.
+
+        Args:
+            wait: Called to wait for the descriptor. It may return early. Whatever it raises passes through, and no
+                item is lost. It may be omitted if `ready` is True.
+
+        Raises:
+            BaseException: The error of the iterator.
+        """
+        while not self._made:
+            if self._finished:
+                if self._made:  # the last item may have come between the two checks
+                    break
+                if self._error is not None:
+                    raise self._error
+                return None
+            assert wait is not None
+            wait(self.descriptor)
+        os.read(self.descriptor, 1)
+        self._room.release()
+        return self._made.popleft()
+
+    def close(self) -> None:
+        """Tell the thread to end after its current item, which is discarded; return at once."""
+        with self._lock:
+            if not self._closed:
+                self._closed = True
+                os.close(self.descriptor)
+                os.close(self._write_end)
+        self._room.release()
+
+    def _notify(self) -> None:
+        with self._lock:
+            if not self._closed:
+                os.write(self._write_end, b"\0")
 
 
 @frozen
-class Kept:
-    """A model that is loaded."""
+class LoadedModel:
+    """A model in memory, with the stamps of its files at the time of loading."""
 
     model: Model
-    stamps: tuple[tuple[int, int, int], ...]  # of its files when it was loaded
+    stamps: tuple[tuple[int, int, int], ...]
 
 
-class Loader:
-    """The models that are in memory, and those that are to come."""
+class ModelLoader:
+    """The models in memory, and the queue of voices to load."""
 
     def __init__(self) -> None:
-        #: by voice
-        self._models: dict[str, Kept] = {}
-        #: to be loaded after the one that is being loaded
+        self._models: dict[str, LoadedModel] = {}
         self._waiting: deque[str] = deque()
-        self._work: Work[Kept] | None = None
+        self._load: BackgroundIterator[LoadedModel] | None = None
+        #: the voice that is being loaded, and when its load started
         self._voice = ""
-        self._began = 0.0
-        #: those of them that could not be spoken with
+        self._started_at = 0.0
+        #: loaded voices that failed to speak
         self._suspect: set[str] = set()
-        #: why the last attempt to load a voice failed
+        #: the error of each voice's last load
         self._errors: dict[str, str] = {}
-        self._news: list[VoiceLoaded | VoiceUnloaded | VoiceMemory] = []
-        #: the process's own bytes before the first load, and by how many it had grown when that was told last
-        self._at_first: int | None = None
-        self._grown = 0
-        #: the voice that has spoken since the process was measured, "" for one that was dropped; None for none
+        self._events: list[VoiceLoaded | VoiceUnloaded | VoiceMemory] = []
+        #: the process's own memory before the first load, and the growth that was reported last
+        self._initial_bytes: int | None = None
+        self._reported_growth = 0
+        #: the voice that spoke since the last measurement, "" if one was dropped, None for neither
         self._unmeasured: str | None = None
 
     @property
     def descriptor(self) -> int | None:
-        """What is readable when something has been loaded; None where nothing is being loaded."""
-        return self._work.descriptor if self._work else None
+        """A descriptor that is readable once the load has finished; None if nothing is being loaded."""
+        return self._load.descriptor if self._load else None
 
     @property
     def deadline(self) -> float:
-        """The monotonic time at which what is being loaded is given up."""
-        return self._began + LOAD_LIMIT_S
+        """The monotonic time at which the load in progress is given up."""
+        return self._started_at + LOAD_LIMIT_S
 
     def drop(self, voice: str) -> None:
-        """Keep a voice no longer; one that speaks is there until it has spoken."""
+        """Release the model of a voice; a sentence that is being spoken keeps it to its end."""
         if self._models.pop(voice, None):
             self._unmeasured = ""
         self._suspect.discard(voice)
 
     def start(self, voice: str) -> None:
-        """Have a voice loaded, unless it is, or is about to be; what was wrong with it is forgotten."""
+        """Load a voice in the background, unless it is loaded or queued; an earlier error is forgotten."""
         if voice in self._models:
-            self._news.append(VoiceLoaded(voice, 0.0))
-        elif voice not in self._waiting and not (self._work and voice == self._voice):
+            self._events.append(VoiceLoaded(voice, 0.0))
+        elif voice not in self._waiting and not (self._load and voice == self._voice):
             self._errors.pop(voice, None)
             self._waiting.append(voice)
-            self._go_on()
+            self._start_next()
 
     def model(self, voice: str) -> Model | None:
-        """Return the model of a voice, if it is there."""
-        self._look()
+        """Return the model of a voice; None if it isn't loaded."""
+        self._check_load()
         found = self._models.get(voice)
         if found and voice in self._suspect and found.stamps != _stamps(found.model.path):
             self.drop(voice)
-            self._news.append(VoiceUnloaded(voice))
+            self._events.append(VoiceUnloaded(voice))
             return None
         return found.model if found else None
 
     def error(self, voice: str) -> str | None:
-        """Return why a voice can't be had, by the last attempt to load it."""
+        """Return the error of a voice's last load, for people."""
         return self._errors.get(voice)
 
     def suspect(self, voice: str) -> None:
-        """Take note that a voice that is loaded could not be spoken with: it is dropped once its files are others."""
+        """Record that a loaded voice failed to speak, so that it is dropped once its files change."""
         self._suspect.add(voice)
 
     def spoken(self, voice: str) -> None:
-        """Take note that a voice has spoken: the first sentences need memory that is kept."""
+        """Record that a voice has spoken: the first sentences need memory that stays allocated."""
         if voice not in self._models:
-            self._unmeasured = ""  # it was dropped meanwhile, and is freed only now
+            self._unmeasured = ""  # it was dropped meanwhile, and is released only now
         elif self._unmeasured is None:
             self._unmeasured = voice
 
     def events(self) -> list[VoiceLoaded | VoiceUnloaded | VoiceMemory]:
-        """Return what became of voices since this was asked last."""
-        self._look()
+        """Return the events since the last call."""
+        self._check_load()
         if self._unmeasured is not None:
-            self._measure(self._unmeasured, least=GROWTH_BYTES)
-        news, self._news = self._news, []
-        return news
+            self._measure(self._unmeasured, min_growth=GROWTH_BYTES)
+        events, self._events = self._events, []
+        return events
 
-    def _look(self) -> None:
-        """Take what has been loaded, or has failed to be; never waits."""
-        work, voice = self._work, self._voice
-        if work is None:
+    def _check_load(self) -> None:
+        """Take the model if the load has finished, or give up a load that takes too long."""
+        load, voice = self._load, self._voice
+        if load is None:
             return
         try:
-            if not work.ready:
+            if not load.ready:
                 if time.monotonic() < self.deadline:
                     return
-                # Whatever its thread hangs in, a file of a server that is gone, may hang for ever.
-                raise BadFile(f"{voice} was not loaded within {LOAD_LIMIT_S:g} s: are its files on a slow disk?")
-            made = work.take()
-            assert made is not None
-        except BadFile as error:
-            self._end(voice, self._took(), str(error))
-        except Exception as error:  # noqa: BLE001 - of whatever kind: a voice costs no engine
+                # The thread may hang for ever, for example in a file on a server that is gone.
+                raise VoiceFileError(f"{voice} was not loaded within {LOAD_LIMIT_S:g} s: are its files on a slow disk?")
+            loaded = load.take()
+            assert loaded is not None
+        except VoiceFileError as error:
+            self._record_failure(str(error), self._elapsed())
+        except Exception as error:  # noqa: BLE001 - a faulty voice must not cost the engine process
             traceback.print_exception(error)
-            self._end(voice, self._took(), f"{voice} cannot be loaded: {type(error).__name__}: {error}")
+            self._record_failure(f"{voice} cannot be loaded: {type(error).__name__}: {error}", self._elapsed())
         else:
-            self._models[voice] = made
+            self._models[voice] = loaded
             self._measure(voice)
-            self._news.append(VoiceLoaded(voice, self._took()))
-        work.close()
-        self._work = None
-        self._go_on()
+            self._events.append(VoiceLoaded(voice, self._elapsed()))
+        load.close()
+        self._load = None
+        self._start_next()
 
-    def _measure(self, voice: str, least: int = 0) -> None:
-        """Tell by how much the process has grown; for a voice that has spoken only from so many bytes more on."""
+    def _measure(self, voice: str, min_growth: int = 0) -> None:
+        """Report by how much the process has grown, unless a voice that spoke grew it by less than `min_growth`."""
         self._unmeasured = None
-        before, now = self._at_first, memory.own_bytes()
-        if before is None or now is None or (voice and least and now - before - self._grown < least):
+        before, now = self._initial_bytes, _own_bytes()
+        if (
+            before is None
+            or now is None
+            or (voice and min_growth and now - before - self._reported_growth < min_growth)
+        ):
             return
-        memory.give_back()
-        self._grown = max(0, (memory.own_bytes() or now) - before)
-        self._news.append(VoiceMemory(voice, self._grown))
+        _trim_heap()
+        self._reported_growth = max(0, (_own_bytes() or now) - before)
+        self._events.append(VoiceMemory(voice, self._reported_growth))
 
-    def _took(self) -> float:
-        return round(time.monotonic() - self._began, 3)
+    def _elapsed(self) -> float:
+        return round(time.monotonic() - self._started_at, 3)
 
-    def _end(self, voice: str, seconds: float, why: str) -> None:
-        self._errors[voice] = why
-        self._news.append(VoiceLoaded(voice, seconds, why))
+    def _record_failure(self, why: str, seconds: float) -> None:
+        self._errors[self._voice] = why
+        self._events.append(VoiceLoaded(self._voice, seconds, why))
 
-    def _go_on(self) -> None:
-        """Load the next, one at a time: each takes twice its memory, and a processor, meanwhile."""
-        if self._work or not self._waiting:
-            return
-        self._voice, self._began = self._waiting.popleft(), time.monotonic()
-        try:
-            path = _path(self._voice)
-        except BadFile as error:
-            self._end(self._voice, 0.0, str(error))
-            self._go_on()
-            return
-        if self._at_first is None:
-            self._at_first = memory.own_bytes()
-        self._work = Work(_load(path), room=1)
+    def _start_next(self) -> None:
+        """Start the next load. Only one runs at a time, because it needs a processor and twice the model's memory."""
+        while self._load is None and self._waiting:
+            self._voice, self._started_at = self._waiting.popleft(), time.monotonic()
+            try:
+                path = _model_path(self._voice)
+            except VoiceFileError as error:
+                self._record_failure(str(error), 0.0)
+                continue
+            if self._initial_bytes is None:
+                self._initial_bytes = _own_bytes()
+            self._load = BackgroundIterator(_load(path), max_ahead=1)
 
 
-def _path(voice: str) -> str:
-    """Return the path of a voice's model; BadFile."""
-    lacking = models.missing()
-    if lacking is not None:
-        raise BadFile(lacking)
-    path = models.found().get(voice.removeprefix(NEURAL))
+def _model_path(voice: str) -> str:
+    """Return the path of a voice's model.
+
+    Raises:
+        VoiceFileError: A package is missing, or the file is.
+    """
+    missing = models.missing_package()
+    if missing is not None:
+        raise VoiceFileError(missing)
+    path = models.find_models().get(voice.removeprefix(NEURAL_PREFIX))
     if path is None:
-        raise BadFile(f"{voice}: its file is not there any more")
+        raise VoiceFileError(f"{voice}: its file is not there any more")
     return path
 
 
 def _stamps(path: str) -> tuple[tuple[int, int, int], ...]:
-    """Return what tells that the files of a voice are others: none where they can't be looked at."""
+    """Return values that differ once a voice's files have changed; empty if the files can't be examined."""
     try:
-        found = [os.stat(each) for each in (path, path + models.JSON)]
+        found = [os.stat(each) for each in (path, path + models.JSON_SUFFIX)]
     except OSError:
         return ()
     return tuple((each.st_ino, each.st_size, each.st_mtime_ns) for each in found)
 
 
-def _load(path: str) -> Iterator[Kept]:
+def _load(path: str) -> Iterator[LoadedModel]:
+    """Yield the model at a path; VoiceFileError if it can't be loaded."""
     try:
-        load_libraries(path)  # first, so that it is known of any load that took time
+        load_libraries(path)  # first, so that a load that has taken time has certainly imported them
         stamps = _stamps(path)
-        yield Kept(Model(path, models.describe(path), _cache()), stamps)
+        yield LoadedModel(Model(path, models.read_description(path), _open_cache()), stamps)
     except OSError as error:
-        raise BadFile(f"{path} cannot be read: {error.strerror}") from error
+        raise VoiceFileError(f"{path} cannot be read: {error.strerror}") from error
     except ImportError as error:
-        raise BadFile(f"{path} cannot be loaded ({error}): {install.neural()}") from error
+        raise VoiceFileError(f"{path} cannot be loaded ({error}): {install.neural()}") from error
     except MemoryError as error:
-        raise BadFile(f"{path} cannot be loaded: there is no memory for it; end another program") from error
+        raise VoiceFileError(f"{path} cannot be loaded: there is no memory for it; end another program") from error
 
 
-def _cache() -> Cache | None:
-    """Return where halves are kept; None where that can't be had, which the log tells."""
+def _open_cache() -> ModelCache | None:
+    """Return the cache; None if it can't be used, which is logged."""
     try:
-        return Cache(cache_directory())
+        return ModelCache(cache_directory())
     except OSError:
         traceback.print_exc()
         return None
+
+
+def _own_bytes() -> int | None:
+    """Return this process's private memory, swapped pages included; None in sandboxes without /proc/self/status."""
+    try:
+        with open("/proc/self/status", "rb") as file:
+            fields = dict(line.split(b":", 1) for line in file)
+        return sum(int(fields[each].split()[0]) for each in (b"RssAnon", b"VmSwap")) * 1024
+    except (OSError, KeyError, ValueError):
+        return None
+
+
+def _trim_heap() -> None:
+    """Return freed memory to the system; glibc would keep most of a dropped model. It takes 1 to 13 ms."""
+    import ctypes
+
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)

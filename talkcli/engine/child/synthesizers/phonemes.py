@@ -1,8 +1,8 @@
-"""A text as a neural voice takes it: sentence by sentence, as the sounds that libespeak-ng has for it, with its words.
+"""Split a text into parts for a neural voice: phonemes from libespeak-ng, with the positions of the words.
 
-The library says the sounds of each clause, with blanks between words, and of its own voice where in the text each word
-is. It speaks several words as one ("in the") and one as several ("1,000"), so the two are laid side by side. Who has
-the library is handed in, so that the rest is what it is without one.
+libespeak-ng returns the phonemes of each clause with blanks between words, and separately, for its own speech, the
+positions of the words in the text. It joins some words ("in the") and splits others ("1,000"), so the two lists have to
+be aligned. This module doesn't use the library itself: it gets a `Phonemizer`.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ if TYPE_CHECKING:
 else:
     Protocol = object
 
-#: The most sounds of a piece. What a model needs for them grows with their square: on a PC 250 take 0.25 s and 60 MB
-#: beside the model, 800 take 2 s and 450 MB.
-LONGEST = 250
-#: The most pairs of sounds that are compared to lay two strings side by side, which takes up to 50 ms: those of a
-#: clause of 1,000 sounds, as the library never makes a clause of more than 800 bytes. In a number of 800 digits, which
-#: has ten times as many, nobody can tell where a word begins.
-_COMPARED = 1 << 20
-#: Sounds after which a piece may end at a comma, too.
-_LONG = 150
-#: What ends a clause in Piper's voices; behind the last three ends a sentence.
-STOPS = ",;:.!?"
-#: What ends one in a text, by what of these it is.
-_STOPS = {
-    **{each: each for each in STOPS},
+#: The most phonemes of a part. The time and memory of a model grow with their square: on a PC, 250 phonemes take 0.25 s
+#: and 60 MB, and 800 take 2 s and 450 MB.
+MAX_PART_PHONEMES = 250
+#: The number of phonemes from which a part may also end at a comma.
+_LONG_PART_PHONEMES = 150
+#: The most comparisons for aligning two strings, which take up to 50 ms. It allows a clause of 1,000 phonemes;
+#: libespeak-ng ends every clause after 800 bytes. Only a number of 800 digits has ten times as many phonemes, and
+#: nobody can tell where a word begins in it.
+_MAX_COMPARISONS = 1 << 20
+#: The marks between clauses that Piper's voices know; the last three end a sentence.
+PAUSE_MARKS = ",;:.!?"
+#: The punctuation in texts, and the pause mark for each.
+_PUNCTUATION = {
+    **{each: each for each in PAUSE_MARKS},
     **dict.fromkeys("，、،", ","),
     **dict.fromkeys("；؛", ";"),
     "：": ":",
@@ -41,143 +41,144 @@ _STOPS = {
     "！": "!",
     **dict.fromkeys("？؟՞", "?"),
 }
-_ENDS = ".!?"
-_STOP = re.compile(rf"[{re.escape(''.join(_STOPS))}](?=[^\w]*\Z)")
-#: The mark of another language around a word: "(en)hello(de)".
-_SWITCH = re.compile(r"\([^()]*\)")
+_SENTENCE_ENDS = ".!?"
+_LAST_PUNCTUATION = re.compile(rf"[{re.escape(''.join(_PUNCTUATION))}](?=[^\w]*\Z)")
+#: The mark of a change of language: "(en)hello(de)".
+_LANGUAGE_MARK = re.compile(r"\([^()]*\)")
 
 
-class Speller(Protocol):
-    """What knows the sounds of a language: libespeak-ng with one of its voices. Places are characters from 0."""
+class Phonemizer(Protocol):
+    """Knows the phonemes of a language: libespeak-ng with one of its voices. Positions are characters from 0."""
 
     def clauses(self, text: str) -> list[tuple[str, str]]:
-        """Return the clauses of a text, which are the text when they are joined, each with its sounds in IPA."""
+        """Return the clauses of a text, which add up to the text, each with its phonemes in IPA."""
 
-    def places(self, clause: str) -> list[tuple[int, int]]:
-        """Return where the words of a clause begin, and how long they are there, 1 or more."""
+    def word_positions(self, clause: str) -> list[tuple[int, int]]:
+        """Return the start and the length (at least 1) of each word in a clause."""
 
-    def abbreviates(self, clause: str) -> bool:
-        """Tell whether the dot at the end of a clause belongs to its last word, as that of "Mr."."""
+    def ends_with_abbreviation(self, clause: str) -> bool:
+        """Return whether the dot at the end of a clause belongs to its last word, as in "Mr."."""
 
 
 @frozen
-class Piece:
-    """A sentence, or as much of one as is spoken at once."""
+class SpeechPart:
+    """A sentence, or the part of a long sentence that a model speaks at a time."""
 
-    #: characters of IPA, a stop and blanks among them; never none
-    sounds: tuple[str, ...]
-    #: where among the sounds a word begins, where in the text, and its length there; where it begins never decreases
+    #: characters of IPA, blanks and pause marks; never empty
+    phonemes: tuple[str, ...]
+    #: for each word: the index of its first phoneme, and its start and length in the text; the indexes never decrease
     words: tuple[tuple[int, int, int], ...]
-    #: whether a sentence ends with it, so that a pause follows
-    ends: bool
+    #: whether it ends a sentence, so that a pause follows
+    ends_sentence: bool
 
 
-def pieces(speller: Speller, text: str) -> Iterator[Piece]:
-    """Yield the pieces of a text; none where nothing in it has a sound. The speller is asked as they are taken."""
+def split_text(phonemizer: Phonemizer, text: str) -> Iterator[SpeechPart]:
+    """Yield the parts of a text, or none if nothing in it can be spoken.
+
+    The phonemizer is used only as parts are taken.
+    """
     offset = 0
-    begun = _Begun()
-    for clause, said in speller.clauses(text):
-        groups = _groups(said)
-        if len(begun.sounds) > _LONG:
-            yield begun.piece(ends=False)
-        for group, words in _spoken(speller, clause, groups, offset):
-            # A blank goes between them, and a stop may follow.
-            if begun.sounds and len(begun.sounds) + 1 + len(group) >= LONGEST:
-                yield begun.piece(ends=False)
-            yield from begun.add(group, words)
-        stop = _STOP.search(clause) if groups else None
+    pending = _PendingPart()
+    for clause, ipa in phonemizer.clauses(text):
+        groups = _phoneme_groups(ipa)
+        if len(pending.phonemes) > _LONG_PART_PHONEMES:
+            yield pending.finish(ends_sentence=False)
+        for group, words in _groups_with_words(phonemizer, clause, groups, offset):
+            # There must be room for a blank before the group and a pause mark after it.
+            if pending.phonemes and len(pending.phonemes) + 1 + len(group) >= MAX_PART_PHONEMES:
+                yield pending.finish(ends_sentence=False)
+            yield from pending.add(group, words)
+        mark = _LAST_PUNCTUATION.search(clause) if groups else None
         last = offset + len(clause) == len(text)
-        if stop is not None and (last or stop.group() != "." or not speller.abbreviates(clause)):
-            begun.sounds.append(_STOPS[stop.group()])
-            if begun.sounds[-1] in _ENDS:
-                yield begun.piece(ends=True)
+        if mark is not None and (last or mark.group() != "." or not phonemizer.ends_with_abbreviation(clause)):
+            pending.phonemes.append(_PUNCTUATION[mark.group()])
+            if pending.phonemes[-1] in _SENTENCE_ENDS:
+                yield pending.finish(ends_sentence=True)
         offset += len(clause)
-    if begun.sounds:
-        yield begun.piece(ends=True)
+    if pending.phonemes:
+        yield pending.finish(ends_sentence=True)
 
 
-class _Begun:
-    """The piece that is being put together."""
+class _PendingPart:
+    """The part that is being filled."""
 
     def __init__(self) -> None:
-        self.sounds: list[str] = []
+        self.phonemes: list[str] = []
         self._words: list[tuple[int, int, int]] = []
 
-    def add(self, group: str, words: Sequence[tuple[int, int, int]]) -> Iterator[Piece]:
-        """Add sounds that are spoken as one, with the words that begin among them; yield what is full before that."""
-        if self.sounds:
-            self.sounds.append(" ")
-        for at in range(0, len(group), LONGEST - 1):
+    def add(self, group: str, words: Sequence[tuple[int, int, int]]) -> Iterator[SpeechPart]:
+        """Add a group of phonemes with the words that begin in it, and yield parts that are full."""
+        if self.phonemes:
+            self.phonemes.append(" ")
+        for at in range(0, len(group), MAX_PART_PHONEMES - 1):
             if at:
-                yield self.piece(ends=False)
-            part = group[at : at + LONGEST - 1]
-            inside = [each for each in words if at <= each[0] < at + len(part)]
-            self._words += [(len(self.sounds) + place - at, start, length) for place, start, length in inside]
-            self.sounds += part
+                yield self.finish(ends_sentence=False)
+            section = group[at : at + MAX_PART_PHONEMES - 1]
+            inside = [each for each in words if at <= each[0] < at + len(section)]
+            self._words += [(len(self.phonemes) + place - at, start, length) for place, start, length in inside]
+            self.phonemes += section
 
-    def piece(self, *, ends: bool) -> Piece:
-        """Return it, and begin another."""
-        piece = Piece(tuple(self.sounds), tuple(self._words), ends)
-        self.sounds, self._words = [], []
-        return piece
-
-
-def _groups(said: str) -> list[str]:
-    """Return the sounds of a clause by what is spoken as one, a character each."""
-    return [unicodedata.normalize("NFD", each) for each in _SWITCH.sub(" ", said).split()]
+    def finish(self, *, ends_sentence: bool) -> SpeechPart:
+        """Return the part, and start another one."""
+        part = SpeechPart(tuple(self.phonemes), tuple(self._words), ends_sentence)
+        self.phonemes, self._words = [], []
+        return part
 
 
-def _spoken(
-    speller: Speller, clause: str, groups: Sequence[str], offset: int
+def _phoneme_groups(ipa: str) -> list[str]:
+    """Return the groups of phonemes between blanks; each character of a group is a phoneme."""
+    return [unicodedata.normalize("NFD", each) for each in _LANGUAGE_MARK.sub(" ", ipa).split()]
+
+
+def _groups_with_words(
+    phonemizer: Phonemizer, clause: str, groups: Sequence[str], offset: int
 ) -> Iterator[tuple[str, list[tuple[int, int, int]]]]:
-    """Yield each group with the words that begin in it: where among its sounds, where in the text, and their length."""
-    begins = _beginnings(speller, clause, groups) if groups else []
+    """Yield each group with its words: the index in the group, and the start and length in the text."""
+    words = _locate_words(phonemizer, clause, groups) if groups else []
     at = 0
     for group in groups:
-        inside = [each for each in begins if at <= each[0] < at + len(group)]
+        inside = [each for each in words if at <= each[0] < at + len(group)]
         yield group, [(place - at, offset + start, length) for place, start, length in inside]
         at += len(group)
 
 
-def _beginnings(speller: Speller, clause: str, groups: Sequence[str]) -> list[tuple[int, int, int]]:
-    """Return of each word of a clause which of its sounds it begins with, where it is in the clause, and its length."""
-    places = speller.places(clause)
-    starts = [0, *itertools.accumulate(map(len, groups))]
-    if len(places) == len(groups):
-        return [(start, *place) for start, place in zip(starts, places, strict=False)]
-    if not places:  # it has sounds, and nobody says of which word
+def _locate_words(phonemizer: Phonemizer, clause: str, groups: Sequence[str]) -> list[tuple[int, int, int]]:
+    """Return, for each word of a clause, the index of its first phoneme, its start and its length."""
+    positions = phonemizer.word_positions(clause)
+    group_starts = [0, *itertools.accumulate(map(len, groups))]
+    if len(positions) == len(groups):
+        return [(start, *position) for start, position in zip(group_starts, positions, strict=False)]
+    if not positions:  # there are phonemes, but their words are unknown
         return []
-    places = _forward(places)
-    nexts = [*(start for start, _ in places[1:]), len(clause)]
+    # A word that is spelled out is reported once for each letter, always with the word's position.
+    positions = _increasing(positions)
+    next_starts = [*(start for start, _ in positions[1:]), len(clause)]
+    # Each word is spoken alone, and the result is aligned with the phonemes of the whole clause.
     alone = [
-        _alone(speller, clause[start : min(start + length, after)])
-        for (start, length), after in zip(places, nexts, strict=True)
+        "".join(
+            "".join(_phoneme_groups(ipa))
+            for _, ipa in phonemizer.clauses(clause[start : min(start + length, next_start)])
+        )
+        for (start, length), next_start in zip(positions, next_starts, strict=True)
     ]
     ends = [0, *itertools.accumulate(map(len, alone))]
-    found = _side_by_side("".join(alone), "".join(groups), ends[:-1])
-    last = max(0, starts[-1] - 1)
-    return [(min(start, last), *place) for start, place in zip(found, places, strict=True)]
+    found = _align("".join(alone), "".join(groups), ends[:-1])
+    last = max(0, group_starts[-1] - 1)
+    return [(min(start, last), *position) for start, position in zip(found, positions, strict=True)]
 
 
-def _forward(places: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return the places that are behind those before: of a word that it spells the library tells one for each letter.
-
-    It is the word's, again and again.
-    """
+def _increasing(positions: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return the positions that come after all previous ones."""
     found: list[tuple[int, int]] = []
-    for place in places:
-        if not found or place[0] > found[-1][0]:
-            found.append(place)
+    for position in positions:
+        if not found or position[0] > found[-1][0]:
+            found.append(position)
     return found
 
 
-def _alone(speller: Speller, word: str) -> str:
-    return "".join("".join(_groups(said)) for _, said in speller.clauses(word))
-
-
-def _side_by_side(first: str, second: str, places: Sequence[int]) -> list[int]:
-    """Return where in the second string is what is at these places of the first, which is much like it."""
-    if len(first) * len(second) > _COMPARED:
+def _align(first: str, second: str, places: Sequence[int]) -> list[int]:
+    """Return the places in the second string that correspond to places in the similar first string."""
+    if len(first) * len(second) > _MAX_COMPARISONS:
         return [place * len(second) // len(first) for place in places]
     import difflib
 

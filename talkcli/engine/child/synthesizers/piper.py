@@ -1,8 +1,8 @@
-"""Piper's neural voices as a synthesizer: a text's sounds by libespeak-ng, and a model that speaks them.
+"""Piper's neural voices as a synthesizer: libespeak-ng provides the phonemes of a text, and a model speaks them.
 
-A model is loaded (`loader.py`), and run, in a thread beside the one that calls, which waits in the output: signs of
-life, a stop and a pause go on, and so does what is being heard. Libespeak-ng is asked for sounds in that thread, too,
-and by nobody else meanwhile.
+A model is loaded and run in a background thread. The calling thread waits in its sink meanwhile, so playback, signs of
+life, stops and pauses go on. That background thread also asks libespeak-ng for the phonemes, which nobody else uses
+during that time.
 """
 
 from __future__ import annotations
@@ -13,12 +13,11 @@ import itertools
 from talkcli.engine import models
 from talkcli.engine.child.players.base import CannotSpeak
 from talkcli.engine.child.synthesizers.inference import Run
-from talkcli.engine.child.synthesizers.loader import Loader
-from talkcli.engine.child.synthesizers.phonemes import STOPS, pieces
-from talkcli.engine.child.synthesizers.work import Work
-from talkcli.engine.models import BEGIN, END, PAD, BadFile
+from talkcli.engine.child.synthesizers.loader import BackgroundIterator, ModelLoader
+from talkcli.engine.child.synthesizers.phonemes import PAUSE_MARKS, split_text
+from talkcli.engine.models import BEGIN_SYMBOL, END_SYMBOL, PAD_SYMBOL, VoiceFileError
 from talkcli.engine.players import SAMPLE_BYTES
-from talkcli.engine.voices import NEURAL, UnknownVoice, language_of, speaker_number
+from talkcli.engine.voices import NEURAL_PREFIX, UnknownVoice, neural_language, speaker_number
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.options import SPEAKER
 from talkcli.goals.reasons import Reason
@@ -30,118 +29,114 @@ if TYPE_CHECKING:
     from talkcli.engine.child.synthesizers.base import SampleSink, SpeechSettings
     from talkcli.engine.child.synthesizers.espeak import Espeak
     from talkcli.engine.child.synthesizers.inference import Model
-    from talkcli.engine.child.synthesizers.phonemes import Piece
-    from talkcli.engine.models import Description
+    from talkcli.engine.child.synthesizers.phonemes import SpeechPart
     from talkcli.engine.protocol import Voice
 
-#: Frames that are made into samples at once, at first and at most: 0.23 s of sound, so that the first is soon there,
-#: and 0.93, as each time some on both sides are made once more (`inference.AROUND`).
-_FIRST, _MOST = 20, 80
-#: How many of these may lie ready, so that a slow moment of the machine is not heard: seven seconds.
-_AHEAD = 8
-#: Seconds from the last sound of a sentence that can be heard to its end, as libespeak-ng has it: 0.24 to 0.28. A
-#: player may end 0.25 early. What a model itself makes of it, 0.07 to 0.2, is fainter than this, of 1.0.
-_PAUSE, _FAINT = 0.26, 0.01
-#: Sound before a sentence that is no louder than this, of 1.0, is left out, but for so many seconds: 26 to 60 ms, by
-#: which a voice would be later than it must be.
-_UNHEARD, _BEFORE = 0.0015, 0.005
-#: Seconds between two words up to which the second one begins where the first ends: what is between them is the blank
-#: and its pads, which sound like the word that comes; what is longer is a pause.
-_BETWEEN = 0.15
-#: Samples no louder than this, of 1.0, all through a piece, are no speech.
-_SILENT = 0.001
-#: Seconds of sound that are handed on at once.
-_AT_ONCE = 0.1
-#: What 1.0 is in samples of 16 bit.
-_FULL = 32767
-_PITCH = 50
-#: Words per minute of libespeak-ng's that are as fast as a voice as it was trained, and how much of its time is no
-#: matter of its pace, as each duration is rounded up to whole frames. Five sentences, from 80 to 450 words per minute,
-#: by libespeak-ng 1.51 (gmw/en-US) and by en_US-joe-medium at paces from 0.2 to 2.2, from first to last sound: from 120
-#: to 400 the two are within 5 % then, at 80 and 450 the model is slower, by 11 and 13 %.
-_NATURAL, _ROUNDED = 195, 0.30
-_LEAST_PACE = 0.1
+#: The frames that are decoded at a time, at first and at most. The first 0.23 s of sound are ready soon; later parts
+#: have 0.93 s, because each also decodes some frames on both sides (`inference.CONTEXT_FRAMES`).
+_MIN_DECODED_FRAMES, _MAX_DECODED_FRAMES = 20, 80
+#: The decoded parts that may wait, up to seven seconds, so that a slow moment of the machine isn't heard.
+_MAX_PARTS_AHEAD = 8
+#: Seconds between the last audible sound of a sentence and its end. libespeak-ng makes 0.24 to 0.28, and a player may
+#: end 0.25 s early. A model makes 0.07 to 0.2 s of sound below the second value, which is relative to full scale.
+_PAUSE_S, _PAUSE_LEVEL = 0.26, 0.01
+#: Sound below this level (of full scale) before a sentence is cut, except for the second value in seconds. It lasts 26
+#: to 60 ms, by which every sentence would start late.
+_LEADING_LEVEL, _LEADING_S = 0.0015, 0.005
+#: If the silence between two words is shorter, the second word begins where the first one ends, because the blank and
+#: its padding already sound like the second word. Otherwise it is a pause.
+_WORD_GAP_S = 0.15
+#: A part whose samples all stay below this level (of full scale) is no speech.
+_SPEECH_LEVEL = 0.001
+#: Seconds of sound that are written at a time.
+_WRITE_S = 0.1
+_FULL_SCALE = 32767
+_DEFAULT_PITCH = 50
+#: libespeak-ng's words per minute at a voice's own pace, and the share of its time that the pace doesn't change,
+#: because durations are rounded up to whole frames. Both were fitted to five sentences of libespeak-ng 1.51 (gmw/en-US)
+#: at 80 to 450 words per minute, and of en_US-joe-medium at scales of 0.2 to 2.2. The two agree within 5 % from 120 to
+#: 400 words per minute. At 80 and 450, the model is 11 and 13 % slower.
+_NATURAL_WPM, _CONSTANT_SHARE = 195, 0.30
+_MIN_SCALE = 0.1
 
 
 @frozen
-class Made:
-    """Some sound, and before it the words that begin in it or later."""
+class SpokenPart:
+    """Some sound, and the words that begin in it or later."""
 
     samples: bytes
-    #: where in the text, the length there, and the seconds from the beginning of these samples
+    #: for each word: its position and length in the text, and its time from the first of these samples in seconds
     words: tuple[tuple[int, int, float], ...] = ()
 
 
 class Piper:
-    """The neural voices that there are, as one synthesizer."""
+    """All neural voices as one synthesizer."""
 
     version: str | None = None
 
     def __init__(self, espeak: Espeak) -> None:
-        """`espeak` knows the sounds; it is used only while this one speaks."""
+        """Initialize the synthesizer; it uses `espeak` only while it speaks."""
         self._espeak = espeak
-        self.loader = Loader()
-        #: id of the voice in force, with its speaker
+        self.loader = ModelLoader()
         self.voice = ""
+        #: the current voice's id without its speaker, its speaker, and the path of its model
         self._model_id, self._speaker, self._path = "", "", ""
 
     @property
     def ready(self) -> bool:
-        """Whether the voice in force is loaded."""
+        """Whether the current voice is loaded."""
         return self.loader.model(self._model_id) is not None
 
     @property
     def error(self) -> str | None:
-        """Why the voice in force can't be had, by the last attempt to load it."""
+        """The error of the last load of the current voice."""
         return self.loader.error(self._model_id)
 
     @property
     def language(self) -> str:
-        """The language of the voice in force, by libespeak-ng's name for it: its files say it, or else its name."""
+        """The libespeak-ng voice that matches the current voice's language, by its files or else its name."""
         try:
-            return models.describe(self._path).speller
-        except BadFile:
-            return language_of(self._model_id)
+            return models.read_description(self._path).espeak_voice
+        except VoiceFileError:
+            return neural_language(self._model_id)
 
     def voices(self) -> tuple[Voice, ...]:
-        """Return the voices whose files are there now."""
-        return models.voices()
+        return models.installed_voices()
 
     def load(self, voice: str) -> None:
-        """Take a voice of `voices`, with a speaker behind it or without; `speak` waits for what takes seconds.
-
-        What is wrong with its files is said by `speak`, too, so that a goal says it, each time anew.
-        """
-        lacking = models.missing()
-        if lacking is not None:
-            raise UnknownVoice(lacking)
+        """Choose a voice, with or without a speaker; faults of its files are reported by `speak`."""
+        missing = models.missing_package()
+        if missing is not None:
+            raise UnknownVoice(missing)
         model, _, speaker = voice.partition(SPEAKER)
-        path = models.found().get(model.removeprefix(NEURAL)) if voice.startswith(NEURAL) else None
+        path = models.find_models().get(model.removeprefix(NEURAL_PREFIX)) if voice.startswith(NEURAL_PREFIX) else None
         if path is None:
             raise UnknownVoice("its file is not there any more")
-        with contextlib.suppress(BadFile):  # it comes again where the model is loaded
-            _number(models.describe(path), speaker)
+        with contextlib.suppress(VoiceFileError):
+            about = models.read_description(path)
+            speaker_number(speaker, about.speaker_names, about.speakers)
         self.voice, self._model_id, self._speaker, self._path = voice, model, speaker, path
 
-    def speak(self, text: str, sound: SpeechSettings, output: SampleSink) -> None:
-        """Speak as `Synthesizer` says; the samples differ each time, as far as the voice's noise is not 0.
+    def speak(self, text: str, settings: SpeechSettings, sink: SampleSink) -> None:
+        """Speak as `Synthesizer` describes, after waiting for the voice to be loaded.
 
-        Where the voice is not loaded yet, it waits until it is.
+        The samples vary from time to time unless the voice's noise is 0.
         """
-        if sound.pitch != _PITCH:
+        if settings.pitch != _DEFAULT_PITCH:
             words = f"the voice {self.voice} has no pitch but its own: leave --pitch out, or choose one of espeak's"
             raise CannotSpeak(Reason.BAD_OPTION, words)
         voice = self._model_id
-        model = self._loaded(voice, output)
+        model = self._wait_for_model(voice, sink)
+        about = model.description
         try:
-            speaker = _number(model.description, self._speaker)
+            speaker = speaker_number(self._speaker, about.speaker_names, about.speakers)
         except UnknownVoice as error:
             raise CannotSpeak(Reason.UNKNOWN_VOICE, f"{self.voice}: {error}") from error
         try:
-            output.begin(model.description.rate, self.voice)
-            with self._espeak.spelling(model.description.speller) as speller:
-                self._write(model, speaker, pieces(speller, text), sound, output)
-        except BadFile as error:
+            sink.begin(about.rate, self.voice)
+            with self._espeak.lend(about.espeak_voice) as phonemizer:
+                self._write(model, speaker, split_text(phonemizer, text), settings, sink)
+        except VoiceFileError as error:
             self.loader.suspect(voice)
             raise CannotSpeak(Reason.VOICE_FAILED, str(error)) from error
         except MemoryError as error:
@@ -151,134 +146,143 @@ class Piper:
             self.loader.suspect(voice)
             raise CannotSpeak(Reason.VOICE_FAILED, f"{model.path}.json: {error}: get the voice anew") from error
 
-    def _loaded(self, voice: str, output: SampleSink) -> Model:
-        """Return the model of a voice, as soon as it is loaded."""
+    def _wait_for_model(self, voice: str, sink: SampleSink) -> Model:
         loader = self.loader
         if loader.model(voice) is None:
-            loader.start(voice)  # what was wrong with it may be mended
+            loader.start(voice)  # an earlier fault may have been repaired
         while (model := loader.model(voice)) is None:
             why = loader.error(voice)
             if why is not None:
                 raise CannotSpeak(Reason.VOICE_FAILED, why)
             assert loader.descriptor is not None
-            output.wait(loader.descriptor)
+            sink.wait(loader.descriptor)
         return model
 
     def _write(
-        self, model: Model, speaker: int, spelled: Iterator[Piece], sound: SpeechSettings, output: SampleSink
+        self, model: Model, speaker: int, parts: Iterator[SpeechPart], settings: SpeechSettings, sink: SampleSink
     ) -> None:
-        """Write what a thread makes of the pieces, which are spelled there, too, as they are needed."""
+        """Write the sound of a text's parts, which a background thread makes."""
         run = Run()
         rate = model.description.rate
-        at_once = int(_AT_ONCE * rate) * SAMPLE_BYTES
+        write_bytes = int(_WRITE_S * rate) * SAMPLE_BYTES
         seconds = 0.0
-        work = Work(_made(model, spelled, speaker, sound, run), _AHEAD)
+        spoken_parts = BackgroundIterator(_speak_parts(model, parts, speaker, settings, run), _MAX_PARTS_AHEAD)
         try:
-            while (made := work.take(output.wait)) is not None:
-                for start, length, position in made.words:
-                    output.word(start, length, seconds + position)
-                for at in range(0, len(made.samples), at_once):
-                    output.write(made.samples[at : at + at_once])
-                seconds += len(made.samples) / SAMPLE_BYTES / rate
+            while (spoken := spoken_parts.take(sink.wait)) is not None:
+                for start, length, position in spoken.words:
+                    sink.word(start, length, seconds + position)
+                for at in range(0, len(spoken.samples), write_bytes):
+                    sink.write(spoken.samples[at : at + write_bytes])
+                seconds += len(spoken.samples) / SAMPLE_BYTES / rate
         finally:
             run.end()
-            work.close()
+            spoken_parts.close()
             self.loader.spoken(self._model_id)
 
 
-def _made(model: Model, spelled: Iterator[Piece], speaker: int, sound: SpeechSettings, run: Run) -> Iterator[Made]:
-    """Yield the sound of the pieces."""
-    pause = int(_PAUSE * model.description.rate)
-    known, lacking = False, ""
+def _speak_parts(
+    model: Model, parts: Iterator[SpeechPart], speaker: int, settings: SpeechSettings, run: Run
+) -> Iterator[SpokenPart]:
+    """Yield the sound of a text's parts.
+
+    Raises:
+        VoiceFileError: The model is faulty, or knows none of the phonemes.
+    """
+    pause = int(_PAUSE_S * model.description.rate)
+    any_known, unknown = False, ""
     first = True
-    for piece in spelled:
-        numbers, places = _numbered(piece.sounds, model.description.sounds)
+    for part in parts:
+        ids, places = _phoneme_ids(part.phonemes, model.description.phoneme_ids)
         if not places:
-            lacking = lacking or "".join(piece.sounds)
+            unknown = unknown or "".join(part.phonemes)
             continue
-        known = True
-        frames = model.encode(numbers, speaker, _pace(sound.rate), run)
+        any_known = True
+        frames = model.encode(ids, speaker, _duration_scale(settings.rate), run)
         begins = [0, *frames.ends]
-        # One that lacks all of its sounds is put to the next, which may be heard before that.
-        heard_at = itertools.accumulate((_begin(model, piece, places, begins, at) for at, _, _ in piece.words), max)
-        words = tuple((start, length, at) for (_, start, length), at in zip(piece.words, heard_at, strict=True))
+        # A word without any known phoneme gets the time of the next one, which may be early; times must not decrease.
+        times = itertools.accumulate((_word_time(model, part, places, begins, at) for at, _, _ in part.words), max)
+        words = tuple((start, length, time) for (_, start, length), time in zip(part.words, times, strict=True))
         loudest = 0.0
-        faint = 0  # samples, up to here
-        begin, many = 0, _FIRST
-        silent: list[Made] = []  # all so far: what makes no sound can be spoken by another voice
+        quiet = 0  # samples of silence at the end so far
+        begin, count = 0, _MIN_DECODED_FRAMES
+        silent: list[SpokenPart] = []  # held back until there is sound, as another voice can speak a silent part
         while begin < frames.count:
-            end = min(frames.count, begin + many)
-            part = model.decode(frames, begin, end, run)
-            heights = abs(part)
-            loudest = max(loudest, float(heights.max()))
-            heard = (heights > _FAINT).nonzero()[0]
-            faint = len(part) - 1 - int(heard[-1]) if len(heard) else faint + len(part)
+            end = min(frames.count, begin + count)
+            samples = model.decode(frames, begin, end, run)
+            levels = abs(samples)
+            loudest = max(loudest, float(levels.max()))
+            audible = (levels > _PAUSE_LEVEL).nonzero()[0]
+            quiet = len(samples) - 1 - int(audible[-1]) if len(audible) else quiet + len(samples)
             if first:
-                part, words, first = *_from_its_sound(part, heights, words, model.description.rate), False
-            silent.append(Made(_samples(part, sound.volume), words))
-            if loudest >= _SILENT:
+                samples, words, first = *_cut_leading_silence(samples, levels, words, model.description.rate), False
+            silent.append(SpokenPart(_to_bytes(samples, settings.volume), words))
+            if loudest >= _SPEECH_LEVEL:
                 yield from silent
                 silent.clear()
-            words, begin, many = (), end, min(_MOST, 2 * many)
-        if loudest < _SILENT:
-            raise BadFile(f"{model.path} makes no sound of a text: get the voice anew")
-        if piece.ends and faint < pause:
-            yield Made(bytes((pause - faint) * SAMPLE_BYTES))
-    if lacking and not known:
-        why = f"has no number for a sound of the text ({lacking[:20]})"
-        raise BadFile(f"{model.path}.json {why}: get both files from the same place")
+            words, begin, count = (), end, min(_MAX_DECODED_FRAMES, 2 * count)
+        if loudest < _SPEECH_LEVEL:
+            raise VoiceFileError(f"{model.path} makes no sound of a text: get the voice anew")
+        if part.ends_sentence and quiet < pause:
+            yield SpokenPart(bytes((pause - quiet) * SAMPLE_BYTES))
+    if unknown and not any_known:
+        why = f"has no number for a sound of the text ({unknown[:20]})"
+        raise VoiceFileError(f"{model.path}.json {why}: get both files from the same place")
 
 
-def _begin(model: Model, piece: Piece, places: Sequence[int], begins: Sequence[int], at: int) -> float:
-    """Return the seconds into a piece at which the word is heard that begins with the sound at this place.
+def _word_time(model: Model, part: SpeechPart, places: Sequence[int], begins: Sequence[int], at: int) -> float:
+    """Return the second of a part at which the word is heard that begins with the phoneme at index `at`.
 
-    By 300 words at 120, 200 and 300 words per minute against a recognizer's alignment: at most 9 ms early in the
-    median, where the word's own first sound is 41 to 93 ms late.
+    Compared with a recognizer's alignment of 300 words at 120, 200 and 300 words per minute, it is at most 9 ms early
+    in the median. The beginning of the word's own first phoneme is 41 to 93 ms late.
+
+    Args:
+        model: The model.
+        part: The part of the text.
+        places: For each phoneme, the index of its first id.
+        begins: For each id, the frame at which it begins.
+        at: The index of the word's first phoneme.
     """
     own = begins[places[at]]
-    if at >= 2 and piece.sounds[at - 1] == " " and piece.sounds[at - 2] not in STOPS:
-        end = begins[places[at - 1] - len(model.description.sounds[PAD])]
-        if model.seconds(own - end) < _BETWEEN:
+    if at >= 2 and part.phonemes[at - 1] == " " and part.phonemes[at - 2] not in PAUSE_MARKS:
+        end = begins[places[at - 1] - len(model.description.phoneme_ids[PAD_SYMBOL])]
+        if model.seconds(own - end) < _WORD_GAP_S:
             return model.seconds(end)
     return model.seconds(own)
 
 
-def _from_its_sound(
-    part: Any, heights: Any, words: tuple[tuple[int, int, float], ...], rate: int
+def _cut_leading_silence(
+    samples: Any, levels: Any, words: tuple[tuple[int, int, float], ...], rate: int
 ) -> tuple[Any, tuple[tuple[int, int, float], ...]]:
-    """Return the beginning of a sentence without what can't be heard of it, and its words in their new places."""
-    heard = (heights > _UNHEARD).nonzero()[0]
-    cut = max(0, int(heard[0]) - int(_BEFORE * rate)) if len(heard) else 0
-    return part[cut:], tuple((start, length, max(0.0, at - cut / rate)) for start, length, at in words)
+    """Return the start of a sentence without its inaudible beginning, and the words with their new times."""
+    audible = (levels > _LEADING_LEVEL).nonzero()[0]
+    cut = max(0, int(audible[0]) - int(_LEADING_S * rate)) if len(audible) else 0
+    return samples[cut:], tuple((start, length, max(0.0, time - cut / rate)) for start, length, time in words)
 
 
-def _samples(part: Any, volume: float) -> bytes:
-    made: bytes = (part * (_FULL * volume)).clip(-_FULL, _FULL).astype("<i2").tobytes()
+def _to_bytes(samples: Any, volume: float) -> bytes:
+    made: bytes = (samples * (_FULL_SCALE * volume)).clip(-_FULL_SCALE, _FULL_SCALE).astype("<i2").tobytes()
     return made
 
 
-def _numbered(sounds: Sequence[str], numbers: Mapping[str, tuple[int, ...]]) -> tuple[list[int], list[int]]:
-    """Return the model's numbers for some sounds, and where among them each sound begins; no places if it knows none.
+def _phoneme_ids(phonemes: Sequence[str], ids: Mapping[str, tuple[int, ...]]) -> tuple[list[int], list[int]]:
+    """Return the model's ids for some phonemes, and the index of each phoneme's first id.
 
-    One that it doesn't know begins where the next one does that it knows, or the end.
+    The place of a phoneme that the model doesn't know is that of the next known one, or the end. If it knows none, the
+    list of places is empty.
     """
-    result = [*numbers[BEGIN], *numbers[PAD]]
+    result = [*ids[BEGIN_SYMBOL], *ids[PAD_SYMBOL]]
     places = []
-    for sound in sounds:
+    for phoneme in phonemes:
         places.append(len(result))
-        if numbers.get(sound):
-            result += [*numbers[sound], *numbers[PAD]]
-    known = any(numbers.get(each) for each in sounds)
-    return [*result, *numbers[END]], places if known else []
+        if ids.get(phoneme):
+            result += [*ids[phoneme], *ids[PAD_SYMBOL]]
+    known = any(ids.get(each) for each in phonemes)
+    return [*result, *ids[END_SYMBOL]], places if known else []
 
 
-def _pace(rate: int) -> float:
-    """Return what durations are to be multiplied with, so that a sentence takes as long as by libespeak-ng.
+def _duration_scale(rate: int) -> float:
+    """Return the factor of all durations that makes a sentence as long as libespeak-ng's at some words per minute.
 
-    Above 400 words per minute a model is slower than that: no sound is shorter than a frame.
+    Above 400 words per minute, the model is slower than libespeak-ng, because no phoneme is shorter than a frame.
     """
-    return max(_LEAST_PACE, (_NATURAL / rate - _ROUNDED) / (1 - _ROUNDED))
-
-
-def _number(about: Description, speaker: str) -> int:
-    return speaker_number(speaker, about.speaker_names, about.speakers)
+    return max(_MIN_SCALE, (_NATURAL_WPM / rate - _CONSTANT_SHARE) / (1 - _CONSTANT_SHARE))

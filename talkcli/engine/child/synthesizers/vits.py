@@ -1,11 +1,12 @@
-"""A Piper voice's model (VITS, in ONNX) cut in two: from sounds to frames, and from frames to samples.
+"""Split a Piper voice's model (VITS, in ONNX) into an encoder and a decoder.
 
-The second half looks at no more than some frames around each sample, so that it can be run piece by piece, and the
-first tells for how many frames each sound lasts, which the whole keeps to itself: when each word is heard.
+The encoder turns phoneme ids into frames, and the decoder frames into samples. The decoder looks at no more than some
+frames around each sample, so it can run on a part at a time. The encoder also outputs for how many frames each phoneme
+lasts, which the whole model keeps to itself. This tells when each word is heard.
 
-Pure: bytes in, bytes out. It reads as much of ONNX's encoding (protobuf) as that takes, by the field numbers of
-`onnx.proto`. A model is a stranger's file, which a library in C will read: what is not understood, or refers to
-anything outside of the file, is refused here, and nothing is handed on but what was looked at.
+The module is pure. It reads just as much of ONNX's encoding (protobuf) as it needs, by the field numbers of
+`onnx.proto`. A model comes from a stranger, and a C library will read it. Therefore a model that isn't understood, or
+that refers to anything outside of its file, is refused, and only the fields that were examined are passed on.
 """
 
 from __future__ import annotations
@@ -18,104 +19,106 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     Buffer = bytes | memoryview
-    #: a field of a message: its number, its kind (one of the next three), and its value, an integer's as it is encoded
+    #: a field of a message: its number, its wire type (one of the four below), and its value (an integer encoded)
     Field = tuple[int, int, Buffer]
 
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
-#: Fields of a model, of an entry of its list of operators, of a graph, a node, an attribute and a tensor.
-_IR_VERSION, _GRAPH, _OPERATORS, _FUNCTIONS = 1, 7, 8, 25
+#: Field numbers of a model, an operator set, a graph, a node, an attribute and a tensor.
+_IR_VERSION, _GRAPH, _OPERATOR_SETS, _FUNCTIONS = 1, 7, 8, 25
 _DOMAIN = 1
 _NODE, _GRAPH_NAME, _INITIALIZER, _INPUT, _OUTPUT, _SPARSE_INITIALIZER = 1, 2, 5, 11, 12, 15
 _NODE_INPUT, _NODE_OUTPUT, _OPERATOR, _ATTRIBUTE, _NODE_DOMAIN = 1, 2, 4, 5, 7
 _TENSOR, _SUBGRAPH, _TENSORS, _SUBGRAPHS, _SPARSE_TENSOR, _SPARSE_TENSORS = 5, 6, 10, 11, 22, 23
 _TENSOR_NAME, _EXTERNAL_DATA, _DATA_LOCATION = 8, 13, 14
 
-#: The operators that ONNX itself defines go by one of these; any other is somebody's own code.
-_STANDARD = ("", "ai.onnx")
-#: The first layer of the second half, by its weights: the name that it has in each of Piper's models.
-_CUT = "dec.conv_pre.weight"
-#: What rounds the durations up to whole frames; there is one in the first half.
-_ROUNDING = "Ceil"
-#: What makes something else each time is no constant, though it may need nothing.
-_RANDOM = "Random"
-#: The type of a value: floats, in any shape.
-_FLOATS = b"\x12\x04\x0a\x02\x08\x01"
-#: Graphs inside of graphs that are looked at: Piper's have none, and PyTorch writes one for a condition.
-_DEEPEST = 4
-#: Fields that are read of a model, 300 bytes and a microsecond or three each: Piper's have 30,000. And the characters
-#: of a name: theirs have 52 at most.
-_MOST_FIELDS, _LONGEST_NAME = 300_000, 1000
-#: Bits of the longest integer.
-_LONGEST = 64
+#: The domains of ONNX's own operators. An operator of any other domain is foreign code.
+_STANDARD_DOMAINS = ("", "ai.onnx")
+#: The weights of the decoder's first layer, which have this name in all of Piper's models.
+_DECODER_WEIGHTS = "dec.conv_pre.weight"
+#: The operator that rounds durations up to whole frames; the encoder has one of it.
+_ROUNDING_OPERATOR = "Ceil"
+#: The prefix of operators whose results aren't constant, although they may have no inputs.
+_RANDOM_PREFIX = "Random"
+#: The encoded type of a value: floats, in any shape.
+_FLOAT_TYPE = b"\x12\x04\x0a\x02\x08\x01"
+#: The most levels of nested graphs: Piper's models have none, and PyTorch writes one for a condition.
+_MAX_NESTED_GRAPHS = 4
+#: The most fields of a model; reading one takes 300 bytes and 1 to 3 microseconds. Piper's models have 30,000 fields.
+_MAX_FIELDS = 300_000
+#: The longest name; the longest in Piper's models has 52 characters.
+_MAX_NAME_BYTES = 1000
+_MAX_INTEGER_BITS = 64
 
 
-class NotCut(Exception):
-    """The model is none of Piper's, or none that is to be run: the text says why, for behind the file's name."""
+class NotSplit(Exception):
+    """The model is unsafe, or not one of Piper's; the text says why, to be shown after the file's name."""
 
 
 @frozen
-class Halves:
-    """Both halves, each a model of its own, in parts: its bytes are these, one after the other.
+class ModelHalves:
+    """The encoder and the decoder, each a complete model whose bytes are the parts joined.
 
-    The weights, which are nearly all of it, are not copied: they are the whole's.
+    The parts with the weights, which are nearly all of the bytes, are not copied.
     """
 
-    #: has the whole's inputs; its outputs are what the decoder needs, and last the frames of each sound
+    #: has the whole model's inputs. Its outputs are the decoder's inputs, and at the end the frames of each phoneme.
     encoder: tuple[Buffer, ...]
-    #: its inputs are the encoder's outputs but for the last; its output is the whole's
+    #: has the encoder's outputs except the last one as its inputs, and the whole model's output
     decoder: tuple[Buffer, ...]
 
 
-def halves(model: Buffer) -> Halves:
-    """Cut a model; NotCut."""
+def split_model(model: Buffer) -> ModelHalves:
+    """Split a model into its encoder and its decoder.
+
+    Raises:
+        NotSplit: The model is unsafe, or not one of Piper's.
+    """
     reader = _Reader()
     fields = reader.fields(memoryview(model))
-    graphs = [value for number, kind, value in fields if (number, kind) == (_GRAPH, _BYTES)]
+    graphs = _messages(fields, _GRAPH)
     if len(graphs) != 1:
-        raise NotCut("is no ONNX model")
+        raise NotSplit("is no ONNX model")
     if any(number == _FUNCTIONS for number, _, _ in fields):
-        raise NotCut("has operators of its own")
+        raise NotSplit("has operators of its own")
     graph = _Graph(reader, graphs[0])
-    decoder = graph.behind(_CUT)
+    decoder = graph.nodes_after(_DECODER_WEIGHTS)
     if not decoder:
-        raise NotCut(f"is none of Piper's models: it has no {_CUT}")
+        raise NotSplit(f"is none of Piper's models: it has no {_DECODER_WEIGHTS}")
     constants = graph.constants()
-    takes = {name for each in decoder for name in each.inputs}
-    before = {name for each in graph.nodes for name in each.outputs} - {
-        name for each in decoder for name in each.outputs
-    }
-    handed = sorted((takes & before) - constants)
-    first = graph.needed(handed)
-    durations = [each.outputs[0] for each in first if each.operator == _ROUNDING and each.outputs]
-    if not handed or len(durations) != 1:
-        raise NotCut("is none of Piper's models: it does not tell how long each sound lasts")
-    second = [*graph.needed(takes & constants), *decoder]
-    head = [each for each in fields if _is_head(reader, each)]
-    ends = [(_OUTPUT, _BYTES, _value(name)) for name in [*handed, *durations]]
-    begins = [(_INPUT, _BYTES, _value(name)) for name in handed]
-    return Halves(
-        _model(head, [*graph.part(first), *graph.inputs, *ends]),
-        _model(head, [*graph.part(second), *begins, *graph.outputs]),
+    needed = {name for each in decoder for name in each.inputs}
+    made_before = {name for each in graph.nodes for name in each.outputs}
+    made_before -= {name for each in decoder for name in each.outputs}
+    passed = sorted((needed & made_before) - constants)
+    encoder = graph.nodes_for(passed)
+    durations = [each.outputs[0] for each in encoder if each.operator == _ROUNDING_OPERATOR and each.outputs]
+    if not passed or len(durations) != 1:
+        raise NotSplit("is none of Piper's models: it does not tell how long each sound lasts")
+    decoder = [*graph.nodes_for(needed & constants), *decoder]
+    head = [each for each in fields if _is_shared(reader, each)]
+    outputs = [(_OUTPUT, _BYTES, _float_value(name)) for name in [*passed, *durations]]
+    inputs = [(_INPUT, _BYTES, _float_value(name)) for name in passed]
+    return ModelHalves(
+        _encode_model(head, [*graph.fields_of(encoder), *graph.inputs, *outputs]),
+        _encode_model(head, [*graph.fields_of(decoder), *inputs, *graph.outputs]),
     )
 
 
 class _Reader:
-    """Reads messages, of one model and no more of them than a model of Piper's may have."""
+    """Reads the messages of one model, and limits the number of their fields."""
 
     def __init__(self) -> None:
-        self._left = _MOST_FIELDS
+        self._fields_left = _MAX_FIELDS
 
     def fields(self, raw: Buffer) -> list[Field]:
-        """Return the fields of a message; NotCut where it isn't one."""
-        found = list(itertools.islice(_fields(raw), self._left + 1))
-        self._left -= len(found)
-        if self._left < 0:
-            raise NotCut("is none of Piper's models: it has too many parts")
+        found = list(itertools.islice(_parse_fields(raw), self._fields_left + 1))
+        self._fields_left -= len(found)
+        if self._fields_left < 0:
+            raise NotSplit("is none of Piper's models: it has too many parts")
         return found
 
 
 class _Node:
-    """An operation: what it needs, what it makes; what graphs inside of it need, it needs, too."""
+    """An operation; its inputs include those of the graphs inside of it."""
 
     def __init__(self, reader: _Reader, raw: Buffer, depth: int) -> None:
         fields = reader.fields(raw)
@@ -124,12 +127,12 @@ class _Node:
         self.outputs = _names(fields, _NODE_OUTPUT)
         self.operator = "".join(_names(fields, _OPERATOR))
         domain = "".join(_names(fields, _NODE_DOMAIN))
-        if domain not in _STANDARD:
-            raise NotCut(f"has operators of its own ({domain[:40]}:{self.operator[:40]})")
+        if domain not in _STANDARD_DOMAINS:
+            raise NotSplit(f"has operators of its own ({domain[:40]}:{self.operator[:40]})")
         for attribute in _messages(fields, _ATTRIBUTE):
             parts = reader.fields(attribute)
             if any(number in {_SPARSE_TENSOR, _SPARSE_TENSORS} for number, _, _ in parts):
-                raise NotCut("has sparse weights, which none of Piper's has")
+                raise NotSplit("has sparse weights, which none of Piper's has")
             for tensor in (*_messages(parts, _TENSOR), *_messages(parts, _TENSORS)):
                 _tensor_name(reader, tensor)
             for inner in (*_messages(parts, _SUBGRAPH), *_messages(parts, _SUBGRAPHS)):
@@ -137,39 +140,31 @@ class _Node:
 
 
 class _Graph:
-    """The nodes of a graph, in the order in which they run, with their weights."""
+    """The nodes of a graph in the order in which they run, and their weights."""
 
     def __init__(self, reader: _Reader, raw: Buffer, depth: int = 0) -> None:
-        if depth > _DEEPEST:
-            raise NotCut(f"has graphs inside of graphs, more than {_DEEPEST} deep")
+        if depth > _MAX_NESTED_GRAPHS:
+            raise NotSplit(f"has graphs inside of graphs, more than {_MAX_NESTED_GRAPHS} deep")
         fields = reader.fields(raw)
         if any(number == _SPARSE_INITIALIZER for number, _, _ in fields):
-            raise NotCut("has sparse weights, which none of Piper's has")
+            raise NotSplit("has sparse weights, which none of Piper's has")
         self.nodes = [_Node(reader, each, depth) for each in _messages(fields, _NODE)]
         self._weights = {_tensor_name(reader, each): each for each in _messages(fields, _INITIALIZER)}
         self.inputs = [each for each in fields if each[:2] == (_INPUT, _BYTES)]
         self.outputs = [each for each in fields if each[:2] == (_OUTPUT, _BYTES)]
 
-    def behind(self, weight: str) -> list[_Node]:
-        """Return the nodes that take these weights, or what was made by one that does."""
-        made = {weight}
+    def nodes_after(self, name: str) -> list[_Node]:
+        """Return the nodes that depend on a value, directly or indirectly."""
+        names = {name}
         found = []
         for node in self.nodes:
-            if not made.isdisjoint(node.inputs):
-                made.update(node.outputs)
+            if not names.isdisjoint(node.inputs):
+                names.update(node.outputs)
                 found.append(node)
         return found
 
-    def constants(self) -> set[str]:
-        """Return the names of what is always the same: both halves may have it."""
-        names = {*self._weights, ""}
-        for node in self.nodes:
-            if names.issuperset(node.inputs) and not node.operator.startswith(_RANDOM):
-                names.update(node.outputs)
-        return names
-
-    def needed(self, wanted: Iterable[str]) -> list[_Node]:
-        """Return the nodes without which what is wanted is not made."""
+    def nodes_for(self, wanted: Iterable[str]) -> list[_Node]:
+        """Return the nodes that are needed to compute some values."""
         names = {*wanted}
         found = []
         for node in reversed(self.nodes):
@@ -178,78 +173,92 @@ class _Graph:
                 found.append(node)
         return found[::-1]
 
-    def part(self, nodes: list[_Node]) -> list[Field]:
-        """Return these nodes, with the weights that they need, as the fields of a graph without ends."""
+    def constants(self) -> set[str]:
+        """Return the names of the values that are always the same, so that both halves may compute them."""
+        names = {*self._weights, ""}
+        for node in self.nodes:
+            if names.issuperset(node.inputs) and not node.operator.startswith(_RANDOM_PREFIX):
+                names.update(node.outputs)
+        return names
+
+    def fields_of(self, nodes: list[_Node]) -> list[Field]:
+        """Return the fields of a graph with some nodes and their weights, but without inputs and outputs."""
         names = {name for each in nodes for name in each.inputs}
-        kept = [(_INITIALIZER, _BYTES, each) for name, each in self._weights.items() if name in names]
-        return [*((_NODE, _BYTES, each.raw) for each in nodes), (_GRAPH_NAME, _BYTES, b"half"), *kept]
+        weights = [(_INITIALIZER, _BYTES, each) for name, each in self._weights.items() if name in names]
+        return [*((_NODE, _BYTES, each.raw) for each in nodes), (_GRAPH_NAME, _BYTES, b"half"), *weights]
 
 
-def _is_head(reader: _Reader, field: Field) -> bool:
-    """Tell whether a field of the model belongs to both halves: what version it is of, of which standard operators."""
+def _is_shared(reader: _Reader, field: Field) -> bool:
+    """Return whether a field of the model belongs to both halves: its version or a set of standard operators."""
     number, kind, value = field
-    if (number, kind) == (_OPERATORS, _BYTES):
-        return "".join(_names(reader.fields(value), _DOMAIN)) in _STANDARD
+    if (number, kind) == (_OPERATOR_SETS, _BYTES):
+        return "".join(_names(reader.fields(value), _DOMAIN)) in _STANDARD_DOMAINS
     return number == _IR_VERSION
 
 
 def _tensor_name(reader: _Reader, raw: Buffer) -> str:
-    """Return the name of a tensor; NotCut if its numbers are not in it."""
+    """Return the name of a tensor.
+
+    Raises:
+        NotSplit: Its numbers are in another file.
+    """
     fields = reader.fields(raw)
-    outside = (value for number, _, value in fields if number in {_EXTERNAL_DATA, _DATA_LOCATION})
-    if any(bytes(value) != b"\0" for value in outside):
-        raise NotCut("has its weights in another file")
+    locations = (value for number, _, value in fields if number in {_EXTERNAL_DATA, _DATA_LOCATION})
+    if any(bytes(value) != b"\0" for value in locations):
+        raise NotSplit("has its weights in another file")
     return "".join(_names(fields, _TENSOR_NAME))
 
 
 def _messages(fields: Iterable[Field], wanted: int) -> list[Buffer]:
+    """Return the values of the fields with a number."""
     return [value for number, kind, value in fields if (number, kind) == (wanted, _BYTES)]
 
 
 def _names(fields: Iterable[Field], wanted: int) -> list[str]:
+    """Return the texts in the fields with a number."""
     found = _messages(fields, wanted)
-    if any(len(value) > _LONGEST_NAME for value in found):
-        raise NotCut("is none of Piper's models: it has names that are too long")
+    if any(len(value) > _MAX_NAME_BYTES for value in found):
+        raise NotSplit("is none of Piper's models: it has names that are too long")
     try:
         return [bytes(value).decode() for value in found]
     except UnicodeDecodeError as error:
-        raise NotCut("is no ONNX model: it has names that are no text") from error
+        raise NotSplit("is no ONNX model: it has names that are no text") from error
 
 
-def _fields(raw: Buffer) -> Iterator[Field]:
-    """Yield the fields of a message; NotCut where it isn't one."""
+def _parse_fields(raw: Buffer) -> Iterator[Field]:
+    """Yield the fields of a message."""
     at, end = 0, len(raw)
     while at < end:
-        key, at = _integer(raw, at)
+        key, at = _parse_integer(raw, at)
         number, kind = key >> 3, key & 7
         if kind == _BYTES:
-            size, at = _integer(raw, at)
+            size, at = _parse_integer(raw, at)
         elif kind == _VARINT:
-            size = _integer(raw, at)[1] - at
+            size = _parse_integer(raw, at)[1] - at
         elif kind in {_FIXED32, _FIXED64}:
             size = 4 if kind == _FIXED32 else 8
         else:
-            raise NotCut("is no ONNX model")
+            raise NotSplit("is no ONNX model")
         if size > end - at:
-            raise NotCut("is cut short, or no ONNX model")
+            raise NotSplit("is cut short, or no ONNX model")
         yield number, kind, raw[at : at + size]
         at += size
 
 
-def _integer(raw: Buffer, at: int) -> tuple[int, int]:
-    """Return the integer that is encoded there, and where it ends."""
+def _parse_integer(raw: Buffer, at: int) -> tuple[int, int]:
+    """Return the integer that begins at a byte, and the byte after it."""
     result = shift = 0
-    while at < len(raw) and shift < _LONGEST:
+    while at < len(raw) and shift < _MAX_INTEGER_BITS:
         byte = raw[at]
         at += 1
         result |= (byte & 127) << shift
         shift += 7
         if byte < 128:
             return result, at
-    raise NotCut("is cut short, or no ONNX model")
+    raise NotSplit("is cut short, or no ONNX model")
 
 
-def _encoded(value: int) -> bytes:
+def _encode_integer(value: int) -> bytes:
     out = bytearray()
     while value > 127:
         out.append(value & 127 | 128)
@@ -257,21 +266,21 @@ def _encoded(value: int) -> bytes:
     return bytes([*out, value])
 
 
-def _model(head: list[Field], graph: list[Field]) -> tuple[Buffer, ...]:
-    """Return a model, in parts."""
-    parts = list(_written(graph))
-    key = _encoded(_GRAPH << 3 | _BYTES) + _encoded(sum(map(len, parts)))
-    return (*_written(head), key, *parts)
+def _encode_model(head: list[Field], graph: list[Field]) -> tuple[Buffer, ...]:
+    """Return the parts of a model."""
+    parts = list(_encode_fields(graph))
+    key = _encode_integer(_GRAPH << 3 | _BYTES) + _encode_integer(sum(map(len, parts)))
+    return (*_encode_fields(head), key, *parts)
 
 
-def _written(fields: Iterable[Field]) -> Iterator[Buffer]:
+def _encode_fields(fields: Iterable[Field]) -> Iterator[Buffer]:
     for number, kind, value in fields:
-        yield _encoded(number << 3 | kind)
+        yield _encode_integer(number << 3 | kind)
         if kind == _BYTES:
-            yield _encoded(len(value))
+            yield _encode_integer(len(value))
         yield value
 
 
-def _value(name: str) -> bytes:
-    """Return the description of an input or output: its name, and that it is of floats."""
-    return b"".join(_written([(1, _BYTES, name.encode())])) + _FLOATS
+def _float_value(name: str) -> bytes:
+    """Return the encoded description of an input or output of floats."""
+    return b"".join(_encode_fields([(1, _BYTES, name.encode())])) + _FLOAT_TYPE
