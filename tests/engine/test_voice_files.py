@@ -202,7 +202,7 @@ def test_a_file_that_only_the_users_own_group_may_write_is_the_users(
 def test_an_access_list_is_seen_behind_the_users_own_group(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tiny_voice.put(home / "v", "a")
     path.chmod(0o664)
-    monkeypatch.setattr(models, "_is_alone", lambda _user, _group: True)
+    monkeypatch.setattr(models, "_is_private_group", lambda _user, _group: True)
     open_checked(str(path)).close()
     # version 2; the owner, user 4711, the group, the mask, others: read and write but for the last
     entries = [(1, 6, 0xFFFFFFFF), (2, 6, 4711), (4, 6, 0xFFFFFFFF), (16, 6, 0xFFFFFFFF), (32, 4, 0xFFFFFFFF)]

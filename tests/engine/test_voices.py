@@ -303,8 +303,8 @@ def test_a_language_is_listed_however_another_driver_tells_it(languages: list[ob
 
 def test_mbrolas_voices_are_listed_if_they_are_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     known = [Voice("mb/mb-de4-en", "en", "german-mbrola-4-en"), Voice("mb/mb-us1", "en-us", "us-mbrola-1")]
-    monkeypatch.setattr(espeak, "_listed", lambda *_: known)
-    monkeypatch.setattr(espeak, "_MBROLA_PLACES", (f"{tmp_path}/{{0}}/{{0}}",))
+    monkeypatch.setattr(espeak, "_list_voices", lambda *_: known)
+    monkeypatch.setattr(espeak, "_MBROLA_PATHS", (f"{tmp_path}/{{0}}/{{0}}",))
     monkeypatch.setenv("PATH", str(tmp_path / "bin"))
     (tmp_path / "us1").mkdir()
     (tmp_path / "us1" / "us1").touch()
