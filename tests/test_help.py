@@ -117,7 +117,7 @@ def test_every_option_is_explained(name: str) -> None:
 def test_the_examples_can_be_typed(name: str) -> None:
     """The words of each `talk` in them are read as the command line would be; nothing is carried out."""
     seen = []
-    for line in command(name).row.examples.strip().splitlines():
+    for line in command(name).examples.strip().splitlines():
         for part in re.findall(r"\btalk ((?:\"[^\"]*\"|[^|;&)\"])*)", re.split(r"(?<=\S)   +", line.strip())[0]):
             words = [each for each in shlex.split(part.partition("'")[0]) if each != "--json"]
             seen.append(words[0])

@@ -8,7 +8,6 @@ from __future__ import annotations
 import _signal
 import os
 import re
-from inspect import cleandoc
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -37,12 +36,6 @@ if TYPE_CHECKING:
     from talkcli.cli.command import Command, ExitCodes
     from talkcli.goals.option import Option
 
-_EXAMPLES = """
-    talk serve &                      one server on the robot
-    talk say --wait -- "battery low"  the exit code tells whether it was heard
-    talk cancel                       silence, now
-    talk doctor                       silent? what to do next
-"""
 #: Names that other programs have for a command, if they aren't similar to its name here.
 _FOREIGN_NAMES = {
     "check": "doctor",
@@ -55,6 +48,13 @@ _FOREIGN_NAMES = {
     "stop": "cancel",
     "unpause": "resume",
 }
+
+
+def _read_help(name: str) -> tuple[str, str]:
+    """Return the description and the examples of a command from its file in `help`."""
+    with open(os.path.join(os.path.dirname(__file__), "help", f"{name}.txt"), encoding="utf-8") as file:
+        description, _, examples = file.read().partition("\n\nExamples:\n")
+    return description, examples
 
 
 class _OptionType(click.FloatRange):
@@ -174,13 +174,14 @@ class ClickCommand(_HelpfulCommand):
 
     def __init__(self, row: Command) -> None:
         self.row = row
-        self.examples, self.exit_codes = row.examples, row.exit_codes
+        self.exit_codes = row.exit_codes
+        description, self.examples = _read_help(row.name)
         arguments: list[click.Parameter] = [_argument(row.argument)] if row.argument else []
         own, common = map(_option, row.options), [_option(each, common=True) for each in COMMON_OPTIONS]
         super().__init__(
             row.name,
             params=[*arguments, *own, *common],
-            help=cleandoc(row.description),
+            help=description,
             short_help=row.summary,
             callback=self._run,
         )
@@ -215,7 +216,8 @@ class ClickCommand(_HelpfulCommand):
 class _CommandGroup(_HelpfulCommand, click.Group):
     """The group of all commands. Each is made from its row when it is needed."""
 
-    examples, exit_codes = _EXAMPLES, ALL_EXIT_CODES
+    description, examples = _read_help("talk")
+    exit_codes = ALL_EXIT_CODES
     common_heading = "Options, before or after the command"
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
@@ -239,6 +241,7 @@ class _CommandGroup(_HelpfulCommand, click.Group):
 
 @click.group(
     cls=_CommandGroup,
+    help=_CommandGroup.description,
     invoke_without_command=True,
     subcommand_metavar="COMMAND [ARGS]...",
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
@@ -247,7 +250,7 @@ class _CommandGroup(_HelpfulCommand, click.Group):
 @click.version_option(__version__, prog_name="talk", message="%(prog)s %(version)s")
 @click.pass_context
 def talk(context: click.Context) -> None:
-    """Speech for robots: sentences that can be awaited, cancelled and preempted."""
+    """Show the first screen if there is no command."""
     if context.invoked_subcommand is None:
         click.echo(_first_screen(context))
 
@@ -257,7 +260,7 @@ def _first_screen(context: click.Context) -> str:
     formatter = context.make_formatter()
     formatter.write(f"{talk.help}\n")
     with formatter.indentation():
-        _write_lines(_EXAMPLES, formatter)
+        _write_lines(_CommandGroup.examples, formatter)
     talk.format_commands(context, formatter)
     formatter.write("'talk COMMAND --help' says more of each, 'talk --help' has the exit codes.")
     return formatter.getvalue()

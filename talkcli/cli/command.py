@@ -67,17 +67,13 @@ ALL_EXIT_CODES: ExitCodes = {
 
 @frozen
 class Command:
-    """A row that describes a command."""
+    """A row that describes a command. Its description and its examples are in `help/NAME.txt`."""
 
     name: str
     #: one line for the list of commands
     summary: str
-    #: the description in the command's help
-    description: str
     #: the function that runs the command, as "module:name"; it is called with `CommonOptions` and the given values
     function: str
-    #: example command lines, one on each line
-    examples: str
     exit_codes: ExitCodes
     options: tuple[Option, ...] = ()
     #: the positional argument; it takes any number of words if its metavar ends with dots
