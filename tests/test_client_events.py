@@ -14,7 +14,6 @@ import pytest
 
 import talkcli
 from talkcli import Client, GoalHandle, PausedChanged, Result, Snapshot, State, StateChanged, WordHeard
-from talkcli.client.following import MAX_FEEDBACK, MAX_STATES, EventBuffer
 from talkcli.errors import Lost, UnknownGoal, UsageError
 from talkcli.goals.goal import By, Goal, Sender
 from talkcli.goals.states import TRANSITIONS
@@ -89,30 +88,6 @@ def test_library_is_imported_from_one_place() -> None:
         assert getattr(talkcli, name)
     with pytest.raises(AttributeError, match="Speaker"):
         _ = talkcli.Speaker
-
-
-def test_buffer_hands_out_in_order_and_drops_the_oldest_feedback() -> None:
-    buffer = EventBuffer()
-    state, word = StateChanged("g", State.ACTIVE), WordHeard("g", "a", 0, 1, 1, 0.0)
-    for number in range(MAX_FEEDBACK + 2):
-        buffer.add(WordHeard("g", "a", 0, 1, number, 0.0))
-        if number == 5:
-            buffer.add(state)
-    assert buffer.take() == WordHeard("g", "a", 0, 1, 2, 0.0)  # 0 and 1 were dropped
-    assert [buffer.take() for _ in range(4)][3] == state
-    assert buffer.take() == WordHeard("g", "a", 0, 1, 6, 0.0)
-    while buffer.take():
-        pass
-    for _ in range(MAX_STATES):
-        buffer.add(state)
-    assert not buffer.overrun
-    buffer.add(state)
-    buffer.add(word)
-    assert buffer.overrun
-    taken = 0
-    while buffer.take():
-        taken += 1
-    assert taken == MAX_STATES  # nothing that came after what is missing
 
 
 def told(found: list[Event]) -> list[object]:
@@ -243,23 +218,22 @@ def test_poll_of_a_goal_that_nothing_is_heard_of_says_so(client: Client) -> None
 
 
 @pytest.mark.parametrize("how", ["killed", "frozen"])
-def test_poll_tells_that_the_goal_is_lost(
-    client: Client, scripted: Talk, monkeypatch: pytest.MonkeyPatch, how: str
-) -> None:
+def test_poll_tells_that_the_goal_is_lost(scripted: Talk, monkeypatch: pytest.MonkeyPatch, how: str) -> None:
     began = time.monotonic()
-    handle = client.say("never-ends words=1")
-    if how == "killed":
-        scripted.kill()
-    else:
-        monkeypatch.setattr("talkcli.client.connection.SILENCE_LIMIT", 0.3)
-        scripted.freeze()
-    assert told(polled(handle))[-1] is Result
-    assert (handle.state, handle.goal.reason, handle.poll()) == (State.LOST, "lost", None)
-    if how == "frozen":
-        assert time.monotonic() - began >= 0.3
-        assert "nothing for 0.3 s" in (handle.goal.message or "")
-        scripted.thaw()
-        scripted.run("cancel")
+    with Client(scripted.socket, timeout=0.5) as client:
+        handle = client.say("never-ends words=1")
+        if how == "killed":
+            scripted.kill()
+        else:
+            monkeypatch.setattr("talkcli.client.core.SILENCE_LIMIT_S", 0.3)
+            scripted.freeze()
+        assert told(polled(handle))[-1] is Result
+        assert (handle.state, handle.goal.reason, handle.poll()) == (State.LOST, "lost", None)
+        if how == "frozen":
+            assert time.monotonic() - began >= 0.8
+            assert "nothing for 0.3 s" in (handle.goal.message or "")
+            scripted.thaw()
+            scripted.run("cancel")
 
 
 def until_all_ended(watch: Iterator[Event], count: int) -> list[Event]:
@@ -380,7 +354,7 @@ def test_threads_share_the_events_of_one_goal(scripted: Talk) -> None:
 
 @pytest.mark.parametrize("how", ["killed", "closed"])
 def test_end_of_the_connection_ends_every_thread(scripted: Talk, how: str) -> None:
-    with Client(scripted.socket) as client:
+    with Client(scripted.socket, timeout=0.5) as client:
         handles = [client.say("never-ends words=1", feedback=True) for _ in range(6)]
         scripted.watcher.wait_for_word(handles[0].id)
         scripted.unfinished = True

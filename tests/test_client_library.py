@@ -27,7 +27,7 @@ from talkcli.errors import (
 )
 from talkcli.goals.options import OPTIONS
 from talkcli.goals.states import State
-from talkcli.protocol.lines import MAX_LINE, encode
+from talkcli.protocol.lines import MAX_LINE_BYTES, encode
 from tests.conformance.rawsocket import GREETING, FakeServer
 from tests.support.patched_serve import patched_serve
 from tests.support.processes import Talk
@@ -335,7 +335,7 @@ def test_parts_of_a_list_of_ids_fit_into_a_line() -> None:
         parts = batches(ids)
         assert [one for part in parts for one in part] == ids
         longest = max(len(encode({"request": "cancel", "ids": list(part), "key": "\ud800" * 64})) for part in parts)
-        assert longest < MAX_LINE - 1_000
+        assert longest < MAX_LINE_BYTES - 1_000
 
 
 def test_log_is_what_was_said_oldest_first(client: Client) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from talkcli import Client, State
-from talkcli.client.following import Followed
+from talkcli.client.core import EventListeners
 from talkcli.client.goal import GoalHandle, merged
 from talkcli.errors import Lost, ServerUnavailable
 from talkcli.goals.goal import Goal
@@ -20,7 +20,8 @@ from tests.support.scripted_peer import goal, result
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from talkcli.client.connection import Connection, OnReply
+    from talkcli.client.connection import Connection
+    from talkcli.client.core import OnFailure, OnReply
     from talkcli.goals.goal import JsonObject
     from talkcli.protocol.requests import Request
 
@@ -33,7 +34,7 @@ class Scripted:
         self.pid: int | None = None
         self.listener: int | None = None
         self.changed = threading.Condition()
-        self.followed = Followed()
+        self.listeners = EventListeners()
         self.ended: str | None = None
         self.asked: list[Request] = []
         #: events that the next wait receives
@@ -56,6 +57,11 @@ class Scripted:
                 on_reply(reply, items)
         return reply, items
 
+    def submit(self, request: Request, on_reply: OnReply, on_failure: OnFailure) -> None:  # noqa: ARG002
+        reply, items = self.request(request)
+        with self.changed:
+            on_reply(reply, items)
+
     def post(self, request: Request) -> None:
         self.asked.append(request)
 
@@ -65,7 +71,7 @@ class Scripted:
                 if not self.coming:
                     self.ended = self.ended or "that was all"
                     return False
-                self.followed.hear(self.coming.pop(0))
+                self.listeners.hear(self.coming.pop(0))
         return True
 
     def close(self) -> None:

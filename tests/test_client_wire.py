@@ -14,12 +14,12 @@ import pytest
 
 from talkcli import Client, GoalHandle
 from talkcli.client.connection import SocketConnection
-from talkcli.client.following import MAX_FEEDBACK, MAX_STATES
+from talkcli.client.core import MAX_FEEDBACK_EVENTS, MAX_STATE_EVENTS
 from talkcli.errors import Lost, RequestRefused, ServerUnavailable, UnknownGoal
 from talkcli.goals.states import State
 from talkcli.polling import Interrupted
 from talkcli.protocol.events import Event, PausedChanged, Result, Snapshot, StateChanged, WordHeard
-from talkcli.protocol.lines import MAX_LINE
+from talkcli.protocol.lines import MAX_LINE_BYTES
 from tests.support.connection import PATIENCE
 from tests.support.scripted_peer import OVERVIEW, Peer, goal, result, serving
 
@@ -71,7 +71,7 @@ def test_answer_to_any_other_say_must_come_in_time() -> None:
 
 
 def test_server_that_says_nothing_at_all_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("talkcli.client.connection.SILENCE_LIMIT", 0.3)
+    monkeypatch.setattr("talkcli.client.core.SILENCE_LIMIT_S", 0.3)
     with serving(unanswered) as path, Client.over(SocketConnection(path, patience=5)) as client:
         began = time.monotonic()
         with pytest.raises(Lost, match=r"nothing for 0\.3 s"):
@@ -82,7 +82,7 @@ def test_server_that_says_nothing_at_all_is_given_up(monkeypatch: pytest.MonkeyP
 
 
 def test_watch_goes_on_as_long_as_the_server_is_alive(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("talkcli.client.connection.SILENCE_LIMIT", 0.4)
+    monkeypatch.setattr("talkcli.client.core.SILENCE_LIMIT_S", 0.4)
 
     def play(peer: Peer) -> None:
         peer.reply("watch", **OVERVIEW)
@@ -143,7 +143,7 @@ def test_result_that_came_before_the_server_went_away_counts() -> None:
         peer.hang_up()
         gone.set()
 
-    with serving(play) as path, Client(path) as client:
+    with serving(play) as path, Client(path, timeout=0.3) as client:
         handle = client.say("a")
         assert gone.wait(PATIENCE)
         with pytest.raises(ServerUnavailable):
@@ -160,7 +160,7 @@ def test_goal_of_a_server_that_goes_away_is_lost(how: str) -> None:
         peer.send(peer.state("ACTIVE"), peer.word())
         peer.hang_up()
 
-    with serving(play) as path, Client(path) as client:
+    with serving(play) as path, Client(path, timeout=0.3) as client:
         handle = client.say("a", feedback=True)
         if how == "events":
             *seen, last = handle.events(5)
@@ -181,7 +181,7 @@ def test_malformed_message_ends_the_connection_and_blocks_no_caller(word: dict[s
         peer.accept()
         peer.send({**peer.word(), **word})
 
-    with serving(play) as path, Client(path) as client:
+    with serving(play) as path, Client(path, timeout=0.3) as client:
         goal = client.say("a", feedback=True).wait(5)
         assert goal.state is State.LOST
         assert "what is no message" in str(goal.message)
@@ -191,7 +191,7 @@ def test_reply_without_a_goal_is_no_goal() -> None:
     def play(peer: Peer) -> None:
         peer.reply("say", goal={"id": "g", "state": "BORED"})
 
-    with serving(play) as path, Client(path) as client:
+    with serving(play) as path, Client(path, timeout=0.3) as client:
         with pytest.raises(Lost):
             client.say("a")
         with pytest.raises(ServerUnavailable):
@@ -313,7 +313,7 @@ def test_words_are_not_kept_for_a_goal_that_was_sent_without_feedback() -> None:
 def test_watch_that_is_not_read_is_bounded_and_ends() -> None:
     def play(peer: Peer) -> None:
         peer.reply("watch", **OVERVIEW)
-        for _ in range(MAX_STATES + 500):
+        for _ in range(MAX_STATE_EVENTS + 500):
             peer.send(peer.state("ACTIVE"), peer.word())
         peer.reply("status", **OVERVIEW)
 
@@ -325,9 +325,9 @@ def test_watch_that_is_not_read_is_bounded_and_ends() -> None:
             seen.extend(watch)
         states = [each for each in seen if isinstance(each, StateChanged)]
         assert isinstance(seen[0], Snapshot)
-        assert len(states) == MAX_STATES - 1  # and the snapshot
+        assert len(states) == MAX_STATE_EVENTS - 1  # and the snapshot
         assert [each.n for each in states] == list(range(1, 2 * len(states), 2))  # no gap but that of the words
-        assert 0 < len(seen) - len(states) <= MAX_FEEDBACK + 1
+        assert 0 < len(seen) - len(states) <= MAX_FEEDBACK_EVENTS + 1
 
 
 def test_watch_ends_with_its_iterator() -> None:
@@ -342,7 +342,7 @@ def test_watch_ends_with_its_iterator() -> None:
             break
         client.events()  # not even begun
         client.status()
-        watches = client._connection.followed._watches
+        watches = client._connection.listeners._watches
         assert watches is not None
         assert len(watches) == 0
 
@@ -394,7 +394,7 @@ def test_thousands_of_ids_go_in_lines_that_are_not_too_long() -> None:
                     ended = {"seq": request["seq"], "ended": goal(goal_id=request["ids"][0])}
                     peer.send(ended, {"seq": request["seq"], "ok": False, "error": error})
             assert asked == ids
-        assert MAX_LINE // 2 < peer.longest <= MAX_LINE
+        assert MAX_LINE_BYTES // 2 < peer.longest <= MAX_LINE_BYTES
 
     with serving(play) as path, Client(path) as client:
         handles = client.follow([*ids, ids[0]], feedback=True)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from talkcli.cli.interrupts import Interrupts
-from talkcli.client.connect import Begun, ask, connect, hello, reach, stand_back
+from talkcli.client.connect import ConnectionAttempt, connect, hello, reach, send_early, yield_processor
 from talkcli.errors import EXIT_TIMEOUT, AccessDenied
 from talkcli.frozen import replace
 from talkcli.paths import client_sockets
@@ -29,6 +29,7 @@ from tests.support.surroundings import clean_environment, short_directory
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from talkcli.goals.goal import JsonObject
     from tests.support.processes import Talk
 
 
@@ -128,14 +129,14 @@ def test_the_request_goes_before_the_client_is_imported(scripted: Talk) -> None:
     code = (
         "import sys\n"
         "from talkcli.client import connect\n"
-        "ask = connect.ask\n"
+        "send_early = connect.send_early\n"
         "def spy(*arguments):\n"
-        "    found = ask(*arguments)\n"
-        "    assert found and found.sent\n"
+        "    found = send_early(*arguments)\n"
+        "    assert found and found.request_sent\n"
         "    heavy = {{'click', 'json', 're', 'enum', 'socket', 'typing', 'talkcli.client.client'}}\n"
         "    print(sorted(heavy & {{*sys.modules}}))\n"
         "    return found\n"
-        "connect.ask = spy\n"
+        "connect.send_early = spy\n"
         "from talkcli.cli import run\n"
         "assert run({}) == 0\n"
         "print('click' in sys.modules)\n"
@@ -150,12 +151,12 @@ def test_a_client_that_waits_imports_nothing_until_the_server_has_had_its_time(s
     code = (
         "import sys\n"
         "from talkcli.client import connect\n"
-        "stand_back = connect.stand_back\n"
-        "def spy(*begun):\n"
-        "    found = stand_back(*begun)\n"
+        "yield_processor = connect.yield_processor\n"
+        "def spy(*attempt):\n"
+        "    found = yield_processor(*attempt)\n"
         "    print('stood back', {{'json', 'talkcli.client.client'}} & {{*sys.modules}})\n"
         "    return found\n"
-        "connect.stand_back = spy\n"
+        "connect.yield_processor = spy\n"
         "from talkcli.cli import run\n"
         "assert run({}) == 0\n"
     )
@@ -171,24 +172,24 @@ def test_a_client_that_waits_imports_nothing_until_the_server_has_had_its_time(s
 
 def test_a_client_stands_back_for_as_long_as_it_has_worked_and_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     ours, theirs = socket.socketpair()
-    begun = Begun(ours, "s", greeted=True, received=b"greeting\n", sent=b"request\n")
+    attempt = ConnectionAttempt(ours, "s", hello_sent=True, received=b"greeting\n", request_sent=b"request\n")
     with ours, theirs:
         theirs.sendall(b"reply\n")
         monkeypatch.setattr("talkcli.client.connect.time.process_time", lambda: 0.1)
         began = time.monotonic()
-        found = stand_back(begun, None)
+        found = yield_processor(attempt, None)
         assert time.monotonic() - began >= 0.1
-        assert found == replace(begun, received=b"greeting\nreply\n")
+        assert found == replace(attempt, received=b"greeting\nreply\n")
         monkeypatch.setattr("talkcli.client.connect.time.process_time", lambda: PATIENCE)
-        monkeypatch.setattr("talkcli.client.connect._BACK", PATIENCE)
+        monkeypatch.setattr("talkcli.client.connect._LONGEST_YIELD_S", PATIENCE)
         began = time.monotonic()
-        assert stand_back(found, 0.05) == found  # its own limit comes first
+        assert yield_processor(found, 0.05) == found  # its own limit comes first
         for refused in (b'{"seq": 1, "ok": false}\n', b'{"goal": {"state": "REJECTED"}}\n'):
             theirs.sendall(refused)
-            assert stand_back(found, None).received.endswith(refused)  # there is nothing to wait for
+            assert yield_processor(found, None).received.endswith(refused)  # there is nothing to wait for
         theirs.sendall(b"event\n")
         theirs.close()
-        assert stand_back(found, None).received.endswith(b"reply\nevent\n")  # nor is there when the server is gone
+        assert yield_processor(found, None).received.endswith(b"reply\nevent\n")  # nor is there when the server is gone
         assert time.monotonic() - began < PATIENCE
         assert (os.get_blocking(ours.fileno()), ours.recv(1)) == (False, b"")
 
@@ -235,7 +236,7 @@ def test_a_server_whose_backlog_is_full_is_not_passed_over_for_the_next_place() 
             assert first in client_sockets(None)
             assert second in client_sockets(None)
             found = reach(None)
-            assert (found.socket, found.full, found.failures[-1][0]) == (None, True, first)
+            assert (found.socket, found.backlog_full, found.failures[-1][0]) == (None, True, first)
         listening.setblocking(False)
         with pytest.raises(BlockingIOError):  # no client came to the second place
             listening.accept()
@@ -253,8 +254,9 @@ def test_a_server_that_refuses_this_client_is_passed_over_for_the_next_place(ear
                     connected.sendall(greeting)
                     heard.append(connected.recv(65536))
 
-    def begun() -> Begun | None:
-        return ask(reach(None), hello(None, urgent=False), {"request": "status"}, lambda: None) if early else None
+    def attempt() -> ConnectionAttempt | None:
+        first: JsonObject = {"request": "status"}
+        return send_early(reach(None), hello(None, urgent=False), first, lambda: None) if early else None
 
     refusal = b'{"talk": 1, "error": "permission_denied", "message": "not you"}\n'
     with short_directory() as directory, contextlib.ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
@@ -266,13 +268,13 @@ def test_a_server_that_refuses_this_client_is_passed_over_for_the_next_place(ear
             thread.start()
             stack.callback(thread.join, PATIENCE)
             stack.callback(listening.shutdown, socket.SHUT_RDWR)
-        line = connect(None, hello(None, urgent=False), begun=begun())
-        assert (line.path, line.sent) == (second, b"")
+        line = connect(None, hello(None, urgent=False), attempt=attempt())
+        assert (line.path, line.request_sent) == (second, b"")
         assert line.socket
         line.socket.close()
         os.unlink(second)
         with pytest.raises(AccessDenied, match=f"(?s)tried:\n  {first}: the server refuses: not you\n"):
-            connect(None, hello(None, urgent=False), begun=begun())
+            connect(None, hello(None, urgent=False), attempt=attempt())
     assert set(heard) == {b'{"request": "hello"}\n'}, "what was asked is for the server that takes it"
 
 

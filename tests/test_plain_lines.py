@@ -18,7 +18,7 @@ from talkcli.cli.command import COMMON_OPTIONS
 from talkcli.cli.commands import COMMANDS
 from talkcli.cli.show import CommonOptions
 from talkcli.client.client import check, too_long
-from talkcli.client.connect import GREETING
+from talkcli.client.connect import GREETING_START
 from talkcli.goals.option import FLAG
 from talkcli.goals.options import Cancel, Say
 from talkcli.protocol import events
@@ -222,8 +222,8 @@ def test_a_request_that_the_library_may_change_or_refuse_is_not_sent_early(line:
 
 
 def test_the_expected_greeting_is_the_server_s() -> None:
-    assert encode(events.greeting("0.1.0", 1, "4k7f")).startswith(GREETING)
-    assert not encode(events.busy_greeting()).startswith(GREETING)
+    assert encode(events.greeting("0.1.0", 1, "4k7f")).startswith(GREETING_START)
+    assert not encode(events.busy_greeting()).startswith(GREETING_START)
 
 
 def test_the_comparison_is_with_click() -> None:

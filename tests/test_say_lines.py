@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.client.connection import SILENCE_LIMIT
+from talkcli.client.core import SILENCE_LIMIT_S
 from tests.conformance.bareserve import TALK, environment
 from tests.support.forking import Forked
 from tests.support.surroundings import short_directory
@@ -220,7 +220,7 @@ def test_a_line_that_comes_long_after_the_last_goal_ended_is_spoken(scripted: Ta
     typing = Typing(scripted, "say", "--lines")
     typing.type("length=0 one\n")
     scripted.watcher.wait_for(typing.line(), "SUCCEEDED")
-    time.sleep(SILENCE_LIMIT + 1)  # the server needn't show that it is alive
+    time.sleep(SILENCE_LIMIT_S + 1)  # the server needn't show that it is alive
     typing.type("length=0 two\n")
     scripted.watcher.wait_for(typing.line(), "SUCCEEDED")
     assert typing.end()[0] == 0

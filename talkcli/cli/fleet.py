@@ -9,7 +9,7 @@ from talkcli import paths
 from talkcli.cli import units
 from talkcli.cli.command import nearest
 from talkcli.cli.show import note, screen, show, show_result
-from talkcli.client.connect import ANSWER_LIMIT
+from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.errors import EXIT_SIGPIPE, ServerUnavailable, UsageError
 from talkcli.fleet import topics
 from talkcli.fleet.bridge.policy import ASKABLE
@@ -87,7 +87,7 @@ def _show_robots(options: CommonOptions, broker: Broker, selection: Selection | 
     """Show the state of each robot."""
     from talkcli.fleet.desk.watch import read_standings
 
-    found = read_standings(broker, ANSWER_LIMIT, selection.name if selection else None)
+    found = read_standings(broker, ANSWER_LIMIT_S, selection.name if selection else None)
     selected = [each for _, each in sorted(found.items()) if selection is None or selection.includes(each.presence)]
     if not selected:
         raise _no_robot(broker, selection)

@@ -15,7 +15,7 @@ import time
 
 from talkcli.cli.command import COMMON_OPTIONS, OUTPUT_FILE, read_value
 from talkcli.cli.commands import COMMANDS
-from talkcli.client.connect import ask, hello, reach, sender, stand_back
+from talkcli.client.connect import hello, reach, send_early, sender_name, yield_processor
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.option import FLAG, MAX_ID, MAX_NAME
 from talkcli.goals.options import MAX_CHARACTERS, Cancel, Say, bad_key
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from talkcli.cli.command import Command
-    from talkcli.client.connect import Begun
+    from talkcli.client.connect import ConnectionAttempt
     from talkcli.goals.goal import JsonObject
     from talkcli.goals.option import Option
 
@@ -135,8 +135,8 @@ def run(plain: PlainCommand) -> int:
 
     try:
         early = _connect_early(plain, block_signals) if may_send_early(plain) else None
-        if early and early.sent and given.get("wait") and not given.get("feedback"):
-            early = stand_back(early, given["timeout"])
+        if early and early.request_sent and given.get("wait") and not given.get("feedback"):
+            early = yield_processor(early, given["timeout"])
     except KeyboardInterrupt:
         return 128 + int(_signal.SIGINT)  # nothing was sent
     from talkcli.cli.show import CommonOptions, run_command
@@ -157,7 +157,7 @@ def may_send_early(plain: PlainCommand) -> bool:
     return plain.command.name in _EARLY_COMMANDS and not plain.given.get("lines") and plain.given.get("text") != ("-",)
 
 
-def _connect_early(plain: PlainCommand, before_sending: Callable[[], None]) -> Begun | None:
+def _connect_early(plain: PlainCommand, before_sending: Callable[[], None]) -> ConnectionAttempt | None:
     """Connect to the server and send the request, but don't wait for a slow server.
 
     Returns:
@@ -168,12 +168,12 @@ def _connect_early(plain: PlainCommand, before_sending: Callable[[], None]) -> B
         return early
     # The messages are made after connecting, because the server sends its greeting in the meantime.
     messages = early_messages(plain)
-    return ask(early, *messages, before_sending) if messages else early
+    return send_early(early, *messages, before_sending) if messages else early
 
 
 def early_messages(plain: PlainCommand) -> tuple[JsonObject, JsonObject] | None:
     """Return the hello and the request of a command; None if the request may be refused or needs the library."""
-    command, name = plain.command, sender(plain.given.get("name"))
+    command, name = plain.command, sender_name(plain.given.get("name"))
     request = _request(command.name, plain.given)
     if request is None or len(name or "") > MAX_NAME:
         return None

@@ -91,7 +91,7 @@ def _say(
     with Interrupts(blocked=options.blocked_signals, output=wait) as interrupts:
         try:
             with options.connect(timeout, name=name, interrupt=interrupts.watched) as client:
-                if interrupts.signal_number is not None and not (options.early and options.early.sent):
+                if interrupts.signal_number is not None and not (options.early and options.early.request_sent):
                     raise Interrupted  # a goal that was already sent is cancelled below, when its id is known
                 goal = client.say(text, follow=wait, feedback=feedback, **goal_options)
                 reporter = GoalReporter(options, feedback=feedback)

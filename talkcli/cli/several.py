@@ -23,7 +23,7 @@ from talkcli.cli.show import (
     show_json,
 )
 from talkcli.cli.wait import CANCEL_TIMEOUT_S, seconds_left, timeout_error
-from talkcli.client.connect import ANSWER_LIMIT
+from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.errors import EXIT_DIFFER, EXIT_OK, EXIT_TIMEOUT, TalkError, UsageError
 from talkcli.goals.options import Cancel, Say, Set
 from talkcli.polling import Interrupted
@@ -120,7 +120,7 @@ def _ask(options: CommonOptions, request: Request, timeout: float | None = None,
         from talkcli.fleet.desk.several import FleetRequest
 
         selection = Selection(paths.named_robot(options.robot, options.socket) or "")
-        patience = min(ANSWER_LIMIT, timeout or ANSWER_LIMIT)
+        patience = min(ANSWER_LIMIT_S, timeout or ANSWER_LIMIT_S)
         with FleetRequest(
             broker, selection, request, name=name, interrupt=interrupts.watched, patience=patience
         ) as asked:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from typing import Any, TextIO, TypeVar
 
     from talkcli.client.client import Client
-    from talkcli.client.connect import Begun
+    from talkcli.client.connect import ConnectionAttempt
     from talkcli.client.connection import Connection
     from talkcli.fleet.broker import Broker
     from talkcli.goals.goal import Goal, JsonObject
@@ -52,7 +52,7 @@ class CommonOptions:
     quiet = False
     connect_timeout: float | None = None
     #: the connection that `plain` has made early; its request may have been sent
-    early: Begun | None = None
+    early: ConnectionAttempt | None = None
     #: signals that stay blocked until the command can handle them
     blocked_signals: Iterable[int] = ()
     #: the names of the options on the command line
@@ -80,10 +80,10 @@ class CommonOptions:
             TimeoutError: `timeout` ended before a server was found. Only raised with `connect_timeout`.
         """
         from talkcli.client.client import Client
-        from talkcli.client.connect import ANSWER_LIMIT
+        from talkcli.client.connect import ANSWER_LIMIT_S
 
         began, end = time.monotonic(), self.deadline(timeout)
-        options = {"patience": min(ANSWER_LIMIT, timeout or ANSWER_LIMIT), "end": end, **options}
+        options = {"patience": min(ANSWER_LIMIT_S, timeout or ANSWER_LIMIT_S), "end": end, **options}
         connect_timeout, self.connect_timeout = self.connect_timeout, None
         if connect_timeout is None:
             return Client.over(self._connection(**options))
@@ -111,7 +111,7 @@ class CommonOptions:
         if not robot:
             from talkcli.client.connection import SocketConnection
 
-            return SocketConnection(self.socket, begun=self.early, **{"urgent": self.urgent, **options})
+            return SocketConnection(self.socket, attempt=self.early, **{"urgent": self.urgent, **options})
         broker = self.broker()
         from talkcli.fleet.desk.robot import connect_robot
 

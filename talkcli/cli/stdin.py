@@ -26,7 +26,7 @@ from talkcli.cli.show import (
     write_error_line,
 )
 from talkcli.cli.wait import CANCEL_TIMEOUT_S, GoalReporter, seconds_left, timeout_error
-from talkcli.client.connection import BaseConnection
+from talkcli.client.connection import BlockingConnection
 from talkcli.errors import EXIT_OK, ServerUnavailable, TalkError, TimedOut, UnknownGoal, UsageError
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.goal import Goal
@@ -35,7 +35,7 @@ from talkcli.goals.options import MAX_BYTES, MAX_CHARACTERS, Say
 from talkcli.goals.states import State
 from talkcli.polling import Interrupted, wait_ready
 from talkcli.protocol.events import Canceled, Result, unfinished
-from talkcli.protocol.lines import Cut, LineSplitter
+from talkcli.protocol.lines import LineSplitter, TruncatedLine
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
     from talkcli.cli.show import CommonOptions
     from talkcli.client.client import Client, GoalHandle
-    from talkcli.client.connection import Exchange
+    from talkcli.client.core import Exchange
     from talkcli.goals.goal import JsonObject
 
     _T = TypeVar("_T")
@@ -145,9 +145,9 @@ class LineBuffer:
             now, data = self._chunks.popleft()
             self.size -= len(data)
             end = now + self._ttl if self._ttl else None
-            for line in self._splitter.feed(data) if data else [self._splitter.end()]:
+            for line in self._splitter.feed(data) if data else [self._splitter.take_rest()]:
                 self._number += 1
-                text, excess = _decode(line), line.size if isinstance(line, Cut) else 0
+                text, excess = _decode(line), line.size if isinstance(line, TruncatedLine) else 0
                 if excess or text.strip():
                     self._lines.append(InputLine(self._number, text, excess, end))
         return self._lines[0] if self._lines else None
@@ -225,7 +225,7 @@ class _LineSpeaker:
         reporter: GoalReporter,
         max_pending: int,
     ) -> None:
-        assert isinstance(client._connection, BaseConnection)
+        assert isinstance(client._connection, BlockingConnection)
         self._client, self._connection = client, client._connection
         self._interrupts = interrupts
         self._options = options
@@ -405,7 +405,7 @@ class _LineSpeaker:
                 return True
             if not self._wait and any(each.state.terminal for _, each in self._goals):
                 return True  # the server sends no signs of life if it has no goal
-            return self._full != was_full or (self._wait and bool(self._goals) and self._goals[0][1]._has_next())
+            return self._full != was_full or (self._wait and bool(self._goals) and self._goals[0][1]._has_event())
 
         wait = partial(self._connection.wait_until, has_news, since=self._expected_since)
         if self._wants_input:

@@ -1,4 +1,4 @@
-"""The client library: send goals, follow them, cancel them, from Python.
+"""The client library: send goals, follow them, and cancel them, from Python.
 
     with Client(name="patrol") as talk:
         goal = talk.say("battery low")
@@ -6,62 +6,84 @@
         if goal.wait(timeout=10).state is not State.SUCCEEDED:
             print(goal.goal.message)
 
-It imports neither click nor asyncio nor pyttsx3, starts no thread, and may be used from several. Errors are classes of
-`talkcli.errors.TalkError`.
+It starts no thread, and may be used from several. It imports neither click nor asyncio nor pyttsx3. Errors are
+subclasses of `talkcli.errors.TalkError`.
 """
 
 from __future__ import annotations
 
-from talkcli.client.connection import SocketConnection, taken
-from talkcli.client.following import MAX_STATES, EventBuffer
+import os
+import time
+
+from talkcli.client.connect import ANSWER_LIMIT_S
+from talkcli.client.connection import ReconnectingConnection, taken
+from talkcli.client.core import EventBuffer
 from talkcli.client.goal import GoalHandle
 from talkcli.errors import Lost, UnknownGoal, UsageError
-from talkcli.frozen import TYPE_CHECKING
+from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.goal import Goal
 from talkcli.goals.option import MAX_ID, MAX_IDS, MAX_LOG
 from talkcli.goals.options import Cancel, Say, Set, bad_key, bad_option
 from talkcli.goals.states import State
 from talkcli.protocol.events import Canceled, ServerStatus, Snapshot, goal_in, goals
-from talkcli.protocol.lines import MAX_LINE, request_line, write_request
+from talkcli.protocol.lines import MAX_LINE_BYTES, request_line, write_request
 from talkcli.protocol.requests import Log, Pause, Resume, Status, Voices, Wait, Watch
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from talkcli.client.connection import Connection, OnReply
+    from talkcli.client.connection import Connection
+    from talkcli.client.core import OnReply
     from talkcli.goals.goal import JsonObject
     from talkcli.protocol.events import Event
 
 __all__ = ["Client", "GoalHandle"]
 
-#: Bytes of a request's line that are left for what isn't its list of ids: another id, a key, the names of the fields.
-_REST_OF_LINE = 4096
-#: Bytes of JSON that one character may take: a quote with its backslash, two halves of a surrogate pair, escaped.
-_LONGEST_ASCII, _LONGEST_CHARACTER = 2, 12
-#: The number of a request has no more digits than this.
+#: Bytes of a request's line that are left for everything except its list of ids: another id, a key, the field names.
+_REST_OF_LINE_BYTES = 4096
+#: Bytes of JSON that one character may take: a quote with its backslash, or an escaped surrogate pair.
+_LONGEST_ASCII_BYTES, _LONGEST_CHARACTER_BYTES = 2, 12
+#: The longest number that a request is given.
 _LONGEST_NUMBER = 10**15
 
 
 class Client:
-    """A connection to a talk server; the socket is found as the command `talk` finds it."""
+    """A connection to a talk server, which is found as the command `talk` finds it.
 
-    def __init__(self, socket: str | None = None, *, name: str | None = None) -> None:
+    After a break, for example because the server was restarted, the next call connects again. Goals go on being
+    followed if the server is still the same process, else they are LOST. Attempts are at most half a second apart, and
+    a call between two attempts raises ServerUnavailable at once; `cancel` always tries.
+    """
+
+    def __init__(self, socket: str | None = None, *, name: str | None = None, timeout: float = ANSWER_LIMIT_S) -> None:
         """Connect.
 
-        `socket`: path of the server's socket, default TALK_SOCKET, then the usual places; `name`: what this sender
-        calls itself in `talk status` and the log, default TALK_NAME.
+        Args:
+            socket: path of the server's socket. The default is TALK_SOCKET, then the usual places.
+            name: what this sender calls itself in `talk status` and the log, up to 64 characters. The default is
+                TALK_NAME.
+            timeout: seconds in which the server must be reached, and must answer each request.
 
-        UsageError for a name that is too long; ServerUnavailable, AccessDenied, Busy or ProtocolMismatch where there is
-        no server to be had: nothing was sent then.
+        Raises:
+            UsageError: the name is too long, or the timeout is not positive.
+            ServerUnavailable, AccessDenied, Busy, ProtocolMismatch: there is no server that can be used.
         """
-        self._connection: Connection = SocketConnection(socket, name=name)
+        if not timeout > 0:
+            raise UsageError(f"the timeout is {timeout!r}: it must be more than 0 seconds")
+        connection: Connection = ReconnectingConnection(socket, name=name, patience=timeout)
+        self._use(connection)
 
     @classmethod
     def over(cls, connection: Connection) -> Client:
-        """Return a client on a connection that there is already. Internal: for `talk`'s own commands, no promise."""
+        """Return a client that uses an existing connection. Internal: for `talk`'s own commands."""
         client = cls.__new__(cls)
-        client._connection = connection
+        client._use(connection)
         return client
+
+    def _use(self, connection: Connection) -> None:
+        self._connection = connection
+        #: of the server that was reached first: a bare number means one of its goals
+        self._first_boot = connection.boot
 
     @property
     def path(self) -> str:
@@ -70,10 +92,11 @@ class Client:
 
     @property
     def server_pid(self) -> int | None:
+        """The server's process id, as the server says."""
         return self._connection.pid
 
     def close(self) -> None:
-        """Close the connection. What was sent is spoken all the same."""
+        """Close the connection. Goals that were sent are still spoken."""
         self._connection.close()
 
     def __enter__(self) -> Client:
@@ -104,29 +127,47 @@ class Client:
         follow: bool = True,
         feedback: bool = False,
         patient: bool = False,
+        block: bool = True,
     ) -> GoalHandle:
-        """Send a goal, and return it as it was accepted, or REJECTED with the reason.
+        """Send a goal, and return its handle after the server has accepted it, or REJECTED it with a reason.
 
-        `preempt`: stop what is being spoken and go first, None leaves that to the server; `flush`: that, and recall
-        all that is pending of the same or a lower priority; `priority`: higher goes first; `ttl`: seconds in which it
-        must have begun, else it is RECALLED, 0 for no limit, None leaves that to the server; `key`: 1 to 64 characters,
-        replaces the pending goal with the same key; `throttle`: REJECTED where a goal of that key, or else of that
-        text, began less than so many seconds ago; `id`: 1 to 64 of A-Z a-z 0-9 . _ : / - of the sender's choice: said
-        again with the same id it is not spoken twice, the handle is `attached` to the first.
+        Args:
+            text: the sentence, up to 10,000 characters.
+            preempt: stop what is being spoken, and go first. None leaves that to the server's settings.
+            flush: as `preempt`, and also recall all pending goals of the same or a lower priority.
+            priority: goals with a higher priority go first.
+            ttl: seconds in which the goal must begin, or it is RECALLED; 0 for no limit, None for the server's setting.
+            key: a label of 1 to 64 characters. The goal replaces the pending goal with the same key.
+            throttle: REJECT the goal if one with the same key, or else with the same text, began less than this many
+                seconds ago.
+            id: the sender's own id, 1 to 64 of A-Z a-z 0-9 . _ : / -. A text that is sent twice with the same id is
+                spoken once, and the second handle is `attached` to the first goal.
+            rate: 80 to 450 words per minute. None means the server's setting, as for the next three.
+            volume: 0 to 1.
+            voice: id, name or language of a voice.
+            pitch: 0 to 100.
+            voice_only: wait until a neural voice is loaded, and be ABORTED with `voice_failed` if it can't be loaded.
+                Otherwise espeak may speak instead.
+            lead_in: 0 to 5,000 milliseconds of silence before the goal, even if the output was not idle. None means the
+                server's, if the output was idle.
+            audible: abort the goal with `muted` if its output is muted. None leaves that to the server.
+            data: an object of at most 1 KiB of JSON that travels with the goal.
+            follow: have the server send this client the goal's states and result.
+            feedback: and each word as it is heard, for `GoalHandle.feedback` and `events`.
+            patient: if the queue is full, wait until there is room, for any time.
+            block: wait for the server's answer. If False, the call returns at once, and so do `poll` and
+                `request_cancel` of the handle. The client then chooses the id. What the server doesn't take at once,
+                at most 256 KiB, is sent by later calls. The goal ends as REJECTED with the reason `not_sent` if it
+                could not be sent, and as LOST if it was sent but the connection broke or no answer came within the
+                client's timeout.
 
-        `rate`: 80 to 450 words per minute; `volume`: 0 to 1; `voice`: id, name or language; `pitch`: 0 to 100; None is
-        the server's setting when it starts. `voice_only`: wait until a neural voice is loaded, and be ABORTED,
-        `voice_failed`, where it can't be; else espeak may speak in its place. `lead_in`: 0 to 5,000 milliseconds of
-        silence before it, also where the output was not idle; None is the server's, where it was. `audible`: whether it
-        is ABORTED, `muted`, where its output is muted; None leaves that to the server. `data`: an object of at most 1
-        KiB that travels with the goal.
-
-        `follow`: have this connection told how it ends; `feedback`: and each word as it is heard, for
-        `GoalHandle.feedback` and `events`; `patient`: where the queue is full, wait until there is room, any time.
-
-        UsageError for a value out of its range, ServerUnavailable where the server is gone: nothing was sent then.
-        Lost where it was sent and not answered: it may be spoken. Interrupted only while a patient one waits for room:
-        close the client then, and it is not spoken once the server has seen that, within 5 s.
+        Raises:
+            UsageError: a value is out of its range. Nothing was sent.
+            ServerUnavailable: the server can't be reached; nothing was sent. Without `block` only if the client is
+                closed.
+            Lost: the goal was sent, but no answer came. It may be spoken.
+            Interrupted: only while a patient goal waits for room. Close the client, and the goal is not spoken after
+                the server has noticed, which takes up to 5 s.
         """
         request = Say(
             text,
@@ -149,15 +190,27 @@ class Client:
             audible=audible,
             data=data,
         )
+        if not block and id is None:
+            request = replace(request, id=f"talk:{os.urandom(8).hex()}")
         handle, accepted = self._handle(request)
-        if not handle.state.terminal:
+        if handle.state.terminal:
+            return handle
+        if block:
             self._connection.request(request, accepted, slow=patient)
+        else:
+            handle._expect(request, time.monotonic())
+            self._connection.submit(request, accepted, handle._fail)
         return handle
 
     def follow(self, ids: Iterable[str] | None = None, *, feedback: bool = False) -> list[GoalHandle]:
-        """Return handles for these goals, whoever sent them, to wait for; None: for all that have not ended.
+        """Return handles of goals, whoever sent them.
 
-        `feedback`: have this connection told each of their words, too. UnknownGoal if the server doesn't know one.
+        Args:
+            ids: the goals' ids; None for all goals that have not ended.
+            feedback: have the server send each of their words, too.
+
+        Raises:
+            UnknownGoal: the server doesn't know one of them.
         """
         wanted = None if ids is None else [self._full_id(each) for each in ids]
         handles: dict[str, GoalHandle] = {}
@@ -179,11 +232,16 @@ class Client:
         before: str | None = None,
         key: str | None = None,
     ) -> Canceled:
-        """Cancel the goals that are selected, or everything where no selector is given; return once it is silent.
+        """Cancel the selected goals, or everything if nothing is selected. Return once they are silent.
 
-        `ids`: these goals; an empty list selects none; `current`: the goal being spoken; `before`: this goal and all
-        accepted before it; `key`: goals with this key, pending or active. UnknownGoal if an id is not known: the
-        others are cancelled all the same, and are in the error's `items`.
+        Args:
+            ids: these goals; an empty list selects none.
+            current: the goal that is being spoken.
+            before: this goal, and all that were accepted before it.
+            key: the goals with this key, pending or active.
+
+        Raises:
+            UnknownGoal: an id is not known. The other goals are cancelled all the same, and are in the error's `items`.
         """
         wanted = None if ids is None else [self._full_id(each) for each in ids]
         first, *others = [None] if wanted is None else batches(wanted) or [()]
@@ -204,7 +262,7 @@ class Client:
         return Canceled.from_items(items)
 
     def status(self) -> ServerStatus:
-        """Return what the server is saying, will say and said."""
+        """Return the server's description, and its active, pending and recent goals."""
         return ServerStatus.from_reply(*self._connection.request(Status()))
 
     def goal(self, goal_id: str) -> Goal:
@@ -213,7 +271,7 @@ class Client:
         return Goal.from_json(reply.get("goal"))
 
     def log(self, count: int = 20) -> list[Goal]:
-        """Return the last `count` goals that ended, REJECTED ones too, oldest first; at most 2,200 are kept."""
+        """Return the last `count` goals that ended, including REJECTED ones, oldest first. At most 2,200 are kept."""
         if not 0 < count <= MAX_LOG:
             raise UsageError(f"a log has 1 to {MAX_LOG} goals, not {count}")
         _, items = self._connection.request(Log(count))
@@ -222,16 +280,16 @@ class Client:
     def voices(self) -> list[JsonObject]:
         """Return the voices of the server's engine: objects with id, language, name, quality and speakers.
 
-        The last two are a neural voice's: None, or how good its maker calls it, "medium"; and None, or what each of its
-        speakers is called, by number.
+        Only neural voices have the last two. `quality` is what the voice's maker calls it, for example "medium".
+        `speakers` lists the names of the speakers, by number, if there are several. Both may be None.
         """
         _, items = self._connection.request(Voices())
         return [each["voice"] for each in items if isinstance(each.get("voice"), dict)]  # type: ignore[misc]
 
     def settings(self) -> JsonObject:
-        """Return what goals are spoken with that say nothing else: rate, volume, voice, pitch, preempt, ttl.
+        """Return the settings for goals that don't bring their own: rate, volume, voice, pitch, preempt and ttl.
 
-        Units are those of `say`; a voice of None is the driver's own, a ttl of None is no limit.
+        The units are those of `say`. A voice of None is the driver's own, a ttl of None means no limit.
         """
         return self.set()
 
@@ -244,11 +302,14 @@ class Client:
         preempt: bool | None = None,
         ttl: float | None = None,
     ) -> JsonObject:
-        """Change the running server's settings, for goals that have not begun, and return all of them as they are now.
+        """Change the running server's settings for goals that have not begun, and return all of them.
 
-        Those not given stay. `voice`: "default" for the driver's own; `ttl`: 0 for no limit; the others as in `say`.
-        UsageError for a value out of its range; BadOption for one that this server doesn't take, such as a voice that
-        its engine doesn't have.
+        Settings that are not given stay. The values are those of `say`; besides, the voice "default" is the driver's
+        own, and a ttl of 0 means no limit.
+
+        Raises:
+            UsageError: a value is out of its range.
+            BadOption: this server doesn't take a value, for example because its engine doesn't have the voice.
         """
         request = Set(rate, volume, voice, pitch, preempt, ttl)
         check(request)
@@ -257,29 +318,36 @@ class Client:
         return settings if isinstance(settings, dict) else {}
 
     def pause(self) -> Goal | None:
-        """Hold speech where it is; return once it is silent. The goal that is held, if one was being spoken.
+        """Pause speech, and return once it is silent: the paused goal, or None if none was being spoken.
 
         Nothing is spoken until `resume`, whoever sends it. Pausing twice is no error.
         """
         return goal_in(self._connection.request(Pause(), slow=True)[0])
 
     def resume(self) -> Goal | None:
-        """Go on where speech was held. The goal that goes on, if one was held. Resuming twice is no error."""
+        """Resume speech: return the goal that goes on, or None if none was paused. Resuming twice is no error."""
         return goal_in(self._connection.request(Resume())[0])
 
-    def events(self) -> Iterator[Event]:
-        """Iterate over everything that happens to any goal from now on: first a Snapshot, then StateChanged, with the
-        whole goal where it begins and ends, WordHeard and PausedChanged. It has no end but Lost, when the server goes
-        away; break off whenever you like.
+    def events(self, *, reconnect: bool = False) -> Iterator[Event]:
+        """Iterate over everything that happens to any goal from now on.
 
-        Words that nobody takes in time are dropped, the oldest first (`n` has gaps then). States are not: where 10,000
-        wait, because other threads use this client and none takes these, it ends with Lost, too.
+        The first event is a Snapshot. StateChanged follows for each state, with the whole goal when it begins and ends;
+        WordHeard; and PausedChanged. Stop iterating whenever you like.
+
+        Words that nobody takes in time are dropped, the oldest first; `n` has gaps then. States are never dropped. They
+        pile up if other threads use this client and nobody takes them.
+
+        Args:
+            reconnect: go on after a break of the connection, with another Snapshot.
+
+        Raises:
+            Lost: the connection broke, without `reconnect`, or 10,000 states waited to be taken.
         """
-        buffer = EventBuffer()
+        buffer = EventBuffer(reconnects=reconnect)
 
         def accepted(reply: JsonObject, items: list[JsonObject]) -> None:
             buffer.add(Snapshot(ServerStatus.from_reply(reply, items)))
-            self._connection.followed.watch(buffer)
+            self._connection.listeners.watch(buffer)
 
         self._connection.request(Watch(), accepted)
         return self._take_all(buffer)
@@ -287,41 +355,41 @@ class Client:
     # -- inside
 
     def _handle(self, request: Say) -> tuple[GoalHandle, OnReply]:
-        """Return a handle for a goal that has not been sent, and the function that takes in the server's answer.
+        """Return a handle of a goal that is still to be sent, and the function to be called with the server's reply.
 
-        The handle is REJECTED if the text is too long to be sent. UsageError for a value out of its range.
+        The handle is REJECTED if the text is too long to be sent.
+
+        Raises:
+            UsageError: a value is out of its range.
         """
         check(request)
         handle = GoalHandle(self._connection, too_long(request) or Goal("", State.PENDING))
 
         def accepted(reply: JsonObject, _: list[JsonObject]) -> None:
-            handle.goal = Goal.from_json(reply.get("goal"))
-            handle.attached = reply.get("attached") is True
-            handle.speech_paused = reply.get("paused") is True
+            handle._accept(reply)
             if request.wait:
                 handle._listen(feedback=request.feedback)
 
         return handle, accepted
 
     def _full_id(self, goal_id: str) -> str:
-        """Return the whole id for a number alone, which means a goal of this server; what `check_id` raises."""
+        """Return the whole id for a bare number, and any other id as it is; errors are those of `check_id`."""
         if goal_id.isascii() and goal_id.isdecimal():
-            goal_id = f"{self._connection.boot}-{goal_id}"
+            goal_id = f"{self._first_boot}-{goal_id}"
         check_id(goal_id)
         return goal_id
 
     def _take_all(self, buffer: EventBuffer) -> Iterator[Event]:
-        for event in taken(self._connection, lambda: buffer.take() or buffer.overrun, None):
-            if isinstance(event, bool):
+        for event in taken(self._connection, lambda: buffer.take() or buffer.closed, None):
+            if event is None or isinstance(event, str):
                 break
             yield event
-        if buffer.overrun:
-            raise Lost(f"more than {MAX_STATES} events waited and none was taken: watch again, and take them faster")
-        raise Lost(f"nothing more is heard of the server at {self.path}: {self._connection.ended}")
+        why = f"nothing more is heard of the server at {self.path}: {self._connection.ended}"
+        raise Lost(buffer.closed or why)
 
 
 def check_id(goal_id: str) -> None:
-    """UsageError for an empty id, UnknownGoal for one that no goal can have."""
+    """Raise UsageError for an empty id, and UnknownGoal for one that no goal can have."""
     if not goal_id:
         raise UsageError("an id is empty: is the variable set that it comes from?")
     if len(goal_id) > MAX_ID:
@@ -329,22 +397,22 @@ def check_id(goal_id: str) -> None:
 
 
 def batches(ids: Iterable[str]) -> list[tuple[str, ...]]:
-    """Return the ids in their order, each once, in parts that each fit into a request's line."""
-    parts: list[list[str]] = []
+    """Return the ids in their order, each once, in groups that each fit into the line of a request."""
+    groups: list[list[str]] = []
     room = 0
     for each in dict.fromkeys(ids):
         plain = each.isascii() and each.isprintable()
-        size = (_LONGEST_ASCII if plain else _LONGEST_CHARACTER) * len(each) + len('"", ')
-        if not parts or size > room or len(parts[-1]) == MAX_IDS:
-            parts.append([])
-            room = MAX_LINE - _REST_OF_LINE
+        size = (_LONGEST_ASCII_BYTES if plain else _LONGEST_CHARACTER_BYTES) * len(each) + len('"", ')
+        if not groups or size > room or len(groups[-1]) == MAX_IDS:
+            groups.append([])
+            room = MAX_LINE_BYTES - _REST_OF_LINE_BYTES
         room -= size
-        parts[-1].append(each)
-    return [tuple(each) for each in parts]
+        groups[-1].append(each)
+    return [tuple(each) for each in groups]
 
 
 def check(request: Say | Set) -> None:
-    """Raise UsageError for options of the wrong kind, or out of their range: as the server would, without asking it."""
+    """Raise UsageError for options of the wrong type or out of their range, as the server would."""
     for option in request.options:
         try:
             fault = option.fault(getattr(request, option.name))
@@ -357,12 +425,14 @@ def check(request: Say | Set) -> None:
 
 
 def too_long(request: Say) -> Goal | None:
-    """Return the goal that the server would have made of a text that doesn't fit into a request, None if it fits."""
+    """Return the REJECTED goal for a text that doesn't fit into a request; None if it fits."""
     try:
         line = request_line({"seq": _LONGEST_NUMBER, **write_request(request)})
     except ValueError as error:  # NaN in `data`
         raise UsageError(f"'data' is no JSON: {error}") from None
-    if len(line) <= MAX_LINE:
+    if len(line) <= MAX_LINE_BYTES:
         return None
+    from talkcli.goals.reasons import Reason  # no start pays for it
+
     message = f"Talk rejected: the text has {len(request.text):,} characters, more than a request can hold"
-    return Goal("", State.REJECTED, request.text, reason="text_too_long", message=message)
+    return Goal("", State.REJECTED, request.text, reason=Reason.TEXT_TOO_LONG.value, message=message)

@@ -1,10 +1,10 @@
-"""From nothing to a server that has greeted: every place tried, why each failed, and the first request sent at once.
+"""Connecting: every place is tried, a failure at each is explained, and a first request can be sent early.
 
-In two stages. Of the first a connection is made by `reach`, and whoever knows already what to ask sends it by `ask`,
-before the rest of the client is imported: the server works meanwhile. It imports next to nothing itself, not even
-`socket` and `json`, which together take as long as the interpreter's start, and knows only the plain case, a server of
-this protocol that answers at once. The second, `connect`, takes over from wherever that ended: it waits, tries the
-other places, and says what is wrong. Nothing is sent twice that could have an effect.
+There are two stages. `reach` opens a connection, and a caller that already knows its request sends it with
+`send_early`, before the rest of the client is imported: the server works meanwhile. This stage imports next to nothing,
+not even `socket` and `json`, which together take as long as the interpreter's start. It covers only the plain case, a
+server of this protocol that answers at once. The second stage, `connect`, takes over wherever the first one ended. It
+waits, tries the other places, and explains what is wrong. A request that could have an effect is never sent twice.
 """
 
 from __future__ import annotations
@@ -23,83 +23,88 @@ if TYPE_CHECKING:
     from talkcli.errors import AccessDenied, TalkError
     from talkcli.goals.goal import JsonObject
 
-#: How a server of this protocol begins its greeting, as `protocol.lines` writes it; a test compares the two.
-GREETING = b'{"talk": 1, "version": '
-#: The number of the first request on a connection.
-FIRST = 1
-#: Seconds in which a server greets that is up and has time; whoever waits longer wants to be able to interrupt it.
-AT_ONCE = 0.2
-#: Seconds for which a client stands back at most.
-_BACK = 0.2
-#: What is in the answer to a request after which there is nothing to wait for.
+#: The beginning of the greeting of a server of this protocol, as `protocol.lines` writes it; a test compares the two.
+GREETING_START = b'{"talk": 1, "version": '
+#: Seconds in which an idle server greets. A longer wait must be interruptible.
+GREETING_WAIT_S = 0.2
+#: The longest time for which a client leaves the processor to the server.
+_LONGEST_YIELD_S = 0.2
+#: Parts of an answer after which there is nothing to wait for.
 _REFUSED = (b'"ok": false', b'"state": "REJECTED"')
-#: Seconds in which a server greets, and answers each request.
-ANSWER_LIMIT = 5.0
-#: Seconds for which a client tries again where the server is full or its backlog is; with jitter, so that many clients
-#: that were turned away together don't come back together.
-BUSY_LIMIT = 5.0
-_BUSY_PAUSE = (0.02, 0.2)
-#: Seconds between two tries to reach a server that is not there yet: the first pause, which doubles up to the second.
+#: Seconds in which a server must greet, and must answer each request.
+ANSWER_LIMIT_S = 5.0
+#: Seconds for which a server that is full, or whose backlog is full, is tried again.
+BUSY_LIMIT_S = 5.0
+#: The least and the longest pause between two of these attempts. It is random, so that many clients that were turned
+#: away together don't come back together.
+_BUSY_PAUSE_S = (0.02, 0.2)
+#: Seconds between two attempts to reach a server that is not there yet: the first pause, which doubles up to the
+#: second.
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.02, 0.25
-#: What to do next where nobody answers.
+#: What to do next if nobody answers.
 _START = "start one with: talk serve"
 _LET_IN = "have its owner let you in, with `talk serve --socket-mode 0660` and the socket's group"
 _OWN = "or start your own with: talk serve"
 
 
 @frozen
-class Begun:
-    """A connection as the first stage leaves it, or that there is none."""
+class ConnectionAttempt:
+    """How far a connection to a server has come."""
 
-    #: not blocking; None where no place has anybody who could be asked
+    #: non-blocking; None if no place accepted a connection
     socket: _socket.socket | None
     #: the place that it leads to
     path: str = ""
-    #: the places before it, each with what is wrong there: the system's error, or that it belongs to somebody else
+    #: the places before it, each with its error: the system's, or that the server belongs to somebody else
     failures: tuple[tuple[str, Exception], ...] = ()
-    #: whether `hello` was said
-    greeted: bool = False
-    #: what the server has said that nobody has read: less than its greeting, or more
+    #: whether `hello` was sent
+    hello_sent: bool = False
+    #: what the server has sent and nobody has read: a part of its greeting, or more
     received: bytes = b""
-    #: what was sent of the first request
-    sent: bytes = b""
-    #: once its greeting is read, the server's boot id, the first half of its goals' ids, and its process
+    #: the part of the first request that was sent
+    request_sent: bytes = b""
+    #: the server's boot id, the first half of the ids that it gives; empty before the greeting was read
     boot: str = ""
+    #: the server's process, as the server says
     pid: int | None = None
 
     @property
-    def full(self) -> bool:
-        """Whether the last place has a server that takes up no connection at this moment."""
+    def backlog_full(self) -> bool:
+        """Whether there is a server at the last place that accepts no connection at this moment."""
         return self.socket is None and bool(self.failures) and isinstance(self.failures[-1][1], BlockingIOError)
 
 
-def reach(named: str | None, failures: tuple[tuple[str, Exception], ...] = ()) -> Begun:
-    """Return a connection to the first place that takes one, on which nothing has been said.
+def reach(
+    named: str | None, failures: tuple[tuple[str, Exception], ...] = (), only: str | None = None
+) -> ConnectionAttempt:
+    """Open a connection to the first place that accepts one. Nothing is sent.
 
-    `named`: the only socket to try, or None for the list; `failures`: what is wrong with the first places of that,
-    which are not tried again.
+    Args:
+        named: the only socket to try, as the user named it; None for the usual places.
+        failures: the errors of the first of these places, which are not tried again.
+        only: the only one of the usual places to try.
     """
-    for path in paths.client_sockets(named)[len(failures) :]:
+    for path in [only] if only else paths.client_sockets(named)[len(failures) :]:
         connected = _socket.socket(_socket.AF_UNIX, _socket.SOCK_STREAM)
-        # Not blocking: a server that is stopped and whose backlog is full would hold the client for ever.
+        # Non-blocking: a stopped server whose backlog is full would hold the client for ever.
         connected.setblocking(False)
-        wrong: Exception | None
+        error: Exception | None
         try:
             connected.connect(path)
-            wrong = None if named or path == paths.SYSTEM_SOCKET else _foreign(connected)
-        except OSError as error:
-            wrong = error
-        if wrong is None:
-            return Begun(connected, path, failures)
+            error = None if named or path == paths.SYSTEM_SOCKET else _foreign(connected)
+        except OSError as failed:
+            error = failed
+        if error is None:
+            return ConnectionAttempt(connected, path, failures)
         connected.close()
-        failures = (*failures, (path, wrong))
-        if isinstance(wrong, BlockingIOError):  # a server that is there is the one, not the next
+        failures = (*failures, (path, error))
+        if isinstance(error, BlockingIOError):  # the server that is there is the right one, not the next
             break
-    return Begun(None, failures=failures)
+    return ConnectionAttempt(None, failures=failures)
 
 
 def _foreign(connected: _socket.socket) -> AccessDenied | None:
-    """Return what is wrong with a server that somebody else has put where ours belongs: it would hear all."""
+    """Return an error if another user has put a server where this user's belongs: it would hear everything."""
     from talkcli import peers
 
     _, uid = peers.credentials(connected)
@@ -110,87 +115,101 @@ def _foreign(connected: _socket.socket) -> AccessDenied | None:
     return AccessDenied(f"belongs to uid {uid}; to use it all the same, name it with --socket")
 
 
-def ask(begun: Begun, hello: JsonObject, request: JsonObject, before: Callable[[], None]) -> Begun | None:
-    """Say hello, and send the first request as soon as the server has greeted; return how far that has come.
+def send_early(
+    attempt: ConnectionAttempt, hello: JsonObject, request: JsonObject, before: Callable[[], None]
+) -> ConnectionAttempt | None:
+    """Send hello, and the first request as soon as the server has greeted.
 
-    None where the connection broke before: nothing was sent that could have an effect. `before`: called before the
-    request is sent, which is not done where the server greets otherwise, or not at once.
+    The request is not sent if the server greets in another way than expected, or not at once.
+
+    Args:
+        attempt: an open connection.
+        hello: the first line.
+        request: the first request.
+        before: called before the request is sent.
+
+    Returns:
+        How far the connection has come; None if it broke before anything was sent that could have an effect.
     """
-    from talkcli.protocol.lines import request_line
+    from talkcli.protocol.lines import FIRST_NUMBER, request_line
 
-    connected, line = begun.socket, request_line({"seq": FIRST, **request})
+    connected, line = attempt.socket, request_line({"seq": FIRST_NUMBER, **request})
     assert connected
     received = sent = b""
-    connected.settimeout(AT_ONCE)
+    connected.settimeout(GREETING_WAIT_S)
     try:
         connected.sendall(request_line(hello))
         received = connected.recv(65536)
-        if received.startswith(GREETING) and b"\n" in received:
+        if received.startswith(GREETING_START) and b"\n" in received:
             before()
             sent = line[: connected.send(line)]
     except TimeoutError:
-        pass  # it may have more to do than to greet
+        pass  # the server may be busy
     except OSError:
         connected.close()
         return None
     connected.setblocking(False)
-    return replace(begun, greeted=True, received=received, sent=sent)
+    return replace(attempt, hello_sent=True, received=received, request_sent=sent)
 
 
-def stand_back(begun: Begun, timeout: float | None) -> Begun:
-    """Leave the processor to the server for a while, and return the connection with what the server says meanwhile.
+def yield_processor(attempt: ConnectionAttempt, timeout: float | None) -> ConnectionAttempt:
+    """Leave the processor to the server for a while, and return the connection with what the server sends meanwhile.
 
-    For who waits for a goal to end and has nothing to do before. Until the first sound, server, engine, player and
-    sound server take about the processor time that this process has had so far, whatever the machine; the rest of the
-    client, imported in that time, made it 1.4 times as long where both cores of two had other work as well.
+    It is for a client that waits for its goal to end and has nothing else to do. Until the first sound, the server, the
+    engine, the player and the sound server together take about as much processor time as this process has taken so far,
+    on any machine. With the client's other imports in that time, the first sound took 1.4 times as long on two busy
+    cores.
 
-    `timeout`: the seconds that the whole command may take, or None.
+    Args:
+        attempt: a connection on which a request was sent.
+        timeout: seconds that the whole command may take; None for no limit.
     """
-    end = time.monotonic() + min(time.process_time(), _BACK, _BACK if timeout is None else timeout)
-    connected, received = begun.socket, begun.received
+    longest = _LONGEST_YIELD_S if timeout is None else min(_LONGEST_YIELD_S, timeout)
+    end = time.monotonic() + min(time.process_time(), longest)
+    connected, received = attempt.socket, attempt.received
     assert connected
     try:
         while (left := end - time.monotonic()) > 0:
             connected.settimeout(left)
-            said = connected.recv(65536)
-            received += said
-            if not said or any(each in said for each in _REFUSED):
+            data = connected.recv(65536)
+            received += data
+            if not data or any(each in data for each in _REFUSED):
                 break
-    except OSError:  # the time is up; or the connection has broken, which whoever reads on will find
+    except OSError:  # the time is up, or the connection broke, which the next reader will find
         pass
     connected.setblocking(False)
-    return replace(begun, received=received)
+    return replace(attempt, received=received)
 
 
-def sender(name: str | None) -> str | None:
-    """Return what a sender calls itself: by this name, or else by that of TALK_NAME."""
-    # Bytes in a variable that are no UTF-8 keep nobody from cancelling.
-    called = os.environ.get("TALK_NAME", "").encode(errors="surrogateescape").decode(errors="replace")
-    return name or called or None
+def sender_name(name: str | None) -> str | None:
+    """Return the name that a sender goes by: the given one, or else TALK_NAME."""
+    # A variable that is not UTF-8 keeps nobody from cancelling.
+    variable = os.environ.get("TALK_NAME", "").encode(errors="surrogateescape").decode(errors="replace")
+    return name or variable or None
 
 
 def hello(name: str | None, *, urgent: bool) -> JsonObject:
-    """Return what is said first: `requests.Hello`, as it is written, without the import; a test compares the two."""
+    """Return the first message, as `requests.Hello` is written, without that import; a test compares the two."""
     return {"request": "hello", **({"name": name} if name else {}), **({"urgent": True} if urgent else {})}
 
 
 def connect(
     named: str | None,
     hello: JsonObject,
-    patience: float = ANSWER_LIMIT,
+    patience: float = ANSWER_LIMIT_S,
     interrupt: Mapping[int, int] | None = None,
-    begun: Begun | None = None,
+    attempt: ConnectionAttempt | None = None,
     keep_trying: float = 0.0,
     end: float | None = None,
-) -> Begun:
+) -> ConnectionAttempt:
     """Return a connection to the first server that answers, with its greeting read.
 
     Args:
-        named: the only socket to try, or None for the list.
-        hello: the first request.
+        named: the only socket to try, or None for the usual places.
+        hello: the first message.
         patience: seconds in which the server must greet.
-        interrupt: what ends it with Interrupted, as in `ready`.
-        begun: how far the connection has come already.
+        interrupt: descriptors with the poll events that interrupt the wait, as in `polling.wait_ready`.
+        attempt: how far the connection has come already.
         keep_trying: seconds for which a server that is not there yet is tried again, and for which it may greet.
         end: the monotonic time by which the server must have greeted in any case, or None.
 
@@ -199,83 +218,85 @@ def connect(
     """
     from talkcli.errors import AccessDenied, Busy, ServerUnavailable
 
-    give_up = time.monotonic() + (keep_trying or min(BUSY_LIMIT, patience))
-    begun, next_pause = begun or reach(named), _FIRST_PAUSE_S
+    give_up = time.monotonic() + (keep_trying or min(BUSY_LIMIT_S, patience))
+    attempt, next_pause = attempt or reach(named), _FIRST_PAUSE_S
     while True:
         error: TalkError | None = None
-        busy = begun.full
-        again = busy or (keep_trying > 0 and _may_come(begun))
-        if begun.socket:
+        busy = attempt.backlog_full
+        again = busy or (keep_trying > 0 and _may_start(attempt))
+        if attempt.socket:
             greet_by = time.monotonic() + patience
             if keep_trying:
                 greet_by = max(greet_by, give_up)
                 greet_by = greet_by if end is None else min(greet_by, end)
             try:
-                return _greet(begun, begun.socket, hello, greet_by, interrupt)
+                return _greet(attempt, attempt.socket, hello, greet_by, interrupt)
             except AccessDenied as denied:
-                if begun.sent:
+                if attempt.request_sent:
                     raise
-                begun = reach(named, (*begun.failures, (begun.path, denied)))
+                attempt = reach(named, (*attempt.failures, (attempt.path, denied)))
                 continue
             except Busy as refused:
                 error, again, busy = refused, True, True
             except ConnectionError:
-                error = ServerUnavailable(f"the server at {begun.path} closed the connection before it answered")
+                error = ServerUnavailable(f"the server at {attempt.path} closed the connection before it answered")
                 again = keep_trying > 0
         left = give_up - time.monotonic()
-        if not again or begun.sent or left <= 0:
-            raise error or _nobody(begun, named)
+        if not again or attempt.request_sent or left <= 0:
+            raise error or unreachable(attempt, named)
         pause = next_pause
         if busy:
             import random
 
-            pause = random.uniform(*_BUSY_PAUSE)
+            pause = random.uniform(*_BUSY_PAUSE_S)
         else:
             next_pause = min(2 * pause, _LONGEST_PAUSE_S)
         wait_ready({}, min(pause, left), interrupt)
-        begun = reach(named)
+        attempt = reach(named)
 
 
-def _may_come(begun: Begun) -> bool:
-    """Whether a server may still start at one of the places that were tried in vain."""
-    found = (paths.describe_place(path, error) for path, error in begun.failures if isinstance(error, OSError))
+def _may_start(attempt: ConnectionAttempt) -> bool:
+    """Return whether a server may still start at one of the places that were tried."""
+    found = (paths.describe_place(path, error) for path, error in attempt.failures if isinstance(error, OSError))
     return any(each in {paths.PLACE_ABSENT, paths.PLACE_STALE} for each in found)
 
 
 def _greet(
-    begun: Begun, connected: _socket.socket, hello: JsonObject, end: float, interrupt: Mapping[int, int] | None
-) -> Begun:
-    """Greet, unless that has been done, and be greeted by `end`; the connection is closed if that fails.
+    attempt: ConnectionAttempt,
+    connected: _socket.socket,
+    hello: JsonObject,
+    end: float,
+    interrupt: Mapping[int, int] | None,
+) -> ConnectionAttempt:
+    """Send hello, unless that was done, and read the greeting by `end`. Close the connection if that fails.
 
-    ConnectionError if the server hangs up first.
+    Raises:
+        ConnectionError: the server hangs up first.
+        ServerUnavailable, AccessDenied, ProtocolMismatch, Busy: the server can't be used.
     """
+    from talkcli import __version__
+    from talkcli.client.core import identity, read_greeting
     from talkcli.protocol.lines import request_line
 
-    received = begun.received
+    received = attempt.received
     try:
-        if not begun.greeted:
+        if not attempt.hello_sent:
             try:
                 connected.send(request_line(hello))
             except (BrokenPipeError, ConnectionResetError):
                 pass  # it has hung up already, but it may have said why
         while b"\n" not in received:
-            received += _heard(connected, begun.path, end, interrupt)
+            received += _receive(connected, attempt.path, end, interrupt)
         line, _, received = received.partition(b"\n")
-        greeting = _checked(line, begun.path)
+        boot, pid = identity(read_greeting(line, attempt.path, __version__))
     except BaseException:
         connected.close()
         raise
-    boot, pid = greeting.get("boot"), greeting.get("pid")
-    return replace(
-        begun,
-        received=received,
-        boot=boot if isinstance(boot, str) else "",
-        pid=pid if isinstance(pid, int) else None,
-    )
+    return replace(attempt, received=received, boot=boot, pid=pid)
 
 
-def _heard(connected: _socket.socket, path: str, end: float, interrupt: Mapping[int, int] | None) -> bytes:
-    """Return what a server says that has not greeted yet; `end`: until when it may take for that."""
+def _receive(connected: _socket.socket, path: str, end: float, interrupt: Mapping[int, int] | None) -> bytes:
+    """Return what a server sends before its greeting is complete, and by `end`."""
     from select import POLLIN
 
     from talkcli import peers
@@ -291,38 +312,17 @@ def _heard(connected: _socket.socket, path: str, end: float, interrupt: Mapping[
     return data
 
 
-def _checked(line: bytes, path: str) -> JsonObject:
-    """Return a greeting; ServerUnavailable, ProtocolMismatch, Busy or AccessDenied for what greets nobody."""
-    from talkcli import __version__
-    from talkcli.errors import AccessDenied, BadRequest, ServerUnavailable
-    from talkcli.protocol.events import check_greeting
-    from talkcli.protocol.lines import decode
-
-    try:
-        greeting = decode(line)
-    except BadRequest:
-        greeting = {}
-    if "talk" not in greeting:
-        raise ServerUnavailable(f"what answers at {path} is no talk server")
-    check_greeting(greeting, __version__)
-    if "error" in greeting:
-        from talkcli.terminal.text import printable  # no start pays for it
-
-        raise AccessDenied(f"the server refuses: {printable(str(greeting.get('message') or greeting['error']))}")
-    return greeting
-
-
-def _nobody(begun: Begun, named: str | None) -> TalkError:
-    """Return the error that says what was tried."""
+def unreachable(attempt: ConnectionAttempt, named: str | None) -> TalkError:
+    """Return an error that lists the places that were tried, and the next step."""
     from talkcli.errors import AccessDenied, ServerUnavailable
 
-    if begun.full:
-        path = begun.failures[-1][0]
+    if attempt.backlog_full:
+        path = attempt.failures[-1][0]
         return ServerUnavailable(f"the server at {path} does not take up connections: restart it if it hangs")
     tried = ""
-    found = ""  # at the last place, the only one where one was named
+    found = ""  # at the last place, which is the only one if the user named it
     denied = False
-    for path, error in begun.failures:
+    for path, error in attempt.failures:
         words = str(error)
         if isinstance(error, OSError):
             words = found = paths.describe_place(path, error)
@@ -340,7 +340,7 @@ def _nobody(begun: Begun, named: str | None) -> TalkError:
 
 
 def _named_step(named: str, found: str, *, denied: bool) -> str:
-    """Return what to do next where the only place was one that the user named."""
+    """Return the next step if only the place that the user named was tried."""
     import shlex  # it loads `re`
 
     from talkcli.terminal.text import printable
@@ -359,5 +359,5 @@ def _named_step(named: str, found: str, *, denied: bool) -> str:
 
 
 def _inside(directory: str) -> str:
-    """Return the socket in a directory that was named in its place."""
+    """Return the socket in a directory that was named instead of it."""
     return f"{directory.rstrip('/')}/{paths.SOCKET_NAME}"

@@ -1,36 +1,34 @@
-"""A client's connection to a server: requests go out, replies and events come in, each to whom it is for.
+"""Blocking connections to a server: shells around the client core, for any number of threads.
 
-`Connection` is what the rest of the library knows of one, whatever it leads through; `SocketConnection` is that over a
-Unix socket. Nothing here knows what a client asks for, or what a goal's handle makes of its events.
+`Connection` is the interface that the rest of the library uses, whatever the transport is. `SocketConnection` is a
+connection over a Unix socket. `ReconnectingConnection` is one that connects again after a break.
 """
 
 from __future__ import annotations
 
-import itertools
 import os
 import select
 import threading
 import time
 from _socket import SHUT_RDWR, SHUT_WR  # see `peers`
-from collections import deque
-from collections.abc import Callable
 
-from talkcli import paths, peers
-from talkcli.client.connect import ANSWER_LIMIT, FIRST, connect, hello, sender
-from talkcli.client.following import Followed
-from talkcli.errors import BadRequest, Lost, ServerUnavailable, Unreadable, UsageError, refusal
+from talkcli import __version__, paths, peers
+from talkcli.client.connect import ANSWER_LIMIT_S, connect, hello, reach, sender_name, unreachable
+from talkcli.client.core import MAX_UNSENT_BYTES, ClientCore, Exchange
+from talkcli.errors import ServerUnavailable, TalkError, UsageError
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.option import MAX_NAME
-from talkcli.goals.options import Say
+from talkcli.goals.options import Cancel, Say
 from talkcli.polling import wait_ready
-from talkcli.protocol.lines import LineSplitter, decode, request_line, write_request
+from talkcli.protocol.lines import request_line
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    import _socket
+    from collections.abc import Callable, Iterator, Mapping
     from typing import Protocol, TypeVar
 
-    from talkcli.client.connect import Begun
-    from talkcli.errors import TalkError
+    from talkcli.client.connect import ConnectionAttempt
+    from talkcli.client.core import EventListeners, OnFailure, OnReply
     from talkcli.goals.goal import JsonObject
     from talkcli.protocol.requests import Request
 
@@ -38,58 +36,75 @@ if TYPE_CHECKING:
 else:
     Protocol = object
 
-#: Seconds of silence from a server that somebody waits for; it says that it is alive every 5.
-SILENCE_LIMIT = 15.0
-
-
-OnReply = Callable[["JsonObject", "list[JsonObject]"], None]
+#: Bytes that are received at once.
+_RECEIVE_BYTES = 256 * 1024
+#: Seconds between two attempts to reach a server that went away: the first pause, which doubles up to the second.
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.02, 0.5
+#: Seconds after which a thread without a connection looks whether another thread has made one.
+_LOOK_S = 0.1
 
 
 class Connection(Protocol):
-    """A way to one server that has greeted: all that a client and its goals need of it. Any number of threads use it.
+    """A connection to one server that has greeted. Any number of threads use it.
 
-    What it sends a server is carried out once or not at all, in the order in which it was sent; nothing that could have
-    an effect is sent again by itself, but a goal with its id, which is not spoken twice. Replies and events are taken
-    in in the server's order, each before whatever the server said after it: under `changed`, and under it alone, so
-    that a wait whose `done` looks at several things sees them together. Nothing is taken in but while somebody waits in
-    `request` or `wait_until`; whoever does so does it for all. No lock is held while a server is waited for.
+    The server carries out each request once or not at all, in the order in which they were sent. Nothing that could
+    have an effect is sent twice, except a goal with its id, which is not spoken twice. Replies and events are taken in
+    in the server's order, under `changed` and under it alone, so that a wait whose `done` looks at several things sees
+    them together. That happens while a thread waits in `request` or `wait_until`: it reads for all threads. No lock is
+    held while a thread waits for the server.
 
-    It ends once and for ever, with `close`, or where nothing more can come: `ended` says why from then on. What came
-    before is handed out first. What waits is told so, and what is asked afterwards is ServerUnavailable: nothing was
-    sent then.
+    After `close`, or if nothing more can come, `ended` says why. What came before can still be read. Threads that wait
+    are told, and later requests raise ServerUnavailable because nothing is sent.
     """
 
-    #: where the server is, as people are told
+    #: where the server is, for people
     path: str
-    #: the server's boot id: the first half of its goals' ids
+    #: the server's boot id, the first half of the ids that it gives
     boot: str
-    #: the server's process, as it says
+    #: the server's process, as the server says
     pid: int | None
-    #: the lock under which all that comes is handed out; notified whenever something was
+    #: the lock under which everything is taken in; notified after that
     changed: threading.Condition
-    #: why nothing more comes, once that is so
+    #: why nothing more comes; None while something may
     ended: str | None
-    #: who is told of events; used under `changed`
-    followed: Followed
+    #: used under `changed`
+    listeners: EventListeners
 
     @property
     def listener(self) -> int | None:
-        """The process of this machine that listens there, as its kernel tells it; None where there is none."""
+        """The process of this machine that listens there, as its kernel says; None if the server is elsewhere."""
 
     def request(
         self, request: Request, on_reply: OnReply | None = None, *, slow: bool = False
     ) -> tuple[JsonObject, list[JsonObject]]:
-        """Send a request and return its reply and the lines of its list.
+        """Send a request, and return its reply and the lines of its list.
 
-        RequestRefused or a class of it if the server says no; ServerUnavailable if it says nothing in time, or Lost
-        where what was sent may still have an effect that the sender does not know of. `on_reply` is called with both,
-        once the server said yes, before any event that comes after the reply; `slow`: the answer may take any time, in
-        which the server says that it is alive. Interrupted as in `wait_until`, but for a goal that may be accepted
-        already: its sender could not cancel it.
+        A wait for the reply can be interrupted as in `wait_until`. The wait for the reply to a goal can't: the goal may
+        be accepted already, and without its id the sender could not cancel it.
+
+        Args:
+            request: the request.
+            on_reply: called with both under `changed`, if the server accepts the request, before any later event.
+            slow: the answer may take any time, during which the server sends signs of life.
+
+        Raises:
+            RequestRefused: the server refuses the request.
+            ServerUnavailable: the request was not sent, or not answered in time.
+            Lost: the request was sent and not answered, and may have an effect.
+        """
+
+    def submit(self, request: Request, on_reply: OnReply, on_failure: OnFailure) -> None:
+        """Send a request without waiting, and call one of the functions later, under `changed`.
+
+        What the server doesn't take now is sent by later calls. `on_failure` is called for a refusal, too, and if there
+        is no answer in time. It may be called at once.
+
+        Raises:
+            ServerUnavailable: the connection has ended.
         """
 
     def post(self, request: Request) -> None:
-        """Send a request whose reply nobody waits for; ServerUnavailable where that is impossible."""
+        """Send a request without waiting, and ignore its answer; ServerUnavailable if it can't be sent."""
 
     def wait_until(
         self,
@@ -99,25 +114,30 @@ class Connection(Protocol):
         since: float | None = None,
         interruptible: bool = True,
     ) -> bool:
-        """Read until `done()`, and return True; False at the deadline (monotonic), or once the connection ended.
+        """Take in what comes until `done()` is true, and return True.
 
-        `done` is called under `changed`, and no more once it was true; what has arrived by the deadline counts.
-        A server that says nothing for SILENCE_LIMIT, counted from this call on, or from `since` (monotonic), counts as
-        gone. What interrupts the connection's waits does so here, with Interrupted, unless it is not `interruptible`.
+        Return False at the deadline, or if the connection has ended. What has arrived by the deadline counts. A server
+        that is silent for SILENCE_LIMIT_S counts as gone.
+
+        Args:
+            done: called under `changed`, and not again after it was true.
+            deadline: monotonic time, or None for no limit.
+            since: the time from which silence counts; the default is now.
+            interruptible: raise Interrupted if what interrupts this connection's waits does so.
         """
 
     def close(self) -> None:
-        """Close the connection, from any thread; goals that were sent are spoken all the same. It may be called again.
+        """Close the connection, from any thread. Goals that were sent are still spoken.
 
-        In a forked child it closes the child's copy alone.
+        Closing twice is no error. In a forked child, only the child's copies of the descriptors are closed.
         """
 
 
 def taken(connection: Connection, take: Callable[[], _T], end: float | None) -> Iterator[_T]:
-    """Yield what `take` finds, called under `changed`, again and again as it comes.
+    """Call `take` under `changed` whenever something has come, and yield what it returns, unless that is empty.
 
-    What is empty is yielded where nothing has come by `end` (monotonic), or can come any more. What had arrived by then
-    counts, nothing after it: a goal may go on for ever.
+    At `end` (monotonic), or when nothing more can come, yield once what is there, even if it is empty. What arrives
+    after `end` doesn't count: a goal may go on for ever.
     """
     found: _T
 
@@ -137,68 +157,27 @@ def taken(connection: Connection, take: Callable[[], _T], end: float | None) -> 
         yield found
 
 
-class Exchange:
-    """One request on its way: the lines of its list, and at last its reply."""
+class BlockingConnection(ClientCore):
+    """The part of a `Connection` that doesn't depend on the transport: one thread reads, the others wait for it.
 
-    __slots__ = ("error", "items", "latest", "number", "on_reply", "reply", "request", "sent", "touched", "tries")
-
-    def __init__(self, number: int, request: Request, on_reply: OnReply | None) -> None:
-        #: by which its reply is known
-        self.number = number
-        self.request = request
-        #: whether it has gone out, or may have
-        self.sent = True
-        #: how often it went out again; until when it means anything, by the clock of the connection that asks again
-        self.tries = 0
-        self.latest: float | None = None
-        self.items: list[JsonObject] = []
-        self.reply: JsonObject | None = None
-        #: why there will be no reply, where that is known of this one alone
-        self.error: TalkError | None = None
-        self.on_reply = on_reply
-        self.touched = time.monotonic()
-
-    @property
-    def over(self) -> bool:
-        """Whether nothing more is to be waited for."""
-        return self.reply is not None or self.error is not None
-
-
-class BaseConnection:
-    """What connections do alike, whatever they lead through: number requests, read for all, hand out what comes.
-
-    A class of it says how a request is sent and what has come; see `Connection` for what is promised.
+    The core's methods are called under `changed`.
     """
-
-    #: requests that can still have an effect, though nobody knows of it, where they were sent and not answered
-    lasting: tuple[type[Request], ...] = (Say,)
 
     def __init__(self, patience: float) -> None:
         """`patience`: seconds in which the server must answer."""
-        self.path, self.boot = "", ""
-        self.pid: int | None = None
-        self.followed = Followed()
+        super().__init__(patience, time.monotonic())
         self.changed = threading.Condition()
-        self.ended: str | None = None
         self._process = os.getpid()
-        self._patience = patience
-        self._exchanges: dict[int, Exchange] = {}
-        self._numbers: Iterator[int] = itertools.count(FIRST)
-        self._lines: deque[bytes] = deque()
         self._reading = False
         self._closing = False
-        self._heard = time.monotonic()
-        #: what the server said last that was no answer to anything
-        self._told: str | None = None
-        #: why nothing can be sent at this moment, where that may change
-        self._absent = ""
 
     def close(self) -> None:
-        self.ended = self.ended or "the connection was closed"
         if os.getpid() != self._process:
+            self.ended = self.ended or "the connection was closed"
             self._drop()
             return
         with self.changed:
+            self.end("the connection was closed")
             self._closing = True
             self._hang_up()
             if not self._reading:  # else it would poll a descriptor that may be another file's by now
@@ -208,55 +187,58 @@ class BaseConnection:
     def request(
         self, request: Request, on_reply: OnReply | None = None, *, slow: bool = False
     ) -> tuple[JsonObject, list[JsonObject]]:
-        # A goal whose sender was interrupted before it knew the goal's id could not be cancelled any more. One that
-        # waits for room isn't accepted yet: who hangs up takes it back.
+        # A goal whose sender was interrupted before it knew the goal's id could not be cancelled any more. A goal that
+        # waits for room isn't accepted yet: closing the connection takes it back.
         interruptible = slow or not isinstance(request, Say)
-        exchange = self.begin(request, on_reply)
+        exchange = self.begin(request, on_reply, slow=slow)
         try:
-            late, deadline = 0.0, -1.0
-            while not exchange.over and self.ended is None and late != deadline:
-                late, deadline = deadline, self.answer_by(exchange)
-                self.wait_until(lambda: exchange.over, None if slow else deadline, interruptible=interruptible)
+            last, deadline = 0.0, -1.0
+            while not exchange.over and self.ended is None and last != deadline:
+                last, deadline = deadline, self.answer_by(exchange)
+                limit = None if deadline == float("inf") else deadline
+                self.wait_until(lambda: exchange.over, limit, interruptible=interruptible)
         finally:
-            self.forget(exchange)
+            with self.changed:
+                if not self.forget(exchange):
+                    self._cut_off()
         return self.answer(exchange)
 
-    def begin(self, request: Request, on_reply: OnReply | None = None) -> Exchange:
-        """Send a request whose answer is taken in as it comes; `forget` it at last."""
-        exchange = Exchange(next(self._numbers), request, on_reply)
-        self._exchanges[exchange.number] = exchange
-        try:
-            self._send(exchange.number, request)
-        except BaseException:
-            self.forget(exchange)
-            raise
+    def begin(
+        self,
+        request: Request,
+        on_reply: OnReply | None = None,
+        on_failure: OnFailure | None = None,
+        *,
+        slow: bool = False,
+    ) -> Exchange:
+        """Send a request and don't wait for the answer; `forget` the exchange when it is over.
+
+        Raises:
+            ServerUnavailable: nothing can be sent.
+        """
+        exchange = Exchange(request, on_reply, on_failure, slow=slow)
+        with self.changed:
+            self.register(exchange, time.monotonic())
+            try:
+                self._send(exchange)
+            except BaseException:
+                self.forget(exchange)
+                raise
         return exchange
 
-    def forget(self, exchange: Exchange) -> None:
-        """Wait for an answer no more."""
-        del self._exchanges[exchange.number]
-
-    def answer(self, exchange: Exchange) -> tuple[JsonObject, list[JsonObject]]:
-        """Return the reply, and the lines of its list, to a request that nothing more is waited for; errors as of
-        `request`.
-        """
-        request = exchange.request
-        if exchange.error is not None:
-            raise exchange.error
-        if exchange.reply is None and not exchange.sent:
-            raise ServerUnavailable(f"nothing was sent to the server at {self.path}: {self.ended or self._absent}")
-        if exchange.reply is None:
-            why = self.ended or self._no_reply
-            words = f"{request.kind} was sent to the server at {self.path}, but {why}"
-            if isinstance(request, Say):
-                raise Lost(f"{words}; it may still be spoken")
-            raise Lost(words) if isinstance(request, self.lasting) else ServerUnavailable(words)
-        if exchange.reply.get("ok") is not True:
-            raise self._refusal(exchange.reply, exchange.items)
-        return exchange.reply, exchange.items
+    def submit(self, request: Request, on_reply: OnReply, on_failure: OnFailure) -> None:
+        self._look()
+        slow = isinstance(request, Say) and request.patient
+        with self.changed:
+            if self.ended is not None:
+                raise ServerUnavailable(f"nothing was sent to the server at {self.path}: {self.ended}")
+            self.begin(request, on_reply, on_failure, slow=slow)
 
     def post(self, request: Request) -> None:
-        self._send(next(self._numbers), request)
+        failures: list[TalkError] = []
+        self.submit(request, lambda *_: None, failures.append)
+        if failures:
+            raise failures[0]
 
     def wait_until(
         self,
@@ -270,25 +252,29 @@ class BaseConnection:
         last = False
         while True:
             with self.changed:
+                now = time.monotonic()
+                if not self.expire(now):
+                    self._cut_off()
                 if done():
                     return True
                 if self.ended is not None:
                     return False
-                now = time.monotonic()
-                quiet, why = self.silent_by(began)
-                rest = (quiet if deadline is None else min(deadline, quiet)) - now
-                if last and rest <= 0:
-                    if deadline is None or quiet < deadline:
-                        self.ended = why
-                    return False
+                silent_at, why = self.silent_by(began)
+                end = silent_at if deadline is None else min(deadline, silent_at)
+                if last and now >= end:
+                    if deadline is not None and deadline <= silent_at:
+                        return False
+                    self.break_off(why, now)
+                    continue
                 # What has arrived by the deadline counts: one more look, that doesn't wait.
-                last = rest <= 0
+                last = now >= end
+                wait_s = max(0.0, min(end, self.next_expiry()) - now)
                 if self._reading:
-                    self.changed.wait(max(0.0, rest))
+                    self.changed.wait(wait_s)
                     continue
                 self._reading = True
             try:
-                self._read(rest, interruptible)
+                self._step(wait_s, interruptible)
             finally:
                 with self.changed:
                     self._reading = False
@@ -296,90 +282,34 @@ class BaseConnection:
                         self._drop()
                     self.changed.notify_all()
 
-    # -- what each does in its own way
+    def _look(self) -> None:
+        """Take in what has come, without waiting."""
+        self.wait_until(lambda: False, time.monotonic(), interruptible=False)
 
-    def _send(self, number: int, request: Request) -> None:
-        """Send a request; ServerUnavailable where that is impossible."""
+    # -- what each transport does in its own way
+
+    def _send(self, exchange: Exchange) -> None:
+        """Send a registered request, or its beginning; ServerUnavailable if nothing can be sent. Under `changed`."""
         raise NotImplementedError
 
-    def _fill(self, timeout: float, interruptible: bool) -> None:
-        """Put what has come into `_lines`, or wait for it so many seconds; Interrupted."""
+    def _step(self, timeout: float, interruptible: bool) -> None:
+        """Wait until something comes, for the timeout at most, and take it in; Interrupted. By one thread at a time."""
         raise NotImplementedError
 
     def _hang_up(self) -> None:
-        """Have nothing more come, and a thread that reads find that out; under `changed`."""
+        """End the connection so that a thread that reads finds that out. Under `changed`."""
         raise NotImplementedError
 
     def _drop(self) -> None:
         """Close this process's descriptors, whoever else has them open."""
         raise NotImplementedError
 
-    def answer_by(self, exchange: Exchange) -> float:
-        """Return until when an answer is waited for, by the monotonic clock, as far as it is known now."""
-        return exchange.touched + self._patience
-
-    @property
-    def _no_reply(self) -> str:
-        """Why no answer is waited for any more."""
-        return f"it did not reply within {self._patience:g} s"
-
-    def silent_by(self, began: float) -> tuple[float, str]:
-        """Return when the server counts as gone that says nothing, to one who waits since then, and why."""
-        return max(began, self._heard) + SILENCE_LIMIT, f"it has said nothing for {SILENCE_LIMIT:g} s"
-
-    def _refusal(self, reply: JsonObject, items: list[JsonObject]) -> TalkError:
-        """Return the error that a reply stands for; `items`: what was listed before."""
-        from talkcli.terminal.text import printable  # no start pays for it
-
-        error = reply.get("error")
-        code, message = (error.get("code"), error.get("message")) if isinstance(error, dict) else (None, None)
-        return refusal(str(code), printable(str(message or "refused: the server gives no reason")), items)
-
-    # -- what has come
-
-    def _read(self, timeout: float, interruptible: bool) -> None:
-        """Read what there is, or wait for it, and hand it out."""
-        if not self._lines:
-            self._fill(timeout, interruptible)
-        self.hand_out()
-
-    def hand_out(self) -> None:
-        """Hand out what has come, each to whom it is for."""
-        while self._lines:
-            try:
-                message = decode(self._lines.popleft())
-                with self.changed:
-                    self._dispatch(message)
-            except (BadRequest, ValueError) as error:  # ValueError: a goal or an event that is none
-                self.ended = self.ended or f"it sent what is no message: {error}"
-                return
-
-    def _dispatch(self, message: JsonObject) -> None:
-        if "event" in message:
-            self.followed.hear(message)
-            return
-        number = message.get("seq")
-        if number is None and message.get("ok") is False:
-            self._told = f"the server closed it: {self._refusal(message, [])}"
-        exchange = self._exchanges.get(number) if isinstance(number, int) else None
-        if exchange is None or exchange.over:
-            return
-        exchange.touched = time.monotonic()
-        if "ok" not in message:
-            exchange.items.append(message)
-            return
-        if exchange.on_reply and message.get("ok") is True:
-            try:
-                exchange.on_reply(message, exchange.items)
-            except Unreadable as error:
-                if not isinstance(exchange.request, self.lasting):  # else what was sent may have had an effect
-                    exchange.error = error
-                raise
-        exchange.reply = message  # now: what can't be understood is no reply
+    def _cut_off(self) -> None:
+        """Make the server see the end of a connection on which a line was sent in part. Under `changed`."""
 
 
-class SocketConnection(BaseConnection):
-    """A connection by a Unix socket. There is no thread behind it."""
+class SocketConnection(BlockingConnection):
+    """A connection over a Unix socket. It has no thread of its own."""
 
     def __init__(
         self,
@@ -388,101 +318,225 @@ class SocketConnection(BaseConnection):
         name: str | None = None,
         urgent: bool = False,
         interrupt: Mapping[int, int] | None = None,
-        patience: float = ANSWER_LIMIT,
-        begun: Begun | None = None,
+        patience: float = ANSWER_LIMIT_S,
+        attempt: ConnectionAttempt | None = None,
         keep_trying: float = 0.0,
         end: float | None = None,
     ) -> None:
         """Connect; the errors are those of `Client`.
 
         Args:
-            socket: path of the server's socket; default TALK_SOCKET, then the usual places.
-            name: what the sender calls itself; default TALK_NAME.
-            urgent: for status and cancel alone, for which a full server keeps some places.
-            interrupt: what ends any waiting with Interrupted, as in `connect.ready`.
+            socket: path of the server's socket. The default is TALK_SOCKET, then the usual places.
+            name: what the sender calls itself. The default is TALK_NAME.
+            urgent: the connection is for status and cancel alone, for which a full server keeps some places.
+            interrupt: descriptors with the poll events that interrupt any wait, as in `polling.wait_ready`.
             patience: seconds in which the server must greet, and answer each request.
-            begun: how far the connection has come already; its first request may have been sent.
+            attempt: how far the connection has come already. Its first request may have been sent.
             keep_trying: seconds for which a server that is not there yet is tried again. What is left of them counts
                 as patience if it is more.
             end: the monotonic time by which the server must have greeted, if it is tried again; or None.
         """
         super().__init__(patience)
         self._interrupt = interrupt
-        name = sender(name)
+        name = sender_name(name)
         if name and len(name) > MAX_NAME:
             raise UsageError(f"the name of the sender has {len(name)} characters, the longest allowed is {MAX_NAME}")
-        said = hello(name, urgent=urgent)
+        self._first_words = hello(name, urgent=urgent)
+        self._named = paths.named_socket(socket)
         give_up = time.monotonic() + keep_trying
-        begun = connect(paths.named_socket(socket), said, patience, self._interrupt, begun, keep_trying, end)
-        assert begun.socket
+        attempt = connect(self._named, self._first_words, patience, self._interrupt, attempt, keep_trying, end)
         self._patience = max(patience, round(give_up - time.monotonic(), 1))
-        self._socket, self.path, self.boot, self.pid = begun.socket, begun.path, begun.boot, begun.pid
-        self._splitter = LineSplitter()
-        self._lines.extend(self._splitter.feed(begun.received))
-        # The beginning of the first line to be sent, if that was sent before there was this connection.
-        self._sent_early = begun.sent
-        self._sending = threading.Lock()
-        #: why nothing more can be sent, once that is so; what was sent before may still be answered
-        self._mute: str | None = None
+        #: None while there is no connection
+        self._socket: _socket.socket | None = attempt.socket
+        self.path, self.boot, self.pid = attempt.path, attempt.boot, attempt.pid
+        self._sent_early = attempt.request_sent
+        #: received with the greeting: it may answer the request that was sent early, which is still to be registered
+        self._received_early = attempt.received
 
     @property
-    def listener(self) -> int:
-        """The process that listens, as the kernel tells it."""
-        return peers.credentials(self._socket)[0]
+    def listener(self) -> int | None:
+        """The process that listens, as the kernel says; None while there is no connection."""
+        return None if self._socket is None else peers.credentials(self._socket)[0]
 
-    def _fill(self, timeout: float, interruptible: bool) -> None:
+    def _send(self, exchange: Exchange) -> None:
+        line = self.line(exchange)
         try:
-            watched = {self._socket.fileno(): select.POLLIN}
+            if exchange.on_failure and self.unsent_bytes + len(line) > MAX_UNSENT_BYTES:
+                words = f"{MAX_UNSENT_BYTES >> 10} KiB wait to be sent to the server at {self.path} already"
+                raise ServerUnavailable(f"nothing was sent: {words}")
+            self.queue(line, exchange)
+        except ServerUnavailable as error:
+            if exchange.on_failure is None:
+                raise
+            self.fail(exchange, error)
+        self._flush()
+
+    def _flush(self) -> None:
+        """Send as much of what waits as the server takes now. Under `changed`."""
+        try:
+            while self._socket is not None and (data := self.outgoing()):
+                self.mark_sent(self._socket.send(data))
+        except BlockingIOError:
+            pass
+        except OSError as error:  # the reader finds what the server has sent before that, and the end
+            if self.greeted:
+                self.stop_sending("the server went away", f"the server at {self.path} went away: {error.strerror}")
+
+    def _step(self, timeout: float, interruptible: bool) -> None:
+        with self.changed:
+            early, self._received_early = self._received_early, b""
+            if early:
+                self._take_in(early, time.monotonic())
+                return
+            self._flush()
+            connected = self._socket
+            waits = bool(self.outgoing())
+        if connected is None:
+            return
+        data, why = b"", "the server went away"
+        try:
+            watched = {connected.fileno(): select.POLLIN | (select.POLLOUT if waits else 0)}
             if not wait_ready(watched, timeout, self._interrupt if interruptible else None):
                 return
-            data = self._socket.recv(262144)
+            data = connected.recv(_RECEIVE_BYTES)
         except BlockingIOError:
-            return
+            return  # it takes more of what waits
         except ConnectionResetError:  # it left without having read all that was sent
-            data = b""
+            pass
         except (OSError, ValueError) as error:  # ValueError: another thread closed it meanwhile
-            data = b""
-            self.ended = self.ended or f"the connection broke: {error}"
-        if not data:
-            self.ended = self.ended or self._told or "the server went away"
-            return
-        self._heard = time.monotonic()
-        self._lines.extend(self._splitter.feed(data))
+            why = f"the connection broke: {error}"
+        with self.changed:
+            if connected is not self._socket:
+                return  # another thread has given it up
+            now = time.monotonic()
+            if data:
+                self._take_in(data, now)
+                self._flush()
+            else:
+                self.break_off(why, now)
+
+    def _take_in(self, data: bytes, now: float) -> None:
+        self.receive(data, now)
 
     def _hang_up(self) -> None:
         self._shut(SHUT_RDWR)  # wakes a thread that reads; closing alone would not
 
     def _drop(self) -> None:
-        self._socket.close()
+        if self._socket is not None:
+            self._socket.close()
+
+    def _cut_off(self) -> None:
+        self.stop_sending(f"it took nothing for {self._patience:g} s", f"the server at {self.path} does not answer")
+        self._shut(SHUT_WR)
 
     def _shut(self, direction: int) -> None:
         try:
-            self._socket.shutdown(direction)
+            if self._socket is not None:
+                self._socket.shutdown(direction)
         except OSError:
             pass  # the server has hung up
 
-    def _send(self, number: int, request: Request) -> None:
-        """Send a line. What fails here ends nothing that is waited for: the reader still hears what was said before."""
-        data = request_line({"seq": number, **write_request(request)})
-        end = time.monotonic() + ANSWER_LIMIT
-        with self._sending:
-            why = self.ended or self._mute
-            if why:
-                raise ServerUnavailable(f"nothing was sent to the server at {self.path}: {why}")
-            if not data.startswith(self._sent_early):
-                raise AssertionError(f"{self._sent_early!r} was sent early instead of {data!r}")
-            rest = memoryview(data)[len(self._sent_early) :]
-            self._sent_early = b""
-            while rest:
-                try:
-                    rest = rest[self._socket.send(rest) :]
-                except BlockingIOError:
-                    if not wait_ready({self._socket.fileno(): select.POLLOUT}, end - time.monotonic()):
-                        # Half a line may be out: nothing that follows could be understood.
-                        self._mute = f"it took nothing for {ANSWER_LIMIT:g} s"
-                        self._shut(SHUT_WR)
-                        raise ServerUnavailable(f"the server at {self.path} does not answer") from None
-                except OSError as error:
-                    self._mute = "the server went away"
-                    words = f"the server at {self.path} went away: {error.strerror}"
-                    raise ServerUnavailable(words) from None
+
+class ReconnectingConnection(SocketConnection):
+    """A connection that is made again after it broke, by whatever call comes next. It never ends by itself."""
+
+    def __init__(self, socket: str | None = None, *, name: str | None = None, patience: float = ANSWER_LIMIT_S) -> None:
+        """Connect; the arguments are those of `SocketConnection`."""
+        super().__init__(socket, name=name, patience=patience)
+        #: given up while another thread was polling it, which closes it
+        self._given_up: list[_socket.socket] = []
+        #: when the next attempt may be made, and the pause after it (monotonic, seconds)
+        self._retry_at, self._pause_s = 0.0, _FIRST_PAUSE_S
+        #: when the server must have greeted on a new connection (monotonic)
+        self._greet_by = 0.0
+        #: why the last attempt failed
+        self._failure: TalkError = ServerUnavailable("")
+
+    def begin(
+        self,
+        request: Request,
+        on_reply: OnReply | None = None,
+        on_failure: OnFailure | None = None,
+        *,
+        slow: bool = False,
+    ) -> Exchange:
+        if on_failure is None:
+            self._look()  # the connection may have broken since the last call
+        with self.changed:
+            if self.ended is None:
+                self._connect_again(time.monotonic(), at_once=isinstance(request, Cancel))
+            if self._socket is None and self.ended is None and on_failure is None:
+                raise self._failure
+            return super().begin(request, on_reply, on_failure, slow=slow)
+
+    def post(self, request: Request) -> None:
+        self.submit(request, lambda *_: None, lambda _: None)
+
+    def break_off(self, why: str, now: float) -> None:
+        if self.ended is not None:
+            return
+        was_greeted = self.greeted
+        self._give_up_socket()
+        if was_greeted:
+            self.disconnected(why, now)
+            self._retry_at, self._pause_s = now, _FIRST_PAUSE_S
+        else:
+            self._not_connected(ServerUnavailable(f"nothing was sent to the server at {self.path}: {why}"), now)
+
+    def _step(self, timeout: float, interruptible: bool) -> None:
+        with self.changed:
+            now = time.monotonic()
+            if self._socket is not None and not self.greeted and now >= self._greet_by:
+                self._give_up_socket()
+                self._not_connected(ServerUnavailable(f"the server at {self.path} does not answer"), now)
+            if self.ended is None:
+                self._connect_again(now)
+            if self._socket is None:
+                timeout = max(0.0, min(timeout, self._retry_at - now, _LOOK_S))
+            elif not self.greeted:
+                timeout = max(0.0, min(timeout, self._greet_by - now))
+            absent = self._socket is None
+        if absent:
+            wait_ready({}, timeout)
+        else:
+            super()._step(timeout, interruptible)
+        with self.changed:
+            for each in self._given_up:
+                each.close()
+            self._given_up.clear()
+
+    def _take_in(self, data: bytes, now: float) -> None:
+        try:
+            super()._take_in(data, now)
+        except TalkError as error:  # of the greeting
+            self._give_up_socket()
+            self._not_connected(error, now)
+
+    def _connect_again(self, now: float, *, at_once: bool = False) -> None:
+        """Try to connect, unless there is a connection or, not `at_once`, the last attempt is too recent."""
+        if self._socket is not None or (now < self._retry_at and not at_once):
+            return
+        found = reach(self._named, only=self.path)
+        if found.socket is None:
+            self._not_connected(unreachable(found, self._named), now)
+            return
+        self._socket, self._greet_by = found.socket, now + self._patience
+        self.connecting(request_line(self._first_words), __version__)
+        self._flush()
+
+    def _not_connected(self, error: TalkError, now: float) -> None:
+        self._failure = error
+        self._retry_at, self._pause_s = now + self._pause_s, min(2 * self._pause_s, _LONGEST_PAUSE_S)
+        self.not_connected(error, " ".join(error.message.split()))
+
+    def _give_up_socket(self) -> None:
+        """Close the socket, or have the thread that polls it close it. Under `changed`."""
+        self._hang_up()
+        if self._socket is not None and self._reading:
+            self._given_up.append(self._socket)
+        elif self._socket is not None:
+            self._socket.close()
+        self._socket = None
+
+    def _cut_off(self) -> None:
+        self.break_off(f"it took nothing for {self._patience:g} s", time.monotonic())

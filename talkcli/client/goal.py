@@ -1,8 +1,7 @@
-"""A goal that was sent, or is followed: its state, its events as they come, its end. Of several, one stream of them.
+"""Handles of goals: the state of each, its events and its end; and the events of several goals as one stream.
 
-It needs a connection, and knows no client. It reads nothing by itself: whoever waits on the connection reads for all,
-and what is for this goal comes to `_hear`. Whatever changes a handle does so under the connection's lock, and never
-after the goal has ended.
+A handle needs a connection and no client. It reads nothing by itself: a thread that waits on the connection reads for
+all handles. Handles change under the connection's lock only, and never after their goal has ended.
 """
 
 from __future__ import annotations
@@ -10,13 +9,13 @@ from __future__ import annotations
 import time
 
 from talkcli.client.connection import taken
-from talkcli.client.following import EventBuffer, Gone
+from talkcli.client.core import TrackedGoal, lost
 from talkcli.errors import UsageError
-from talkcli.frozen import TYPE_CHECKING, replace
+from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import Cancel
 from talkcli.goals.states import State
-from talkcli.protocol.events import Canceled, PausedChanged, Result, StateChanged, WordHeard, goals
+from talkcli.protocol.events import Canceled, PausedChanged, Result, WordHeard, goals
 from talkcli.protocol.requests import Status, Wait
 
 if TYPE_CHECKING:
@@ -27,44 +26,38 @@ if TYPE_CHECKING:
     from talkcli.protocol.events import Event
 
 
-class GoalHandle:
-    """A goal that was sent, or is followed. Any number of threads may use it.
+class GoalHandle(TrackedGoal):
+    """A goal that was sent or is followed. Any number of threads may use it.
 
-    Its events are kept until somebody takes them, the last 5,000 words of them: `events`, `feedback` and `poll` take
-    from the same store, each event is handed out once, and who breaks off and calls again goes on where it was. An
-    iterator is for one thread; another calls for its own.
+    Its events are kept until they are taken, including the last 5,000 words and pauses. `events`, `feedback` and `poll`
+    take from the same store, so each event is returned once. After a loop over `events` was left, the next call goes on
+    where it ended. An iterator is for one thread; another thread calls the method again.
     """
 
     def __init__(self, connection: Connection, goal: Goal) -> None:
+        super().__init__(goal)
         self._connection = connection
-        #: the goal as it was last heard of
-        self.goal = goal
-        #: whether another `say` had sent this goal before, with the same id: this one only watches
-        self.attached = False
-        #: whether the server holds all speech, as far as it was heard of: nothing is spoken until somebody resumes
-        self.speech_paused = False
-        #: since when the server tells this connection how it ends, by the monotonic clock; None where it doesn't
-        self._followed_at: float | None = None
-        #: whether it tells each word, too
-        self._fed = False
-        self._buffer = EventBuffer()
-        #: whether its Result has been handed out
-        self._told = False
 
     @property
     def id(self) -> str:
-        """The goal's id; empty where the goal was REJECTED before it was sent."""
+        """The goal's id; empty if the goal was REJECTED before it was sent and has no id of the sender's."""
         return self.goal.id
 
     @property
     def state(self) -> State:
-        """The goal's state as far as it was read: `wait`, or any other call of the client, reads on."""
+        """The goal's state, as far as it is known: `wait`, `poll` and any other call of the client update it."""
         return self.goal.state
 
     def wait(self, timeout: float | None = None) -> Goal:
-        """Wait until the goal has ended, and return it; TimeoutError after `timeout` seconds.
+        """Wait until the goal has ended, and return it.
 
-        Where the server goes away first, the goal's state is LOST: it may have been spoken or not.
+        If the server goes away first, the goal ends as LOST: it may have been spoken or not.
+
+        Args:
+            timeout: the longest wait in seconds; None for no limit.
+
+        Raises:
+            TimeoutError: the goal has not ended in this time. It goes on.
         """
         end = _end(timeout)
         self._follow(feedback=False)
@@ -73,115 +66,87 @@ class GoalHandle:
         return self.goal
 
     def events(self, timeout: float | None = None) -> Iterator[Event]:
-        """Iterate over what happens to the goal, as it happens; the last item is its Result.
+        """Iterate over the goal's events as they happen. The last one is its Result.
 
-        StateChanged for each state; and if it was sent or followed with `feedback`, WordHeard for each word as it is
-        heard, and PausedChanged where speech is held or goes on.
+        The events are StateChanged for each state and, if the goal was sent or followed with `feedback`, WordHeard for
+        each word as it is heard and PausedChanged when speech is paused or resumed. If the server goes away first, the
+        Result is that of a LOST goal.
 
-        TimeoutError where the goal has not ended `timeout` seconds after this call. Where the server goes away first,
-        the Result is a goal that is LOST, as with `wait`.
+        Args:
+            timeout: seconds from this call in which the goal must end; None for no limit.
+
+        Raises:
+            TimeoutError: the goal has not ended in this time.
         """
         end = _end(timeout)
         self._follow(feedback=False)
         return self._events(end, timeout)
 
     def feedback(self, timeout: float | None = None) -> Iterator[WordHeard]:
-        """Iterate over the goal's words as they are heard, until it has ended; TimeoutError as with `events`.
+        """Iterate over the goal's words as they are heard, until it has ended.
 
-        A goal that was sent without `feedback` gives those heard from this call on.
+        If the goal was sent without `feedback`, the words are those from this call on. The timeout is that of `events`.
         """
         end = _end(timeout)
         self._follow(feedback=True)
         return (each for each in self._events(end, timeout) if isinstance(each, WordHeard))
 
     def poll(self) -> Event | None:
-        """Return the next event that has come, as `events` has them, else None; the last is the Result. Never waits.
+        """Return the goal's next event, None if there is none now. The last event is the Result. It never waits.
 
-        For a loop that must not: it reads what the server has said meanwhile, so it has to be called again and again.
-        UsageError for a goal that was sent with `follow=False`, of which nothing comes until `wait` or `events` asks.
+        It is made for loops that must not wait. It also sends what is left of earlier requests, and reads what the
+        server has sent, so call it again and again.
+
+        Raises:
+            UsageError: the goal was sent with `follow=False`, so its events don't come before `wait` or `events` has
+                asked for them.
         """
         if self._followed_at is None and not self.state.terminal:
             raise UsageError(f"nothing is heard of {self.id}, which was sent with follow=False: leave that out")
         now, since = time.monotonic(), self._followed_at
-        if not self._connection.wait_until(self._has_next, now, since=since, interruptible=False):
+        if not self._connection.wait_until(self._has_event, now, since=since, interruptible=False):
             self._lose()
         with self._connection.changed:
-            event = self._next()
+            event = self._take()
             if isinstance(event, Result):
-                event, self._told = None if self._told else event, True
+                event, self._result_taken = None if self._result_taken else event, True
         return event
 
     def request_cancel(self) -> None:
-        """Ask for the goal to be cancelled, without waiting for it: `wait` tells how it ended."""
-        if self.id:
+        """Ask the server to cancel the goal. It never waits: `wait` or `poll` tells how the goal ended."""
+        if self.id and (not self.state.terminal or self.state is State.LOST):
             self._connection.post(Cancel((self.id,)))
 
     def cancel(self) -> Goal:
-        """Cancel the goal, and return it once it has ended: silent, if it was being spoken."""
+        """Cancel the goal, and return it after it has ended. If it was being spoken, it is silent then."""
         if not self.state.terminal:
             found = Canceled.from_items(self._connection.request(Cancel((self.id,)))[1])
             goal = next((each for each in (*found.canceled, *found.ended) if each.id == self.id), None)
-            self._settle(goal or Goal.from_json(self._connection.request(Status(self.id))[0].get("goal")))
+            goal = goal or Goal.from_json(self._connection.request(Status(self.id))[0].get("goal"))
+            with self._connection.changed:
+                self._settle(goal)
         return self.goal
 
     # -- inside
 
     def _listen(self, *, feedback: bool) -> None:
-        """Hear of the goal from now on, which the server tells this connection of; under the connection's lock."""
-        self._fed = self._fed or feedback
-        if self._followed_at is None:
-            self._followed_at = time.monotonic()
-            if not self.state.terminal:
-                self._connection.followed.add(self.id, self._hear)
-
-    def _hear(self, event: Event | Gone) -> None:
-        """Take up an event of this goal, or of all speech."""
-        if self.state.terminal:
-            return
-        if isinstance(event, Gone):
-            self.goal = _lost(self.goal, event.why)
-        elif isinstance(event, Result):
-            self.goal = event.goal
-        elif isinstance(event, StateChanged):
-            # Its end comes with the result, which says how and why.
-            if not event.state.terminal:
-                self.goal = replace(self.goal, state=event.state)
-            self._buffer.add(event)
-        else:
-            if isinstance(event, PausedChanged):
-                self.speech_paused = event.paused
-                held = event.paused and event.id == self.id and self.state is State.ACTIVE
-                self.goal = replace(self.goal, paused=held)
-            if self._fed:
-                self._buffer.add(event)
-
-    def _settle(self, goal: Goal) -> None:
-        """Take up what the server says of the goal now, unless it is known to have ended."""
-        with self._connection.changed:
-            if not self.state.terminal:
-                self.goal = goal
+        """Take in the goal's events from now on, which the server sends to this connection. Under its lock."""
+        self._listen_to(self._connection.listeners, feedback=feedback, now=time.monotonic())
 
     def _events(self, end: float | None, timeout: float | None) -> Iterator[Event]:
-        for event in taken(self._connection, self._next, end):
+        for event in taken(self._connection, self._take, end):
             if event is None:
                 self._give_up(timeout)
             elif isinstance(event, Result):
-                self._told = True
+                self._result_taken = True
                 yield event
                 return
             else:
                 yield event
 
-    def _has_next(self) -> bool:
-        return self.state.terminal or bool(self._buffer)
-
-    def _next(self) -> Event | None:
-        """Take the next event, the Result where there is no other; under the connection's lock."""
-        return self._buffer.take() or (Result(self.goal) if self.state.terminal else None)
-
     def _follow(self, *, feedback: bool) -> None:
-        """Have this connection told of the goal, if it isn't yet."""
-        if self.state.terminal or (self._followed_at is not None and (self._fed or not feedback)):
+        """Have the server send the goal's events to this connection, if it doesn't yet."""
+        if self.state.terminal or (self._followed_at is not None and (self._with_feedback or not feedback)):
             return
 
         def accepted(_: JsonObject, items: list[JsonObject]) -> None:
@@ -191,25 +156,29 @@ class GoalHandle:
         self._connection.request(Wait((self.id,), feedback), accepted)
 
     def _give_up(self, timeout: float | None) -> None:
-        """Conclude that the goal is lost, where nothing more can be heard of it; else raise TimeoutError."""
+        """Conclude that the goal is lost if the connection has ended; else raise TimeoutError."""
         if not self._lose():
             raise TimeoutError(f"{self.id} has not ended after {0 if timeout is None else round(timeout, 1):g} s")
 
     def _lose(self) -> bool:
-        """Conclude that the goal is lost, and return True, where nothing more can be heard of it."""
+        """Conclude that the goal is lost if the connection has ended, and return whether it has."""
         ended = self._connection.ended
         if ended is not None:
-            self._settle(_lost(self.goal, f"{ended}; it may still be spoken"))
+            with self._connection.changed:
+                self._settle(lost(self.goal, f"{ended}; it may still be spoken"))
         return ended is not None
 
 
 def merged(handles: Sequence[GoalHandle], timeout: float | None = None) -> Iterator[tuple[GoalHandle, Event]]:
-    """Iterate over what happens to these goals of one connection, each event with its goal, until all have ended.
+    """Iterate over the events of several goals of one connection, each with its handle, until all goals have ended.
 
-    Each goal's last is its Result. That speech is held, which all of them hear, comes once. TimeoutError where they
-    have not all ended `timeout` seconds after the first step; where the server goes away, the rest are LOST.
+    The last event of each goal is its Result. A pause of all speech comes once. If the server goes away, the goals that
+    have not ended are LOST.
+
+    Raises:
+        TimeoutError: not all goals have ended `timeout` seconds after the first step.
     """
-    stream = _Stream(handles)
+    stream = _EventStream(handles)
     if not handles:
         return
     for found in taken(handles[0]._connection, stream.take, _end(timeout)):
@@ -221,39 +190,35 @@ def merged(handles: Sequence[GoalHandle], timeout: float | None = None) -> Itera
             return
 
 
-class _Stream:
-    """The events of some goals, as they come."""
+class _EventStream:
+    """The events of several goals in the server's order."""
 
     def __init__(self, handles: Sequence[GoalHandle]) -> None:
-        #: goals whose Result was not found yet, each once, whoever named it twice
+        #: the goals whose Result was not found yet, each once
         self.going = list({each.id: each for each in handles}.values())
-        #: the number of the last event, by the goal's id: its Result follows that
-        self._last = dict.fromkeys((each.id for each in self.going), 0)
-        self._paused_at: int | None = None
+        #: the number of each goal's last event, which its Result follows
+        self._last_numbers = dict.fromkeys((each.id for each in self.going), 0)
+        self._pause_number: int | None = None
 
     def take(self) -> list[tuple[GoalHandle, Event]]:
-        """Take what has come for all of them, in the server's order; under the connection's lock."""
+        """Remove and return the events that have come for all goals. Under the connection's lock."""
         found = []
         for handle in self.going:
             event: Event | None = None
-            while not isinstance(event, Result) and (event := handle._next()):
+            while not isinstance(event, Result) and (event := handle._take()):
                 number = getattr(event, "n", None)
                 if isinstance(event, PausedChanged) and number is not None:
-                    if number == self._paused_at:
+                    if number == self._pause_number:
                         continue
-                    self._paused_at = number
+                    self._pause_number = number
                 if number is not None:
-                    self._last[handle.id] = number
-                found.append((self._last[handle.id], handle, event))
+                    self._last_numbers[handle.id] = number
+                found.append((self._last_numbers.get(handle.id, 0), handle, event))
         self.going = [each for each in self.going if not each.state.terminal]
         # A stable sort: a Result has the number of its goal's last event, and was found after that.
         return [(handle, event) for _, handle, event in sorted(found, key=lambda each: each[0])]
 
 
-def _lost(goal: Goal, why: str) -> Goal:
-    """Return what is known of a goal of which nothing more can be heard."""
-    return replace(goal, state=State.LOST, reason="lost", message=f"Talk lost: {why}")
-
-
 def _end(timeout: float | None) -> float | None:
+    """Return when a timeout from now is over (monotonic)."""
     return None if timeout is None else time.monotonic() + timeout

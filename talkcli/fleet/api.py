@@ -13,7 +13,7 @@ import os
 from typing import TYPE_CHECKING
 
 from talkcli.client.client import Client
-from talkcli.client.connect import ANSWER_LIMIT
+from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.fleet.broker import URL, from_environment, require_paho
 from talkcli.fleet.desk.request import Selection
 from talkcli.goals.options import Cancel, Say, Set
@@ -71,7 +71,7 @@ class Fleet:
         """
         from talkcli.fleet.desk.watch import read_presences
 
-        return sorted(read_presences(self._broker, ANSWER_LIMIT).values(), key=lambda each: each.name)
+        return sorted(read_presences(self._broker, ANSWER_LIMIT_S).values(), key=lambda each: each.name)
 
     def robot(self, name: str) -> Client:
         """Return a client of one robot's server, which is used like a client of a local server.

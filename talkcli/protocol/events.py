@@ -1,9 +1,9 @@
-"""What a server says, and its form in JSON: the greeting, replies and their lists, and the events that are heard.
+"""The messages of a server and their JSON form: the greeting, replies with their lists, and events.
 
-Rules for this file: form only, no I/O. `to_json` gives what the wire has, which is what the commands print. A field may
-be added, never renamed or given another meaning, and means the same in each event; a reader ignores what it doesn't
-know. A change that an older peer could not read needs another PROTOCOL number; `{"request": "cancel"}` and
-`{"request": "status"}` stay the same in all of them.
+Rules for this file: form only, no I/O. `to_json` returns the object of the wire, which is also what the commands print.
+A field means the same in each event. It may be added, but never renamed or given another meaning. Readers ignore fields
+that they don't know. A change that an older peer could not read needs another PROTOCOL number. `{"request": "cancel"}`
+and `{"request": "status"}` stay the same in every protocol.
 """
 
 from __future__ import annotations
@@ -24,14 +24,15 @@ PROTOCOL = 1
 
 @frozen
 class ServerStatus:
-    """What a server says, will say and said. `server` is its own description, for people and programs."""
+    """The state of a server and its goals."""
 
+    #: the server's description of itself, see `server` in the wire's document
     server: JsonObject
     #: the goal that is ACTIVE or PREEMPTING
     active: Goal | None
-    #: what comes next, in its order
+    #: in the order in which they will be spoken
     pending: tuple[Goal, ...]
-    #: what ended last, oldest first
+    #: the goals that ended last, oldest first
     recent: tuple[Goal, ...]
 
     def to_json(self) -> JsonObject:
@@ -44,7 +45,7 @@ class ServerStatus:
 
     @classmethod
     def from_json(cls, message: JsonObject) -> ServerStatus:
-        """Return the status in an object; Unreadable where one of its goals is none."""
+        """Return the status in an object; Unreadable if one of its goals is malformed."""
         server, pending, recent = message.get("server"), message.get("pending"), message.get("recent")
         return cls(
             server if isinstance(server, dict) else {},
@@ -55,87 +56,89 @@ class ServerStatus:
 
     @classmethod
     def from_reply(cls, reply: JsonObject, items: list[JsonObject]) -> ServerStatus:
-        """Return what a reply and the lines of its list say."""
+        """Return the status in a reply and the lines of its list."""
         lists = {name: [each[name] for each in items if name in each] for name in ("pending", "recent")}
         return cls.from_json({**reply, **lists})
 
 
 def unfinished(status: ServerStatus) -> list[Goal]:
-    """Return the goals of a status that have not ended: the active one, then those that wait, in their order."""
+    """Return the goals of a status that have not ended: the active one, then the pending ones in their order."""
     return [*([status.active] if status.active else []), *status.pending]
 
 
 @frozen
 class Canceled:
-    """What a cancel did: the goals that it ended, and those named that had ended before."""
+    """The effect of a cancel."""
 
+    #: the goals that it ended
     canceled: tuple[Goal, ...]
+    #: the goals that were named and had ended before
     ended: tuple[Goal, ...]
 
     @classmethod
     def from_items(cls, items: list[JsonObject]) -> Canceled:
-        """Return what the lines of a cancel's list say."""
+        """Return the effect as the lines of a cancel's list tell it."""
         return cls(tuple(goals(items, "canceled")), tuple(goals(items, "ended")))
 
 
 @frozen
 class StateChanged:
-    """A goal is in another state now."""
+    """A change of a goal's state."""
 
     id: str
     state: State
-    #: when, in seconds since 1970 UTC
+    #: the time of the event, in seconds since 1970 UTC
     at: float | None = None
-    #: the server's count of events: a gap in it shows feedback that was dropped, or was for others
+    #: the number of the event; gaps are events for other clients, or words that were dropped for a slow reader
     n: int | None = None
-    #: the whole goal, where the server tells all goals: with the first state and the last
+    #: the whole goal, with the first and the last state, for clients that watch all goals
     goal: Goal | None = None
 
     def to_json(self) -> JsonObject:
-        message = {**_counted("state", self), "state": self.state.name}
+        message = {**_numbered("state", self), "state": self.state.name}
         del message["goal"]
         return message if self.goal is None else {**message, "goal": self.goal.to_json()}
 
 
 @frozen
 class WordHeard:
-    """A word of a goal is being heard: it begins now."""
+    """The beginning of a word that is being heard."""
 
     id: str
     word: str
-    #: where it stands in the goal's text: `text[start:end]`, in characters
+    #: the word's place in the goal's text, `text[start:end]`, in characters
     start: int
     end: int
-    #: 1 for the first word that was heard
+    #: 1 for the first word of the goal that was heard
     number: int
-    #: seconds into the sentence
+    #: seconds since the goal's sound began
     time: float
     at: float | None = None
     n: int | None = None
 
     def to_json(self) -> JsonObject:
-        return _counted("word", self)
+        return _numbered("word", self)
 
 
 @frozen
 class PausedChanged:
-    """Speech is held, or goes on."""
+    """A pause of all speech, or its end."""
 
     paused: bool
-    #: the goal that is held, or goes on; None where none was being spoken
+    #: the goal that is paused or goes on; None if none was being spoken
     id: str | None = None
-    #: who asked for it
+    #: the client that asked for it
     by: By | None = None
     at: float | None = None
     n: int | None = None
 
     def to_json(self) -> JsonObject:
-        return {**_counted("paused", self), "by": None if self.by is None else self.by.to_json()}
+        return {**_numbered("paused", self), "by": None if self.by is None else self.by.to_json()}
 
 
 @frozen
 class Result:
-    """A goal has ended; this is how."""
+    """The end of a goal."""
 
     goal: Goal
 
@@ -145,7 +148,7 @@ class Result:
 
 @frozen
 class Snapshot:
-    """How everything is as watching begins."""
+    """The state of the server and its goals at the time when watching begins."""
 
     status: ServerStatus
 
@@ -155,7 +158,7 @@ class Snapshot:
 
 Event = StateChanged | WordHeard | PausedChanged | Result | Snapshot
 
-_KINDS: dict[str, type[StateChanged | WordHeard | PausedChanged | Result]] = {
+_EVENTS_BY_KIND: dict[str, type[StateChanged | WordHeard | PausedChanged | Result]] = {
     "state": StateChanged,
     "word": WordHeard,
     "paused": PausedChanged,
@@ -164,55 +167,55 @@ _KINDS: dict[str, type[StateChanged | WordHeard | PausedChanged | Result]] = {
 
 
 def from_json(message: JsonObject) -> Event | None:
-    """Return the event in a message; None for a kind that is not known here; Unreadable where its fields are wrong."""
+    """Return the event in a message, None for an unknown kind of event; Unreadable if a field is malformed."""
     kind = str(message.get("event"))
     if kind == "snapshot":
         return Snapshot(ServerStatus.from_json(message))
-    event = _KINDS.get(kind)
+    event = _EVENTS_BY_KIND.get(kind)
     if event is None:
         return None
     found = known(event, message)
     for name, annotation in event.__annotations__.items():
         value = message.get(name)
-        # A time past all calendars is none, as in a goal: what has happened is no less true for that.
-        none = value is None or (annotation.startswith("float") and type(value) in (int, float))
-        if name not in found and not (none and annotation.endswith(" | None")):
+        # A time that no calendar can show counts as missing, as in a goal; the event is still true.
+        missing = value is None or (annotation.startswith("float") and type(value) in (int, float))
+        if name not in found and not (missing and annotation.endswith(" | None")):
             raise Unreadable(f"the {name!r} of a {kind!a} event is {value!a}")
     return event(**found)
 
 
-def _counted(kind: str, event: StateChanged | WordHeard | PausedChanged) -> JsonObject:
-    """Return an event as an object: the kind first, the server's count and the time last."""
+def _numbered(kind: str, event: StateChanged | WordHeard | PausedChanged) -> JsonObject:
+    """Return an event as an object: the kind first, the number and the time last."""
     own = fields(event)
     at, n = own.pop("at"), own.pop("n")
     return {"event": kind, **own, "n": n, "at": at}
 
 
 def goals(items: list[JsonObject], name: str) -> Iterator[Goal]:
-    """Return the goals that the lines of a list have under this name."""
+    """Return the goals under this name in the lines of a list; Unreadable if one is malformed."""
     return (Goal.from_json(each[name]) for each in items if name in each)
 
 
 def goal_in(reply: JsonObject, name: str = "goal") -> Goal | None:
-    """Return the goal in a reply, None where it is null; Unreadable where it is no goal."""
+    """Return the goal in a reply, None if it is null; Unreadable if it is malformed."""
     return None if reply.get(name) is None else Goal.from_json(reply[name])
 
 
 def greeting(version: str, pid: int, boot: str) -> JsonObject:
-    """Return what a server says first."""
+    """Return the first message of a server."""
     return {"talk": PROTOCOL, "version": version, "pid": pid, "boot": boot, "features": []}
 
 
 def busy_greeting(message: str | None = None) -> JsonObject:
-    """Return the greeting of a server that takes no more clients.
+    """Return the greeting of a server that has too many clients.
 
-    `message`: why, and what to do; None if the limit is `--max-clients`.
+    `message` gives the reason and the next step; None if the limit is `--max-clients`.
     """
     return {"talk": PROTOCOL, "error": "busy", **({} if message is None else {"message": message})}
 
 
 def check_greeting(message: JsonObject, version: str) -> None:
-    """Raise ProtocolMismatch or Busy where a client of `version` can't go on after this greeting."""
+    """Raise ProtocolMismatch or Busy if a client of this version can't go on after a greeting."""
     theirs = message.get("talk")
     if theirs != PROTOCOL or isinstance(theirs, bool):
         server = ascii(message.get("version", "unknown"))
@@ -224,18 +227,18 @@ def check_greeting(message: JsonObject, version: str) -> None:
         )
     if message.get("error") == "busy":
         words = message.get("message")
-        if not (isinstance(words, str) and words and words.isprintable()):  # it may be a stranger's, for a terminal
+        if not (isinstance(words, str) and words and words.isprintable()):  # unsafe on a terminal
             words = "the server has as many clients as it takes (`talk serve --max-clients`)"
         raise Busy(words, "busy")
 
 
 def item(seq: int | None, **fields: object) -> JsonObject:
-    """Return one line of a list; the list's reply follows."""
+    """Return a line of a list, which comes before the reply."""
     return fields if seq is None else {"seq": seq, **fields}
 
 
 def ok(seq: int | None, **fields: object) -> JsonObject:
-    """Return the reply that closes a request that was carried out."""
+    """Return the reply to a request that was carried out."""
     return item(seq, ok=True, **fields)
 
 
@@ -245,7 +248,7 @@ def failure(seq: int | None, code: str, message: str) -> JsonObject:
 
 
 def take_seq(message: JsonObject) -> int | None:
-    """Take the number of a request out of it; BadRequest where it is no number."""
+    """Remove the number from a request and return it, None if there is none; BadRequest if it is no integer."""
     seq = message.pop("seq", None)
     if seq is not None and (isinstance(seq, bool) or not isinstance(seq, int)):
         raise BadRequest('"seq" must be an integer', "bad_field")

@@ -1,8 +1,8 @@
-"""Lines: one JSON object each, UTF-8. No I/O: bytes go in, objects come out, and back.
+"""Lines of JSON in UTF-8, one object per line: how a stream is split into lines, and how a line is read and written.
 
-Rules for this file: it knows lines and their limits, never what a request means. Anything that comes from outside ends
-as an object or as a BadRequest, whatever bytes they were. The engine process and its players cut lines, too, and a
-client writes its first request before anything else is there: `json` and the errors are imported by who needs them.
+Rules for this file: no I/O. It knows lines and their limits, never what a request means. Any received bytes become an
+object or a BadRequest. The engine process and its players split lines, too, and a client writes its first request
+before the rest of it is imported, so `json` and the errors are imported by the functions that need them.
 """
 
 from __future__ import annotations
@@ -18,59 +18,62 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
     from talkcli.protocol.requests import Request
 
-#: Bytes of one request line, its newline included: the longest text (40,000 bytes of UTF-8) fits with room for quotes,
+#: The longest request line, including its newline. The longest text (40,000 bytes of UTF-8) fits with room for quotes,
 #: and so do 10,000 characters that are all escaped as \uXXXX.
-MAX_LINE = 64 * 1024
+MAX_LINE_BYTES = 64 * 1024
 
-#: A JSON integer of more digits is no count or time of ours, and converting thousands of digits takes quadratic time.
+#: The number of the first request on a connection.
+FIRST_NUMBER = 1
+
+#: The longest JSON integer: no count or time is longer, and converting thousands of digits takes quadratic time.
 MAX_DIGITS = 20
 
 
-class Cut(bytes):
-    """The beginning of a line that was longer than what is kept of one."""
+class TruncatedLine(bytes):
+    """The beginning of a line that is longer than the limit of its `LineSplitter`."""
 
-    #: bytes that the whole line had
+    #: bytes of the whole line
     size: int
 
 
 class LineSplitter:
-    """Takes bytes as they come and gives lines; holds no more than the first `most` bytes of one."""
+    """Splits a stream of bytes into lines. It keeps at most the first `max_bytes` bytes of a line."""
 
-    __slots__ = ("_begun", "_most", "size")
+    __slots__ = ("_max_bytes", "_rest", "size")
 
-    def __init__(self, most: int = sys.maxsize) -> None:
-        self._most = most
-        self._begun = bytearray()
-        #: bytes of the line that has begun and not ended, those that are not kept among them
+    def __init__(self, max_bytes: int = sys.maxsize) -> None:
+        self._max_bytes = max_bytes
+        self._rest = bytearray()
+        #: bytes of the line that is not complete yet, including those that are not kept
         self.size = 0
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Return the lines that are complete now, without their newlines; those that are too long are `Cut`."""
-        *lines, begun = data.split(b"\n")
+        """Return the lines that are complete now, without their newlines; a line that is too long is truncated."""
+        *lines, rest = data.split(b"\n")
         for place, line in enumerate(lines):
-            if self.size or len(line) > self._most:
+            if self.size or len(line) > self._max_bytes:
                 self._add(line)
-                lines[place] = self.end()
-        self._add(begun)
+                lines[place] = self.take_rest()
+        self._add(rest)
         return lines
 
-    def end(self) -> bytes:
-        """Return the line that has begun and not ended, as if it ended here; empty if there is none."""
-        line = bytes(self._begun)
-        if self.size > self._most:
-            line = Cut(line)
+    def take_rest(self) -> bytes:
+        """Return the line that is not complete, as if it ended here; empty if there is none."""
+        line = bytes(self._rest)
+        if self.size > self._max_bytes:
+            line = TruncatedLine(line)
             line.size = self.size
-        self._begun.clear()
+        self._rest.clear()
         self.size = 0
         return line
 
     def _add(self, data: bytes) -> None:
         self.size += len(data)
-        self._begun += data[: self._most - len(self._begun)]
+        self._rest += data[: self._max_bytes - len(self._rest)]
 
 
 def write_request(request: Request) -> JsonObject:
-    """Return a request as the object that goes over the wire; fields at their defaults are left out."""
+    """Return a request as an object for the wire, without the fields that have their default value."""
     message: JsonObject = {"request": request.kind}
     for option in request.options:
         value = getattr(request, option.name)
@@ -80,7 +83,7 @@ def write_request(request: Request) -> JsonObject:
 
 
 def request_line(message: JsonObject) -> bytes:
-    """Return what `encode` does, without `json` where the values are plain."""
+    """Return an object as a line, as `encode` does, without importing `json` if the values are plain."""
     try:
         shown = ", ".join(f'"{name}": {_plain(value)}' for name, value in message.items())
         return f"{{{shown}}}\n".encode()
@@ -89,10 +92,11 @@ def request_line(message: JsonObject) -> bytes:
 
 
 def _plain(value: object) -> str:
+    """Return a value as JSON; TypeError if only `json` can write it."""
     if isinstance(value, str):
         if value.isprintable() and '"' not in value and "\\" not in value:
             return f'"{value}"'
-        from _json import encode_basestring  # a library of its own, whose loading most texts need not wait for
+        from _json import encode_basestring  # a shared library, which most texts don't need
 
         return encode_basestring(value)
     if isinstance(value, bool):
@@ -107,9 +111,9 @@ def _plain(value: object) -> str:
 
 
 def encode(message: JsonObject) -> bytes:
-    """Return the object as a line; ValueError or TypeError where it is no JSON.
+    """Return an object as a line; ValueError or TypeError if it has no JSON form.
 
-    Text goes as UTF-8; only what UTF-8 cannot hold (a lone surrogate) is escaped.
+    Text is written as UTF-8. Only lone surrogates, which UTF-8 can't hold, are escaped.
     """
     text: str = _json("encode")(message)
     try:
@@ -120,11 +124,11 @@ def encode(message: JsonObject) -> bytes:
 
 
 def decode(line: bytes) -> JsonObject:
-    """Return the object in a line; BadRequest, whose code says why, where there is none."""
+    """Return the object in a line; BadRequest, with a code that says why, if there is none."""
     from talkcli.errors import BadRequest, LineTooLong
 
-    if isinstance(line, Cut):
-        raise LineTooLong(f"a line has at most {MAX_LINE} bytes")
+    if isinstance(line, TruncatedLine):
+        raise LineTooLong(f"a line has at most {MAX_LINE_BYTES} bytes")
     try:
         value = _json("decode")(line.decode())
     except UnicodeDecodeError as error:
@@ -138,22 +142,22 @@ def decode(line: bytes) -> JsonObject:
     return value
 
 
-#: What writes and reads JSON. `json.dumps` and `json.loads` make new ones for each line that isn't written or read in
-#: their own way, which takes half as long as an event's line itself.
-_made: dict[str, Callable[[Any], Any]] = {}
+#: Functions that write and read JSON. With arguments, `json.dumps` and `json.loads` make new ones for each line, which
+#: takes half as long as writing the line of an event.
+_json_functions: dict[str, Callable[[Any], Any]] = {}
 
 
-def _json(way: str) -> Callable[[Any], Any]:
-    """Return one of them, made when the first line needs it."""
-    if not _made:
+def _json(name: str) -> Callable[[Any], Any]:
+    """Return one of the functions `decode`, `encode` and `escape`, which are made at the first call."""
+    if not _json_functions:
         import json
 
         reading = json.JSONDecoder(
             object_pairs_hook=_no_duplicates, parse_constant=_no_constant, parse_int=_short_integer, parse_float=_number
         )
         writing, escaping = json.JSONEncoder(ensure_ascii=False, allow_nan=False), json.JSONEncoder(allow_nan=False)
-        _made.update(decode=reading.decode, encode=writing.encode, escape=escaping.encode)
-    return _made[way]
+        _json_functions.update(decode=reading.decode, encode=writing.encode, escape=escaping.encode)
+    return _json_functions[name]
 
 
 def _no_duplicates(pairs: list[tuple[str, object]]) -> JsonObject:
@@ -181,5 +185,5 @@ def _number(digits: str) -> float:
 
 
 def _finite(number: float) -> bool:
-    """Whether it is neither NaN nor infinite."""
+    """Return whether a number is neither NaN nor infinite."""
     return number - number == 0

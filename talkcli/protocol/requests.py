@@ -1,9 +1,9 @@
-"""The requests of a client, as frozen values, and how they are read from JSON.
+"""The requests of a client as frozen values, and how they are read from JSON.
 
-Rules for this file: form only; whether a goal is admitted is the scheduler's business. A request is one class and the
-rows of its fields; what a goal is and a server's settings are is in `goals.options`. A field may be added, never
-renamed or given another meaning. A field that is not in the rows is an error: an option that this server doesn't know
-is refused, never dropped. The first sentence of a request's docstring is its meaning in the wire's table.
+Rules for this file: form only. The scheduler decides whether a goal is admitted. A request is one class with a row for
+each of its fields; `say`, `cancel` and `set` are in `goals.options`. A field may be added, but never renamed or given
+another meaning. A field that is not in the rows is an error: an option that this server doesn't know is refused, never
+ignored. `meaning` is the text of the wire's table; without it, the table has the first sentence of the docstring.
 """
 
 from __future__ import annotations
@@ -27,17 +27,18 @@ def _bad_count(value: int) -> str | None:
     return None if 0 < value <= MAX_LOG else f"must be 1 to {MAX_LOG}"
 
 
-_NAME = Kind("string", (str,), "must be a string", fault=_bad_name)
-_COUNT = Kind("integer", (int,), "must be an integer", fault=_bad_count)
+_NAME_TYPE = Kind("string", (str,), "must be a string", fault=_bad_name)
+_COUNT_TYPE = Kind("integer", (int,), "must be an integer", fault=_bad_count)
 
 
 @frozen
 class Hello:
-    """Who connects; send it at once, and the server knows that you are alive."""
+    """The first message of a client."""
 
     kind: ClassVar[str] = "hello"
+    meaning: ClassVar[str] = "Who connects; send it at once, and the server knows that you are alive"
     options: ClassVar[tuple[Option, ...]] = (
-        Option("name", _NAME, "what the sender calls itself", form=f"1 to {MAX_NAME} characters"),
+        Option("name", _NAME_TYPE, "what the sender calls itself", form=f"1 to {MAX_NAME} characters"),
         Option(
             "urgent",
             FLAG,
@@ -51,9 +52,10 @@ class Hello:
 
 @frozen
 class Wait:
-    """Send the results of these goals, whoever sent them."""
+    """A subscription to the results of these goals, whoever sent them."""
 
     kind: ClassVar[str] = "wait"
+    meaning: ClassVar[str] = "Send the results of these goals, whoever sent them"
     options: ClassVar[tuple[Option, ...]] = (
         Option("ids", IDS, "null: all that are active or pending now", form=f"of to {MAX_IDS:,} ids", absent="all"),
         Option("feedback", FLAG, "each word as it is heard, too", default=False),
@@ -64,72 +66,78 @@ class Wait:
 
 @frozen
 class Status:
-    """The server, and what it says, will say and said; or one goal."""
+    """A question about the server and its goals, or about one goal."""
 
     kind: ClassVar[str] = "status"
+    meaning: ClassVar[str] = "The server, and what it says, will say and said; or one goal"
     options: ClassVar[tuple[Option, ...]] = (Option("id", ID, "this goal alone"),)
     id: str | None = None
 
 
 @frozen
 class Voices:
-    """The engine's voices."""
+    """A question about the engine's voices."""
 
     kind: ClassVar[str] = "voices"
+    meaning: ClassVar[str] = "The engine's voices"
     options: ClassVar[tuple[Option, ...]] = ()
 
 
 @frozen
 class Watch:
-    """Everything as it is now, and then all that happens to any goal."""
+    """A subscription to the events of all goals, after an overview."""
 
     kind: ClassVar[str] = "watch"
+    meaning: ClassVar[str] = "Everything as it is now, and then all that happens to any goal"
     options: ClassVar[tuple[Option, ...]] = ()
 
 
 @frozen
 class Log:
-    """The last goals that ended, REJECTED ones too, oldest first."""
+    """A question about the last goals that ended, oldest first."""
 
     kind: ClassVar[str] = "log"
-    options: ClassVar[tuple[Option, ...]] = (Option("count", _COUNT, "so many", 20, form=f"1 to {MAX_LOG:,}"),)
+    meaning: ClassVar[str] = "The last goals that ended, REJECTED ones too, oldest first"
+    options: ClassVar[tuple[Option, ...]] = (Option("count", _COUNT_TYPE, "so many", 20, form=f"1 to {MAX_LOG:,}"),)
     count: int = 20
 
 
 @frozen
 class Pause:
-    """Hold speech where it is. Answered when it is silent."""
+    """A pause of all speech. The answer comes when it is silent."""
 
     kind: ClassVar[str] = "pause"
+    meaning: ClassVar[str] = "Hold speech where it is"
     options: ClassVar[tuple[Option, ...]] = ()
 
 
 @frozen
 class Resume:
-    """Go on where speech was held."""
+    """The end of a pause."""
 
     kind: ClassVar[str] = "resume"
+    meaning: ClassVar[str] = "Go on where speech was held"
     options: ClassVar[tuple[Option, ...]] = ()
 
 
 Request = Hello | Say | Wait | Cancel | Status | Voices | Watch | Log | Set | Pause | Resume
 
-KINDS: dict[str, type[Request]] = {each.kind: each for each in Request.__args__}
-_OPTIONS = {kind: {each.name: each for each in request.options} for kind, request in KINDS.items()}
+REQUEST_TYPES: dict[str, type[Request]] = {each.kind: each for each in Request.__args__}
+_OPTIONS_BY_KIND = {kind: {each.name: each for each in request.options} for kind, request in REQUEST_TYPES.items()}
 
 
 def read_request(message: JsonObject) -> Request:
-    """Return the request in a decoded line, whose `seq` was taken out; BadRequest, with a code, where there is none."""
+    """Return the request in a decoded line without its `seq`; BadRequest, with a code, if it is malformed."""
     fields = dict(message)
     kind = fields.pop("request", None)
     if not isinstance(kind, str):
         raise BadRequest('a request is an object with a "request"', "bad_request")
-    request = KINDS.get(kind)
+    request = REQUEST_TYPES.get(kind)
     if request is None:
-        known = ", ".join(KINDS)
+        known = ", ".join(REQUEST_TYPES)
         raise BadRequest(f"this server does not know the request {kind[:MAX_NAME]!r}, but {known}", "unknown_request")
     for name, value in fields.items():
-        option = _OPTIONS[kind].get(name)
+        option = _OPTIONS_BY_KIND[kind].get(name)
         if option is None:
             raise BadRequest(f"this server does not know the field {name[:MAX_NAME]!r} of {kind}", "unknown_field")
         fault = option.fault(value)

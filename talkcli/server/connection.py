@@ -15,7 +15,7 @@ from talkcli.errors import BadRequest
 from talkcli.frozen import replace
 from talkcli.goals.options import Cancel
 from talkcli.protocol.events import busy_greeting, failure, ok, take_seq
-from talkcli.protocol.lines import MAX_LINE, Cut, LineSplitter, decode, encode
+from talkcli.protocol.lines import MAX_LINE_BYTES, LineSplitter, TruncatedLine, decode, encode
 from talkcli.protocol.requests import Hello, Request, Status, read_request
 from talkcli.server.stream import Stream
 
@@ -75,7 +75,7 @@ class Connection(asyncio.Protocol):
         self.stream = Stream(streams, connected, self, SOFT_OUTPUT)
         self._handler = handler
         self._loop = streams.loop
-        self._splitter = LineSplitter(MAX_LINE - 1)
+        self._splitter = LineSplitter(MAX_LINE_BYTES - 1)
         self._lines: deque[bytes] = deque()
         #: what has to be sent in its order while a list is on its way: lists, and what came after them
         self._outbox: deque[Iterator[JsonObject] | bytes] = deque()
@@ -113,8 +113,8 @@ class Connection(asyncio.Protocol):
 
     def data_received(self, data: bytes) -> None:
         self._lines.extend(self._splitter.feed(data))
-        if self._splitter.size >= MAX_LINE:
-            self._lines.append(self._splitter.end())  # its end need not be awaited
+        if self._splitter.size >= MAX_LINE_BYTES:
+            self._lines.append(self._splitter.take_rest())  # its end need not be awaited
         if b"\n" in data:
             self._stop_line_limit()  # what follows the newline is another line
         self._work()
@@ -258,7 +258,7 @@ class Connection(asyncio.Protocol):
             seq = take_seq(message)
             request = read_request(message)
         except BadRequest as error:
-            self._bad_lines += MAX_BAD_LINES if isinstance(line, Cut) else 1  # nobody knows what follows it
+            self._bad_lines += MAX_BAD_LINES if isinstance(line, TruncatedLine) else 1  # nobody knows what follows it
             self.send(failure(seq, error.code, str(error)))
             if self._bad_lines >= MAX_BAD_LINES or not self.admitted:
                 self.stream.close()

@@ -15,7 +15,7 @@ from talkcli.cli.commands import COMMANDS
 from talkcli.goals.option import IDS, SECONDS, Option
 from talkcli.goals.options import Set
 from talkcli.goals.reasons import Reason
-from talkcli.protocol.requests import KINDS
+from talkcli.protocol.requests import REQUEST_TYPES
 from tests.support.documents import COMMAND_LINE, WIRE
 
 #: Stands in the place of a command's name where the options are everybody's.
@@ -40,8 +40,8 @@ def options() -> str:
 def requests() -> str:
     """Return the table of requests and their fields."""
     lines = ["| request | field | type | default | meaning |\n| --- | --- | --- | --- | --- |\n"]
-    for kind, request in KINDS.items():
-        meaning = re.split(r"\.(?:\s|$)", request.__doc__ or "")[0]
+    for kind, request in REQUEST_TYPES.items():
+        meaning = re.split(r"\.(?:\s|$)", getattr(request, "meaning", request.__doc__) or "")[0]
         lines.append(f"| `{kind}` | | | | {meaning[0].lower()}{meaning[1:]} |\n")
         lines += [_field(each, changes=request is Set) for each in request.options]
     return "".join(lines)

@@ -26,8 +26,8 @@ from talkcli.goals.goal import By, Goal, Sender
 from talkcli.goals.option import MAX_NAME, is_clients_id
 from talkcli.goals.options import Cancel, Say
 from talkcli.goals.states import State
-from talkcli.protocol.lines import MAX_LINE
-from talkcli.protocol.requests import KINDS
+from talkcli.protocol.lines import MAX_LINE_BYTES
+from talkcli.protocol.requests import REQUEST_TYPES
 
 NOW = 1000.0
 OWN, PLAIN, CANCEL = (f"talk/robot/anna/{kind}/bob" for kind in ("request", "say", "cancel"))
@@ -112,8 +112,8 @@ def test_a_message_with_the_response_topic_of_another_is_dropped(response: str) 
 @pytest.mark.parametrize(
     ("payload", "topic", "code"),
     [
-        (b"x" * MAX_LINE, OWN, "line_too_long"),
-        (b" " * (MAX_LINE - 1) + b"\n", OWN, "bad_json"),  # as long as a line may be
+        (b"x" * MAX_LINE_BYTES, OWN, "line_too_long"),
+        (b" " * (MAX_LINE_BYTES - 1) + b"\n", OWN, "bad_json"),  # as long as a line may be
         (b"\xff", OWN, "bad_encoding"),
         (b"{", OWN, "bad_json"),
         (b"[1]", OWN, "bad_json"),
@@ -125,7 +125,7 @@ def test_a_message_with_the_response_topic_of_another_is_dropped(response: str) 
         (b'{"request": "say"}', OWN, "bad_field"),
         (b'{"request": "say", "text": 1}', OWN, "bad_field"),
         (b'{"request": "say", "text": "a"}\n{"request": "say", "text": "b"}', OWN, "bad_json"),
-        (b"x" * MAX_LINE, PLAIN, "line_too_long"),
+        (b"x" * MAX_LINE_BYTES, PLAIN, "line_too_long"),
         (b"a\xff", PLAIN, "bad_encoding"),
     ],
 )
@@ -153,7 +153,7 @@ def test_correlation_data_that_are_too_long_are_on_no_answer(fields: object, cod
 
 
 def test_each_kind_of_request_can_be_forbidden_but_hello_and_watch() -> None:
-    assert {*policy.ASKABLE, *policy.ALWAYS_ALLOWED} == {*KINDS}
+    assert {*policy.ASKABLE, *policy.ALWAYS_ALLOWED} == {*REQUEST_TYPES}
     for kind in policy.ALWAYS_ALLOWED:
         assert asked(judge(request({"request": kind}), allow=())).request.kind == kind
     for kind in policy.ASKABLE:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from talkcli.errors import BadRequest, LineTooLong
 from talkcli.protocol.events import failure
-from talkcli.protocol.lines import MAX_LINE, Cut, LineSplitter, decode, encode
+from talkcli.protocol.lines import MAX_LINE_BYTES, LineSplitter, TruncatedLine, decode, encode
 
 if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
@@ -147,20 +147,25 @@ def test_any_segmentation_gives_the_same_lines(stream: bytes, places: list[int])
     *whole, rest = stream.split(b"\n")
     assert lines == whole
     assert everything.size == len(rest)
-    assert everything.end() == rest
-    kept.append(beginnings.end())
+    assert everything.take_rest() == rest
+    kept.append(beginnings.take_rest())
     assert kept == [line[:MOST] for line in (*whole, rest)]
-    assert [each.size if isinstance(each, Cut) else len(each) for each in kept] == [*map(len, whole), len(rest)]
-    assert all(isinstance(each, Cut) == (len(line) > MOST) for each, line in zip(kept, (*whole, rest), strict=True))
+    assert [each.size if isinstance(each, TruncatedLine) else len(each) for each in kept] == [
+        *map(len, whole),
+        len(rest),
+    ]
+    assert all(
+        isinstance(each, TruncatedLine) == (len(line) > MOST) for each, line in zip(kept, (*whole, rest), strict=True)
+    )
 
 
 @pytest.mark.parametrize("most", [MOST, 100])
 def test_a_stream_goes_on_after_its_end(most: int) -> None:
     splitter = LineSplitter(most)
-    assert splitter.end() == b""
+    assert splitter.take_rest() == b""
     assert splitter.feed(b"123456789") == []
-    assert splitter.end() == b"123456789"[:most]
-    assert (splitter.size, splitter.end()) == (0, b"")
+    assert splitter.take_rest() == b"123456789"[:most]
+    assert (splitter.size, splitter.take_rest()) == (0, b"")
     assert splitter.feed(b"a\nb") == [b"a"]
 
 
@@ -168,20 +173,20 @@ def test_a_line_that_never_ends_is_not_kept() -> None:
     splitter = LineSplitter(MOST)
     for _ in range(100):
         assert splitter.feed(b"x" * 65536) == []
-    assert len(splitter._begun) == MOST
+    assert len(splitter._rest) == MOST
     assert splitter.size == 100 * 65536
 
 
 def feed(stream: bytes, segment: int) -> list[bytes]:
     """Return the lines of a stream that comes in such segments, the last as if it ended there."""
-    splitter = LineSplitter(MAX_LINE - 1)
+    splitter = LineSplitter(MAX_LINE_BYTES - 1)
     lines = [each for at in range(0, len(stream), segment) for each in splitter.feed(stream[at : at + segment])]
-    return [*lines, splitter.end()]
+    return [*lines, splitter.take_rest()]
 
 
 @pytest.mark.parametrize("segment", [7, 64 * KIB, 10 * KIB * KIB])
 def test_a_line_of_64_kib_with_its_newline_is_the_longest(segment: int) -> None:
-    assert MAX_LINE == 64 * KIB
+    assert MAX_LINE_BYTES == 64 * KIB
     line = b"a" * (64 * KIB - 1)
     assert feed(line + b"\n", segment) == [line, b""]
     too_long, _ = feed(line + b"a\n", segment)
@@ -192,14 +197,14 @@ def test_a_line_of_64_kib_with_its_newline_is_the_longest(segment: int) -> None:
 
 @pytest.mark.parametrize("end", [b"", b"\n", b'\n{"request": "status"}\n'])
 def test_lines_before_one_that_is_too_long_are_not_lost(end: bytes) -> None:
-    first, blank, too_long, *_ = feed(b'{"request": "cancel"}\n\n' + b"[" * MAX_LINE + end, 11)
+    first, blank, too_long, *_ = feed(b'{"request": "cancel"}\n\n' + b"[" * MAX_LINE_BYTES + end, 11)
     assert (first, blank) == (b'{"request": "cancel"}', b"")
-    assert isinstance(too_long, Cut)
+    assert isinstance(too_long, TruncatedLine)
 
 
 def test_a_longest_text_fits_in_a_line() -> None:
     for text in ("🤖" * 10_000, "日" * 10_000, "\x01" * 10_000, '"' * 10_000):
-        assert len(encode({"seq": 1, "request": "say", "text": text, "wait": True})) <= MAX_LINE
+        assert len(encode({"seq": 1, "request": "say", "text": text, "wait": True})) <= MAX_LINE_BYTES
 
 
 def test_a_line_is_what_any_json_writer_makes() -> None:

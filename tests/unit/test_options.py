@@ -38,7 +38,7 @@ from talkcli.goals.options import (
     given,
     told,
 )
-from talkcli.protocol.requests import KINDS
+from talkcli.protocol.requests import REQUEST_TYPES
 from talkcli.server import run
 
 if TYPE_CHECKING:
@@ -151,9 +151,9 @@ TYPES = {
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", REQUEST_TYPES)
 def test_the_fields_of_a_request_are_its_rows(kind: str) -> None:
-    request = KINDS[kind]
+    request = REQUEST_TYPES[kind]
     empty = Say("") if issubclass(request, Say) else request()
     own = annotated(request)
     assert list(own) == [each.name for each in request.options]

@@ -13,7 +13,7 @@ from talkcli.goals.option import MAX_DATA, MAX_ID, MAX_IDS, MAX_LOG, MAX_NAME
 from talkcli.goals.options import Cancel, Say
 from talkcli.protocol.events import failure
 from talkcli.protocol.lines import decode, encode, request_line, write_request
-from talkcli.protocol.requests import KINDS, Log, Request, Status, Wait, read_request
+from talkcli.protocol.requests import REQUEST_TYPES, Log, Request, Status, Wait, read_request
 from tests.unit.test_lines import values
 
 if TYPE_CHECKING:
@@ -41,9 +41,9 @@ def requests_of(kind: type[Request]) -> st.SearchStrategy[Request]:
     return st.builds(kind, **{**fields, **optional, **{name: limited[name] for name in fields if name in limited}})
 
 
-requests = st.one_of(*map(requests_of, KINDS.values()))
+requests = st.one_of(*map(requests_of, REQUEST_TYPES.values()))
 SETTINGS = {"rate", "volume", "voice", "pitch", "preempt", "ttl"}
-ALL_FIELDS = sorted({option.name for kind in KINDS.values() for option in kind.options})
+ALL_FIELDS = sorted({option.name for kind in REQUEST_TYPES.values() for option in kind.options})
 
 
 def least(kind: str, **fields: object) -> JsonObject:
@@ -79,7 +79,7 @@ def test_what_is_no_json_has_no_line(data: JsonObject) -> None:
         request_line({"data": data})
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", REQUEST_TYPES)
 def test_fields_at_their_defaults_are_not_written(kind: str) -> None:
     assert write_request(read_request(least(kind))) == least(kind)
 
@@ -90,7 +90,7 @@ def test_a_cancel_that_selects_is_not_of_everything() -> None:
         assert not Cancel(**selection).everything
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", REQUEST_TYPES)
 def test_a_field_that_is_not_known_is_refused_and_named(kind: str) -> None:
     for name in ("", "loudness", "Text", "seq", "request2", "a" * 5_000, "\x1b[31m", "\ud800"):
         refused = refusal(least(kind, **{name: None}))
@@ -99,9 +99,9 @@ def test_a_field_that_is_not_known_is_refused_and_named(kind: str) -> None:
         assert len(refused.message) < 500
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", REQUEST_TYPES)
 def test_a_request_knows_its_own_fields_and_no_others(kind: str) -> None:
-    for name in set(ALL_FIELDS) - {option.name for option in KINDS[kind].options}:
+    for name in set(ALL_FIELDS) - {option.name for option in REQUEST_TYPES[kind].options}:
         assert refusal(least(kind, **{name: None})).code == "unknown_field"
 
 
@@ -109,7 +109,7 @@ def test_a_request_knows_its_own_fields_and_no_others(kind: str) -> None:
 def test_a_request_that_is_not_known_is_refused_with_those_that_are(kind: str) -> None:
     refused = refusal({"request": kind})
     assert refused.code == "unknown_request"
-    assert all(each in refused.message for each in KINDS)
+    assert all(each in refused.message for each in REQUEST_TYPES)
     assert len(refused.message) < 500
 
 
@@ -134,7 +134,7 @@ OUTSIDE: dict[str, list[object]] = {"hello name": ["", "a" * 65], "log count": [
 
 @pytest.mark.parametrize(
     ("kind", "option"),
-    [(kind, each) for kind in KINDS for each in KINDS[kind].options],
+    [(kind, each) for kind in REQUEST_TYPES for each in REQUEST_TYPES[kind].options],
     ids=lambda each: getattr(each, "name", each),
 )
 def test_a_value_of_the_wrong_type_or_length_is_refused_and_its_field_named(kind: str, option: Option) -> None:
@@ -169,9 +169,9 @@ def test_values_out_of_range_are_read_so_that_the_goal_itself_can_be_rejected() 
     assert read.priority == 10**12
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", REQUEST_TYPES)
 def test_null_is_the_default_where_there_may_be_nothing(kind: str) -> None:
-    nothing = {each.name: None for each in KINDS[kind].options if each.default is None}
+    nothing = {each.name: None for each in REQUEST_TYPES[kind].options if each.default is None}
     assert read_request(least(kind, **nothing)) == read_request(least(kind))
 
 
@@ -183,7 +183,7 @@ def test_data_at_any_depth_of_nesting_is_taken_or_refused() -> None:
 
 
 @given(
-    st.fixed_dictionaries({"request": st.sampled_from(sorted(KINDS)) | values})
+    st.fixed_dictionaries({"request": st.sampled_from(sorted(REQUEST_TYPES)) | values})
     | st.dictionaries(st.sampled_from(["request", *ALL_FIELDS]) | st.text(max_size=3), values),
     st.dictionaries(st.sampled_from(ALL_FIELDS), values, max_size=3),
 )

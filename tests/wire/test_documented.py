@@ -15,8 +15,8 @@ from talkcli.goals.goal import Goal
 from talkcli.goals.history import MAX_RECALLED, MAX_REJECTED, MAX_SPOKEN
 from talkcli.goals.states import State
 from talkcli.protocol import events
-from talkcli.protocol.lines import MAX_LINE
-from talkcli.protocol.requests import KINDS
+from talkcli.protocol.lines import MAX_LINE_BYTES
+from talkcli.protocol.requests import REQUEST_TYPES
 from talkcli.server import connection, stream
 from talkcli.server.requests import ALL_WAITING, EACH, MAX_WAITING, RECENT
 from talkcli.server.run import MAX_CLIENTS, MAX_QUEUE
@@ -36,7 +36,7 @@ def test_states_and_replies_are_in_the_tables() -> None:
     documented = {words(row[0])[0]: (int(row[1]), row[3] == "yes") for row in states[1:]}
     assert documented == {each.name: (int(each), each.terminal) for each in State}
     answered = {each for row in tables(WIRE.section("Requests"))[1][1:] for each in words(row[0])[:1]}
-    assert answered == set(KINDS)
+    assert answered == set(REQUEST_TYPES)
 
 
 def test_keys_and_error_codes_of_the_tables_are_those_of_the_code() -> None:
@@ -67,7 +67,7 @@ def test_numbers_of_kept_goals_are_in_the_text() -> None:
 
 def test_limits_are_those_of_the_code() -> None:
     limits = {row[0]: row[1] for row in LIMITS[1:]}
-    assert limits["a request"].startswith(f"{MAX_LINE:,} bytes")
+    assert limits["a request"].startswith(f"{MAX_LINE_BYTES:,} bytes")
     assert f"within {connection.FIRST_REQUEST:g} s" in limits["the first request"]
     assert f"within {connection.LINE_LIMIT:g} s" in limits["a line"]
     assert limits["lines that are no requests"].startswith(f"{connection.MAX_BAD_LINES} ")
@@ -90,7 +90,7 @@ def test_limits_of_a_fleet_are_those_of_the_code() -> None:
     from talkcli.fleet.bridge import publisher, session
 
     limits = {row[0]: row[1] for row in tables(FLEET.section("Limits"))[0][1:]}
-    assert limits["a request"].startswith(f"{MAX_LINE:,} bytes")
+    assert limits["a request"].startswith(f"{MAX_LINE_BYTES:,} bytes")
     assert limits["correlation data"] == f"{policy.MAX_CORRELATION_BYTES} bytes"
     assert f"past {policy.MAX_CORRELATION_BYTES} bytes the request" in FLEET.section("Requests and replies")
     assert f"at most {(link.MAX_PACKET_BYTES - link.MAX_HEADER_BYTES) // 1024} KiB" in limits["a reply's payload"]
@@ -122,7 +122,7 @@ def test_places_are_those_of_the_code(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_events_are_in_the_table() -> None:
     table = {words(row[0])[0]: set(words(row[2])) for row in tables(WIRE.section("Events"))[0][1:]}
-    sent = {kind: set(each.__annotations__) for kind, each in events._KINDS.items() if kind != "snapshot"}
+    sent = {kind: set(each.__annotations__) for kind, each in events._EVENTS_BY_KIND.items() if kind != "snapshot"}
     assert set(table) == {*sent, "alive"}
     assert all(fields <= table[kind] for kind, fields in sent.items())
 

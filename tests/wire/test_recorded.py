@@ -18,7 +18,7 @@ from talkcli.goals.goal import Goal
 from talkcli.protocol import events
 from talkcli.protocol.events import ServerStatus
 from talkcli.protocol.lines import decode
-from talkcli.protocol.requests import KINDS
+from talkcli.protocol.requests import REQUEST_TYPES
 from tests.conformance.rawsocket import Raw
 
 if TYPE_CHECKING:
@@ -133,16 +133,16 @@ def test_recording_is_what_it_was(recording: Path) -> None:
 
 
 def test_every_request_and_field_is_recorded() -> None:
-    recorded: dict[str, set[str]] = {each: set() for each in KINDS}
+    recorded: dict[str, set[str]] = {each: set() for each in REQUEST_TYPES}
     for line in [each for recording in RECORDINGS for each in read(recording) if each.what == ">"]:
         try:
             message = line.message
         except ValueError:
             continue  # a malformed line was recorded, too
         recorded.setdefault(message.get("request", ""), set()).update(message)
-    missing = {kind: {each.name for each in KINDS[kind].options} - recorded[kind] for kind in KINDS}
+    missing = {kind: {each.name for each in REQUEST_TYPES[kind].options} - recorded[kind] for kind in REQUEST_TYPES}
     assert not any(missing.values()), f"record these in a file of their own beside {RECORDINGS[0].name}: {missing}"
-    assert all("request" in recorded[kind] for kind in KINDS)
+    assert all("request" in recorded[kind] for kind in REQUEST_TYPES)
 
 
 def test_client_of_today_understands_every_recorded_line() -> None:

@@ -18,7 +18,7 @@ from talkcli.frozen import replace
 from talkcli.protocol.lines import LineSplitter, encode
 
 if TYPE_CHECKING:
-    from talkcli.client.connect import Begun
+    from talkcli.client.connect import ConnectionAttempt
     from talkcli.goals.goal import JsonObject
 
 _READ_BYTES = 64 * 1024
@@ -33,7 +33,7 @@ class LocalConnection:
     machine took 1.2 times as long.
     """
 
-    def __init__(self, greeted: Begun) -> None:
+    def __init__(self, greeted: ConnectionAttempt) -> None:
         """`greeted` is a connection whose greeting has been read."""
         assert greeted.socket
         self.path, self.boot, self.pid = greeted.path, greeted.boot, greeted.pid
@@ -148,27 +148,27 @@ def _discard(dialing: asyncio.Task[LocalConnection]) -> None:
 
 async def _dial(place: str | None, hello: JsonObject) -> LocalConnection:
     loop = asyncio.get_running_loop()
-    give_up = loop.time() + connect.BUSY_LIMIT
+    give_up = loop.time() + connect.BUSY_LIMIT_S
     while True:
-        begun = connect.reach(place)
+        attempt = connect.reach(place)
         try:
-            begun = await _await_greeting(begun, hello)
-            return LocalConnection(connect.connect(place, hello, 0, begun=begun))
+            attempt = await _await_greeting(attempt, hello)
+            return LocalConnection(connect.connect(place, hello, 0, attempt=attempt))
         except TalkError as error:
-            if not (begun.full or isinstance(error, Busy)) or loop.time() > give_up:
+            if not (attempt.backlog_full or isinstance(error, Busy)) or loop.time() > give_up:
                 raise
         except asyncio.CancelledError:
-            if begun.socket:
-                begun.socket.close()
+            if attempt.socket:
+                attempt.socket.close()
             raise
         await asyncio.sleep(random.uniform(*_BUSY_PAUSE_S))
 
 
-async def _await_greeting(begun: Begun, hello: JsonObject) -> Begun:
+async def _await_greeting(attempt: ConnectionAttempt, hello: JsonObject) -> ConnectionAttempt:
     """Say hello, and return the connection with what the server has said within the limit for a greeting."""
-    connected, received = begun.socket, bytearray()
+    connected, received = attempt.socket, bytearray()
     if not connected:
-        return begun
+        return attempt
     loop = asyncio.get_running_loop()
     done = loop.create_future()
 
@@ -187,10 +187,10 @@ async def _await_greeting(begun: Begun, hello: JsonObject) -> Begun:
     with contextlib.suppress(OSError):  # the server has hung up, but may have said why
         connected.send(encode(hello))
     loop.add_reader(connected, read)
-    limit = loop.call_later(connect.ANSWER_LIMIT, finish)
+    limit = loop.call_later(connect.ANSWER_LIMIT_S, finish)
     try:
         await done
     finally:
         limit.cancel()
         loop.remove_reader(connected)
-    return replace(begun, greeted=True, received=bytes(received))
+    return replace(attempt, hello_sent=True, received=bytes(received))

@@ -25,7 +25,7 @@ from talkcli.fleet.link import REASON_NOT_AUTHORIZED, Link, LinkOpener, Will, bo
 from talkcli.fleet.payloads import HOMEASSISTANT_ONLINE, Presence, bridge_rank, homeassistant_device
 from talkcli.frozen import frozen
 from talkcli.protocol.events import failure
-from talkcli.protocol.lines import MAX_LINE, encode
+from talkcli.protocol.lines import MAX_LINE_BYTES, encode
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -52,7 +52,7 @@ SLOW_BROKER_BYTES = 256 * 1024
 STUCK_BROKER_BYTES = 4 * 1024 * 1024
 #: Largest packet that the broker may send: the longest request, and some more, so that longer ones get an error. paho
 #: needs several seconds for 250 kB of MQTT properties, and a tenth of a second for a quarter of that.
-_MAX_INPUT_BYTES = MAX_LINE + 8 * 1024
+_MAX_INPUT_BYTES = MAX_LINE_BYTES + 8 * 1024
 #: A robot answers a Home Assistant that has started after a random delay of at most this time.
 _DEVICE_DELAY_S = 3.0
 #: Time for the broker to take the goodbye.

@@ -15,8 +15,8 @@ from talkcli.goals.goal import By, Goal, Sender
 from talkcli.goals.option import MAX_NAME
 from talkcli.goals.options import SHOWN, Say
 from talkcli.protocol.events import Result, StateChanged, ok, take_seq
-from talkcli.protocol.lines import MAX_DIGITS, MAX_LINE, decode
-from talkcli.protocol.requests import KINDS, read_request
+from talkcli.protocol.lines import MAX_DIGITS, MAX_LINE_BYTES, decode
+from talkcli.protocol.requests import REQUEST_TYPES, read_request
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
@@ -31,7 +31,7 @@ STALE_CODE = "stale"
 #: Requests that are always allowed. They tell nothing that the broker doesn't publish anyway.
 ALWAYS_ALLOWED = ("hello", "watch")
 #: Requests that the option `--allow` can name.
-ASKABLE = tuple(each for each in KINDS if each not in ALWAYS_ALLOWED)
+ASKABLE = tuple(each for each in REQUEST_TYPES if each not in ALWAYS_ALLOWED)
 
 #: At the server, the name of a remote client begins with this.
 _REMOTE_PREFIX = "mqtt:"
@@ -167,8 +167,8 @@ def _request_fields(kind: str, payload: bytes) -> JsonObject:
     if kind == topics.PLAIN_CANCEL:
         return {"request": "cancel"}
     line = payload.removesuffix(b"\n") if kind == topics.REQUEST else payload
-    if len(line) >= MAX_LINE:
-        raise LineTooLong(f"a request has at most {MAX_LINE} bytes")
+    if len(line) >= MAX_LINE_BYTES:
+        raise LineTooLong(f"a request has at most {MAX_LINE_BYTES} bytes")
     if kind == topics.REQUEST:
         return decode(line)
     try:

@@ -21,7 +21,7 @@ from talkcli.goals.goal import By, Sender
 from talkcli.goals.options import Cancel, Say, Set
 from talkcli.goals.states import State
 from talkcli.protocol.events import failure
-from talkcli.protocol.lines import MAX_LINE, decode, encode
+from talkcli.protocol.lines import MAX_LINE_BYTES, decode, encode
 from talkcli.protocol.requests import Hello, Pause, Resume, Status, Wait, Watch
 
 if TYPE_CHECKING:
@@ -387,8 +387,8 @@ class RemoteSession:
         assert self._server
         self._last_number += 1
         line = encode({"seq": self._last_number, **fields})
-        if len(line) > MAX_LINE:
-            self._refuse(sent.request, "line_too_long", f"a request has at most {MAX_LINE} bytes")
+        if len(line) > MAX_LINE_BYTES:
+            self._refuse(sent.request, "line_too_long", f"a request has at most {MAX_LINE_BYTES} bytes")
             return False
         self._sent[self._last_number] = sent
         self._server.write(line)

@@ -13,8 +13,9 @@ from collections import deque
 from typing import TYPE_CHECKING, Any
 
 from talkcli import __version__
-from talkcli.client.connect import ANSWER_LIMIT, sender
-from talkcli.client.connection import BaseConnection, Exchange
+from talkcli.client.connect import ANSWER_LIMIT_S, sender_name
+from talkcli.client.connection import BlockingConnection
+from talkcli.client.core import Exchange
 from talkcli.errors import (
     AccessDenied,
     BadRequest,
@@ -33,14 +34,14 @@ from talkcli.goals.options import Cancel, Say, Set
 from talkcli.goals.states import State
 from talkcli.polling import wait_ready
 from talkcli.protocol.events import ServerStatus, Snapshot, check_greeting
-from talkcli.protocol.lines import LineSplitter, decode, request_line, write_request
+from talkcli.protocol.lines import decode, request_line, write_request
 from talkcli.protocol.requests import Hello, Pause, Resume, Wait, Watch
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from talkcli.client.connection import OnReply
+    from talkcli.client.core import OnFailure, OnReply
     from talkcli.fleet.broker import Broker
     from talkcli.fleet.link import Link
     from talkcli.fleet.payloads import Message
@@ -61,7 +62,27 @@ _ID_USER_CHARS = 48
 _MAX_OPEN_LOOKUPS = 32
 
 
-class RobotConnection(BaseConnection):
+class RobotExchange(Exchange):
+    """An exchange that survives absences of the robot."""
+
+    __slots__ = ("latest", "tries")
+
+    def __init__(
+        self,
+        request: Request,
+        on_reply: OnReply | None = None,
+        on_failure: OnFailure | None = None,
+        *,
+        slow: bool = False,
+    ) -> None:
+        super().__init__(request, on_reply, on_failure, slow=slow)
+        #: how often the request was sent again
+        self.tries = 0
+        #: when the goal must have begun, by the clock of `boottime`; None for no limit
+        self.latest: float | None = None
+
+
+class RobotConnection(BlockingConnection):
     """A connection to a robot's server through the broker.
 
     It has no thread, except while it connects to the broker.
@@ -78,7 +99,7 @@ class RobotConnection(BaseConnection):
         *,
         name: str | None = None,
         interrupt: Mapping[int, int] | None = None,
-        patience: float = ANSWER_LIMIT,
+        patience: float = ANSWER_LIMIT_S,
         end: float | None = None,
         numbers: Iterator[int] | None = None,
     ) -> None:
@@ -100,7 +121,7 @@ class RobotConnection(BaseConnection):
         fault = topics.name_fault(robot)
         if fault:
             raise UsageError(f"no robot can be called '{printable(robot)}': a name {fault}")
-        self._sender = sender(name)
+        self._sender = sender_name(name)
         if self._sender and len(self._sender) > MAX_NAME:
             raise UsageError(f"the name of the sender has {len(self._sender)} characters, the longest is {MAX_NAME}")
         self._robot, self._desk = robot, desk
@@ -108,37 +129,51 @@ class RobotConnection(BaseConnection):
         self.path = f"{robot} ({desk.broker.url})"
         self._interrupt, self._end = interrupt, end
         self._published_at = time.monotonic()
-        self._splitter = LineSplitter()
         #: the robot's presence as received on the current connection to the broker; empty if unknown
         self._presence: JsonObject = {}
         #: the session id of the bridge that has the open requests; None if there is none
         self._bridge_session: object = None
-        #: since when (monotonic) the robot can't be asked; None if it can
-        self._absent_since: float | None = self._published_at
+        self.absent_since = self._published_at
         #: the goals whose results will be received, and whether their words will be, too
         self._followed_goals: dict[str, bool] = {}
         #: goals to cancel again after every absence
         self._canceled: set[str] = set()
         #: goals to look up, and the open lookups by request number. Each has the goal's id, and the exchange whose
         #: answer depends on it; None for a followed goal
-        self._lookups: deque[tuple[str, Exchange | None]] = deque()
-        self._open_lookups: dict[int, tuple[str, Exchange | None]] = {}
+        self._lookups: deque[tuple[str, RobotExchange | None]] = deque()
+        self._open_lookups: dict[int, tuple[str, RobotExchange | None]] = {}
 
     # -- requests
 
-    def begin(self, request: Request, on_reply: OnReply | None = None) -> Exchange:
+    def begin(
+        self,
+        request: Request,
+        on_reply: OnReply | None = None,
+        on_failure: OnFailure | None = None,
+        *,
+        slow: bool = False,
+    ) -> RobotExchange:
         if isinstance(request, Say) and request.id is None:
             request = replace(request, id=new_goal_id(self._desk))
-        return super().begin(request, on_reply)
+        exchange = RobotExchange(request, on_reply, on_failure, slow=slow)
+        with self.changed:  # so that `_resend_all` doesn't send it at the same time
+            self.register(exchange, time.monotonic())
+            if isinstance(request, Say) and request.ttl:
+                exchange.latest = boottime() + request.ttl
+            exchange.sent = self._publish(exchange.number, request, exchange)
+        if not exchange.sent:
+            self._desk.wake()  # it will be sent when the robot is back
+        return exchange
 
-    def expect(self, exchange: Exchange) -> None:
+    def expect(self, exchange: RobotExchange) -> None:
         """Expect an answer to a request that was sent to the robot's group."""
-        self._exchanges[exchange.number] = exchange
+        exchange.sent = True
         self._published_at = time.monotonic()
+        self.register(exchange, self._published_at)
 
     def post(self, request: Request) -> None:
         if not self._publish(next(self._numbers), request):
-            raise ServerUnavailable(f"nothing was sent to the server at {self.path}: {self.ended or self._absent}")
+            raise ServerUnavailable(f"nothing was sent to the server at {self.path}: {self.ended or self.absence}")
 
     def cancel_lastingly(self, goal_id: str, *, is_sent: bool) -> None:
         """Cancel a goal now and after each absence, and never send it again.
@@ -152,29 +187,21 @@ class RobotConnection(BaseConnection):
             if not is_sent:
                 self._publish(next(self._numbers), Cancel((goal_id,)))
 
-    def _send(self, number: int, request: Request) -> None:
-        with self.changed:  # so that `_resend_all` doesn't send it at the same time
-            exchange = self._exchanges[number]
-            if isinstance(request, Say) and request.ttl:
-                exchange.latest = boottime() + request.ttl
-            exchange.sent = self._publish(number, request, exchange)
-        if not exchange.sent:
-            self._desk.wake()  # it will be sent when the robot is back
-
-    def _publish(self, number: int, request: Request, exchange: Exchange | None = None) -> bool:
+    def _publish(self, number: int, request: Request, exchange: RobotExchange | None = None) -> bool:
         """Send a request to the robot, and return whether that was possible."""
         link = self._desk.link
-        if link is None or self.ended is not None or self._absent_since is not None:
+        if link is None or self.ended is not None or self.absent_since is not None:
             return False
 
         def on_acknowledged(code: int) -> None:
             if exchange is not None and code >= REASON_FAILURE:
-                exchange.error = self._desk.publish_error(code, f"ask {self._robot} for anything")
+                with self.changed:
+                    self.fail(exchange, self._desk.publish_error(code, f"ask {self._robot} for anything"))
 
         line = request_line({"seq": number, **write_request(request)})
         if (refused := link.size_error(line, request.kind)) is not None:
             if exchange is not None:
-                exchange.error = refused
+                self.fail(exchange, refused)
             return False
         self._published_at = time.monotonic()
         topic = topics.robot(self._robot, topics.REQUEST, self._desk.user)
@@ -183,30 +210,29 @@ class RobotConnection(BaseConnection):
         return link.publish(topic, line, expiry=expiry, response=response, acknowledged=on_acknowledged)
 
     def answer_by(self, exchange: Exchange) -> float:
-        if self._absent_since is None:
+        if self.absent_since is None:
             by = super().answer_by(exchange)
         else:
-            by = self._absent_since + (ABSENCE_LIMIT_S if self._patience >= ANSWER_LIMIT else self._patience)
-        return by if self._end is None else min(by, max(self._end, exchange.touched))
+            by = self.absent_since + (ABSENCE_LIMIT_S if self._patience >= ANSWER_LIMIT_S else self._patience)
+        return by if self._end is None else min(by, max(self._end, exchange.heard_at))
 
-    @property
-    def _no_reply(self) -> str:
-        return super()._no_reply if self._absent_since is None else self._absent
+    def goals_lost_at(self) -> float:
+        return float("inf")  # the connection ends before that, see `silent_by`
 
     def silent_by(self, began: float) -> tuple[float, str]:
-        if self._absent_since is None:
+        if self.absent_since is None:
             return super().silent_by(began)
-        return self._absent_since + ABSENCE_LIMIT_S, f"{self._absent}, for {ABSENCE_LIMIT_S:g} s"
+        return self.absent_since + ABSENCE_LIMIT_S, f"{self.absence}, for {ABSENCE_LIMIT_S:g} s"
 
-    def _refusal(self, reply: JsonObject, items: list[JsonObject]) -> TalkError:
-        error = super()._refusal(reply, items)
+    def refusal(self, reply: JsonObject, items: list[JsonObject]) -> TalkError:
+        error = super().refusal(reply, items)
         kinds = {"not_allowed": AccessDenied, "no_server": ServerUnavailable, "stale": ServerUnavailable, "lost": Lost}
         kind = kinds.get(error.code)
         return kind(f"{self._robot}: {error.message}") if kind else error
 
     # -- messages from the robot
 
-    def _fill(self, timeout: float, interruptible: bool) -> None:
+    def _step(self, timeout: float, interruptible: bool) -> None:
         self.keep_alive()
         self._desk.poll(timeout, self._interrupt if interruptible else None)
 
@@ -223,7 +249,7 @@ class RobotConnection(BaseConnection):
     def on_disconnected(self, why: str) -> None:
         """Treat the robot as absent until its presence is received again."""
         with self.changed:
-            self._splitter = LineSplitter()
+            self.begin_stream()
             self._presence, self._bridge_session = {}, None
             self._mark_absent(why)
 
@@ -233,13 +259,12 @@ class RobotConnection(BaseConnection):
             if message.topic == topics.robot(self._robot, topics.PRESENCE):
                 self._update_presence(message.payload)
             else:
-                self._heard = time.monotonic()
-                self._lines.extend(self._splitter.feed(message.payload))
+                self.receive(message.payload, time.monotonic())
 
     def _mark_absent(self, why: str) -> None:
-        self._absent = why
-        if self._absent_since is None:
-            self._absent_since = time.monotonic()
+        self.absence = why
+        if self.absent_since is None:
+            self.absent_since = time.monotonic()
 
     def _update_presence(self, payload: bytes) -> None:
         """Process a presence message. It is from the robot's bridge, or it is the bridge's will."""
@@ -253,11 +278,11 @@ class RobotConnection(BaseConnection):
             self._mark_absent(f"{self._robot} is offline")
         elif not isinstance(server, dict):
             self._mark_absent(f"{self._robot} has no talk server at this moment")
-        elif self._bridge_session != presence.get("session") or self._absent_since is not None:
+        elif self._bridge_session != presence.get("session") or self.absent_since is not None:
             self.boot = server["boot"] if isinstance(server.get("boot"), str) else ""
             self.pid = server["pid"] if isinstance(server.get("pid"), int) else None
             self._bridge_session = presence.get("session")
-            self._absent_since, self._heard = None, time.monotonic()
+            self.absent_since, self._heard = None, time.monotonic()
             self._resend_all()
 
     # -- connecting
@@ -269,7 +294,7 @@ class RobotConnection(BaseConnection):
         """
         left = self._patience if self._end is None else max(0.0, self._end - time.monotonic())
         self._desk.wait_for_retained(min(self._patience, left), lambda: bool(self._presence), self._interrupt)
-        while self._absent_since is not None and self._desk.link and (left := give_up - time.monotonic()) > 0:
+        while self.absent_since is not None and self._desk.link and (left := give_up - time.monotonic()) > 0:
             self._desk.poll(left, self._interrupt)
         self._patience = max(self._patience, round(give_up - time.monotonic(), 1))
         if not self._presence:
@@ -280,8 +305,8 @@ class RobotConnection(BaseConnection):
     def check_online(self) -> None:
         """Raise ServerUnavailable or ProtocolMismatch if the robot can't take requests now."""
         check_greeting(self._presence, __version__)
-        if self._absent_since is not None:
-            raise ServerUnavailable(f"{self._absent}: nothing was sent")
+        if self.absent_since is not None:
+            raise ServerUnavailable(f"{self.absence}: nothing was sent")
 
     # -- after an absence
 
@@ -292,36 +317,36 @@ class RobotConnection(BaseConnection):
         if self._canceled:
             self._publish(next(self._numbers), Cancel(tuple(self._canceled)))
         for number in self._open_lookups:
-            del self._exchanges[number]
+            del self.exchanges[number]
         self._open_lookups.clear()
         self._lookups = deque((each, None) for each in self._followed_goals)
-        for exchange in [each for each in list(self._exchanges.values()) if not each.over]:
+        for exchange in [each for each in self.exchanges.values() if isinstance(each, RobotExchange) and not each.over]:
             if exchange.sent and isinstance(exchange.request, Say):
                 self._lookups.append((str(exchange.request.id), exchange))
             elif exchange.sent and isinstance(exchange.request, self.lasting):
                 # Sent again, the request could affect newer goals.
-                exchange.error = self._lost(exchange, self._absent)
+                self.fail(exchange, self._lost(exchange, self.absence))
             else:
                 self._resend(exchange)
-        if self.followed.watched:
+        if self.listeners.watched:
             self._begin_lookup(Watch(), "", None)
         self._begin_lookups()
 
-    def _resend(self, exchange: Exchange) -> None:
+    def _resend(self, exchange: RobotExchange) -> None:
         """Send a request again, or fail it if its time is over or too many attempts have failed."""
         request = exchange.request
         left = 0.0 if exchange.latest is None else exchange.latest - boottime()
         exchange.tries += 1
-        why = "its time was over before an answer came" if left < 0 else f"{self._absent}, {_MAX_RESENDS} times"
+        why = "its time was over before an answer came" if left < 0 else f"{self.absence}, {_MAX_RESENDS} times"
         if isinstance(request, Say) and request.id in self._canceled:
             left, why = -1.0, "it was cancelled before the robot had heard of it"
         if left < 0 or exchange.tries > _MAX_RESENDS:
-            exchange.error = self._lost(exchange, why)
+            self.fail(exchange, self._lost(exchange, why))
             return
         if isinstance(request, Say) and left:
             request = replace(request, ttl=left)
         exchange.items.clear()
-        exchange.touched = time.monotonic()
+        exchange.heard_at = time.monotonic()
         exchange.sent = self._publish(exchange.number, request, exchange) or exchange.sent
 
     def _lost(self, exchange: Exchange, why: str) -> Lost:
@@ -335,39 +360,40 @@ class RobotConnection(BaseConnection):
             feedback = self._followed_goals.get(goal_id, False)
             if exchange is not None and isinstance(exchange.request, Say):
                 feedback = exchange.request.feedback
-                exchange.touched = time.monotonic()
+                exchange.heard_at = time.monotonic()
             self._begin_lookup(Wait((goal_id,), feedback), goal_id, exchange)
 
-    def _begin_lookup(self, request: Request, goal_id: str, exchange: Exchange | None) -> None:
+    def _begin_lookup(self, request: Request, goal_id: str, exchange: RobotExchange | None) -> None:
         """Send a lookup, whose answer nobody waits for."""
         number = next(self._numbers)
         self._open_lookups[number] = goal_id, exchange
-        self._exchanges[number] = Exchange(number, request, self._on_snapshot)
+        lookup = RobotExchange(request, self._on_snapshot)
+        lookup.number, lookup.sent = number, True
+        self.register(lookup, time.monotonic())
         self._publish(number, request)
 
-    def _dispatch(self, message: JsonObject) -> None:
+    def dispatch(self, message: JsonObject, now: float) -> Exchange | None:
         if message.get("event") == "gone":
-            self.ended = self.ended or printable(str(message.get("message") or "the server went away"))
-            return
-        super()._dispatch(message)
+            self.end(printable(str(message.get("message") or "the server went away")))
+            return None
+        exchange = super().dispatch(message, now)
         if message.get("event") == "result":
             goal = message.get("goal")
             self._followed_goals.pop(str(goal.get("id")) if isinstance(goal, dict) else "", None)
-        number = message.get("seq")
-        exchange = self._exchanges.get(number) if isinstance(number, int) else None
-        if exchange is None or exchange.reply is not message:
-            return
+        if exchange is None:
+            return None
         if message.get("ok") is True:
             self._note_followed(exchange)
         if exchange.number in self._open_lookups:
-            del self._exchanges[exchange.number]
+            del self.exchanges[exchange.number]
             self._end_lookup(*self._open_lookups.pop(exchange.number), exchange)
             self._begin_lookups()
+        return exchange
 
     def _on_snapshot(self, reply: JsonObject, items: list[JsonObject]) -> None:
         """Pass the server's state in the reply to a lookup to those who watch all goals."""
         if "server" in reply:
-            self.followed.hear(Snapshot(ServerStatus.from_reply(reply, items)).to_json())
+            self.listeners.hear(Snapshot(ServerStatus.from_reply(reply, items)).to_json())
 
     def _note_followed(self, exchange: Exchange) -> None:
         """Remember the goals whose results the server will now send."""
@@ -383,7 +409,7 @@ class RobotConnection(BaseConnection):
                 goal_id = str(goal.get("id"))
                 self._followed_goals[goal_id] = self._followed_goals.get(goal_id, False) or feedback
 
-    def _end_lookup(self, goal_id: str, exchange: Exchange | None, lookup: Exchange) -> None:
+    def _end_lookup(self, goal_id: str, exchange: RobotExchange | None, lookup: Exchange) -> None:
         """Process the answer to a lookup.
 
         Args:
@@ -401,16 +427,17 @@ class RobotConnection(BaseConnection):
                     exchange.on_reply(reply, [])
                 exchange.reply = reply
             elif not _goal_state(goal).terminal:  # for an ended goal, a result follows
-                self.followed.hear({"event": "state", "id": goal_id, "state": _goal_state(goal).name})
+                self.listeners.hear({"event": "state", "id": goal_id, "state": _goal_state(goal).name})
             return
-        error = self._refusal(lookup.reply or {}, [])
+        error = self.refusal(lookup.reply or {}, [])
         if exchange is not None and isinstance(error, UnknownGoal):
             self._resend(exchange)
         elif exchange is not None:
-            exchange.error = Lost(f"what became of {goal_id} is not told, it may still be spoken: {error.message}")
+            words = f"what became of {goal_id} is not told, it may still be spoken: {error.message}"
+            self.fail(exchange, Lost(words))
         else:
             self._followed_goals.pop(goal_id, None)
-            self.followed.lose(goal_id, f"{error.message}; it may have been spoken")
+            self.listeners.lose(goal_id, f"{error.message}; it may have been spoken")
 
     # -- closing
 

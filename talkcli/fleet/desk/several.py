@@ -13,14 +13,13 @@ from collections import deque
 from typing import TYPE_CHECKING
 
 from talkcli.client.client import batches, check, check_id, too_long
-from talkcli.client.connect import ANSWER_LIMIT, FIRST
-from talkcli.client.connection import Exchange
+from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.client.goal import GoalHandle
 from talkcli.errors import EXIT_OK, Lost, ServerUnavailable, TalkError, UnknownGoal, UsageError
 from talkcli.fleet import topics
 from talkcli.fleet.desk.desk import DeskLink
 from talkcli.fleet.desk.request import Outcome, cancel_outcomes, failure_outcome, reply_outcomes
-from talkcli.fleet.desk.robot import REQUEST_EXPIRY_S, RobotConnection, new_goal_id
+from talkcli.fleet.desk.robot import REQUEST_EXPIRY_S, RobotConnection, RobotExchange, new_goal_id
 from talkcli.fleet.link import REASON_FAILURE, boottime
 from talkcli.fleet.payloads import Presence
 from talkcli.frozen import replace
@@ -28,7 +27,7 @@ from talkcli.goals.goal import Goal
 from talkcli.goals.options import Cancel, Say, Set, bad_key
 from talkcli.goals.states import State
 from talkcli.protocol.events import goals
-from talkcli.protocol.lines import request_line, write_request
+from talkcli.protocol.lines import FIRST_NUMBER, request_line, write_request
 from talkcli.protocol.requests import Pause, Status, Wait
 
 if TYPE_CHECKING:
@@ -66,7 +65,7 @@ class FleetRequest:
         *,
         name: str | None = None,
         interrupt: Mapping[int, int] | None = None,
-        patience: float = ANSWER_LIMIT,
+        patience: float = ANSWER_LIMIT_S,
     ) -> None:
         """Connect to the broker, and send the request.
 
@@ -95,7 +94,7 @@ class FleetRequest:
         #: names of the robots that have more outcomes to come
         self._open: set[str] = set()
         self._outcomes: deque[Outcome] = deque()
-        self._numbers = itertools.count(FIRST)
+        self._numbers = itertools.count(FIRST_NUMBER)
         self._number = next(self._numbers)
         #: why the broker has refused the message to the group
         self._refused: TalkError | None = None
@@ -328,7 +327,6 @@ class FleetRequest:
                 robot.connection.cancel_lastingly(str(self.request.id), is_sent=False)
         if robot:
             robot.connection.on_message(message)
-            robot.connection.hand_out()
             self._update(name)
 
     def _connection(self, name: str) -> RobotConnection:
@@ -361,7 +359,7 @@ class RobotRequest:
     def __init__(self, connection: RobotConnection, name: str, request: Request) -> None:
         self.connection = connection
         self._name, self._request = name, request
-        self._exchange: Exchange | None = None
+        self._exchange: RobotExchange | None = None
         #: the goals to wait for, since when, and how many of them have an outcome
         self._handles: list[GoalHandle] = []
         self._since = time.monotonic()
@@ -388,8 +386,8 @@ class RobotRequest:
             number: the number of that request.
             latest: time by `boottime` after which a sentence must not be sent again; None for no limit.
         """
-        self._exchange = Exchange(number, self._request, self._on_reply)
-        self._exchange.latest = latest
+        self._exchange = RobotExchange(self._request, self._on_reply)
+        self._exchange.number, self._exchange.latest = number, latest
         self.connection.expect(self._exchange)
 
     def new_outcomes(self, *, check_time: bool) -> list[Outcome]:
@@ -438,7 +436,7 @@ class RobotRequest:
         for each in self._handles:
             each._listen(feedback=False)
 
-    def _replied(self, exchange: Exchange) -> list[Outcome]:
+    def _replied(self, exchange: RobotExchange) -> list[Outcome]:
         """Return the outcomes that are known from the reply; none if its goals have to be waited for."""
         try:
             reply, items = self.connection.answer(exchange)

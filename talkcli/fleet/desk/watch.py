@@ -10,7 +10,7 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING
 
-from talkcli.client.connect import ANSWER_LIMIT
+from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.errors import BadRequest, Lost
 from talkcli.fleet import topics
 from talkcli.fleet.desk.desk import ABSENCE_LIMIT_S, DeskLink
@@ -242,8 +242,8 @@ class FleetWatch:
             raise self._desk.failure
         if self._away_since is not None:
             away = now - self._away_since
-            if not self._began and away >= ANSWER_LIMIT:
-                raise self._desk.no_answer(ANSWER_LIMIT)
+            if not self._began and away >= ANSWER_LIMIT_S:
+                raise self._desk.no_answer(ANSWER_LIMIT_S)
             if away >= ABSENCE_LIMIT_S:
                 raise Lost(f"the broker at {self._broker.url} was away for {ABSENCE_LIMIT_S:g} s: {self._away_why}")
         for name in [name for name, until in self._missing.items() if now >= until]:
@@ -254,7 +254,7 @@ class FleetWatch:
         """Return the seconds until `_check_limits` has something to do."""
         limits = list(self._missing.values())
         if self._away_since is not None:
-            limits.append(self._away_since + (ABSENCE_LIMIT_S if self._began else ANSWER_LIMIT))
+            limits.append(self._away_since + (ABSENCE_LIMIT_S if self._began else ANSWER_LIMIT_S))
         return max(0.0, min(limits, default=now + ABSENCE_LIMIT_S) - now)
 
     # -- changes

@@ -21,7 +21,7 @@ from collections import deque
 from talkcli.goals.goal import Goal, Sender
 from talkcli.goals.states import State
 from talkcli.protocol import events
-from talkcli.protocol.lines import MAX_LINE, LineSplitter, encode
+from talkcli.protocol.lines import MAX_LINE_BYTES, LineSplitter, encode
 
 #: An engine process that ends each sentence at once.
 _ENGINE = "import os\nwhile data := os.read(0, 65536):\n    os.write(0, data)"
@@ -77,7 +77,7 @@ class Client(asyncio.Protocol):
     def __init__(self, server: Server) -> None:
         self._server = server
         self._transport: asyncio.Transport
-        self._lines = LineSplitter(MAX_LINE - 1)
+        self._lines = LineSplitter(MAX_LINE_BYTES - 1)
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)

@@ -218,7 +218,7 @@ class ErrorOutput:
 
     def line(self) -> str | None:
         """Return the line that names the error, or else the first line; None if there is neither."""
-        self._examine(self._lines.end())
+        self._examine(self._lines.take_rest())
         return self._error or self._first
 
     def _examine(self, raw: bytes) -> None:

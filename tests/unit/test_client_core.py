@@ -1,0 +1,518 @@
+"""The client core, without a socket: requests, answers, limits, breaks and new connections, and who hears events."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from talkcli.client.core import (
+    MAX_FEEDBACK_EVENTS,
+    MAX_STATE_EVENTS,
+    SILENCE_LIMIT_S,
+    ClientCore,
+    EventBuffer,
+    Exchange,
+    TrackedGoal,
+)
+from talkcli.errors import AccessDenied, Busy, Lost, ProtocolMismatch, ServerUnavailable, TalkError, UnknownGoal
+from talkcli.goals.goal import Goal
+from talkcli.goals.options import Cancel, Say
+from talkcli.goals.states import State
+from talkcli.protocol.events import Result, Snapshot, StateChanged, WordHeard
+from talkcli.protocol.lines import decode, encode
+from talkcli.protocol.requests import Pause, Status, Wait
+
+if TYPE_CHECKING:
+    from talkcli.goals.goal import JsonObject
+    from talkcli.protocol.events import Event
+    from talkcli.protocol.requests import Request
+
+PATIENCE = 5.0
+HELLO = b'{"request": "hello"}\n'
+
+
+class Reconnecting(ClientCore):
+    """A core whose shell connects again."""
+
+    def break_off(self, why: str, now: float) -> None:
+        self.disconnected(why, now)
+
+
+def core_of(kind: type[ClientCore] = ClientCore) -> ClientCore:
+    core = kind(PATIENCE, 0.0)
+    core.path, core.boot = "/s", "4k7f"
+    return core
+
+
+@pytest.fixture
+def core() -> ClientCore:
+    return core_of()
+
+
+@pytest.fixture
+def reconnecting() -> ClientCore:
+    return core_of(Reconnecting)
+
+
+def begin(core: ClientCore, request: Request, now: float = 0.0, **options: Any) -> Exchange:
+    exchange = Exchange(request, **options)
+    core.register(exchange, now)
+    core.queue(core.line(exchange), exchange)
+    return exchange
+
+
+def sent(core: ClientCore) -> list[JsonObject]:
+    """Send all that waits, and return it."""
+    data = core.outgoing()
+    core.mark_sent(len(data))
+    return [decode(each) for each in data.splitlines()]
+
+
+def hear(core: ClientCore, *messages: JsonObject, now: float = 1.0) -> None:
+    core.receive(b"".join(map(encode, messages)), now)
+
+
+def goal(state: str = "PENDING", goal_id: str = "g") -> JsonObject:
+    return Goal(goal_id, State[state], "a").to_json()
+
+
+def state(name: str, number: int = 1) -> JsonObject:
+    return {"event": "state", "id": "g", "state": name, "n": number, "at": 0.0}
+
+
+def word(number: int) -> JsonObject:
+    place = {"start": 0, "end": 1, "number": number, "time": 0.0}
+    return {"event": "word", "id": "g", "word": "a", **place, "n": number, "at": 0.0}
+
+
+def say(core: ClientCore, now: float = 0.0, **options: Any) -> TrackedGoal:
+    """Say something without waiting for the answer, as `Client.say(block=False)` does."""
+    request = Say("a", wait=True, id="g", **options)
+    tracked = TrackedGoal(Goal("", State.PENDING))
+    tracked._expect(request, now)
+
+    def on_reply(reply: JsonObject, _: list[JsonObject]) -> None:
+        tracked._accept(reply)
+        tracked._listen_to(core.listeners, feedback=request.feedback, now=now)
+
+    begin(core, request, now, on_reply=on_reply, on_failure=tracked._fail, slow=request.patient)
+    return tracked
+
+
+def greet(core: ClientCore, boot: str = "4k7f", now: float = 2.0) -> None:
+    core.connecting(HELLO, "1.0")
+    core.mark_sent(len(HELLO))
+    hear(core, {"talk": 1, "version": "1.0", "pid": 7, "boot": boot, "features": []}, now=now)
+
+
+# Requests and answers
+
+
+def test_requests_are_numbered_and_go_out_in_their_order(core: ClientCore) -> None:
+    begin(core, Status())
+    begin(core, Say("a", wait=True))
+    assert sent(core) == [
+        {"seq": 1, "request": "status"},
+        {"seq": 2, "request": "say", "text": "a", "wait": True},
+    ]
+    assert core.outgoing() == b""
+
+
+def test_an_answer_is_a_list_and_a_reply_and_answers_may_overtake_each_other(core: ClientCore) -> None:
+    heard: list[object] = []
+    first = begin(core, Wait(("g",)), on_reply=lambda reply, items: heard.append((reply["count"], len(items))))
+    second = begin(core, Status())
+    core.listeners.add("g", heard.append)
+    hear(core, {"seq": 1, "goal": goal()}, {"seq": 2, "ok": True})
+    assert (first.over, second.over) == (False, True)
+    hear(core, {"seq": 1, "ok": True, "count": 1}, state("ACTIVE"), {"seq": 1, "ok": True, "count": 2})
+    assert core.answer(first) == ({"seq": 1, "ok": True, "count": 1}, [{"seq": 1, "goal": goal()}])
+    assert heard == [(1, 1), StateChanged("g", State.ACTIVE, 0.0, 1)]
+
+
+def test_a_refusal_is_an_error_with_the_lines_of_its_list(core: ClientCore) -> None:
+    exchange = begin(core, Cancel(("x",)))
+    hear(core, {"seq": 1, "ended": goal("SUCCEEDED")})
+    hear(core, {"seq": 1, "ok": False, "error": {"code": "unknown_goal", "message": "no x"}})
+    with pytest.raises(UnknownGoal, match="no x") as refused:
+        core.answer(exchange)
+    assert len(refused.value.items) == 1
+
+
+@given(st.lists(st.integers(1, 40)))
+def test_bytes_may_be_taken_in_any_portions(counts: list[int]) -> None:
+    core = core_of()
+    exchanges = [begin(core, Say("a" * each)) for each in range(3)]
+    whole = core.outgoing()
+    ends = [place + 1 for place, byte in enumerate(whole) if byte == ord("\n")]
+    taken = b""
+    for count in [*counts, len(whole)]:
+        portion = core.outgoing()[:count]
+        core.mark_sent(len(portion))
+        taken += portion
+        assert core.unsent_bytes == len(whole) - len(taken)
+        assert [each.sent for each in exchanges] == [len(taken) >= end for end in ends]
+    assert taken == whole
+
+
+@given(st.lists(st.integers(1, 80)))
+def test_bytes_may_come_in_any_portions(counts: list[int]) -> None:
+    core = core_of()
+    exchange = begin(core, Status())
+    data = encode({"seq": 1, "pending": goal()}) + encode({"event": "alive"}) + encode({"seq": 1, "ok": True})
+    for count in [*counts, len(data)]:
+        core.receive(data[:count], 0.0)
+        data = data[count:]
+    assert core.answer(exchange)[1] == [{"seq": 1, "pending": goal()}]
+
+
+def test_a_request_that_was_sent_early_is_not_sent_again(core: ClientCore) -> None:
+    line = encode({"seq": 1, "request": "status"})
+    core._sent_early = line[:5]
+    exchange = begin(core, Status())
+    assert (core.outgoing(), exchange.sent) == (line[5:], False)
+    core = core_of()
+    core._sent_early = line
+    exchange = begin(core, Status())
+    assert (core.outgoing(), exchange.sent) == (b"", True)
+    core = core_of()
+    core._sent_early = line
+    with pytest.raises(AssertionError, match="early"):
+        begin(core, Pause())
+
+
+def test_a_request_is_held_back_unless_a_part_of_it_is_sent(core: ClientCore) -> None:
+    first, second, third = (begin(core, Say(each)) for each in "abc")
+    core.mark_sent(3)
+    assert core.forget(second)
+    assert [decode(each)["text"] for each in (b'{"s' + core.outgoing()).splitlines()] == ["a", "c"]
+    assert not core.forget(first)
+    assert core.forget(third)
+    assert core.exchanges == {}
+
+
+def test_sending_ends_and_what_was_sent_is_still_answered(core: ClientCore) -> None:
+    first = begin(core, Status())
+    sent(core)
+    second = begin(core, Status())
+    core.stop_sending("it is gone", "the server at /s went away")
+    with pytest.raises(ServerUnavailable, match="went away"):
+        core.answer(second)
+    with pytest.raises(ServerUnavailable, match="nothing was sent to the server at /s: it is gone"):
+        begin(core, Status())
+    hear(core, {"seq": 1, "ok": True})
+    assert core.answer(first)
+
+
+# The end
+
+
+@pytest.mark.parametrize(
+    ("request_", "is_sent", "error"),
+    [
+        (Say("a"), True, Lost),
+        (Say("a"), False, ServerUnavailable),
+        (Cancel(), True, ServerUnavailable),
+        (Status(), False, ServerUnavailable),
+    ],
+)
+def test_the_end_loses_what_was_sent(
+    core: ClientCore, request_: Request, is_sent: bool, error: type[TalkError]
+) -> None:
+    exchange = begin(core, request_)
+    if is_sent:
+        sent(core)
+    else:
+        core.mark_sent(5)
+    core.end("it is gone")
+    with pytest.raises(error, match="it is gone") as raised:
+        core.answer(exchange)
+    assert ("nothing was sent" in raised.value.message) != is_sent
+    with pytest.raises(ServerUnavailable, match="nothing was sent"):
+        begin(core, Status())
+
+
+def test_the_servers_last_words_are_the_reason_of_the_end(core: ClientCore) -> None:
+    hear(core, {"ok": False, "error": {"code": "too_slow", "message": "you are too slow"}})
+    core.end("the server went away")
+    assert core.ended == "the server closed it: you are too slow"
+
+
+@pytest.mark.parametrize(
+    "line", [b"{\n", b'{"event": "state", "id": "g", "state": "BORED"}\n', b'{"event": "result"}\n']
+)
+def test_a_malformed_line_ends_the_connection_and_nothing_after_it_counts(core: ClientCore, line: bytes) -> None:
+    exchange = begin(core, Status())
+    core.receive(line + b"\n" + encode({"seq": 1, "ok": True}), 0.0)
+    assert (core.ended or "").startswith("it sent what is no message")
+    assert not exchange.over
+
+
+def test_a_reply_with_a_malformed_goal_is_none(core: ClientCore) -> None:
+    tracked = say(core)
+    sent(core)
+    hear(core, {"seq": 1, "ok": True, "goal": {"id": "g", "state": "BORED"}})
+    assert (tracked.goal.state, tracked.goal.reason, core.exchanges) == (State.LOST, "lost", {})
+
+
+# Limits
+
+
+def test_an_answer_must_come_in_time_and_each_line_of_it_counts(core: ClientCore) -> None:
+    exchange = begin(core, Status(), now=1.0)
+    assert core.answer_by(exchange) == 1.0 + PATIENCE
+    sent(core)
+    hear(core, {"seq": 1, "recent": goal()}, now=3.0)
+    assert core.answer_by(exchange) == 3.0 + PATIENCE
+    slow = begin(core, Say("a", patient=True), now=1.0, slow=True)
+    assert core.answer_by(slow) == 1.0 + PATIENCE  # it must be sent
+    sent(core)
+    assert core.answer_by(slow) == float("inf")
+
+
+def test_a_silent_server_counts_as_gone(core: ClientCore) -> None:
+    assert core.silent_by(2.0) == (2.0 + SILENCE_LIMIT_S, "it has said nothing for 15 s")
+    hear(core, {"event": "alive"}, now=7.0)
+    assert core.silent_by(2.0)[0] == 7.0 + SILENCE_LIMIT_S
+
+
+def test_a_goal_without_an_answer_is_lost_if_it_was_sent_else_rejected(core: ClientCore) -> None:
+    tracked = say(core, now=1.0)
+    assert core.next_expiry() == 1.0 + PATIENCE
+    sent(core)
+    late = say(core, now=1.5)
+    assert core.expire(5.9)
+    assert (tracked.goal.state, tracked._has_event()) == (State.PENDING, False)
+    assert core.expire(7.0)
+    assert (tracked.goal.state, tracked.goal.reason, tracked.goal.id) == (State.LOST, "lost", "g")
+    assert (late.goal.state, late.goal.reason) == (State.REJECTED, "not_sent")
+    assert [tracked._take(), late._take()] == [Result(tracked.goal), Result(late.goal)]
+    assert (core.next_expiry(), core.outgoing(), core.exchanges) == (float("inf"), b"", {})
+
+
+def test_a_goal_whose_line_is_sent_in_part_is_rejected_and_the_connection_is_useless(core: ClientCore) -> None:
+    tracked = say(core)
+    core.mark_sent(5)
+    assert not core.expire(PATIENCE)
+    assert (tracked.goal.state, tracked.goal.reason) == (State.REJECTED, "not_sent")
+
+
+def test_a_goal_whose_ttl_ends_before_it_can_be_sent_is_rejected(core: ClientCore) -> None:
+    tracked = say(core, ttl=2)
+    assert core.next_expiry() == 2.0
+    core.expire(2.0)
+    assert tracked.goal.reason == "not_sent"
+
+
+def test_a_refused_goal_is_rejected_with_the_servers_code(core: ClientCore) -> None:
+    tracked = say(core)
+    sent(core)
+    hear(core, {"seq": 1, "ok": False, "error": {"code": "unknown_field", "message": "no melody"}})
+    assert (tracked.goal.state, tracked.goal.reason) == (State.REJECTED, "unknown_field")
+    assert (tracked.goal.message, core.exchanges) == ("Talk rejected: no melody", {})
+
+
+# A break, and another connection
+
+
+def test_a_break_loses_what_was_sent_and_rejects_what_was_not(reconnecting: ClientCore) -> None:
+    answered = begin(reconnecting, Status())
+    unanswered, following = say(reconnecting), say(reconnecting)
+    sent(reconnecting)
+    hear(reconnecting, {"seq": 1, "ok": True}, {"seq": 3, "ok": True, "goal": goal()})
+    partly = say(reconnecting)
+    reconnecting.mark_sent(5)
+    reconnecting.disconnected("it is gone", 1.0)
+    assert answered.reply is not None
+    assert (unanswered.goal.state, partly.goal.reason) == (State.LOST, "not_sent")
+    assert (following.goal.state, following._has_event()) == (State.PENDING, False)
+    assert (reconnecting.outgoing(), reconnecting.ended) == (b"", None)
+
+
+def test_goals_of_the_same_server_are_followed_again(reconnecting: ClientCore) -> None:
+    tracked = say(reconnecting, feedback=True)
+    sent(reconnecting)
+    hear(reconnecting, {"seq": 1, "ok": True, "goal": goal()}, state("PENDING"))
+    assert tracked._take() == StateChanged("g", State.PENDING, 0.0, 1)
+    reconnecting.disconnected("it is gone", 1.0)
+    late = begin(reconnecting, Status(), now=1.5, on_failure=lambda _: None)
+    greet(reconnecting)
+    assert sent(reconnecting) == [
+        {"seq": 3, "request": "wait", "ids": ["g"], "feedback": True},
+        {"seq": 2, "request": "status"},
+    ]
+    hear(reconnecting, {"seq": 3, "goal": goal("ACTIVE")}, {"seq": 3, "ok": True}, word(5), {"seq": 2, "ok": True})
+    found = [tracked._take(), tracked._take()]
+    assert [type(each) for each in found] == [StateChanged, WordHeard]
+    assert (tracked.goal.state, late.over) == (State.ACTIVE, True)
+    hear(reconnecting, {"event": "result", "goal": goal("SUCCEEDED")})
+    assert tracked.goal.state is State.SUCCEEDED
+
+
+def test_goals_of_a_server_that_was_restarted_are_lost(reconnecting: ClientCore) -> None:
+    tracked = say(reconnecting)
+    sent(reconnecting)
+    hear(reconnecting, {"seq": 1, "ok": True, "goal": goal()})
+    reconnecting.disconnected("it is gone", 1.0)
+    greet(reconnecting, "5m8g")
+    assert (tracked.goal.state, sent(reconnecting), reconnecting.boot) == (State.LOST, [], "5m8g")
+    assert tracked.goal.message == "Talk lost: it is gone; it may still be spoken"
+
+
+def test_a_goal_that_the_same_server_has_forgotten_is_lost(reconnecting: ClientCore) -> None:
+    tracked = say(reconnecting)
+    sent(reconnecting)
+    hear(reconnecting, {"seq": 1, "ok": True, "goal": goal()})
+    reconnecting.disconnected("it is gone", 1.0)
+    greet(reconnecting)
+    sent(reconnecting)
+    reconnecting.disconnected("gone again", 2.5)
+    assert tracked.goal.state is State.PENDING
+    greet(reconnecting)
+    hear(reconnecting, {"seq": 3, "ok": False, "error": {"code": "unknown_goal", "message": "no g"}})
+    assert (tracked.goal.state, tracked.goal.message) == (State.LOST, "Talk lost: no g; it may have been spoken")
+
+
+def test_goals_are_lost_if_no_connection_is_made_in_time(reconnecting: ClientCore) -> None:
+    tracked = say(reconnecting)
+    sent(reconnecting)
+    hear(reconnecting, {"seq": 1, "ok": True, "goal": goal()})
+    reconnecting.disconnected("it is gone", 1.0)
+    assert reconnecting.next_expiry() == 1.0 + PATIENCE
+    reconnecting.not_connected(ServerUnavailable("no server"), "no server")
+    reconnecting.expire(5.9)
+    assert tracked.goal.state is State.PENDING
+    reconnecting.expire(6.0)
+    assert (tracked.goal.state, tracked.goal.message) == (State.LOST, "Talk lost: it is gone; it may still be spoken")
+
+
+def test_a_goal_that_is_said_without_a_connection_waits_for_one(reconnecting: ClientCore) -> None:
+    reconnecting.disconnected("it is gone", 1.0)
+    tracked, other = say(reconnecting, now=2.0, ttl=4), say(reconnecting, now=2.0)
+    waits_for = begin(reconnecting, Status(), now=2.0)
+    reconnecting.not_connected(ServerUnavailable("no server"), "no server")
+    with pytest.raises(ServerUnavailable, match="no server"):
+        reconnecting.answer(waits_for)
+    reconnecting.connecting(HELLO, "1.0")
+    assert reconnecting.outgoing() == HELLO
+    reconnecting.mark_sent(len(HELLO))
+    assert reconnecting.outgoing() == b""
+    greet(reconnecting, "5m8g", now=3.0)
+    assert [each.get("ttl") for each in sent(reconnecting)] == [3.0, None]
+    reconnecting.expire(7.9)
+    assert [tracked._has_event(), other._has_event()] == [False, False]  # the limit counts from the greeting on
+    reconnecting.expire(8.0)
+    assert other.goal.state is State.LOST
+
+
+def test_a_goal_that_is_said_without_a_connection_is_rejected_in_time(reconnecting: ClientCore) -> None:
+    reconnecting.disconnected("it is gone", 1.0)
+    tracked = say(reconnecting, now=2.0)
+    reconnecting.not_connected(ServerUnavailable("no server"), "no server, tried: /s")
+    assert reconnecting.next_expiry() == 2.0 + PATIENCE
+    assert reconnecting.expire(7.0)
+    message = "Talk rejected: nothing was sent to the server at /s: no server, tried: /s"
+    assert (tracked.goal.reason, tracked.goal.message) == ("not_sent", message)
+
+
+@pytest.mark.parametrize(
+    ("greeting", "error"),
+    [
+        ({"talk": 2}, ProtocolMismatch),
+        ({"talk": 1, "error": "busy"}, Busy),
+        ({"talk": 1, "error": "permission_denied", "message": "not you"}, AccessDenied),
+        ({"ok": True}, ServerUnavailable),
+    ],
+)
+def test_a_greeting_that_refuses_is_an_error(
+    reconnecting: ClientCore, greeting: JsonObject, error: type[TalkError]
+) -> None:
+    reconnecting.disconnected("it is gone", 1.0)
+    reconnecting.connecting(HELLO, "1.0")
+    with pytest.raises(error):
+        hear(reconnecting, greeting)
+
+
+# Who hears what
+
+
+def test_watching_ends_with_a_break_or_goes_on_with_another_snapshot(reconnecting: ClientCore) -> None:
+    ending, lasting = EventBuffer(), EventBuffer(reconnects=True)
+    reconnecting.listeners.watch(ending)
+    reconnecting.listeners.watch(lasting)
+    hear(reconnecting, state("ACTIVE", 5))
+    reconnecting.disconnected("it is gone", 1.0)
+    greet(reconnecting, "5m8g")
+    assert sent(reconnecting) == [{"seq": 1, "request": "watch"}]
+    hear(reconnecting, {"seq": 1, "ok": True, "server": {"pid": 7}, "active": None}, state("ACTIVE", 5))
+    assert ending.closed == "nothing more is heard of the server at /s: it is gone"
+    assert taken(ending) == [StateChanged]
+    assert (lasting.closed, taken(lasting)) == (None, [StateChanged, Snapshot, StateChanged])
+    del lasting
+    reconnecting.disconnected("it is gone", 3.0)
+    greet(reconnecting, "5m8g")
+    assert sent(reconnecting) == []
+
+
+def test_watching_that_is_refused_later_ends(reconnecting: ClientCore) -> None:
+    buffer = EventBuffer(reconnects=True)
+    reconnecting.listeners.watch(buffer)
+    reconnecting.disconnected("it is gone", 1.0)
+    greet(reconnecting)
+    hear(reconnecting, {"seq": 1, "ok": False, "error": {"code": "busy", "message": "no"}})
+    assert buffer.closed == "no"
+
+
+def taken(buffer: EventBuffer) -> list[type[Event]]:
+    found = []
+    while event := buffer.take():
+        found.append(type(event))
+    return found
+
+
+def test_buffer_hands_out_in_order_and_drops_the_oldest_feedback() -> None:
+    buffer = EventBuffer()
+    changed, heard = StateChanged("g", State.ACTIVE), WordHeard("g", "a", 0, 1, 1, 0.0)
+    for number in range(MAX_FEEDBACK_EVENTS + 2):
+        buffer.add(WordHeard("g", "a", 0, 1, number, 0.0))
+        if number == 5:
+            buffer.add(changed)
+    assert buffer.take() == WordHeard("g", "a", 0, 1, 2, 0.0)  # 0 and 1 were dropped
+    assert [buffer.take() for _ in range(4)][3] == changed
+    assert buffer.take() == WordHeard("g", "a", 0, 1, 6, 0.0)
+    taken(buffer)
+    for _ in range(MAX_STATE_EVENTS):
+        buffer.add(changed)
+    assert buffer.closed is None
+    buffer.add(changed)
+    buffer.add(heard)
+    assert "take them faster" in (buffer.closed or "")
+    assert len(taken(buffer)) == MAX_STATE_EVENTS  # nothing that came after what is missing
+
+
+def test_event_that_comes_twice_is_kept_once() -> None:
+    buffer = EventBuffer()
+    for number in (1, 1, 2, None, None):
+        buffer.add(StateChanged("g", State.ACTIVE, n=number))
+    assert len(buffer) == 4
+
+
+def test_ended_goal_hears_nothing_more(core: ClientCore) -> None:
+    tracked = say(core)
+    sent(core)
+    hear(core, {"seq": 1, "ok": True, "goal": goal(), "attached": True, "paused": True})
+    assert (tracked.attached, tracked.speech_paused) == (True, True)
+    hear(core, state("ACTIVE"), word(1), {"event": "paused", "paused": True, "id": "g", "by": None, "n": 2})
+    assert (tracked.goal.paused, core.listeners.goals) == (True, {"g": False})
+    hear(core, {"event": "result", "goal": goal("SUCCEEDED")}, state("ACTIVE"))
+    assert [type(each) for each in (tracked._take(), tracked._take(), tracked._take())] == [
+        StateChanged,
+        Result,
+        Result,
+    ]
+    tracked._fail(Lost("too late"))
+    tracked._settle(Goal("g", State.ACTIVE))
+    assert (tracked.goal.state, core.listeners.goals) == (State.SUCCEEDED, {})
