@@ -85,9 +85,9 @@ def fleet(options: CommonOptions, what: str) -> int | None:
 
 def _show_robots(options: CommonOptions, broker: Broker, selection: Selection | None) -> None:
     """Show the state of each robot."""
-    from talkcli.fleet.desk.watch import read_standings
+    from talkcli.fleet.desk.watch import read_robots
 
-    found = read_standings(broker, ANSWER_LIMIT_S, selection.name if selection else None)
+    found = read_robots(broker, ANSWER_LIMIT_S, selection.name if selection else None)
     selected = [each for _, each in sorted(found.items()) if selection is None or selection.includes(each.presence)]
     if not selected:
         raise _no_robot(broker, selection)
@@ -143,9 +143,9 @@ def _show_event(options: CommonOptions, broker: Broker, transcript: FleetTranscr
         message = {"robot": event.name, **event.message}
         show_result(options, [message], lambda: transcript.lines(event.name, event.event, screen(), now))
     elif isinstance(event, EventsMissed):
-        name = event.standing.presence.name
+        name = event.robot.presence.name
         lines = (line for each in event.events for line in transcript.lines(name, each, screen(), now))
-        show_result(options, [_snapshot_object(event.standing)], lambda: lines)
+        show_result(options, [_snapshot_object(event.robot)], lambda: lines)
     elif options.quiet:
         pass
     elif isinstance(event, BrokerAway):
@@ -154,8 +154,8 @@ def _show_event(options: CommonOptions, broker: Broker, transcript: FleetTranscr
         note(f"the broker at {broker.url} is back, after {event.after:.1f} s")
 
 
-def _snapshot_object(standing: RobotInfo) -> JsonObject:
-    return {"robot": standing.presence.name, "event": "snapshot", **standing.to_json()}
+def _snapshot_object(robot: RobotInfo) -> JsonObject:
+    return {"robot": robot.presence.name, "event": "snapshot", **robot.to_json()}
 
 
 def _row_without_goals(presence: Presence) -> RobotRow:
@@ -164,9 +164,9 @@ def _row_without_goals(presence: Presence) -> RobotRow:
     return RobotRow(presence.name, presence.online, server, since=presence.since)
 
 
-def _table_row(standing: RobotInfo) -> RobotRow:
+def _table_row(robot: RobotInfo) -> RobotRow:
     """Return the table row of a robot."""
-    row, status = _row_without_goals(standing.presence), standing.status
+    row, status = _row_without_goals(robot.presence), robot.status
     if status is None:
         return row
     last = status.last

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from fnmatch import translate
 
-from talkcli.errors import EXIT_OK, AccessDenied, Lost, ServerUnavailable, TalkError, UnknownGoal
+from talkcli.errors import EXIT_OK, Lost, ServerUnavailable, TalkError, UnknownGoal
 from talkcli.fleet import topics
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.goal import Goal
@@ -65,6 +65,10 @@ class Selection:
         return self.text == presence.name
 
 
+class NoServer(ServerUnavailable):
+    """The robot is online, but its server is not running."""
+
+
 @frozen
 class Outcome:
     """The outcome of a request at one robot.
@@ -100,7 +104,7 @@ class Outcome:
 
 def failure_outcome(robot: str, error: TalkError, state: str | None = None) -> Outcome:
     """Return the outcome of a failed request. By default, its state follows from the error."""
-    states = {UnknownGoal: "UNKNOWN", Lost: State.LOST.name, AccessDenied: "REFUSED", ServerUnavailable: "UNREACHABLE"}
+    states = {UnknownGoal: "UNKNOWN", Lost: State.LOST.name, NoServer: "NO_SERVER", ServerUnavailable: "UNREACHABLE"}
     default = next((name for kind, name in states.items() if isinstance(error, kind)), "REFUSED")
     return Outcome(robot, state or default, error.exit_code, error=error)
 

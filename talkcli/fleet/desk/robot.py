@@ -15,27 +15,19 @@ from typing import TYPE_CHECKING, Any
 from talkcli import __version__
 from talkcli.client.connect import ANSWER_LIMIT_S, sender_name
 from talkcli.client.connection import BlockingConnection
-from talkcli.client.core import Exchange
-from talkcli.errors import (
-    AccessDenied,
-    BadRequest,
-    Lost,
-    ServerUnavailable,
-    TalkError,
-    UnknownGoal,
-    UsageError,
-)
+from talkcli.client.core import Exchange, identity
+from talkcli.errors import AccessDenied, BadRequest, Lost, ServerUnavailable, TalkError, UnknownGoal, UsageError
 from talkcli.fleet import topics
 from talkcli.fleet.desk.desk import ABSENCE_LIMIT_S, DeskLink
+from talkcli.fleet.desk.request import NoServer
 from talkcli.fleet.link import REASON_FAILURE, boottime
 from talkcli.frozen import replace
 from talkcli.goals.option import MAX_NAME
 from talkcli.goals.options import Cancel, Say, Set
-from talkcli.goals.states import State
 from talkcli.polling import wait_ready
-from talkcli.protocol.events import ServerStatus, Snapshot, check_greeting
-from talkcli.protocol.lines import decode, request_line, write_request
-from talkcli.protocol.requests import Hello, Pause, Resume, Wait, Watch
+from talkcli.protocol.events import check_greeting
+from talkcli.protocol.lines import decode
+from talkcli.protocol.requests import Hello, Pause, Resume, Wait
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
@@ -63,23 +55,12 @@ _MAX_OPEN_LOOKUPS = 32
 
 
 class RobotExchange(Exchange):
-    """An exchange that survives absences of the robot."""
+    """A request and its answer, which may come after an absence of the robot."""
 
-    __slots__ = ("latest", "tries")
-
-    def __init__(
-        self,
-        request: Request,
-        on_reply: OnReply | None = None,
-        on_failure: OnFailure | None = None,
-        *,
-        slow: bool = False,
-    ) -> None:
-        super().__init__(request, on_reply, on_failure, slow=slow)
-        #: how often the request was sent again
-        self.tries = 0
-        #: when the goal must have begun, by the clock of `boottime`; None for no limit
-        self.latest: float | None = None
+    #: how often the request was sent again
+    resends = 0
+    #: by when a sentence must be sent, by the clock of `boottime`; None for no limit
+    latest: float | None = None
 
 
 class RobotConnection(BlockingConnection):
@@ -133,15 +114,12 @@ class RobotConnection(BlockingConnection):
         self._presence: JsonObject = {}
         #: the session id of the bridge that has the open requests; None if there is none
         self._bridge_session: object = None
+        #: since when (monotonic) the robot can't be asked; None if it can
         self.absent_since = self._published_at
-        #: the goals whose results will be received, and whether their words will be, too
-        self._followed_goals: dict[str, bool] = {}
         #: goals to cancel again after every absence
         self._canceled: set[str] = set()
-        #: goals to look up, and the open lookups by request number. Each has the goal's id, and the exchange whose
-        #: answer depends on it; None for a followed goal
-        self._lookups: deque[tuple[str, RobotExchange | None]] = deque()
-        self._open_lookups: dict[int, tuple[str, RobotExchange | None]] = {}
+        #: lookups of goals that are to be sent when others have been answered
+        self._lookups: deque[Exchange] = deque()
 
     # -- requests
 
@@ -156,11 +134,11 @@ class RobotConnection(BlockingConnection):
         if isinstance(request, Say) and request.id is None:
             request = replace(request, id=new_goal_id(self._desk))
         exchange = RobotExchange(request, on_reply, on_failure, slow=slow)
+        if isinstance(request, Say) and request.ttl:
+            exchange.latest = boottime() + request.ttl
         with self.changed:  # so that `_resend_all` doesn't send it at the same time
             self.register(exchange, time.monotonic())
-            if isinstance(request, Say) and request.ttl:
-                exchange.latest = boottime() + request.ttl
-            exchange.sent = self._publish(exchange.number, request, exchange)
+            self._publish(exchange)
         if not exchange.sent:
             self._desk.wake()  # it will be sent when the robot is back
         return exchange
@@ -172,7 +150,7 @@ class RobotConnection(BlockingConnection):
         self.register(exchange, self._published_at)
 
     def post(self, request: Request) -> None:
-        if not self._publish(next(self._numbers), request):
+        if not self._post(request):
             raise ServerUnavailable(f"nothing was sent to the server at {self.path}: {self.ended or self.absence}")
 
     def cancel_lastingly(self, goal_id: str, *, is_sent: bool) -> None:
@@ -185,31 +163,40 @@ class RobotConnection(BlockingConnection):
         with self.changed:
             self._canceled.add(goal_id)
             if not is_sent:
-                self._publish(next(self._numbers), Cancel((goal_id,)))
+                self._post(Cancel((goal_id,)))
 
-    def _publish(self, number: int, request: Request, exchange: RobotExchange | None = None) -> bool:
+    def _post(self, request: Request) -> bool:
+        """Send a request and ignore its answer. Return whether it could be sent."""
+        exchange = RobotExchange(request)
+        exchange.number = next(self._numbers)
+        return self._publish(exchange)
+
+    def _publish(self, exchange: Exchange) -> bool:
         """Send a request to the robot, and return whether that was possible."""
-        link = self._desk.link
+        link, request = self._desk.link, exchange.request
         if link is None or self.ended is not None or self.absent_since is not None:
             return False
 
         def on_acknowledged(code: int) -> None:
-            if exchange is not None and code >= REASON_FAILURE:
+            if code >= REASON_FAILURE:
                 with self.changed:
                     self.fail(exchange, self._desk.publish_error(code, f"ask {self._robot} for anything"))
 
-        line = request_line({"seq": number, **write_request(request)})
+        line = self.line(exchange)
         if (refused := link.size_error(line, request.kind)) is not None:
-            if exchange is not None:
-                self.fail(exchange, refused)
+            self.fail(exchange, refused)
             return False
         self._published_at = time.monotonic()
         topic = topics.robot(self._robot, topics.REQUEST, self._desk.user)
         response = self._desk.reply_topic(self._robot)
         expiry = (request.ttl or None) if isinstance(request, Say) else REQUEST_EXPIRY_S
-        return link.publish(topic, line, expiry=expiry, response=response, acknowledged=on_acknowledged)
+        published = link.publish(topic, line, expiry=expiry, response=response, acknowledged=on_acknowledged)
+        exchange.sent = exchange.sent or published
+        return published
 
     def answer_by(self, exchange: Exchange) -> float:
+        if not isinstance(exchange, RobotExchange):
+            return float("inf")  # a lookup ends with the answer, or is repeated after the next absence
         if self.absent_since is None:
             by = super().answer_by(exchange)
         else:
@@ -217,7 +204,7 @@ class RobotConnection(BlockingConnection):
         return by if self._end is None else min(by, max(self._end, exchange.heard_at))
 
     def goals_lost_at(self) -> float:
-        return float("inf")  # the connection ends before that, see `silent_by`
+        return float("inf")  # the connection ends first, see `silent_by`
 
     def silent_by(self, began: float) -> tuple[float, str]:
         if self.absent_since is None:
@@ -226,7 +213,7 @@ class RobotConnection(BlockingConnection):
 
     def refusal(self, reply: JsonObject, items: list[JsonObject]) -> TalkError:
         error = super().refusal(reply, items)
-        kinds = {"not_allowed": AccessDenied, "no_server": ServerUnavailable, "stale": ServerUnavailable, "lost": Lost}
+        kinds = {"not_allowed": AccessDenied, "no_server": NoServer, "stale": ServerUnavailable, "lost": Lost}
         kind = kinds.get(error.code)
         return kind(f"{self._robot}: {error.message}") if kind else error
 
@@ -239,7 +226,7 @@ class RobotConnection(BlockingConnection):
     def keep_alive(self) -> None:
         """Keep the bridge's session alive if nothing has been sent for a while."""
         if time.monotonic() - self._published_at > _KEEP_ALIVE_INTERVAL_S:
-            self._publish(next(self._numbers), Hello(self._sender))
+            self._post(Hello(self._sender))
 
     def on_connected(self, link: Link) -> None:
         """Subscribe to the robot's replies and its presence."""
@@ -279,8 +266,7 @@ class RobotConnection(BlockingConnection):
         elif not isinstance(server, dict):
             self._mark_absent(f"{self._robot} has no talk server at this moment")
         elif self._bridge_session != presence.get("session") or self.absent_since is not None:
-            self.boot = server["boot"] if isinstance(server.get("boot"), str) else ""
-            self.pid = server["pid"] if isinstance(server.get("pid"), int) else None
+            self.boot, self.pid = identity(server)
             self._bridge_session = presence.get("session")
             self.absent_since, self._heard = None, time.monotonic()
             self._resend_all()
@@ -312,132 +298,85 @@ class RobotConnection(BlockingConnection):
 
     def _resend_all(self) -> None:
         """Send open requests again, and look up the goals."""
+        now = time.monotonic()
         if self._sender:
-            self._publish(next(self._numbers), Hello(self._sender))
+            self._post(Hello(self._sender))
         if self._canceled:
-            self._publish(next(self._numbers), Cancel(tuple(self._canceled)))
-        for number in self._open_lookups:
-            del self.exchanges[number]
-        self._open_lookups.clear()
-        self._lookups = deque((each, None) for each in self._followed_goals)
+            self._post(Cancel(tuple(self._canceled)))
+        self._lookups.clear()
+        self.exchanges = {n: each for n, each in self.exchanges.items() if isinstance(each, RobotExchange)}
+        for goal_id, feedback in self.listeners.goals.items():
+            self._follow_again(goal_id, feedback=feedback, now=now)
         for exchange in [each for each in self.exchanges.values() if isinstance(each, RobotExchange) and not each.over]:
             if exchange.sent and isinstance(exchange.request, Say):
-                self._lookups.append((str(exchange.request.id), exchange))
+                self._look_up(exchange, exchange.request, now)
             elif exchange.sent and isinstance(exchange.request, self.lasting):
                 # Sent again, the request could affect newer goals.
                 self.fail(exchange, self._lost(exchange, self.absence))
             else:
                 self._resend(exchange)
         if self.listeners.watched:
-            self._begin_lookup(Watch(), "", None)
-        self._begin_lookups()
+            self._watch_again(now)
 
     def _resend(self, exchange: RobotExchange) -> None:
         """Send a request again, or fail it if its time is over or too many attempts have failed."""
         request = exchange.request
         left = 0.0 if exchange.latest is None else exchange.latest - boottime()
-        exchange.tries += 1
+        exchange.resends += 1
         why = "its time was over before an answer came" if left < 0 else f"{self.absence}, {_MAX_RESENDS} times"
         if isinstance(request, Say) and request.id in self._canceled:
             left, why = -1.0, "it was cancelled before the robot had heard of it"
-        if left < 0 or exchange.tries > _MAX_RESENDS:
+        if left < 0 or exchange.resends > _MAX_RESENDS:
             self.fail(exchange, self._lost(exchange, why))
             return
         if isinstance(request, Say) and left:
-            request = replace(request, ttl=left)
+            exchange.request = replace(request, ttl=left)
         exchange.items.clear()
         exchange.heard_at = time.monotonic()
-        exchange.sent = self._publish(exchange.number, request, exchange) or exchange.sent
+        self._publish(exchange)
 
     def _lost(self, exchange: Exchange, why: str) -> Lost:
         words = f"{exchange.request.kind} was sent to the server at {self.path}, but {why}"
         return Lost(f"{words}; it may have been carried out")
 
-    def _begin_lookups(self) -> None:
-        """Look up as many goals as the bridge takes at once."""
-        while self._lookups and len(self._open_lookups) < _MAX_OPEN_LOOKUPS:
-            goal_id, exchange = self._lookups.popleft()
-            feedback = self._followed_goals.get(goal_id, False)
-            if exchange is not None and isinstance(exchange.request, Say):
-                feedback = exchange.request.feedback
-                exchange.heard_at = time.monotonic()
-            self._begin_lookup(Wait((goal_id,), feedback), goal_id, exchange)
+    def _look_up(self, exchange: RobotExchange, request: Say, now: float) -> None:
+        """Look up a goal whose acceptance is not known. If the robot doesn't know the goal, send it again."""
 
-    def _begin_lookup(self, request: Request, goal_id: str, exchange: RobotExchange | None) -> None:
-        """Send a lookup, whose answer nobody waits for."""
-        number = next(self._numbers)
-        self._open_lookups[number] = goal_id, exchange
-        lookup = RobotExchange(request, self._on_snapshot)
-        lookup.number, lookup.sent = number, True
-        self.register(lookup, time.monotonic())
-        self._publish(number, request)
+        def on_reply(_: JsonObject, items: list[JsonObject]) -> None:
+            for each in items:
+                if not exchange.over:
+                    self._finish(exchange, {"ok": True, "goal": each.get("goal")})
+
+        def on_failure(error: TalkError) -> None:
+            if isinstance(error, UnknownGoal):
+                self._resend(exchange)
+            elif self.absent_since is None:
+                words = f"what became of {request.id} is not told, it may still be spoken: {error.message}"
+                self.fail(exchange, Lost(words))
+
+        exchange.heard_at = now
+        self._begin(Exchange(Wait((str(request.id),), request.feedback), on_reply, on_failure), now)
+
+    def _begin(self, exchange: Exchange, now: float) -> None:
+        self._lookups.append(exchange)
+        self._send_lookups(now)
+
+    def _send_lookups(self, now: float) -> None:
+        """Send as many lookups as the bridge takes at once."""
+        open_count = sum(not isinstance(each, RobotExchange) for each in self.exchanges.values())
+        for _ in range(min(len(self._lookups), _MAX_OPEN_LOOKUPS - open_count)):
+            exchange = self._lookups.popleft()
+            self.register(exchange, now)
+            self._publish(exchange)
 
     def dispatch(self, message: JsonObject, now: float) -> Exchange | None:
         if message.get("event") == "gone":
             self.end(printable(str(message.get("message") or "the server went away")))
             return None
         exchange = super().dispatch(message, now)
-        if message.get("event") == "result":
-            goal = message.get("goal")
-            self._followed_goals.pop(str(goal.get("id")) if isinstance(goal, dict) else "", None)
-        if exchange is None:
-            return None
-        if message.get("ok") is True:
-            self._note_followed(exchange)
-        if exchange.number in self._open_lookups:
-            del self.exchanges[exchange.number]
-            self._end_lookup(*self._open_lookups.pop(exchange.number), exchange)
-            self._begin_lookups()
+        if exchange is not None and not isinstance(exchange, RobotExchange):
+            self._send_lookups(now)
         return exchange
-
-    def _on_snapshot(self, reply: JsonObject, items: list[JsonObject]) -> None:
-        """Pass the server's state in the reply to a lookup to those who watch all goals."""
-        if "server" in reply:
-            self.listeners.hear(Snapshot(ServerStatus.from_reply(reply, items)).to_json())
-
-    def _note_followed(self, exchange: Exchange) -> None:
-        """Remember the goals whose results the server will now send."""
-        request, reply = exchange.request, exchange.reply or {}
-        if isinstance(request, Say) and request.wait:
-            found, feedback = [reply.get("goal")], request.feedback
-        elif isinstance(request, Wait):
-            found, feedback = [each.get("goal") for each in exchange.items], request.feedback
-        else:
-            return
-        for goal in found:
-            if isinstance(goal, dict) and not _goal_state(goal).terminal:
-                goal_id = str(goal.get("id"))
-                self._followed_goals[goal_id] = self._followed_goals.get(goal_id, False) or feedback
-
-    def _end_lookup(self, goal_id: str, exchange: RobotExchange | None, lookup: Exchange) -> None:
-        """Process the answer to a lookup.
-
-        Args:
-            goal_id: the goal's id; "" if the lookup was for all goals.
-            exchange: the exchange whose answer depends on it; None for a followed goal.
-            lookup: the lookup, with its answer.
-        """
-        if not goal_id:
-            return
-        goal = next((each["goal"] for each in lookup.items if isinstance(each.get("goal"), dict)), None)
-        if isinstance(goal, dict):
-            if exchange is not None and not exchange.over:
-                reply: JsonObject = {"ok": True, "goal": goal}
-                if exchange.on_reply:
-                    exchange.on_reply(reply, [])
-                exchange.reply = reply
-            elif not _goal_state(goal).terminal:  # for an ended goal, a result follows
-                self.listeners.hear({"event": "state", "id": goal_id, "state": _goal_state(goal).name})
-            return
-        error = self.refusal(lookup.reply or {}, [])
-        if exchange is not None and isinstance(error, UnknownGoal):
-            self._resend(exchange)
-        elif exchange is not None:
-            words = f"what became of {goal_id} is not told, it may still be spoken: {error.message}"
-            self.fail(exchange, Lost(words))
-        else:
-            self._followed_goals.pop(goal_id, None)
-            self.listeners.lose(goal_id, f"{error.message}; it may have been spoken")
 
     # -- closing
 
@@ -491,11 +430,3 @@ def connect_robot(robot: str, broker: Broker, *, keep_trying: float = 0.0, **opt
 def new_goal_id(desk: DeskLink) -> str:
     """Return a new id for a goal, which differs in form from a server's own ids."""
     return f"{desk.user[:_ID_USER_CHARS]}:{os.urandom(5).hex()}"
-
-
-def _goal_state(goal: JsonObject) -> State:
-    """Return the state of a goal; ValueError if it is unknown."""
-    name = goal.get("state")
-    if name not in State.__members__:
-        raise ValueError(f"the state {name!a} is none")
-    return State[str(name)]

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING
 from talkcli.client.client import batches, check, check_id, too_long
 from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.client.goal import GoalHandle
-from talkcli.errors import EXIT_OK, Lost, ServerUnavailable, TalkError, UnknownGoal, UsageError
+from talkcli.errors import EXIT_OK, Lost, ServerUnavailable, TalkError, UnknownGoal, Unreadable, UsageError
 from talkcli.fleet import topics
 from talkcli.fleet.desk.desk import DeskLink
-from talkcli.fleet.desk.request import Outcome, cancel_outcomes, failure_outcome, reply_outcomes
+from talkcli.fleet.desk.request import NoServer, Outcome, cancel_outcomes, failure_outcome, reply_outcomes
 from talkcli.fleet.desk.robot import REQUEST_EXPIRY_S, RobotConnection, RobotExchange, new_goal_id
 from talkcli.fleet.link import REASON_FAILURE, boottime
 from talkcli.fleet.payloads import Presence
@@ -311,9 +311,10 @@ class FleetRequest:
             robot.expect(self._number, self._latest)
         elif presence.server is None:
             words = f"{name} has no talk server at this moment: nothing was sent"
-            self._take([failure_outcome(name, ServerUnavailable(words), "NO_SERVER")])
+            self._take([failure_outcome(name, NoServer(words))])
         else:
-            self._take(robot.send())
+            robot.send()
+            self._update(name)
 
     def _on_reply(self, name: str, message: Message) -> None:
         """Process a robot's lines. A robot that answers a group's request is a member, even if it seemed absent."""
@@ -358,26 +359,24 @@ class RobotRequest:
 
     def __init__(self, connection: RobotConnection, name: str, request: Request) -> None:
         self.connection = connection
+        #: whether the request has been sent to the robot
+        self.was_asked = False
         self._name, self._request = name, request
-        self._exchange: RobotExchange | None = None
-        #: the goals to wait for, since when, and how many of them have an outcome
-        self._handles: list[GoalHandle] = []
+        #: whether the answer may take any time
+        self._slow = isinstance(request, Pause) or (isinstance(request, Say) and request.patient)
+        self._outcomes: list[Outcome] = []
+        #: the goals that have not ended, and since when they are waited for
+        self._handles: deque[GoalHandle] = deque()
         self._since = time.monotonic()
-        self._ended_count = 0
 
-    @property
-    def was_asked(self) -> bool:
-        """Whether the request has been sent to the robot."""
-        return self._exchange is not None
-
-    def send(self) -> list[Outcome]:
-        """Send the request to this robot alone. If that is impossible, return the failure."""
+    def send(self) -> None:
+        """Send the request to this robot alone."""
         try:
             self.connection.check_online()
-            self._exchange = self.connection.begin(self._request, self._on_reply)
+            self.connection.begin(self._request, self._on_reply, self._on_failure, slow=self._slow)
+            self.was_asked = True
         except TalkError as error:
-            return [failure_outcome(self._name, error)]
-        return []
+            self._on_failure(error)
 
     def expect(self, number: int, latest: float | None) -> None:
         """Expect an answer to the request that was sent to the robot's group.
@@ -386,9 +385,10 @@ class RobotRequest:
             number: the number of that request.
             latest: time by `boottime` after which a sentence must not be sent again; None for no limit.
         """
-        self._exchange = RobotExchange(self._request, self._on_reply)
-        self._exchange.number, self._exchange.latest = number, latest
-        self.connection.expect(self._exchange)
+        exchange = RobotExchange(self._request, self._on_reply, self._on_failure, slow=self._slow)
+        exchange.number, exchange.latest = number, latest
+        self.connection.expect(exchange)
+        self.was_asked = True
 
     def new_outcomes(self, *, check_time: bool) -> list[Outcome]:
         """Return the outcomes since the last call.
@@ -396,68 +396,45 @@ class RobotRequest:
         Args:
             check_time: whether to fail if the robot has not answered in time.
         """
-        exchange, connection = self._exchange, self.connection
-        assert exchange is not None
-        connection.keep_alive()
-        now = time.monotonic()
-        if not self._handles:
-            request = self._request
-            is_slow = isinstance(request, Pause) or (isinstance(request, Say) and request.patient)
-            limit = connection.silent_by(self._since)[0] if is_slow else connection.answer_by(exchange)
-            if not (exchange.over or connection.ended is not None or (check_time and now > limit)):
-                return []
-            connection.forget(exchange)
-            try:
-                outcomes = self._replied(exchange)
-                if outcomes:
-                    return outcomes
-            except TalkError as error:
-                refused = (exchange.reply or {}).get("error")
-                has_no_server = isinstance(refused, dict) and refused.get("code") == ServerUnavailable.code
-                return [failure_outcome(self._name, error, "NO_SERVER" if has_no_server else None)]
-        silent_at, why = connection.silent_by(self._since)
-        if check_time and now > silent_at:
-            connection.ended = connection.ended or why
-        return self._ended()
-
-    def _on_reply(self, reply: JsonObject, items: list[JsonObject]) -> None:
-        """Follow the goals that have to be waited for."""
-        request = self._request
-        if isinstance(request, Say):
-            found = [Goal.from_json(reply.get("goal"))]  # a reply without it is malformed
-            if not request.wait:
-                return
-        elif isinstance(request, Wait):
-            found = list(goals(items, "goal"))
-        else:
-            return
-        self._since = time.monotonic()
-        self._handles = [GoalHandle(self.connection, each) for each in found]
-        for each in self._handles:
-            each._listen(feedback=False)
-
-    def _replied(self, exchange: RobotExchange) -> list[Outcome]:
-        """Return the outcomes that are known from the reply; none if its goals have to be waited for."""
-        try:
-            reply, items = self.connection.answer(exchange)
-        except UnknownGoal as error:
-            return [*cancel_outcomes(self._name, error.items, last=False), failure_outcome(self._name, error)]
-        return [] if self._handles else reply_outcomes(self._name, self._request, reply, items)
-
-    def _ended(self) -> list[Outcome]:
-        """Return the outcomes of goals that have ended since the last call, in the order of the goals."""
-        found = []
-        while self._ended_count < len(self._handles):
-            handle = self._handles[self._ended_count]
-            if not (handle.state.terminal or handle._lose()):
-                break
-            self._ended_count += 1
+        self.connection.keep_alive()
+        if check_time:
+            now = time.monotonic()
+            self.connection.expire(now)
+            silent_at, why = self.connection.silent_by(self._since)
+            if now > silent_at:
+                self.connection.end(why)
+        while self._handles and (self._handles[0].state.terminal or self._handles[0]._lose()):
+            handle = self._handles.popleft()
             # A wait without ids succeeds however the goals end.
             any_end = isinstance(self._request, Wait) and self._request.ids is None and handle.state is not State.LOST
             code = EXIT_OK if any_end else handle.goal.exit_code or EXIT_OK
-            last = self._ended_count == len(self._handles)
-            found.append(Outcome(self._name, handle.state.name, code, handle.goal, last=last))
-        return found
+            self._outcomes.append(Outcome(self._name, handle.state.name, code, handle.goal, last=not self._handles))
+        outcomes, self._outcomes = self._outcomes, []
+        return outcomes
+
+    def _on_reply(self, reply: JsonObject, items: list[JsonObject]) -> None:
+        """Follow the goals that have to be waited for; if there are none, the reply has all outcomes."""
+        request = self._request
+        found: list[Goal] = []
+        if isinstance(request, Say):
+            goal = Goal.from_json(reply.get("goal"))  # a reply without it is malformed
+            found = [goal] if request.wait else []
+        elif isinstance(request, Wait):
+            found = list(goals(items, "goal"))
+        self._since = time.monotonic()
+        self._handles.extend(GoalHandle(self.connection, each) for each in found)
+        for each in self._handles:
+            each._listen(feedback=False)
+        if not found:
+            self._outcomes += reply_outcomes(self._name, request, reply, items)
+
+    def _on_failure(self, error: TalkError) -> None:
+        try:
+            items = error.items if isinstance(error, UnknownGoal) else []
+            self._outcomes += cancel_outcomes(self._name, items, last=False)
+        except Unreadable as malformed:
+            error = malformed
+        self._outcomes.append(failure_outcome(self._name, error))
 
 
 def _check_request(request: Request) -> None:

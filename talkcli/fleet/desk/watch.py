@@ -62,7 +62,7 @@ class RobotEvent:
 class EventsMissed:
     """The state of a robot whose events were missed for a while, and those events that its state reveals."""
 
-    standing: RobotInfo
+    robot: RobotInfo
     events: tuple[StateChanged, ...]
 
 
@@ -99,17 +99,17 @@ def read_presences(broker: Broker, timeout: float) -> dict[str, Presence]:
     return {name: each for name, found in retained.items() if (each := Presence.read(name, found[topics.PRESENCE]))}
 
 
-def read_standings(broker: Broker, timeout: float, name: str | None = None) -> dict[str, RobotInfo]:
+def read_robots(broker: Broker, timeout: float, name: str | None = None) -> dict[str, RobotInfo]:
     """Return the state of each robot that the broker knows, or only of the robot `name`, by name.
 
     The errors are those of `read_presences`.
     """
-    standings = {}
+    robots = {}
     for each, found in _read_retained(broker, timeout, name, topics.PRESENCE, topics.STATUS).items():
         presence = Presence.read(each, found.get(topics.PRESENCE, b""))
         if presence:
-            standings[each] = RobotInfo(presence, RobotStatus.read(found.get(topics.STATUS, b"")))
-    return standings
+            robots[each] = RobotInfo(presence, RobotStatus.read(found.get(topics.STATUS, b"")))
+    return robots
 
 
 def _read_retained(broker: Broker, timeout: float, name: str | None, *kinds: str) -> dict[str, dict[str, bytes]]:
