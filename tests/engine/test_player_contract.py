@@ -167,9 +167,15 @@ def _with_silent_server(_: Path) -> PulsePlayer:
     return PulsePlayer(RATE)
 
 
+class StoppedClock(NullPlayer):
+    """A silent player whose time stands still."""
+
+    _clock = staticmethod(lambda: 100.0)
+
+
 PLAYERS = {
     "the sound server": Case(_pulse, played=_taped, lost=_cut_off, refused=_without_server, stuck=_with_silent_server),
-    "null": Case(lambda _: NullPlayer(RATE), stuck=lambda _: NullPlayer(RATE, clock=lambda: 100.0)),
+    "null": Case(lambda _: NullPlayer(RATE), stuck=lambda _: StoppedClock(RATE)),
     "a program": Case(
         lambda at: _program("tee", str(at / "tape")),
         played=lambda at: (at / "tape").read_bytes() if (at / "tape").exists() else b"",

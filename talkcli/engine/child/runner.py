@@ -192,9 +192,10 @@ class GoalRunner:
         for descriptor, events in interests:
             poll.register(descriptor, events)
         deadlines = [until, self._alive_due()]
-        if self._synthesizer is not None and self._synthesizer.load_descriptor is not None:
-            poll.register(self._synthesizer.load_descriptor, select.POLLIN)
-            deadlines.append(self._synthesizer.load_deadline)
+        loader = self._synthesizer.loader if self._synthesizer else None
+        if loader is not None and loader.descriptor is not None:
+            poll.register(loader.descriptor, select.POLLIN)
+            deadlines.append(loader.deadline)
         first = min((each for each in deadlines if each is not None), default=None)
         timeout = None if first is None else max(0.0, first - time.monotonic()) * 1000
         ready = [descriptor for descriptor, _ in poll.poll(timeout)]
@@ -243,7 +244,8 @@ class GoalRunner:
                 self._end(protocol.OUTCOME_STOPPED)
 
     def _send_voice_events(self) -> None:
-        for event in self._synthesizer.load_events() if self._synthesizer else ():
+        loader = self._synthesizer.loader if self._synthesizer else None
+        for event in loader.events() if loader else ():
             self._channel.send(event)
 
     def report_voice(self, voice: str, fallback_reason: str | None) -> None:
@@ -368,7 +370,8 @@ class GoalRunner:
 
     def _alive_due(self) -> float | None:
         """Return when the next sign of life is due; None if none is to be sent."""
-        loading = self._synthesizer is not None and self._synthesizer.load_descriptor is not None
+        loader = self._synthesizer.loader if self._synthesizer else None
+        loading = loader is not None and loader.descriptor is not None
         if not loading and (self._goal is None or self._is_overdue(self._goal)):
             return None
         return self._channel.sent_at + protocol.ALIVE_INTERVAL_S

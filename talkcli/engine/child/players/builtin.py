@@ -16,7 +16,7 @@ from talkcli.goals.reasons import Reason
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
 
     from talkcli.engine.child.players.base import Interest
 
@@ -71,17 +71,11 @@ class NullPlayer(BuiltInPlayer):
     name = "null"
     real_time = True
 
-    def __init__(
-        self,
-        rate: int,
-        _device: str | None = None,
-        _audible: bool = False,
-        *,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
+    _clock = staticmethod(time.monotonic)
+
+    def __init__(self, rate: int, _device: str | None = None, _audible: bool = False) -> None:
         super().__init__()
         self._bytes_per_second = rate * SAMPLE_BYTES
-        self._clock = clock
         self._started: float | None = None
 
     def offer(self, data: memoryview) -> int:

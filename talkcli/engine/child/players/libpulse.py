@@ -20,6 +20,7 @@ from ctypes import c_uint8 as u8
 from ctypes import c_uint32 as u32
 from ctypes import c_uint64 as u64
 from functools import cache
+from types import SimpleNamespace
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -129,7 +130,7 @@ SinkCallback = CFUNCTYPE(None, c_void_p, POINTER(SinkInfo), c_int, c_void_p)
 SinkInputCallback = CFUNCTYPE(None, c_void_p, POINTER(SinkInputInfo), c_int, c_void_p)
 
 #: The functions that are used, with their result and argument types.
-_FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
+_SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     "pa_mainloop_new": (c_void_p, []),
     "pa_mainloop_free": (None, [c_void_p]),
     "pa_mainloop_get_api": (c_void_p, [c_void_p]),
@@ -168,46 +169,30 @@ _FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
 }
 
 
-class Library:
-    """The functions of libpulse, as attributes without the prefix "pa_"."""
-
-    def __init__(self) -> None:
-        """Load the library.
-
-        Raises:
-            OSError: It isn't installed.
-            AttributeError: It lacks a function.
-        """
-        library = ctypes.CDLL(_LIBPULSE)
-        for name, (result, arguments) in _FUNCTIONS.items():
-            function = getattr(library, name)
-            function.restype, function.argtypes = result, arguments
-            setattr(self, name.removeprefix("pa_"), function)
-        self.poll = ctypes.CDLL(None).poll
-        self.poll.argtypes = [POINTER(PollDescriptor), ctypes.c_ulong, c_int]
-
-    if TYPE_CHECKING:
-
-        def __getattr__(self, name: str) -> Any: ...
-
-
 @cache
-def load() -> Library:
-    """Return libpulse, which is loaded once per process.
+def load() -> Any:
+    """Return the functions of libpulse as attributes without the prefix "pa_", and the C library's `poll`.
 
     Raises:
-        OSError: It isn't installed, or lacks a function.
+        OSError: libpulse isn't installed, or lacks a function.
     """
-    try:
-        return Library()
-    except AttributeError as error:
-        raise OSError(str(error)) from error
+    library, poll = ctypes.CDLL(_LIBPULSE), ctypes.CDLL(None).poll
+    poll.argtypes = [POINTER(PollDescriptor), ctypes.c_ulong, c_int]
+    functions = {"poll": poll}
+    for name, (result, arguments) in _SIGNATURES.items():
+        try:
+            function = getattr(library, name)
+        except AttributeError as error:
+            raise OSError(str(error)) from error
+        function.restype, function.argtypes = result, arguments
+        functions[name.removeprefix("pa_")] = function
+    return SimpleNamespace(**functions)
 
 
 class MainLoop:
     """A main loop of libpulse that never waits by itself."""
 
-    def __init__(self, library: Library) -> None:
+    def __init__(self, library: Any) -> None:
         self._library = library
         self._pointer = library.mainloop_new()
         self._callback = PollCallback(self._poll)

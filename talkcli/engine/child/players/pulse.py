@@ -262,8 +262,9 @@ class PulsePlayer(Player):
             begins, self._sink_index = self._sink_index == libpulse.NO_INDEX, index
             self._volume_settled_at = time.monotonic() + VOLUME_SETTLES_S if begins else self._volume_settled_at
             self.device = (self._lib.stream_get_device_name(self._stream) or b"").decode("utf-8", "replace")
-            if self.device == DUMMY_SINK != self._wanted_device:
-                self._error = _dummy_error(begins)
+            if self.device == DUMMY_SINK != self._wanted_device:  # no other player would be heard either
+                reason, left = (Reason.AUDIO_DEVICE, "") if begins else (Reason.AUDIO_LOST, " left")
+                self._error = CannotSpeak(reason, f"the sound server has only a dummy output{left}", final=True)
             self._request_sink_level()
             if begins:
                 self._lib.context_set_subscribe_callback(self._context, self._change_callback, None)
@@ -410,10 +411,3 @@ class PulsePlayer(Player):
             self._check_mute()
         elif end < 0:
             self._level_refused = True
-
-
-def _dummy_error(begins: bool) -> CannotSpeak:
-    """Return the error for a stream on the dummy sink, on which no other player would be heard either."""
-    if begins:
-        return CannotSpeak(Reason.AUDIO_DEVICE, "the sound server has only a dummy output", final=True)
-    return CannotSpeak(Reason.AUDIO_LOST, "the sound server has only a dummy output left", final=True)

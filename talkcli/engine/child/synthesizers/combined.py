@@ -18,8 +18,9 @@ from talkcli.goals.reasons import Reason
 
 if TYPE_CHECKING:
     from talkcli.engine.child.synthesizers.base import SampleSink, Synthesizer
+    from talkcli.engine.child.synthesizers.loader import ModelLoader
     from talkcli.engine.child.synthesizers.piper import Piper
-    from talkcli.engine.protocol import DropVoice, LoadVoice, Voice, VoiceLoaded, VoiceMemory, VoiceUnloaded
+    from talkcli.engine.protocol import DropVoice, LoadVoice, Voice
 
 
 class CombinedSynthesizer:
@@ -66,17 +67,10 @@ class CombinedSynthesizer:
         self._espeak.load_language(neural.language)
         self._espeak.speak(text, settings, _WatchedSink(sink, why))
 
-    # -- neural voices that are loaded while another voice speaks
-
     @property
-    def load_descriptor(self) -> int | None:
-        """A descriptor that is readable once a voice has been loaded; None if none is being loaded."""
-        return self._neural.loader.descriptor if self._neural else None
-
-    @property
-    def load_deadline(self) -> float:
-        """The monotonic time at which the load in progress is given up."""
-        return self._piper().loader.deadline
+    def loader(self) -> ModelLoader | None:
+        """The loader of neural voices; None until a neural voice has been asked for."""
+        return self._neural.loader if self._neural else None
 
     def carry_out(self, command: LoadVoice | DropVoice) -> None:
         """Start to load a neural voice in the background, or drop one."""
@@ -85,10 +79,6 @@ class CombinedSynthesizer:
             loader.drop(command.voice)
         else:
             loader.start(command.voice)
-
-    def load_events(self) -> list[VoiceLoaded | VoiceUnloaded | VoiceMemory]:
-        """Return what has happened to neural voices since the last call."""
-        return self._neural.loader.events() if self._neural else []
 
     def _piper(self) -> Piper:
         if self._neural is None:

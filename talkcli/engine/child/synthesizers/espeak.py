@@ -237,13 +237,12 @@ class Espeak:
         """
         self._take_back()
         voice = self._find(language)
-        if voice is None:
-            raise self._no_voice_error(language)
-        self._borrower = phonemizer = EspeakPhonemizer(self._espeak, voice.id)
+        voice_id = voice.id if voice is not None else ""
+        self._borrower = phonemizer = EspeakPhonemizer(self._espeak, voice_id)
+        if not voice_id or self._espeak.SetVoiceByName(voice_id.encode()) != self._espeak.EE_OK:
+            raise UnknownVoice(f'{self.version} has no voice "{language}", which knows its sounds')
+        self._espeak.SetParameter(self._espeak.RATE, _ESPEAK_DEFAULT_WPM, 0)
         try:
-            if self._espeak.SetVoiceByName(voice.id.encode()) != self._espeak.EE_OK:
-                raise self._no_voice_error(language)
-            self._espeak.SetParameter(self._espeak.RATE, _ESPEAK_DEFAULT_WPM, 0)
             yield phonemizer
         finally:
             phonemizer.end()
@@ -251,9 +250,6 @@ class Espeak:
     def _find(self, word: str) -> Voice | None:
         self._listed = self._listed or _list_voices(self._espeak, None)
         return find_voice(word, self._listed)
-
-    def _no_voice_error(self, language: str) -> UnknownVoice:
-        return UnknownVoice(f'{self.version} has no voice "{language}", which knows its sounds')
 
     def _take_back(self) -> None:
         """Restore the library's state from before it was lent."""

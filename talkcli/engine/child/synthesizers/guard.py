@@ -63,7 +63,7 @@ _IDEOGRAPHS, _HANGUL, _HANGUL_END = "\u2e80", "\uac00", "\ud7a3"
 #: memory that it has just freed (`LookupLetter` in its `numbers.c`). They were found in 1.51 by speaking every
 #: character in each of the 131 voices with that memory overwritten. Those voices speak none of them except the four
 #: Greek symbols.
-_UNSAFE_CHARACTERS = {
+_CRASHING_CHARACTERS = {
     ("el", "grc"): "\u0384\u0385\u0387\u03f6",
     ("hy",): "\u055a\u058d-\u058f",
     ("hi", "kok", "mr", "ne", "sd", "ur"): "\u0970",
@@ -78,7 +78,7 @@ _UNSAFE_CHARACTERS = {
     ("ko",): "\u1180-\u11a7\u11c3-\u11ff",
 }
 #: A number, with or without separators of thousands.
-_DIGITS = re.compile(r"[0-9]+(?:,[0-9]{3})*")
+_SPOKEN_NUMBER = re.compile(r"[0-9]+(?:,[0-9]{3})*")
 #: The lengths of numbers, in digits, that crash the Cantonese and Shan voices, because their words have more than 200
 #: bytes of phonemes (N_WORD_PHONEMES). Longer numbers are spoken digit by digit. This was measured by speaking 382
 #: numbers of 6 to 39 digits in each of the 131 voices.
@@ -99,7 +99,7 @@ def guarded(text: str, voice: str = "") -> str:
     if not text.isascii():
         text = _unsafe_characters(language).sub(" ", text)
     if language in _UNSAFE_DIGIT_COUNTS:
-        text = _DIGITS.sub(lambda found: _split_number(found[0], *_UNSAFE_DIGIT_COUNTS[language]), text)
+        text = _SPOKEN_NUMBER.sub(lambda found: _split_number(found[0], *_UNSAFE_DIGIT_COUNTS[language]), text)
     if _may_have_long_initials(text):
         text = _without_long_initials(text)
     if "-" in text:
@@ -110,7 +110,7 @@ def guarded(text: str, voice: str = "") -> str:
 @functools.lru_cache(maxsize=8)
 def _unsafe_characters(language: str) -> re.Pattern[str]:
     """Return a pattern for the characters that voices of this language must not get."""
-    found = (signs for languages, signs in _UNSAFE_CHARACTERS.items() if language not in languages)
+    found = (signs for languages, signs in _CRASHING_CHARACTERS.items() if language not in languages)
     return re.compile(f"[{''.join(found)}]")
 
 

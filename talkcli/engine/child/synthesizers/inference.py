@@ -184,6 +184,8 @@ class Model:
         Raises:
             VoiceFileError: The model can't be loaded.
         """
+        import onnxruntime
+
         self.path = path
         self.description = description
         with open_checked(path) as file:
@@ -191,11 +193,12 @@ class Model:
             if size > _MAX_MODEL_BYTES:
                 raise VoiceFileError(f"{path} is larger than any of Piper's models: get the voice anew")
             content: bytes = file.read(size)
-        key = f"{hashlib.sha256(content).hexdigest()}-{_SPLIT_VERSION}-{_onnxruntime_version()}"
+        key = f"{hashlib.sha256(content).hexdigest()}-{_SPLIT_VERSION}-{onnxruntime.__version__}"
         cached = cache.find(key) if cache is not None else None
         if cache is not None and cached is not None:
             try:
-                self._set_halves(*_load_cached(*cached))
+                unchanged = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL  # the encoder is optimized already
+                self._set_halves(_session(cached[0], unchanged), _session(cached[1]))
                 return
             except Exception as error:
                 if _is_out_of_memory(error):
@@ -331,19 +334,6 @@ def load_libraries(path: str) -> None:
         if _is_out_of_memory(error):
             raise _no_memory_error(path) from error
         raise ImportError(_first_line(error)) from error
-
-
-def _onnxruntime_version() -> str:
-    import onnxruntime
-
-    return str(onnxruntime.__version__)
-
-
-def _load_cached(encoder: str, decoder: str) -> tuple[Any, Any]:
-    """Return the sessions of two cached files; the encoder is already optimized."""
-    import onnxruntime
-
-    return _session(encoder, onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL), _session(decoder)
 
 
 def _split(path: str, content: bytes, cache: ModelCache | None, key: str) -> tuple[Any, Any]:

@@ -11,8 +11,6 @@ that refers to anything outside of its file, is refused, and only the fields tha
 
 from __future__ import annotations
 
-import itertools
-
 from talkcli.frozen import TYPE_CHECKING, frozen
 
 if TYPE_CHECKING:
@@ -24,7 +22,7 @@ if TYPE_CHECKING:
 
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 #: Field numbers of a model, an operator set, a graph, a node, an attribute and a tensor.
-_IR_VERSION, _GRAPH, _OPERATOR_SETS, _FUNCTIONS = 1, 7, 8, 25
+_IR_VERSION, _GRAPH, _OPERATOR_SETS, _MODEL_FUNCTIONS = 1, 7, 8, 25
 _DOMAIN = 1
 _NODE, _GRAPH_NAME, _INITIALIZER, _INPUT, _OUTPUT, _SPARSE_INITIALIZER = 1, 2, 5, 11, 12, 15
 _NODE_INPUT, _NODE_OUTPUT, _OPERATOR, _ATTRIBUTE, _NODE_DOMAIN = 1, 2, 4, 5, 7
@@ -78,7 +76,7 @@ def split_model(model: Buffer) -> ModelHalves:
     graphs = _messages(fields, _GRAPH)
     if len(graphs) != 1:
         raise NotSplit("is no ONNX model")
-    if any(number == _FUNCTIONS for number, _, _ in fields):
+    if any(number == _MODEL_FUNCTIONS for number, _, _ in fields):
         raise NotSplit("has operators of its own")
     graph = _Graph(reader, graphs[0])
     decoder = graph.nodes_after(_DECODER_WEIGHTS)
@@ -110,10 +108,27 @@ class _Reader:
         self._fields_left = _MAX_FIELDS
 
     def fields(self, raw: Buffer) -> list[Field]:
-        found = list(itertools.islice(_parse_fields(raw), self._fields_left + 1))
-        self._fields_left -= len(found)
-        if self._fields_left < 0:
-            raise NotSplit("is none of Piper's models: it has too many parts")
+        """Return the fields of a message."""
+        found = []
+        at, end = 0, len(raw)
+        while at < end:
+            key, at = _parse_integer(raw, at)
+            number, kind = key >> 3, key & 7
+            if kind == _BYTES:
+                size, at = _parse_integer(raw, at)
+            elif kind == _VARINT:
+                size = _parse_integer(raw, at)[1] - at
+            elif kind in {_FIXED32, _FIXED64}:
+                size = 4 if kind == _FIXED32 else 8
+            else:
+                raise NotSplit("is no ONNX model")
+            if size > end - at:
+                raise NotSplit("is cut short, or no ONNX model")
+            self._fields_left -= 1
+            if self._fields_left < 0:
+                raise NotSplit("is none of Piper's models: it has too many parts")
+            found.append((number, kind, raw[at : at + size]))
+            at += size
         return found
 
 
@@ -223,26 +238,6 @@ def _names(fields: Iterable[Field], wanted: int) -> list[str]:
         return [bytes(value).decode() for value in found]
     except UnicodeDecodeError as error:
         raise NotSplit("is no ONNX model: it has names that are no text") from error
-
-
-def _parse_fields(raw: Buffer) -> Iterator[Field]:
-    """Yield the fields of a message."""
-    at, end = 0, len(raw)
-    while at < end:
-        key, at = _parse_integer(raw, at)
-        number, kind = key >> 3, key & 7
-        if kind == _BYTES:
-            size, at = _parse_integer(raw, at)
-        elif kind == _VARINT:
-            size = _parse_integer(raw, at)[1] - at
-        elif kind in {_FIXED32, _FIXED64}:
-            size = 4 if kind == _FIXED32 else 8
-        else:
-            raise NotSplit("is no ONNX model")
-        if size > end - at:
-            raise NotSplit("is cut short, or no ONNX model")
-        yield number, kind, raw[at : at + size]
-        at += size
 
 
 def _parse_integer(raw: Buffer, at: int) -> tuple[int, int]:
