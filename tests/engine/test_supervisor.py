@@ -522,7 +522,10 @@ def test_a_start_costs_a_goal_only_if_it_began_long_after_there_was_a_process() 
 def _complaining(script: str) -> tuple[list[str], str]:
     """Return the lines that a process passes on which writes to standard error, and its last words."""
     lines: list[str] = []
-    process = EngineProcess(CONFIGURE, lines.append, command=[sys.executable, "-c", f"import os\n{script}"])
+    command = [sys.executable, "-c", f"import os\n{script}"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("talkcli.engine.parent.process.engine_command", lambda: command)
+        process = EngineProcess(CONFIGURE, lines.append)
     while process.stderr in wait_ready({process.stderr: select.POLLIN}, 20.0) and process.read_stderr():
         pass
     words = process.describe_exit()

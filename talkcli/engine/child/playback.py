@@ -42,8 +42,8 @@ EARLY_END_LIMIT_S = 0.25
 
 #: Time for which a busy device is tried again, so that the sound of another program, or `talk doctor --silent`, doesn't
 #: cost a sentence.
-BUSY_LIMIT_S = 1.0
-BUSY_RETRY_INTERVAL_S = 0.05
+DEVICE_BUSY_LIMIT_S = 1.0
+DEVICE_RETRY_INTERVAL_S = 0.05
 
 #: Most zeros that can be left out before a sentence. libespeak-ng makes 0 to 11 ms. More silence is intended, as from a
 #: voice with volume 0.
@@ -245,13 +245,13 @@ class Playback:
             raise error if lost else first
         self.silence()
         if not others:
-            self._wait((), time.monotonic() + BUSY_RETRY_INTERVAL_S)
+            self._wait((), time.monotonic() + DEVICE_RETRY_INTERVAL_S)
 
     def _is_busy(self, error: CannotSpeak) -> bool:
         """Return whether another program holds the device, and has not held it for long."""
         if error.reason != Reason.AUDIO_DEVICE or "busy" not in str(error).lower():
             return False
-        self._busy_until = self._busy_until or time.monotonic() + BUSY_LIMIT_S
+        self._busy_until = self._busy_until or time.monotonic() + DEVICE_BUSY_LIMIT_S
         return time.monotonic() < self._busy_until
 
     def _release_player(self, begin: int) -> None:

@@ -57,7 +57,6 @@ class EngineProcess:
         configure: protocol.Configure,
         on_stderr_line: Callable[[str], None] = lambda _: None,
         env: Mapping[str, str] | None = None,
-        command: list[str] | None = None,
     ) -> None:
         """Start the process.
 
@@ -65,7 +64,6 @@ class EngineProcess:
             configure: its settings.
             on_stderr_line: called with each line that it writes to standard error.
             env: its environment, or None for a copy of this process's.
-            command: its command line, or None for `engine_command()`.
 
         Raises:
             OSError: it can't be started.
@@ -95,7 +93,7 @@ class EngineProcess:
             self.socket.setblocking(False)
             self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
             self._process: subprocess.Popen[bytes] = subprocess.Popen(
-                command or engine_command(),
+                engine_command(),
                 stdin=theirs.fileno(),
                 stdout=subprocess.DEVNULL,
                 stderr=stderr,

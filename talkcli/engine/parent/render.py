@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
 #: Reasons with the exit code of a rejected goal. All others have that of an aborted one.
-_REJECTED = frozenset({Reason.INVALID_TEXT, Reason.UNKNOWN_VOICE, Reason.BAD_OPTION})
+_REJECTED_REASONS = frozenset({Reason.INVALID_TEXT, Reason.UNKNOWN_VOICE, Reason.BAD_OPTION})
 #: Reasons that come from the player. The only player here is the file.
 _FILE_REASONS = frozenset({Reason.AUDIO_DEVICE, Reason.AUDIO_LOST})
 #: Paths that mean standard output. It is used as the shell has opened it.
@@ -49,7 +49,7 @@ class RenderFailed(TalkError):
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
         self.code = code
-        self.exit_code = EXIT_CODES[State.REJECTED if code in _REJECTED else State.ABORTED]
+        self.exit_code = EXIT_CODES[State.REJECTED if code in _REJECTED_REASONS else State.ABORTED]
 
 
 class CannotWrite(RenderFailed):
