@@ -102,11 +102,11 @@ def goal_lines(goal: Goal, screen: Screen, now: float) -> list[str]:
         ("reason", goal.reason and printable(goal.reason)),
         ("message", goal.message and printable(goal.message)),
         ("ended", _describe_cause(goal.by) if goal.by else None),
-        ("text", None if goal.text is None else f'"{printable(goal.text)}"'),
-        ("spoken", None if goal.spoken is None else f'"{printable(goal.spoken)}"'),
+        ("text", _quote(goal.text)),
+        ("spoken", _quote(goal.spoken)),
         ("from", _describe_sender(goal.client)),
         ("priority", str(goal.priority)),
-        ("key", goal.key and f'"{printable(goal.key)}"'),
+        ("key", _quote(goal.key or None)),
         ("ttl", goal.ttl and ", ".join(filter(None, (f"{figure(goal.ttl)} s", _left(goal, now))))),
         ("data", None if goal.data is None else printable(encode(goal.data).decode().rstrip("\n"))),
         ("queued", _moment(goal.queued_at)),
@@ -188,11 +188,8 @@ def format_duration(seconds: float) -> str:
 
 def _table(label: str, goals: Sequence[Goal], id_columns: int, screen: Screen, now: float) -> list[str]:
     """Return one line for each goal of a status, no wider than the terminal."""
-    heads = [
-        f"{'' if number else label:<{_LABEL_COLUMNS}}{_head(goal, id_columns, screen)}"
-        for number, goal in enumerate(goals)
-    ]
-    tails = [_tails(goal, now) for goal in goals]
+    heads = [_label("" if number else label) + _head(goal, id_columns, screen) for number, goal in enumerate(goals)]
+    tails = [_tail_forms(goal, now) for goal in goals]
     texts = [quoted_text(goal, _LISTED_TEXT_CHARS) for goal in goals]
     columns = screen.columns_left(max(map(width, heads)))
     if columns is None:
@@ -208,7 +205,7 @@ def _head(goal: Goal, id_columns: int, screen: Screen) -> str:
     return f"{clock_time(goal.ended_at)}{COLUMN_GAP}{head}" if goal.state.terminal else head
 
 
-def _tails(goal: Goal, now: float) -> list[str]:
+def _tail_forms(goal: Goal, now: float) -> list[str]:
     """Return several wordings for the column after a goal's text, the longest first."""
     if goal.state.terminal:
         return _muted(goal) if goal.state is State.SUCCEEDED else reason_forms(goal)
@@ -218,7 +215,11 @@ def _tails(goal: Goal, now: float) -> list[str]:
 
 def quoted_text(goal: Goal, limit: int | None = None) -> str:
     """Return the text of a goal in quotes, cut after `limit` characters."""
-    return TEXT_NOT_KEPT if goal.text is None else f'"{printable(goal.text, limit)}"'
+    return _quote(goal.text, limit) or TEXT_NOT_KEPT
+
+
+def _quote(text: str | None, limit: int | None = None) -> str | None:
+    return None if text is None else f'"{printable(text, limit)}"'
 
 
 def _notes(goal: Goal, now: float) -> list[str]:
@@ -245,11 +246,13 @@ def _describe_sender(sender: Sender | None) -> str:
     """Return everything that is known about a sender: its command, its process, its user and its name."""
     if sender is None:
         return _UNKNOWN_SENDER
-    numbers = {"pid": sender.pid, "uid": sender.uid}
-    parts = [_program(sender), *(f"{name} {number}" for name, number in numbers.items() if number is not None)]
-    if sender.name:
-        parts.append(f'calls itself "{printable(sender.name)}"')
-    return ", ".join(parts)
+    parts = [
+        _program(sender),
+        None if sender.pid is None else f"pid {sender.pid}",
+        None if sender.uid is None else f"uid {sender.uid}",
+        f"calls itself {_quote(sender.name)}" if sender.name else None,
+    ]
+    return ", ".join(filter(None, parts))
 
 
 def sender_forms(sender: Sender | None) -> list[str]:
