@@ -15,7 +15,6 @@ from click.core import ParameterSource
 
 from talkcli import __version__
 from talkcli.cli.command import (
-    ALL_EXIT_CODES,
     COMMON_OPTIONS,
     OUTPUT_FILE,
     nearest,
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
 
     from click.shell_completion import CompletionItem
 
-    from talkcli.cli.command import Command, ExitCodes
+    from talkcli.cli.command import Command
     from talkcli.goals.option import Option
 
 #: Names that other programs have for a command, if they aren't similar to its name here.
@@ -50,11 +49,25 @@ _FOREIGN_NAMES = {
 }
 
 
-def _read_help(name: str) -> tuple[str, str]:
-    """Return the description and the examples of a command from its file in `help`."""
+def _read_help_file(name: str) -> str:
     with open(os.path.join(os.path.dirname(__file__), "help", f"{name}.txt"), encoding="utf-8") as file:
-        description, _, examples = file.read().partition("\n\nExamples:\n")
-    return description, examples
+        return file.read()
+
+
+def _read_help(name: str) -> tuple[str, str, dict[str, str]]:
+    """Return the description, the examples and the exit codes of a command from its file in `help`."""
+    description, _, rest = _read_help_file(name).partition("\n\nExamples:\n")
+    examples, _, exit_codes = rest.partition("\n\nExit codes:\n")
+    return description, examples, _read_exit_codes(exit_codes)
+
+
+def _read_exit_codes(lines: str) -> dict[str, str]:
+    """Return what each exit code means. A line such as `@exit-codes-server` includes the codes of that file."""
+    found: dict[str, str] = {}
+    for line in lines.splitlines():
+        code, _, words = line.partition(" ")
+        found |= _read_exit_codes(_read_help_file(code[1:])) if code.startswith("@") else {code: words.strip()}
+    return found
 
 
 class _OptionType(click.FloatRange):
@@ -136,7 +149,8 @@ class _HelpfulCommand(click.Command):
     """A command whose help has examples, its own options, the common options, and exit codes."""
 
     examples: str
-    exit_codes: ExitCodes
+    #: what each exit code means
+    exit_codes: dict[str, str]
     #: the heading of the common options
     common_heading = "Options of every command"
 
@@ -164,9 +178,8 @@ class _HelpfulCommand(click.Command):
                     formatter.write_dl(records)
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
-        rows = sorted(self.exit_codes.items(), key=lambda row: row[0] if isinstance(row[0], int) else 128)
         with formatter.section("Exit codes"):
-            formatter.write_dl([(str(code), words) for code, words in rows])
+            formatter.write_dl(sorted(self.exit_codes.items(), key=lambda row: int(row[0].removesuffix("+n"))))
 
 
 class ClickCommand(_HelpfulCommand):
@@ -174,8 +187,7 @@ class ClickCommand(_HelpfulCommand):
 
     def __init__(self, row: Command) -> None:
         self.row = row
-        self.exit_codes = row.exit_codes
-        description, self.examples = _read_help(row.name)
+        description, self.examples, self.exit_codes = _read_help(row.name)
         arguments: list[click.Parameter] = [_argument(row.argument)] if row.argument else []
         own, common = map(_option, row.options), [_option(each, common=True) for each in COMMON_OPTIONS]
         super().__init__(
@@ -216,8 +228,7 @@ class ClickCommand(_HelpfulCommand):
 class _CommandGroup(_HelpfulCommand, click.Group):
     """The group of all commands. Each is made from its row when it is needed."""
 
-    description, examples = _read_help("talk")
-    exit_codes = ALL_EXIT_CODES
+    description, examples, exit_codes = _read_help("talk")
     common_heading = "Options, before or after the command"
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002

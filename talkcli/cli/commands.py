@@ -1,4 +1,4 @@
-"""The commands. Each has a row with a summary, its options, its exit codes, and the function that runs it.
+"""The commands. Each has a row with a summary, its options, and the function that runs it.
 
 This module is imported before anything is sent, so it must import nothing heavy, and it must not run anything. The
 options of goals and servers are in `goals.options`. The functions here say which options can't be combined.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 
-from talkcli.cli.command import FILE_MODE, FLEET_EXIT_CODES, OUTPUT_FILE, SERVER_EXIT_CODES, Command, option, spelling
+from talkcli.cli.command import FILE_MODE, OUTPUT_FILE, Command, option, spelling
 from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.option import FLAG, ID, IDS, INTEGER, MAX_LOG, NUMBER, TEXT, WORD, Option
 from talkcli.goals.options import MAX_CHARACTERS, MAX_LEAD_IN, OPTIONS, SETTINGS, SOUND, Cancel
@@ -178,12 +178,6 @@ _ROWS = (
         function="serve:serve",
         plain=False,
         uses_server=False,
-        exit_codes={
-            0: "ended by SIGTERM or SIGINT; by a second one 128+n",
-            1: "anything not named here; a bug says so",
-            2: "usage: an option or a voice that there isn't",
-            11: "this socket is served already, or its directory is not safe",
-        },
         options=_SERVE_OPTIONS,
         rule=_serve_rule,
     ),
@@ -192,17 +186,6 @@ _ROWS = (
         summary="Speak a sentence.",
         function="say:say",
         fleet_function="several:say",
-        exit_codes={
-            **FLEET_EXIT_CODES,
-            0: "accepted; with --wait succeeded: all of it was played; throttled, as was asked for",
-            4: "aborted: engine or audio failed; 'talk doctor' says more",
-            5: "rejected: never queued (bad text, full queue or full server)",
-            6: "recalled: taken out of the queue before it was spoken; with --lines: not sent within its --ttl",
-            7: "preempted: stopped while it was spoken",
-            12: "lost: it was sent, then the server went away; it may still be spoken",
-            124: "timed out, and cancelled",
-            "128+n": "ended by signal n, and cancelled; 141: whoever read its output went away while it waited",
-        },
         options=_SAY_OPTIONS,
         argument=Option("text", TEXT, metavar="TEXT..."),
         unknown_option_hint="To speak a text that starts with '-', write: talk say -- TEXT",
@@ -213,18 +196,6 @@ _ROWS = (
         summary="Wait until goals have ended.",
         function="wait:wait",
         fleet_function="several:wait",
-        exit_codes={
-            **FLEET_EXIT_CODES,
-            0: "all succeeded; or no ID was given, and all have ended",
-            4: "aborted; 4 to 7 are those of the first goal in order that did not succeed",
-            5: "rejected; or the server has as many clients as it takes",
-            6: "recalled",
-            7: "preempted",
-            8: "unknown goal",
-            12: "lost: the server went away",
-            124: "timed out; the goals go on",
-            "128+n": "ended by signal n, 141: whoever read its output went away meanwhile; the goals go on",
-        },
         options=(
             _timeout("Wait no longer than SEC seconds; the goals go on; exit code 124."),
             option("-f, --feedback", FLAG, "Show each word as it is heard."),
@@ -236,11 +207,6 @@ _ROWS = (
         summary="Stop speaking: everything, or what is named.",
         function="ask:cancel",
         fleet_function="several:cancel",
-        exit_codes={
-            **FLEET_EXIT_CODES,
-            0: "it is silent, or was already",
-            8: "an ID is unknown; the others are cancelled all the same",
-        },
         options=tuple(each for each in Cancel.options if each.flags),
         argument=_GOAL_IDS,
         urgent=True,
@@ -250,7 +216,6 @@ _ROWS = (
         summary="What is being said, what will be, what was.",
         function="ask:status",
         fleet_function="several:status",
-        exit_codes={**FLEET_EXIT_CODES, 0: "the server runs", 8: "unknown goal"},
         argument=Option("goal_id", ID, metavar="[ID]", offers="known_ids"),
         urgent=True,
     ),
@@ -259,18 +224,12 @@ _ROWS = (
         summary="Follow all goals as they happen.",
         function="ask:watch",
         plain=False,
-        exit_codes={
-            **SERVER_EXIT_CODES,
-            12: "lost: the server went away",
-            "128+n": "ended by signal n: 130 by Ctrl-C, 141 where its reader is gone",
-        },
         options=(option("-f, --words", FLAG, "A line for each word as it is heard, too."),),
     ),
     Command(
         name="log",
         summary="What was said: when, by whom, how it ended.",
         function="ask:log",
-        exit_codes={**SERVER_EXIT_CODES, 0: "listed"},
         options=(option("-n, --count", INTEGER, "The last N goals that ended.", default=20, limits=(1, MAX_LOG)),),
     ),
     Command(
@@ -278,40 +237,24 @@ _ROWS = (
         summary="Hold speech where it is.",
         function="ask:pause",
         fleet_function="several:pause",
-        exit_codes={
-            **FLEET_EXIT_CODES,
-            0: "speech is held, and it is silent",
-            1: "speech is held, but that it is silent was not known within 2 seconds",
-        },
     ),
     Command(
         name="resume",
         summary="Go on where speech was held.",
         function="ask:resume",
         fleet_function="several:resume",
-        exit_codes={**FLEET_EXIT_CODES, 0: "speech goes on"},
     ),
     Command(
         name="set",
         summary="Change the running server's settings, or print them.",
         function="ask:change",
         fleet_function="several:change",
-        exit_codes={
-            **FLEET_EXIT_CODES,
-            0: "changed, or printed",
-            2: "usage: a value out of its range, or an unknown voice; nothing was changed",
-        },
         options=tuple(each.to_set() for each in SETTINGS),
     ),
     Command(
         name="voices",
         summary="List the voices.",
         function="ask:voices",
-        exit_codes={
-            **SERVER_EXIT_CODES,
-            0: "listed",
-            1: "no voice speaks that language, or the engine can't list them",
-        },
         options=(
             option("--language", TEXT, "Only this language, with its variants: en, pt-BR, german.", metavar="LANGUAGE"),
         ),
@@ -322,13 +265,6 @@ _ROWS = (
         function="ask:doctor",
         plain=False,
         connects=False,
-        exit_codes={
-            0: "a sentence would be heard; with --robot: the robot answers",
-            1: "anything not named here; a bug says so",
-            2: "usage",
-            4: "it would not, as without a server",
-            "128+n": "ended by signal n",
-        },
         options=(option("--silent", FLAG, "Play half a second of zeros, which is no goal and no sound."),),
     ),
     Command(
@@ -337,12 +273,6 @@ _ROWS = (
         function="fleet:bridge",
         plain=False,
         uses_server=False,
-        exit_codes={
-            0: "ended by SIGTERM or SIGINT",
-            1: "anything not named here; a bug says so",
-            2: "usage: a setting that is wrong or missing, or paho-mqtt is",
-            11: "another bridge of this name is there already",
-        },
         options=_BRIDGE_OPTIONS,
         rule=_bridge_rule,
     ),
@@ -352,16 +282,6 @@ _ROWS = (
         function="fleet:fleet",
         fleet_function="fleet:fleet",
         connects=False,
-        exit_codes={
-            0: "shown",
-            1: "anything not named here; a bug says so",
-            2: "usage: a setting that is wrong or missing, or paho-mqtt is",
-            3: "no broker, or it knows no robot, or none of those that are meant",
-            9: "the broker does not speak MQTT 5",
-            10: "the broker doesn't let this user in, or ask; or it is not to be trusted",
-            12: "lost: 'watch' has found no broker for 30 seconds",
-            "128+n": "ended by signal n: 130 by Ctrl-C, 141 where its reader is gone",
-        },
         argument=Option("what", WORD, metavar="WHAT", choices=("status", "watch")),
     ),
     Command(
@@ -370,11 +290,6 @@ _ROWS = (
         function="completion:completion",
         plain=False,
         uses_server=False,
-        exit_codes={
-            0: "printed",
-            1: "anything not named here; a bug says so",
-            2: "usage: a shell that there is no script for",
-        },
         argument=Option("shell", WORD, metavar="SHELL", choices=SHELLS),
     ),
 )
