@@ -14,6 +14,7 @@ import pytest
 from talkcli import errors
 from talkcli.cli import commands, show
 from talkcli.cli.click_app import ClickCommand, talk
+from talkcli.cli.command import ALL_EXIT_CODES
 from talkcli.engine import players
 from talkcli.goals import states
 from tests.conformance.bareserve import TALK, alone, environment, run
@@ -92,12 +93,12 @@ def test_help_of_each_command_has_a_purpose_examples_options_and_exit_codes(name
     assert len(purpose) > 30
     for option in ("--socket PATH", "--json", "--quiet", "--help"):
         assert option in out.partition("Options of every command:")[2]
-    codes = command(name).exit_codes
-    assert "2" in codes
-    assert codes.keys() <= {*re.findall(r"(?m)^  (\S+) +\S", as_it_was("talk").partition("\nExit codes:\n")[2])}
+    codes = command(name).row.exit_codes
+    assert 2 in codes
+    assert codes.keys() <= ALL_EXIT_CODES.keys()
     assert re.findall(r"(?m)^  (\d\S*) +\S", out.partition("\nExit codes:\n")[2]) == [
-        *sorted(filter(str.isdecimal, codes), key=int),
-        *(each for each in codes if not each.isdecimal()),
+        *map(str, sorted(each for each in codes if isinstance(each, int))),
+        *(each for each in codes if isinstance(each, str)),
     ]
 
 
@@ -116,7 +117,7 @@ def test_every_option_is_explained(name: str) -> None:
 def test_the_examples_can_be_typed(name: str) -> None:
     """The words of each `talk` in them are read as the command line would be; nothing is carried out."""
     seen = []
-    for line in command(name).examples.strip().splitlines():
+    for line in command(name).row.examples.strip().splitlines():
         for part in re.findall(r"\btalk ((?:\"[^\"]*\"|[^|;&)\"])*)", re.split(r"(?<=\S)   +", line.strip())[0]):
             words = [each for each in shlex.split(part.partition("'")[0]) if each != "--json"]
             seen.append(words[0])

@@ -8,6 +8,7 @@ from __future__ import annotations
 import _signal
 import os
 import re
+from inspect import cleandoc
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -15,6 +16,7 @@ from click.core import ParameterSource
 
 from talkcli import __version__
 from talkcli.cli.command import (
+    ALL_EXIT_CODES,
     COMMON_OPTIONS,
     OUTPUT_FILE,
     nearest,
@@ -32,9 +34,15 @@ if TYPE_CHECKING:
 
     from click.shell_completion import CompletionItem
 
-    from talkcli.cli.command import Command
+    from talkcli.cli.command import Command, ExitCodes
     from talkcli.goals.option import Option
 
+_EXAMPLES = """
+    talk serve &                      one server on the robot
+    talk say --wait -- "battery low"  the exit code tells whether it was heard
+    talk cancel                       silence, now
+    talk doctor                       silent? what to do next
+"""
 #: Names that other programs have for a command, if they aren't similar to its name here.
 _FOREIGN_NAMES = {
     "check": "doctor",
@@ -47,27 +55,6 @@ _FOREIGN_NAMES = {
     "stop": "cancel",
     "unpause": "resume",
 }
-
-
-def _read_help_file(name: str) -> str:
-    with open(os.path.join(os.path.dirname(__file__), "help", f"{name}.txt"), encoding="utf-8") as file:
-        return file.read()
-
-
-def _read_help(name: str) -> tuple[str, str, dict[str, str]]:
-    """Return the description, the examples and the exit codes of a command from its file in `help`."""
-    description, _, rest = _read_help_file(name).partition("\n\nExamples:\n")
-    examples, _, exit_codes = rest.partition("\n\nExit codes:\n")
-    return description, examples, _read_exit_codes(exit_codes)
-
-
-def _read_exit_codes(lines: str) -> dict[str, str]:
-    """Return what each exit code means. A line such as `@exit-codes-server` includes the codes of that file."""
-    found: dict[str, str] = {}
-    for line in lines.splitlines():
-        code, _, words = line.partition(" ")
-        found |= _read_exit_codes(_read_help_file(code[1:])) if code.startswith("@") else {code: words.strip()}
-    return found
 
 
 class _OptionType(click.FloatRange):
@@ -149,8 +136,7 @@ class _HelpfulCommand(click.Command):
     """A command whose help has examples, its own options, the common options, and exit codes."""
 
     examples: str
-    #: what each exit code means
-    exit_codes: dict[str, str]
+    exit_codes: ExitCodes
     #: the heading of the common options
     common_heading = "Options of every command"
 
@@ -178,8 +164,9 @@ class _HelpfulCommand(click.Command):
                     formatter.write_dl(records)
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
+        rows = sorted(self.exit_codes.items(), key=lambda row: row[0] if isinstance(row[0], int) else 128)
         with formatter.section("Exit codes"):
-            formatter.write_dl(sorted(self.exit_codes.items(), key=lambda row: int(row[0].removesuffix("+n"))))
+            formatter.write_dl([(str(code), words) for code, words in rows])
 
 
 class ClickCommand(_HelpfulCommand):
@@ -187,13 +174,13 @@ class ClickCommand(_HelpfulCommand):
 
     def __init__(self, row: Command) -> None:
         self.row = row
-        description, self.examples, self.exit_codes = _read_help(row.name)
+        self.examples, self.exit_codes = row.examples, row.exit_codes
         arguments: list[click.Parameter] = [_argument(row.argument)] if row.argument else []
         own, common = map(_option, row.options), [_option(each, common=True) for each in COMMON_OPTIONS]
         super().__init__(
             row.name,
             params=[*arguments, *own, *common],
-            help=description,
+            help=cleandoc(row.description),
             short_help=row.summary,
             callback=self._run,
         )
@@ -228,7 +215,7 @@ class ClickCommand(_HelpfulCommand):
 class _CommandGroup(_HelpfulCommand, click.Group):
     """The group of all commands. Each is made from its row when it is needed."""
 
-    description, examples, exit_codes = _read_help("talk")
+    examples, exit_codes = _EXAMPLES, ALL_EXIT_CODES
     common_heading = "Options, before or after the command"
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
@@ -252,7 +239,6 @@ class _CommandGroup(_HelpfulCommand, click.Group):
 
 @click.group(
     cls=_CommandGroup,
-    help=_CommandGroup.description,
     invoke_without_command=True,
     subcommand_metavar="COMMAND [ARGS]...",
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
@@ -261,7 +247,7 @@ class _CommandGroup(_HelpfulCommand, click.Group):
 @click.version_option(__version__, prog_name="talk", message="%(prog)s %(version)s")
 @click.pass_context
 def talk(context: click.Context) -> None:
-    """Show the first screen if there is no command."""
+    """Speech for robots: sentences that can be awaited, cancelled and preempted."""
     if context.invoked_subcommand is None:
         click.echo(_first_screen(context))
 
@@ -271,7 +257,7 @@ def _first_screen(context: click.Context) -> str:
     formatter = context.make_formatter()
     formatter.write(f"{talk.help}\n")
     with formatter.indentation():
-        _write_lines(_CommandGroup.examples, formatter)
+        _write_lines(_EXAMPLES, formatter)
     talk.format_commands(context, formatter)
     formatter.write("'talk COMMAND --help' says more of each, 'talk --help' has the exit codes.")
     return formatter.getvalue()

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from talkcli.cli.show import CommonOptions
 
+    ExitCodes = Mapping[int | str, str]
     #: Returns what is wrong with a combination of options. It is called with the values of all options, by name, and
     #: with the names of the options on the command line.
     Rule = Callable[[Mapping[str, Any], AbstractSet[str]], str | None]
@@ -30,16 +31,54 @@ FILE_MODE = Kind("string", (str,), "must be a string", "MODE")
 #: Options of `say`, `wait` and others that can't be combined with several robots.
 _SINGLE_ROBOT_OPTIONS = ("lines", "ahead", "feedback", "output")
 
+#: The exit codes of every command that uses a server. A command can give other meanings to them.
+SERVER_EXIT_CODES: ExitCodes = {
+    1: "anything not named here; a bug says so",
+    2: "usage: what is wrong stands on standard error",
+    3: "no server: nothing was sent, so it is safe to try again",
+    5: "the server has as many clients as it takes",
+    9: "this command and the server speak different versions of the protocol",
+    10: "permission denied",
+    12: "lost: it was sent, then nothing more was heard; it may have an effect all the same",
+}
+#: The exit codes of every command that can be sent to several robots.
+FLEET_EXIT_CODES: ExitCodes = {
+    **SERVER_EXIT_CODES,
+    13: "robots differ: those that did not do it failed in more than one way",
+}
+#: All exit codes, for the general help and the README. The help of each command has its own meanings.
+ALL_EXIT_CODES: ExitCodes = {
+    **FLEET_EXIT_CODES,
+    0: "accepted; with --wait succeeded: all of it was played",
+    1: "anything not named here; a bug says so, and TALK_DEBUG=1 where",
+    2: "usage",
+    4: "aborted: engine or audio failed, or nothing in the text can be spoken",
+    5: "rejected: never queued",
+    6: "recalled: taken out of the queue before it was spoken",
+    7: "preempted: stopped while it was spoken",
+    8: "unknown goal",
+    9: "client and server speak different versions of the protocol",
+    11: "the socket is served already, or its directory is not safe",
+    12: "lost: it was sent, then the server went away; it may still be spoken",
+    124: "timed out",
+    "128+n": "ended by signal n; 141: standard output is closed, or its reader went away",
+}
+
 
 @frozen
 class Command:
-    """A row that describes a command. Its help is in `help/NAME.txt`."""
+    """A row that describes a command."""
 
     name: str
     #: one line for the list of commands
     summary: str
+    #: the description in the command's help
+    description: str
     #: the function that runs the command, as "module:name"; it is called with `CommonOptions` and the given values
     function: str
+    #: example command lines, one on each line
+    examples: str
+    exit_codes: ExitCodes
     options: tuple[Option, ...] = ()
     #: the positional argument; it takes any number of words if its metavar ends with dots
     argument: Option | None = None

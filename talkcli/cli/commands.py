@@ -1,4 +1,4 @@
-"""The commands. Each has a row with a summary, its options, and the function that runs it.
+"""The commands. Each has a row with its purpose, its options, its exit codes, and the function that runs it.
 
 This module is imported before anything is sent, so it must import nothing heavy, and it must not run anything. The
 options of goals and servers are in `goals.options`. The functions here say which options can't be combined.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 
-from talkcli.cli.command import FILE_MODE, OUTPUT_FILE, Command, option, spelling
+from talkcli.cli.command import FILE_MODE, FLEET_EXIT_CODES, OUTPUT_FILE, SERVER_EXIT_CODES, Command, option, spelling
 from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.option import FLAG, ID, IDS, INTEGER, MAX_LOG, NUMBER, TEXT, WORD, Option
 from talkcli.goals.options import MAX_CHARACTERS, MAX_LEAD_IN, OPTIONS, SETTINGS, SOUND, Cancel
@@ -175,17 +175,63 @@ _ROWS = (
     Command(
         name="serve",
         summary="Run the server, in the foreground.",
+        description="""
+        Run the server, in the foreground, until SIGTERM or Ctrl-C.
+
+        It queues sentences and speaks one at a time; its log is on standard error. For systemd it prints its own
+        units.
+        """,
         function="serve:serve",
         plain=False,
         uses_server=False,
+        examples="""
+        talk serve --rate 150
+        talk serve --player null       no sound, same timing: for simulation and CI
+        talk serve --print-unit user   a service for systemd, with how to install it
+        """,
+        exit_codes={
+            0: "ended by SIGTERM or SIGINT; by a second one 128+n",
+            1: "anything not named here; a bug says so",
+            2: "usage: an option or a voice that there isn't",
+            11: "this socket is served already, or its directory is not safe",
+        },
         options=_SERVE_OPTIONS,
         rule=_serve_rule,
     ),
     Command(
         name="say",
         summary="Speak a sentence.",
+        description="""
+        Speak TEXT: its words, joined by blanks; or standard input, as one sentence, where TEXT is '-'.
+
+        Prints the goal's id. Without --wait it returns as soon as the goal is accepted. With --wait it owns the
+        goal: Ctrl-C, SIGTERM and SIGHUP cancel it, and so does a reader of its output that goes away, as ssh does.
+        With --lines its exit code is that of the first line that did not succeed. With --ttl a line's time counts
+        from when it was read.
+        """,
         function="say:say",
         fleet_function="several:say",
+        examples="""
+        talk say "battery low"
+        talk say --wait -- "$text" || echo "nobody heard it"
+        talk say -wf "please step back"         each word as it is heard
+        talk say --key battery --throttle 60 "battery low"
+        fortune | talk say -
+        tail -n 0 -F log | talk say --lines --ttl 10
+        talk say -o hello.wav "hello"           needs no server
+        talk say -o - "hello" | aplay
+        """,
+        exit_codes={
+            **FLEET_EXIT_CODES,
+            0: "accepted; with --wait succeeded: all of it was played; throttled, as was asked for",
+            4: "aborted: engine or audio failed; 'talk doctor' says more",
+            5: "rejected: never queued (bad text, full queue or full server)",
+            6: "recalled: taken out of the queue before it was spoken; with --lines: not sent within its --ttl",
+            7: "preempted: stopped while it was spoken",
+            12: "lost: it was sent, then the server went away; it may still be spoken",
+            124: "timed out, and cancelled",
+            "128+n": "ended by signal n, and cancelled; 141: whoever read its output went away while it waited",
+        },
         options=_SAY_OPTIONS,
         argument=Option("text", TEXT, metavar="TEXT..."),
         unknown_option_hint="To speak a text that starts with '-', write: talk say -- TEXT",
@@ -194,8 +240,30 @@ _ROWS = (
     Command(
         name="wait",
         summary="Wait until goals have ended.",
+        description="""
+        Wait until these goals have ended, whoever sent them; without an ID, all that are active or pending now.
+
+        It only watches: Ctrl-C and --timeout cancel nothing. A goal that has ended already is answered at once.
+        """,
         function="wait:wait",
         fleet_function="several:wait",
+        examples="""
+        id=$(talk say "moving back")
+        move_back
+        talk wait "$id"
+        """,
+        exit_codes={
+            **FLEET_EXIT_CODES,
+            0: "all succeeded; or no ID was given, and all have ended",
+            4: "aborted; 4 to 7 are those of the first goal in order that did not succeed",
+            5: "rejected; or the server has as many clients as it takes",
+            6: "recalled",
+            7: "preempted",
+            8: "unknown goal",
+            12: "lost: the server went away",
+            124: "timed out; the goals go on",
+            "128+n": "ended by signal n, 141: whoever read its output went away meanwhile; the goals go on",
+        },
         options=(
             _timeout("Wait no longer than SEC seconds; the goals go on; exit code 124."),
             option("-f, --feedback", FLAG, "Show each word as it is heard."),
@@ -205,8 +273,24 @@ _ROWS = (
     Command(
         name="cancel",
         summary="Stop speaking: everything, or what is named.",
+        description="""
+        Stop speaking: the goals that are named, or everything, from every client. Returns when it is silent.
+
+        Prints the ids of the goals that ended because of it. Nothing to cancel is success. Selectors add up.
+        """,
         function="ask:cancel",
         fleet_function="several:cancel",
+        examples="""
+        talk cancel                 everything, now
+        talk cancel --current       this sentence; the next one follows
+        talk cancel --key battery   what was sent with --key battery
+        talk cancel 12 13           these goals of this server
+        """,
+        exit_codes={
+            **FLEET_EXIT_CODES,
+            0: "it is silent, or was already",
+            8: "an ID is unknown; the others are cancelled all the same",
+        },
         options=tuple(each for each in Cancel.options if each.flags),
         argument=_GOAL_IDS,
         urgent=True,
@@ -214,47 +298,134 @@ _ROWS = (
     Command(
         name="status",
         summary="What is being said, what will be, what was.",
+        description="Show what is being said, what will be and what was; with an ID, all that is known of that goal.",
         function="ask:status",
         fleet_function="several:status",
+        examples="""
+        talk status
+        talk status 12                          goal 12 of this server
+        talk --json status | jq .active.text
+        """,
+        exit_codes={**FLEET_EXIT_CODES, 0: "the server runs", 8: "unknown goal"},
         argument=Option("goal_id", ID, metavar="[ID]", offers="known_ids"),
         urgent=True,
     ),
     Command(
         name="watch",
         summary="Follow all goals as they happen.",
+        description="""
+        Show all goals as they happen, from now on: who says what, how it ends and why. Ctrl-C ends it.
+
+        It begins with what is being said and what waits. On a terminal, what is over at once is left out: that a
+        goal waits where nothing is before it, that one is being stopped. In a pipe, each event is a line.
+
+        With --json each event is an object a line, words included; the first is {"event": "snapshot", ...}.
+        """,
         function="ask:watch",
         plain=False,
+        examples="""
+        talk watch
+        ssh robot talk watch
+        talk --json watch | jq -r 'select(.event == "word").word'
+        """,
+        exit_codes={
+            **SERVER_EXIT_CODES,
+            12: "lost: the server went away",
+            "128+n": "ended by signal n: 130 by Ctrl-C, 141 where its reader is gone",
+        },
         options=(option("-f, --words", FLAG, "A line for each word as it is heard, too."),),
     ),
     Command(
         name="log",
         summary="What was said: when, by whom, how it ended.",
+        description="""
+        Show what was said: when and how each goal ended, its text, who sent it, and why it ended; the newest last.
+
+        Who sent it is the program that called talk, the process id of talk itself, and after "as" what the sender
+        calls itself. Rejected goals are listed, too.
+        """,
         function="ask:log",
+        examples="""
+        talk log
+        talk log -n 100 | grep patrol
+        talk --json log | jq -r 'select(.state == "ABORTED").message'
+        """,
+        exit_codes={**SERVER_EXIT_CODES, 0: "listed"},
         options=(option("-n, --count", INTEGER, "The last N goals that ended.", default=20, limits=(1, MAX_LOG)),),
     ),
     Command(
         name="pause",
         summary="Hold speech where it is.",
+        description="""
+        Hold speech where it is, until 'talk resume'. Returns when it is silent; twice is success.
+
+        Nothing is spoken until then, whoever sends it and however urgent it is. Goals can be sent and cancelled.
+        """,
         function="ask:pause",
         fleet_function="several:pause",
+        examples="talk pause; listen_to_the_operator; talk resume",
+        exit_codes={
+            **FLEET_EXIT_CODES,
+            0: "speech is held, and it is silent",
+            1: "speech is held, but that it is silent was not known within 2 seconds",
+        },
     ),
     Command(
         name="resume",
         summary="Go on where speech was held.",
+        description="Go on where 'talk pause' held speech. Twice is success, and so is without a pause.",
         function="ask:resume",
         fleet_function="several:resume",
+        examples="talk resume",
+        exit_codes={**FLEET_EXIT_CODES, 0: "speech goes on"},
     ),
     Command(
         name="set",
         summary="Change the running server's settings, or print them.",
+        description="""
+        Change settings of the running server; without an option, print them.
+
+        They hold for each goal that doesn't bring its own, from the next one that begins; --preempt and --ttl from
+        the next one that is sent. A server that is started anew has those of its command line.
+        """,
         function="ask:change",
         fleet_function="several:change",
+        examples="""
+        talk set
+        talk set --rate 150 --volume 0.5
+        talk set --voice en-us --no-preempt
+        """,
+        exit_codes={
+            **FLEET_EXIT_CODES,
+            0: "changed, or printed",
+            2: "usage: a value out of its range, or an unknown voice; nothing was changed",
+        },
         options=tuple(each.to_set() for each in SETTINGS),
     ),
     Command(
         name="voices",
         summary="List the voices.",
+        description="""
+        List the voices of the server's engine: id, language, name. Any of the three can be given as a voice.
+
+        So can a locale, and a language in English: de_DE, german.
+
+        Behind the voices are variants: each goes behind any of them. Neural voices come last, and are given by as much
+        of their id as it takes to tell one from the others: "joe" is enough for "piper/en_US-joe-medium". If one has
+        several speakers, a number or a name goes behind: "piper/NAME#3". Where the server speaks with a neural voice,
+        that one's language means it, too.
+        """,
         function="ask:voices",
+        examples="""
+        talk voices --language en
+        talk serve --voice en-us
+        talk say --voice en-us+f3 "a variant"
+        """,
+        exit_codes={
+            **SERVER_EXIT_CODES,
+            0: "listed",
+            1: "no voice speaks that language, or the engine can't list them",
+        },
         options=(
             option("--language", TEXT, "Only this language, with its variants: en, pt-BR, german.", metavar="LANGUAGE"),
         ),
@@ -262,34 +433,118 @@ _ROWS = (
     Command(
         name="doctor",
         summary="Check everything between a sentence and a loudspeaker.",
+        description="""
+        Check everything between a sentence and a loudspeaker, in order, and say the one thing to do next.
+
+        Each check is a line: ok, warning or failed. At last a sentence is played: by the server, where it waits
+        its turn (20 seconds at most), or without a server by an engine of this command's own, with TALK_PLAYER and
+        TALK_VOICE. With --silent it is always that engine, which plays zeros by the server's player: no goal waits,
+        and none is in the log.
+
+        With --robot it is the way to a robot of a fleet: broker, certificate, login, rights, the robot's answer.
+        """,
         function="ask:doctor",
         plain=False,
         connects=False,
+        examples="""
+        talk doctor
+        talk doctor --silent                    at night: all of it, without a sound
+        ssh robot talk doctor                   the exit code comes back
+        talk doctor --robot anna                what is between here and anna
+        talk --json doctor | jq 'select(.state != "ok")'
+        """,
+        exit_codes={
+            0: "a sentence would be heard; with --robot: the robot answers",
+            1: "anything not named here; a bug says so",
+            2: "usage",
+            4: "it would not, as without a server",
+            "128+n": "ended by signal n",
+        },
         options=(option("--silent", FLAG, "Play half a second of zeros, which is no goal and no sound."),),
     ),
     Command(
         name="bridge",
         summary="Be a robot on an MQTT broker, in the foreground.",
+        description="""
+        Be the robot of this name on an MQTT broker, in the foreground, until SIGTERM or Ctrl-C.
+
+        Who may write to it there can have it speak, by the server of this machine. Its log is on standard error.
+
+        TALK_BROKER names the broker: mqtts://HOST, or mqtt://HOST without TLS. Beside it are TALK_MQTT_USER and
+        TALK_MQTT_PASSWORD_FILE, and for certificates TALK_MQTT_CA, TALK_MQTT_CERT and TALK_MQTT_KEY, all three files.
+        """,
         function="fleet:bridge",
         plain=False,
         uses_server=False,
+        examples="""
+        TALK_BROKER=mqtts://broker talk bridge --name anna
+        talk bridge --name anna --group warehouse,night --allow say,cancel
+        talk bridge --name anna --print-unit system   a service for systemd
+        talk bridge --print-acl                       for the broker
+        """,
+        exit_codes={
+            0: "ended by SIGTERM or SIGINT",
+            1: "anything not named here; a bug says so",
+            2: "usage: a setting that is wrong or missing, or paho-mqtt is",
+            11: "another bridge of this name is there already",
+        },
         options=_BRIDGE_OPTIONS,
         rule=_bridge_rule,
     ),
     Command(
         name="fleet",
         summary="The robots of a fleet: who is there, what each says.",
+        description="""
+        Show the robots of a fleet, by its broker (TALK_BROKER): who is there, and what each says.
+
+        'status' is a table: whether a robot is there, its server's version, what it speaks, how many goals wait, how
+        the last one ended and how long ago, and since when it is there. 'watch' goes on with what happens.
+
+        --robot picks some of them: a name, a glob such as 'wh-*', or a group as @warehouse.
+        """,
         function="fleet:fleet",
         fleet_function="fleet:fleet",
         connects=False,
+        examples="""
+        talk fleet status
+        talk fleet status --robot @warehouse
+        talk --json fleet status | jq -r 'select(.presence.online | not).robot'
+        talk fleet watch
+        """,
+        exit_codes={
+            0: "shown",
+            1: "anything not named here; a bug says so",
+            2: "usage: a setting that is wrong or missing, or paho-mqtt is",
+            3: "no broker, or it knows no robot, or none of those that are meant",
+            9: "the broker does not speak MQTT 5",
+            10: "the broker doesn't let this user in, or ask; or it is not to be trusted",
+            12: "lost: 'watch' has found no broker for 30 seconds",
+            "128+n": "ended by signal n: 130 by Ctrl-C, 141 where its reader is gone",
+        },
         argument=Option("what", WORD, metavar="WHAT", choices=("status", "watch")),
     ),
     Command(
         name="completion",
         summary="Print the completion script of a shell.",
+        description="""
+        Print the completion script of a shell: bash, zsh or fish. Its start file loads it.
+
+        Tab then completes commands, options and their values, and what the running server knows: goals, keys,
+        voices.
+        """,
         function="completion:completion",
         plain=False,
         uses_server=False,
+        examples="""
+        eval "$(talk completion bash)"   the last line of ~/.bashrc
+        eval "$(talk completion zsh)"    the last line of ~/.zshrc
+        talk completion fish | source    the last line of ~/.config/fish/config.fish
+        """,
+        exit_codes={
+            0: "printed",
+            1: "anything not named here; a bug says so",
+            2: "usage: a shell that there is no script for",
+        },
         argument=Option("shell", WORD, metavar="SHELL", choices=SHELLS),
     ),
 )

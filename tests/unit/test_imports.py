@@ -364,8 +364,9 @@ def test_contributing_names_every_file_that_an_option_goes_through() -> None:
     # On a broker it is a message's expiry, too; no other option is known there.
     having -= {module for module in having if part(module) == "fleet"}
     assert named - having == {"engine.protocol"}  # it takes no expiry
-    # The sentence of the doctor, requests that wait for the queue, and reasons in words.
+    # Examples and help of commands, the sentence of the doctor, requests that wait for the queue, and reasons in words.
     assert having - named == {
+        "cli.commands",
         "doctor.sentence",
         "cli.stdin",
         "client.core",
