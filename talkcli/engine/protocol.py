@@ -274,7 +274,9 @@ class Ended:
     player: str | None = None  # player that took the sound, if `Configure` names none
 
 
-Command = Configure | Speak | Stop | Hold | Continue | NextGoal | LoadVoice | DropVoice
+#: Commands that begin a goal: one for each kind of goal.
+GoalCommand = Speak
+Command = Configure | GoalCommand | Stop | Hold | Continue | NextGoal | LoadVoice | DropVoice
 #: Events that belong to the goal given by their `id`.
 GoalEvent = Started | Alive | Word | OutputChanged | VoiceChosen | Held | Ended
 Event = Ready | StartFailed | VoiceList | VoiceLoaded | VoiceUnloaded | VoiceMemory | GoalEvent

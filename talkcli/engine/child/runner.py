@@ -175,7 +175,7 @@ class GoalRunner:
                     self.wait((), None)
                     continue
                 command = self._backlog.popleft()
-                if isinstance(command, protocol.Speak):  # anything else came after its goal had ended
+                if isinstance(command, protocol.GoalCommand):  # anything else came after its goal had ended
                     self._speak(command)
         finally:
             self._engine.endLoop()
@@ -216,7 +216,7 @@ class GoalRunner:
         if isinstance(command, protocol.LoadVoice | protocol.DropVoice):
             if self._synthesizer is not None:
                 self._synthesizer.carry_out(command)
-        elif goal is None or isinstance(command, protocol.Configure | protocol.Speak):
+        elif goal is None or isinstance(command, protocol.Configure | protocol.GoalCommand):
             self._backlog.append(command)
         elif goal.id != command.id:
             return  # that goal ended before the command arrived

@@ -259,7 +259,7 @@ class PrivateEngine:
         wait_ready({self._process.liveness: select.POLLIN}, KILL_LIMIT_S)
         self._process.close()
 
-    def speak(self, command: protocol.Speak) -> None:
+    def speak(self, command: protocol.GoalCommand) -> None:
         """Have a text spoken. The process must be ready, and the text before must have ended."""
         self._last_event_at = time.monotonic()
         if not self._process.send(command):

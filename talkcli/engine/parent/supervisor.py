@@ -195,7 +195,7 @@ class RestartPolicy:
 class SupervisedGoal:
     """A goal from the time it is handed in until its `Ended` is posted."""
 
-    command: protocol.Speak
+    command: protocol.GoalCommand
     #: time of the last sign of life for this goal; None while it waits for a process
     last_sign_at: float | None = None
     #: whether the process has reported that it has begun
@@ -252,7 +252,7 @@ class Supervisor:
 
     # -- methods for other threads
 
-    def say(self, command: protocol.Speak) -> None:
+    def say(self, command: protocol.GoalCommand) -> None:
         """Hand in a goal, always from the same thread. The goal before must have ended or been given up.
 
         The caller's thread sends it to the process if possible, because waking the engine thread would take a tenth to
@@ -388,7 +388,7 @@ class Supervisor:
         """Return the goal with this id; None if it has ended."""
         return self._goal if self._goal and self._goal.command.id == goal_id else None
 
-    def _take_goal(self, command: protocol.Speak, sent_to: EngineProcess | None = None, at: float = 0.0) -> None:
+    def _take_goal(self, command: protocol.GoalCommand, sent_to: EngineProcess | None = None, at: float = 0.0) -> None:
         """Take charge of a goal. Send it to the process unless that was already done."""
         self._goal = SupervisedGoal(command)
         if sent_to is not None and sent_to is self._process:
