@@ -214,12 +214,12 @@ def robots(context: click.Context, _: click.Parameter, incomplete: str) -> Items
     try:
         broker = options.broker()
         from talkcli.fleet import topics
-        from talkcli.fleet.desk.watch import read_presences
+        from talkcli.fleet.desk.watch import read_robots
 
-        found = read_presences(broker, COMPLETION_TIMEOUT_S)
+        found = read_robots(broker, COMPLETION_TIMEOUT_S, with_status=False)
     except (TalkError, OSError, ValueError):
         return []
-    online = [each for _, each in sorted(found.items()) if each.online]
+    online = [each.presence for each in found if each.presence.online]
     offered = [(each.name, ", ".join(map(_shorten, each.groups)) or "robot") for each in online]
     members = Counter(f"@{group}" for each in online for group in {*each.groups} if not topics.name_fault(group))
     offered += [(name, f"{count} robot{'' if count == 1 else 's'}") for name, count in sorted(members.items())]

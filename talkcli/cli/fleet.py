@@ -88,7 +88,7 @@ def _show_robots(options: CommonOptions, broker: Broker, selection: Selection | 
     from talkcli.fleet.desk.watch import read_robots
 
     found = read_robots(broker, ANSWER_LIMIT_S, selection.name if selection else None)
-    selected = [each for _, each in sorted(found.items()) if selection is None or selection.includes(each.presence)]
+    selected = [each for each in found if selection is None or selection.includes(each.presence)]
     if not selected:
         raise _no_robot(broker, selection)
     show_result(

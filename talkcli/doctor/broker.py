@@ -25,7 +25,7 @@ from talkcli.errors import ServerUnavailable, TalkError, UsageError
 from talkcli.fleet import topics
 from talkcli.fleet.broker import CA, URL, USER, client_user, from_environment, is_local
 from talkcli.fleet.desk.robot import connect_robot
-from talkcli.fleet.desk.watch import read_presences
+from talkcli.fleet.desk.watch import read_robots
 from talkcli.fleet.link import LOGIN_LIMIT_S, REASON_NOT_AUTHORIZED, Link
 from talkcli.fleet.payloads import Presence
 from talkcli.frozen import frozen, replace
@@ -232,7 +232,8 @@ class BrokerExamination:
     def _known_robots(self, broker: Broker) -> tuple[str, ...]:
         """Return the names of all robots that the broker knows. If the broker doesn't tell, return none."""
         try:
-            return tuple(sorted(self._wait_for(partial(read_presences, broker, LOGIN_LIMIT_S))))
+            found = self._wait_for(partial(read_robots, broker, LOGIN_LIMIT_S, with_status=False))
+            return tuple(each.presence.name for each in found)
         except (TalkError, TimeoutError):
             return ()
 

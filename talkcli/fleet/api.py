@@ -69,9 +69,9 @@ class Fleet:
             ServerUnavailable: There is no broker.
             AccessDenied: The broker doesn't let this user log in, or ask.
         """
-        from talkcli.fleet.desk.watch import read_presences
+        from talkcli.fleet.desk.watch import read_robots
 
-        return sorted(read_presences(self._broker, ANSWER_LIMIT_S).values(), key=lambda each: each.name)
+        return [each.presence for each in read_robots(self._broker, ANSWER_LIMIT_S, with_status=False)]
 
     def robot(self, name: str) -> Client:
         """Return a client of one robot's server, which is used like a client of a local server.

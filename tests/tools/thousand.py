@@ -15,7 +15,7 @@ import time
 from typing import TYPE_CHECKING
 
 from talkcli.fleet.broker import from_environment
-from talkcli.fleet.desk.watch import read_presences
+from talkcli.fleet.desk.watch import read_robots
 from tests.fleet.many import RealRobots, Roll, SimulatedRobots
 from tests.support.bridge import Bridge, Desk
 from tests.support.broker import Broker
@@ -113,7 +113,7 @@ def measure_roster(fleet: MeasuredFleet) -> None:
     broker, times = from_environment(fleet.desk.env), []
     for _ in fleet.rounds:
         began = time.monotonic()
-        assert len(read_presences(broker, _LIMIT_S)) == len(fleet.names)
+        assert len(read_robots(broker, _LIMIT_S, with_status=False)) == len(fleet.names)
         times.append(time.monotonic() - began)
     _print("all robots, in a program", times)
     _print("`talk fleet status`", [fleet.desk.run("fleet", "status", timeout=_LIMIT_S).seconds for _ in fleet.rounds])

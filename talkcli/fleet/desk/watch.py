@@ -84,36 +84,22 @@ class BrokerBack:
 FleetEvent = FleetSnapshot | RobotChanged | RobotEvent | EventsMissed | BrokerAway | BrokerBack
 
 
-def read_presences(broker: Broker, timeout: float) -> dict[str, Presence]:
-    """Return the presence of each robot that the broker knows, online or not, by name.
+def read_robots(
+    broker: Broker, timeout: float, name: str | None = None, *, with_status: bool = True
+) -> list[RobotInfo]:
+    """Return the robots that the broker knows, online or not, sorted by name.
 
     Args:
         broker: the broker of the fleet.
         timeout: seconds in which the broker must answer.
+        name: the only robot to return; None for all.
+        with_status: whether to read the robots' statuses, too.
 
     Raises:
         ServerUnavailable: There is no broker, or it doesn't answer in time.
         AccessDenied: The broker doesn't let this user log in, or ask.
     """
-    retained = _read_retained(broker, timeout, None, topics.PRESENCE)
-    return {name: each for name, found in retained.items() if (each := Presence.read(name, found[topics.PRESENCE]))}
-
-
-def read_robots(broker: Broker, timeout: float, name: str | None = None) -> dict[str, RobotInfo]:
-    """Return the state of each robot that the broker knows, or only of the robot `name`, by name.
-
-    The errors are those of `read_presences`.
-    """
-    robots = {}
-    for each, found in _read_retained(broker, timeout, name, topics.PRESENCE, topics.STATUS).items():
-        presence = Presence.read(each, found.get(topics.PRESENCE, b""))
-        if presence:
-            robots[each] = RobotInfo(presence, RobotStatus.read(found.get(topics.STATUS, b"")))
-    return robots
-
-
-def _read_retained(broker: Broker, timeout: float, name: str | None, *kinds: str) -> dict[str, dict[str, bytes]]:
-    """Return the retained payloads of these kinds, by robot and kind."""
+    kinds = (topics.PRESENCE, topics.STATUS) if with_status else (topics.PRESENCE,)
     reader = _RetainedReader([topics.robot(name or topics.ANY, each) for each in kinds])
     desk = DeskLink(broker)
     desk.handler = reader
@@ -121,7 +107,12 @@ def _read_retained(broker: Broker, timeout: float, name: str | None, *kinds: str
         desk.wait_for_retained(timeout, lambda: bool(reader.payloads))
     finally:
         desk.close()
-    return reader.payloads
+    robots = []
+    for each, payloads in sorted(reader.payloads.items()):
+        presence = Presence.read(each, payloads.get(topics.PRESENCE, b""))
+        if presence:
+            robots.append(RobotInfo(presence, RobotStatus.read(payloads.get(topics.STATUS, b""))))
+    return robots
 
 
 class _RetainedReader:
