@@ -1,7 +1,6 @@
 """The desk's connection to the broker, which reconnects after every break.
 
-It knows nothing about robots or requests. A handler subscribes to topics and processes the messages. Nothing is queued
-while the broker is unreachable.
+A handler subscribes to topics and processes the messages. Nothing is queued while the broker is unreachable.
 """
 
 from __future__ import annotations
@@ -26,17 +25,22 @@ from talkcli.fleet.link import (
     Link,
     LinkOpener,
 )
+from talkcli.goals.options import Say
 from talkcli.polling import wait_ready
+from talkcli.protocol.lines import request_line, write_request
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from talkcli.fleet.broker import Broker
     from talkcli.fleet.payloads import Message
+    from talkcli.protocol.requests import Request
 
 #: A broker or a robot that is absent for this long counts as gone, and open requests as lost. Bridges come back within
 #: 15 s after their broker, and systemd restarts a bridge after two.
 ABSENCE_LIMIT_S = 30.0
+#: Lifetime of all requests except sentences: nobody waits for a later answer.
+_REQUEST_EXPIRY_S = 5
 #: Time allowed for late retained messages: some brokers send them a moment after the others.
 RETAINED_GRACE_S = 0.3
 #: Bounds of the pause before the next attempt to connect. The pause is random, and doubles on average each time.
@@ -81,6 +85,8 @@ class DeskLink:
         #: when the marker came back, which the broker sends after its retained messages; None if it hasn't
         self.marker_at: float | None = None
         self._inbox: deque[Message] = deque()
+        #: errors of refused requests with the functions to call, which `poll` does: the link is locked when it reports
+        self._refusals: deque[tuple[Callable[[TalkError], None], TalkError]] = deque()
         self._opening: LinkOpener | None = None
         self._failed_attempts = 0
         self._next_attempt_at = self._polled_at = time.monotonic()
@@ -122,6 +128,9 @@ class DeskLink:
         self._polled_at = time.monotonic()
         if link is not None and descriptor in ready:
             link.read()
+        while self._refusals:
+            on_refused, error = self._refusals.popleft()
+            on_refused(error)
         received = bool(self._inbox)
         while self._inbox:
             message = self._inbox.popleft()
@@ -153,6 +162,46 @@ class DeskLink:
             if left <= 0:
                 raise self.no_answer(timeout)
             self.poll(left, interrupt)
+
+    def send(
+        self, request: Request, number: int, to: str, on_refused: Callable[[TalkError], None], *, is_group: bool = False
+    ) -> bool:
+        """Send a request, and return whether that was possible.
+
+        Args:
+            request: the request.
+            number: the number that answers to the request will have.
+            to: the name of a robot, or of a group.
+            on_refused: called with the error if the request is too long, or later if the broker refuses it.
+            is_group: whether `to` is a group.
+        """
+        if self.link is None:
+            return False
+
+        def on_acknowledged(code: int) -> None:
+            if code >= REASON_FAILURE:
+                error = self.publish_error(code, f"ask {'the group ' * is_group}{to} for anything")
+                self._refusals.append((on_refused, error))
+
+        line = request_line({"seq": number, **write_request(request)})
+        if (error := self.link.size_error(line, request.kind)) is not None:
+            on_refused(error)
+            return False
+        expiry = (request.ttl or None) if isinstance(request, Say) else _REQUEST_EXPIRY_S
+        topic, response = self._topics(to, is_group=is_group)
+        return self.link.publish(topic, line, expiry=expiry, response=response, acknowledged=on_acknowledged)
+
+    def end_session(self, to: str, *, is_group: bool = False) -> None:
+        """Tell the bridges of a robot or a group that this desk sends nothing more."""
+        if self.link is not None:
+            topic, response = self._topics(to, is_group=is_group)
+            self.link.publish(topic, b"", 0, response=response)
+
+    def _topics(self, to: str, *, is_group: bool) -> tuple[str, str]:
+        """Return the topics for requests to a robot or a group, and for the replies."""
+        topic = topics.group if is_group else topics.robot
+        response = topics.reply(self.user, self.session) if is_group else self.reply_topic(to)
+        return topic(to, topics.REQUEST, self.user), response
 
     def wake(self) -> None:
         """Wake the thread that waits in `poll`."""

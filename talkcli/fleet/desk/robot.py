@@ -20,7 +20,7 @@ from talkcli.errors import AccessDenied, BadRequest, Lost, ServerUnavailable, Ta
 from talkcli.fleet import topics
 from talkcli.fleet.desk.desk import ABSENCE_LIMIT_S, DeskLink
 from talkcli.fleet.desk.request import NoServer
-from talkcli.fleet.link import REASON_FAILURE, boottime
+from talkcli.fleet.link import boottime
 from talkcli.frozen import replace
 from talkcli.goals.option import MAX_NAME
 from talkcli.goals.options import Cancel, Say, Set
@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
     from talkcli.protocol.requests import Request
 
-#: Lifetime of all requests except sentences: nobody waits for a later answer.
-REQUEST_EXPIRY_S = 5
 #: Interval of the messages that keep the bridge's session alive, which ends after 90 s of silence.
 _KEEP_ALIVE_INTERVAL_S = 30.0
 #: Limit for sending a request again: the request itself may make the broker end the connection.
@@ -173,26 +171,18 @@ class RobotConnection(BlockingConnection):
 
     def _publish(self, exchange: Exchange) -> bool:
         """Send a request to the robot, and return whether that was possible."""
-        link, request = self._desk.link, exchange.request
-        if link is None or self.ended is not None or self.absent_since is not None:
+
+        def on_refused(error: TalkError) -> None:
+            with self.changed:
+                self.fail(exchange, error)
+
+        if self.ended is not None or self.absent_since is not None:
             return False
-
-        def on_acknowledged(code: int) -> None:
-            if code >= REASON_FAILURE:
-                with self.changed:
-                    self.fail(exchange, self._desk.publish_error(code, f"ask {self._robot} for anything"))
-
-        line = self.line(exchange)
-        if (refused := link.size_error(line, request.kind)) is not None:
-            self.fail(exchange, refused)
+        if not self._desk.send(exchange.request, exchange.number, self._robot, on_refused):
             return False
         self._published_at = time.monotonic()
-        topic = topics.robot(self._robot, topics.REQUEST, self._desk.user)
-        response = self._desk.reply_topic(self._robot)
-        expiry = (request.ttl or None) if isinstance(request, Say) else REQUEST_EXPIRY_S
-        published = link.publish(topic, line, expiry=expiry, response=response, acknowledged=on_acknowledged)
-        exchange.sent = exchange.sent or published
-        return published
+        exchange.sent = True
+        return True
 
     def answer_by(self, exchange: Exchange) -> float:
         if not isinstance(exchange, RobotExchange):
@@ -382,10 +372,8 @@ class RobotConnection(BlockingConnection):
 
     def end_session(self) -> None:
         """Tell the bridge to end the session of this desk."""
-        link = self._desk.link
-        if link is not None and self._bridge_session is not None:
-            topic = topics.robot(self._robot, topics.REQUEST, self._desk.user)
-            link.publish(topic, b"", 0, response=self._desk.reply_topic(self._robot))  # an empty message says so
+        if self._bridge_session is not None:
+            self._desk.end_session(self._robot)
 
     def _hang_up(self) -> None:
         self.end_session()

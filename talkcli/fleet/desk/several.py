@@ -19,15 +19,15 @@ from talkcli.errors import EXIT_OK, Lost, ServerUnavailable, TalkError, UnknownG
 from talkcli.fleet import topics
 from talkcli.fleet.desk.desk import DeskLink
 from talkcli.fleet.desk.request import NoServer, Outcome, cancel_outcomes, failure_outcome, reply_outcomes
-from talkcli.fleet.desk.robot import REQUEST_EXPIRY_S, RobotConnection, RobotExchange, new_goal_id
-from talkcli.fleet.link import REASON_FAILURE, boottime
+from talkcli.fleet.desk.robot import RobotConnection, RobotExchange, new_goal_id
+from talkcli.fleet.link import boottime
 from talkcli.fleet.payloads import Presence
 from talkcli.frozen import replace
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import Cancel, Say, Set, bad_key
 from talkcli.goals.states import State
 from talkcli.protocol.events import goals
-from talkcli.protocol.lines import FIRST_NUMBER, request_line, write_request
+from talkcli.protocol.lines import FIRST_NUMBER
 from talkcli.protocol.requests import Pause, Status, Wait
 
 if TYPE_CHECKING:
@@ -189,59 +189,42 @@ class FleetRequest:
         if self._closed:
             raise UsageError("all outcomes have been taken: cancel the goal by its id")
         self._canceled = True
-        in_group = self._selection.group is not None
-        if in_group and self._desk.link is not None:
-            self._publish(Cancel((str(self.request.id),)), next(self._numbers))
+        group, goal_id = self._selection.group, str(self.request.id)
+        if group is not None:
+            self._desk.send(Cancel((goal_id,)), next(self._numbers), group, self._on_refused, is_group=True)
         for name in self._open:
             # A robot that has left the group doesn't receive the message to the group.
-            is_sent = in_group and name in self._presences and self._selection.includes(self._presences[name])
-            self._robots[name].connection.cancel_lastingly(str(self.request.id), is_sent=is_sent)
+            presence = self._presences.get(name)
+            is_sent = group is not None and presence is not None and self._selection.includes(presence)
+            self._robots[name].connection.cancel_lastingly(goal_id, is_sent=is_sent)
 
     def close(self) -> None:
         """End the connection to the broker. The robots carry the request out all the same."""
         began, self._began, self._closed = self._began, False, True
         if began:
             self._desk.flush(_FLUSH_LIMIT_S)
-            self._end_sessions()
+            if self._selection.group is not None:
+                self._desk.end_session(self._selection.group, is_group=True)
+            else:
+                for each in self._robots.values():
+                    if each.was_asked:
+                        each.connection.end_session()
         self._desk.close()
 
     def _begin(self) -> None:
         """Send the request to the robots that are known to be online."""
         self._began = True
-        if self._selection.group is not None and self._rejected is None:
-            self._publish(self.request, self._number)
+        group = self._selection.group
+        if group is not None and self._rejected is None:
+            self._desk.send(self.request, self._number, group, self._on_refused, is_group=True)
+            if self._refused is not None:
+                raise self._refused
         for each in list(self._presences.values()):
             if self._selection.includes(each):
                 self._on_presence(each)
 
-    def _publish(self, request: Request, number: int) -> None:
-        """Send a request to the group."""
-        desk, group = self._desk, self._selection.group
-        assert group is not None
-        if desk.link is None:
-            raise ServerUnavailable(f"the broker at {desk.broker.url} went away: nothing was sent")
-
-        def on_acknowledged(code: int) -> None:
-            if code >= REASON_FAILURE:
-                self._refused = desk.publish_error(code, f"ask the group {group} for anything")
-
-        line = request_line({"seq": number, **write_request(request)})
-        if (refused := desk.link.size_error(line, request.kind)) is not None:
-            raise refused
-        expiry = (request.ttl or None) if isinstance(request, Say) else REQUEST_EXPIRY_S
-        topic, response = topics.group(group, topics.REQUEST, desk.user), topics.reply(desk.user, desk.session)
-        desk.link.publish(topic, line, expiry=expiry, response=response, acknowledged=on_acknowledged)
-
-    def _end_sessions(self) -> None:
-        """Tell the bridges to end the sessions of this desk."""
-        desk, group = self._desk, self._selection.group
-        if desk.link is not None and group is not None:
-            topic = topics.group(group, topics.REQUEST, desk.user)
-            desk.link.publish(topic, b"", 0, response=topics.reply(desk.user, desk.session))
-        elif group is None:
-            for each in self._robots.values():
-                if each.was_asked:
-                    each.connection.end_session()
+    def _on_refused(self, error: TalkError) -> None:
+        self._refused = error
 
     def _check_all(self) -> None:
         """Process the messages that have arrived, then fail the robots that have not answered in time."""
