@@ -108,7 +108,7 @@ def installed_voices() -> tuple[Voice, ...]:
 
 
 def installed_names(environment: Mapping[str, str] | None = None) -> tuple[Voice, ...]:
-    """Return the voices whose files exist without reading any file, so only with their names."""
+    """Return the voices whose files exist, with nothing but their names, because no file is read."""
     return tuple(Voice(NEURAL_PREFIX + name, None, name) for name in find_models(environment))
 
 
@@ -187,10 +187,10 @@ def _check_paths(*paths: str) -> None:
 
 
 def _walk_path(path: str) -> Iterator[tuple[str, bool]]:
-    """Yield the directories on the way to a file, and the file itself.
+    """Yield the directories that lead to a file, and the file itself.
 
-    Each is yielded without links, together with whether it leads to another directory. The way ends before the first
-    part that doesn't exist; opening the file reports that.
+    Links are resolved. Each path comes with a flag that is True if another directory follows it. The walk ends before
+    the first path that doesn't exist; opening the file reports that.
 
     Raises:
         VoiceFileError: A link belongs to another user.

@@ -1,4 +1,4 @@
-"""The players that `talk` knows by name, the command lines of player programs, and whether any device is there.
+"""The players that `talk` knows by name, the command lines of player programs, and the devices to play to.
 
 Nothing is started or opened here, so the server, doctor and the command line may use this module. The classes that play
 are in `talkcli.engine.child.players`.
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 #: Bytes of one sample: signed 16 bit, one channel.
 SAMPLE_BYTES = 2
 
-#: Seconds of sound that a player is offered at a time. A short piece keeps little sound on its way when speech stops.
+#: Seconds of sound that a player is offered at a time. With short pieces, little sound is left to play after a stop.
 PIECE_S = 0.02
 
 #: Milliseconds of sound that a player may buffer. Buffered sound delays words and is lost in a stall. With fewer than
@@ -89,7 +89,7 @@ def _pacat(rate: int, device: str | None) -> PlayerCommand:
     argv = ["pacat", "--playback", "--raw", "--format=s16le", "--channels=1", f"--rate={rate}"]
     argv += [f"--latency-msec={BUFFER_MS}", "--process-time-msec=20", "--client-name=talk", "--stream-name=talk"]
     argv += ["-d", device] if device else []
-    # pacat reads once while it still connects, and at most one piece is there to be read.
+    # pacat reads once while it still connects, and finds one piece at most.
     return PlayerCommand("pacat", tuple(argv), read_ahead=int(PIECE_S * rate) * SAMPLE_BYTES)
 
 
@@ -110,9 +110,9 @@ def _au_header(rate: int) -> bytes:
     return b"dns." + struct.pack("<5I", 24, unknown_length, pcm16, rate, 1)
 
 
-#: The players by name. Automatic players are tried in this order, classes before programs: the sound server starts at
-#: once and reports more than any program. aplay comes first of the programs because it opens the device before it
-#: reads, so no sample is lost if that fails, and because it is installed on robots without a desktop.
+#: The players by name. Automatic players are tried in this order, but classes before programs, because the sound server
+#: starts at once and reports more than any program. Of the programs, aplay comes first: it opens the device before it
+#: reads, so no sample is lost if that fails, and it is installed on robots without a desktop.
 PLAYERS = {
     "aplay": KnownPlayer("ALSA", "alsa-utils", _aplay, automatic=True),
     "pacat": KnownPlayer("PulseAudio", "pulseaudio-utils", _pacat, automatic=True),
@@ -193,7 +193,7 @@ def playback_devices(nodes: str = "/dev/snd") -> list[str]:
 
 
 def sound_server_sockets(env: Mapping[str, str], *uids: int) -> list[str]:
-    """Return the existing sockets of PulseAudio and PipeWire: those of an environment, these users and the system."""
+    """Return the existing sockets of PulseAudio and PipeWire, of an environment, of some users and of the system."""
     runtime = [env.get("XDG_RUNTIME_DIR"), *(f"/run/user/{each}" for each in uids)]
     found = [f"{each}/{socket}" for each in runtime if each for socket in ("pulse/native", "pipewire-0")]
     found += [f"{each}/native" for each in (env.get("PULSE_RUNTIME_PATH"), _SYSTEM_PULSE) if each]

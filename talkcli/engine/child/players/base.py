@@ -21,16 +21,15 @@ Interest = tuple[int, int]
 
 
 class CannotSpeak(Exception):
-    """The sentence can't be spoken, or its rest can't."""
+    """The sentence, or the rest of it, can't be spoken.
+
+    Args:
+        reason: The reason for programs, such as "audio_lost".
+        message: The reason for people.
+        final: Whether no other player would be heard either, so none is tried.
+    """
 
     def __init__(self, reason: Reason, message: str, *, final: bool = False) -> None:
-        """Initialize the exception.
-
-        Args:
-            reason: The reason for programs, such as "audio_lost".
-            message: The reason for people.
-            final: Whether no other player would be heard either, so none is tried.
-        """
         super().__init__(message)
         self.reason = reason
         self.final = final
@@ -45,7 +44,7 @@ class CannotEnd(Exception):
 
 
 class Player(Protocol):
-    """Plays the samples of one sentence. Each sentence has a player of its own.
+    """A player for the samples of one sentence; every sentence has a player of its own.
 
     A constructor that can't open the output raises CannotSpeak (`no_player` or `audio_device`) and leaves nothing
     open. After that, the playback calls the player from a single thread:
@@ -106,10 +105,10 @@ class Player(Protocol):
         return None
 
     def close(self) -> None:
-        """Note that no more samples follow; the samples taken are played to their end.
+        """Take no more samples, and play those already taken to their end.
 
         Raises:
-            CannotSpeak: They can't be.
+            CannotSpeak: They can't be played to their end.
         """
 
     def ended(self) -> bool:
@@ -122,11 +121,11 @@ class Player(Protocol):
     def interests(self) -> Sequence[Interest]:
         """Return the open descriptors to poll for room, failure or the end.
 
-        POLLOUT on its own means room. It is left out of the wait if there are no samples to offer.
+        The playback leaves out descriptors that only wait for POLLOUT if it has no samples to offer.
         """
 
     def wake_at(self) -> float | None:
-        """Return the monotonic time of the next check, whatever poll reports; None if poll is enough."""
+        """Return the monotonic time at which the player has to be checked again, or None if poll is enough."""
 
     def kill(self) -> None:
         """Fall silent at once and release what can be released; never raises, and may be called again."""

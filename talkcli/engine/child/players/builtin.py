@@ -1,4 +1,4 @@
-"""The players without a program or a sound server: "null", "file:PATH", and the stream of `talk say --output`."""
+"""The players that need neither a program nor a sound server: "null", "file:PATH", and `talk say --output`."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class BuiltInPlayer(Player):
 
 
 class NullPlayer(BuiltInPlayer):
-    """Makes no sound, but takes as long as the sound would.
+    """A player that makes no sound, but takes as long as the sound would.
 
     It is for robots in simulation and for CI, where scripts have to keep their timing.
     """
@@ -103,10 +103,10 @@ class NullPlayer(BuiltInPlayer):
 
 
 class WavPlayer(BuiltInPlayer):
-    """Appends each sentence to a WAV file, which is valid after every sentence and after a stop.
+    """A player that appends each sentence to a WAV file.
 
-    It only writes to files with the plain 44-byte header that it writes itself. If a crash left samples beyond the
-    length in that header, they are cut off.
+    The file is valid after every sentence and after a stop. The player only writes to files with the plain 44-byte
+    header that it writes itself. If a crash left samples beyond the length in that header, they are cut off.
     """
 
     real_time = False
@@ -160,23 +160,18 @@ class WavPlayer(BuiltInPlayer):
 
 
 class WavStreamPlayer(BuiltInPlayer):
-    """Writes a WAV stream to a pipe, a device or a file that the shell has opened, one sentence after another.
+    """A player that writes a WAV stream to a pipe, a device, or a file that the shell has opened.
 
-    The header states unknown lengths, because it can't be rewritten later. The reader sets the pace. Other programs
-    share the descriptor, so it is left in blocking mode and only written to if poll reports room.
+    The sentences follow each other in the stream. The header states unknown lengths, because it can't be rewritten
+    later. The reader sets the pace. Other programs share the descriptor, so its mode isn't changed, and it is only
+    written to if poll reports room.
     """
 
     real_time = False
     name = OUTPUT_STREAM_NAME
 
     def __init__(self, output: int, rate: int, *, first: bool) -> None:
-        """Initialize the player.
-
-        Args:
-            output: An open descriptor.
-            rate: Samples per second.
-            first: Whether this is the first sentence of the stream, which starts with the header.
-        """
+        """Open the player on a descriptor; the `first` sentence of a stream starts with the header."""
         super().__init__()
         self._output = output
         self._header = _WAV_HEADER.pack(*_header_fields(rate, _UNKNOWN_BYTES, _UNKNOWN_BYTES)) if first else b""

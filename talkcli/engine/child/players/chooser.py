@@ -1,4 +1,4 @@
-"""Chooses and opens a player for each sentence, as `--player` and `--device` say.
+"""The choice of a player for each sentence, as `--player` and `--device` say.
 
 No player stays open between two sentences. If a player fails, the playback decides whether the next one is tried.
 """
@@ -36,15 +36,15 @@ IDLE_AFTER_S = 1.0
 #: The number of handovers whose median predicts the next one. The median ignores a late one on a busy machine.
 MAX_HANDOVERS = 5
 
-#: Seconds of silence that are cut at most: half of the pause after a sentence stays, because it separates sentences.
+#: The most seconds of silence to cut. Half of the pause after a sentence stays, because it separates sentences.
 MAX_CUT_S = 0.12
 
-#: Seconds after which the next sentence is no handover: the waiting goal was canceled or held, and another came later.
+#: The longest handover. If it takes longer, the waiting goal was canceled or held, and another one came later.
 MAX_HANDOVER_S = 0.5
 
 
 class HandoverTimes:
-    """Measures how long the change from one sentence to the next takes, and how much silence to cut because of it.
+    """The times that changes from one sentence to the next have taken, and the silence to cut because of them.
 
     A sentence ends with a pause. After it, the player drains and ends, the server is told, and the next sentence
     starts. This makes a queue 25 to 40 ms slower than it should sound. If another goal waits, the playback therefore
@@ -84,15 +84,14 @@ class HandoverTimes:
 
 
 class PlayerChooser:
-    """Opens the players of one engine process, and knows where the current sentence is played."""
+    """The players of one engine process, and the output of the current sentence.
+
+    Args:
+        configure: The engine's settings: the player, the device and so on.
+        inherited: Descriptors that every player program inherits.
+    """
 
     def __init__(self, configure: Configure, inherited: Sequence[int] = ()) -> None:
-        """Initialize the chooser.
-
-        Args:
-            configure: The engine's settings: the player, the device and so on.
-            inherited: Descriptors that every player program inherits.
-        """
         self._configure = configure
         self._inherited = inherited
         self._open_fixed = self._fixed_player()
@@ -180,7 +179,7 @@ class PlayerChooser:
             return None
 
     def _fixed_player(self) -> Callable[[int], Player] | None:
-        """Return the function that opens the configured player for a sample rate; None if programs play."""
+        """Return a function that opens the configured player for a sample rate; None if the player is a program."""
         player, output = self._configure.player or "", self._configure.output_fd
         if output is not None:
             return partial(self._open_stream, output)

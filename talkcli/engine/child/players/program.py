@@ -33,6 +33,7 @@ import time
 from talkcli.engine.child.players.base import CannotSpeak, Player
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.reasons import Reason
+from talkcli.polling import wait_ready
 from talkcli.processes import close, is_held, kill, kill_holders, open_pipes, signal_name
 from talkcli.protocol.lines import LineSplitter
 
@@ -136,9 +137,7 @@ class PlayerProcess:
     def await_end(self, seconds: float) -> None:
         """Block until the program ends, for a limited time; return at once if the system can't report the end."""
         if self.exit is not None and self._status is None:
-            wait = select.poll()
-            wait.register(self.exit, select.POLLIN)
-            wait.poll(seconds * 1000)
+            wait_ready({self.exit: select.POLLIN}, seconds)
 
     def close_stdin(self) -> None:
         """Close the program's standard input."""
@@ -161,7 +160,7 @@ class PlayerProcess:
 
 
 def _spawn(argv: tuple[str, ...], stdin: int, stderr: int, inherited: Sequence[int]) -> int:
-    """Start the program and return its process id; `inherited` is inheritable only meanwhile."""
+    """Start the program and return its process id; the inherited descriptors are inheritable only during the call."""
     actions = [
         (os.POSIX_SPAWN_DUP2, stdin, 0),
         (os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0),
@@ -199,10 +198,10 @@ def _exit_descriptor(pid: int) -> int | None:
 
 
 class ErrorOutput:
-    """Finds the line on a program's standard error that names the error.
+    """The line on a program's standard error that names the error.
 
-    A player may write underrun messages for hours, so only the wanted line is kept. The last line is rarely the wanted
-    one, because some programs print their parameters after the error. The patterns are compiled at the first message;
+    A player may write underrun messages for hours, so no other line is kept. It is rarely the last line, because some
+    programs print their parameters after the error. The patterns are compiled at the first message;
     at the start of each engine process they would cost 1 ms.
     """
 
@@ -232,7 +231,7 @@ class ErrorOutput:
 
 
 class ProgramPlayer(Player):
-    """Plays a sentence through a program that reads samples from its standard input."""
+    """A player that writes its sentence to the standard input of a program."""
 
     real_time = True
 

@@ -52,7 +52,7 @@ class Level:
 
 
 class PulsePlayer(Player):
-    """Plays a sentence as a stream of the sound server."""
+    """A player that streams its sentence to the sound server."""
 
     name = "pulse"
     real_time = True
@@ -63,7 +63,7 @@ class PulsePlayer(Player):
         Args:
             rate: Samples per second.
             device: The name of a sink, or None for the server's choice.
-            audible: Whether a muted output fails the sentence (`muted`).
+            audible: Whether the sentence fails if the output is muted (`muted`).
 
         Raises:
             CannotSpeak: No server answers (`no_player`).
@@ -157,9 +157,9 @@ class PulsePlayer(Player):
         return self._loop.interests if self._loop is not None else []
 
     def wake_at(self) -> float | None:
-        """Return when libpulse has work, or a time limit ends.
+        """Return when libpulse has work to do, or the next time limit ends.
 
-        This is now if there is room, or if the server has just reported the time, because words may be due.
+        That is now if there is room, or if the server has just reported the time, because words may be due.
         """
         report = self._clock_report
         self._run()
@@ -170,7 +170,7 @@ class PulsePlayer(Player):
             times.append(self._ready_by)
         if self._suspended_at is not None:
             times.append(self._suspended_at + SUSPENDED_LIMIT_S)
-        if self._volume_settles():
+        if self._is_volume_pending():
             times.append(self._volume_settled_at)
         if self.proven and self._clock_report is None:
             times.append(self._time_request_at)
@@ -194,7 +194,7 @@ class PulsePlayer(Player):
     @property
     def output(self) -> Output | None:
         sink, stream = self._sink_level, self._stream_level
-        if self.device is None or sink is None or stream is None or self._volume_settles():
+        if self.device is None or sink is None or stream is None or self._is_volume_pending():
             return None
         volume = stream.volume if sink.flat else sink.volume * stream.volume
         return Output(self.name, self.device, round(min(1.0, volume), 2), self._muted)
@@ -213,7 +213,7 @@ class PulsePlayer(Player):
             pass
 
     def _advance(self) -> bool:
-        """Take the stream's next step, and return whether libpulse may have work because of it."""
+        """Take the next step in the stream's life, and return whether libpulse may have work because of it."""
         if self._error is not None or self._drained:
             return False
         state = self._lib.context_get_state(self._context)
@@ -269,7 +269,7 @@ class PulsePlayer(Player):
             if begins:
                 self._lib.context_set_subscribe_callback(self._context, self._change_callback, None)
                 mask = libpulse.MASK_SINK | libpulse.MASK_SINK_INPUT
-                self._start(self._lib.context_subscribe(self._context, mask, None, None))
+                self._release(self._lib.context_subscribe(self._context, mask, None, None))
                 self._request_stream_level()
         self._check_mute()
         if not self._lib.stream_is_suspended(self._stream):
@@ -289,20 +289,20 @@ class PulsePlayer(Player):
         if not self.proven or self._clock_report or due is None or time.monotonic() < due:
             return False
         self._time_request_at = None
-        self._start(self._lib.stream_update_timing_info(self._stream, None, None))
+        self._release(self._lib.stream_update_timing_info(self._stream, None, None))
         return True
 
     def _request_sink_level(self) -> None:
         index = self._sink_index
-        self._start(self._lib.context_get_sink_info_by_index(self._context, index, self._sink_callback, None))
+        self._release(self._lib.context_get_sink_info_by_index(self._context, index, self._sink_callback, None))
 
     def _request_stream_level(self) -> None:
         self._pending_levels += 1
         index = self._lib.stream_get_index(self._stream)
-        self._start(self._lib.context_get_sink_input_info(self._context, index, self._stream_callback, None))
+        self._release(self._lib.context_get_sink_input_info(self._context, index, self._stream_callback, None))
 
-    def _start(self, operation: int | None) -> None:
-        """Let an operation run; if it couldn't be created, the context has failed and its state says so."""
+    def _release(self, operation: int | None) -> None:
+        """Release an operation, which goes on; if it is None, the context has failed, and its state says so."""
         if operation is not None:
             self._lib.operation_unref(operation)
 
@@ -324,8 +324,8 @@ class PulsePlayer(Player):
         room = self._lib.stream_writable_size(self._stream)
         return 0 if room == libpulse.SIZE_ERROR else room // SAMPLE_BYTES * SAMPLE_BYTES
 
-    def _volume_settles(self) -> bool:
-        """Return whether the stream's volume is still to be set by the server."""
+    def _is_volume_pending(self) -> bool:
+        """Return whether the server has yet to set the stream's volume."""
         level = self._stream_level
         if level is None or level.volume > 0 or level.muted or self._drained:
             return False
@@ -334,18 +334,18 @@ class PulsePlayer(Player):
     def _check_mute(self) -> None:
         """Record whether the output is muted now; once muted, the sentence counts as muted."""
         levels = [each for each in (self._sink_level, self._stream_level) if each is not None]
-        if self._drained or self._volume_settles() or not any(each.muted or each.volume == 0 for each in levels):
+        if self._drained or self._is_volume_pending() or not any(each.muted or each.volume == 0 for each in levels):
             return
         self._muted = True
         if self._audible and self._error is None:
             self._error = CannotSpeak(Reason.MUTED, f"the output is muted: {self.device}", final=True)
 
     def _restart_clock(self) -> None:
-        """Ask for the time again after it stood still: before the stream began, after it ran dry, or during a sleep."""
+        """Ask for the time again, after it stood still because the stream had not begun, ran dry or was suspended."""
         self._clock_report, self._time_request_at = None, 0.0
 
     def _fail(self, reason: Reason) -> None:
-        """Record a failure, in the words of libpulse's error number."""
+        """Record that the stream has failed, with a message for libpulse's error number."""
         if self._error is not None:
             return
         number = self._lib.context_errno(self._context)

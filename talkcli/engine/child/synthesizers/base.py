@@ -31,7 +31,7 @@ class SpeechSettings:
 
 
 class SampleSink(Protocol):
-    """Receives the samples and words of one sentence; the playback is one.
+    """A receiver of the samples and words of one sentence, such as the playback.
 
     Each method may block for as long as the sentence is held. Each may raise Stopped if the sentence has to end, or
     CannotSpeak if it can't be played. After that, the sink must not be called again.
@@ -68,10 +68,10 @@ class SampleSink(Protocol):
 
 
 class Synthesizer(Protocol):
-    """Turns texts into samples and words, one text at a time, in the voice that was loaded last.
+    """A converter of texts into samples and words, in the voice that was loaded last.
 
-    Only the thread that made the synthesizer calls it, and the synthesizer calls its sink in that thread only. It
-    raises NotInstalled when it is made if a part of it is missing.
+    Only the thread that made the synthesizer calls it, and the synthesizer calls its sink in that thread only. The
+    constructor raises NotInstalled if a part of the synthesizer is missing.
     """
 
     #: the synthesizer's name for people, such as "eSpeak NG 1.51 (system)", or None

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class CombinedSynthesizer:
-    """Speaks each voice with the synthesizer that has it: libespeak-ng or Piper."""
+    """A synthesizer that speaks every voice, with libespeak-ng or with Piper."""
 
     def __init__(self, espeak: Espeak | None = None) -> None:
         self._espeak = espeak or Espeak()
@@ -89,10 +89,14 @@ class CombinedSynthesizer:
 
 
 class _WatchedSink:
-    """Passes a sentence on to a sink, and records whether it has any words or samples yet."""
+    """A sink that passes a sentence on, and records whether it has any words or samples yet.
+
+    Args:
+        sink: The sink that gets the sentence.
+        why: Why another voice speaks than was asked for, for people.
+    """
 
     def __init__(self, sink: SampleSink, why: str | None = None) -> None:
-        """Initialize the sink; `why` says why another voice speaks than was asked for."""
         self._sink = sink
         self._why = why
         self.used = False

@@ -228,9 +228,9 @@ class Espeak:
     def lend(self, language: str) -> Iterator[EspeakPhonemizer]:
         """Lend the library as a phonemizer, which another thread may use until the end of the `with` block.
 
-        The synthesizer must not be used meanwhile. After the block, calls of the phonemizer raise Stopped. The end of
-        the block doesn't wait for a call in progress: it ends within milliseconds, or 130 ms for phonemes, and the next
-        use of the library waits for that.
+        The synthesizer must not be used meanwhile. After the block, calls of the phonemizer raise Stopped. A call that
+        is in progress at the end of the block goes on for some milliseconds, or up to 130 ms if it asks for phonemes.
+        The block doesn't wait for it, but the next use of the library does.
 
         Raises:
             UnknownVoice: The library has no voice of this language.
@@ -295,10 +295,14 @@ class Espeak:
 
 
 class EspeakPhonemizer:
-    """libespeak-ng as a `phonemes.Phonemizer`: it makes no sound. Texts pass through the guard here too."""
+    """libespeak-ng as a `phonemes.Phonemizer`, which makes no sound.
+
+    Args:
+        espeak: The binding of the library.
+        voice: The id of the library's current voice.
+    """
 
     def __init__(self, espeak: Any, voice: str) -> None:
-        """Initialize the phonemizer; `voice` is the id of the library's current voice."""
         import threading
 
         self._espeak = espeak

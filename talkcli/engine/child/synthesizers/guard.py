@@ -1,4 +1,4 @@
-"""Replace the few characters of a text that would crash libespeak-ng.
+"""The guard before libespeak-ng, which replaces the few characters of a text that would crash the library.
 
 The module is pure. It replaces a character by a single one, so every position in the text stays the same. Ordinary text
 must pass unchanged: a rule looks for a known cause of a crash, states where its numbers come from, and does nothing
@@ -51,7 +51,7 @@ _LONG_RUN = re.compile(rf"\S{{{_MAX_WORD_APOSTROPHES + 1},}}")
 _SYMBOL_LETTERS = frozenset(map(chr, (*range(0x2460, 0x2500), *range(0x2800, 0x2900))))
 #: The ends of a clause: Western punctuation if a blank, a bracket or nothing follows, and other punctuation anywhere.
 _CLAUSE_END = re.compile(r"[.,;:!?…](?:[\s()\[\]{}<>\"«»“”‘’„]|\Z)|[。、，！？：；︒؟،؛।॥։՝]|\n\s*\n")
-#: The clearest of those ends; a clause certainly ends here.
+#: The ends of a clause that are certain.
 _CERTAIN_CLAUSE_END = re.compile(r"[,;:!?]\s|\.\s+[A-Z]")
 #: A hyphen between a symbol and a letter.
 _HYPHEN = re.compile(r"(?<=[^\w\s]|_)-(?=[^\W\d_])")

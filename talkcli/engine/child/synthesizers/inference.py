@@ -1,4 +1,4 @@
-"""Run a Piper voice's model with onnxruntime, in two halves, and cache the halves for the next start.
+"""The models of Piper voices in onnxruntime, as two halves each, and the cache of these halves.
 
 The encoder turns phoneme ids into frames, and the decoder turns any part of the frames into samples. A model runs only
 in the thread that calls it: onnxruntime must not start any, so a voice uses one processor, and none while nobody
@@ -162,7 +162,7 @@ class Frames:
 
 
 class Run:
-    """The model runs of one sentence, which can be ended."""
+    """The handle of all runs of a model for one sentence, which can end them."""
 
     def __init__(self) -> None:
         import onnxruntime
@@ -176,7 +176,7 @@ class Run:
 
 
 class Model:
-    """A loaded model."""
+    """A loaded model of a Piper voice."""
 
     def __init__(self, path: str, description: VoiceDescription, cache: ModelCache | None = None) -> None:
         """Load a model, which takes 0.3 to 3 s; most of that is saved if the cache has its halves.

@@ -34,7 +34,7 @@ _T = TypeVar("_T")
 
 
 class BackgroundIterator(threading.Thread, Generic[_T]):
-    """Runs an iterator in a thread, some items ahead of the thread that takes them."""
+    """A thread that runs an iterator, some items ahead of the thread that takes them."""
 
     def __init__(self, items: Iterator[_T], max_ahead: int) -> None:
         """Start the thread; it pauses while `max_ahead` items wait to be taken."""

@@ -1,4 +1,4 @@
-"""Split a text into parts for a neural voice: phonemes from libespeak-ng, with the positions of the words.
+"""The parts of a text that a neural voice speaks: phonemes from libespeak-ng, with the positions of the words.
 
 libespeak-ng returns the phonemes of each clause with blanks between words, and separately, for its own speech, the
 positions of the words in the text. It joins some words ("in the") and splits others ("1,000"), so the two lists have to
@@ -48,7 +48,10 @@ _LANGUAGE_MARK = re.compile(r"\([^()]*\)")
 
 
 class Phonemizer(Protocol):
-    """Knows the phonemes of a language: libespeak-ng with one of its voices. Positions are characters from 0."""
+    """A source of the phonemes of a language: libespeak-ng with one of its voices.
+
+    Positions are characters from 0.
+    """
 
     def clauses(self, text: str) -> list[tuple[str, str]]:
         """Return the clauses of a text, which add up to the text, each with its phonemes in IPA."""

@@ -32,10 +32,10 @@ if TYPE_CHECKING:
     from talkcli.engine.child.synthesizers.phonemes import SpeechPart
     from talkcli.engine.protocol import Voice
 
-#: The frames that are decoded at a time, at first and at most. The first 0.23 s of sound are ready soon; later parts
-#: have 0.93 s, because each also decodes some frames on both sides (`inference.CONTEXT_FRAMES`).
+#: The numbers of frames that are decoded at a time, at first and at most. The first 0.23 s of sound are ready soon. Later
+#: parts have up to 0.93 s, because each has to decode some frames on both sides as well (`inference.CONTEXT_FRAMES`).
 _MIN_DECODED_FRAMES, _MAX_DECODED_FRAMES = 20, 80
-#: The decoded parts that may wait, up to seven seconds, so that a slow moment of the machine isn't heard.
+#: The most decoded parts that may wait, up to seven seconds, so that a slow moment of the machine is not heard.
 _MAX_PARTS_AHEAD = 8
 #: Seconds between the last audible sound of a sentence and its end. libespeak-ng makes 0.24 to 0.28, and a player may
 #: end 0.25 s early. A model makes 0.07 to 0.2 s of sound below the second value, which is relative to full scale.
@@ -70,12 +70,11 @@ class SpokenPart:
 
 
 class Piper:
-    """All neural voices as one synthesizer."""
+    """The synthesizer for all neural voices; it uses libespeak-ng only while it speaks."""
 
     version: str | None = None
 
     def __init__(self, espeak: Espeak) -> None:
-        """Initialize the synthesizer; it uses `espeak` only while it speaks."""
         self._espeak = espeak
         self.loader = ModelLoader()
         self.voice = ""
@@ -230,10 +229,10 @@ def _speak_parts(
 
 
 def _word_time(model: Model, part: SpeechPart, places: Sequence[int], begins: Sequence[int], at: int) -> float:
-    """Return the second of a part at which the word is heard that begins with the phoneme at index `at`.
+    """Return when a word is heard, in seconds from the start of its part.
 
-    Compared with a recognizer's alignment of 300 words at 120, 200 and 300 words per minute, it is at most 9 ms early
-    in the median. The beginning of the word's own first phoneme is 41 to 93 ms late.
+    In the median, the result is at most 9 ms early, where the start of the word's first phoneme would be 41 to 93 ms
+    late. This was measured with a recognizer's alignment of 300 words at 120, 200 and 300 words per minute.
 
     Args:
         model: The model.
@@ -281,8 +280,8 @@ def _phoneme_ids(phonemes: Sequence[str], ids: Mapping[str, tuple[int, ...]]) ->
 
 
 def _duration_scale(rate: int) -> float:
-    """Return the factor of all durations that makes a sentence as long as libespeak-ng's at some words per minute.
+    """Return the factor of all durations for a rate in words per minute.
 
-    Above 400 words per minute, the model is slower than libespeak-ng, because no phoneme is shorter than a frame.
+    With it, a sentence takes as long as with libespeak-ng. Above 400 words per minute, the model is slower than libespeak-ng, because no phoneme is shorter than a frame.
     """
     return max(_MIN_SCALE, (_NATURAL_WPM / rate - _CONSTANT_SHARE) / (1 - _CONSTANT_SHARE))

@@ -1,4 +1,4 @@
-"""Split a Piper voice's model (VITS, in ONNX) into an encoder and a decoder.
+"""The split of a Piper voice's model (VITS, in ONNX) into an encoder and a decoder.
 
 The encoder turns phoneme ids into frames, and the decoder frames into samples. The decoder looks at no more than some
 frames around each sample, so it can run on a part at a time. The encoder also outputs for how many frames each phoneme
@@ -102,7 +102,7 @@ def split_model(model: Buffer) -> ModelHalves:
 
 
 class _Reader:
-    """Reads the messages of one model, and limits the number of their fields."""
+    """A reader of the messages of one model, which limits the number of their fields."""
 
     def __init__(self) -> None:
         self._fields_left = _MAX_FIELDS
