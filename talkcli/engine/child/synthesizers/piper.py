@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from talkcli.engine.child.synthesizers.phonemes import SpeechPart
     from talkcli.engine.protocol import Voice
 
-#: The numbers of frames that are decoded at a time, at first and at most. The first 0.23 s of sound are ready soon. Later
-#: parts have up to 0.93 s, because each has to decode some frames on both sides as well (`inference.CONTEXT_FRAMES`).
+#: The numbers of frames that are decoded at a time, at first and at most. The first 0.23 s of sound are ready soon.
+#: Later parts have up to 0.93 s, because each also decodes some frames on both sides (`inference.CONTEXT_FRAMES`).
 _MIN_DECODED_FRAMES, _MAX_DECODED_FRAMES = 20, 80
 #: The most decoded parts that may wait, up to seven seconds, so that a slow moment of the machine is not heard.
 _MAX_PARTS_AHEAD = 8
@@ -282,6 +282,7 @@ def _phoneme_ids(phonemes: Sequence[str], ids: Mapping[str, tuple[int, ...]]) ->
 def _duration_scale(rate: int) -> float:
     """Return the factor of all durations for a rate in words per minute.
 
-    With it, a sentence takes as long as with libespeak-ng. Above 400 words per minute, the model is slower than libespeak-ng, because no phoneme is shorter than a frame.
+    With it, a sentence takes as long as with libespeak-ng. Above 400 words per minute, the model is slower, because no
+    phoneme is shorter than a frame.
     """
     return max(_MIN_SCALE, (_NATURAL_WPM / rate - _CONSTANT_SHARE) / (1 - _CONSTANT_SHARE))
