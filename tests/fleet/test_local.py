@@ -11,10 +11,13 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli import __version__
+from talkcli.client.core import Exchange
 from talkcli.errors import Busy, ServerUnavailable
 from talkcli.fleet.bridge.local import dial
+from talkcli.goals.options import Say
 from talkcli.protocol.events import busy_greeting, greeting
-from talkcli.protocol.lines import encode
+from talkcli.protocol.lines import decode, encode
+from talkcli.protocol.requests import Status
 from tests.fleet.conftest import in_loop
 from tests.support.surroundings import short_directory
 
@@ -71,11 +74,11 @@ async def test_a_server_may_greet_at_once_or_later_or_in_pieces(
             server.sendall(each)
         local = await dialing
         assert (local.boot, local.pid) == ("a1b2", 7)
-        local.write(b"asked\n")
+        assert local.send(Exchange(Status()))
         server.sendall(b"answered\n")
         assert await asyncio.to_thread(lines, server, 2) == [
             encode({"request": "hello", "name": "bob"}),
-            b"asked\n",
+            encode({"seq": 1, "request": "status"}),
         ]
         heard = [each for _ in range(len(parts[-1].splitlines())) for each in await local.read()]
         assert heard == [*parts[-1].splitlines()[1:], b"answered"]
@@ -85,13 +88,15 @@ async def test_a_server_may_greet_at_once_or_later_or_in_pieces(
 
 @in_loop
 async def test_lines_that_the_server_does_not_take_at_once_come_later_and_in_order(listening: socket.socket) -> None:
-    sent = [b"%d " % each + b"x" * 60_000 + b"\n" for each in range(50)]
+    texts = [f"{each} " + "x" * 60_000 for each in range(50)]
     async with greeted(listening) as (local, server):
-        for each in sent:
-            local.write(each)
-        assert (await asyncio.to_thread(lines, server, 51))[1:] == sent
-        local.write(b"and more\n")
-        assert await asyncio.to_thread(lines, server, 1) == [b"and more\n"]
+        for each in texts:
+            assert local.send(Exchange(Say(each)))
+        assert not local.send(Exchange(Say("x" * 70_000)))
+        sent = (await asyncio.to_thread(lines, server, 51))[1:]
+        assert [decode(each)["text"] for each in sent] == texts
+        assert local.send(Exchange(Status()))
+        assert decode((await asyncio.to_thread(lines, server, 1))[0])["request"] == "status"
         local.close()
 
 
@@ -104,7 +109,7 @@ async def test_a_read_ends_with_the_connection(listening: socket.socket, who: st
         (server if who == "the server" else local).close()
         assert await reading == []
         for _ in range(2):
-            local.write(b"to nobody\n")
+            local.send(Exchange(Status()))
             local.close()
         assert await local.read() == []
 
@@ -140,9 +145,9 @@ async def test_a_connection_on_which_a_line_can_not_be_sent_has_ended(listening:
         reading = asyncio.create_task(local.read())
         await asyncio.sleep(0)
         server.shutdown(socket.SHUT_RD)
-        local.write(b"asked\n")
+        local.send(Exchange(Status()))
         assert await reading == []
-        local.write(b"asked again\n")
+        local.send(Exchange(Status()))
         local.close()
 
 
@@ -185,7 +190,7 @@ async def test_a_dial_that_is_cancelled_keeps_its_slot_until_the_server_has_gree
 async def test_a_dial_without_a_free_descriptor_gives_its_slot_back(
     listening: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def none_left(_: str | None) -> None:
+    def none_left(*_: object) -> None:
         raise OSError("Too many open files")
 
     monkeypatch.setattr("talkcli.client.connect.reach", none_left)

@@ -1,6 +1,6 @@
-"""The bridge's connections to the robot's own server, as sockets in the event loop.
+"""The bridge's connections to the robot's own server: shells around the client core, in the event loop.
 
-Only the greeting is read here. All other lines pass undecoded.
+They pass lines undecoded, so that their owner decides which lines to read.
 """
 
 from __future__ import annotations
@@ -11,41 +11,64 @@ import contextlib
 import random
 from typing import TYPE_CHECKING
 
-from talkcli import paths
+from talkcli import __version__, paths, peers
 from talkcli.client import connect
-from talkcli.errors import Busy, TalkError
-from talkcli.frozen import replace
-from talkcli.protocol.lines import LineSplitter, encode
+from talkcli.client.core import ClientCore, identity, read_greeting
+from talkcli.errors import AccessDenied, Busy, ServerUnavailable, TalkError
+from talkcli.protocol.lines import MAX_LINE_BYTES, request_line
 
 if TYPE_CHECKING:
-    from talkcli.client.connect import ConnectionAttempt
+    from talkcli.client.core import Exchange
     from talkcli.goals.goal import JsonObject
 
-_READ_BYTES = 64 * 1024
-#: Pause before another try if the server is busy. Random, so that many clients don't come back together.
+_RECEIVE_BYTES = 64 * 1024
+#: Range of the pause before another attempt if the server is busy. It is random, so that many clients don't come back
+#: together.
 _BUSY_PAUSE_S = (0.02, 0.2)
 
 
-class LocalConnection:
+class LocalConnection(ClientCore):
     """A connection to the server of this machine, used by one reader.
 
     It uses the loop directly. With asyncio's streams and a thread that connects, a cancel of a thousand robots on one
     machine took 1.2 times as long.
     """
 
-    def __init__(self, greeted: ConnectionAttempt) -> None:
-        """`greeted` is a connection whose greeting has been read."""
-        assert greeted.socket
-        self.path, self.boot, self.pid = greeted.path, greeted.boot, greeted.pid
-        self._socket = greeted.socket
+    def __init__(self, socket: _socket.socket, path: str) -> None:
+        """`socket` is connected to the server at `path` and doesn't block."""
         self._loop = asyncio.get_running_loop()
-        self._splitter = LineSplitter()
-        self._lines = self._splitter.feed(greeted.received)
-        #: what the server has not accepted yet
-        self._unsent = bytearray()
+        super().__init__(connect.ANSWER_LIMIT_S, self._loop.time())
+        self.path = path
+        self._socket = socket
+        self._lines: list[bytes] = []
         #: done as soon as there may be something to read
         self._readable: asyncio.Future[None] | None = None
         self._closed = False
+
+    async def greet(self, hello: JsonObject) -> None:
+        """Say hello, and wait for the server's greeting. The connection is closed if there is none that can be used.
+
+        Raises:
+            ServerUnavailable, AccessDenied, ProtocolMismatch, Busy: the server can't be used.
+        """
+        self.connecting(request_line(hello), __version__)
+        self._flush()
+        pid, _ = peers.credentials(self._socket)
+        limit = self._loop.call_later(connect.ANSWER_LIMIT_S, self.close)
+        try:
+            first, *self._lines = await self.read() or [b""]
+            if not first and self._closed:
+                hint = f"look at process {pid}, and restart it if it hangs"
+                raise ServerUnavailable(f"the server at {self.path} does not answer; {hint}")
+            if not first:
+                raise ServerUnavailable(f"the server at {self.path} closed the connection before it answered")
+            greeting = read_greeting(first, self.path, __version__)
+        except BaseException:
+            self.close()
+            raise
+        finally:
+            limit.cancel()
+        self.connected(*identity(greeting), self._loop.time())
 
     async def read(self) -> list[bytes]:
         """Return the lines that have come, without their newlines. Wait for the first; none if the connection ended."""
@@ -53,16 +76,22 @@ class LocalConnection:
             data = await self._receive()
             if not data:
                 return []
-            self._lines = self._splitter.feed(data)
+            self._lines = self.split(data, self._loop.time())
         lines, self._lines = self._lines, []
         return lines
 
-    def write(self, line: bytes) -> None:
-        """Send a line as soon as the server accepts it."""
-        waits = bool(self._unsent)
-        self._unsent += line
-        if not waits:
-            self._send()
+    def send(self, exchange: Exchange) -> bool:
+        """Send a request as soon as the server accepts it. Return False if it is too long."""
+        self.register(exchange, self._loop.time())
+        line = self.line(exchange)
+        if len(line) > MAX_LINE_BYTES:
+            self.forget(exchange)
+            return False
+        with contextlib.suppress(ServerUnavailable):  # the reader finds that the connection has ended
+            self.queue(line, exchange)
+        if len(line) == self.unsent_bytes:  # else the loop is waiting for the server
+            self._flush()
+        return True
 
     def close(self) -> None:
         """Close the connection now. The server cancels unanswered requests if that is still possible."""
@@ -78,7 +107,7 @@ class LocalConnection:
         await asyncio.sleep(0)  # lets other tasks run if the server sends a lot
         while not self._closed:
             try:
-                return self._socket.recv(_READ_BYTES)
+                return self._socket.recv(_RECEIVE_BYTES)
             except BlockingIOError:
                 pass
             except OSError:
@@ -96,20 +125,20 @@ class LocalConnection:
         if self._readable and not self._readable.done():
             self._readable.set_result(None)
 
-    def _send(self) -> None:
+    def _flush(self) -> None:
         if self._closed:
             return
         try:
-            del self._unsent[: self._socket.send(self._unsent)]
+            self.mark_sent(self._socket.send(self.outgoing()))
         except BlockingIOError:
             pass
-        except OSError:
+        except OSError as error:
             # A part of a line may have been sent, so nothing may follow. The reader finds that the connection ended.
-            self._unsent.clear()
+            self.stop_sending("the server went away", str(error))
             with contextlib.suppress(OSError):
                 self._socket.shutdown(_socket.SHUT_RDWR)
-        if self._unsent:
-            self._loop.add_writer(self._socket, self._send)
+        if self.outgoing():
+            self._loop.add_writer(self._socket, self._flush)
         else:
             self._loop.remove_writer(self._socket)
 
@@ -149,48 +178,22 @@ def _discard(dialing: asyncio.Task[LocalConnection]) -> None:
 async def _dial(place: str | None, hello: JsonObject) -> LocalConnection:
     loop = asyncio.get_running_loop()
     give_up = loop.time() + connect.BUSY_LIMIT_S
+    failures: tuple[tuple[str, Exception], ...] = ()
     while True:
-        attempt = connect.reach(place)
-        try:
-            attempt = await _await_greeting(attempt, hello)
-            return LocalConnection(connect.connect(place, hello, 0, attempt=attempt))
-        except TalkError as error:
-            if not (attempt.backlog_full or isinstance(error, Busy)) or loop.time() > give_up:
-                raise
-        except asyncio.CancelledError:
-            if attempt.socket:
-                attempt.socket.close()
-            raise
+        attempt = connect.reach(place, failures)
+        failures = ()
+        if attempt.socket:
+            connection = LocalConnection(attempt.socket, attempt.path)
+            try:
+                await connection.greet(hello)
+                return connection
+            except AccessDenied as denied:  # try the next place
+                failures = (*attempt.failures, (attempt.path, denied))
+                continue
+            except Busy as busy:
+                error: TalkError = busy
+        else:
+            error = connect.unreachable(attempt, place)
+        if not (attempt.backlog_full or isinstance(error, Busy)) or loop.time() > give_up:
+            raise error
         await asyncio.sleep(random.uniform(*_BUSY_PAUSE_S))
-
-
-async def _await_greeting(attempt: ConnectionAttempt, hello: JsonObject) -> ConnectionAttempt:
-    """Say hello, and return the connection with what the server has said within the limit for a greeting."""
-    connected, received = attempt.socket, bytearray()
-    if not connected:
-        return attempt
-    loop = asyncio.get_running_loop()
-    done = loop.create_future()
-
-    def finish() -> None:
-        if not done.done():
-            done.set_result(None)
-
-    def read() -> None:
-        data = b""
-        with contextlib.suppress(OSError):
-            data = connected.recv(_READ_BYTES)
-        received.extend(data)
-        if not data or b"\n" in data:
-            finish()
-
-    with contextlib.suppress(OSError):  # the server has hung up, but may have said why
-        connected.send(encode(hello))
-    loop.add_reader(connected, read)
-    limit = loop.call_later(connect.ANSWER_LIMIT_S, finish)
-    try:
-        await done
-    finally:
-        limit.cancel()
-        loop.remove_reader(connected)
-    return replace(attempt, hello_sent=True, received=bytes(received))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from talkcli.errors import BadRequest, LineTooLong
 from talkcli.fleet import topics
-from talkcli.frozen import frozen
+from talkcli.frozen import frozen, replace
 from talkcli.goals.goal import By, Goal, Sender
 from talkcli.goals.option import MAX_NAME
 from talkcli.goals.options import SHOWN, Say
@@ -60,28 +60,25 @@ class RemoteRequest:
     reply_topic: str | None
     seq: int | None
     request: Request
-    #: the request as it came, without `seq`
-    fields: JsonObject
     correlation: bytes | None = None
     #: size of the payload, which counts while the request waits
     size_bytes: int = 0
     #: when its goal must have started, by the clock of `judge`; None for no limit
     start_by: float | None = None
 
-    def to_json(self, now: float, goal_id: str | None) -> JsonObject:
-        """Return the request for the server, without `seq`.
+    def say(self, goal_id: str, now: float) -> Say:
+        """Return the `say` for the server, with an id, and with a ttl that respects the expiry of the message.
 
         Args:
+            goal_id: the goal's id.
             now: the current time by the clock of `judge`.
-            goal_id: the id of the goal to say, None for other requests.
         """
-        fields = dict(self.fields)
-        if goal_id is not None:
-            fields["id"] = goal_id
-        if self.start_by is not None and isinstance(self.request, Say):
+        assert isinstance(self.request, Say)
+        ttl = self.request.ttl
+        if self.start_by is not None:
             left = max(_EXPIRED_TTL_S, self.start_by - now)
-            fields["ttl"] = min(self.request.ttl or left, left)
-        return fields
+            ttl = min(ttl or left, left)
+        return replace(self.request, id=goal_id, ttl=ttl)
 
 
 @frozen
@@ -159,7 +156,7 @@ class Policy:
             return Refusal(reply_topic, seq, correlation, error)
         start_by = None if message.expiry is None else now + message.expiry
         size = 0 if topic.kind == topics.PLAIN_CANCEL else len(message.payload)
-        return RemoteRequest(topic.user, reply_topic, seq, request, fields, correlation, size, start_by)
+        return RemoteRequest(topic.user, reply_topic, seq, request, correlation, size, start_by)
 
 
 def _request_fields(kind: str, payload: bytes) -> JsonObject:

@@ -10,17 +10,18 @@ import asyncio
 import random
 from typing import TYPE_CHECKING
 
+from talkcli.client.core import Exchange
 from talkcli.daemon import log
 from talkcli.errors import BadRequest, ServerUnavailable, TalkError
 from talkcli.fleet import topics
 from talkcli.fleet.bridge.local import dial
 from talkcli.fleet.payloads import LastGoal, RobotStatus
 from talkcli.frozen import replace
-from talkcli.goals.goal import Goal
 from talkcli.goals.option import MAX_LOG
 from talkcli.goals.states import State
-from talkcli.protocol.events import PausedChanged, ServerStatus, StateChanged, from_json, unfinished
+from talkcli.protocol.events import PausedChanged, ServerStatus, StateChanged, from_json, goals, unfinished
 from talkcli.protocol.lines import decode, encode
+from talkcli.protocol.requests import Log, Watch
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
     from talkcli.fleet.bridge.local import LocalConnection
     from talkcli.fleet.bridge.session import RemoteSessions
-    from talkcli.goals.goal import JsonObject
+    from talkcli.goals.goal import Goal, JsonObject
 
     class PublishToAll(Protocol):
         """Publishes a message for everybody if the broker is there."""
@@ -50,8 +51,6 @@ _MAX_TEXT_CHARS = 1_000
 _SERVER_SILENCE_LIMIT_S = 15.0
 #: Longest pause before the first try to find the server again, and before later tries. The pause is random.
 _FIRST_RETRY_S, _LAST_RETRY_S = 0.2, 5.0
-# Numbers of the requests: the log, so that goals of an earlier bridge are known, and then the watch.
-_LOG_SEQ, _WATCH_SEQ = 1, 2
 
 
 class Publisher:
@@ -77,8 +76,6 @@ class Publisher:
         self._connection: LocalConnection | None = None
         #: when the server was last heard, by the loop's clock
         self._heard_at = 0.0
-        #: items of the reply to the watch
-        self._items: list[JsonObject] = []
         #: texts of the goals that have not ended, and the goal that is being spoken
         self._texts: dict[str, str | None] = {}
         self._active: str | None = None
@@ -97,8 +94,8 @@ class Publisher:
             try:
                 self._connection = await dial(self._sessions.socket, "talk bridge")
                 self._heard_at = self._loop.time()
-                self._items.clear()
-                self._connection.write(encode({"seq": _LOG_SEQ, "request": "log", "count": MAX_LOG}))
+                # The log comes first, so that the goals of an earlier bridge are known.
+                self._connection.send(Exchange(Log(MAX_LOG), self._on_log, lambda _: self._watch()))
                 try:
                     while lines := await self._connection.read():
                         self._receive(lines)
@@ -137,28 +134,35 @@ class Publisher:
     def _receive(self, lines: list[bytes]) -> None:
         server = self._connection
         assert server
-        self._heard_at = self._loop.time()
+        now = self._heard_at = self._loop.time()
         for line in lines:
             try:
                 message = decode(line)
-                if message.get("seq") == _LOG_SEQ:
-                    if "goal" in message:
-                        self._sessions.remember(Goal.from_json(message["goal"]), server.boot)
-                    elif "ok" in message:
-                        server.write(encode({"seq": _WATCH_SEQ, "request": "watch"}))
-                elif message.get("seq") != _WATCH_SEQ:
+                if "event" in message:
                     self._receive_event(server, message, line)
-                elif "ok" not in message:
-                    self._items.append(message)
-                elif message["ok"] is not True:
-                    raise ServerUnavailable(f"the server at {server.path} can't be watched: {message.get('error')}")
                 else:
-                    self._server_came(server, ServerStatus.from_reply(message, self._items))
-                    self._items.clear()
+                    server.dispatch(message, now)
             except (BadRequest, ValueError) as error:
                 log.write_limited("line", f"what the server says can't be read: {log.sanitize(str(error))}")
 
-    def _server_came(self, server: LocalConnection, status: ServerStatus) -> None:
+    def _on_log(self, _reply: JsonObject, items: list[JsonObject]) -> None:
+        server = self._connection
+        assert server
+        for goal in goals(items, "goal"):
+            self._sessions.remember(goal, server.boot)
+        self._watch()
+
+    def _watch(self) -> None:
+        if self._connection:
+            self._connection.send(Exchange(Watch(), self._on_watch, self._on_refused))
+
+    def _on_refused(self, error: TalkError) -> None:
+        assert self._connection
+        raise ServerUnavailable(f"the server at {self._connection.path} can't be watched: {error}")
+
+    def _on_watch(self, reply: JsonObject, items: list[JsonObject]) -> None:
+        server, status = self._connection, ServerStatus.from_reply(reply, items)
+        assert server
         self._retry_s = _FIRST_RETRY_S
         for each in unfinished(status):
             self._sessions.remember(each, server.boot)

@@ -12,11 +12,13 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING
 
+from talkcli.client.core import Exchange
 from talkcli.daemon import log
 from talkcli.errors import BadRequest, Busy, TalkError
 from talkcli.fleet.bridge import policy
 from talkcli.fleet.bridge.local import dial
 from talkcli.fleet.link import boottime
+from talkcli.frozen import replace
 from talkcli.goals.goal import By, Sender
 from talkcli.goals.options import Cancel, Say, Set
 from talkcli.goals.states import State
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
     from talkcli.fleet.bridge.policy import RemoteRequest
     from talkcli.goals.goal import Goal, JsonObject
     from talkcli.protocol.events import StateChanged
+    from talkcli.protocol.requests import Request
 
     #: Publishes lines: topic, payload, QoS, correlation data.
     Publish = Callable[[str, bytes, int, bytes | None], None]
@@ -215,11 +218,16 @@ class RemoteSessions:
         self.schedule_release()
 
 
-class _Sent:
-    """A request that was sent to the server and not answered yet."""
+class _RemoteExchange(Exchange):
+    """An exchange with the server for a remote client."""
 
-    def __init__(self, request: RemoteRequest, goal_id: str | None = None, *, fresh: bool = False) -> None:
-        self.request = request
+    __slots__ = ("canceled", "fresh", "goal_id", "remote")
+
+    def __init__(
+        self, remote: RemoteRequest, request: Request, goal_id: str | None = None, *, fresh: bool = False
+    ) -> None:
+        super().__init__(request)
+        self.remote = remote
         #: for a goal: the id that it was sent with, and whether it was never sent before
         self.goal_id, self.fresh = goal_id, fresh
         #: for a cancel: the goals that it ended before they reached the server
@@ -247,8 +255,6 @@ class RemoteSession:
         self._task: asyncio.Task[None] | None = None
         #: requests that wait for the connection
         self._queue: deque[RemoteRequest] = deque()
-        self._sent: dict[int, _Sent] = {}
-        self._last_number = 0
         #: ids of the goals whose results the client is still to get
         self._awaited: set[str] = set()
         self._watching = False
@@ -260,12 +266,12 @@ class RemoteSession:
     @property
     def idle(self) -> bool:
         """Whether the client is waiting for nothing."""
-        return not (self._queue or self._sent or self._awaited or self._watching or self._waiting_for_room())
+        return not (self._unanswered or self._awaited or self._watching or self._waiting_for_room())
 
     @property
     def waiting_bytes(self) -> int:
         """Size of the requests that wait for the connection or for their answers."""
-        return sum(each.size_bytes for each in (*self._queue, *(sent.request for sent in self._sent.values())))
+        return sum(each.size_bytes for each in self._unanswered)
 
     def submit(self, request: RemoteRequest) -> None:
         """Carry out a request after those that came before it."""
@@ -275,7 +281,7 @@ class RemoteSession:
             self._goodbye_timer, self._reply_topic = None, request.reply_topic
         urgent = isinstance(request.request, Cancel | Status)
         limit = 2 * MAX_WAITING_BYTES if urgent else MAX_WAITING_BYTES
-        if len(self._sent) + len(self._queue) + len(self._waiting_for_room()) >= MAX_WAITING_REQUESTS:
+        if len(self._unanswered) + len(self._waiting_for_room()) >= MAX_WAITING_REQUESTS:
             self._refuse(request, Busy.code, f"{MAX_WAITING_REQUESTS} requests of yours are waiting already")
         elif self._sessions.waiting_bytes() + request.size_bytes > limit:
             self._refuse(request, Busy.code, f"{MAX_WAITING_BYTES >> 20} MiB of requests are waiting already")
@@ -316,11 +322,22 @@ class RemoteSession:
 
     def release(self, request: RemoteRequest) -> None:
         """Send a goal that has waited for room."""
-        self._send_say(request, has_room=True)
+        assert isinstance(request.request, Say)
+        self._send_say(request, request.request, has_room=True)
 
     def cancel_waiting(self, request: RemoteRequest, by: By | None) -> Goal:
         """End a goal that has waited for room, because it was canceled."""
         return self._end_goal(request, State.RECALLED, "canceled", "canceled before it was spoken", by)
+
+    @property
+    def _exchanges(self) -> list[_RemoteExchange]:
+        exchanges = self._server.exchanges.values() if self._server else ()
+        return [each for each in exchanges if isinstance(each, _RemoteExchange)]
+
+    @property
+    def _unanswered(self) -> list[RemoteRequest]:
+        """The requests that wait for the connection or for their answers."""
+        return [*self._queue, *(each.remote for each in self._exchanges)]
 
     def _waiting_for_room(self) -> list[RemoteRequest]:
         return [request for request, session in self._sessions.waiting if session is self]
@@ -330,68 +347,61 @@ class RemoteSession:
 
     def _end_if_done(self) -> None:
         """End the session if the client said goodbye and the server has taken all requests."""
-        sent = (each.request for each in self._sent.values())
-        if self._goodbye_timer and not self._queue and not any(map(_outlives_client, sent)):
+        if self._goodbye_timer and not any(map(_outlives_client, self._unanswered)):
             self.end()
 
     # -- to the server
 
-    def _send_request(self, request: RemoteRequest) -> None:
-        asked = request.request
-        if isinstance(asked, Say):
-            self._send_say(request)
-        elif isinstance(asked, Cancel):
-            self._send_cancel(request, asked)
-        elif isinstance(asked, Hello):
-            self._name = policy.sender_name(self._user, asked.name)
-            self._send(_Sent(request), {**request.fields, "name": self._name})
+    def _send_request(self, remote: RemoteRequest) -> None:
+        request = remote.request
+        if isinstance(request, Say):
+            self._send_say(remote, request)
+        elif isinstance(request, Cancel):
+            self._send_cancel(remote, request)
         else:
-            self._watching = self._watching or isinstance(asked, Watch)
-            self._send(_Sent(request), request.fields)
+            if isinstance(request, Hello):
+                self._name = policy.sender_name(self._user, request.name)
+                request = replace(request, name=self._name)
+            self._watching = self._watching or isinstance(request, Watch)
+            self._send(_RemoteExchange(remote, request))
 
-    def _send_say(self, request: RemoteRequest, *, has_room: bool = False) -> None:
-        shared, say, server = self._sessions, request.request, self._server
-        assert isinstance(say, Say)
+    def _send_say(self, remote: RemoteRequest, say: Say, *, has_room: bool = False) -> None:
+        shared, server = self._sessions, self._server
         assert server
         goal_id = say.id or self._new_id()
         boot, counted = shared.ids.boot_of(goal_id), shared.goals.counts(say)
         if boot not in (None, server.boot):
             words = f"{goal_id} was sent to a server that has ended since: it may have been spoken"
-            self._refuse(request, "lost", words)
+            self._refuse(remote, "lost", words)
         elif has_room or (shared.goals.has_room(say) and not (counted and shared.waiting)):
-            if self._send(_Sent(request, goal_id, fresh=boot is None), request.to_json(boottime(), goal_id)):
+            if self._send(_RemoteExchange(remote, remote.say(goal_id, boottime()), goal_id, fresh=boot is None)):
                 shared.ids.add(goal_id, server.boot, counted=counted)
                 if counted:
                     shared.goals.add(goal_id, say.key)
         elif say.patient:
-            shared.waiting.append((request, self))
+            shared.waiting.append((remote, self))
         else:
             words = f"{policy.MAX_REMOTE_GOALS} goals from afar are waiting already"
-            self._end_goal(request, State.REJECTED, "queue_full", words, None)
+            self._end_goal(remote, State.REJECTED, "queue_full", words, None)
 
-    def _send_cancel(self, request: RemoteRequest, selection: Cancel) -> None:
+    def _send_cancel(self, remote: RemoteRequest, cancel: Cancel) -> None:
         """Cancel goals that wait for room, then goals at the server, which doesn't know the ids of the former."""
-        sent = _Sent(request)
-        sent.canceled = self._sessions.cancel_waiting(selection, By(client=Sender(name=self._name)))
-        fields = dict(request.fields)
-        canceled = {each.id for each in sent.canceled}
-        if selection.ids is not None:
-            fields["ids"] = [each for each in selection.ids if each not in canceled]
-        if selection.before in canceled:
-            del fields["before"]
-            fields.setdefault("ids", [])
-        self._send(sent, fields)
+        goals = self._sessions.cancel_waiting(cancel, By(client=Sender(name=self._name)))
+        canceled = {each.id for each in goals}
+        if cancel.ids is not None:
+            cancel = replace(cancel, ids=tuple(each for each in cancel.ids if each not in canceled))
+        if cancel.before in canceled:
+            cancel = replace(cancel, before=None, ids=cancel.ids or ())
+        exchange = _RemoteExchange(remote, cancel)
+        exchange.canceled = goals
+        self._send(exchange)
 
-    def _send(self, sent: _Sent, fields: JsonObject) -> bool:
+    def _send(self, exchange: _RemoteExchange) -> bool:
         """Send a request to the server. If it is too long, refuse it and return False."""
         assert self._server
-        self._last_number += 1
-        line = encode({"seq": self._last_number, **fields})
-        if len(line) > MAX_LINE_BYTES:
-            self._refuse(sent.request, "line_too_long", f"a request has at most {MAX_LINE_BYTES} bytes")
+        if not self._server.send(exchange):
+            self._refuse(exchange.remote, "line_too_long", f"a request has at most {MAX_LINE_BYTES} bytes")
             return False
-        self._sent[self._last_number] = sent
-        self._server.write(line)
         return True
 
     def _new_id(self) -> str:
@@ -449,25 +459,25 @@ class RemoteSession:
 
     def _translate(self, message: JsonObject) -> list[tuple[bytes, bytes | None]]:
         """Return the lines that answer a client's request, from a reply of the server or an item of its list."""
-        number = message.pop("seq")
-        sent = self._sent.get(number) if isinstance(number, int) else None
-        if sent is None:
+        assert self._server
+        exchange = self._server.match(message)
+        if not isinstance(exchange, _RemoteExchange):
             return []
-        request = sent.request
+        del message["seq"]
+        remote = exchange.remote
         found: list[JsonObject] = []
         goal = message.get("goal")
         if isinstance(goal, dict):
-            self._note_awaited(request, goal)
+            self._note_awaited(remote, goal)
         if "ok" in message:
-            assert isinstance(number, int)
-            del self._sent[number]
-            self._count_goal(sent, message)
-            found = [{"canceled": each.to_json()} for each in sent.canceled]
+            self._server.forget(exchange)
+            self._count_goal(exchange, message)
+            found = [{"canceled": each.to_json()} for each in exchange.canceled]
             count = message.get("count")
             if found and isinstance(count, int):
                 message["count"] = count + len(found)
-        numbered = (each if request.seq is None else {"seq": request.seq, **each} for each in (*found, message))
-        return [(encode(each), request.correlation) for each in numbered]
+        numbered = (each if remote.seq is None else {"seq": remote.seq, **each} for each in (*found, message))
+        return [(encode(each), remote.correlation) for each in numbered]
 
     def _note_awaited(self, remote: RemoteRequest, goal: JsonObject) -> None:
         """Remember a goal if the client waits for its result."""
@@ -476,7 +486,7 @@ class RemoteSession:
         if waits and state is not None and not state.terminal:
             self._awaited.add(str(goal.get("id")))
 
-    def _count_goal(self, sent: _Sent, reply: JsonObject) -> None:
+    def _count_goal(self, sent: _RemoteExchange, reply: JsonObject) -> None:
         """Update the number of pending goals after the server's reply to a `say`."""
         if sent.goal_id is None:
             return
@@ -538,11 +548,11 @@ class RemoteSession:
         """Close the connection and forget unanswered requests."""
         shared = self._sessions
         self._leave_waiting()
-        for sent in self._sent.values():
-            if sent.goal_id is not None:
-                shared.goals.answered(sent.goal_id, pending=False)
-        self._sent.clear()
+        for exchange in self._exchanges:
+            if exchange.goal_id is not None:
+                shared.goals.answered(exchange.goal_id, pending=False)
         if self._server:
+            self._server.exchanges.clear()
             self._server.close()
         shared.forget(self)
         shared.schedule_release()
