@@ -30,8 +30,8 @@ _BUSY_PAUSE_S = (0.02, 0.2)
 class LocalConnection(ClientCore):
     """A connection to the server of this machine, used by one reader.
 
-    It uses the loop directly: with asyncio's transports, a new client takes 1.6 times the processor time. That counts if
-    somebody cancels everything on a thousand robots.
+    It uses the loop directly. With asyncio's transports, each new client takes 1.6 times the processor time, which
+    matters when somebody cancels everything on a thousand robots.
     """
 
     def __init__(self, socket: _socket.socket, path: str) -> None:
