@@ -57,9 +57,9 @@ def say(
     if output is None:
         discard_unread_output()
     if lines:
-        from talkcli.cli.stdin import say_lines
+        from talkcli.cli.stdin import LineSpeaker
 
-        return say_lines(options, name, goal_options, wait, feedback, timeout, ahead)
+        return LineSpeaker(options, name, goal_options, wait, feedback, timeout, ahead).run()
     sentence = " ".join(text)
     if text == ("-",):
         from talkcli.cli.stdin import InputTooLong, read_text, rejected_goal

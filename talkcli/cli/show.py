@@ -322,7 +322,7 @@ def show_error(error: TalkError, *, json: bool) -> None:
 
 
 class Feedback:
-    """Display of the events of goals. This base class shows nothing. The classes in `feedback` do."""
+    """A display for the events of goals. This base class shows nothing, unlike those in `feedback`."""
 
     #: whether events are shown; the command itself then doesn't print ids and results
     shows_events = False

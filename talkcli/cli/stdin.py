@@ -49,9 +49,9 @@ if TYPE_CHECKING:
     _T = TypeVar("_T")
 
 #: The size of one read: the capacity of a pipe.
-_READ_BYTES = 65_536
+_STDIN_READ_BYTES = 65_536
 #: The longest text, with the end of its line.
-_MAX_INPUT_BYTES = MAX_BYTES + len("\r\n")
+_MAX_STDIN_TEXT_BYTES = MAX_BYTES + len("\r\n")
 #: How much input with a ttl is read before it can be sent.
 _MAX_BUFFERED_BYTES = 1_000_000
 #: How many goals may be pending without --ahead.
@@ -82,10 +82,10 @@ def read_text(end: float | None, *, wait: bool = False, whole: bool = False) -> 
     """
     data = bytearray()
     with Interrupts(output=wait) as interrupts:
-        while whole or len(data) <= _MAX_INPUT_BYTES:
+        while whole or len(data) <= _MAX_STDIN_TEXT_BYTES:
             if not wait_ready({0: select.POLLIN}, seconds_left(end), interrupts.watched):
                 raise TimedOut("standard input has not ended within the time: nothing was sent")
-            more = _read_available(_READ_BYTES if whole else _MAX_INPUT_BYTES + 1 - len(data))
+            more = _read_available(_STDIN_READ_BYTES if whole else _MAX_STDIN_TEXT_BYTES + 1 - len(data))
             if more == b"":
                 return _decode(bytes(data))
             data += more or b""
@@ -177,62 +177,38 @@ def _decode(data: bytes) -> str:
     return data.decode(errors="surrogateescape").rstrip("\r\n")
 
 
-def say_lines(
-    options: CommonOptions,
-    name: str | None,
-    goal_options: dict[str, Any],
-    wait: bool,
-    feedback: bool,
-    timeout: float | None,
-    ahead: int | None,
-) -> int:
-    """Speak standard input line by line, and return the exit code.
-
-    Args:
-        options: the options of every command.
-        name: the sender's name.
-        goal_options: the options of each goal.
-        wait: whether to wait until the goals have ended.
-        feedback: whether to show each word as it is heard.
-        timeout: seconds for the whole command; None for no limit.
-        ahead: how many goals may be pending at once; None for the default.
-    """
-    reporter = GoalReporter(options, feedback=feedback)
-    try:
-        with (
-            Interrupts(timeout, output=wait) as interrupts,
-            options.connect(timeout, name=name, interrupt=interrupts.watched) as client,
-        ):
-            max_pending = ahead or _DEFAULT_PENDING_GOALS
-            return _LineSpeaker(client, interrupts, options, goal_options, wait, reporter, max_pending).run()
-    finally:
-        retry_without_output(reporter.feedback.close)
-    if interrupts.timed_out and interrupts.signal_number is None and not interrupts.reader_gone:
-        raise timeout_error(timeout)
-    return interrupts.exit_code
-
-
-class _LineSpeaker:
-    """One run of `say --lines`: it sends lines as goals, and follows these goals."""
+class LineSpeaker:
+    """One run of `say --lines`: it sends the lines of standard input as goals, and follows these goals."""
 
     def __init__(
         self,
-        client: Client,
-        interrupts: Interrupts,
         options: CommonOptions,
+        name: str | None,
         goal_options: dict[str, Any],
         wait: bool,
-        reporter: GoalReporter,
-        max_pending: int,
+        feedback: bool,
+        timeout: float | None,
+        ahead: int | None,
     ) -> None:
-        assert isinstance(client._connection, BlockingConnection)
-        self._client, self._connection = client, client._connection
-        self._interrupts = interrupts
+        """Prepare the run.
+
+        Args:
+            options: the options of every command.
+            name: the sender's name.
+            goal_options: the options of each goal.
+            wait: whether to wait until the goals have ended.
+            feedback: whether to show each word as it is heard.
+            timeout: seconds for the whole command; None for no limit.
+            ahead: how many goals may be pending at once; None for the default.
+        """
         self._options = options
+        self._name = name
         self._goal_options = goal_options
         self._wait = wait
-        self._reporter, self._feedback = reporter, reporter.feedback
-        self._max_pending = max_pending
+        self._reporter = GoalReporter(options, feedback=feedback)
+        self._feedback = self._reporter.feedback
+        self._timeout = timeout
+        self._max_pending = ahead or _DEFAULT_PENDING_GOALS
         self._ttl: float | None = goal_options["ttl"] or None
         self._buffer = LineBuffer(self._ttl)
         #: the number of the line that is being sent, until it is accepted or refused
@@ -254,6 +230,22 @@ class _LineSpeaker:
 
     def run(self) -> int:
         """Send all lines, and return the exit code. With --wait, also wait until the goals have ended."""
+        interrupts = self._interrupts = Interrupts(self._timeout, output=self._wait)
+        try:
+            with (
+                interrupts,
+                self._options.connect(self._timeout, name=self._name, interrupt=interrupts.watched) as client,
+            ):
+                assert isinstance(client._connection, BlockingConnection)
+                self._client, self._connection = client, client._connection
+                return self._speak()
+        finally:
+            retry_without_output(self._feedback.close)
+        if interrupts.timed_out and interrupts.signal_number is None and not interrupts.reader_gone:
+            raise timeout_error(self._timeout)
+        return interrupts.exit_code
+
+    def _speak(self) -> int:
         try:
             while not self._done:
                 try:
@@ -419,7 +411,7 @@ class _LineSpeaker:
             if watched.pop(0, None) is None:
                 raise
             wait_ready({}, 0, watched)  # raises Interrupted again if there was more than input
-            data = _read_available(_READ_BYTES)
+            data = _read_available(_STDIN_READ_BYTES)
             if data is not None:
                 self._buffer.feed(data, time.monotonic())
             if self._unanswered or self._goals:  # read from the server even if the input never pauses
