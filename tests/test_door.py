@@ -8,8 +8,8 @@ import json
 import socket
 from typing import TYPE_CHECKING, Any, cast
 
-from talkcli.server.connection import Connection
-from talkcli.server.run import Server, Settings
+from talkcli.server.connection import ClientConnection
+from talkcli.server.run import Server, ServerSettings
 from tests.support.loop import in_loop
 
 if TYPE_CHECKING:
@@ -50,13 +50,13 @@ def _word(line: dict[str, Any]) -> str:
 @contextlib.contextmanager
 def server_for(clients: int) -> Iterator[Callable[[bytes], Client]]:
     """Return a function that connects a client, after its first words, to a server with so many places."""
-    served = Server(Settings(max_clients=clients), cast("Any", Unused()))
+    served = Server(ServerSettings(max_clients=clients), cast("Any", Unused()))
     made: list[Client] = []
 
     def connect(says: bytes = b"") -> Client:
         client = Client(says)
         made.append(client)
-        Connection(served, served.speech.streams, client.theirs).begin()
+        ClientConnection(served, served.speech.streams, client.theirs).begin()
         return client
 
     try:

@@ -14,7 +14,7 @@ import click
 import pytest
 
 import talkcli
-from talkcli.server import lock
+from talkcli.server import listener
 from tests.conformance.bareserve import SERVE, TALK, environment, run, serving
 from tests.support.connection import Wire
 from tests.support.surroundings import needs
@@ -67,7 +67,7 @@ def test_second_server_names_the_one_that_serves_and_never_the_one_before_it(hom
     with open(path, "w+b", buffering=0) as file:
         file.write(f"{gone.pid}\n".encode())
         found: list[int | None] = []
-        reader = threading.Thread(target=lambda: found.append(lock._holder(file.fileno())))
+        reader = threading.Thread(target=lambda: found.append(listener._holder(file.fileno())))
         reader.start()
         reader.join(0.1)
         assert reader.is_alive(), f"it named {found}, which has ended"

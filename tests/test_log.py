@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli import peers
-from talkcli.goals.option import MAX_LOG
+from talkcli.goals.options import MAX_LOG_GOALS
 from talkcli.terminal.text import width
 from tests.conformance.bareserve import TALK
 from tests.support.terminal import Terminal
@@ -66,7 +66,7 @@ def test_count_and_order(scripted: Talk) -> None:
     scripted.run("wait")
     assert [each.split()[2] for each in scripted.run("log").out.splitlines()] == history[-20:]
     assert [each.split()[2] for each in scripted.run("log", "-n", "2").out.splitlines()] == history[-2:]
-    assert [each.split()[2] for each in scripted.run("log", "--count", str(MAX_LOG)).out.splitlines()] == history
+    assert [each.split()[2] for each in scripted.run("log", "--count", str(MAX_LOG_GOALS)).out.splitlines()] == history
 
 
 def test_lines_fit_the_terminal_and_line_up(scripted: Talk, history: list[str]) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.server import stream
-from talkcli.server.stream import Stream, Streams
+from talkcli.server.stream import ClientStream, ClientStreams
 from tests.support.loop import in_loop
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ class Pair:
             each.setblocking(False)
         self.told = Told()
         loop = asyncio.get_running_loop()
-        self.stream = Stream(Streams(loop), self.socket, self.told, HIGH)
+        self.stream = ClientStream(ClientStreams(loop), self.socket, self.told, HIGH)
 
     def receive(self) -> bytes:
         """Return the bytes that have arrived at the client's end."""
@@ -253,12 +253,12 @@ async def test_bug_in_the_receiver_ends_the_connection() -> None:
 async def test_one_callback_sends_the_output_of_all_streams() -> None:
     loop = asyncio.get_running_loop()
     calls = []
-    streams = Streams(loop)
+    streams = ClientStreams(loop)
     call = loop.call_soon
     async with paired() as first, paired() as second:
         pairs = [first, second]
         for pair in pairs:
-            pair.stream = Stream(streams, pair.socket, pair.told, HIGH)
+            pair.stream = ClientStream(streams, pair.socket, pair.told, HIGH)
         loop.call_soon = lambda *values, **named: calls.append(call(*values, **named))  # type: ignore[assignment, method-assign]
         for _ in range(3):
             for pair in pairs:
@@ -272,14 +272,14 @@ async def test_one_callback_sends_the_output_of_all_streams() -> None:
 @in_loop
 async def test_past_the_limit_for_all_output_the_largest_backlog_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     loop = asyncio.get_running_loop()
-    streams = Streams(loop)
+    streams = ClientStreams(loop)
     async with contextlib.AsyncExitStack() as stack:
         pairs = [await stack.enter_async_context(paired()) for _ in range(3)]
         for pair in pairs:
-            pair.stream = Stream(streams, pair.socket, pair.told, HIGH)
+            pair.stream = ClientStream(streams, pair.socket, pair.told, HIGH)
             pair.stream.write(b"x" * 1_000_000)  # more than the system takes
         taken = 1_000_000 - pairs[0].stream.size
-        monkeypatch.setattr(stream, "ALL_OUTPUT", streams.waiting + 3_000)
+        monkeypatch.setattr(stream, "MAX_TOTAL_OUTPUT_BYTES", streams.unread_bytes + 3_000)
         pairs[0].stream.write(b"x" * 1_000)
         pairs[1].stream.hold(1_500)  # as for a list that its client doesn't read
         pairs[1].stream.hold(500)
@@ -287,11 +287,11 @@ async def test_past_the_limit_for_all_output_the_largest_backlog_is_dropped(monk
         pairs[2].stream.write(b"x" * 1_000)
         await until_lost(pairs[1])
         assert [each.stream.closing for each in pairs] == [False, True, False]
-        assert streams.waiting == 2 * (1_000_000 - taken) + 2_000
+        assert streams.unread_bytes == 2 * (1_000_000 - taken) + 2_000
         pairs[1].stream.hold(-2_000)  # released after its end
         assert len(pairs[0].receive()) == taken
         await turn()
-        assert streams.waiting == pairs[0].stream.size + pairs[2].stream.size
+        assert streams.unread_bytes == pairs[0].stream.size + pairs[2].stream.size
         for pair in (pairs[0], pairs[2]):
             pair.stream.abort()
-        assert (streams.waiting, streams.open) == (0, set())
+        assert (streams.unread_bytes, streams.open) == (0, set())

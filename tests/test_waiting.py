@@ -19,10 +19,10 @@ from talkcli.goals.options import Cancel, Say
 from talkcli.goals.scheduler import Scheduler
 from talkcli.protocol.requests import Status, Wait, Watch
 from talkcli.server import subscribers
-from talkcli.server.call import Call
-from talkcli.server.requests import ALL_WAITING, EACH, Requests
-from talkcli.server.speech import AT_ONCE, Speech
-from talkcli.server.subscribers import News
+from talkcli.server.connection import PendingRequest
+from talkcli.server.requests import MAX_WAITING_BYTES, REQUEST_BYTES, Requests
+from talkcli.server.speech import REPORTS_PER_TURN, Speech
+from talkcli.server.subscribers import Notifications
 from tests.support.loop import in_loop
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 class Client:
     """A connection that records its replies."""
 
-    sender = Sender(1, 1, "client")
+    client = Sender(1, 1, "client")
 
     def __init__(self) -> None:
         self.told: list[JsonObject] = []
@@ -111,9 +111,9 @@ async def turn() -> None:
     await asyncio.sleep(0)
 
 
-async def all_told(line: News) -> None:
+async def all_told(line: Notifications) -> None:
     for _ in range(1_000_000):
-        if line.told:
+        if line.done:
             return
         await asyncio.sleep(0)
 
@@ -125,7 +125,7 @@ async def test_a_check_for_room_asks_once_for_goals_that_need_the_same_room() ->
     for number in range(1_000):
         server.wait(client, f"{number}", priority=-(number % 2))
     server.asked = 0
-    server.requests._look()
+    server.requests._check_room_soon()
     await turn()
     assert (server.asked, client.told) == (2, [])
     server.make_room()
@@ -142,7 +142,7 @@ async def test_waiting_requests_of_all_connections_have_a_limit_in_bytes() -> No
     while not other.told:
         server.wait(one if count < 900 else other, "w" * 9_000, data={"a": ["w" * 30_000]})
         count += 1
-    assert 0.9 * ALL_WAITING < (count - 1) * (39_000 + EACH) < ALL_WAITING
+    assert 0.9 * MAX_WAITING_BYTES < (count - 1) * (39_000 + REQUEST_BYTES) < MAX_WAITING_BYTES
     (refused,) = cast("Any", other.told)
     assert refused["goal"]["reason"] == "queue_full"
     assert "64 MiB of requests are waiting already" in refused["goal"]["message"]
@@ -153,7 +153,7 @@ async def test_waiting_requests_of_all_connections_have_a_limit_in_bytes() -> No
     assert third.told == []
     server.requests.left(cast("Any", one))
     server.requests.left(cast("Any", third))
-    assert server.requests._size == 0
+    assert server.requests._waiting_bytes == 0
 
 
 @pytest.mark.parametrize(
@@ -162,8 +162,8 @@ async def test_waiting_requests_of_all_connections_have_a_limit_in_bytes() -> No
 @in_loop
 async def test_small_values_count_with_the_memory_that_they_take(request_: Say | Wait) -> None:
     server = Server()
-    assert server.requests._keep(Call(cast("Any", Client()), None, request_))
-    assert server.requests._size > EACH + 16_000
+    assert server.requests._keep(PendingRequest(cast("Any", Client()), None, request_))
+    assert server.requests._waiting_bytes > REQUEST_BYTES + 16_000
 
 
 @in_loop
@@ -175,10 +175,10 @@ async def test_client_that_leaves_while_its_goals_are_cancelled_is_forgotten() -
         server.wait(other, f"other {number}")
     server.ask(canceling, Cancel())
     server.requests.left(cast("Any", one))
-    await all_told(server.speech.news)
+    await all_told(server.speech.notifications)
     assert len(other.told) == 100
     assert len(one.told) < 100
-    assert server.requests._size == 0
+    assert server.requests._waiting_bytes == 0
     assert not server.requests.owes(cast("Any", other))
 
 
@@ -202,7 +202,7 @@ async def test_bug_in_a_request_that_waited_harms_no_other_request(monkeypatch: 
     assert first["error"]["code"] == "internal_error"
     assert second["goal"]["text"] == "two"
     assert not server.requests.owes(cast("Any", client))
-    assert server.requests._size == 0
+    assert server.requests._waiting_bytes == 0
 
 
 class Readers:
@@ -210,12 +210,12 @@ class Readers:
 
     def __init__(self) -> None:
         self.loop = asyncio.get_running_loop()
-        self.waiting = 0
+        self.unread_bytes = 0
         self.told: list[int] = []
 
     def tell(self, number: int) -> None:
         self.told.append(number)
-        self.waiting += 300_000
+        self.unread_bytes += 300_000
 
 
 @in_loop
@@ -224,7 +224,7 @@ async def test_a_cancel_of_thousands_of_pending_goals_leaves_the_others_their_tu
     server, watcher, canceling, asking = Server(count), Client(), Client(), Client()
     server.fill(1)
     ended = []
-    server.speech.subscribers.changed = lambda record, *_: ended.append(record.id)  # type: ignore[method-assign]
+    server.speech.subscribers.state_changed = lambda record, *_: ended.append(record.id)  # type: ignore[method-assign]
     server.ask(watcher, Cancel(ids=()))
     for number in range(count):
         server.ask(watcher, Say(f"{number}"))
@@ -236,8 +236,8 @@ async def test_a_cancel_of_thousands_of_pending_goals_leaves_the_others_their_tu
         server.ask(asking, Status(id="4k7f-1"))
         await asyncio.sleep(0)
         most = max(most, len(ended) - before)
-    assert most <= 2 * subscribers._PORTION
-    assert len(asking.told) > count / subscribers._PORTION / 2
+    assert most <= 2 * subscribers._MAX_PER_TURN
+    assert len(asking.told) > count / subscribers._MAX_PER_TURN / 2
 
 
 @in_loop
@@ -250,20 +250,20 @@ async def test_new_watcher_gets_only_events_after_its_snapshot(monkeypatch: pyte
     subscribed = server.speech.subscribers
     monkeypatch.setattr(subscribed, "watch", lambda _: told.append(str(subscribed._numbers)))
     server.ask(watcher, Watch())
-    assert (told, server.speech.news.told) == ([], False)
-    await all_told(server.speech.news)
+    assert (told, server.speech.notifications.done) == ([], False)
+    await all_told(server.speech.notifications)
     assert told == [str(subscribed._numbers)]
 
 
 @in_loop
 async def test_news_is_told_as_fast_as_clients_read_it() -> None:
     readers = Readers()
-    line = News(cast("Any", readers))
-    line.tell([partial(readers.tell, number) for number in range(100)])
+    line = Notifications(cast("Any", readers))
+    line.add([partial(readers.tell, number) for number in range(100)])
     most = 0
-    while not line.told:
-        most = max(most, readers.waiting)
-        readers.waiting = 0  # all clients have read
+    while not line.done:
+        most = max(most, readers.unread_bytes)
+        readers.unread_bytes = 0  # all clients have read
         await asyncio.sleep(0.001)
     assert most < 2_000_000
     assert readers.told == list(range(100))
@@ -271,13 +271,13 @@ async def test_news_is_told_as_fast_as_clients_read_it() -> None:
 
 @in_loop
 async def test_wait_for_clients_that_do_not_read_news_has_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(subscribers, "_PATIENCE", 0.02)
-    monkeypatch.setattr(subscribers, "_LESS", 0.1)
+    monkeypatch.setattr(subscribers, "_READ_TIME_S", 0.02)
+    monkeypatch.setattr(subscribers, "_READ_TIME_FACTOR", 0.1)
     loop, readers, waits = asyncio.get_running_loop(), Readers(), []
     later = loop.call_later
     loop.call_later = lambda *values: waits.append(values) or later(*values)  # type: ignore[method-assign, func-returns-value]
-    line = News(cast("Any", readers))
-    line.tell([partial(readers.tell, number) for number in range(400)])
+    line = Notifications(cast("Any", readers))
+    line.add([partial(readers.tell, number) for number in range(400)])
     assert len(readers.told) < 20
     await all_told(line)
     assert readers.told == list(range(400))
@@ -288,14 +288,14 @@ async def test_wait_for_clients_that_do_not_read_news_has_a_limit(monkeypatch: p
 @in_loop
 async def test_news_about_news_is_told_in_order_and_a_bug_harms_no_other() -> None:
     told: list[str] = []
-    line = News(cast("Any", Readers()))
+    line = Notifications(cast("Any", Readers()))
 
     def first() -> None:
         told.append("first")
-        line.tell([lambda: told.append("of the first")])
+        line.add([lambda: told.append("of the first")])
         raise ZeroDivisionError("a bug")
 
-    line.tell([first, lambda: told.append("second")])
+    line.add([first, lambda: told.append("second")])
     assert told == ["first", "of the first", "second"]
 
 
@@ -317,11 +317,11 @@ class _Written:
 
 @in_loop
 async def test_many_words_at_once_leave_the_clients_their_turns() -> None:
-    loop, count = asyncio.get_running_loop(), 5 * AT_ONCE + 1
+    loop, count = asyncio.get_running_loop(), 5 * REPORTS_PER_TURN + 1
     taken: list[object] = []
     wakes = []
     served = Speech(Scheduler("4k7f", max_queue=1))
-    served._takes[protocol.Word] = taken.append
+    served._take = taken.append  # type: ignore[method-assign, assignment]
     call = loop.call_soon_threadsafe
     loop.call_soon_threadsafe = lambda *values: wakes.append(call(*values))  # type: ignore[assignment, method-assign]
     words = [protocol.Word("4k7f-1", 0, 1, number, 0.0) for number in range(count)]
@@ -338,7 +338,7 @@ async def test_many_words_at_once_leave_the_clients_their_turns() -> None:
     while len(taken) < count:
         await asyncio.sleep(0)
         turns += 1
-        assert len(taken) <= turns * AT_ONCE
+        assert len(taken) <= turns * REPORTS_PER_TURN
     assert taken == words
     served.report(words[0])
     assert len(wakes) == 2
@@ -355,7 +355,7 @@ async def test_bug_in_a_report_harms_no_other_report(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(log, "bug", lambda what, error: failed.append((what, type(error))))
     served = Speech(Scheduler("4k7f", max_queue=1))
-    served._takes[protocol.Alive] = take
+    served._take = take  # type: ignore[method-assign, assignment]
     for number in range(3):
         served.report(protocol.Alive(f"4k7f-{number}"))
     await asyncio.sleep(0)
@@ -373,7 +373,7 @@ async def test_engine_gets_its_next_task_before_clients_get_events() -> None:
     def changed(record: Record, state: State, _: float) -> None:
         written.append(f"{state.name} {record.text}")
 
-    served.subscribers.changed = changed  # type: ignore[assignment, method-assign]
+    served.subscribers.state_changed = changed  # type: ignore[assignment, method-assign]
     for text, preempt in (("first", False), ("second", True)):
         served.apply(served.scheduler.submit(Say(text, preempt=preempt), Sender(), served.now()).effects)
     served.report(protocol.Ended("4k7f-1", protocol.OUTCOME_STOPPED))

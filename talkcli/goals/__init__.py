@@ -1,5 +1,6 @@
-"""What a goal is, and which one is spoken when: states, texts, the queue, the history, the scheduler that decides.
+"""Goals: what a goal is, which one is spoken when, and how it ends.
 
-Pure: no clock, no thread, no socket; the time comes in as an argument. It may import the ground alone. A rule about
-goals goes here, into the module that has its noun; how it is written on the wire goes to `protocol`.
+Pure: no clock, no thread, no socket. The time is an argument. This package imports nothing of `talkcli` but the modules
+at its top. A rule about goals goes into the module that has its noun. How a goal is written on the wire is in
+`protocol`.
 """

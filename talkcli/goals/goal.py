@@ -1,8 +1,8 @@
-"""A goal and who sent it, as client and server tell each other of them: frozen values and their form in JSON.
+"""A goal and its sender as values, and their form in JSON.
 
-Rules for this file: form only. Whether a goal is admitted is the scheduler's business, how a line is cut from a stream
-is the wire's. A field may be added, never renamed or given another meaning. A reader ignores fields that it doesn't
-know; requests, where that would drop what somebody asked for, are in `options` and `protocol.requests`.
+Only the form is here. The scheduler decides whether a goal is accepted. A field may be added, but never renamed or
+given another meaning. Unknown fields are ignored. That would be wrong in requests, which are in `options` and
+`protocol.requests`.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ if TYPE_CHECKING:
 
 JsonObject = dict[str, object]
 
-#: Seconds in some thirty million years: what is longer, no calendar can show.
-_LONGEST = 1e15
+#: some thirty million years, more than any calendar can show
+_MAX_TIME_S = 1e15
 
 
 @frozen
 class Sender:
-    """Who is at the other end of a connection. None where the system doesn't tell."""
+    """The program at the other end of a connection. A field is None if the system doesn't tell."""
 
     pid: int | None = None
     uid: int | None = None
     #: the program that connected
     command: str | None = None
-    #: the command line of the program that started it: the script that one looks for
+    #: the command line of the program that started it, which is usually a script
     parent: str | None = None
-    #: what the sender calls itself; a claim, and shown as one
+    #: the name that the sender gives itself, which may be wrong
     name: str | None = None
 
     def to_json(self) -> JsonObject:
@@ -39,12 +39,12 @@ class Sender:
 
     @classmethod
     def from_json(cls, value: object) -> Sender:
-        return cls(**known(cls, value if isinstance(value, dict) else {}))
+        return cls(**read_fields(cls, value if isinstance(value, dict) else {}))
 
 
 @frozen
 class By:
-    """What ended a goal: another goal, or a client's request. Neither where it was the server itself."""
+    """The cause of a goal's end: another goal, or the request of a client. Neither is set if it was the server."""
 
     goal: str | None = None
     client: Sender | None = None
@@ -56,18 +56,18 @@ class By:
 
     @classmethod
     def from_json(cls, value: object) -> By | None:
-        return cls(**known(cls, value)) if isinstance(value, dict) else None
+        return cls(**read_fields(cls, value)) if isinstance(value, dict) else None
 
 
 @frozen
 class Output:
-    """Where a goal's sound goes, and whether anybody can hear it, as far as the sound server tells."""
+    """The audio output of a goal, as the sound server reports it."""
 
     #: the player's name
     player: str
-    #: the device, by the sound server's name for it
+    #: the sound server's name for the device
     device: str
-    #: 0 to 1; 1 is what the device calls 100 %
+    #: 0 to 1, where 1 is 100 % of the device
     volume: float
     #: whether it was muted, or its volume 0, at any time while the goal was spoken
     muted: bool
@@ -77,21 +77,21 @@ class Output:
 
     @classmethod
     def from_json(cls, value: object) -> Output | None:
-        found = known(cls, value) if isinstance(value, dict) else {}
+        found = read_fields(cls, value) if isinstance(value, dict) else {}
         return cls(**found) if len(found) == len(cls.__annotations__) else None
 
 
 @frozen
 class Goal:
-    """A goal as it is at one moment. In JSON it always has all its keys, null where unknown.
+    """A goal at one moment. In JSON it always has all keys, with null for unknown values.
 
-    Times are seconds since 1970 UTC, `duration` is seconds of audio.
+    Times are seconds since 1970 UTC. `duration` is in seconds of audio.
     """
 
     id: str
     state: State
     text: str | None = None
-    #: why it ended, for programs: one of the reasons in protocol/README.md
+    #: why it ended, for programs: a `Reason`, or another string from a newer server
     reason: str | None = None
     by: By | None = None
     #: how it ended, for people
@@ -109,19 +109,19 @@ class Goal:
     started_at: float | None = None
     ended_at: float | None = None
     duration: float | None = None
-    #: id of the voice by which it is heard, which may be another than it asked for; None until it is ACTIVE
+    #: id of the voice that speaks it, which may differ from the requested voice; None until it is ACTIVE
     voice: str | None = None
-    #: None where it can't be known
+    #: None if unknown
     output: Output | None = None
 
     @property
     def exit_code(self) -> int | None:
-        """What a command ends with whose goal this is; None until it has ended."""
-        # That it is not said again is what the sender of a throttled one has asked for.
+        """The exit code of a command with this goal; None until the goal has ended."""
+        # A throttled goal did what its sender asked for.
         return 0 if self.reason == "throttled" else EXIT_CODES.get(self.state)
 
     def to_json(self) -> JsonObject:
-        # Written out: each goal is told of two or three times, and a busy server does little else.
+        # Written out, because a busy server does little else.
         return {
             "id": self.id,
             "state": self.state.name,
@@ -148,15 +148,15 @@ class Goal:
 
     @classmethod
     def from_json(cls, value: object) -> Goal:
-        """Return the goal in a server's message; Unreadable where it is none. Fields not known here are ignored."""
-        found = known(cls, value if isinstance(value, dict) else {})
-        if not str(found.get("id", "\n")).isprintable() or "state" not in found:  # ids are shown as they are
+        """Return the goal in a message of a server; raise Unreadable if the message has none."""
+        found = read_fields(cls, value if isinstance(value, dict) else {})
+        if not str(found.get("id", "\n")).isprintable() or "state" not in found:  # ids are shown unescaped
             raise Unreadable("what the server sent for a goal has no id that can be one, or an unknown state")
         return cls(**found)
 
 
-def known(cls: type, message: JsonObject) -> dict[str, Any]:
-    """Return what an object has of the fields of a value, each as the value has it; none that is of another kind."""
+def read_fields(cls: type, message: JsonObject) -> dict[str, Any]:
+    """Return the values in a JSON object for the fields of a class; leave out those of the wrong type."""
     found = {}
     for name, annotation in cls.__annotations__.items():
         value = message.get(name)
@@ -165,23 +165,23 @@ def known(cls: type, message: JsonObject) -> dict[str, Any]:
     return found
 
 
-def _of(kind: type) -> Callable[[object], object]:
+def _of_type(kind: type) -> Callable[[object], object]:
     return lambda value: value if isinstance(value, kind) and (kind is bool or not isinstance(value, bool)) else None
 
 
-def seconds(value: object) -> float | None:
-    """Return a time, or a length of time, that somebody else tells; None for what is none, or past all calendars."""
+def read_seconds(value: object) -> float | None:
+    """Return a time or a length of time from a message; None if it is no number or too large to be shown."""
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    return float(value) if number and abs(value) <= _LONGEST else None  # type: ignore[arg-type]
+    return float(value) if number and abs(value) <= _MAX_TIME_S else None  # type: ignore[arg-type]
 
 
-#: What reads a field, by its annotation; None for what is of another kind.
+#: the functions that read a field, by its annotation; they return None for a value of the wrong type
 _READ: dict[str, Callable[[object], object]] = {
-    "str": _of(str),
-    "int": _of(int),
-    "float": seconds,
-    "bool": _of(bool),
-    "JsonObject": _of(dict),
+    "str": _of_type(str),
+    "int": _of_type(int),
+    "float": read_seconds,
+    "bool": _of_type(bool),
+    "JsonObject": _of_type(dict),
     "State": lambda value: State.__members__.get(value) if isinstance(value, str) else None,
     "By": By.from_json,
     "Sender": Sender.from_json,

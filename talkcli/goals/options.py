@@ -1,105 +1,291 @@
-"""The options of a goal and the settings of a server: each is one row, and everything else is made from the rows.
+"""The options of goals and the settings of servers: one row for each, from which everything else is made.
 
-Made from them: the fields of `say` and `set` on the wire and their checks, what the library refuses, the options of the
-commands and how they are read, what a server's settings are called, the documents' tables. `Say` and `Client.say` name
-them again, for type checkers and readers; tests hold both to the rows, which say what each means, and its unit. How two
-options go together is `bad_option`.
+Made from the rows: the fields of `say` and `set` on the wire and their checks, the checks of the library, the options
+of the commands and how they are read, the names of a server's settings, and the tables of the documents. `Say` and
+`Client.say` repeat them for type checkers and readers, and tests compare both with the rows. A row may be added, but
+never renamed or given another meaning.
 
-Rules for this file: a client imports it before it sends anything, so it imports nothing heavy. A row may be added,
-never renamed or given another meaning. The first sentence of a request's docstring is its meaning in the wire's table.
+A value may be wrong in two ways. A request with a value of the wrong type is an error and does nothing
+(`Option.type_error`). A goal with a value that can't be had is REJECTED (`Option.value_error`).
+
+A client imports this module before it sends anything, so it imports nothing heavy. The first sentence of a request's
+docstring is its meaning in the wire's document.
 """
 
 from __future__ import annotations
 
-from talkcli.frozen import TYPE_CHECKING, fields, frozen
-from talkcli.goals.option import (
-    DATA,
-    FLAG,
-    ID,
-    IDS,
-    INTEGER,
-    MAX_DATA,
-    MAX_ID,
-    MAX_IDS,
-    NUMBER,
-    SECONDS,
-    TEXT,
-    WORD,
-    Option,
-    Setting,
-    figure,
-    is_clients_id,
-)
+from talkcli.frozen import TYPE_CHECKING, fields, frozen, replace
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Iterable, Sequence
     from typing import Any, ClassVar
 
     from talkcli.goals.goal import JsonObject
+    from talkcli.goals.reasons import Refusal
 
-#: Characters of one text: some minutes of speech. More is a document, not a sentence, and could not be stopped halfway
-#: by anybody who waits for its end.
-MAX_CHARACTERS = 10_000
-#: Bytes of one text in UTF-8: 10,000 characters of four bytes fit, and so does its request line.
-MAX_BYTES = 40_000
-#: Far more than anybody needs, and a number that every language's JSON reader holds exactly.
+MAX_ID_CHARS = 64
+#: ids in one request; more would not fit into a line
+MAX_IDS = 4096
+#: the name that a client gives itself, which is shown on one line of a terminal
+MAX_NAME_CHARS = 64
+#: `data` of a goal as JSON: a label for programs, not a store
+MAX_DATA_BYTES = 1024
+#: goals in one reply to `log`: as many as the server keeps
+MAX_LOG_GOALS = 2_200
+#: A text is some minutes of speech at most. Nobody who waits for the end of a longer one could stop it in between.
+MAX_TEXT_CHARS = 10_000
+#: A text of 10,000 characters with four bytes each fits into a request.
+MAX_TEXT_BYTES = 40_000
+#: far more than anybody needs, and exact in the JSON reader of every language
 MAX_PRIORITY = 1_000_000
-#: A key is a label, shown on one line.
-MAX_KEY = 64
-#: Milliseconds of silence before a sentence: no output needs longer to wake.
-MAX_LEAD_IN = 5000
-#: What stands for the driver's own voice, where a voice is named.
+#: a label, which is shown on one line
+MAX_KEY_CHARS = 64
+#: the silence before a sentence: no output needs longer to wake
+MAX_LEAD_IN_MS = 5000
+#: the word for the driver's own voice
 DEFAULT_VOICE = "default"
-#: What stands between the id of a neural voice and its speaker, where it has several: "piper/NAME#3".
-SPEAKER = "#"
+#: how the ids of neural voices begin: "piper/NAME"
+NEURAL_PREFIX = "piper/"
+#: what separates the id of a neural voice from its speaker: "piper/NAME#3"
+SPEAKER_MARK = "#"
+#: Unicode categories of characters that make no sound: separators, controls, format characters such as the zero-width
+#: space, and code points that are unassigned or private
+_SILENT_CATEGORIES = frozenset({"Zs", "Zl", "Zp", "Cc", "Cf", "Cn", "Co"})
+_DIGITS = frozenset("0123456789")
+_LETTERS = frozenset("abcdefghijklmnopqrstuvwxyz")
+_ID_CHARACTERS = _DIGITS | _LETTERS | frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZ._:/-")
+#: sys.float_info.max, which neither NaN nor a huge integer is below
+_MAX_FLOAT = 1.7976931348623157e308
 
 
 def model_of(voice: str | None) -> str:
-    """Return what has to be loaded for a neural voice, by its id: that without the speaker; "" for no voice."""
-    return (voice or "").partition(SPEAKER)[0]
+    """Return the id of a neural voice without its speaker, which is what has to be loaded; "" for no voice."""
+    return (voice or "").partition(SPEAKER_MARK)[0]
 
 
-def _bad_priority(value: int) -> str | None:
+def is_neural(voice: str) -> bool:
+    """Return whether a word names a neural voice, even if no such voice exists."""
+    return voice.casefold().startswith(NEURAL_PREFIX)
+
+
+@frozen
+class Kind:
+    """The kind of values that an option has."""
+
+    #: its name in the wire's document
+    name: str
+    types: tuple[type, ...]
+    #: the message about a value of another type
+    wrong_type: str
+    #: the placeholder for the value in help
+    metavar: str = ""
+    #: returns what is wrong with a value of the right type, for people, or None
+    check: Callable[[Any], str | None] | None = None
+
+
+def is_clients_id(goal_id: str) -> bool:
+    """Return whether a client may choose this id. A server never gives an id of this form."""
+    if not (0 < len(goal_id) <= MAX_ID_CHARS and _ID_CHARACTERS.issuperset(goal_id)) or goal_id[0] == "-":
+        return False
+    boot, dash, number = goal_id.partition("-")
+    if not dash:
+        return not _DIGITS.issuperset(goal_id)
+    # A server's ids are like 4k7f-12. Nobody names a goal like that, as people do `goal-1` or `2024-12`.
+    servers = len(boot) == 4 and _DIGITS.issuperset(boot[::2]) and _LETTERS.issuperset(boot[1::2])
+    return not (servers and number and _DIGITS.issuperset(number))
+
+
+def _id_error(value: str) -> str | None:
+    return None if 0 < len(value) <= MAX_ID_CHARS else f"must be an id of 1 to {MAX_ID_CHARS} characters"
+
+
+def _ids_error(value: list[object]) -> str | None:
+    if len(value) > MAX_IDS:
+        return IDS.wrong_type
+    errors = (_id_error(each) if isinstance(each, str) else ID.wrong_type for each in value)
+    return next(filter(None, errors), None)
+
+
+def _data_error(value: JsonObject) -> str | None:
+    import json
+
+    try:
+        return None if len(json.dumps(value)) <= MAX_DATA_BYTES else DATA.wrong_type
+    except RecursionError:
+        return DATA.wrong_type
+
+
+def format_number(value: object) -> str:
+    """Return a value for people: a number has at most four decimals."""
+    return f"{round(value, 4):.12g}" if isinstance(value, float) else str(value)
+
+
+FLAG = Kind("boolean", (bool,), "must be true or false")
+TEXT = Kind("string", (str,), "must be a string", "TEXT")
+#: a name; on a command line it is never empty, and it is UTF-8
+WORD = Kind("string", (str,), "must be a string")
+#: a path of a file or a socket; it may have any bytes but is never empty
+PATH = Kind("string", (str,), "must be a string", "PATH")
+INTEGER = Kind("integer", (int,), "must be an integer", "N")
+NUMBER = Kind("number", (int, float), "must be a number", "X")
+#: a length of time, 0 or more
+SECONDS = Kind("number", (int, float), "must be a number", "SEC")
+DATA = Kind("object", (dict,), f"must be an object of at most {MAX_DATA_BYTES} bytes", check=_data_error)
+ID = Kind("id", (str,), "must be a string", "ID", _id_error)
+IDS = Kind("list", (list, tuple), f"must be a list of at most {MAX_IDS} ids", "[ID]...", _ids_error)
+
+
+@frozen
+class Setting:
+    """The server's value of an option, for goals that don't give the option."""
+
+    initial: Any
+    #: the value that means "none", and is shown as null
+    none_value: Any = None
+    #: its meaning in `set` on the wire, if it differs from the option's
+    meaning: str = ""
+    #: its help in `talk set` and `talk serve`, if it differs from that of `talk say`
+    set_help: str = ""
+    serve_help: str = ""
+    #: its spellings for `talk set`, if they differ
+    flags: str = ""
+    #: how its value is shown to people, and how it is shown that there is none
+    words: str = ""
+    none_words: str = ""
+
+
+@frozen
+class Option:
+    """An option of a goal or of a command: its name, its values, and everything that is said about it."""
+
+    name: str
+    kind: Kind
+    #: its meaning on the wire; only for documents, like `form` and `default_words`
+    meaning: str = ""
+    #: its value if it isn't given; if this is None, a request may also have null
+    default: Any = None
+    #: the least and the greatest number; None for no limit
+    limits: tuple[float | None, float | None] = (None, None)
+    #: whether the least number itself is out of range
+    excludes_minimum: bool = False
+    #: the unit of a number, with a space before it
+    unit: str = ""
+    #: the only possible values
+    choices: tuple[str, ...] = ()
+    #: returns what else is wrong with a value, for people, or None
+    check: Callable[[Any], str | None] | None = None
+    #: what else is said about its values
+    form: str = ""
+    #: what is said about its default
+    default_words: str = ""
+    #: its spellings on a command line, "-w, --wait"; with one for yes and one for no, "--preempt/--queue"
+    flags: str = ""
+    metavar: str = ""
+    help: str = ""
+    #: the environment variable that replaces it
+    env: str = ""
+    #: the function of `cli.completion` that completes its values
+    completion: str = ""
+    #: the server's own value, if servers have one
+    setting: Setting | None = None
+    #: whether the engine is told its value
+    for_engine: bool = False
+    #: whether goals show its value
+    in_goal: bool = False
+
+    def type_error(self, value: Any) -> str | None:
+        """Return what is wrong with the type or form of a value, as in "must be an integer"; None if it is right."""
+        if value is None and self.default is None:
+            return None
+        kind = self.kind
+        if not isinstance(value, kind.types) or (isinstance(value, bool) and kind is not FLAG):
+            return kind.wrong_type
+        return kind.check(value) if kind.check else None
+
+    def value_error(self, value: Any) -> str | None:
+        """Return why a value of the right type can't be had, for people; None if it can."""
+        if value is None:
+            return None
+        if self.limits != (None, None) and self.is_out_of_range(value):
+            wanted = "no number of seconds" if self.kind is SECONDS else "not"
+            wanted = wanted if self.limits[1] is None else "not within"
+            return f"the {self.name} {value} is {wanted} {self.range}{self.unit}"
+        return self.check(value) if self.check else None
+
+    def is_out_of_range(self, value: float) -> bool:
+        """Return whether a number is outside the limits."""
+        low, high = self.limits
+        if self.kind is SECONDS and high is None:
+            high = _MAX_FLOAT
+        # NaN is outside, because every comparison with it is false.
+        above = low is None or (value > low if self.excludes_minimum else value >= low)
+        return not (above and (high is None or value <= high))
+
+    @property
+    def range(self) -> str:
+        """The limits in words; "" if there are none."""
+        low, high = self.limits
+        if low is None:
+            return ""
+        if high is not None:
+            return f"{low:g} to {high:g}"
+        return f"above {low:g}" if self.excludes_minimum else f"from {low:g} on"
+
+    def for_set(self) -> Option:
+        """Return the option of `talk set` for this setting. It has no default, because other settings stay."""
+        setting = self.setting
+        assert setting
+        return replace(self, env="", flags=setting.flags or self.flags, help=setting.set_help or self.help)
+
+    def for_serve(self) -> Option:
+        """Return the option of `talk serve` for this setting."""
+        setting = self.setting
+        assert setting
+        flags = (setting.flags or self.flags).split("/")[0]
+        return replace(self, default=setting.initial, flags=flags, help=setting.serve_help or self.help)
+
+
+def _priority_error(value: int) -> str | None:
     if -MAX_PRIORITY <= value <= MAX_PRIORITY:
         return None
     return f"the priority {value} is not within {-MAX_PRIORITY} to {MAX_PRIORITY}"
 
 
-def bad_key(value: str) -> str | None:
-    """Return why no goal can have this key, for people, or None."""
-    if 0 < len(value) <= MAX_KEY:
+def key_error(value: str) -> str | None:
+    """Return why no goal can have this key, for people; None if one can."""
+    if 0 < len(value) <= MAX_KEY_CHARS:
         return None
-    return f"a key has 1 to {MAX_KEY} characters, this one has {len(value)}"
+    return f"a key has 1 to {MAX_KEY_CHARS} characters, this one has {len(value)}"
 
 
-def _foreign_id(value: str) -> str | None:
+def _own_id_error(value: str) -> str | None:
     if is_clients_id(value):
         return None
     return (
-        f"the id {value[:MAX_ID]!a} is not one that a sender may choose: 1 to {MAX_ID} of A-Z a-z 0-9 . _ : / -, "
-        "no '-' in front, not digits alone, and not of the form of a server's own, 4k7f-12"
+        f"the id {value[:MAX_ID_CHARS]!a} is not one that a sender may choose: 1 to {MAX_ID_CHARS} of A-Z a-z 0-9 . _ "
+        ": / -, no '-' in front, not digits alone, and not of the form of a server's own, 4k7f-12"
     )
 
 
-def _unknown_format(value: str) -> str | None:
-    return None if value == "text" else f"the format {value[:MAX_ID]!r} is not known, only 'text'"
+def _format_error(value: str) -> str | None:
+    return None if value == "text" else f"the format {value[:MAX_ID_CHARS]!r} is not known, only 'text'"
 
 
-def _empty_voice(value: str) -> str | None:
+def _voice_error(value: str) -> str | None:
     return None if value else "the voice is empty"
 
 
-_RECALLED = "A goal that has not begun after SEC seconds is recalled; "
+_EXPIRY_HELP = "A goal that has not begun after SEC seconds is recalled; "
 
-#: The options of a goal, in their order on the wire and in help.
+#: The options of a goal, in the order of the wire's document and of help.
 OPTIONS = (
     Option(
         "text",
         TEXT,
         "the sentence",
         default="",
-        form=f"to {MAX_CHARACTERS:,} characters and {MAX_BYTES:,} bytes",
-        absent="needed",
+        form=f"to {MAX_TEXT_CHARS:,} characters and {MAX_TEXT_BYTES:,} bytes",
+        default_words="needed",
     ),
     Option(
         "wait",
@@ -127,17 +313,17 @@ OPTIONS = (
         "preempt",
         FLAG,
         "stop what is being spoken, if its priority is not higher, and go first",
-        absent="the server's",
+        default_words="the server's",
         flags="--preempt/--queue",
         help="Stop what is spoken and go first, or wait in the queue. [default: as 'talk serve' was told]",
         setting=Setting(
             False,
             meaning="whether a goal preempts that says nothing else",
-            to_set="Every goal stops the one before it, or goals queue; one that says --queue stops none.",
-            at_start="Every goal stops the one before it, unless it says --queue.",
+            set_help="Every goal stops the one before it, or goals queue; one that says --queue stops none.",
+            serve_help="Every goal stops the one before it, unless it says --queue.",
             flags="--preempt/--no-preempt",
-            told="goals preempt",
-            told_none="goals queue",
+            words="goals preempt",
+            none_words="goals queue",
         ),
     ),
     Option(
@@ -153,43 +339,43 @@ OPTIONS = (
         INTEGER,
         "higher goes first; first in first out among equals",
         default=0,
-        # As limits, help would show them, and nobody needs to know.
-        refuses=_bad_priority,
+        # These are no `limits`, because help would show them.
+        check=_priority_error,
         form=f"{-MAX_PRIORITY:,} to {MAX_PRIORITY:,}",
         flags="--priority",
         help="Higher goes first; what has a higher one is neither stopped nor dropped.",
-        shown=True,
+        in_goal=True,
     ),
     Option(
         "ttl",
         SECONDS,
         "seconds from now in which it must begin, else RECALLED; 0 for no limit",
         limits=(0, None),
-        absent="the server's",
+        default_words="the server's",
         flags="--ttl",
         help="Drop it if it has not begun within SEC seconds; 0: no limit.",
         setting=Setting(
             0,
-            none=0,
+            none_value=0,
             meaning="for goals that have none of their own; 0 for no limit",
-            to_set=_RECALLED + "0: no limit.",
-            at_start=_RECALLED + "it may bring its own --ttl; 0: no limit.",
-            told="ttl {} s",
-            told_none="no ttl",
+            set_help=_EXPIRY_HELP + "0: no limit.",
+            serve_help=_EXPIRY_HELP + "it may bring its own --ttl; 0: no limit.",
+            words="ttl {} s",
+            none_words="no ttl",
         ),
-        shown=True,
+        in_goal=True,
     ),
     Option(
         "key",
         WORD,
         "replaces the pending goal that has the same key",
-        refuses=bad_key,
-        form=f"1 to {MAX_KEY} characters",
+        check=key_error,
+        form=f"1 to {MAX_KEY_CHARS} characters",
         flags="--key",
         metavar="KEY",
-        help=f"A label of up to {MAX_KEY} characters; replaces what waits under the same one.",
-        offers="keys",
-        shown=True,
+        help=f"A label of up to {MAX_KEY_CHARS} characters; replaces what waits under the same one.",
+        completion="keys",
+        in_goal=True,
     ),
     Option(
         "throttle",
@@ -204,9 +390,9 @@ OPTIONS = (
         "id",
         WORD,
         "the sender's own id, see below",
-        refuses=_foreign_id,
-        form=f"1 to {MAX_ID} of `A-Z a-z 0-9 . _ : / -`",
-        absent="the server's",
+        check=_own_id_error,
+        form=f"1 to {MAX_ID_CHARS} of `A-Z a-z 0-9 . _ : / -`",
+        default_words="the server's",
         flags="--id",
         metavar="ID",
         help="An id of your own: sent twice, it is spoken once.",
@@ -215,47 +401,47 @@ OPTIONS = (
         "rate",
         INTEGER,
         "words per minute",
-        # What libespeak-ng takes.
+        # libespeak-ng takes no others.
         limits=(80, 450),
         unit=" words per minute",
-        absent="the server's",
+        default_words="the server's",
         flags="--rate",
         help="Words per minute.",
         env="TALK_RATE",
-        setting=Setting(200, told="rate {}"),
-        engine=True,
+        setting=Setting(200, words="rate {}"),
+        for_engine=True,
     ),
     Option(
         "volume",
         NUMBER,
         "loudness",
         limits=(0.0, 1.0),
-        absent="the server's",
+        default_words="the server's",
         flags="--volume",
         help="Loudness.",
         env="TALK_VOLUME",
-        setting=Setting(1.0, told="volume {}"),
-        engine=True,
+        setting=Setting(1.0, words="volume {}"),
+        for_engine=True,
     ),
     Option(
         "voice",
         WORD,
         f"id, name or language; `{DEFAULT_VOICE}` for the driver's own",
-        refuses=_empty_voice,
-        absent="the server's",
+        check=_voice_error,
+        default_words="the server's",
         flags="--voice",
         metavar="VOICE",
         help="Voice by id, name or language: see 'talk voices'.",
         env="TALK_VOICE",
-        offers="voices",
+        completion="voices",
         setting=Setting(
             None,
-            none=DEFAULT_VOICE,
-            to_set="Voice by id, name or language: see 'talk voices'; 'default' is the engine's own.",
-            told="voice {}",
-            told_none="voice the driver's own",
+            none_value=DEFAULT_VOICE,
+            set_help="Voice by id, name or language: see 'talk voices'; 'default' is the engine's own.",
+            words="voice {}",
+            none_words="voice the driver's own",
         ),
-        engine=True,
+        for_engine=True,
     ),
     Option(
         "voice_only",
@@ -265,59 +451,60 @@ OPTIONS = (
         default=False,
         flags="--voice-only",
         help="Insist on the voice: wait until it is loaded, or be aborted.",
-        engine=True,
+        for_engine=True,
     ),
     Option(
         "pitch",
         INTEGER,
         "50 is the voice's own; a neural voice has no other",
         limits=(0, 100),
-        absent="the server's",
+        default_words="the server's",
         flags="--pitch",
         help="Pitch of the voice; 50 is its own, and a neural voice has no other.",
-        setting=Setting(50, told="pitch {}"),
-        engine=True,
+        setting=Setting(50, words="pitch {}"),
+        for_engine=True,
     ),
     Option(
         "lead_in",
         INTEGER,
         "milliseconds of silence before it, also where the output was not idle; 0 for none",
-        limits=(0, MAX_LEAD_IN),
+        limits=(0, MAX_LEAD_IN_MS),
         unit=" milliseconds",
-        absent="the server's",
+        default_words="the server's",
         flags="--lead-in",
         metavar="MS",
         help="Milliseconds of silence before it; also where the output was not idle; 0: none. [default: as 'talk "
         "serve' was told]",
-        engine=True,
+        for_engine=True,
     ),
     Option(
         "audible",
         FLAG,
         "whether it is ABORTED, `muted`, where its output is muted; where that can't be known it is spoken",
-        absent="the server's",
+        default_words="the server's",
         flags="--audible",
         help="Abort it where its output is muted. [default: as 'talk serve' was told]",
-        engine=True,
+        for_engine=True,
     ),
     Option(
         "data",
         DATA,
         "travels with the goal, untouched",
-        form=f"to {MAX_DATA:,} bytes of JSON in ASCII (`é` is `\\u00e9`)",
-        shown=True,
+        form=f"to {MAX_DATA_BYTES:,} bytes of JSON in ASCII (`é` is `\\u00e9`)",
+        in_goal=True,
     ),
-    Option("format", TEXT, "anything else is REJECTED", "text", refuses=_unknown_format, shown=True),
+    Option("format", TEXT, "anything else is REJECTED", "text", check=_format_error, in_goal=True),
 )
 
-#: What the engine is told of a goal, and what everybody is.
-FOR_ENGINE = tuple(each.name for each in OPTIONS if each.engine)
-#: How it sounds, in a file, too: of these a server has a value of its own.
-SOUND = tuple(each for each in OPTIONS if each.engine and each.setting)
-SHOWN = tuple(each.name for each in OPTIONS if each.shown)
-#: The options of which a server has a value of its own: first what the engine is told, then what decides who is spoken.
-SETTINGS = tuple(sorted((each for each in OPTIONS if each.setting), key=lambda each: not each.engine))
-_NONES = {each.name: each.setting.none for each in SETTINGS if each.setting}
+#: the names of the options that the engine is told
+ENGINE_OPTIONS = tuple(each.name for each in OPTIONS if each.for_engine)
+#: the options that decide how a goal sounds, also in a file; servers have values of their own for them
+SOUND_OPTIONS = tuple(each for each in OPTIONS if each.for_engine and each.setting)
+#: the names of the options that goals show
+SHOWN_OPTIONS = tuple(each.name for each in OPTIONS if each.in_goal)
+#: the options for which servers have values of their own: first those that the engine is told
+SETTINGS = tuple(sorted((each for each in OPTIONS if each.setting), key=lambda each: not each.for_engine))
+_NONE_VALUES = {each.name: each.setting.none_value for each in SETTINGS if each.setting}
 
 
 @frozen
@@ -362,10 +549,6 @@ class Set:
     ttl: float | None = None  # seconds, 0 for no limit
 
 
-#: The settings of a server that was told nothing else.
-INITIAL = Set(**{each.name: each.setting.initial for each in SETTINGS if each.setting})
-
-
 @frozen
 class Cancel:
     """End what these fields select, goals that wait for room (`patient`) too; they add up; without any: everything."""
@@ -387,7 +570,7 @@ class Cancel:
             "this goal, and all accepted before it",
             flags="--before",
             help="This goal, and all that were accepted before it.",
-            offers="goal_ids",
+            completion="goal_ids",
         ),
         Option(
             "key",
@@ -396,7 +579,7 @@ class Cancel:
             flags="--key",
             metavar="KEY",
             help="The goals with this key, spoken or waiting.",
-            offers="unfinished_keys",
+            completion="unfinished_keys",
         ),
     )
     ids: tuple[str, ...] | None = None
@@ -406,69 +589,112 @@ class Cancel:
 
     @property
     def everything(self) -> bool:
+        """Whether it selects all goals."""
         return self.ids is None and not self.current and self.before is None and self.key is None
 
     def of_waiting(self, goals: Sequence[Say]) -> list[int]:
-        """Return which of these goals it selects, which wait for being accepted: their places in their order.
+        """Return the indexes of the selected goals among goals that wait for room.
 
-        `before` selects them only where it names one of them, by its sender's id.
+        `before` selects such goals only if it is the id that a sender has given to one of them.
         """
         ids = set(self.ids or ())
-        last = max((place for place, say in enumerate(goals) if say.id == self.before is not None), default=-1)
+        last = max((index for index, say in enumerate(goals) if say.id == self.before is not None), default=-1)
         return [
-            place
-            for place, say in enumerate(goals)
-            if self.everything or say.id in ids or place <= last or say.key == self.key is not None
+            index
+            for index, say in enumerate(goals)
+            if self.everything or say.id in ids or index <= last or say.key == self.key is not None
         ]
 
 
-#: The options whose values may be refused: a scheduler asks of each goal.
-_REFUSING = {
-    each: tuple(option for option in each.options if option.refuses or option.limits != (None, None))
+def require_fields(cls: type, options: Iterable[str]) -> None:
+    """Raise TypeError if a class has no field for one of these options, so that a mistake in a row shows at import."""
+    for name in options:
+        if name not in cls.__annotations__:
+            raise TypeError(f"the option {name!r} has a row but {cls.__name__} has no such field")
+
+
+for _request in (Say, Set, Cancel):
+    require_fields(_request, (each.name for each in _request.options))
+
+#: the settings of a server that is given none
+INITIAL = Set(**{each.name: each.setting.initial for each in SETTINGS if each.setting})
+#: the options whose values must be checked for each goal
+_CHECKED = {
+    each: tuple(option for option in each.options if option.check or option.limits != (None, None))
     for each in (Say, Set)
 }
 
 
 def bad_option(asked: Say | Set) -> str | None:
-    """Return what is wrong with the values of a goal's options, or of settings, for people, or None."""
+    """Return what is wrong with the options of a goal, or with settings, for people; None if they are right."""
     if isinstance(asked, Say) and asked.flush and asked.preempt is False:
         return "flush preempts: it can't be had together with preempt false"
-    for option in _REFUSING[type(asked)]:
+    for option in _CHECKED[type(asked)]:
         value = getattr(asked, option.name)
-        if value is not None and value != option.default and (words := option.refusal(value)):
+        if value is not None and value != option.default and (words := option.value_error(value)):
             return words
     return None
 
 
-def given(asked: Say | Set) -> dict[str, Any]:
-    """Return those options, or settings, that are given, by their names."""
+def bad_text(text: str, max_chars: int | None = MAX_TEXT_CHARS) -> Refusal | None:
+    """Return why a text can't be a goal; None if it can.
+
+    Only the engine knows whether there is something to say in it.
+
+    Args:
+        text: the text.
+        max_chars: its greatest length; None for any length.
+    """
+    import unicodedata
+
+    from talkcli.goals.reasons import Reason
+
+    if max_chars is not None and len(text) > max_chars:
+        return Reason.TEXT_TOO_LONG, f"the text has {len(text):,} characters, the longest allowed is {max_chars:,}"
+    try:
+        size = len(text.encode())
+    except UnicodeEncodeError as error:
+        words = f"character {error.start + 1} of the text is half of a surrogate pair: it is not valid UTF-8"
+        return Reason.INVALID_TEXT, words
+    if max_chars is not None and size > MAX_TEXT_BYTES:
+        return Reason.TEXT_TOO_LONG, f"the text has {size:,} bytes, the longest allowed is {MAX_TEXT_BYTES:,}"
+    if "\0" in text:
+        return Reason.INVALID_TEXT, f"character {text.index(chr(0)) + 1} of the text is NUL"
+    if all(unicodedata.category(each) in _SILENT_CATEGORIES for each in text):
+        return Reason.INVALID_TEXT, "the text is empty" if not text.strip() else "the text has nothing that can be seen"
+    return None
+
+
+def given_values(asked: Say | Set) -> dict[str, Any]:
+    """Return the options or settings that are given, by name."""
     return {name: value for name, value in fields(asked).items() if value is not None}
 
 
-def for_engine(say: Say, settings: Set) -> dict[str, Any]:
-    """Return what the engine is told of a goal, by the options' names: its own value, or the server's."""
+def engine_options(say: Say, settings: Set) -> dict[str, Any]:
+    """Return the options that the engine is told of a goal, by name: the goal's own value, or the server's."""
     found = {}
-    for name in FOR_ENGINE:
+    for name in ENGINE_OPTIONS:
         own = getattr(say, name)
         found[name] = getattr(settings, name, None) if own is None else own
     return _without_none(found)
 
 
-def as_shown(settings: Set) -> JsonObject:
-    """Return settings as everybody is told of them: None where there is none."""
+def shown_settings(settings: Set) -> JsonObject:
+    """Return settings as the server shows them: None if there is no voice or no ttl."""
     return _without_none(fields(settings))
 
 
 def _without_none(values: dict[str, Any]) -> dict[str, Any]:
-    """Return values by the options' names, with None for what stands for none: the default voice, a ttl of 0."""
-    return {name: None if value == _NONES.get(name) else value for name, value in values.items()}
+    """Replace the values that mean "none", the default voice and a ttl of 0, by None."""
+    return {name: None if value == _NONE_VALUES.get(name) else value for name, value in values.items()}
 
 
-def told(settings: JsonObject) -> list[str]:
-    """Return each of a server's settings, as it shows them, in a few words for people."""
+def describe_settings(settings: JsonObject) -> list[str]:
+    """Return a few words for people about each setting that a server shows."""
     found = []
     for each in SETTINGS:
         setting, value = each.setting, settings.get(each.name)
         if setting:
-            found.append(setting.told_none if setting.told_none and not value else setting.told.format(figure(value)))
+            none = setting.none_words and not value
+            found.append(setting.none_words if none else setting.words.format(format_number(value)))
     return found

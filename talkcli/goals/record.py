@@ -1,6 +1,6 @@
-"""The scheduler's own record of a goal. Outside the scheduler it is read, never written.
+"""The scheduler's record of a goal.
 
-Slots and no dictionary: a queue of ten thousand goals has to stay small.
+Only this package writes to it; other packages may read it. It has slots, because ten thousand goals may wait.
 """
 
 from __future__ import annotations
@@ -11,13 +11,15 @@ from typing import TYPE_CHECKING
 
 from talkcli.frozen import replace
 from talkcli.goals.goal import By, Goal
-from talkcli.goals.options import SHOWN
-from talkcli.goals.states import State, follow
+from talkcli.goals.options import SHOWN_OPTIONS, require_fields
+from talkcli.goals.states import State, check_transition
 
 if TYPE_CHECKING:
     from talkcli.goals.goal import Output, Sender
     from talkcli.goals.options import Say
     from talkcli.goals.reasons import Reason
+
+require_fields(Goal, SHOWN_OPTIONS)
 
 
 @dataclass(slots=True, eq=False)
@@ -25,45 +27,45 @@ class Record:
     """One goal, from its acceptance to its end."""
 
     id: str
-    #: order of acceptance
+    #: its place in the order of acceptance
     number: int
-    #: what its sender asked for, with the server's own time to live where it brought none
+    #: the request; it has the server's time to live if the sender gave none
     say: Say
     sender: Sender
     queued_at: float
     preempt: bool = False
-    #: the monotonic time by which it must have begun
+    #: when it expires if it has not begun (monotonic seconds)
     expires_at: float | None = None
-    #: its text; None once that is dropped
+    #: None once the text is dropped
     text: str | None = field(init=False)
-    #: stands for the text once that is dropped
+    #: replaces a text that is dropped
     text_hash: int = 0
-    #: bytes that the text takes; none once that is dropped
+    #: memory for the text; 0 once it is dropped
     text_bytes: int = field(init=False)
     state: State = State.PENDING
-    #: its place among the pending goals of its priority; the queue's business alone
-    turn: int = 0
+    #: its place among the pending goals of its priority; only the queue uses it
+    position: int = 0
     reason: Reason | None = None
     by: By | None = None
     message: str | None = None
-    #: offset after the last word that was heard
+    #: the offset after the last word that was heard
     spoken_end: int = 0
-    #: held in the middle of being spoken
+    #: whether it is held while it is spoken
     paused: bool = False
-    #: how often that was asked for
-    holds: int = 0
-    #: monotonic time at which its turn had come, whether its voice was there or not
-    turn_at: float = inf
-    #: monotonic time at which it was handed to the engine
-    began: float = 0.0
+    #: how often it was paused
+    pause_count: int = 0
+    #: since when it is the next goal (monotonic seconds); inf before that
+    next_since: float = inf
+    #: when it was handed to the engine (monotonic seconds)
+    began_at: float = 0.0
     started_at: float | None = None
     ended_at: float | None = None
     duration: float | None = None
-    #: id of the voice by which it is heard
+    #: id of the voice that speaks it
     voice: str | None = None
     output: Output | None = None
-    #: monotonic time of the first stop
-    stop_since: float | None = None
+    #: when it was first told to stop (monotonic seconds)
+    stop_requested_at: float | None = None
 
     def __post_init__(self) -> None:
         self.text = self.say.text
@@ -71,29 +73,29 @@ class Record:
 
     @property
     def priority(self) -> int:
-        """Higher goes first."""
+        """The goal's priority: higher goes first."""
         return self.say.priority
 
     @property
     def key(self) -> str | None:
-        """What a later goal replaces it by; None for nothing."""
+        """The label by which a later goal replaces this one, if it has one."""
         return self.say.key
 
     def become(self, state: State) -> None:
-        """Change the state as the table allows, or raise IllegalTransition and change nothing."""
-        self.state = follow(self.state, state)
+        """Change the state, or raise IllegalTransition and change nothing."""
+        self.state = check_transition(self.state, state)
 
     def drop_text(self) -> None:
-        """Forget the text, to make room; the result stays."""
+        """Forget the text to free memory, but not the result."""
         self.text_hash = hash(self.text)
         self.text, self.text_bytes, self.say = None, 0, replace(self.say, text="")
 
     def has_text(self, text: str) -> bool:
-        """Whether this was the goal's text, also where it is not kept any more."""
+        """Return whether this is the goal's text, even if the text was dropped."""
         return hash(text) == self.text_hash if self.text is None else text == self.text
 
     def snapshot(self, state: State | None = None) -> Goal:
-        """Return the goal as it is now; with PENDING, as it was when it was accepted."""
+        """Return the goal as it is now, or with PENDING, as it was when it was accepted."""
         state = self.state if state is None else state
         accepted = state is State.PENDING
         spoken = None if accepted or self.started_at is None or self.text is None else self.text[: self.spoken_end]
@@ -113,5 +115,5 @@ class Record:
             duration=None if accepted else self.duration,
             voice=None if accepted else self.voice,
             output=None if accepted else self.output,
-            **{name: getattr(self.say, name) for name in SHOWN},
+            **{name: getattr(self.say, name) for name in SHOWN_OPTIONS},
         )

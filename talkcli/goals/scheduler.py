@@ -1,11 +1,11 @@
-"""The scheduler: which goal is spoken, which waits, and how each ends.
+"""The scheduler: decides which goal is spoken, which goals wait, how each one ends, and which voices are loaded.
 
-Pure: a request, an engine event or the time goes in, effects come out; no thread, socket or clock inside. A method
-either does all of its step or raises and has changed nothing. Effects are to be carried out in the order in which they
-come: those for the engine in theirs, and the news for clients, `Changed`, in theirs.
+Pure: a request, a report of the engine or the time goes in, and effects come out. A method either does its whole step
+or raises an error and changes nothing. Effects must be carried out in their order: the orders for the engine among
+themselves, and the changes to be published among themselves. Only this package writes to the scheduler and its records.
 
-What holds after every step: at most one goal is ACTIVE or PREEMPTING, and none starts before that one has ended, while
-speech is paused, or while there is no engine; a goal ends once; the order in which goals wait is the queue's.
+After every step: at most one goal is ACTIVE or PREEMPTING. No goal starts before that one has ended, while speech is
+paused, or without an engine. A goal ends once.
 """
 
 from __future__ import annotations
@@ -16,16 +16,23 @@ from math import inf
 from typing import TYPE_CHECKING
 
 from talkcli.frozen import frozen, replace
-from talkcli.goals import text as texts
 from talkcli.goals.goal import By
-from talkcli.goals.history import EarlyCancels, History, Said
-from talkcli.goals.loading import Loading
-from talkcli.goals.option import figure, is_clients_id
-from talkcli.goals.options import INITIAL, MAX_CHARACTERS, bad_option
+from talkcli.goals.history import EarlyCancels, History, SpeechTimes
+from talkcli.goals.options import (
+    INITIAL,
+    MAX_TEXT_CHARS,
+    bad_option,
+    bad_text,
+    format_number,
+    is_clients_id,
+    is_neural,
+    model_of,
+)
 from talkcli.goals.queue import Queue
 from talkcli.goals.reasons import Reason, Refusal
 from talkcli.goals.record import Record
 from talkcli.goals.states import IllegalTransition, State
+from talkcli.goals.voices import NeuralVoices, VoiceDropOrder, VoiceLoadOrder, VoiceWarning
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
@@ -33,125 +40,155 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import Output, Sender
     from talkcli.goals.options import Cancel, Say, Set
 
-#: Seconds after a stop in which silence must be confirmed: `cancel` is answered within 2 s whatever happens.
-SILENCE_LIMIT = 1.9
+#: How long the engine may take to confirm silence after a stop. A cancel must be answered within 2 s in any case.
+CONFIRM_SILENCE_S = 1.9
 
 
 @frozen
 class Now:
-    """One moment on both clocks, in seconds: monotonic, for limits, and since 1970 UTC, to be shown.
+    """One moment on both clocks, in seconds.
 
-    The monotonic one counts the time in which the machine was suspended: what was true before is not news after it.
+    The monotonic clock must go on while the machine is suspended, so that goals expire meanwhile.
     """
 
     monotonic: float
+    #: seconds since 1970 UTC, only to be shown
     wall: float
 
 
 @frozen
 class Changed:
-    """A goal is in a new state; to be published."""
+    """Effect: publish that a goal is in a new state."""
 
     record: Record
     state: State
 
 
 class Order(Enum):
-    """What the engine shall do with a goal, as the log calls it."""
+    """What the engine is to do with a goal; the value is the name in the log."""
 
     START = "Start"
-    #: the answer is `ended`
+    #: be silent, and report the end
     STOP = "Stop"
-    #: it didn't become silent in time: it must be replaced before it may be given another goal
+    #: replace the engine process, because it did not become silent in time
     GIVE_UP = "GiveUp"
-    #: be silent, and go on with it at `RESUME`
+    #: be silent until RESUME
     HOLD = "Hold"
     RESUME = "Resume"
 
 
 @frozen
 class Ordered:
-    """The engine shall do this with a goal."""
+    """Effect: give the engine an order about a goal."""
 
     record: Record
     order: Order
 
 
-Effect = Changed | Ordered
+Effect = Changed | Ordered | VoiceLoadOrder | VoiceDropOrder | VoiceWarning
 
 
 @frozen
 class Submitted:
-    """What became of a goal that was sent: its record, or that of the first goal of its id, to which it is attached."""
+    """The result of `Scheduler.submit`."""
 
+    #: the new goal, or the earlier goal with the same id and text
     record: Record
     effects: list[Effect]
+    #: whether it is the earlier goal
     attached: bool = False
 
 
 @dataclass(slots=True)
 class Cancelled:
-    """What a cancel did: goals that ended at once, the one being stopped, those that had ended, ids nobody knows."""
+    """The result of `Scheduler.cancel`."""
 
+    #: goals that have ended at once
     recalled: list[Record] = field(default_factory=list)
+    #: the active goal, if it is being stopped
     stopping: Record | None = None
+    #: goals that had ended before
     ended: list[Record] = field(default_factory=list)
+    #: ids that no goal has
     unknown: list[str] = field(default_factory=list)
     effects: list[Effect] = field(default_factory=list)
 
 
 class Scheduler:
-    """Goals of one server. `boot` makes their ids: four characters a server start."""
+    """The goals of one server."""
 
-    def __init__(self, boot: str, *, max_queue: int, max_text: int = MAX_CHARACTERS, settings: Set = INITIAL) -> None:
+    def __init__(
+        self,
+        boot: str,
+        *,
+        max_queue: int,
+        max_text: int = MAX_TEXT_CHARS,
+        settings: Set = INITIAL,
+        voices: NeuralVoices | None = None,
+    ) -> None:
+        """Create a scheduler without goals and without an engine.
+
+        Args:
+            boot: four characters that begin the ids of this server's goals.
+            max_queue: the number of goals that may be pending.
+            max_text: the number of characters that a text may have.
+            settings: the values of options that goals don't give. None of them is None.
+            voices: the neural voices, if they have a memory limit.
+        """
         self.boot = boot
-        #: what holds for goals that don't say; all of them are given
         self.settings = settings
         self.max_queue = max_queue
         self.max_text = max_text
         self.history = History()
+        self.voices = voices or NeuralVoices()
         #: the goal that is ACTIVE or PREEMPTING
         self.active: Record | None = None
-        #: whether nothing is to be spoken until `resume`
+        #: whether no goal starts until `resume`
         self.paused = False
-        #: whether there is an engine to start the next goal; without one they wait
-        self.has_engine = True
-        self.loading = Loading()
-        #: whether it was told to end, and takes no goal any more
+        #: whether goals can start
+        self.has_engine = False
+        #: whether `shutdown` was called, so that every new goal is rejected
         self.closing = False
+        #: whether there is an engine process that loads voices
+        self._loads_voices = False
         self._queue = Queue()
         self._by_id: dict[str, Record] = {}
-        self._said = Said()
-        self._early = EarlyCancels()
+        self._speech_times = SpeechTimes()
+        self._early_cancels = EarlyCancels()
         self._count = 0
 
     # -- what there is
 
     @property
     def pending_count(self) -> int:
+        """The number of pending goals."""
         return len(self._queue)
 
     def pending(self) -> Iterator[Record]:
         """Return the pending goals in the order in which they will be spoken."""
         return iter(self._queue)
 
+    def unfinished(self) -> list[Record]:
+        """Return the active goal and the pending goals."""
+        return ([self.active] if self.active else []) + list(self._queue)
+
     def find(self, goal_id: str) -> Record | None:
-        """Return a goal that is active, pending, or still remembered."""
+        """Return the goal with this id, if it is active, pending or still in the history."""
         return self._by_id.get(goal_id) or self.history.find(goal_id)
 
-    def lacks_room(self, say: Say, now: Now, fault: Refusal | None = None) -> bool:
-        """Whether this goal would be REJECTED only because the queue is full; `fault` as in `submit`."""
-        early = self._early.find(say.id, now.monotonic)
-        return not (early or self.has_room(say)) and self._refuse(say, fault, None) is None
-
     def has_room(self, say: Say) -> bool:
-        """Whether a goal that lacked nothing but room need wait no longer."""
+        """Return whether a goal that waits for room in the queue can be submitted now."""
         attaches = say.id is not None and self.find(say.id) is not None
-        return attaches or self._way(say) is not None
+        return attaches or self._find_room(say) is not None
 
-    def unfinished(self) -> list[Record]:
-        """Return the active goal and the pending ones."""
-        return ([self.active] if self.active else []) + list(self._queue)
+    def lacks_room(self, say: Say, now: Now, refusal: Refusal | None = None) -> bool:
+        """Return whether a goal would be rejected only because the queue is full; `refusal` as in `submit`."""
+        canceled = self._early_cancels.find(say.id, now.monotonic)
+        return not (canceled or self.has_room(say)) and self._refuse(say, refusal, None) is None
+
+    def wanted_voice(self, record: Record) -> str:
+        """Return the voice of a goal: its own, or that of the settings; "" for the engine's default."""
+        return record.say.voice or self.settings.voice or ""
 
     # -- what clients ask for
 
@@ -160,33 +197,33 @@ class Scheduler:
         say: Say,
         sender: Sender,
         now: Now,
-        fault: Refusal | None = None,
+        refusal: Refusal | None = None,
         canceled: By | None = None,
-        waited: float = 0.0,
+        waited_s: float = 0.0,
     ) -> Submitted:
-        """Accept or reject a goal. Admission is one step: a goal that is REJECTED has done nothing to the others.
+        """Accept or reject a goal. A rejected goal has no effect on the others.
 
         Args:
             say: the goal.
             sender: its sender.
             now: the time.
-            fault: reason and words, if something is wrong with it that can't be known here.
-            canceled: who cancelled it while it waited for room; it is RECALLED at once, and does nothing to the others.
-            waited: seconds for which it waited for room; if its ttl is over, it is RECALLED likewise.
+            refusal: why the server refuses the goal, if it does.
+            canceled: who cancelled the goal while it waited for room. It is recalled at once.
+            waited_s: how long the goal waited for room. It is recalled at once if its time to live is over.
         """
         first = self.find(say.id) if say.id is not None and is_clients_id(say.id) else None
         if first is not None and first.has_text(say.text):
             return Submitted(first, [], attached=True)
         self._count += 1
         ttl = (self.settings.ttl if say.ttl is None else say.ttl) or None
-        expires_at = None if ttl is None else now.monotonic + ttl - waited
+        expires_at = None if ttl is None else now.monotonic + ttl - waited_s
         number, asked = self._count, say if ttl == say.ttl else replace(say, ttl=ttl)
         record = Record(f"{self.boot}-{number}", number, asked, sender, now.wall, self._preempts(say), expires_at)
-        by = canceled or self._early.find(say.id, now.monotonic)
-        refused = self._refuse(say, fault, first) or (None if canceled else self._throttle(say, record, now))
+        by = canceled or self._early_cancels.find(say.id, now.monotonic)
+        refused = self._refuse(say, refusal, first) or (None if canceled else self._throttle(say, record, now))
         expired = expires_at is not None and expires_at <= now.monotonic
-        way = self._way(say)
-        if way is None and not (by or refused or expired):
+        recalled = self._find_room(say)
+        if recalled is None and not (by or refused or expired):
             refused = Reason.QUEUE_FULL, f"{len(self._queue)} goals are waiting already (`talk serve --max-queue`)"
         if refused:
             record.reason, words = refused
@@ -198,35 +235,75 @@ class Scheduler:
         effects: list[Effect] = [Changed(record, State.PENDING)]
         if by:
             words = "canceled before it was spoken" if canceled else "canceled before it arrived"
-            return Submitted(record, effects + self._recalled(record, Reason.CANCELED, words, by, now))
+            return Submitted(record, effects + self._end_unqueued(record, Reason.CANCELED, words, by, now))
         if expired:
-            return Submitted(record, effects + self._recalled(record, Reason.EXPIRED, _expired(record), None, now))
-        effects += self._make_way(record, way or [], now)
-        return Submitted(record, effects + self._start_next(now))
+            words = _expiry_message(record)
+            return Submitted(record, effects + self._end_unqueued(record, Reason.EXPIRED, words, None, now))
+        effects += self._enqueue(record, recalled or [], now)
+        self._request_voice(self.wanted_voice(record), now)
+        return Submitted(record, effects + self._start_next(now) + self._load_next(now))
 
     def cancel(
         self, selection: Cancel, sender: Sender | None, now: Now, waiting: Collection[str | None] = ()
     ) -> Cancelled:
-        """End what is selected: pending goals at once, the active one as soon as the engine is silent.
+        """End the selected goals: the pending ones at once, the active one when the engine is silent.
 
-        `waiting`: ids that it selects of goals that have not been submitted yet.
+        Args:
+            selection: the goals to end.
+            sender: who cancels them.
+            now: the time.
+            waiting: the ids of selected goals that wait for room and have not been submitted yet.
         """
-        done = Cancelled()
+        result = Cancelled()
         by = By(client=sender)
-        chosen = self._select(selection, done, waiting)
-        for goal_id in filter(is_clients_id, done.unknown):
-            self._early.note(goal_id, by, now.monotonic)
+        chosen = self._select(selection, result, waiting)
+        for goal_id in filter(is_clients_id, result.unknown):
+            self._early_cancels.note(goal_id, by, now.monotonic)
         for record in chosen:
             if record.state is State.PENDING:
-                done.effects += self._recall(record, Reason.CANCELED, "canceled before it was spoken", by, now)
-                done.recalled.append(record)
+                result.effects += self._recall(record, Reason.CANCELED, "canceled before it was spoken", by, now)
+                result.recalled.append(record)
             else:
-                done.effects += self._stop(record, Reason.CANCELED, by, now)
-                done.stopping = record
-        return done
+                result.effects += self._stop(record, Reason.CANCELED, by, now)
+                result.stopping = record
+        result.effects += self._load_next(now)
+        return result
+
+    def change_settings(self, changes: dict[str, object], now: Now) -> list[Effect]:
+        """Change the values of options that goals don't give, for the goals that have not begun.
+
+        A voice that has failed before is loaded again if it is named here.
+        """
+        self.settings = replace(self.settings, **changes)
+        voice = changes.get("voice")
+        if isinstance(voice, str):
+            self.voices.forget_failure(model_of(voice))
+            self._request_voice(voice, now)
+        return self.tick(now)  # the next goal may not have to wait for its voice any more
+
+    def pause(self) -> list[Effect]:
+        """Hold the active goal, and start no other."""
+        if self.paused:
+            return []
+        self.paused = True
+        if self.active is None or self.active.state is not State.ACTIVE:
+            return []
+        self.active.paused = True
+        self.active.pause_count += 1
+        return [Ordered(self.active, Order.HOLD)]
+
+    def resume(self, now: Now) -> list[Effect]:
+        """Continue the goal that is held, or start the next one."""
+        if not self.paused:
+            return []
+        self.paused = False
+        if not (self.active and self.active.paused):
+            return self._start_next(now)
+        self.active.paused = False
+        return [Ordered(self.active, Order.RESUME)]
 
     def shutdown(self, now: Now) -> list[Effect]:
-        """End everything, and take no goal any more."""
+        """End all goals, and reject every new one."""
         self.closing = True
         effects: list[Effect] = []
         for record in list(self._queue):
@@ -235,63 +312,59 @@ class Scheduler:
             effects += self._stop(self.active, Reason.SHUTDOWN, None, now)
         return effects
 
-    def pause(self) -> list[Effect]:
-        """Hold the goal being spoken, and start none."""
-        if self.paused:
-            return []
-        self.paused = True
-        if self.active is None or self.active.state is not State.ACTIVE:
-            return []
-        self.active.paused = True
-        self.active.holds += 1
-        return [Ordered(self.active, Order.HOLD)]
+    # -- what the engine reports
 
-    def resume(self, now: Now) -> list[Effect]:
-        """Go on with the goal that is held, or else with the next."""
-        if not self.paused:
-            return []
-        self.paused = False
-        if not (self.active and self.active.paused):
-            return self._start_next(now)  # nothing where one is being stopped
-        self.active.paused = False
-        return [Ordered(self.active, Order.RESUME)]
-
-    # -- what the engine says
-
-    def engine_lost(self) -> None:
-        """Start no goal until there is an engine again, which has no voice loaded."""
-        self.has_engine = False
-        self.loading.clear()
+    def engine_lost(self, now: Now) -> list[Effect]:
+        """Start no goal until there is an engine again."""
+        self.has_engine = self._loads_voices = False
+        return [*self.voices.engine_lost(now.monotonic)]
 
     def engine_ready(self, now: Now) -> list[Effect]:
-        """Go on: there is an engine that takes the next goal."""
-        self.has_engine = True
+        """Start the next goal, and load the voices that goals need: there is an engine."""
+        self.has_engine = self._loads_voices = True
+        for voice in (*self._needed_voices(), self.settings.voice or ""):
+            self._request_voice(voice, now)
+        return self._start_next(now) + self._load_next(now)
+
+    def engine_unavailable(self, now: Now) -> list[Effect]:
+        """Start goals although no engine can be started, so that each one fails at once."""
+        self.has_engine, self._loads_voices = True, False
         return self._start_next(now)
 
-    def engine_missing(self, words: str, now: Now) -> list[Effect]:
-        """End the goal whose turn it is: an engine was waited for long enough, and once more none came."""
+    def fail_next(self, message: str, now: Now) -> list[Effect]:
+        """Fail the next goal: no engine could be started for a long time."""
         if self.has_engine:
             return []
-        self.loading.clear()  # there is nothing that would load a voice
         record, effects = self._activate_next(now)
-        return effects + self.failed(record.id, Reason.ENGINE_FAILED, words, None, now) if record else effects
+        return effects + self.failed(record.id, Reason.ENGINE_FAILED, message, None, now) if record else effects
 
-    def heard(self, goal_id: str, end: int) -> Record:
-        """Note that the word that ends at this offset of the text is being heard."""
+    def word_heard(self, goal_id: str, end: int) -> Record:
+        """Note that a word is being heard, which ends at this offset of the text. Return the goal."""
         record = self._spoken(goal_id)
         record.spoken_end = max(record.spoken_end, end)
         return record
 
-    def spoken_by(self, goal_id: str, voice: str) -> None:
-        """Note by which voice the active goal is heard."""
+    def voice_chosen(self, goal_id: str, voice: str, now: Now) -> list[Effect]:
+        """Note which voice speaks the active goal. Another goal's voice may be loaded in place of its own now."""
         self._spoken(goal_id).voice = voice
+        return self._load_next(now)
 
-    def goes_to(self, goal_id: str, output: Output | None) -> None:
-        """Note where the active goal's sound goes, as far as that is known."""
+    def output_changed(self, goal_id: str, output: Output | None) -> None:
+        """Note where the sound of the active goal goes; None if unknown."""
         self._spoken(goal_id).output = output
 
-    def completed(self, goal_id: str, duration: float | None, now: Now, gaps: int = 0, late: float = 0) -> list[Effect]:
-        """End the active goal: all of it was played, with so many gaps, so many seconds `late` by them."""
+    def completed(
+        self, goal_id: str, duration: float | None, now: Now, gaps: int = 0, gap_seconds: float = 0
+    ) -> list[Effect]:
+        """End the active goal: all of it was played.
+
+        Args:
+            goal_id: its id.
+            duration: the seconds of audio, if known.
+            now: the time.
+            gaps: how often the sound was interrupted because it was not made in time.
+            gap_seconds: how long all gaps were together.
+        """
         record = self._spoken(goal_id)
         record.duration = duration
         record.spoken_end = len(record.text or "")
@@ -299,60 +372,78 @@ class Scheduler:
         if record.output and record.output.muted:
             words += f", but the output was muted: {record.output.device}"
         if gaps:
-            many = f"{gaps} gap{'s' if gaps > 1 else ''} of {late:.1f} s in all"
+            many = f"{gaps} gap{'s' if gaps > 1 else ''} of {gap_seconds:.1f} s in all"
             words += f", but with {many}: this machine is too slow for the voice"
-        # A stop that came too late ended nothing: its reason goes.
-        return self._end(record, State.SUCCEEDED, None, words, None, now)
+        # A stop that came too late had no effect, so its reason goes.
+        return self._end(record, State.SUCCEEDED, None, words, None, now) + self._load_next(now)
 
-    def failed(self, goal_id: str, reason: Reason, words: str, duration: float | None, now: Now) -> list[Effect]:
-        """End the active goal: engine or audio failed.
+    def failed(self, goal_id: str, reason: Reason, message: str, duration: float | None, now: Now) -> list[Effect]:
+        """End the active goal because engine or audio failed.
 
-        One that was being stopped is silent now, so it is PREEMPTED, unless the silence is what failed (not_silent).
+        If the goal was being stopped, it is silent now and ends PREEMPTED. Only `not_silent` makes it ABORTED.
         """
         record = self._spoken(goal_id)
         record.duration = duration
         if record.state is State.PREEMPTING and reason is not Reason.NOT_SILENT:
             return self.stopped(goal_id, now)
-        return self._end(record, State.ABORTED, reason, f"Talk aborted: {words}", record.by, now)
+        message = f"Talk aborted: {message}"
+        return self._end(record, State.ABORTED, reason, message, record.by, now) + self._load_next(now)
 
     def stopped(self, goal_id: str, now: Now) -> list[Effect]:
-        """End the active goal, which was told to stop: it is silent."""
+        """End the active goal, which was being stopped and is silent now."""
         record = self._spoken(goal_id)
-        return self._end(record, State.PREEMPTED, record.reason, "Talk preempted", record.by, now)
+        effects = self._end(record, State.PREEMPTED, record.reason, "Talk preempted", record.by, now)
+        return effects + self._load_next(now)
+
+    def voice_load_ended(self, voice: str, error: str | None, now: Now, *, has_libraries: bool) -> list[Effect]:
+        """Note that a voice was loaded, or why it could not be; and whether the engine has the libraries now."""
+        self.voices.has_libraries = self.voices.has_libraries or has_libraries
+        self.voices.load_ended(voice, error, now.monotonic)
+        return self._drop_excess() + self.tick(now)
+
+    def voices_measured(self, voice: str, memory_bytes: int, now: Now) -> list[Effect]:
+        """Note the memory that all voices take, measured after something was done with this one."""
+        self.voices.measured(voice, memory_bytes)
+        return self._drop_excess() + self._load_next(now)
+
+    def voice_unloaded(self, voice: str, now: Now) -> list[Effect]:
+        """Note that the engine has dropped a voice by itself."""
+        self.voices.unloaded(voice, self._needed_voices())
+        return self._load_next(now)
 
     # -- time
 
     def deadline(self) -> float | None:
-        """Return the monotonic time at which `tick` has something to do."""
+        """Return the time at which `tick` has something to do (monotonic); None if it has nothing to do."""
         due = (self._active_deadline(), self._queue.next_expiry(), self._next_deadline())
         return min((each for each in due if each is not None), default=None)
 
     def tick(self, now: Now) -> list[Effect]:
-        """Do what is due: recall what is too late, abort what isn't silent in time, start what has waited."""
+        """Recall expired goals, abort the active goal if it isn't silent in time, and start the next goal."""
         effects: list[Effect] = []
         record, deadline = self.active, self._active_deadline()
         if record is not None and deadline is not None and now.monotonic >= deadline:
-            if record.stop_since is None:
+            if record.stop_requested_at is None:
                 effects = self._stop(record, Reason.EXPIRED, None, now)
             else:
-                words = f"Talk aborted: silence could not be confirmed within {SILENCE_LIMIT:g} s"
+                words = f"Talk aborted: silence could not be confirmed within {CONFIRM_SILENCE_S:g} s"
                 effects = [Ordered(record, Order.GIVE_UP)]
                 effects += self._end(record, State.ABORTED, Reason.NOT_SILENT, words, record.by, now)
-        return effects + self._expire(now) + self._start_next(now)
+        return effects + self._expire(now) + self._start_next(now) + self._load_next(now)
 
-    # -- inside
+    # -- admission
 
-    def _select(self, selection: Cancel, done: Cancelled, waiting: Collection[str | None]) -> list[Record]:
-        """Return the selected goals that have not ended; note in `done` what else was named."""
+    def _select(self, selection: Cancel, result: Cancelled, waiting: Collection[str | None]) -> list[Record]:
+        """Return the selected goals that have not ended; note the others in `result`."""
         chosen = self.unfinished() if selection.everything else []
         for goal_id in dict.fromkeys(selection.ids or ()):
             record = self.find(goal_id)
             if record and record.state.terminal:
-                done.ended.append(record)
+                result.ended.append(record)
             elif record:
                 chosen.append(record)
             elif goal_id not in waiting:
-                done.unknown.append(goal_id)
+                result.unknown.append(goal_id)
         if self.active and (selection.current or self.active.key == selection.key is not None):
             chosen.append(self.active)
         if pending := self._queue.with_key(selection.key):
@@ -362,23 +453,23 @@ class Scheduler:
             if last or selection.before in waiting:
                 chosen += [each for each in self.unfinished() if last is None or each.number <= last.number]
             else:
-                done.unknown.append(selection.before)
-        once = {each.number: each for each in chosen}.values()
-        # The active one last: another must not start, even for the length of this step, and be stopped again.
-        return sorted(once, key=lambda each: (each is self.active, each.number))
+                result.unknown.append(selection.before)
+        unique = {each.number: each for each in chosen}.values()
+        # The active goal comes last. Otherwise a selected goal would start, only to be stopped again.
+        return sorted(unique, key=lambda each: (each is self.active, each.number))
 
-    def _refuse(self, say: Say, fault: Refusal | None, first: Record | None) -> Refusal | None:
-        """Return reason and words why a goal can't be had, whatever else is being said."""
+    def _refuse(self, say: Say, refusal: Refusal | None, first: Record | None) -> Refusal | None:
+        """Return why a goal is refused whatever the other goals do. `first`: an earlier goal with the same id."""
         if self.closing:
             return Reason.SHUTDOWN, "the server is being stopped"
         if words := bad_option(say):
             return Reason.BAD_OPTION, words
         if first is not None:
             return Reason.ID_CONFLICT, f"the id {say.id} is that of another text already"
-        return texts.fault(say.text, self.max_text) or fault
+        return bad_text(say.text, self.max_text) or refusal
 
     def _throttle(self, say: Say, record: Record, now: Now) -> Refusal | None:
-        """Return reason and words where the same is being said, waits, or was said just now; note which goal it is."""
+        """Return why a goal is throttled, and note the goal that it repeats; None if it is not throttled."""
         if say.throttle is None:
             return None
         active = self.active
@@ -388,113 +479,161 @@ class Scheduler:
         elif waiting:
             first, words = waiting.id, "is waiting already"
         else:
-            last = self._said.within(say.throttle, say.key, say.text, now.monotonic)
+            last = self._speech_times.find(now.monotonic - say.throttle, say.key, say.text)
             if last is None:
                 return None
-            first, words = last, f"was said less than {figure(say.throttle)} s ago"
+            first, words = last, f"was said less than {format_number(say.throttle)} s ago"
         record.by = By(goal=first)
         return Reason.THROTTLED, f"the same {words}"
 
-    def _way(self, say: Say) -> list[tuple[Record, Reason]] | None:
-        """Return the pending goals that this one recalls, and the reason; None if it has no room even so."""
+    def _preempts(self, say: Say) -> bool:
+        return say.flush or bool(self.settings.preempt if say.preempt is None else say.preempt)
+
+    def _find_room(self, say: Say) -> list[tuple[Record, Reason]] | None:
+        """Return the pending goals that this goal recalls, each with the reason; None if there is no room for it."""
         replaced = self._queue.with_key(say.key)
         preempted: list[Record] = []
         if say.flush:
             preempted = self._queue.up_to(say.priority)
         elif self._preempts(say):
             preempted = self._queue.preempting_up_to(say.priority)
-        way = [(replaced, Reason.REPLACED)] if replaced else []
-        way += [(each, Reason.PREEMPTED) for each in preempted if each is not replaced]
-        # There never are more goals in the queue than may be: one that will be recalled makes room enough.
-        if way or len(self._queue) < self.max_queue:
-            return way
+        recalled = [(replaced, Reason.REPLACED)] if replaced else []
+        recalled += [(each, Reason.PREEMPTED) for each in preempted if each is not replaced]
+        # The queue never holds too many goals, so one recalled goal makes enough room.
+        if recalled or len(self._queue) < self.max_queue:
+            return recalled
         last = self._queue.newest_of_lowest()
-        # A goal that brings `preempt` displaces its own priority, too. Any preempting goal there is in `way` already.
+        # A goal that brings `preempt` also displaces its own priority. Goals that preempt are in `recalled` already.
         limit = say.priority if say.preempt else say.priority - 1
         return [(last, Reason.DISPLACED)] if last and last.priority <= limit else None
 
-    def _preempts(self, say: Say) -> bool:
-        return say.flush or bool(self.settings.preempt if say.preempt is None else say.preempt)
-
-    def _make_way(self, record: Record, ended: list[tuple[Record, Reason]], now: Now) -> list[Effect]:
-        """Queue a goal that was accepted, and end what it replaces, preempts or displaces."""
+    def _enqueue(self, record: Record, recalled: list[tuple[Record, Reason]], now: Now) -> list[Effect]:
+        """Queue an accepted goal, end the pending goals that it recalls, and stop the active goal if it preempts it."""
         by = By(goal=record.id)
         effects: list[Effect] = []
-        instead = None
-        for each, reason in ended:
+        replaced = None
+        for each, reason in recalled:
             if reason is Reason.REPLACED and each.priority == record.priority and not record.preempt:
-                instead = each
+                replaced = each
             effects += self._recall(each, reason, f"{reason} by {record.id}", by, now)
         if record.preempt and self.active and self.active.priority <= record.priority:
             effects += self._stop(self.active, Reason.PREEMPTED, by, now)
-        self._queue.add(record, instead)
+        self._queue.add(record, replaced)
         return effects
+
+    # -- voices
+
+    def _request_voice(self, voice: str, now: Now) -> None:
+        """Have a voice loaded for a goal, if it is a neural one and there is an engine."""
+        if self._loads_voices and is_neural(model := model_of(voice)):
+            self.voices.request(model, now.monotonic)
+
+    def _needed_voices(self) -> list[str]:
+        """Return the neural voices that goals need, in the order of the goals.
+
+        The active goal needs none once it is heard: its voice is kept until it has spoken.
+        """
+        voices = (model_of(self.wanted_voice(each)) for each in self.unfinished() if each.voice is None)
+        return list(filter(is_neural, dict.fromkeys(voices)))
+
+    def _load_next(self, now: Now) -> list[Effect]:
+        """Return the order to load the next voice, if there is one.
+
+        The first voice is not loaded while a goal is heard. The libraries that are imported then stop the whole engine
+        process for a tenth of a second.
+        """
+        if not (self._loads_voices and self.voices.can_load) or self.closing:
+            return []
+        if self.active and not self.voices.has_libraries:
+            return []
+        order = self.voices.load_next(self._needed_voices(), model_of(self.settings.voice), now.monotonic)
+        return [order] if order else []
+
+    def _drop_excess(self) -> list[Effect]:
+        """Return orders to drop voices if they take more memory than allowed."""
+        needed = self._needed_voices()
+        speaking = model_of(self.active.voice) if self.active else ""
+        if is_neural(speaking) and not self.voices.is_loaded(speaking):
+            return []  # it was dropped but keeps its memory until it has spoken, and the engine measures again then
+        return [*self.voices.drop_excess(next(iter(needed), speaking), needed)]
+
+    # -- how goals begin and end
 
     def _expire(self, now: Now) -> list[Effect]:
         effects: list[Effect] = []
         for record in self._queue.expired(now.monotonic):
-            effects += self._recall(record, Reason.EXPIRED, _expired(record), None, now)
+            effects += self._recall(record, Reason.EXPIRED, _expiry_message(record), None, now)
         return effects
 
     def _active_deadline(self) -> float | None:
-        """Return by when the active goal must be silent, if it was stopped, or else when it expires.
+        """Return when the active goal must be silent, if it is being stopped, or when it expires.
 
-        It does so only where its engine was lost before it was heard, and it may have to begin anew.
+        It expires only if its engine was lost before any of it was heard, because it has to begin again.
         """
         goal = self.active
         if goal is None:
             return None
-        if goal.stop_since is not None:
-            return goal.stop_since + SILENCE_LIMIT
+        if goal.stop_requested_at is not None:
+            return goal.stop_requested_at + CONFIRM_SILENCE_S
         return None if self.has_engine or goal.spoken_end else goal.expires_at
 
     def _next_deadline(self) -> float | None:
-        """Return when the goal whose turn it is waits no longer for its voice."""
+        """Return when the next goal no longer waits for its voice; None if it doesn't wait."""
         record = None if self.active or self.paused or not self.has_engine else self._queue.first()
         if record is None:
             return None
-        begins_at = 0.0 if record.turn_at == inf else self.loading.begins_at(record, self.settings.voice)
-        return begins_at if begins_at < inf else None
+        start = 0.0 if record.next_since == inf else self._start_time(record)
+        return start if start < inf else None
+
+    def _start_time(self, record: Record) -> float:
+        """Return the earliest time at which the next goal may start (monotonic)."""
+        return self.voices.start_time(record, self.settings.voice) if self._loads_voices else 0.0
 
     def _start_next(self, now: Now) -> list[Effect]:
+        """Start the next goal, if one can start."""
         if not self.has_engine:
             return []
         record, effects = self._activate_next(now)
         return [*effects, Ordered(record, Order.START)] if record else effects
 
     def _activate_next(self, now: Now) -> tuple[Record | None, list[Effect]]:
-        """Make the goal whose turn it is the active one, if there is one and nothing speaks against it."""
+        """Make the next goal the active one, and return it; None if no goal can start."""
         if self.active or self.paused:
             return None, []
         effects = self._expire(now)
         record = self._queue.first()
-        if record:
-            record.turn_at = min(record.turn_at, now.monotonic)
-        if record and self.loading.begins_at(record, self.settings.voice) <= now.monotonic:
-            record.become(State.ACTIVE)
-            self._queue.remove(record)
-            record.started_at, record.began = now.wall, now.monotonic
-            self.active = record
-            return record, [*effects, Changed(record, State.ACTIVE)]
-        return None, effects
+        if record is None:
+            return None, effects
+        record.next_since = min(record.next_since, now.monotonic)
+        if self._start_time(record) > now.monotonic:
+            return None, effects
+        record.become(State.ACTIVE)
+        self._queue.remove(record)
+        record.started_at, record.began_at = now.wall, now.monotonic
+        self.active = record
+        return record, [*effects, Changed(record, State.ACTIVE)]
 
     def _recall(self, record: Record, reason: Reason, words: str, by: By | None, now: Now) -> list[Effect]:
+        """End a pending goal."""
         self._queue.remove(record)
-        return self._recalled(record, reason, words, by, now)
+        return self._end_unqueued(record, reason, words, by, now)
 
-    def _recalled(self, record: Record, reason: Reason, words: str, by: By | None, now: Now) -> list[Effect]:
+    def _end_unqueued(self, record: Record, reason: Reason, words: str, by: By | None, now: Now) -> list[Effect]:
+        """End a PENDING goal that is not in the queue."""
         record.become(State.RECALLING)
         return self._end(record, State.RECALLED, reason, f"Talk recalled: {words}", by, now)
 
     def _stop(self, record: Record, reason: Reason, by: By | None, now: Now) -> list[Effect]:
+        """Have the engine stop the active goal."""
         if record.state is State.PREEMPTING:
-            return []  # the first stop gives the reason, later ones join it
+            return []  # the first stop gives the reason
         record.become(State.PREEMPTING)
-        record.reason, record.by, record.stop_since = reason, by, now.monotonic
+        record.reason, record.by, record.stop_requested_at = reason, by, now.monotonic
         record.paused = False
         return [Changed(record, State.PREEMPTING), Ordered(record, Order.STOP)]
 
     def _spoken(self, goal_id: str) -> Record:
+        """Return the active goal; IllegalTransition if this is not its id."""
         if self.active is None or self.active.id != goal_id:
             raise IllegalTransition(f"{goal_id} is not being spoken")
         return self.active
@@ -502,12 +641,12 @@ class Scheduler:
     def _end(
         self, record: Record, state: State, reason: Reason | None, message: str, by: By | None, now: Now
     ) -> list[Effect]:
-        """End a goal for ever, and start the next if it was the active one."""
+        """End a goal. If it was the active one, start the next."""
         record.become(state)
         record.reason, record.message, record.by = reason, message, by
         record.ended_at, record.paused = now.wall, False
         if record.spoken_end and state is not State.ABORTED:
-            self._said.note(record)
+            self._speech_times.note(record)
         self._by_id.pop(record.id)
         self.history.add(record)
         if record is not self.active:
@@ -516,5 +655,5 @@ class Scheduler:
         return [Changed(record, state), *self._start_next(now)]
 
 
-def _expired(record: Record) -> str:
-    return f"its time to live of {figure(record.say.ttl)} s was over before it was spoken"
+def _expiry_message(record: Record) -> str:
+    return f"its time to live of {format_number(record.say.ttl)} s was over before it was spoken"

@@ -1,7 +1,7 @@
-"""The states of a goal, as a table: actionlib's names and numbers.
+"""The states of a goal, with the names and numbers of actionlib, and the table of allowed transitions.
 
-A pair that is not in the table is an error and changes nothing. Nothing but the table decides; whoever wants another
-transition changes the table and the tests that list it.
+A transition that is not in the table is an error and changes nothing. To allow another one, change the table and the
+tests that list it.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ class State(IntEnum):
     ABORTED = 4  # engine or audio failed, or nothing in the text can be spoken
     REJECTED = 5  # never queued
     PREEMPTING = 6  # told to stop, not yet silent
-    RECALLING = 7  # being taken out of the queue; never rests there
+    RECALLING = 7  # being taken out of the queue; a goal never stays in this state
     RECALLED = 8  # taken out of the queue before it was spoken
-    LOST = 9  # the client's alone: it was accepted, then the connection to the server ended
+    LOST = 9  # set by a client: the connection to the server ended after the goal was accepted
 
     @property
     def terminal(self) -> bool:
@@ -34,11 +34,11 @@ class State(IntEnum):
         return self.name
 
     def __format__(self, spec: str) -> str:
-        # From Python 3.11 on, IntEnum formats the number unless this method is overridden, too.
+        # Without this, IntEnum formats the number from Python 3.11 on.
         return format(int(self) if spec.endswith("d") else self.name, spec)
 
 
-#: The terminal states, each with the exit code of a command whose goal ended in it.
+#: the terminal states, each with the exit code of a command whose goal ended in it
 EXIT_CODES: dict[State, int] = {
     State.SUCCEEDED: 0,
     State.ABORTED: 4,
@@ -48,9 +48,8 @@ EXIT_CODES: dict[State, int] = {
     State.LOST: 12,
 }
 
-#: What may follow what. A goal begins PENDING or REJECTED. PREEMPTING may end ABORTED only for the reason not_silent:
-#: the state machine allows it, the scheduler watches over the reason. LOST is what a client concludes for itself, from
-#: any state in which the goal had not ended; no server ever sets it.
+#: The states that may follow each state. A goal begins PENDING or REJECTED. PREEMPTING may end ABORTED only with the
+#: reason `not_silent`, which the scheduler ensures. A client may conclude LOST from any state that is not terminal.
 TRANSITIONS: dict[State, frozenset[State]] = {
     State.PENDING: frozenset({State.ACTIVE, State.RECALLING, State.LOST}),
     State.RECALLING: frozenset({State.RECALLED, State.LOST}),
@@ -61,13 +60,13 @@ TRANSITIONS: dict[State, frozenset[State]] = {
 
 
 class IllegalTransition(TalkError):
-    """A change of state that the table does not allow. It is a bug of whoever asked for it, and it changed nothing."""
+    """A change of state that the table does not allow. It is a bug of the caller and has changed nothing."""
 
     code = "illegal_transition"
 
 
-def follow(state: State, target: State) -> State:
-    """Return `target` if it may follow `state`, else raise IllegalTransition."""
+def check_transition(state: State, target: State) -> State:
+    """Return `target` if it may follow `state`. Otherwise raise IllegalTransition."""
     if target not in TRANSITIONS[state]:
         raise IllegalTransition(f"a goal that is {state.name} can't become {target.name}")
     return target

@@ -1,77 +1,95 @@
-"""The listening socket: who may serve at a path, and how its file comes and goes.
+"""The listening socket and the lock beside it: who may serve at a path, and how the files come and go.
 
-A lock that is held for life decides who serves; only its holder removes a socket that an ended server left. Cleaners of
-temporary directories and people remove the file while it is served: then it is bound again. When to look is the
-server's.
+The server that holds the lock serves, and only that server removes a socket that an earlier one has left. If people or
+cleaners of temporary directories remove the socket's file while it is served, it is bound again. `run` decides when to
+check that.
+
+The file of the lock stays when a server ends, and names the process that holds it. If it is removed, the first server
+that locks a new one goes on, and the other one ends. Only a regular file with a single name is opened, because somebody
+else may have put something in its place.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import os
 import socket
 import stat
 import sys
+import time
+from typing import TYPE_CHECKING
 
 from talkcli import paths, peers
 from talkcli.client.connect import connect, hello
 from talkcli.errors import AccessDenied, AddressInUse, ServerUnavailable, TalkError, UsageError
-from talkcli.server.lock import Lock, identity, refusing, serves_already
 
-#: Connections that may wait to be accepted; the system's own limit applies too (net.core.somaxconn).
-BACKLOG = 1024
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+#: Connections that may wait to be accepted. The system has a limit of its own (net.core.somaxconn).
+MAX_BACKLOG_CONNECTIONS = 1024
+#: How long to wait until the holder of the lock has written its process id.
+HOLDER_ID_S = 1.0
 #: The first descriptor that systemd passes (SD_LISTEN_FDS_START).
 _FIRST_PASSED = 3
 _RESTART_SOCKET = "restart the socket's unit (systemctl restart talk.socket)"
-#: What passes, so that the next look may well succeed: no room, no descriptor, a disk that is read-only for a while.
-_PASSING = {errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOBUFS, errno.ENOSPC, errno.EDQUOT, errno.EROFS}
+#: Errors that may be gone at the next attempt: no memory, descriptor or space, or a disk that is read-only for a while.
+_TEMPORARY = {errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOBUFS, errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 
 
 class Listener:
-    """A bound, listening socket. AddressInUse if it is served already, or its directory is not safe."""
+    """A listening socket that this server has bound, and its lock."""
 
-    #: whether somebody else made the socket, so that its file is not ours
+    #: whether another program has made the socket and owns its file
     passed = False
 
-    def __init__(self, named: str | None, mode: int) -> None:
-        """`named`: the path that the user named; `mode`: who may connect, as the mode of the socket's file."""
+    def __init__(self, path: str | None, mode: int) -> None:
+        """Bind the socket. AddressInUse if the path is served already, or its directory is not safe.
+
+        Args:
+            path: where the user wants the socket; None for the usual place.
+            mode: the mode of the socket's file, which decides who may connect.
+        """
         self.mode = mode
-        self.path = paths.server_socket(named)
-        #: absolute: the directory that it was relative to may be gone when it is bound again
-        self._named = self.path if named else None
+        self.path = paths.server_socket(path)
+        #: absolute, because the current directory may be another one when the socket is bound again
+        self._named_path = self.path if path else None
         _check_directory(os.path.dirname(self.path))
         _refuse_other_file(self.path)
-        _refuse_second_server(self._named)
+        _refuse_second_server(self._named_path)
         self._lock = Lock(self.path)
         try:
             self.socket = _bind(self.path, mode)
         except BaseException:
             self._lock.undo()
             raise
-        self._identity = identity(self.path)
+        self._identity = _identity(self.path)
 
     def in_place(self) -> bool:
-        """Whether the files of socket and lock are the ones that were made."""
-        # Neither inode can be another's meanwhile: an open socket, and an open file, keep theirs.
-        return identity(self.path) == self._identity and self._lock.in_place(self.path)
+        """Return whether the files of socket and lock are still the ones that this server made."""
+        # No other file can have the same inode meanwhile, because both are still open.
+        return _identity(self.path) == self._identity and self._lock.in_place(self.path)
 
     def bind_again(self) -> socket.socket | None:
-        """Make anew what is not in place, by the rules of the start: directory, lock, socket.
+        """Make the files that are no longer in place again, with all checks of the start.
 
-        Returns the former socket, to be closed by whoever listens to it; None if it is the same still. AddressInUse if
-        another server serves by now, or something else is in the way; then all is as before.
+        AddressInUse if another server serves now or something else is in the way. Then nothing has changed.
+
+        Returns:
+            The former socket, to be closed by the caller; None if it is still in use.
         """
-        path = paths.server_socket(self._named)
+        path = paths.server_socket(self._named_path)
         _check_directory(os.path.dirname(path))
         lock = self._lock if self._lock.in_place(path) else Lock(path)
         former = None
         try:
-            if identity(path) != self._identity:
+            if _identity(path) != self._identity:
                 _refuse_live_socket(path)
                 bound = _bind(path, self.mode)
                 former = self.socket
-                self.socket, self.path, self._identity = bound, path, identity(path)
+                self.socket, self.path, self._identity = bound, path, _identity(path)
         except BaseException:
             if lock is not self._lock:
                 lock.undo()
@@ -82,8 +100,8 @@ class Listener:
         return former
 
     def close(self) -> None:
-        """Remove the socket's file, if it is still this one, and let the lock go."""
-        if self._identity is not None and identity(self.path) == self._identity:
+        """Close the socket and release the lock. Remove the socket's file if it is still the same one."""
+        if self._identity is not None and _identity(self.path) == self._identity:
             with contextlib.suppress(FileNotFoundError):
                 os.unlink(self.path)
         self.socket.close()
@@ -91,7 +109,7 @@ class Listener:
 
 
 class InheritedListener:
-    """The socket that systemd bound (LISTEN_FDS): its file is systemd's to remove."""
+    """A listening socket that systemd has passed (LISTEN_FDS). Only systemd removes its file."""
 
     passed = True
 
@@ -100,7 +118,7 @@ class InheritedListener:
         self.socket = socket.socket(fileno=fd)
         try:
             self.path = _path_of(self.socket)
-            self._identity = identity(self.path)
+            self._identity = _identity(self.path)
             if self._identity is None:
                 raise AddressInUse(f"the passed socket's file {self.path} is gone: {_RESTART_SOCKET}")
             self.mode = stat.S_IMODE(os.lstat(self.path).st_mode)
@@ -110,20 +128,107 @@ class InheritedListener:
         self.socket.setblocking(False)
 
     def in_place(self) -> bool:
-        """Whether the socket's file is the one that was there at the start."""
-        return identity(self.path) == self._identity
+        """Return whether the socket's file is still the same one."""
+        return _identity(self.path) == self._identity
 
     def bind_again(self) -> socket.socket | None:
-        """Say what to do: whoever passed the socket would pass the old one again."""
+        """Raise AddressInUse, because systemd would pass the old socket again."""
         raise AddressInUse(f"the file of the socket {self.path} was removed or replaced: {_RESTART_SOCKET}")
 
     def close(self) -> None:
-        """Stop listening; the file stays."""
+        """Close the socket. Its file stays."""
         self.socket.close()
 
 
+def listen(path: str | None, mode: int) -> Listener | InheritedListener:
+    """Return the socket to serve: the one that systemd has passed, or a new one at the path or the usual place."""
+    passed = os.environ.get("LISTEN_FDS")
+    if passed and os.environ.get("LISTEN_PID") == str(os.getpid()):
+        if passed != "1":
+            raise UsageError(f"{passed} sockets were passed (LISTEN_FDS), talk serves one")
+        inherited = InheritedListener(_FIRST_PASSED)
+        if not path or paths.server_socket(path) == inherited.path:
+            return inherited
+        inherited.close()
+    return Listener(path, mode)
+
+
+def is_temporary(error: AddressInUse) -> bool:
+    """Return whether binding may succeed at another time."""
+    return isinstance(error.__cause__, OSError) and error.__cause__.errno in _TEMPORARY
+
+
+class Lock:
+    """The lock of a socket's path, held by this server."""
+
+    def __init__(self, path: str) -> None:
+        """Take the lock. AddressInUse if another server holds it."""
+        self._path = path
+        while True:
+            self._fd, self._made = _open_lock(_lock_of(path))
+            try:
+                fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                holder = _holder(self._fd)
+                os.close(self._fd)
+                raise _already_served(holder, path, here=holder is not None) from None
+            if self.in_place(path):
+                break
+            os.close(self._fd)  # it was removed between the two steps, so another server may hold a new one
+        os.ftruncate(self._fd, 0)
+        with contextlib.suppress(OSError):  # on a full disk, the lock holds without the id, which is for people
+            os.write(self._fd, f"{os.getpid()}\n".encode())
+
+    def in_place(self, path: str) -> bool:
+        """Return whether the file of this lock is still the lock of a path."""
+        status = os.fstat(self._fd)
+        return _identity(_lock_of(path)) == (status.st_dev, status.st_ino)
+
+    def undo(self) -> None:
+        """Release the lock, and remove its file if this server made it.
+
+        Another server that has opened the file meanwhile notices, when it locks it, that the file is not in place.
+        """
+        if self._made and self.in_place(self._path):
+            with contextlib.suppress(OSError):
+                os.unlink(_lock_of(self._path))
+        self.close()
+
+    def close(self) -> None:
+        """Release the lock. Its file stays."""
+        os.close(self._fd)
+
+
+@contextlib.contextmanager
+def _refusing(what: str) -> Iterator[None]:
+    """Raise AddressInUse for an OSError."""
+    try:
+        yield
+    except OSError as error:
+        raise AddressInUse(f"{what}: {error.strerror or error}") from error
+
+
+def _identity(path: str) -> tuple[int, int] | None:
+    """Return device and inode of a file; None if there is no file, or it can't be seen."""
+    try:
+        status = os.lstat(path)
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino
+
+
+def _already_served(pid: int | None, path: str, *, here: bool) -> AddressInUse:
+    """Return the error about another server. `here`: whether its process is on this machine."""
+    name = "unknown" if pid is None else pid
+    how = f" (kill {pid})" if here else ""
+    return AddressInUse(f"a server (pid {name}) serves {path} already: use it, or end it first{how}")
+
+
+# -- the socket
+
+
 def _path_of(passed: socket.socket) -> str:
-    """Return the file of a listening Unix socket; UsageError for others, which fail later in ways hard to read."""
+    """Return the file of a listening Unix socket; raise UsageError for any other socket."""
     if passed.family != socket.AF_UNIX:
         raise UsageError("the socket that was passed (LISTEN_FDS) is not a Unix socket: use ListenStream=/path")
     if passed.type != socket.SOCK_STREAM or not passed.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):
@@ -134,40 +239,22 @@ def _path_of(passed: socket.socket) -> str:
     return name
 
 
-def listen(named: str | None, mode: int) -> Listener | InheritedListener:
-    """Return the socket to serve: the one passed by systemd, else at the path that was named, else at the usual one."""
-    passed = os.environ.get("LISTEN_FDS")
-    if passed and os.environ.get("LISTEN_PID") == str(os.getpid()):
-        if passed != "1":
-            raise UsageError(f"{passed} sockets were passed (LISTEN_FDS), talk serves one")
-        inherited = InheritedListener(_FIRST_PASSED)
-        if not named or paths.server_socket(named) == inherited.path:
-            return inherited
-        inherited.close()
-    return Listener(named, mode)
-
-
-def may_pass(error: AddressInUse) -> bool:
-    """Whether it can well be bound at another time."""
-    return isinstance(error.__cause__, OSError) and error.__cause__.errno in _PASSING
-
-
-def _refuse_second_server(named: str | None) -> None:
-    """Refuse where clients would find another server before or instead of this one."""
+def _refuse_second_server(path: str | None) -> None:
+    """Raise AddressInUse if clients would find another server before this one or instead of it."""
     try:
-        found = connect(named, hello(None, urgent=True))
+        found = connect(path, hello(None, urgent=True))
     except (ServerUnavailable, AccessDenied):
-        return  # nobody there who would answer our clients
+        return  # no server that would answer our clients
     except TalkError as error:
         raise AddressInUse(f"a server is there already: {error}") from error
     assert found.socket
-    here, _ = peers.credentials(found.socket)  # behind a socket that ssh forwards it is a process of another machine's
+    here, _ = peers.credentials(found.socket)  # another process than the server if ssh forwards the socket
     found.socket.close()
-    raise serves_already(found.pid, found.path, here=here == found.pid)
+    raise _already_served(found.pid, found.path, here=here == found.pid)
 
 
 def _refuse_live_socket(path: str) -> None:
-    """Refuse where a program listens without the lock: to remove its socket would take it from its users."""
+    """Raise AddressInUse if a program listens without the lock. Its users would lose it with its socket."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         try:
@@ -180,8 +267,8 @@ def _refuse_live_socket(path: str) -> None:
 
 
 def _check_directory(directory: str) -> None:
-    """Make sure that nobody else can put a socket of theirs in this one's place."""
-    with refusing(f"the socket's directory {directory} can't be made"), contextlib.suppress(FileExistsError):
+    """Make the directory, and raise AddressInUse if somebody else could replace the socket in it."""
+    with _refusing(f"the socket's directory {directory} can't be made"), contextlib.suppress(FileExistsError):
         os.mkdir(directory, 0o700)
     status = os.lstat(directory)
     if stat.S_ISLNK(status.st_mode):
@@ -198,7 +285,7 @@ def _check_directory(directory: str) -> None:
 
 
 def _refuse_other_file(path: str) -> None:
-    """Refuse where something is that no server has made."""
+    """Raise AddressInUse if the path exists and is no socket."""
     try:
         mode = os.lstat(path).st_mode
     except OSError:
@@ -212,26 +299,92 @@ def _refuse_other_file(path: str) -> None:
 
 
 def _bind(path: str, mode: int) -> socket.socket:
+    """Return a socket that listens at the path. The lock must be held."""
     _refuse_other_file(path)
-    with refusing(f"the socket {path} of an earlier server can't be removed"), contextlib.suppress(FileNotFoundError):
-        os.unlink(path)  # the lock is ours, so whoever bound it is gone
+    with _refusing(f"the socket {path} of an earlier server can't be removed"), contextlib.suppress(FileNotFoundError):
+        os.unlink(path)
     listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         listening.setblocking(False)
         if sys.platform.startswith("linux"):
-            # Before bind, so that the file never has a wider mode; bind takes the umask away, which chmod gives back.
-            # The umask itself stays: it is the whole process's, and the engine may be starting in another thread.
+            # The mode is set before `bind`, so that the file never has a wider one. `bind` applies the umask, which
+            # `chmod` corrects. The umask can't be changed, because the engine may be starting in another thread.
             os.fchmod(listening.fileno(), mode)
             listening.bind(path)
             os.chmod(path, mode)
-        else:  # a socket has no mode of its own, and the umask has to do
+        else:  # a socket has no mode before `bind`
             umask = os.umask(0o777 & ~mode)
             try:
                 listening.bind(path)
             finally:
                 os.umask(umask)
-        listening.listen(BACKLOG)
+        listening.listen(MAX_BACKLOG_CONNECTIONS)
     except OSError as error:
         listening.close()
         raise AddressInUse(f"cannot listen at {path}: {error.strerror or error}") from error
     return listening
+
+
+# -- the lock
+
+
+def _lock_of(path: str) -> str:
+    return f"{path}.lock"
+
+
+def _open_lock(name: str) -> tuple[int, bool]:
+    """Return the descriptor of the lock's file, and whether the file is new."""
+    flags = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+    while True:
+        with _refusing(f"the lock {name} can't be opened"):
+            with contextlib.suppress(FileExistsError):
+                return os.open(name, flags | os.O_CREAT | os.O_EXCL, 0o600), True
+            try:
+                _refuse_other_lock(name, os.lstat(name))  # before it is opened, because opening a device may act on it
+                fd = os.open(name, flags)
+            except FileNotFoundError:
+                continue  # it was removed meanwhile
+        try:
+            _refuse_other_lock(name, os.fstat(fd))
+        except AddressInUse:
+            os.close(fd)
+            raise
+        return fd, False
+
+
+def _refuse_other_lock(name: str, status: os.stat_result) -> None:
+    """Raise AddressInUse unless the file is a regular one with a single name."""
+    if stat.S_ISLNK(status.st_mode):
+        what = "a symbolic link"
+    elif not stat.S_ISREG(status.st_mode):
+        what = "no regular file"
+    elif status.st_nlink > 1:
+        what = "a hard link, another name of some file"
+    else:
+        return
+    raise AddressInUse(f"the lock {name} is {what}: remove it, or name another socket with --socket")
+
+
+def _lives(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        pass  # it belongs to another user
+    return True
+
+
+def _holder(fd: int) -> int | None:
+    """Return the process id in the lock; None if the holder doesn't write it in time.
+
+    Before that, the file may name an earlier server, which has ended.
+    """
+    end = time.monotonic() + HOLDER_ID_S
+    while True:
+        words = os.pread(fd, 32, 0).decode(errors="replace")
+        if words.endswith("\n") and words.strip().isdecimal() and _lives(int(words)):
+            return int(words)
+        if time.monotonic() > end:
+            return None
+        time.sleep(0.01)

@@ -1,6 +1,6 @@
-"""What the server's log says of goals, engines and who sent what; a line is written by `talkcli.daemon.log`.
+"""The lines of the server's log about goals, engines and senders. `talkcli.daemon.log` writes them.
 
-Nothing that a client sends can forge a line or reach a terminal raw: all of it goes through `printable`.
+Texts of clients are made printable, so that they can neither forge a line nor send control codes to a terminal.
 """
 
 from __future__ import annotations
@@ -20,62 +20,61 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import By, Sender
     from talkcli.goals.record import Record
 
-#: Characters of a program's name or command line in the log.
-_MAX_COMMAND = 80
-#: What plays where a driver needs no player.
-_BY_ITSELF = "which plays by itself"
+#: The length of a program's name or command line in the log.
+_MAX_LOGGED_COMMAND_CHARS = 80
+_NO_PLAYER_NEEDED = "which plays by itself"
 
 
-def ended(record: Record, seconds: float) -> None:
-    """Write the line of a goal that has ended; `seconds`: since it began to be spoken, if it did."""
+def goal_ended(record: Record, seconds: float) -> None:
+    """Log that a goal has ended. `seconds`: the time since it began to be spoken, if it did."""
     took = "" if record.started_at is None else f" after {seconds:.1f} s"
     how = f"{record.id} {record.state.name}{took}"
     if record.state is not State.SUCCEEDED:
-        how += f" ({record.reason}{_by(record.by)})"
+        how += f" ({record.reason}{_cause(record.by)})"
     detail = f"; {sanitize(record.message)}" if record.state is State.ABORTED and record.message else ""
-    write(f'{how}: "{sanitize(record.text or "")}" from {who(record.sender)}{detail}')
+    write(f'{how}: "{sanitize(record.text or "")}" from {describe_sender(record.sender)}{detail}')
 
 
-def ready(engine: Ready, for_player: Sequence[str]) -> None:
-    """Write the line of an engine that is ready; `for_player`: the options that were given for a player."""
+def engine_ready(engine: Ready, player_options: Sequence[str]) -> None:
+    """Log that an engine is ready. `player_options`: the options for the player that the server was given."""
     version = f", {sanitize(engine.version)}" if engine.version else ""
-    sound = sound_of(engine)
+    sound = describe_sound(engine)
     words = f"engine ready: driver {engine.driver}{version}, {sound}"
-    if for_player and sound == _BY_ITSELF:
-        words += f": {' and '.join(for_player)} {'has' if len(for_player) == 1 else 'have'} no effect"
+    if player_options and sound == _NO_PLAYER_NEEDED:
+        words += f": {' and '.join(player_options)} {'has' if len(player_options) == 1 else 'have'} no effect"
     write(words)
 
 
-def loaded(voice: VoiceLoaded) -> None:
-    """Write the line of a neural voice that can be spoken with from now on, or can't."""
+def voice_load_ended(voice: VoiceLoaded) -> None:
+    """Log that a neural voice was loaded, or why it could not be."""
     if voice.error is None:
         write(f"voice {sanitize(voice.voice)} loaded in {voice.seconds:.1f} s")
     else:
         write(f"voice {sanitize(voice.voice)} cannot be loaded, espeak speaks where it may: {sanitize(voice.error)}")
 
 
-def sound_of(engine: Ready) -> str:
-    """Return what plays, for people."""
+def describe_sound(engine: Ready) -> str:
+    """Return a few words about what plays the sound."""
     if engine.player:
         return f"player {engine.player}"
-    return NO_PLAYER if is_own_driver(engine.driver) else _BY_ITSELF
+    return NO_PLAYER if is_own_driver(engine.driver) else _NO_PLAYER_NEEDED
 
 
-def who(sender: Sender) -> str:
-    """Return the sender in a few words."""
+def describe_sender(sender: Sender) -> str:
+    """Return a few words about a sender."""
     parts = [] if sender.uid is None else [f"uid {sender.uid}"]
     if sender.pid is not None:
         parts.append(f"pid {sender.pid}")
     if sender.command:
-        parts.append(printable(sender.command, _MAX_COMMAND))
+        parts.append(printable(sender.command, _MAX_LOGGED_COMMAND_CHARS))
     if sender.parent:
-        parts.append(f"started by {printable(sender.parent, _MAX_COMMAND)}")
+        parts.append(f"started by {printable(sender.parent, _MAX_LOGGED_COMMAND_CHARS)}")
     if sender.name:
         parts.append(f'calls itself "{printable(sender.name)}"')
     return ", ".join(parts) or "nobody known"
 
 
-def _by(by: By | None) -> str:
+def _cause(by: By | None) -> str:
     if by is None:
         return ""
-    return f" by {by.goal}" if by.goal else f" by {who(by.client)}" if by.client else ""
+    return f" by {by.goal}" if by.goal else f" by {describe_sender(by.client)}" if by.client else ""

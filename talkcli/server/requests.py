@@ -1,76 +1,84 @@
-"""A coroutine a request: carries it out, and answers it now or as soon as what it asks for is so.
+"""What each request does and how it is answered: one coroutine for each kind of request.
 
-Each is driven on the spot, and waits by `call.wait`; what it waits for is brought about by what is spoken
-(`speech.py`), or here: room in the queue, and a cancel that ends goals which wait themselves. While a request waits it
-keeps its connection open, and it is forgotten with it.
+A coroutine runs until it has to wait: for the voices, for room in the queue, or for silence. While a request waits, its
+connection stays open, and it is forgotten if the connection ends.
 """
 
 from __future__ import annotations
 
 import asyncio
 import sys
+import time
+from functools import partial
 from itertools import chain
 from typing import TYPE_CHECKING
 
 from talkcli.daemon import log
-from talkcli.engine.voices import is_neural
 from talkcli.errors import RequestRefused, UnknownGoal
 from talkcli.frozen import fields, replace
 from talkcli.goals.goal import By
-from talkcli.goals.option import figure
-from talkcli.goals.options import INITIAL, Cancel, Say, Set, as_shown, bad_option, given
+from talkcli.goals.options import (
+    INITIAL,
+    Cancel,
+    Say,
+    Set,
+    bad_option,
+    format_number,
+    given_values,
+    is_neural,
+    shown_settings,
+)
 from talkcli.goals.reasons import Reason
 from talkcli.goals.states import State
 from talkcli.protocol.events import Result
 from talkcli.protocol.lines import encode
 from talkcli.protocol.requests import Log, Pause, Request, Resume, Status, Voices, Wait, Watch
-from talkcli.server.call import Call, go_on
-from talkcli.server.log import who
+from talkcli.server.connection import PendingRequest, resume_all
+from talkcli.server.log import describe_sender
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
     from typing import Any
 
     from talkcli.goals.goal import JsonObject
     from talkcli.goals.reasons import Refusal
     from talkcli.goals.record import Record
-    from talkcli.server.call import Place
-    from talkcli.server.connection import Connection
+    from talkcli.server.connection import ClientConnection, Steps, WaitingList
     from talkcli.server.speech import Speech
 
-#: Ended goals that `status` lists.
-RECENT = 10
-#: Seconds for which the voices are awaited; a client gives up after five.
-VOICES_LIMIT = 4.0
-#: Seconds after which a pause is answered though nobody knows that it is silent.
-PAUSE_LIMIT = 2.0
-#: Requests that wait for one client; the wire names it. Each is kept with its text, and a client is read from all the
-#: while, because a cancel may come behind them.
-MAX_WAITING = 1_000
-#: Bytes of all the requests that wait, as of the output that waits.
-ALL_WAITING = 64 * 1024 * 1024
-#: Bytes that each is counted with besides what it carries. It takes a tenth of that; but so no more than 8,000 wait,
-#: and a cancel of so many is answered within 2 s, too.
-EACH = 8 * 1024
+#: Ended goals in the list of `status`.
+RECENT_GOALS = 10
+#: How long a request waits for the voices. A client gives up after five seconds.
+VOICES_LIMIT_S = 4.0
+#: When a pause is answered although speech is not known to be silent.
+PAUSE_ANSWER_S = 2.0
+#: Waiting requests of one client. The wire's document names this limit. The client is read from all the while, because
+#: a cancel may follow.
+MAX_WAITING_REQUESTS = 1_000
+#: Memory for all waiting requests, as much as for unread output.
+MAX_WAITING_BYTES = 64 * 1024 * 1024
+#: Memory that is counted for each waiting request, beside its values. It is ten times what a request takes, so that at
+#: most 8,000 requests wait and a cancel of all of them is answered within 2 s.
+REQUEST_BYTES = 8 * 1024
 
 
 class Requests:
     """Carries out the requests of a server's clients."""
 
     def __init__(self, speech: Speech, describe: Callable[[], JsonObject]) -> None:
-        """`describe` returns what `status` says of the server itself."""
+        """Create it without any request. `describe` returns what `status` shows about the server."""
         self._speech = speech
         self._scheduler = speech.scheduler
         self._describe = describe
-        #: goals that were cancelled while they waited, and are to be told so
-        self._canceled: Place = {}
-        #: those that are not answered yet, by connection, in their order
-        self._calls: dict[Connection, Place] = {}
-        #: bytes of all that are kept while they wait
-        self._size = 0
-        self._turn: asyncio.Handle | None = None
-        speech.queue_changed = self._look
-        self._by_kind: dict[type[Request], Callable[[Call, Any], Coroutine[Place, bool | None, None]]] = {
+        #: goals that were cancelled while they waited, until their clients have been told
+        self._canceled: WaitingList = {}
+        #: the requests of each connection that are not answered yet, in their order
+        self._pending: dict[ClientConnection, WaitingList] = {}
+        #: the memory that is counted for waiting requests
+        self._waiting_bytes = 0
+        self._room_check: asyncio.Handle | None = None
+        speech.on_queue_change = self._check_room_soon
+        self._by_kind: dict[type[Request], Callable[[PendingRequest, Any], Steps]] = {
             Say: self._say,
             Wait: self._wait,
             Cancel: self._cancel,
@@ -83,62 +91,64 @@ class Requests:
             Resume: self._resume,
         }
 
-    def handle(self, connection: Connection, seq: int | None, request: Request) -> None:
+    def handle(self, connection: ClientConnection, seq: int | None, request: Request) -> None:
         """Carry out a request, and answer it now or later."""
-        call = Call(connection, seq, request)
-        self._calls.setdefault(connection, {})[call] = None
-        call.begin(self._carry_out(call))
+        pending = PendingRequest(connection, seq, request)
+        self._pending.setdefault(connection, {})[pending] = None
+        pending.start(self._carry_out(pending))
 
-    def owes(self, connection: Connection) -> bool:
-        """Whether a client waits: for an answer, or for what it is to be told."""
-        return connection in self._calls or self._speech.subscribers.has(connection)
+    def owes(self, connection: ClientConnection) -> bool:
+        """Return whether a client waits for an answer or an event."""
+        return connection in self._pending or self._speech.subscribers.has(connection)
 
-    def left(self, connection: Connection) -> None:
-        """Forget the requests of a client that is gone, and what it was to be told."""
-        for each in self._waiting(connection):
+    def left(self, connection: ClientConnection) -> None:
+        """Forget the requests and subscriptions of a client that is gone."""
+        for each in self._unanswered(connection):
             each.drop()
         self._speech.subscribers.left(connection)
 
     def shut_down(self) -> None:
-        """End all goals, those that wait, too."""
-        ends = self._end_waiting(self._select(Cancel()), None)
+        """End all goals, also those that wait for room."""
+        notifications = self._cancel_waiting(self._select_waiting(Cancel()), None)
         self._speech.shut_down()
-        go_on(self._speech.for_voices)
-        self._speech.news.tell([*ends, self._speech.look_finished])
+        resume_all(self._speech.for_voices)
+        self._speech.notifications.add([*notifications, self._speech.check_finished])
 
-    async def _carry_out(self, call: Call) -> None:
-        request = call.request
+    async def _carry_out(self, pending: PendingRequest) -> None:
+        request = pending.request
         try:
             if isinstance(request, Cancel | Pause):
-                self._hurry(call.connection)  # silence waits for nothing; what was asked for before comes before it
-            elif self._must_wait(call):
-                if self._keep(call):
-                    await call.wait(self._speech.for_voices, VOICES_LIMIT)
+                self._skip_voices(pending.connection)  # never delayed, but earlier requests come first
+            elif self._needs_voices(pending):
+                if self._keep(pending):
+                    await pending.wait(self._speech.for_voices, VOICES_LIMIT_S)
                 elif not isinstance(request, Say):
-                    self._hurry(call.connection)
-            await self._by_kind[type(request)](call, request)
+                    self._skip_voices(pending.connection)
+            await self._by_kind[type(request)](pending, request)
         except RequestRefused as error:
-            call.refuse(error.code, str(error))
-        except Exception as error:  # noqa: BLE001 - one client's request must not take the voice from the others
+            pending.refuse(error.code, str(error))
+        except Exception as error:  # noqa: BLE001 - the server goes on for other clients
             log.write_bug(request.kind, error)
-            call.refuse("internal_error", f"{request.kind} failed: a bug of talk's, see its log")
+            pending.refuse("internal_error", f"{request.kind} failed: a bug of talk's, see its log")
         finally:
-            self._size -= call.size
-            mine = self._calls[call.connection]
-            del mine[call]
+            self._waiting_bytes -= pending.kept_bytes
+            mine = self._pending[pending.connection]
+            del mine[pending]
             if not mine:
-                del self._calls[call.connection]
+                del self._pending[pending.connection]
 
-    # -- who waits
+    # -- requests that wait
 
-    def _waiting(self, connection: Connection) -> list[Call]:
-        """Return the requests of this connection that are not answered yet, in their order."""
-        return list(self._calls.get(connection, ()))
+    def _unanswered(self, connection: ClientConnection) -> list[PendingRequest]:
+        return list(self._pending.get(connection, ()))
 
-    def _must_wait(self, call: Call) -> bool:
-        """Whether it can't be carried out yet: the voices are needed, or what came before it needs them."""
-        request, waiting = call.request, self._speech.for_voices
-        if waiting and (isinstance(request, Say) or self._held(call.connection)):
+    def _waiting_for_voices(self, connection: ClientConnection) -> list[PendingRequest]:
+        return [each for each in self._unanswered(connection) if each.waiting_list is self._speech.for_voices]
+
+    def _needs_voices(self, pending: PendingRequest) -> bool:
+        """Return whether a request must wait for the voices, or for an earlier request that does."""
+        request = pending.request
+        if self._speech.for_voices and (isinstance(request, Say) or self._waiting_for_voices(pending.connection)):
             return True
         if not self._speech.awaits_voices:
             return False
@@ -146,229 +156,248 @@ class Requests:
             return request.voice is not None and not bad_option(request)
         return isinstance(request, Voices) or (isinstance(request, Say) and request.voice is not None)
 
-    def _held(self, connection: Connection) -> list[Call]:
-        """Return the requests of this connection that wait for the voices: what comes after them must not overtake."""
-        return [each for each in self._waiting(connection) if each.place is self._speech.for_voices]
-
-    def _keep(self, call: Call) -> bool:
-        """Count a request that is to wait; where it can't, return False, and it has a fault."""
-        if call.size:
-            return True  # it has waited for something else already
-        size = EACH + sum(map(_bytes_of, fields(call.request).values()))
-        if len(self._waiting(call.connection)) > MAX_WAITING:  # it is one of them
-            call.fault = Reason.QUEUE_FULL, f"{MAX_WAITING:,} requests of this connection are waiting already"
-        elif self._size + size > ALL_WAITING:
-            call.fault = Reason.QUEUE_FULL, f"{ALL_WAITING >> 20} MiB of requests are waiting already"
-        else:
-            call.size = size
-            self._size += size
-        return call.fault is None
-
-    def _hurry(self, connection: Connection) -> None:
-        """Have go on what of this connection waits for the voices; the others' know nothing of what hurries."""
-        for each in self._held(connection):
+    def _skip_voices(self, connection: ClientConnection) -> None:
+        """Continue the requests of a connection that wait for the voices."""
+        for each in self._waiting_for_voices(connection):
             each.resume()
 
-    def _look(self) -> None:
-        """Let go, soon, what may go now that a goal has come to the queue, or left it."""
-        if self._speech.for_room and self._turn is None:
-            # Soon, not at once: whoever changed something may be in the middle of other changes.
-            self._turn = asyncio.get_running_loop().call_soon(self._let_go)
+    def _keep(self, pending: PendingRequest) -> bool:
+        """Count a request that is about to wait. Return False if it can't wait, and note why."""
+        if pending.kept_bytes:
+            return True  # it has waited before
+        size = REQUEST_BYTES + sum(map(_memory_of, fields(pending.request).values()))
+        if len(self._unanswered(pending.connection)) > MAX_WAITING_REQUESTS:  # with this one
+            words = f"{MAX_WAITING_REQUESTS:,} requests of this connection are waiting already"
+        elif self._waiting_bytes + size > MAX_WAITING_BYTES:
+            words = f"{MAX_WAITING_BYTES >> 20} MiB of requests are waiting already"
+        else:
+            pending.kept_bytes = size
+            self._waiting_bytes += size
+            return True
+        pending.refusal = Reason.QUEUE_FULL, words
+        return False
 
-    def _let_go(self) -> None:
-        self._turn = None
-        full: set[object] = set()
-        went = False
+    def _check_room_soon(self) -> None:
+        """Schedule a check of the goals that wait for room, because the queue has changed."""
+        if self._speech.for_room and self._room_check is None:
+            # In the next turn, because the caller may be in the middle of other changes.
+            self._room_check = asyncio.get_running_loop().call_soon(self._check_room)
+
+    def _check_room(self) -> None:
+        """Continue the goals that have room now."""
+        self._room_check = None
+        without_room: set[object] = set()
+        resumed = False
         for each in list(self._speech.for_room):
             say = each.request
             assert isinstance(say, Say)
-            # All that room depends on, but for an id: where a thousand lack it, one is asked for.
+            # Room depends on these values alone if the goal has no id. One check answers for a thousand such goals.
             kind = (say.priority, say.key, say.flush, say.preempt) if say.id is None else None
-            if kind in full:
+            if kind in without_room:
                 continue
             if not self._scheduler.has_room(say):
                 if kind:
-                    full.add(kind)
+                    without_room.add(kind)
             elif not each.connection.has_hung_up():
                 each.resume()
-                went = True
-        if went:
-            self._look()  # they may have made room for others, those before them first
+                resumed = True
+        if resumed:
+            self._check_room_soon()  # they may have made room for goals before them
 
-    def _select(self, selection: Cancel) -> list[Call]:
-        """Return the selected goals of those that wait."""
+    def _select_waiting(self, selection: Cancel) -> list[PendingRequest]:
+        """Return the selected goals among those that wait."""
         waiting = (*self._canceled, *self._speech.for_room, *self._speech.for_voices)
         goals = [(each, each.request) for each in waiting if isinstance(each.request, Say)]
-        selected = selection.of_waiting([say for _, say in goals])
-        # Who has hung up has taken its request back, and is about to be forgotten.
-        return [goals[place][0] for place in selected if not goals[place][0].connection.has_hung_up()]
+        selected = (goals[index][0] for index in selection.of_waiting([say for _, say in goals]))
+        # A client that has hung up has withdrawn its goals.
+        return [each for each in selected if not each.connection.has_hung_up()]
 
-    def _end_waiting(self, calls: list[Call], by: By | None) -> list[Callable[[], None]]:
-        """Have these goals wait for nothing more; return what submits them as cancelled, to be told in its turn."""
-        new = [each for each in calls if each.place is not self._canceled]
+    def _cancel_waiting(self, goals: list[PendingRequest], by: By | None) -> list[Callable[[], None]]:
+        """Cancel goals that wait. Return the notifications that submit them, so that they end like other goals."""
+        new = [each for each in goals if each.waiting_list is not self._canceled]
         for each in new:
-            each.by = by
+            each.canceled_by = by
             each.move(self._canceled)
         return [each.resume for each in new]
 
-    async def _await_room(self, call: Call, say: Say) -> float:
-        """Wait until there is room or the goal's ttl is over, and return the seconds that count towards its ttl."""
+    async def _await_room(self, pending: PendingRequest, say: Say) -> float:
+        """Wait until there is room or the goal has expired. Return the seconds that count towards its ttl."""
         ttl = (self._scheduler.settings.ttl if say.ttl is None else say.ttl) or None
         began = self._speech.now().monotonic
         self._speech.subscribers.keep_alive()
-        in_time = await call.wait(self._speech.for_room, ttl)
+        in_time = await pending.wait(self._speech.for_room, ttl)
         waited = self._speech.now().monotonic - began
         return waited if in_time or ttl is None else max(waited, ttl)
 
-    # -- one method a request
+    # -- one coroutine for each request
 
-    async def _say(self, call: Call, say: Say) -> None:
-        connection, sender = call.connection, call.connection.sender
+    async def _say(self, pending: PendingRequest, say: Say) -> None:
+        speech, scheduler, connection = self._speech, self._scheduler, pending.connection
         waited = 0.0
-        if call.by is None:
-            now = self._speech.now()
-            if self._turn:  # a goal that comes now must not take the room of one that waits
-                self._turn.cancel()
-                self._let_go()
-            fault = call.fault or self._speech.voices.fault(say.voice, self._scheduler.settings.voice)
-            if say.patient and self._scheduler.lacks_room(say, now, fault) and self._keep(call):
-                waited = await self._await_room(call, say)
-        voices, usual = self._speech.voices, self._scheduler.settings.voice
-        now, fault = self._speech.now(), call.fault or voices.fault(say.voice, usual)
-        if not fault:
-            say = replace(say, voice=voices.meant(say.voice, usual))
-            fault = _unpitched(say)
-        if not fault:
-            self._speech.want(say.voice or usual)
-        submitted = self._scheduler.submit(say, sender, now, fault, call.by, waited)
+        if pending.canceled_by is None:
+            now = speech.now()
+            if self._room_check:  # a new goal must not take the room of one that waits
+                self._room_check.cancel()
+                self._check_room()
+            refusal = pending.refusal or speech.voices.refusal(say.voice, scheduler.settings.voice)
+            if say.patient and scheduler.lacks_room(say, now, refusal) and self._keep(pending):
+                waited = await self._await_room(pending, say)
+        now, usual = speech.now(), scheduler.settings.voice
+        refusal = pending.refusal or speech.voices.refusal(say.voice, usual)
+        if not refusal:
+            say = replace(say, voice=speech.voices.resolve(say.voice, usual))
+            refusal = _refuse_pitch(say)
+        submitted = scheduler.submit(say, connection.client, now, refusal, pending.canceled_by, waited)
         record = submitted.record
-        extra: JsonObject = {"paused": True} if self._scheduler.paused else {}
+        extra: JsonObject = {"paused": True} if scheduler.paused else {}
         if submitted.attached:
             state = record.state
             extra["attached"] = True
         else:
-            # As it was accepted: it may have started in the same step, but that is told by its events.
+            # As it was accepted. Its events tell if it has begun in the same step.
             state = record.state if record.state is State.REJECTED else State.PENDING
-            if call.by and record.by is call.by:
-                call.ended = record
+            if pending.canceled_by and record.by is pending.canceled_by:
+                pending.canceled_goal = record
         goal = record.snapshot(state).to_json()
         ended = submitted.attached and state.terminal
         if (say.wait or say.feedback) and not ended:
-            self._speech.subscribers.await_result(record.id, connection, feedback=say.feedback)
-        call.answer(goal=goal, **extra)
+            speech.subscribers.await_result(record.id, connection, feedback=say.feedback)
+        pending.answer(goal=goal, **extra)
         if ended and (say.wait or say.feedback):
             connection.publish(encode({"event": "result", "goal": goal}))
-        self._speech.apply(submitted.effects)
+        speech.apply(submitted.effects)
 
-    async def _wait(self, call: Call, request: Wait) -> None:
-        await self._speech.news.until_told(call)  # the result of a goal that has ended is the last of it
+    async def _wait(self, pending: PendingRequest, request: Wait) -> None:
+        await self._speech.notifications.wait_done(pending)  # the result must be the last event of a goal
         if request.ids is None:
             records = self._scheduler.unfinished()
         else:
             records = [self._find(each) for each in dict.fromkeys(request.ids)]
         for record in records:
             if not record.state.terminal:
-                self._speech.subscribers.await_result(record.id, call.connection, feedback=request.feedback)
-        # As they are now: what becomes of them meanwhile is told by the events that come after the list. Of a thousand
-        # that have ended, each is looked at when its turn comes to be sent.
+                self._speech.subscribers.await_result(record.id, pending.connection, feedback=request.feedback)
+        # The list has the goals as they are now, and events tell how they go on. A goal that has ended doesn't change,
+        # so its snapshot is made when it is sent.
         active = self._scheduler.active
         spoken = active.snapshot() if active else None
-        told = [(record, record.state) for record in records]
-        goals = (spoken if spoken and record is active else record.snapshot(state) for record, state in told)
-        # Subscribers are told of the others.
-        results = (Result(record.snapshot()).to_json() for record, state in told if state.terminal)
-        call.answer(({"goal": each.to_json()} for each in goals), results, count=len(records))
+        states = [(record, record.state) for record in records]
+        goals = (spoken if spoken and record is active else record.snapshot(state) for record, state in states)
+        results = (Result(record.snapshot()).to_json() for record, state in states if state.terminal)
+        pending.answer(({"goal": each.to_json()} for each in goals), results, count=len(records))
 
-    async def _cancel(self, call: Call, selection: Cancel) -> None:
-        speech, by = self._speech, By(client=call.connection.sender)
+    async def _cancel(self, pending: PendingRequest, selection: Cancel) -> None:
+        speech, client = self._speech, pending.connection.client
         now = speech.now()
-        waiting = self._select(selection)
-        ends = self._end_waiting(waiting, by)
+        waiting = self._select_waiting(selection)
+        notifications = self._cancel_waiting(waiting, By(client=client))
         ids = {each.request.id for each in waiting if isinstance(each.request, Say)}
-        done = self._scheduler.cancel(selection, call.connection.sender, now, ids)
-        speech.apply(done.effects)  # the engine is told before thousands of clients may be
-        speech.news.tell(ends)
-        if done.stopping:  # its end will be told after all that
-            while not done.stopping.state.terminal:
-                await call.wait(speech.for_silence(done.stopping))
+        result = self._scheduler.cancel(selection, client, now, ids)
+        speech.apply(result.effects)  # first, because thousands of notifications may follow
+        speech.notifications.add(notifications)
+        if result.stopping:
+            while not result.stopping.state.terminal:
+                await pending.wait(speech.for_silence(result.stopping))
         else:
-            await speech.news.until_told(call)
-        ended = done.recalled + [each.ended for each in waiting if each.ended]
-        if done.stopping and done.stopping.state is not State.SUCCEEDED:
-            ended.append(done.stopping)
-        goals = chain(_listed("canceled", ended), _listed("ended", done.ended))
-        if done.unknown:
-            call.refuse(UnknownGoal.code, _unknown(*done.unknown), goals)
+            await speech.notifications.wait_done(pending)
+        ended = result.recalled + [each.canceled_goal for each in waiting if each.canceled_goal]
+        if result.stopping and result.stopping.state is not State.SUCCEEDED:
+            ended.append(result.stopping)
+        goals = chain(_listed("canceled", ended), _listed("ended", result.ended))
+        if result.unknown:
+            pending.refuse(UnknownGoal.code, _unknown(*result.unknown), goals)
         else:
-            call.answer(goals, count=len(ended))
+            pending.answer(goals, count=len(ended))
 
-    async def _pause(self, call: Call, _: Pause) -> None:
-        speech = self._speech
-        speech.pause(By(client=call.connection.sender))
-        active = self._scheduler.active
-        if active and active is not speech.silent and not await call.wait(speech.for_silence(active), PAUSE_LIMIT):
-            words = f"speech is paused, but {active.id} was not known to be silent within {PAUSE_LIMIT:g} s"
+    async def _pause(self, pending: PendingRequest, _: Pause) -> None:
+        speech, scheduler = self._speech, self._scheduler
+        speech.now()
+        changed, effects, active = not scheduler.paused, scheduler.pause(), scheduler.active
+        if changed:
+            self._publish_pause(active if active and active.paused else None, pending)
+        speech.apply(effects)
+        active = scheduler.active
+        if (
+            active
+            and active is not speech.silent
+            and not await pending.wait(speech.for_silence(active), PAUSE_ANSWER_S)
+        ):
+            words = f"speech is paused, but {active.id} was not known to be silent within {PAUSE_ANSWER_S:g} s"
             raise RequestRefused(words, Reason.NOT_SILENT)
-        self._report_pause(call, active)
+        self._answer_pause(pending, active)
 
-    async def _resume(self, call: Call, _: Resume) -> None:
-        self._report_pause(call, self._speech.resume(By(client=call.connection.sender)))
+    async def _resume(self, pending: PendingRequest, _: Resume) -> None:
+        speech, scheduler = self._speech, self._scheduler
+        now = speech.now()
+        changed, active = scheduler.paused, scheduler.active
+        if active and active.state is not State.ACTIVE:
+            active = None  # it is being stopped
+        speech.silent = None
+        effects = scheduler.resume(now)
+        if changed:
+            self._publish_pause(active, pending)
+        speech.apply(effects)
+        if active:
+            resume_all(speech.for_silence(active))  # these requests will not see it silent any more
+        self._answer_pause(pending, active)
 
-    def _report_pause(self, call: Call, goal: Record | None) -> None:
-        told = None if goal is None or goal.state.terminal else goal.snapshot().to_json()
-        call.answer(paused=self._scheduler.paused, goal=told)
+    def _publish_pause(self, held: Record | None, pending: PendingRequest) -> None:
+        """Publish and log that speech was paused or resumed."""
+        paused, held_id, client = self._scheduler.paused, held.id if held else None, pending.connection.client
+        publish = self._speech.subscribers.paused_changed
+        self._speech.notifications.add([partial(publish, held_id, paused=paused, by=By(client=client), at=time.time())])
+        log.write(f"{'paused' if paused else 'resumed'} by {describe_sender(client)}")
 
-    async def _status(self, call: Call, request: Status) -> None:
+    def _answer_pause(self, pending: PendingRequest, goal: Record | None) -> None:
+        shown = None if goal is None or goal.state.terminal else goal.snapshot().to_json()
+        pending.answer(paused=self._scheduler.paused, goal=shown)
+
+    async def _status(self, pending: PendingRequest, request: Status) -> None:
         if request.id is None:
-            self._send_overview(call)
+            self._answer_overview(pending)
         else:
-            call.answer(goal=self._find(request.id).snapshot().to_json())
+            pending.answer(goal=self._find(request.id).snapshot().to_json())
 
-    async def _watch(self, call: Call, _: Watch) -> None:
-        await self._speech.news.until_told(call)  # what comes after the overview has happened after it
-        self._send_overview(call)
-        self._speech.subscribers.watch(call.connection)
+    async def _watch(self, pending: PendingRequest, _: Watch) -> None:
+        await self._speech.notifications.wait_done(pending)  # so that every event is later than the overview
+        self._answer_overview(pending)
+        self._speech.subscribers.watch(pending.connection)
 
-    def _send_overview(self, call: Call) -> None:
-        pending = list(self._scheduler.pending())
-        recent = list(self._scheduler.history.latest(RECENT))
+    def _answer_overview(self, pending: PendingRequest) -> None:
+        recent = list(self._scheduler.history.latest(RECENT_GOALS))
         active = self._scheduler.active
         now = active.snapshot().to_json() if active else None
-        goals = chain(_listed("pending", pending), _listed("recent", reversed(recent)))
-        call.answer(goals, server=self._describe(), active=now)
+        goals = chain(_listed("pending", list(self._scheduler.pending())), _listed("recent", reversed(recent)))
+        pending.answer(goals, server=self._describe(), active=now)
 
-    async def _voices(self, call: Call, _: Voices) -> None:
-        self._speech.voices.look_for_files()
+    async def _voices(self, pending: PendingRequest, _: Voices) -> None:
+        self._speech.voices.find_new_files()
         voices = self._speech.voices.listed
         if voices is None:
-            words = f"the engine can't list its voices now: it is {self._speech.engine_words}"
+            words = f"the engine can't list its voices now: it is {self._speech.engine_status}"
             if self._scheduler.active:
                 words += ", and busy with its first sentence: ask again after that"
             raise RequestRefused(words, Reason.ENGINE_FAILED)
-        call.answer(({"voice": fields(each)} for each in voices), count=len(voices))
+        pending.answer(({"voice": fields(each)} for each in voices), count=len(voices))
 
-    async def _log(self, call: Call, request: Log) -> None:
+    async def _log(self, pending: PendingRequest, request: Log) -> None:
         records = list(self._scheduler.history.log(request.count))
-        call.answer(_listed("goal", reversed(records)), count=len(records))
+        pending.answer(_listed("goal", reversed(records)), count=len(records))
 
-    async def _set(self, call: Call, request: Set) -> None:
-        words = bad_option(request)
-        if words:
+    async def _set(self, pending: PendingRequest, request: Set) -> None:
+        speech, scheduler = self._speech, self._scheduler
+        if words := bad_option(request):
             raise RequestRefused(words, Reason.BAD_OPTION)
-        voices = self._speech.voices
-        fault = voices.fault(request.voice)
-        if fault:
-            code, words = fault
+        if refusal := speech.voices.refusal(request.voice):
+            code, words = refusal
             raise RequestRefused(words, code)
-        changed = given(replace(request, voice=voices.meant(request.voice)))
-        self._scheduler.settings = replace(self._scheduler.settings, **changed)
-        self._look()  # what preempts may have room
-        self._speech.want(changed.get("voice"), anew=True)
-        self._speech.apply(self._scheduler.tick(self._speech.now()))  # who waited for a voice may wait no more
-        if changed:
-            values = ", ".join(f"{name} {figure(value)}" for name, value in changed.items())
-            log.write(f"set to {log.sanitize(values)} by {who(call.connection.sender)}")
-        call.answer(settings=as_shown(self._scheduler.settings))
+        changes = given_values(replace(request, voice=speech.voices.resolve(request.voice)))
+        effects = scheduler.change_settings(changes, speech.now())
+        self._check_room_soon()  # goals that preempt now may have room
+        speech.apply(effects)
+        if changes:
+            values = ", ".join(f"{name} {format_number(value)}" for name, value in changes.items())
+            log.write(f"set to {log.sanitize(values)} by {describe_sender(pending.connection.client)}")
+        pending.answer(settings=shown_settings(scheduler.settings))
 
     def _find(self, goal_id: str) -> Record:
         record = self._scheduler.find(goal_id)
@@ -381,8 +410,8 @@ def _unknown(*ids: str) -> str:
     return f"no goal {', '.join(map(repr, ids))} is known: see `talk status`"
 
 
-def _unpitched(say: Say) -> Refusal | None:
-    """Return reason and words why a goal can't be had that wants a pitch of a voice that has none but its own."""
+def _refuse_pitch(say: Say) -> Refusal | None:
+    """Return why a goal is refused if it asks for another pitch of a neural voice."""
     if say.pitch in {None, INITIAL.pitch} or not is_neural(say.voice or ""):
         return None
     words = f"the voice {say.voice} has no pitch but its own: leave the pitch out, or take one of espeak's"
@@ -390,11 +419,11 @@ def _unpitched(say: Say) -> Refusal | None:
 
 
 def _listed(name: str, records: Iterable[Record]) -> Iterator[JsonObject]:
-    """Return the lines of a list of goals; each is looked at when its turn comes to be sent."""
+    """Return the lines of a list of goals. Each snapshot is made when it is sent."""
     return ({name: each.snapshot().to_json()} for each in records)
 
 
-def _bytes_of(value: object) -> int:
-    """Return the bytes that a value from a request takes in memory: small lists take many times their JSON."""
+def _memory_of(value: object) -> int:
+    """Return the memory that a value of a request takes in bytes, which may be many times that of its JSON."""
     inside = value.values() if isinstance(value, dict) else value if isinstance(value, (list, tuple)) else ()
-    return sys.getsizeof(value) + sum(map(_bytes_of, inside))
+    return sys.getsizeof(value) + sum(map(_memory_of, inside))

@@ -1,8 +1,8 @@
-"""What is spoken: carries out the scheduler's decisions and takes the engine's reports, all in the loop's thread.
+"""Carries out the scheduler's effects, and passes the engine's reports to the scheduler.
 
-What happens is the scheduler's decision, how it is spoken the engine thread's, who hears of it the subscribers'. It
-passes between them and never waits for any of them. It has the one timer: for the scheduler's `deadline`, at which it
-calls `tick`. It knows no requests but as those who wait, and are to go on.
+All of it runs in the event loop's thread. The scheduler decides what happens, the engine thread speaks, and
+`subscribers` publishes the events. This module waits for none of them. It has the one timer, which calls the
+scheduler's `tick` at its `deadline`.
 """
 
 from __future__ import annotations
@@ -17,263 +17,122 @@ from typing import TYPE_CHECKING
 from talkcli.daemon import log
 from talkcli.engine import protocol
 from talkcli.engine.parent.supervisor import EngineDied, EngineMissing, EngineSaid, Report, ThreadDied
-from talkcli.engine.voices import is_neural
 from talkcli.errors import TalkError, UsageError
 from talkcli.frozen import replace
 from talkcli.goals.goal import Output
-from talkcli.goals.options import INITIAL, for_engine, model_of
+from talkcli.goals.options import ENGINE_OPTIONS, INITIAL, engine_options, is_neural, model_of, require_fields
 from talkcli.goals.reasons import Reason
-from talkcli.goals.scheduler import Changed, Effect, Now, Order
+from talkcli.goals.scheduler import Changed, Effect, Now, Order, Ordered
 from talkcli.goals.states import State
+from talkcli.goals.voices import VoiceDropOrder, VoiceLoadOrder, VoiceWarning
 from talkcli.server import log as server_log
-from talkcli.server.call import go_on
-from talkcli.server.stream import Streams
-from talkcli.server.subscribers import News, Subscribers
-from talkcli.server.voices import Readiness, Voices
+from talkcli.server.connection import resume_all
+from talkcli.server.stream import ClientStreams
+from talkcli.server.subscribers import Notifications, Subscribers
+from talkcli.server.voices import VoiceCatalog
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-    from typing import Any
 
     from talkcli.engine.parent.supervisor import Supervisor
-    from talkcli.goals.goal import By
     from talkcli.goals.record import Record
     from talkcli.goals.scheduler import Scheduler
-    from talkcli.server.call import Place
+    from talkcli.server.connection import WaitingList
 
-#: Linux's monotonic clock stands still while the machine sleeps, the one since the boot does not. Elsewhere, on macOS,
-#: the monotonic one goes on.
+#: The monotonic clock of Linux stands still while the machine is suspended; the clock since the boot goes on, and so
+#: does the monotonic clock of macOS.
 _CLOCK = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
-#: Seconds after which a timer looks at this clock again: the event loop's own timers stand still in a suspend, and what
-#: was due in it must not wait for as long again.
-LOOK_EVERY = 1.0
-#: How an engine is that takes goals.
+#: How often the timer compares its clock with the deadline. The event loop's own timers stand still in a suspend.
+CLOCK_CHECK_S = 1.0
+#: The status of an engine that takes goals.
 READY = "ready"
-#: Reports that are taken before the loop looks at the clients again: to tell fifty watchers of so many words takes it
-#: some milliseconds, on a busy machine a hundredth of a second or two.
-AT_ONCE = 8
+#: Reports that are taken before clients have a turn. To publish as many words to fifty watchers takes 10 to 20 ms on a
+#: busy machine.
+REPORTS_PER_TURN = 8
+
+require_fields(protocol.Speak, ENGINE_OPTIONS)
 
 
 def elapsed() -> float:
-    """Return seconds since some moment in the past: no change of the wall clock moves it, and a suspend counts."""
+    """Return the time in seconds by a clock that goes on in a suspend and is never set."""
     return time.clock_gettime(_CLOCK)
 
 
 class Speech:
-    """The goals of one server and the engine that speaks them, for as long as it runs."""
+    """The goals of one server, and the engine that speaks them."""
 
-    def __init__(self, scheduler: Scheduler, for_player: Sequence[str] = (), voice_memory: int = 0) -> None:
-        """`for_player`: the server's options that were given for a player; `voice_memory`: as in `Voices`."""
+    def __init__(self, scheduler: Scheduler, player_options: Sequence[str] = ()) -> None:
+        """Create it without an engine.
+
+        Args:
+            scheduler: the server's scheduler.
+            player_options: the options for the player that the server was given, for the log.
+        """
         self.scheduler = scheduler
-        self._for_player = for_player
-        #: set before the first client is there
+        self._player_options = player_options
+        #: set before the first client connects
         self.engine: Supervisor
-        #: called, in the loop's thread, when `words` may have changed
-        self.changed: Callable[[], None] = lambda: None
-        #: called when a goal has come to the queue, or left it
-        self.queue_changed: Callable[[], None] = lambda: None
-        #: called when nothing can be spoken any more, and why
-        self.lost: Callable[[TalkError], None] = lambda _: None
-        scheduler.engine_lost()  # none is ready yet
-        #: set once everything has ended after `shut_down`
+        #: called when `status_words` may have changed
+        self.on_status_change: Callable[[], None] = lambda: None
+        #: called when a goal has come to the queue or left it
+        self.on_queue_change: Callable[[], None] = lambda: None
+        #: called with the reason when nothing can be spoken any more
+        self.on_failure: Callable[[TalkError], None] = lambda _: None
+        #: set when all goals have ended after `shut_down`
         self.finished = asyncio.Event()
+        #: what the engine has said about itself; None before the first one is ready
         self.ready: protocol.Ready | None = None
-        self.voices = Voices(voice_memory)
-        #: requests that wait until the voices are known, or it is known that they won't be
-        self.for_voices: Place = {}
-        #: goals that wait for room in the queue; whoever hears of `queue_changed` lets them go
-        self.for_room: Place = {}
-        #: how the engine is, in a few words
-        self.engine_words = "starting"
-        #: set once an engine process is ready, or it is known that none will be; and at the server's end
+        self.voices = VoiceCatalog()
+        #: requests that wait until the voices are known, or won't be
+        self.for_voices: WaitingList = {}
+        #: goals that wait for room in the queue
+        self.for_room: WaitingList = {}
+        #: the status of the engine, for people
+        self.engine_status = "starting"
+        #: set when an engine is ready, when it is known that none will be, and when the server ends
         self.engine_known = asyncio.Event()
         self._loop = asyncio.get_running_loop()
         self.subscribers = Subscribers(self._loop, lambda: (each.connection for each in self.for_room))
-        self.streams = Streams(self._loop)
-        self.news = News(self.streams)
+        self.streams = ClientStreams(self._loop)
+        self.notifications = Notifications(self.streams)
         self._timer: asyncio.TimerHandle | None = None
-        #: requests that wait for a goal to be silent, until its end is told
-        self._for_silence: dict[Record, Place] = {}
-        #: the goal that was last known to be held and silent
+        #: requests that wait until a goal is silent or its end has been published
+        self._for_silence: dict[Record, WaitingList] = {}
+        #: the goal that is held and known to be silent
         self.silent: Record | None = None
-        self._orders: dict[Order, Callable[[Record], None]] = {
-            Order.START: self._start,
-            Order.STOP: lambda goal: self.engine.stop(goal.id),
-            Order.GIVE_UP: lambda goal: self.engine.give_up(goal.id),
-            Order.HOLD: lambda goal: self.engine.pause(goal.id, goal.holds),
-            Order.RESUME: lambda goal: self.engine.resume(goal.id),
-        }
-        #: what the engine thread has said, and is still to be taken
+        #: reports of the engine thread that have not been taken
         self._reports: deque[Report] = deque()
-        #: whether the loop has been told so: to wake it for each costs as much as to take one
+        #: whether the loop will take them. To wake it costs as much as to take a report.
         self._reports_due = False
-        self._takes: dict[type[Report], Callable[[Any], None]] = {
-            protocol.Ready: self._ready,
-            protocol.StartFailed: self._start_failed,
-            protocol.VoiceList: self._voices_known,
-            protocol.VoiceLoaded: self._loaded,
-            protocol.VoiceUnloaded: self._unloaded,
-            protocol.VoiceMemory: self._grown,
-            protocol.VoiceChosen: self._speaks,
-            protocol.Word: self._word,
-            protocol.OutputChanged: self._output,
-            protocol.Held: self._paused,
-            protocol.Ended: self._ended,
-            EngineSaid: lambda said: log.write(f"engine: {log.sanitize(said.line)}"),
-            EngineDied: self._died,
-            EngineMissing: self._missing,
-            ThreadDied: self._thread_died,
-        }
-        #: whether the engine was told that a goal waits behind the one it has in hand, and whether by a neural voice
-        self._followed = False, False
+        #: what the engine was last told: whether a goal follows the active one, and whether it has a neural voice
+        self._told_following = False, False
 
-    def words(self) -> str:
-        """Return what is done and how the engine is, for people; no goal's text: any user may read it."""
+    def status_words(self) -> str:
+        """Return what the server does, for people. It contains no text of a goal, because any user may read it."""
         scheduler, ready = self.scheduler, self.ready
-        if self.engine_words != READY:
-            doing = f"engine: {self.engine_words}"
+        if self.engine_status != READY:
+            doing = f"engine: {self.engine_status}"
         elif scheduler.paused:
             doing = "paused"
         else:
             doing = f"speaking {scheduler.active.id}" if scheduler.active else "idle"
         waiting = f", {scheduler.pending_count} waiting" if scheduler.pending_count else ""
-        voice = f"; {ready.version or ready.driver}, {server_log.sound_of(ready)}" if ready else ""
+        voice = f"; {ready.version or ready.driver}, {server_log.describe_sound(ready)}" if ready else ""
         return log.sanitize(doing + waiting + voice)
-
-    # -- what is waited for
 
     @property
     def awaits_voices(self) -> bool:
-        """Whether the voices will be known."""
-        return self.voices.listed is None and self.engine_words in {"starting", READY}
+        """Whether the engine has not listed its voices yet and will."""
+        return self.voices.listed is None and self.engine_status in {"starting", READY}
 
-    # -- neural voices, which have to be loaded
-
-    def want(self, voice: str | None, *, anew: bool = False) -> None:
-        """Have goals wait for a voice, if it is a neural one that is not loaded; `apply` has it loaded if any does.
-
-        `anew`: whatever was wrong with it before. Without an engine nothing is loaded: the next one's `Ready` asks.
-        """
-        model = model_of(voice)
-        if not is_neural(model) or self.engine_words != READY:
-            return
-        if anew:
-            self.voices.forgive(model)
-        if self.voices.want(model, elapsed()) is Readiness.WAITING:
-            self.scheduler.loading.wait_for(model)
-
-    def _load_next(self) -> None:
-        """Have the engine load what is needed next, if anything is, and there is room for it.
-
-        Not its first beside a goal that is heard: that takes the libraries, too, and they stop all of the process for a
-        tenth of a second in their start.
-        """
-        if not self.voices.lacking or self.engine_words != READY:
-            return
-        if self.scheduler.active and not self.voices.warm:
-            return
-        found = self.voices.next(self._needed(), model_of(self.scheduler.settings.voice))
-        if found is None:
-            return
-        voice, drop = found
-        if self.voices.neural[voice].state is Readiness.LOADING:
-            self.scheduler.loading.begin(voice, elapsed())
-        for each in drop:
-            log.write(f"voice {log.sanitize(each)} dropped, to make room for {log.sanitize(voice)}")
-            if each in self.voices.neural:
-                self.scheduler.loading.wait_for(each)
-        self.engine.load(voice, drop)
-
-    def _needed(self) -> list[str]:
-        """Return what has to be loaded for the goals, in their order.
-
-        Not for one that is heard: its voice is there until it has spoken.
-        """
-        goals = (self._asked(each) for each in self.scheduler.unfinished() if each.voice is None)
-        return list(filter(is_neural, dict.fromkeys(map(model_of, goals))))
-
-    def _loaded(self, loaded: protocol.VoiceLoaded) -> None:
-        server_log.loaded(loaded)
-        self.voices.warm = self.voices.warm or loaded.seconds > 0
-        self.voices.loaded(loaded.voice, loaded.error, elapsed())
-        self.scheduler.loading.end(loaded.voice)
-        self._drop_excess()
-        self.apply(self.scheduler.tick(self._now()))
-
-    def _grown(self, grown: protocol.VoiceMemory) -> None:
-        self.voices.grown(grown.voice, grown.memory)
-        self._drop_excess()
-        self._load_next()
-
-    def _drop_excess(self) -> None:
-        """Have the engine drop voices, if they take more memory than they may; warn if one takes too much alone."""
-        active, needed = self.scheduler.active, self._needed()
-        speaking = model_of(active.voice) if active and active.voice else ""
-        if is_neural(speaking) and not self.voices.is_loaded(speaking):
-            return  # it was dropped, and keeps its memory until it has spoken: then the engine measures again
-        for each in self.voices.excess(next(iter(needed), speaking), needed):
-            log.write(f"voice {log.sanitize(each)} dropped: the voices take more than --voice-memory allows")
-            if each in self.voices.neural:
-                self.scheduler.loading.wait_for(each)
-            self.engine.drop(each)
-        words = self.voices.too_large()
-        if words:
-            log.write(log.sanitize(words))
-
-    def _unloaded(self, unloaded: protocol.VoiceUnloaded) -> None:
-        self.voices.unloaded(unloaded.voice, self._needed())
-        if unloaded.voice in self.voices.neural:
-            self.scheduler.loading.wait_for(unloaded.voice)
-        self._load_next()
-
-    def _speaks(self, speaks: protocol.VoiceChosen) -> None:
-        active = self.scheduler.active
-        if active is not None and active.id == speaks.id:
-            self.scheduler.spoken_by(speaks.id, speaks.voice)
-            if speaks.fallback_reason:
-                log.write(log.sanitize(f"{speaks.id} is spoken by {speaks.voice}: {speaks.fallback_reason}"))
-            self._load_next()  # its own may be dropped now
-
-    def for_silence(self, record: Record) -> Place:
-        """Return where to wait until the active goal is silent, goes on after a pause, or its end has been told."""
+    def for_silence(self, record: Record) -> WaitingList:
+        """Return the list of requests that wait until the active goal is silent, resumed or ended."""
         return self._for_silence.setdefault(record, {})
-
-    # -- pauses
-
-    def pause(self, by: By) -> None:
-        """Hold what is being spoken, and start nothing."""
-        self.now()
-        newly, effects, active = not self.scheduler.paused, self.scheduler.pause(), self.scheduler.active
-        if newly:
-            self._tell_paused(active if active and active.paused else None, by)
-        self.apply(effects)
-
-    def resume(self, by: By) -> Record | None:
-        """Go on with what is held, or start what waits; return what was held, or is spoken anyway."""
-        now = self.now()
-        newly, active = self.scheduler.paused, self.scheduler.active
-        if active and active.state is not State.ACTIVE:
-            active = None  # it is being stopped
-        self.silent = None
-        effects = self.scheduler.resume(now)
-        if newly:
-            self._tell_paused(active, by)
-        self.apply(effects)
-        if active:
-            go_on(self.for_silence(active))  # they will not see it silent any more
-        return active
-
-    def _tell_paused(self, held: Record | None, by: By) -> None:
-        """Publish and log that speech is paused, or not any more."""
-        paused, held_id = self.scheduler.paused, held.id if held else None
-        self.news.tell([partial(self.subscribers.paused, held_id, paused=paused, by=by, at=time.time())])
-        assert by.client
-        log.write(f"{'paused' if paused else 'resumed'} by {server_log.who(by.client)}")
 
     # -- the scheduler's effects
 
     def now(self) -> Now:
-        """Return the time, after whatever was due by then is done."""
+        """Return the time, after everything that is due by now has been done."""
         now = self._now()
         deadline = self.scheduler.deadline()
         if deadline is not None and deadline <= now.monotonic:
@@ -285,66 +144,86 @@ class Speech:
         return Now(elapsed(), time.time())
 
     def apply(self, effects: list[Effect]) -> None:
-        """Carry out what the scheduler decided, in its order, but what is for the engine before what clients are told.
-
-        So it works, or stops, while they are. What it says to that is taken in another turn of the loop: they hear of
-        everything in the scheduler's order.
-        """
-        told, moved, at = [], False, time.time()
+        """Carry out the scheduler's effects: first the orders for the engine, so that it works meanwhile."""
+        changes, queue_changed, at = [], False, time.time()
         for effect in effects:
             if isinstance(effect, Changed):
-                told.append(partial(self._tell_changed, effect.record, effect.state, at))
-                moved = moved or effect.state is not State.REJECTED
+                changes.append(partial(self._publish_change, effect.record, effect.state, at))
+                queue_changed = queue_changed or effect.state is not State.REJECTED
                 continue
             try:
-                self._orders[effect.order](effect.record)
-            except Exception as error:  # noqa: BLE001 - the effects after it must not be lost: the engine would wait
-                log.write_bug(effect.order.value, error)
-        if moved:
-            self.queue_changed()
-        self.news.tell(told)
-        self._tell_followed()
-        self._load_next()  # a goal that has ended may have made room
+                self._carry_out(effect)
+            except Exception as error:  # noqa: BLE001 - the other effects must not be lost
+                log.write_bug(effect.order.value if isinstance(effect, Ordered) else type(effect).__name__, error)
+        if queue_changed:
+            self.on_queue_change()
+        self.notifications.add(changes)
+        self._report_following()
         self._set_timer()
-        self.changed()
-        self.look_finished()
+        self.on_status_change()
+        self.check_finished()
 
-    def _tell_changed(self, record: Record, state: State, at: float) -> None:
-        self.subscribers.changed(record, state, at)
-        if state.terminal:
-            server_log.ended(record, elapsed() - record.began)
-            go_on(self._for_silence.pop(record, {}))
-            self.look_finished()
+    def _carry_out(self, effect: Ordered | VoiceLoadOrder | VoiceDropOrder | VoiceWarning) -> None:
+        match effect:
+            case Ordered(record=record, order=order):
+                self._give_order(record, order)
+            case VoiceLoadOrder(voice=voice, dropped=dropped):
+                for each in dropped:
+                    log.write(f"voice {log.sanitize(each)} dropped, to make room for {log.sanitize(voice)}")
+                self.engine.load(voice, dropped)
+            case VoiceDropOrder(voice=voice):
+                log.write(f"voice {log.sanitize(voice)} dropped: the voices take more than --voice-memory allows")
+                self.engine.drop(voice)
+            case VoiceWarning(message=message):
+                log.write(log.sanitize(message))
+
+    def _give_order(self, record: Record, order: Order) -> None:
+        match order:
+            case Order.START:
+                self._start(record)
+            case Order.STOP:
+                self.engine.stop(record.id)
+            case Order.GIVE_UP:
+                self.engine.give_up(record.id)
+            case Order.HOLD:
+                self.engine.pause(record.id, record.pause_count)
+            case Order.RESUME:
+                self.engine.resume(record.id)
 
     def _start(self, record: Record) -> None:
-        self._followed = followed, by_neural = self._following()
-        chosen = for_engine(record.say, self.scheduler.settings)
-        if not is_neural(chosen["voice"] or ""):
-            chosen["voice_only"] = False
-        elif chosen["voice_only"]:
-            if why := self.voices.failure(model_of(chosen["voice"])):
+        self._told_following = next_waits, next_is_neural = self._following()
+        options = engine_options(record.say, self.scheduler.settings)
+        if not is_neural(options["voice"] or ""):
+            options["voice_only"] = False
+        elif options["voice_only"]:
+            if why := self.scheduler.voices.failure(model_of(options["voice"])):
                 self.report(protocol.Ended(record.id, protocol.OUTCOME_FAILED, Reason.VOICE_FAILED, why))
                 return
-            chosen["pitch"] = INITIAL.pitch  # another is for voices that have one
+            options["pitch"] = INITIAL.pitch  # a neural voice has no other
         self.engine.say(
-            protocol.Speak(record.id, record.text or "", next_waits=followed, next_is_neural=by_neural, **chosen)
+            protocol.Speak(
+                record.id, record.text or "", next_waits=next_waits, next_is_neural=next_is_neural, **options
+            )
         )
 
-    def _tell_followed(self) -> None:
-        """Have the engine know that a goal waits behind the one it speaks: it makes good what the change will take."""
+    def _report_following(self) -> None:
+        """Tell the engine whether a goal follows the active one, because the change of goals takes time."""
         active, following = self.scheduler.active, self._following()
-        if active and following != self._followed:
-            self._followed = following
+        if active and following != self._told_following:
+            self._told_following = following
             self.engine.announce_next(active.id, *following)
 
     def _following(self) -> tuple[bool, bool]:
-        """Return whether a goal waits, and whether it asks for a neural voice."""
+        """Return whether a goal is pending, and whether the next one has a neural voice."""
         following = next(self.scheduler.pending(), None)
-        return following is not None, following is not None and is_neural(self._asked(following))
+        return following is not None, following is not None and is_neural(self.scheduler.wanted_voice(following))
 
-    def _asked(self, record: Record) -> str:
-        """Return the voice that a goal asks for: its own, or the server's; "" for the engine's."""
-        return record.say.voice or self.scheduler.settings.voice or ""
+    def _publish_change(self, record: Record, state: State, at: float) -> None:
+        self.subscribers.state_changed(record, state, at)
+        if state.terminal:
+            server_log.goal_ended(record, elapsed() - record.began_at)
+            resume_all(self._for_silence.pop(record, {}))
+            self.check_finished()
 
     def _set_timer(self) -> None:
         if self._timer:
@@ -352,7 +231,7 @@ class Speech:
         deadline = self.scheduler.deadline()
         self._timer = None
         if deadline is not None:
-            self._timer = self._loop.call_later(min(deadline - elapsed(), LOOK_EVERY), self._tick)
+            self._timer = self._loop.call_later(min(deadline - elapsed(), CLOCK_CHECK_S), self._tick)
 
     def _tick(self) -> None:
         self.apply(self.scheduler.tick(self._now()))
@@ -360,128 +239,144 @@ class Speech:
     # -- the engine's reports
 
     def report(self, report: Report) -> None:
-        """Take what the engine thread says, in its order, and a few at a time; called in any thread.
+        """Take a report of the engine thread, after the earlier ones. May be called in any thread.
 
-        A sentence of many words must not keep clients waiting who ask for something meanwhile: words that come faster
-        than they can be told wait, and the clients have their turn in between.
+        Only a few reports are taken in one turn, so that clients don't wait for a sentence of many words.
         """
         self._reports.append(report)
         if not self._reports_due:
             self._reports_due = True
-            with contextlib.suppress(RuntimeError):  # the loop is closed: nobody is left who would want to know
+            with contextlib.suppress(RuntimeError):  # the loop is closed
                 self._loop.call_soon_threadsafe(self._take_reports)
 
     def _take_reports(self) -> None:
-        # Before it looks: what is added after the last look finds it so, and tells the loop again.
+        # Set before the first look, so that a report that comes after the last look wakes the loop again.
         self._reports_due = False
-        for _ in range(AT_ONCE):
+        for _ in range(REPORTS_PER_TURN):
             if not self._reports:
                 return
             report = self._reports.popleft()
             try:
-                if take := self._takes.get(type(report)):  # what else the process says is for its thread alone
-                    take(report)
-            except Exception as error:  # noqa: BLE001 - what comes after it must not be lost
+                self._take(report)
+            except Exception as error:  # noqa: BLE001 - the other reports must not be lost
                 log.write_bug("a report of the engine", error)
         self._reports_due = True
         self._loop.call_soon(self._take_reports)
 
-    def _voices_known(self, voices: protocol.VoiceList) -> None:
-        self.voices.listed = voices.voices
-        go_on(self.for_voices)
+    def _take(self, report: Report) -> None:
+        """Pass one report to the scheduler."""
+        now, active = self.now(), self.scheduler.active
+        if isinstance(report, protocol.GoalEvent):
+            if active and active.id == report.id:  # otherwise the goal was given up
+                self._take_goal_event(report, active, now)
+        elif not self._take_voice_event(report, now):
+            self._take_engine_event(report, now)
 
-    def _died(self, died: EngineDied) -> None:
-        self.scheduler.engine_lost()
-        given_up = self.voices.engine_lost(elapsed())
-        if given_up:
-            log.write(log.sanitize(f"voice {given_up} is left alone: {self.voices.failure(given_up)}"))
-        self._set_timer()
-        self._engine_fails(died.message)
+    def _take_goal_event(self, event: protocol.GoalEvent, active: Record, now: Now) -> None:
+        scheduler = self.scheduler
+        match event:
+            case protocol.Word():
+                scheduler.word_heard(event.id, event.end)
+                text = (active.text or "")[event.start : event.end]
+                self.notifications.add([partial(self.subscribers.word_heard, event, text, time.time())])
+            case protocol.Ended():
+                self._goal_ended(event, active, now)
+            case protocol.OutputChanged():
+                scheduler.output_changed(event.id, Output.from_json(event.output))
+            case protocol.VoiceChosen():
+                if event.fallback_reason:
+                    log.write(log.sanitize(f"{event.id} is spoken by {event.voice}: {event.fallback_reason}"))
+                self.apply(scheduler.voice_chosen(event.id, event.voice, now))
+            case protocol.Held():
+                if active.paused and active.pause_count == event.number:
+                    self.silent = active
+                    resume_all(self.for_silence(active))
 
-    def _missing(self, missing: EngineMissing) -> None:
-        self.apply(self.scheduler.engine_missing(missing.message, self.now()))
+    def _take_voice_event(self, event: Report, now: Now) -> bool:
+        """Take an event about voices. Return False for every other event."""
+        scheduler = self.scheduler
+        match event:
+            case protocol.VoiceList():
+                self.voices.listed = event.voices
+                resume_all(self.for_voices)
+            case protocol.VoiceLoaded():
+                server_log.voice_load_ended(event)
+                imported = event.seconds > 0
+                self.apply(scheduler.voice_load_ended(event.voice, event.error, now, has_libraries=imported))
+            case protocol.VoiceMemory():
+                self.apply(scheduler.voices_measured(event.voice, event.memory, now))
+            case protocol.VoiceUnloaded():
+                self.apply(scheduler.voice_unloaded(event.voice, now))
+            case _:
+                return False
+        return True
 
-    def _ready(self, ready: protocol.Ready) -> None:
-        if self.ready is None and ready.voice is not None:
-            self.scheduler.settings = replace(self.scheduler.settings, voice=ready.voice)
-        if self.ready is None or self.ready != replace(ready, player=self.ready.player):
-            server_log.ready(ready, self._for_player)
-        self.ready, self.engine_words, self.voices.driver = ready, READY, ready.driver
-        self.engine_known.set()
-        now = self.now()
-        for voice in (*self._needed(), self.scheduler.settings.voice):
-            self.want(voice)
-        self.apply(self.scheduler.engine_ready(now))
+    def _take_engine_event(self, event: Report, now: Now) -> None:
+        match event:
+            case protocol.Ready():
+                self._engine_ready(event, now)
+            case protocol.StartFailed():
+                self._start_failed(event, now)
+            case EngineSaid():
+                log.write(f"engine: {log.sanitize(event.line)}")
+            case EngineDied():
+                self.apply(self.scheduler.engine_lost(now))
+                self._engine_failed(event.message)
+            case EngineMissing():
+                self.apply(self.scheduler.fail_next(event.message, now))
+            case ThreadDied():
+                # Nothing can be spoken any more. A supervisor may start another server.
+                self._engine_failed(event.message)
+                self.on_failure(TalkError(event.message))
+                if active := self.scheduler.active:
+                    self.apply(self.scheduler.failed(active.id, Reason.ENGINE_FAILED, event.message, None, now))
 
-    def _start_failed(self, failed: protocol.StartFailed) -> None:
-        if failed.usage_error and self.ready is None:
-            self.lost(UsageError(failed.message))
-            return
-        self._engine_fails(failed.message)
-        if failed.permanent:
-            self.engine_known.set()
-            # None will come: goals need not wait to be told.
-            self.apply(self.scheduler.engine_ready(self.now()))
-
-    def _engine_fails(self, words: str) -> None:
-        if words != self.engine_words:
-            log.write(log.sanitize(words))
-        self.engine_words = words
-        go_on(self.for_voices)
-        self.changed()
-
-    def _thread_died(self, died: ThreadDied) -> None:
-        """End: there is nothing left that could speak, and a supervisor will start another server."""
-        self._engine_fails(died.message)
-        self.lost(TalkError(died.message))
-        if self.scheduler.active:
-            self.apply(
-                self.scheduler.failed(self.scheduler.active.id, Reason.ENGINE_FAILED, died.message, None, self._now())
-            )
-
-    def _ended(self, ended: protocol.Ended) -> None:
-        now = self.now()
-        active = self.scheduler.active
-        if active is None or active.id != ended.id:
-            return  # it was given up before the engine came to its end, perhaps just now
-        if self.ready and ended.player:  # status shows what plays, not what was tried first
+    def _goal_ended(self, ended: protocol.Ended, active: Record, now: Now) -> None:
+        scheduler = self.scheduler
+        if self.ready and ended.player:  # the status shows the player that played
             self.ready = replace(self.ready, player=ended.player)
         if ended.outcome == protocol.OUTCOME_COMPLETED:
-            effects = self.scheduler.completed(ended.id, ended.duration, now, ended.gaps, ended.gap_seconds)
-        elif ended.outcome == protocol.OUTCOME_STOPPED and active.stop_since is not None:
-            effects = self.scheduler.stopped(ended.id, now)
+            effects = scheduler.completed(ended.id, ended.duration, now, ended.gaps, ended.gap_seconds)
+        elif ended.outcome == protocol.OUTCOME_STOPPED and active.stop_requested_at is not None:
+            effects = scheduler.stopped(ended.id, now)
         else:
             reason, words = ended.reason or Reason.ENGINE_FAILED, ended.message or "the engine stopped by itself"
-            effects = self.scheduler.failed(ended.id, reason, words, ended.duration, now)
+            effects = scheduler.failed(ended.id, reason, words, ended.duration, now)
         self.apply(effects)
 
-    def _word(self, word: protocol.Word) -> None:
-        active = self.scheduler.active
-        if active is None or active.id != word.id:
+    def _engine_ready(self, ready: protocol.Ready, now: Now) -> None:
+        if self.ready is None and ready.voice is not None:
+            self.apply(self.scheduler.change_settings({"voice": ready.voice}, now))
+        if self.ready is None or self.ready != replace(ready, player=self.ready.player):
+            server_log.engine_ready(ready, self._player_options)
+        self.ready, self.engine_status, self.voices.driver = ready, READY, ready.driver
+        self.engine_known.set()
+        self.apply(self.scheduler.engine_ready(now))
+
+    def _start_failed(self, failed: protocol.StartFailed, now: Now) -> None:
+        if failed.usage_error and self.ready is None:
+            self.on_failure(UsageError(failed.message))
             return
-        record = self.scheduler.heard(word.id, word.end)
-        text = (record.text or "")[word.start : word.end]
-        self.news.tell([partial(self.subscribers.heard, word, text, time.time())])
+        self._engine_failed(failed.message)
+        if failed.permanent:
+            self.engine_known.set()
+            self.apply(self.scheduler.engine_unavailable(now))
 
-    def _output(self, told: protocol.OutputChanged) -> None:
-        active = self.scheduler.active
-        if active is not None and active.id == told.id:
-            self.scheduler.goes_to(told.id, Output.from_json(told.output))
-
-    def _paused(self, paused: protocol.Held) -> None:
-        active = self.scheduler.active
-        if active is not None and active.id == paused.id and active.paused and active.holds == paused.number:
-            self.silent = active
-            go_on(self.for_silence(active))
+    def _engine_failed(self, words: str) -> None:
+        if words != self.engine_status:
+            log.write(log.sanitize(words))
+        self.engine_status = words
+        resume_all(self.for_voices)
+        self.on_status_change()
 
     # -- the end
 
     def shut_down(self) -> None:
-        """End every goal, and take no other."""
+        """End all goals, and reject every new one."""
         self.engine_known.set()
         self.apply(self.scheduler.shutdown(self._now()))
 
-    def look_finished(self) -> None:
-        """Set `finished`, where everything has ended and that is told."""
-        if self.scheduler.closing and self.scheduler.active is None and self.news.told:
+    def check_finished(self) -> None:
+        """Set `finished` if all goals have ended and all notifications have been made."""
+        if self.scheduler.closing and self.scheduler.active is None and self.notifications.done:
             self.finished.set()

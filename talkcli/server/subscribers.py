@@ -1,7 +1,6 @@
-"""Who is told what: those who wait for a goal, those who watch all, and that the server is alive while they do.
+"""The events for clients that wait for a goal or watch all goals, and the signs of life while they do.
 
-What there is to tell is told in its order, and as fast as they read where it is much: a cancel may end thousands of
-goals. It knows connections and goals, of the engine what a word is, and of requests that one may wait for the news.
+Events are sent in their order, and no faster than clients read them, because a cancel may end thousands of goals.
 """
 
 from __future__ import annotations
@@ -23,181 +22,182 @@ if TYPE_CHECKING:
     from talkcli.engine.protocol import Word
     from talkcli.goals.goal import By, JsonObject
     from talkcli.goals.record import Record
-    from talkcli.server.call import Call
-    from talkcli.server.connection import Connection
-    from talkcli.server.stream import Streams
+    from talkcli.server.connection import ClientConnection, PendingRequest
+    from talkcli.server.stream import ClientStreams
 
-#: Seconds between signs of life to those who wait; a client gives a server up after three of them.
-ALIVE_EVERY = 5.0
+#: The interval of signs of life. A client gives a server up after three of them.
+CLIENT_ALIVE_INTERVAL_S = 5.0
 
-#: News that are told before others have their turn: three milliseconds.
-_PORTION = 64
-#: Bytes of them that may wait for the clients before they are given time to read: a client is let go for four times as
-#: much.
-_PORTION_OUTPUT = 1024 * 1024
-#: Seconds that they are given, unless they have read it before, and seconds between two looks whether they have.
-_PATIENCE = 0.05
-_LOOK_AGAIN = 0.002
-#: What is left of that each time that it was in vain, until all is told: 0.8 s in all, so that a cancel of which many
-#: are told who don't read is answered within 2 s, too.
-_LESS = 0.94
+#: Notifications that are made before other work has a turn. They take three milliseconds.
+_MAX_PER_TURN = 64
+#: Unread output of the notifications of one turn, past which clients are given time to read.
+_UNREAD_LIMIT_BYTES = 1024 * 1024
+#: How long clients are given to read, and how often it is checked whether they have.
+_READ_TIME_S = 0.05
+_READ_CHECK_S = 0.002
+#: The factor by which the time to read shrinks each time that clients don't read. The sum is 0.8 s, so that a cancel
+#: is answered within 2 s even if its clients don't read.
+_READ_TIME_FACTOR = 0.94
 
 
 class Subscribers:
-    """The connections that have asked to be told."""
+    """The connections that receive events."""
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, others: Callable[[], Iterable[Connection]]) -> None:
-        """`others`: who else is told that the server is alive, because a request waits."""
+    def __init__(
+        self, loop: asyncio.AbstractEventLoop, waiting_for_room: Callable[[], Iterable[ClientConnection]]
+    ) -> None:
+        """Create it without any connection.
+
+        Args:
+            loop: the event loop.
+            waiting_for_room: returns the connections that also get signs of life, because their goals wait for room.
+        """
         self._loop = loop
-        self._others = others
-        #: counts the events: a watcher sees by a gap that feedback was dropped
+        self._waiting_for_room = waiting_for_room
+        #: numbers the events, so that a watcher notices dropped feedback
         self._numbers = count(1)
-        #: by goal, until its end: those who wait for that, and whether they want its feedback
-        self._waiters: dict[str, dict[Connection, bool]] = {}
-        self._watchers: dict[Connection, None] = {}
-        self._alive: asyncio.TimerHandle | None = None
+        #: the connections that wait for each goal, and whether they want its feedback
+        self._waiters: dict[str, dict[ClientConnection, bool]] = {}
+        self._watchers: dict[ClientConnection, None] = {}
+        self._alive_timer: asyncio.TimerHandle | None = None
 
-    def await_result(self, goal_id: str, connection: Connection, *, feedback: bool = False) -> None:
-        """Tell this connection of the goal's states, of each word where it wants `feedback`, and at last its result."""
+    def await_result(self, goal_id: str, connection: ClientConnection, *, feedback: bool = False) -> None:
+        """Send a connection the states and the result of a goal, and with `feedback` each word."""
         waiting = self._waiters.setdefault(goal_id, {})
         waiting[connection] = waiting.get(connection, False) or feedback
         self.keep_alive()
 
-    def has(self, connection: Connection) -> bool:
-        """Whether this connection is to be told of a goal, or of everything."""
-        return connection in self._watchers or any(connection in each for each in self._waiters.values())
-
-    def watch(self, connection: Connection) -> None:
-        """Tell this connection of everything."""
+    def watch(self, connection: ClientConnection) -> None:
+        """Send a connection all events."""
         self._watchers[connection] = None
         self.keep_alive()
 
-    def left(self, connection: Connection) -> None:
+    def has(self, connection: ClientConnection) -> bool:
+        """Return whether a connection waits for a goal or watches."""
+        return connection in self._watchers or any(connection in each for each in self._waiters.values())
+
+    def left(self, connection: ClientConnection) -> None:
         """Forget a connection that is gone."""
         self._watchers.pop(connection, None)
         for waiting in self._waiters.values():
             waiting.pop(connection, None)
 
-    def changed(self, record: Record, state: State, at: float) -> None:
-        """Publish a goal's new state; with its last one, its result."""
+    def state_changed(self, record: Record, state: State, at: float) -> None:
+        """Publish a goal's new state, and its result if it has ended."""
         event = StateChanged(record.id, state, at, next(self._numbers))
         if self._watchers:
-            # Its first state, and its last, tell watchers all of it.
+            # The first and the last state come with the whole goal.
             whole = record.snapshot(state) if state is State.PENDING or state.terminal else None
             _publish(replace(event, goal=whole).to_json(), self._watchers)
         if not state.terminal:
             _publish(event.to_json(), self._waiters.get(record.id, ()))
         elif record.id in self._waiters:
-            # In one piece: a thousand may wait for it.
-            piece = encode(event.to_json()) + encode(Result(record.snapshot()).to_json())
+            # Encoded once, because a thousand clients may wait for it.
+            lines = encode(event.to_json()) + encode(Result(record.snapshot()).to_json())
             for connection in self._waiters.pop(record.id):
-                connection.publish(piece)
+                connection.publish(lines)
 
-    def heard(self, word: Word, text: str, at: float) -> None:
-        """Publish that a word of a goal is being heard; `text`: as it stands there."""
+    def word_heard(self, word: Word, text: str, at: float) -> None:
+        """Publish that a word is being heard. `text`: the word as it is written."""
         event = WordHeard(word.id, text, word.start, word.end, word.number, word.time, at, next(self._numbers))
-        _publish(event.to_json(), self._listening([self._waiters.get(word.id, {})]), feedback=True)
+        _publish(event.to_json(), self._listeners([self._waiters.get(word.id, {})]), feedback=True)
 
-    def paused(self, held: str | None, *, paused: bool, by: By, at: float) -> None:
-        """Publish that speech is held, or goes on: `held` is the goal that was being spoken."""
-        event = PausedChanged(paused, held, by, at, next(self._numbers))
-        _publish(event.to_json(), self._listening(self._waiters.values()))
+    def paused_changed(self, held_id: str | None, *, paused: bool, by: By, at: float) -> None:
+        """Publish that speech is paused or resumed. `held_id`: the goal that is being spoken."""
+        event = PausedChanged(paused, held_id, by, at, next(self._numbers))
+        _publish(event.to_json(), self._listeners(self._waiters.values()))
 
     def keep_alive(self) -> None:
-        """Tell those who wait for anything, from now on, that the server is alive."""
-        if self._alive is None:
-            self._alive = self._loop.call_later(ALIVE_EVERY, self._say_alive)
+        """Send signs of life to the connections that wait for anything."""
+        if self._alive_timer is None:
+            self._alive_timer = self._loop.call_later(CLIENT_ALIVE_INTERVAL_S, self._send_alive)
 
-    def _listening(self, waiting: Iterable[dict[Connection, bool]]) -> dict[Connection, None]:
-        """Return who hears of these goals' feedback: those of who waits for them that want it, and who watches all."""
-        listening = dict(self._watchers)
+    def _listeners(self, waiting: Iterable[dict[ClientConnection, bool]]) -> dict[ClientConnection, None]:
+        """Return the connections that get the feedback of goals, from the connections that wait for these goals."""
+        listeners = dict(self._watchers)
         for each in waiting:
-            listening.update((connection, None) for connection, feedback in each.items() if feedback)
-        return listening
+            listeners.update((connection, None) for connection, feedback in each.items() if feedback)
+        return listeners
 
-    def _say_alive(self) -> None:
-        self._alive = None
-        listening = dict.fromkeys(chain(self._watchers, self._others(), *self._waiters.values()))
-        _publish({"event": "alive"}, listening)
-        if listening:
+    def _send_alive(self) -> None:
+        self._alive_timer = None
+        listeners = dict.fromkeys(chain(self._watchers, self._waiting_for_room(), *self._waiters.values()))
+        _publish({"event": "alive"}, listeners)
+        if listeners:
             self.keep_alive()
 
 
-def _publish(event: JsonObject, connections: Iterable[Connection], *, feedback: bool = False) -> None:
-    told = list(connections)
-    line = encode(event) if told else b""  # most words are heard by nobody
-    for connection in told:
+def _publish(event: JsonObject, connections: Iterable[ClientConnection], *, feedback: bool = False) -> None:
+    receivers = list(connections)
+    line = encode(event) if receivers else b""  # most words have no listener
+    for connection in receivers:
         connection.publish(line, feedback=feedback)
 
 
-class News:
-    """What is still to be told to the clients of a server: one line for all of them.
+class Notifications:
+    """The notifications of all clients, made one after another.
 
-    What there is to tell is told at once; past a portion the others have their turn, and those who are told have time
-    to read. It looks at nothing of what is told.
+    They are made at once. After a certain number, other work has a turn and the clients get time to read.
     """
 
-    def __init__(self, streams: Streams) -> None:
+    def __init__(self, streams: ClientStreams) -> None:
         self._loop = streams.loop
         self._streams = streams
-        self._line: deque[Callable[[], None]] = deque()
-        self._telling = False
+        self._pending: deque[Callable[[], None]] = deque()
+        self._working = False
         self._turn: asyncio.Handle | None = None
-        self._patience = _PATIENCE
+        self._read_time_s = _READ_TIME_S
 
     @property
-    def told(self) -> bool:
-        """Whether nothing is left to be told."""
-        return not self._line
+    def done(self) -> bool:
+        """Whether all notifications have been made."""
+        return not self._pending
 
-    def tell(self, news: Iterable[Callable[[], None]]) -> None:
-        """Do these, each of which tells something, behind all that there is to tell already.
-
-        What comes of one that is being told belongs to it: it is told with it.
-        """
-        if self._telling:
-            for each in news:
-                self._do(each)
+    def add(self, notifications: Iterable[Callable[[], None]]) -> None:
+        """Make notifications after all pending ones. A notification that adds others makes them at once."""
+        if self._working:
+            for each in notifications:
+                self._make(each)
             return
-        self._line.extend(news)
+        self._pending.extend(notifications)
         if self._turn is None:
-            self._tell_some(self._streams.waiting)
+            self._work(self._streams.unread_bytes)
 
-    async def until_told(self, call: Call) -> None:
-        """Wait until all is told that there is to tell by now."""
-        if self._line:
-            self._line.append(call.resume)
-            await call.wait({})
+    async def wait_done(self, request: PendingRequest) -> None:
+        """Wait until the notifications that are pending now have been made."""
+        if self._pending:
+            self._pending.append(request.resume)
+            await request.wait({})
 
-    def _tell_some(self, before: int) -> None:
-        """Tell a portion; `before`: bytes that waited for clients before what this one has to be read with."""
+    def _work(self, unread_before: int) -> None:
+        """Make some notifications. `unread_before`: the unread output before those that clients shall read first."""
         self._turn = None
-        self._telling = True
-        for _ in range(min(_PORTION, len(self._line))):
-            self._do(self._line.popleft())
-            if self._streams.waiting > before + _PORTION_OUTPUT:
+        self._working = True
+        for _ in range(min(_MAX_PER_TURN, len(self._pending))):
+            self._make(self._pending.popleft())
+            if self._streams.unread_bytes > unread_before + _UNREAD_LIMIT_BYTES:
                 break
-        self._telling = False
-        if not self._line:
-            self._patience = _PATIENCE
-        elif self._streams.waiting > before + _PORTION_OUTPUT:
-            until = self._loop.time() + self._patience
-            self._turn = self._loop.call_later(_LOOK_AGAIN, self._await_readers, before, until)
+        self._working = False
+        if not self._pending:
+            self._read_time_s = _READ_TIME_S
+        elif self._streams.unread_bytes > unread_before + _UNREAD_LIMIT_BYTES:
+            until = self._loop.time() + self._read_time_s
+            self._turn = self._loop.call_later(_READ_CHECK_S, self._await_readers, unread_before, until)
         else:
-            self._turn = self._loop.call_soon(self._tell_some, min(before, self._streams.waiting))
+            self._turn = self._loop.call_soon(self._work, min(unread_before, self._streams.unread_bytes))
 
-    def _await_readers(self, before: int, until: float) -> None:
-        """Go on when what was written has been read, or by then: who doesn't read must not keep others waiting."""
-        if self._streams.waiting <= before:
-            self._tell_some(before)
+    def _await_readers(self, unread_before: int, until: float) -> None:
+        """Continue when clients have read the output, or at this time, because other clients can't wait for them."""
+        if self._streams.unread_bytes <= unread_before:
+            self._work(unread_before)
         elif self._loop.time() < until:
-            self._turn = self._loop.call_later(_LOOK_AGAIN, self._await_readers, before, until)
+            self._turn = self._loop.call_later(_READ_CHECK_S, self._await_readers, unread_before, until)
         else:
-            self._patience *= _LESS
-            self._tell_some(self._streams.waiting)
+            self._read_time_s *= _READ_TIME_FACTOR
+            self._work(self._streams.unread_bytes)
 
-    def _do(self, telling: Callable[[], None]) -> None:
+    def _make(self, notification: Callable[[], None]) -> None:
         try:
-            telling()
-        except Exception as error:  # noqa: BLE001 - those behind it must not wait for ever because of it
+            notification()
+        except Exception as error:  # noqa: BLE001 - the others are still made
             log.write_bug("telling clients", error)

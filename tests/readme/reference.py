@@ -12,8 +12,7 @@ import click
 
 from talkcli.cli.click_app import talk
 from talkcli.cli.commands import COMMANDS
-from talkcli.goals.option import IDS, SECONDS, Option
-from talkcli.goals.options import Set
+from talkcli.goals.options import IDS, SECONDS, Option, Set
 from talkcli.goals.reasons import Reason
 from talkcli.protocol.requests import REQUEST_TYPES
 from tests.support.documents import COMMAND_LINE, WIRE
@@ -58,7 +57,7 @@ def _field(option: Option, *, changes: bool) -> str:
     null = "null" if option.default is None else json.dumps(option.default)
     default = f"`{option.default}`" if option.default and isinstance(option.default, str) else null
     meaning = (changes and option.setting and option.setting.meaning) or option.meaning
-    absent = "" if changes else option.absent
+    absent = "" if changes else option.default_words
     return f"| | `{option.name}` | {_values(option)} | {absent or default} | {meaning} |\n"
 
 

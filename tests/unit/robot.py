@@ -7,8 +7,8 @@ other step is a verb:
     heard a; completed a; failed a; stopped a; deaf a   report this of a goal, as the engine does; * is the active one
     cancel; cancel a b; cancel current before=c key=k
     wait 1; pass 1              let a second pass, with or without a look at the clock
-    pause; resume; shutdown; lost; ready; missing; room 2 (the places in the queue); set ttl=5 preempt=yes
-    expect joe; begin joe; end joe      load the voice piper/joe
+    pause; resume; shutdown; lost; ready; unavailable; missing; room 2 (the places in the queue); set ttl=5 preempt=yes
+    loaded joe; unloadable joe; unloaded joe; measured joe 2; chosen a joe      report this of the voice piper/joe
 
 In the outcome, "a ACTIVE; c b PENDING; d e RECALLED replaced by c", pending goals have their order in the queue.
 """
@@ -21,11 +21,11 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from talkcli.frozen import replace
 from talkcli.goals.goal import By, Sender
 from talkcli.goals.options import INITIAL, Cancel, Say
 from talkcli.goals.reasons import Reason
-from talkcli.goals.scheduler import Cancelled, Changed, Effect, Now, Scheduler, Submitted
+from talkcli.goals.scheduler import Cancelled, Changed, Effect, Now, Ordered, Scheduler, Submitted
+from talkcli.goals.voices import NeuralVoices, VoiceDropOrder, VoiceLoadOrder
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -50,7 +50,9 @@ class Robot:
     attached: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.scheduler = Scheduler("4k7f", max_queue=self.max_queue, settings=INITIAL)
+        voices = NeuralVoices(limit_bytes=10, file_size=lambda _: 1)
+        self.scheduler = Scheduler("4k7f", max_queue=self.max_queue, settings=INITIAL, voices=voices)
+        self.scheduler.engine_ready(self.now)
 
     @property
     def now(self) -> Now:
@@ -58,8 +60,14 @@ class Robot:
 
     def see(self, effects: list[Effect]) -> list[Effect]:
         for effect in effects:
-            what = effect.state.name if isinstance(effect, Changed) else effect.order.value
-            self.seen.append(f"{self.name_of(effect.record)} {what}")
+            if isinstance(effect, Changed):
+                self.seen.append(f"{self.name_of(effect.record)} {effect.state.name}")
+            elif isinstance(effect, Ordered):
+                self.seen.append(f"{self.name_of(effect.record)} {effect.order.value}")
+            elif isinstance(effect, VoiceLoadOrder):
+                self.seen += [*(f"drop {each}" for each in effect.dropped), f"load {effect.voice}"]
+            elif isinstance(effect, VoiceDropOrder):
+                self.seen.append(f"drop {effect.voice}")
         return effects
 
     def name_of(self, record: Record) -> str:
@@ -91,11 +99,15 @@ class Robot:
         self.seconds += seconds
         self.see(self.scheduler.tick(self.now))
 
+    def loads(self, voice: str, error: str | None) -> None:
+        """Let the engine tell that it has loaded a voice, or why it could not."""
+        self.see(self.scheduler.voice_load_ended(f"piper/{voice}", error, self.now, has_libraries=True))
+
     def tells(self, event: str, goal_id: str) -> None:
         """Let the engine tell this of a goal."""
         match event:
             case "heard":
-                self.scheduler.heard(goal_id, 4)
+                self.scheduler.word_heard(goal_id, 4)
             case "completed":
                 self.see(self.scheduler.completed(goal_id, 1.5, self.now))
             case "failed":
@@ -114,9 +126,10 @@ class Robot:
             verb, *words = step.split()
             if len(verb) == 1:
                 given = options(words)
-                known = {each: given.pop(each) for each in ("waited", "fault", "canceled") if each in given}
-                if "fault" in known:
-                    known["fault"] = known["fault"], "it can't be had"
+                words_of = {"waited": "waited_s", "fault": "refusal", "canceled": "canceled"}
+                known = {name: given.pop(each) for each, name in words_of.items() if each in given}
+                if "refusal" in known:
+                    known["refusal"] = Reason(known["refusal"]), "it can't be had"
                 if "canceled" in known:
                     known["canceled"] = By(client=DOOR)
                 self.submits(Say(**{"text": verb, **given}), verb, **known)
@@ -135,20 +148,21 @@ class Robot:
             "pause": lambda: self.see(scheduler.pause()),
             "resume": lambda: self.see(scheduler.resume(self.now)),
             "shutdown": lambda: self.see(scheduler.shutdown(self.now)),
-            "lost": scheduler.engine_lost,
+            "lost": lambda: self.see(scheduler.engine_lost(self.now)),
             "ready": lambda: self.see(scheduler.engine_ready(self.now)),
-            "missing": lambda: self.see(scheduler.engine_missing("no memory", self.now)),
-            "expect": lambda: scheduler.loading.wait_for(f"piper/{word}"),
-            "begin": lambda: scheduler.loading.begin(f"piper/{word}", self.seconds),
-            "end": lambda: scheduler.loading.end(f"piper/{word}"),
+            "missing": lambda: self.see(scheduler.fail_next("no memory", self.now)),
+            "unavailable": lambda: self.see(scheduler.engine_unavailable(self.now)),
+            "loaded": lambda: self.loads(word, None),
+            "unloadable": lambda: self.loads(word, "no json"),
+            "unloaded": lambda: self.see(scheduler.voice_unloaded(f"piper/{word}", self.now)),
+            "measured": lambda: self.see(scheduler.voices_measured(f"piper/{word}", int(words[1]), self.now)),
+            "chosen": lambda: self.see(scheduler.voice_chosen(self._id(word), f"piper/{words[1]}", self.now)),
             "wait": lambda: self.waits(float(word)),
             "pass": lambda: setattr(self, "seconds", self.seconds + float(word)),
             "room": lambda: setattr(scheduler, "max_queue", int(word)),
-            "set": lambda: setattr(scheduler, "settings", replace(scheduler.settings, **options(words))),
+            "set": lambda: self.see(scheduler.change_settings(options(words), self.now)),
         }.get(verb, lambda: self.tells(verb, self._id(word)))
         step()
-        if verb == "end":
-            self.waits(0)
 
     def _id(self, name: str) -> str:
         if name == "*" and self.scheduler.active:

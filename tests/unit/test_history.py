@@ -49,7 +49,7 @@ def test_the_newest_end_comes_first_and_latest_leaves_rejected_ones_out() -> Non
 
 def test_an_id_that_was_forgotten_may_come_again() -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "MAX_SPOKEN", 2)
+        patch.setattr(module, "MAX_SPOKEN_GOALS", 2)
         history = History()
         for number in (1, 2, 3, 1):
             history.add(ended(number))
@@ -89,9 +89,9 @@ def test_a_text_without_words_spoken_is_forgotten_with_them() -> None:
 @given(st.lists(st.tuples(st.booleans(), st.integers(0, 12)), max_size=60))
 def test_limits_hold_after_any_goals_and_only_the_oldest_texts_are_gone(goals: list[tuple[bool, int]]) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "MAX_SPOKEN", 7)
-        patch.setattr(module, "MAX_REJECTED", 3)
-        patch.setattr(module, "MAX_TEXT_BYTES", 40)
+        patch.setattr(module, "MAX_SPOKEN_GOALS", 7)
+        patch.setattr(module, "MAX_REJECTED_GOALS", 3)
+        patch.setattr(module, "MAX_KEPT_TEXT_BYTES", 40)
         history = History()
         records = []
         for number, (rejected, size) in enumerate(goals):

@@ -19,24 +19,28 @@ from talkcli.cli.command import FILE_MODE, read_value
 from talkcli.cli.commands import COMMANDS
 from talkcli.engine import protocol
 from talkcli.frozen import fields, replace
-from talkcli.goals.option import INTEGER, NUMBER, SECONDS, Option, is_clients_id
 from talkcli.goals.options import (
     DEFAULT_VOICE,
-    FOR_ENGINE,
+    ENGINE_OPTIONS,
     INITIAL,
-    MAX_KEY,
+    INTEGER,
+    MAX_KEY_CHARS,
     MAX_PRIORITY,
+    NUMBER,
     OPTIONS,
+    SECONDS,
     SETTINGS,
-    SHOWN,
-    SOUND,
+    SHOWN_OPTIONS,
+    SOUND_OPTIONS,
+    Option,
     Say,
     Set,
-    as_shown,
     bad_option,
-    for_engine,
-    given,
-    told,
+    describe_settings,
+    engine_options,
+    given_values,
+    is_clients_id,
+    shown_settings,
 )
 from talkcli.protocol.requests import REQUEST_TYPES
 from talkcli.server import run
@@ -55,7 +59,7 @@ GOOD: list[tuple[str, list[object]]] = [
     ("ttl", [0, 0.0, 0.001, 5, 86_400.0]),
     ("throttle", [0, 0.0, 0.5, 60]),
     ("priority", [0, -1, 1, MAX_PRIORITY, -MAX_PRIORITY]),
-    ("key", ["b", "a" * MAX_KEY, "battery low!", "é日"]),
+    ("key", ["b", "a" * MAX_KEY_CHARS, "battery low!", "é日"]),
 ]
 BAD: list[tuple[str, list[object]]] = [
     ("rate", [79, 451, 0, -200, 10**400]),
@@ -66,7 +70,7 @@ BAD: list[tuple[str, list[object]]] = [
     ("ttl", NO_SECONDS),
     ("throttle", NO_SECONDS),
     ("priority", [MAX_PRIORITY + 1, -MAX_PRIORITY - 1, 10**400]),
-    ("key", ["", "a" * (MAX_KEY + 1)]),
+    ("key", ["", "a" * (MAX_KEY_CHARS + 1)]),
     ("format", ["ssml", "", "TEXT", "a" * 5_000]),
 ]
 OWN_IDS = [
@@ -123,7 +127,7 @@ def test_an_id_is_the_servers_or_a_clients_and_never_both(goal_id: str) -> None:
 
 
 def test_an_id_of_a_server_is_no_client_s() -> None:
-    assert not [boot for boot in (run._boot() for _ in range(1_000)) if is_clients_id(f"{boot}-1")]
+    assert not [boot for boot in (run._random_boot_id() for _ in range(1_000)) if is_clients_id(f"{boot}-1")]
 
 
 # What stands twice, for type checkers and readers, is what the rows say
@@ -161,7 +165,7 @@ def test_the_fields_of_a_request_are_its_rows(kind: str) -> None:
         nothing = " | None" if each.default is None else ""
         assert own[each.name] == TYPES[each.kind.name] + nothing, each.name
         assert getattr(empty, each.name) == each.default, each.name
-        assert each.fault(each.default) is None, each.name
+        assert each.type_error(each.default) is None, each.name
         assert each.meaning, each.name
 
 
@@ -180,33 +184,40 @@ def test_what_the_library_takes_is_what_the_rows_say() -> None:
 
 def test_what_a_goal_shows_and_what_the_engine_is_told_are_what_the_rows_say() -> None:
     goal, say, engine = annotated(Goal), annotated(Say), annotated(protocol.Speak)
-    assert {name: goal[name] for name in SHOWN} == {name: say[name] for name in SHOWN}
+    assert {name: goal[name] for name in SHOWN_OPTIONS} == {name: say[name] for name in SHOWN_OPTIONS}
     told = {name: kind for name, kind in engine.items() if name not in {"id", "text", "next_waits", "next_is_neural"}}
-    assert set(told) == set(FOR_ENGINE)
+    assert set(told) == set(ENGINE_OPTIONS)
     assert {name: kind.removesuffix(" | None") for name, kind in told.items()} == {
-        name: say[name].removesuffix(" | None") for name in FOR_ENGINE
+        name: say[name].removesuffix(" | None") for name in ENGINE_OPTIONS
     }
 
 
 def test_settings_are_given_whole_at_the_start_and_shown_with_null_for_what_there_is_not() -> None:
     assert list(annotated(Set)) == [each.name for each in SETTINGS]
-    assert [each.name for each in SOUND] == ["rate", "volume", "voice", "pitch"]
-    shown = as_shown(INITIAL)
+    assert [each.name for each in SOUND_OPTIONS] == ["rate", "volume", "voice", "pitch"]
+    shown = shown_settings(INITIAL)
     assert shown == {"rate": 200, "volume": 1.0, "voice": None, "pitch": 50, "preempt": False, "ttl": None}
-    assert as_shown(replace(INITIAL, voice=DEFAULT_VOICE, ttl=0.0)) == shown
-    assert told({**shown, "volume": 0.1 + 0.2, "ttl": 1e6})[1::4] == ["volume 0.3", "ttl 1000000 s"]
-    assert told(shown) == ["rate 200", "volume 1", "voice the driver's own", "pitch 50", "goals queue", "no ttl"]
-    changed = as_shown(replace(INITIAL, voice="de", ttl=2.5, preempt=True))
-    assert told(changed)[2:] == ["voice de", "pitch 50", "goals preempt", "ttl 2.5 s"]
+    assert shown_settings(replace(INITIAL, voice=DEFAULT_VOICE, ttl=0.0)) == shown
+    assert describe_settings({**shown, "volume": 0.1 + 0.2, "ttl": 1e6})[1::4] == ["volume 0.3", "ttl 1000000 s"]
+    assert describe_settings(shown) == [
+        "rate 200",
+        "volume 1",
+        "voice the driver's own",
+        "pitch 50",
+        "goals queue",
+        "no ttl",
+    ]
+    changed = shown_settings(replace(INITIAL, voice="de", ttl=2.5, preempt=True))
+    assert describe_settings(changed)[2:] == ["voice de", "pitch 50", "goals preempt", "ttl 2.5 s"]
 
 
 def test_a_setting_is_typed_and_helped_as_its_command_wants_it() -> None:
     preempt, rate = ROWS["preempt"], ROWS["rate"]
     assert preempt.setting
-    at_start, to_set = preempt.at_start(), preempt.to_set()
-    assert (at_start.flags, at_start.help, at_start.default) == ("--preempt", preempt.setting.at_start, False)
-    assert (to_set.flags, to_set.help, to_set.default) == ("--preempt/--no-preempt", preempt.setting.to_set, None)
-    at_start, to_set = rate.at_start(), rate.to_set()
+    at_start, to_set = preempt.for_serve(), preempt.for_set()
+    assert (at_start.flags, at_start.help, at_start.default) == ("--preempt", preempt.setting.serve_help, False)
+    assert (to_set.flags, to_set.help, to_set.default) == ("--preempt/--no-preempt", preempt.setting.set_help, None)
+    at_start, to_set = rate.for_serve(), rate.for_set()
     assert (at_start.flags, at_start.help, at_start.default, at_start.env) == ("--rate", rate.help, 200, "TALK_RATE")
     assert (to_set.flags, to_set.help, to_set.default, to_set.env) == ("--rate", rate.help, None, "")
 
@@ -215,16 +226,16 @@ def test_the_engine_is_told_the_goal_s_own_value_else_the_server_s() -> None:
     settings = replace(INITIAL, voice="de", rate=150)
     general = {"rate": 150, "volume": 1.0, "voice": "de", "pitch": 50, "lead_in": None, "audible": None}
     general["voice_only"] = False
-    assert for_engine(Say("hi"), settings) == general
+    assert engine_options(Say("hi"), settings) == general
     own = Say("hi", rate=80, volume=0.0, voice=DEFAULT_VOICE, pitch=0, lead_in=0, audible=False)
     asked = {"rate": 80, "volume": 0.0, "voice": None, "pitch": 0, "lead_in": 0, "audible": False, "voice_only": False}
-    assert for_engine(own, settings) == asked
-    assert given(Set(preempt=False, ttl=0)) == {"preempt": False, "ttl": 0}
+    assert engine_options(own, settings) == asked
+    assert given_values(Set(preempt=False, ttl=0)) == {"preempt": False, "ttl": 0}
 
 
 def test_a_server_that_is_told_nothing_is_what_its_command_says() -> None:
     rows = {each.name: each for each in COMMANDS["serve"].options}
-    server = fields(run.Settings())
+    server = fields(run.ServerSettings())
     assert server.pop("goals") == Set(**{name: row.default for name, row in rows.items() if row.setting})
     assert server.pop("socket") is None
     assert server == {
@@ -239,7 +250,7 @@ def test_a_server_that_is_told_nothing_is_what_its_command_says() -> None:
     [
         (Option("x", NUMBER, limits=(0, 1), unit=" m"), 2, "the x 2 is not within 0 to 1 m"),
         (Option("x", INTEGER, limits=(1, None)), 0, "the x 0 is not from 1 on"),
-        (Option("x", NUMBER, limits=(0, None), above=True), 0, "the x 0 is not above 0"),
+        (Option("x", NUMBER, limits=(0, None), excludes_minimum=True), 0, "the x 0 is not above 0"),
         (Option("x", SECONDS, limits=(0, None)), -1, "the x -1 is no number of seconds from 0 on"),
         (Option("x", SECONDS, limits=(0, 9)), 10, "the x 10 is not within 0 to 9"),
         (Option("x", NUMBER), 10, None),
@@ -251,8 +262,8 @@ def test_a_server_that_is_told_nothing_is_what_its_command_says() -> None:
     ids=lambda each: getattr(each, "name", None) or str(each)[:24],
 )
 def test_a_refusal_says_what_a_value_may_be(option: Option, value: object, words: str | None) -> None:
-    assert option.refusal(value) == words
-    assert option.refusal(None) is None
+    assert option.value_error(value) == words
+    assert option.value_error(None) is None
     assert ROWS["key"].range == ""
 
 
@@ -267,7 +278,11 @@ def test_what_carries_a_command_out_takes_what_its_row_gives(command: str) -> No
         assert each.default is inspect.Parameter.empty, f"{each.name} is always given"
 
 
-LIMITED = Option("x", NUMBER, limits=(0, 1), above=True), Option("x", INTEGER, limits=(1, None)), Option("x", INTEGER)
+LIMITED = (
+    Option("x", NUMBER, limits=(0, 1), excludes_minimum=True),
+    Option("x", INTEGER, limits=(1, None)),
+    Option("x", INTEGER),
+)
 
 
 def test_limits_hold_on_the_wire_and_on_the_command_line_alike() -> None:
@@ -275,9 +290,9 @@ def test_limits_hold_on_the_wire_and_on_the_command_line_alike() -> None:
     refused: list[list[float]] = [[0, -1, 1.5], [0, -5], []]
     for option, good, bad in zip(LIMITED, taken, refused, strict=True):
         for value in good:
-            assert (option.refusal(value), read_value(option, str(value))) == (None, value)
+            assert (option.value_error(value), read_value(option, str(value))) == (None, value)
         for value in bad:
-            assert f"{value}" in str(option.refusal(value))
+            assert f"{value}" in str(option.value_error(value))
             with pytest.raises(ValueError, match=f"'{value}' is not a"):
                 read_value(option, str(value))
     wanted = ["a number from 0 to 1", "a whole number from 1 on", "a valid integer"]
@@ -288,6 +303,6 @@ def test_limits_hold_on_the_wire_and_on_the_command_line_alike() -> None:
 
 def test_a_plain_line_is_read_before_an_option_is_worth_compiling() -> None:
     """It is read before anything is sent: some hundred rows are made for it."""
-    code = "import talkcli.cli.plain; from talkcli import frozen; from talkcli.goals.option import Option; "
+    code = "import talkcli.cli.plain; from talkcli import frozen; from talkcli.goals.options import Option; "
     code += "print(Option.__init__ is frozen._init_of_few)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "True\n"

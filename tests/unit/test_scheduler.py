@@ -6,10 +6,10 @@ import pytest
 
 from talkcli.goals import history
 from talkcli.goals.goal import By, Output
-from talkcli.goals.history import EARLY_CANCEL, MAX_EARLY_CANCELS, MAX_SAID
+from talkcli.goals.history import EARLY_CANCEL_S, MAX_EARLY_CANCELS, MAX_SPEECH_TIMES
 from talkcli.goals.options import Cancel, Say
 from talkcli.goals.reasons import Reason
-from talkcli.goals.scheduler import SILENCE_LIMIT, Cancelled, Now
+from talkcli.goals.scheduler import CONFIRM_SILENCE_S, Cancelled, Now
 from talkcli.goals.states import State
 from tests.unit.robot import ARM, DOOR, Robot, play
 
@@ -62,9 +62,9 @@ DEADLINES = {
     "a; b ttl=9; c ttl=2; d ttl=4": 102,
     "a; b ttl=9; c ttl=2; d ttl=4; cancel c": 104,
     "a; b ttl=9; c ttl=2; d ttl=4; cancel c; wait 4": 109,
-    "a; b ttl=5; cancel a": 100 + SILENCE_LIMIT,
+    "a; b ttl=5; cancel a": 100 + CONFIRM_SILENCE_S,
     "a; b ttl=1; cancel a": 101,
-    "a; cancel a; pass 1; cancel a": 100 + SILENCE_LIMIT,
+    "a; cancel a; pass 1; cancel a": 100 + CONFIRM_SILENCE_S,
     "a; cancel a; wait 2": None,
     "a ttl=1; lost": 101,
     "a ttl=1; heard a; lost": None,
@@ -90,7 +90,7 @@ def test_the_deadline_is_the_first_that_is_due(script: str) -> None:
 
 
 def test_silence_is_given_up_within_the_two_seconds_in_which_a_cancel_is_answered() -> None:
-    assert 1.5 < SILENCE_LIMIT < 2
+    assert 1.5 < CONFIRM_SILENCE_S < 2
 
 
 def test_a_goal_that_succeeded_shows_how_it_was_spoken() -> None:
@@ -109,7 +109,7 @@ def test_what_was_heard_only_moves_forward_and_stays_after_a_failure() -> None:
     assert robot.goals["a"].snapshot().spoken == ""
     assert robot.goals["b"].snapshot().spoken is None
     for end, spoken in ((4, "door"), (2, "door"), (0, "door"), (9, "door_open"), (4, "door_open")):
-        assert robot.scheduler.heard("4k7f-1", end) is robot.goals["a"]
+        assert robot.scheduler.word_heard("4k7f-1", end) is robot.goals["a"]
         assert robot.goals["a"].snapshot().spoken == spoken
     goal = play("a text=door_open; heard a; failed a").goals["a"].snapshot()
     assert (goal.spoken, goal.duration) == ("door", 1.5)
@@ -127,7 +127,7 @@ def test_what_was_heard_only_moves_forward_and_stays_after_a_failure() -> None:
 def test_a_goal_that_was_not_heard_well_says_so(gaps: int, muted: bool, words: str) -> None:
     robot = play("a")
     output = Output("pulse", "card", 0.5, muted)
-    robot.scheduler.goes_to("4k7f-1", output)
+    robot.scheduler.output_changed("4k7f-1", output)
     robot.see(robot.scheduler.completed("4k7f-1", 1.5, robot.now, gaps, 2.04))
     goal = robot.goals["a"].snapshot()
     assert (goal.state, goal.output, goal.message) == (State.SUCCEEDED, output, f"Talk completed successfully{words}")
@@ -135,8 +135,8 @@ def test_a_goal_that_was_not_heard_well_says_so(gaps: int, muted: bool, words: s
 
 def test_a_goal_as_it_was_accepted_shows_nothing_that_came_later() -> None:
     robot = play("pause; a; resume; pause")
-    robot.scheduler.spoken_by("4k7f-1", "gmw/en-US")
-    robot.scheduler.goes_to("4k7f-1", Output("pulse", "card", 0.5, False))
+    robot.scheduler.voice_chosen("4k7f-1", "gmw/en-US", robot.now)
+    robot.scheduler.output_changed("4k7f-1", Output("pulse", "card", 0.5, False))
     robot.play("cancel; failed a")
     now = robot.goals["a"].snapshot()
     assert (now.voice, now.reason, now.message, now.duration) == ("gmw/en-US", "canceled", "Talk preempted", 1.5)
@@ -144,7 +144,7 @@ def test_a_goal_as_it_was_accepted_shows_nothing_that_came_later() -> None:
     assert (goal.voice, goal.reason, goal.by, goal.message, goal.spoken) == (None,) * 5
     assert (goal.started_at, goal.ended_at, goal.duration, goal.output) == (None,) * 4
     assert (goal.state, goal.paused, goal.queued_at) == (State.PENDING, False, 1.7e9 + 100)
-    assert robot.goals["a"].holds == 1
+    assert robot.goals["a"].pause_count == 1
 
 
 @pytest.mark.parametrize(
@@ -246,8 +246,8 @@ def test_a_goal_that_waits_for_room_goes_on_if_it_has_it_or_never_will() -> None
 
 
 def test_as_many_keys_and_texts_are_remembered_as_may_be_and_the_oldest_goes(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert MAX_SAID == 10_000
-    monkeypatch.setattr(history, "MAX_SAID", 3)
+    assert MAX_SPEECH_TIMES == 10_000
+    monkeypatch.setattr(history, "MAX_SPEECH_TIMES", 3)
     robot = Robot()
     for name in ("a", "b", "c", "a", "d"):
         robot.tells("completed", robot.asks(Say(f"text {name}", key=f"key {name}")).id)
@@ -259,7 +259,7 @@ def test_as_many_keys_and_texts_are_remembered_as_may_be_and_the_oldest_goes(mon
 
 
 def test_a_thousand_early_cancels_are_remembered_and_the_oldest_goes(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert (EARLY_CANCEL, MAX_EARLY_CANCELS) == (60, 1_000)
+    assert (EARLY_CANCEL_S, MAX_EARLY_CANCELS) == (60, 1_000)
     monkeypatch.setattr(history, "MAX_EARLY_CANCELS", 3)
     robot = play("cancel one two three; cancel one four; cancel 4k7f-8 9z9z-7 17 -x")
     robot.play("a id=one; b id=three; c id=four; d id=two")

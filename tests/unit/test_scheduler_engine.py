@@ -12,7 +12,7 @@ from tests.unit.robot import play
 if TYPE_CHECKING:
     from tests.unit.robot import Robot
 
-EVENTS = ["heard", "completed", "failed", "deaf", "stopped", "spoken_by", "goes_to"]
+EVENTS = ["heard", "completed", "failed", "deaf", "stopped", "voice_chosen", "output_changed"]
 #: Goals that are not spoken, while another one is; the last was given up.
 SCENE = "a; completed a; b; failed b; c text=; d; cancel d; stopped d; e; f; cancel f; g; cancel e; pass 2; wait 0; h"
 SPOKEN = "g ACTIVE; h PENDING; a SUCCEEDED; b ABORTED audio_lost; c REJECTED invalid_text; "
@@ -20,10 +20,10 @@ SPOKEN += "d PREEMPTED canceled by door; e ABORTED not_silent by door; f RECALLE
 
 
 def tell(robot: Robot, event: str, goal_id: str) -> None:
-    if event == "spoken_by":
-        robot.scheduler.spoken_by(goal_id, "en")
-    elif event == "goes_to":
-        robot.scheduler.goes_to(goal_id, None)
+    if event == "voice_chosen":
+        robot.scheduler.voice_chosen(goal_id, "en", robot.now)
+    elif event == "output_changed":
+        robot.scheduler.output_changed(goal_id, None)
     else:
         robot.tells(event, goal_id)
 

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from talkcli.goals.scheduler import SILENCE_LIMIT, Changed, Now, Order
+from talkcli.goals.scheduler import CONFIRM_SILENCE_S, Changed, Now, Order, Ordered
 from talkcli.goals.states import TRANSITIONS, IllegalTransition, State
 from tests.unit.robot import Robot
 
@@ -63,7 +63,9 @@ def script(seed: int, length: int = 40) -> list[str]:
         *[lambda: pick(["pause", "resume", "resume", "lost", "ready", "ready", "missing"])] * 2,
         lambda: f"{pick(['heard', 'completed', 'failed', 'stopped'])} {pick(IDS)}",
         lambda: f"set preempt={pick(['yes', 'no'])} ttl={pick(['0.0', '1.0'])} voice={pick(['en', 'piper/joe'])}",
-        lambda: f"{pick(['expect', 'begin', 'end', 'end'])} {pick(['joe', 'amy'])}",
+        lambda: (
+            f"{pick(['loaded', 'loaded', 'unloadable', 'unloaded', 'measured'])} {pick(['joe', 'amy'])} {pick('29')}"
+        ),
         cancel,
     ]
     first = f"set preempt={pick(['no', 'no', 'yes'])} ttl={pick(['0.0', '2.0'])}"
@@ -134,7 +136,7 @@ class Checked(Robot):
         for effect in effects:
             if isinstance(effect, Changed):
                 self._see_state(effect.record, effect.state)
-            else:
+            elif isinstance(effect, Ordered):
                 self._see_order(effect.record, effect.order)
         return effects
 
@@ -167,8 +169,8 @@ class Checked(Robot):
         elif order is Order.GIVE_UP:
             assert self.engine is record
             assert self.orders[-1] is Order.STOP
-            assert record.stop_since is not None
-            assert self.seconds >= record.stop_since + SILENCE_LIMIT
+            assert record.stop_requested_at is not None
+            assert self.seconds >= record.stop_requested_at + CONFIRM_SILENCE_S
         else:
             assert self.engine is record, "an order for a goal that the engine does not have"
             assert Order.STOP not in self.orders, "an order for a goal that was told to stop"
@@ -186,7 +188,7 @@ class Checked(Robot):
         assert len(keys) == len(set(keys)), "two goals with one key wait"
         assert all(scheduler.find(each.id) is each for each in scheduler.unfinished())
         if waiting and not (scheduler.active or scheduler.paused) and scheduler.has_engine:
-            waits_for_voice = scheduler.loading.begins_at(waiting[0], scheduler.settings.voice) > 0
+            waits_for_voice = scheduler._start_time(waiting[0]) > self.seconds
             deadline = scheduler.deadline()
             is_due = deadline is not None and deadline <= self.seconds  # the next tick starts it
             assert waits_for_voice or is_due, "a goal waits without a reason"

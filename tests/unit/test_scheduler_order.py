@@ -158,7 +158,7 @@ the goal that is spoken is held
 the held goal goes on at resume
     a; b; pause; resume; resume  ->  a ACTIVE; b PENDING
 resume without a pause does nothing
-    begin joe; a voice=piper/joe ttl=1; pass 1; resume  ->  a PENDING
+    a voice=piper/joe ttl=1; pass 1; resume  ->  a PENDING
 goals are accepted and none starts while speech is paused
     pause; a; b  ->  a b PENDING
 the first of them starts at resume
@@ -338,11 +338,11 @@ an engine that does not come aborts one goal
 an engine that does not come aborts one goal each time
     lost; a; b; missing; missing  ->  a b ABORTED engine_failed
 an engine that does not come aborts a goal that waits for its voice
-    lost; begin joe; a voice=piper/joe; missing  ->  a ABORTED engine_failed
+    lost; a voice=piper/joe; missing  ->  a ABORTED engine_failed
 an engine that does not come aborts no goal while speech is paused
     lost; a; pause; missing  ->  a PENDING
 an engine that has come aborts no goal that waits for its voice
-    begin joe; a voice=piper/joe; missing  ->  a PENDING
+    a voice=piper/joe; missing  ->  a PENDING
 an engine that has come aborts no goal
     a; b; missing  ->  a ACTIVE; b PENDING
 """

@@ -1,4 +1,4 @@
-"""How long a goal waits for its voice to be loaded: each rule with a script, in the language of `tests.unit.robot`."""
+"""Which voices the scheduler has loaded, and how long goals wait: rules in the language of `tests.unit.robot`."""
 
 from __future__ import annotations
 
@@ -8,69 +8,106 @@ from tests.unit.robot import play, rules
 
 RULES = """
 a goal waits for its voice, and so do those behind it
-    begin joe; a voice=piper/joe; b  ->  a b PENDING
+    a voice=piper/joe; b  ->  a b PENDING
 a goal with a speaker waits for the speaker's voice
-    begin joe; a voice=piper/joe#3; b; wait 9.9; end amy  ->  a b PENDING
+    a voice=piper/joe#3; b; wait 9.9; loaded amy  ->  a b PENDING
 a goal begins once its voice is loaded
-    begin joe; a voice=piper/joe#3; b; end joe  ->  a ACTIVE; b PENDING
-a goal does not wait for another voice
-    begin joe; a voice=piper/amy  ->  a ACTIVE
+    a voice=piper/joe#3; b; loaded joe  ->  a ACTIVE; b PENDING
+a goal begins if its voice can't be loaded
+    a voice=piper/joe; b; unloadable joe  ->  a ACTIVE; b PENDING
+a goal does not wait for a voice that has failed before
+    a voice=piper/joe; unloadable joe; completed a; b voice=piper/joe  ->  b ACTIVE; a SUCCEEDED
+a goal does not wait for a voice that is loaded
+    a voice=piper/joe; loaded joe; completed a; b voice=piper/joe  ->  b ACTIVE; a SUCCEEDED
+a goal does not wait for the voice of another
+    a voice=piper/joe; loaded joe; b voice=piper/amy; completed a; loaded amy  ->  b ACTIVE; a SUCCEEDED
 a goal without a voice waits for the server's
-    begin joe; set voice=piper/joe; a; b voice=en  ->  a b PENDING
+    set voice=piper/joe; a; b voice=en  ->  a b PENDING
 a goal with a voice does not wait for the server's
-    begin joe; set voice=piper/joe; a voice=en; b  ->  a ACTIVE; b PENDING
+    set voice=piper/joe; a voice=en; b  ->  a ACTIVE; b PENDING
 a goal without a voice begins if the server's voice changes
-    begin joe; set voice=piper/joe; a; set voice=en; wait 0  ->  a ACTIVE
+    set voice=piper/joe; a; set voice=en  ->  a ACTIVE
 a goal waits ten seconds from when loading began
-    begin joe; wait 4; a voice=piper/joe; wait 5.9  ->  a PENDING
+    set voice=piper/joe; wait 4; a voice=piper/joe; wait 5.9  ->  a PENDING
 a goal begins ten seconds after loading began
-    begin joe; wait 4; a voice=piper/joe; wait 6  ->  a ACTIVE
+    set voice=piper/joe; wait 4; a voice=piper/joe; wait 6  ->  a ACTIVE
 a goal that preempts does not wait
-    begin joe; a voice=piper/joe; b voice=piper/joe preempt  ->  b ACTIVE; a PENDING
+    a voice=piper/joe; b voice=piper/joe preempt  ->  b ACTIVE; a PENDING
 a goal that flushes does not wait
-    begin joe; a voice=piper/joe; b voice=piper/joe flush  ->  b ACTIVE; a RECALLED preempted by b
+    a voice=piper/joe; b voice=piper/joe flush  ->  b ACTIVE; a RECALLED preempted by b
 a goal of a higher priority does not wait
-    begin joe; a voice=piper/joe; b voice=piper/joe 1  ->  b ACTIVE; a PENDING
+    a voice=piper/joe; b voice=piper/joe 1  ->  b ACTIVE; a PENDING
 a goal of a lower priority waits
-    begin joe; a voice=piper/joe -1  ->  a PENDING
+    a voice=piper/joe -1  ->  a PENDING
 a goal of which half a second is left begins at once
-    begin joe; a voice=piper/joe ttl=0.5  ->  a ACTIVE
+    a voice=piper/joe ttl=0.5  ->  a ACTIVE
 a goal that insists waits until the voice is loaded
-    begin joe; a voice=piper/joe voice_only; wait 60  ->  a PENDING
+    a voice=piper/joe voice_only; wait 60  ->  a PENDING
 a goal that insists waits even if it preempts
-    begin joe; a voice=piper/joe voice_only preempt; wait 60  ->  a PENDING
+    a voice=piper/joe voice_only preempt; wait 60  ->  a PENDING
 a goal that insists waits even if its priority is high
-    begin joe; a voice=piper/joe voice_only 5; wait 60; end joe  ->  a ACTIVE
+    a voice=piper/joe voice_only 5; wait 60; loaded joe  ->  a ACTIVE
 a goal that insists expires like any other
-    begin joe; a voice=piper/joe voice_only ttl=3; b; wait 3  ->  b ACTIVE; a RECALLED expired
+    a voice=piper/joe voice_only ttl=3; b; wait 3  ->  b ACTIVE; a RECALLED expired
 a goal behind one that was cancelled begins
-    begin joe; a voice=piper/joe; b; cancel a; wait 0  ->  b ACTIVE; a RECALLED canceled by door
+    a voice=piper/joe; b; cancel a; wait 0  ->  b ACTIVE; a RECALLED canceled by door
 a loaded voice starts none beside the active goal
-    a; begin joe; b voice=piper/joe; end joe  ->  a ACTIVE; b PENDING
+    a; b voice=piper/joe; loaded joe  ->  a ACTIVE; b PENDING
 a loaded voice starts no goal while speech is paused
-    begin joe; a voice=piper/joe; pause; end joe  ->  a PENDING
-an engine that is lost loads nothing
-    begin joe; a voice=piper/joe; lost; wait 20; ready  ->  a ACTIVE
+    a voice=piper/joe; pause; loaded joe  ->  a PENDING
+a goal waits for its voice again if another engine has to load it
+    a voice=piper/joe; lost; wait 3; ready  ->  a PENDING
+a goal that has waited ten seconds for an engine does not wait for its voice
+    a voice=piper/joe; lost; wait 20; ready  ->  a ACTIVE
+goals wait for no voice if there is no engine to load it
+    a voice=piper/joe; lost; unavailable  ->  a ACTIVE
+an engine that stays away fails a goal that waited for its voice
+    a voice=piper/joe; lost; missing  ->  a ABORTED engine_failed
 """
 
 #: When the goal whose turn it is waits no longer, in monotonic seconds; a script begins at 100.
 DEADLINES = {
-    "begin joe; wait 4; a voice=piper/joe": 110,
-    "begin joe; wait 4; expect joe; a voice=piper/joe": 110,
-    "a; expect joe; b voice=piper/joe; wait 60": None,
-    "a; expect joe; b voice=piper/joe; wait 60; completed a": 170,
-    "a; expect joe; b voice=piper/joe; wait 60; completed a; wait 4; begin joe": 174,
-    "begin joe; expect amy; a voice=piper/joe; b voice=piper/amy; wait 3; cancel a": 0,
-    "begin joe; expect amy; a voice=piper/joe; b voice=piper/amy; wait 3; cancel a; wait 0": 113,
-    "begin joe; a voice=piper/joe ttl=2": 101.5,
-    "begin joe; a voice=piper/joe ttl=99": 110,
-    "begin joe; a voice=piper/joe voice_only": None,
-    "begin joe; a voice=piper/joe voice_only ttl=3": 103,
-    "begin joe; a voice=piper/joe; end joe": None,
-    "a; begin joe; b voice=piper/joe": None,
-    "begin joe; a voice=piper/joe; pause": None,
-    "begin joe; a voice=piper/joe; lost": None,
-    "begin joe; set voice=piper/joe; a; set voice=en": 0,
+    "set voice=piper/joe; wait 4; a voice=piper/joe": 110,
+    "a; b voice=piper/joe; wait 60": None,
+    "a; b voice=piper/joe; wait 60; completed a": 170,
+    "a; b voice=piper/joe; wait 60; completed a; wait 4; loaded amy": 170,
+    "a voice=piper/joe; b voice=piper/amy; wait 3; cancel a": 0,
+    "a voice=piper/joe; b voice=piper/amy; wait 3; cancel a; wait 0": 113,
+    "a voice=piper/joe ttl=2": 101.5,
+    "a voice=piper/joe ttl=99": 110,
+    "a voice=piper/joe voice_only": None,
+    "a voice=piper/joe voice_only ttl=3": 103,
+    "a voice=piper/joe; loaded joe": None,
+    "a voice=piper/joe; pause": None,
+    "a voice=piper/joe; lost": None,
+    "set voice=piper/joe; a; pause; set voice=en; resume": None,
+}
+
+#: Orders to load and to drop voices. The robot's voices may take 10 bytes.
+ORDERS = {
+    "a voice=piper/joe": "load piper/joe",
+    "a voice=piper/joe; b voice=piper/amy": "load piper/joe",
+    "a voice=piper/joe; b voice=piper/amy; loaded joe": "load piper/joe, load piper/amy",
+    "a; b voice=piper/joe": "",  # the libraries would be imported while a goal is heard
+    "a; b voice=piper/joe; completed a": "load piper/joe",
+    "a voice=piper/joe; loaded joe; b voice=piper/amy": "load piper/joe, load piper/amy",
+    "set voice=piper/joe": "load piper/joe",
+    "set voice=piper/joe; unloadable joe; set voice=piper/joe": "load piper/joe, load piper/joe",
+    "a voice=piper/joe; unloadable joe; wait 1; b voice=piper/joe": "load piper/joe",
+    "a voice=piper/joe; unloadable joe; wait 5; b voice=piper/joe": "load piper/joe, load piper/joe",
+    "a voice=piper/joe; measured joe 8; loaded joe; chosen a joe; completed a; b voice=piper/amy; measured amy 16; "
+    "loaded amy": "load piper/joe, load piper/amy, drop piper/joe",
+    "a voice=piper/joe; measured joe 8; loaded joe; b voice=piper/amy; measured amy 16; loaded amy": (
+        "load piper/joe, load piper/amy, drop piper/amy"  # amy is needed later
+    ),
+    "a voice=piper/joe; measured joe 10; loaded joe; b voice=piper/amy": "load piper/joe",
+    "a voice=piper/joe; measured joe 10; loaded joe; b voice=piper/amy; chosen a joe": (
+        "load piper/joe, drop piper/joe, load piper/amy"
+    ),
+    "a voice=piper/joe; loaded joe; completed a; unloaded joe": "load piper/joe",
+    "a voice=piper/joe; loaded joe; b voice=piper/joe; unloaded joe": "load piper/joe, load piper/joe",
+    "a voice=piper/joe; lost; ready": "load piper/joe, load piper/joe",
+    "a voice=piper/joe; shutdown; loaded joe": "load piper/joe",
 }
 
 
@@ -82,3 +119,9 @@ def test_a_rule_holds(script: str, outcome: str) -> None:
 @pytest.mark.parametrize("script", DEADLINES)
 def test_the_deadline_is_the_end_of_the_wait(script: str) -> None:
     assert play(script).scheduler.deadline() == DEADLINES[script]
+
+
+@pytest.mark.parametrize("script", ORDERS)
+def test_voices_are_loaded_and_dropped_in_the_order_of_the_goals(script: str) -> None:
+    orders = [each for each in play(script).seen if each.startswith(("load", "drop"))]
+    assert ", ".join(orders) == ORDERS[script]

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.goals.text import fault
+from talkcli.goals.options import bad_text
 
 INVALID = {
     "empty": "",
@@ -34,7 +34,7 @@ SPOKEN = [
 @pytest.mark.parametrize("text", INVALID.values(), ids=INVALID.keys())
 def test_a_text_without_anything_to_say_is_invalid_whatever_its_length(text: str) -> None:
     for most in (10_000, None):
-        found = fault(text, most)
+        found = bad_text(text, most)
         assert found is not None
         assert found[0] == "invalid_text"
         assert found[1]
@@ -42,7 +42,7 @@ def test_a_text_without_anything_to_say_is_invalid_whatever_its_length(text: str
 
 @pytest.mark.parametrize("text", SPOKEN)
 def test_a_text_of_any_kind_is_taken(text: str) -> None:
-    assert fault(text) is None
+    assert bad_text(text) is None
 
 
 @pytest.mark.parametrize(
@@ -58,7 +58,7 @@ def test_a_text_of_any_kind_is_taken(text: str) -> None:
     ],
 )
 def test_the_words_say_what_is_wrong_and_count_from_1(text: str, words: str) -> None:
-    assert fault(text) == ("invalid_text", words)
+    assert bad_text(text) == ("invalid_text", words)
 
 
 CHARACTERS, BYTES = "characters, the longest allowed is", "bytes, the longest allowed is 40,000"
@@ -75,21 +75,21 @@ CHARACTERS, BYTES = "characters, the longest allowed is", "bytes, the longest al
     ids=lambda each: f"{each[:1]}{len(each)}" if isinstance(each, str) else str(each),
 )
 def test_a_text_has_a_longest_number_of_characters_and_of_bytes(longest: str, most: int, words: str) -> None:
-    assert fault(longest, most) is None
-    assert fault(f"{longest}{longest[0] if most == 10_000 else 'a'}", most) == ("text_too_long", words)
-    assert fault(f"{longest}a", None) is None, "a text that is no goal may have any length"
+    assert bad_text(longest, most) is None
+    assert bad_text(f"{longest}{longest[0] if most == 10_000 else 'a'}", most) == ("text_too_long", words)
+    assert bad_text(f"{longest}a", None) is None, "a text that is no goal may have any length"
 
 
 def test_ten_thousand_characters_are_the_longest_text() -> None:
-    assert fault("a" * 10_000) is None
-    assert fault("a" * 10_001) == ("text_too_long", f"the text has 10,001 {CHARACTERS} 10,000")
+    assert bad_text("a" * 10_000) is None
+    assert bad_text("a" * 10_001) == ("text_too_long", f"the text has 10,001 {CHARACTERS} 10,000")
 
 
 @given(
     st.text(st.characters(exclude_categories=[])) | st.text(st.characters(categories=["Zs", "Cc", "Cf", "Cn", "Cs"]))
 )
 def test_any_text_is_taken_or_refused_with_reason_and_words(text: str) -> None:
-    found = fault(text, 50)
+    found = bad_text(text, 50)
     if found is None:
         assert 0 < len(text) <= 50
         assert "\0" not in text

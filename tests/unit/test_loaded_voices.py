@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.server.voices import DEATHS, RETRY_AFTER, RETRY_AT_LAST, Readiness, Voices
+from talkcli.goals.voices import (
+    FIRST_RETRY_S,
+    LAST_RETRY_S,
+    MAX_ENGINE_DEATHS,
+    NeuralVoices,
+    VoiceDropOrder,
+    VoiceState,
+    VoiceWarning,
+)
 from tests.unit.robot import rules
 
 if TYPE_CHECKING:
@@ -109,17 +118,14 @@ a death is forgotten once the voice is loaded
 """
 
 
-class Asked(Voices):
+class Asked(NeuralVoices):
     """Voices whose files have one byte each."""
 
     answer = "nothing"
+    warnings: tuple[str, ...] | list[str] = ()
 
     def __init__(self, memory: int = 2) -> None:
-        super().__init__(memory)
-
-    @staticmethod
-    def _size(_: str) -> int:
-        return 1
+        super().__init__(memory, lambda _: 1)
 
     def play(self, script: str, now: float = 0.0) -> Asked:
         for step in script.split("; "):
@@ -131,25 +137,34 @@ class Asked(Voices):
         place = words.index(":") if ":" in words else len(words)
         before, after = (["" if each == "-" else each for each in part] for part in (words[:place], words[place + 1 :]))
         steps: dict[str, Callable[[], object]] = {
-            "memory": lambda: setattr(self, "_memory", int(words[0])),
-            "want": lambda: [self.want(each, now) for each in words],
-            "next": lambda: self._tell(*(self.next(before, *after) or ("", ()))),
+            "memory": lambda: setattr(self, "_limit_bytes", int(words[0])),
+            "want": lambda: list(map(partial(self.request, now=now), words)),
+            "next": lambda: self._load_next(before, after, now),
             "load": lambda: [self.play(f"want {each}; next {each}; loaded {each}") for each in words],
-            "loaded": lambda: self.loaded(words[0], None, now),
-            "failed": lambda: self.loaded(words[0], "no json", now),
+            "loaded": lambda: self.load_ended(words[0], None, now),
+            "failed": lambda: self.load_ended(words[0], "no json", now),
             "unloaded": lambda: self.unloaded(words[0], []),
-            "grown": lambda: self.grown(before[0], int(words[1])),
-            "excess": lambda: self._tell("", self.excess(before[0], after)),
+            "grown": lambda: self.measured(before[0], int(words[1])),
+            "excess": lambda: self._drop_excess(before[0], after),
             "lost": lambda: self.engine_lost(now),
         }
         steps[verb]()
+
+    def _load_next(self, needed: list[str], default: list[str], now: float) -> None:
+        order = self.load_next(needed, "".join(default), now)
+        self._tell(order.voice if order else "", order.dropped if order else ())
+
+    def _drop_excess(self, first: str, needed: list[str]) -> None:
+        orders = self.drop_excess(first, needed)
+        self._tell("", tuple(each.voice for each in orders if isinstance(each, VoiceDropOrder)))
+        self.warnings = [each.message for each in orders if isinstance(each, VoiceWarning)]
 
     def _tell(self, voice: str, dropped: tuple[str, ...]) -> None:
         told = [voice, f"{' '.join(dropped)} dropped" if dropped else ""]
         self.answer = ", ".join(filter(None, told)) or "nothing"
 
     def outcome(self) -> str:
-        states = ", ".join(f"{voice} {each.state.value}" for voice, each in self.neural.items())
+        states = ", ".join(f"{voice} {each.state.value}" for voice, each in self._voices.items())
         return f"{self.answer}; {states or 'none'}"
 
 
@@ -159,13 +174,14 @@ def test_a_rule_holds(script: str, outcome: str) -> None:
 
 
 def test_a_voice_that_is_too_large_alone_stays_and_that_is_told_once() -> None:
-    voices = Asked(100_000_000).play("load a; grown a 99000000")
-    assert voices.too_large() is None
+    voices = Asked(100_000_000).play("load a; grown a 99000000; excess a : a")
+    assert voices.warnings == []
     voices.play("grown a 120000000; excess a : a")
     why = "it takes 120 MB, more than --voice-memory 100"
-    assert (voices.answer, voices.too_large(), voices.too_large()) == ("nothing", f"voice a: {why}", None)
+    assert (voices.answer, voices.warnings) == ("nothing", [f"voice a: {why}"])
+    assert voices.play("excess a : a").warnings == []
     assert voices.to_json() == {"a": {"state": "loaded", "why": why}}
-    assert Asked(0).play("load a").too_large() is None, "a limit of 0 means one voice at a time"
+    assert Asked(0).play("load a; excess a : a").warnings == [], "a limit of 0 means one voice at a time"
 
 
 def test_a_voice_that_fails_is_tried_again_later_and_later() -> None:
@@ -174,34 +190,36 @@ def test_a_voice_that_fails_is_tried_again_later_and_later() -> None:
     for _ in range(14):
         voices.play("want a; next a; failed a", now)
         assert (voices.answer, voices.failure("a")) == ("a", "no json")
-        again = voices.neural["a"].again_at
+        again = voices._voices["a"].retry_at
         assert voices.play("want a; next a", again - 0.001).outcome() == "nothing; a failed"
         waited.append(again - now)
         now = again
-    assert waited[:3] == pytest.approx([RETRY_AFTER, 2 * RETRY_AFTER, 4 * RETRY_AFTER])
-    assert waited[-1] == pytest.approx(RETRY_AT_LAST)
-    voices.forgive("a")
-    assert voices.want("a", now) is Readiness.WAITING
+    assert waited[:3] == pytest.approx([FIRST_RETRY_S, 2 * FIRST_RETRY_S, 4 * FIRST_RETRY_S])
+    assert waited[-1] == pytest.approx(LAST_RETRY_S)
+    voices.forget_failure("a")
+    assert voices.play("want a", now).outcome() == "nothing; a waiting"
 
 
 def test_a_voice_has_failed_while_it_is_tried_again() -> None:
     voices = Asked().play("want a; next a; failed a")
-    assert voices.play("want a; next a", RETRY_AFTER).outcome() == "a; a failed"
-    assert voices.want("a", 1000.0) is Readiness.FAILED
-    assert not voices.lacking
+    assert voices.play("want a; next a", FIRST_RETRY_S).outcome() == "a; a failed"
+    assert voices.play("want a", 1000.0)._voices["a"].state is VoiceState.FAILED
+    assert not voices.can_load
     assert voices.play("loaded a").to_json() == {"a": {"state": "loaded", "why": None}}
 
 
 def test_a_voice_that_no_goal_needs_any_more_keeps_nobody_looking() -> None:
     voices = Asked().play("want a; next : b")
-    assert (voices.lacking, voices.outcome()) == (False, "nothing; none")
-    voices.play("want a; next a; failed a").play("want a", RETRY_AFTER)
-    assert voices.lacking
-    assert (voices.play("next").outcome(), voices.lacking) == ("nothing; a failed", False)
+    assert (voices.can_load, voices.outcome()) == (False, "nothing; none")
+    voices.play("want a; next a; failed a").play("want a", FIRST_RETRY_S)
+    assert voices.can_load
+    assert (voices.play("next").outcome(), voices.can_load) == ("nothing; a failed", False)
 
 
 def test_an_engine_that_dies_twice_has_its_cause() -> None:
-    assert DEATHS == 2
+    assert MAX_ENGINE_DEATHS == 2
     voices = Asked().play("want a; next a; lost; want a; next a")
-    assert (voices.engine_lost(0.0), voices.engine_lost(0.0)) == ("a", None)
-    assert voices.failure("a") == "the engine process ended while it was being loaded"
+    why = "the engine process ended while it was being loaded"
+    assert voices.engine_lost(0.0) == [VoiceWarning(f"voice a is left alone: {why}")]
+    assert voices.engine_lost(0.0) == []
+    assert voices.failure("a") == why
