@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from talkcli.goals.option import Option
+    from talkcli.goals.options import Option
     from tests.conftest import MakeTalk
 
 
@@ -296,7 +296,7 @@ def test_patient_goal_waits_for_room(make_talk: MakeTalk) -> None:
 
 def test_patient_goal_whose_sender_hangs_up_is_not_spoken(make_talk: MakeTalk, tmp_path: Path) -> None:
     """The server notices that a waiting client has hung up when it shows that it is alive."""
-    talk = make_talk("--max-queue", "1", program=patched_serve(tmp_path, subscribers__ALIVE_EVERY=0.5))
+    talk = make_talk("--max-queue", "1", program=patched_serve(tmp_path, subscribers__CLIENT_ALIVE_INTERVAL_S=0.5))
     with Client(talk.socket) as client:
         active = client.say("never-ends")
         talk.watcher.wait_for(active.id, "ACTIVE")

@@ -94,7 +94,7 @@ def test_silence_of_an_earlier_pause_answers_no_later_one(scripted: Talk) -> Non
 
 def test_each_pause_that_is_not_confirmed_is_answered_in_its_own_time(make_talk: MakeTalk, tmp_path: Path) -> None:
     limit = 0.5
-    talk = make_talk(program=patched_serve(tmp_path, requests__PAUSE_LIMIT=limit))
+    talk = make_talk(program=patched_serve(tmp_path, requests__PAUSE_ANSWER_S=limit))
     begin(talk, "never-ends ignore-pause")
     with talk.connect() as wire:
         wire.send({"seq": 1, "request": "pause"})

@@ -19,8 +19,7 @@ from talkcli.cli.commands import COMMANDS
 from talkcli.cli.show import CommonOptions
 from talkcli.client.client import check, too_long
 from talkcli.client.connect import GREETING_START
-from talkcli.goals.option import FLAG
-from talkcli.goals.options import Cancel, Say
+from talkcli.goals.options import FLAG, Cancel, Say
 from talkcli.protocol import events
 from talkcli.protocol.lines import encode, write_request
 from talkcli.protocol.requests import Hello, Pause, Resume, Status

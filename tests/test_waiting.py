@@ -20,7 +20,7 @@ from talkcli.goals.scheduler import Scheduler
 from talkcli.protocol.requests import Status, Wait, Watch
 from talkcli.server import subscribers
 from talkcli.server.connection import PendingRequest
-from talkcli.server.requests import MAX_WAITING_BYTES, REQUEST_BYTES, Requests
+from talkcli.server.requests import MAX_KEPT_REQUEST_BYTES, REQUEST_BYTES, Requests
 from talkcli.server.speech import REPORTS_PER_TURN, Speech
 from talkcli.server.subscribers import Notifications
 from tests.support.loop import in_loop
@@ -142,7 +142,7 @@ async def test_waiting_requests_of_all_connections_have_a_limit_in_bytes() -> No
     while not other.told:
         server.wait(one if count < 900 else other, "w" * 9_000, data={"a": ["w" * 30_000]})
         count += 1
-    assert 0.9 * MAX_WAITING_BYTES < (count - 1) * (39_000 + REQUEST_BYTES) < MAX_WAITING_BYTES
+    assert 0.9 * MAX_KEPT_REQUEST_BYTES < (count - 1) * (39_000 + REQUEST_BYTES) < MAX_KEPT_REQUEST_BYTES
     (refused,) = cast("Any", other.told)
     assert refused["goal"]["reason"] == "queue_full"
     assert "64 MiB of requests are waiting already" in refused["goal"]["message"]

@@ -206,7 +206,7 @@ def _suggest_key(key: str, client: Client) -> None:
 
 def _no_voice(language: str, voices: Iterable[JsonObject]) -> str:
     """Return the error for a language without a voice. The user may have typed a language's code or its name."""
-    from talkcli.engine.voices import is_neural
+    from talkcli.goals.options import is_neural
     from talkcli.terminal.text import printable
 
     codes = {_language(each): _language(each) for each in voices}

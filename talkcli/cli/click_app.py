@@ -27,7 +27,7 @@ from talkcli.cli.command import (
 from talkcli.cli.commands import COMMANDS
 from talkcli.cli.show import CommonOptions, note, run_command, show_error, write_error_line
 from talkcli.errors import EXIT_ERROR, UsageError
-from talkcli.goals.option import FLAG, INTEGER, NUMBER, SECONDS
+from talkcli.goals.options import FLAG, INTEGER, NUMBER, SECONDS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
     from talkcli.cli.command import Command, ExitCodes
-    from talkcli.goals.option import Option
+    from talkcli.goals.options import Option
 
 _EXAMPLES = """
     talk serve &                      one server on the robot
@@ -62,7 +62,7 @@ class _OptionType(click.FloatRange):
 
     def __init__(self, option: Option) -> None:
         self._option = option
-        super().__init__(*option.limits, min_open=option.above)
+        super().__init__(*option.limits, min_open=option.excludes_minimum)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         try:
@@ -92,7 +92,7 @@ def _option(option: Option, *, common: bool = False) -> click.Option:
         help=option.help,
         envvar=option.env or None,
         show_envvar=bool(option.env),
-        shell_complete=_completer(option.offers),
+        shell_complete=_completer(option.completion),
         callback=_store_common if common else None,
         expose_value=not common,
     )
@@ -111,7 +111,7 @@ def _argument(argument: Option) -> click.Argument:
         required=bool(argument.choices),
         type=click.Choice(argument.choices) if argument.choices else None,
         metavar=argument.metavar,
-        shell_complete=_completer(argument.offers),
+        shell_complete=_completer(argument.completion),
     )
 
 

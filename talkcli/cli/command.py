@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from talkcli.errors import UsageError
 from talkcli.frozen import TYPE_CHECKING, frozen
-from talkcli.goals.option import FLAG, ID, INTEGER, NUMBER, PATH, SECONDS, WORD, Kind, Option
+from talkcli.goals.options import FLAG, ID, INTEGER, NUMBER, PATH, SECONDS, WORD, Kind, Option
 from talkcli.paths import named_robot
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ class Command:
         if robot is not None and common.get("socket"):
             return "--robot is a robot of a fleet, --socket a server of this machine: leave out one of them"
         fault = self._connection_fault(given, robot, connect_timeout)
-        refusals = (words for each in self.options if (words := each.refusal(given[each.name])))
+        refusals = (words for each in self.options if (words := each.value_error(given[each.name])))
         return fault or next(refusals, None) or (self.rule(given, typed) if self.rule else None)
 
     def _connection_fault(
@@ -170,21 +170,21 @@ COMMON_OPTIONS = (
         "--socket",
         PATH,
         "Socket of the server.  [env var: TALK_SOCKET; default: the usual places, as 'talk doctor' lists]",
-        offers="files",
+        completion="files",
     ),
     option(
         "--robot",
         WORD,
         "A robot of a fleet, by its broker (TALK_BROKER); or several: a glob, @GROUP, @all.  [env var: TALK_ROBOT]",
         metavar="NAME",
-        offers="robots",
+        completion="robots",
     ),
     option(
         "--connect-timeout",
         NUMBER,
         "Keep trying to reach the server for SEC seconds; with --robot, until the robot is online.",
         limits=(0, None),
-        above=True,
+        excludes_minimum=True,
         metavar="SEC",
     ),
     option("--insecure", FLAG, "Send the password to the broker without TLS."),
@@ -237,7 +237,7 @@ def _read_number(option: Option, text: str) -> float:
         raise ValueError(f"{value!r} is not a number")
     if option.kind is SECONDS and value == float("inf"):
         raise ValueError("no limit is 0")
-    if option.outside(value):
+    if option.is_out_of_range(value):
         raise ValueError(f"'{text}' is not {wanted}")
     return value
 

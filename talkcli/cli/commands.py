@@ -10,8 +10,23 @@ import os
 
 from talkcli.cli.command import FILE_MODE, FLEET_EXIT_CODES, OUTPUT_FILE, SERVER_EXIT_CODES, Command, option, spelling
 from talkcli.frozen import TYPE_CHECKING, replace
-from talkcli.goals.option import FLAG, ID, IDS, INTEGER, MAX_LOG, NUMBER, TEXT, WORD, Option
-from talkcli.goals.options import MAX_CHARACTERS, MAX_LEAD_IN, OPTIONS, SETTINGS, SOUND, Cancel
+from talkcli.goals.options import (
+    FLAG,
+    ID,
+    IDS,
+    INTEGER,
+    MAX_LEAD_IN_MS,
+    MAX_LOG_GOALS,
+    MAX_TEXT_CHARS,
+    NUMBER,
+    OPTIONS,
+    SETTINGS,
+    SOUND_OPTIONS,
+    TEXT,
+    WORD,
+    Cancel,
+    Option,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -29,7 +44,7 @@ SHELLS = ("bash", "zsh", "fish")
 
 def _timeout(words: str) -> Option:
     """Return the option --timeout. `words` is its help."""
-    return option("-t, --timeout", NUMBER, words, limits=(0, None), above=True, metavar="SEC")
+    return option("-t, --timeout", NUMBER, words, limits=(0, None), excludes_minimum=True, metavar="SEC")
 
 
 def _print_unit(names: tuple[str, ...]) -> Option:
@@ -56,7 +71,7 @@ def _say_options() -> Iterator[Option]:
 
 _SAY_OPTIONS = tuple(_say_options())
 #: Options of `say` that also work without a server.
-_SERVERLESS_OPTIONS = {"timeout", "output", *(each.name for each in SOUND)}
+_SERVERLESS_OPTIONS = {"timeout", "output", *(each.name for each in SOUND_OPTIONS)}
 #: File extensions of other audio formats than WAV.
 _OTHER_EXTENSIONS = (".aac", ".aiff", ".au", ".flac", ".m4a", ".mp3", ".mp4", ".oga", ".ogg", ".opus", ".webm", ".wma")
 
@@ -86,11 +101,11 @@ def _say_rule(given: Mapping[str, Any], typed: AbstractSet[str]) -> str | None:
 
 
 _SERVE_OPTIONS = (
-    *(each.at_start() for each in SETTINGS),
+    *(each.for_serve() for each in SETTINGS),
     # At two seconds a sentence, 100 goals are more than three minutes of speech. Going through the longest queue takes
     # about a millisecond.
     option("--max-queue", INTEGER, "Goals that may wait.", default=100, limits=(1, MAX_QUEUED_GOALS)),
-    option("--max-text", INTEGER, "Characters of one text.", default=MAX_CHARACTERS, limits=(1, MAX_CHARACTERS)),
+    option("--max-text", INTEGER, "Characters of one text.", default=MAX_TEXT_CHARS, limits=(1, MAX_TEXT_CHARS)),
     # Each client takes one of the 1,024 file descriptors that a process usually has.
     option("--max-clients", INTEGER, "Clients at once.", default=256, limits=(1, None)),
     option(
@@ -101,7 +116,7 @@ _SERVE_OPTIONS = (
         "--device. [default: the first of the four that works]",
         metavar="PLAYER",
         env="TALK_PLAYER",
-        offers="players",
+        completion="players",
     ),
     option(
         "--device",
@@ -117,7 +132,7 @@ _SERVE_OPTIONS = (
         "Milliseconds of silence before a sentence; only where the output was idle: HDMI, USB and Bluetooth "
         "outputs fall asleep, and swallow what comes while they wake.",
         default=0,
-        limits=(0, MAX_LEAD_IN),
+        limits=(0, MAX_LEAD_IN_MS),
         metavar="MS",
     ),
     option("--audible", FLAG, "Abort every sentence whose output is muted."),
@@ -168,7 +183,7 @@ def _bridge_rule(given: Mapping[str, Any], _: AbstractSet[str]) -> str | None:
     return None
 
 
-_GOAL_IDS = Option("ids", IDS, metavar=IDS.metavar, offers="goal_ids")
+_GOAL_IDS = Option("ids", IDS, metavar=IDS.metavar, completion="goal_ids")
 
 #: The commands in the order of the help. Those that a new user needs first come first.
 _ROWS = (
@@ -307,7 +322,7 @@ _ROWS = (
         talk --json status | jq .active.text
         """,
         exit_codes={**FLEET_EXIT_CODES, 0: "the server runs", 8: "unknown goal"},
-        argument=Option("goal_id", ID, metavar="[ID]", offers="known_ids"),
+        argument=Option("goal_id", ID, metavar="[ID]", completion="known_ids"),
         urgent=True,
     ),
     Command(
@@ -351,7 +366,9 @@ _ROWS = (
         talk --json log | jq -r 'select(.state == "ABORTED").message'
         """,
         exit_codes={**SERVER_EXIT_CODES, 0: "listed"},
-        options=(option("-n, --count", INTEGER, "The last N goals that ended.", default=20, limits=(1, MAX_LOG)),),
+        options=(
+            option("-n, --count", INTEGER, "The last N goals that ended.", default=20, limits=(1, MAX_LOG_GOALS)),
+        ),
     ),
     Command(
         name="pause",
@@ -400,7 +417,7 @@ _ROWS = (
             0: "changed, or printed",
             2: "usage: a value out of its range, or an unknown voice; nothing was changed",
         },
-        options=tuple(each.to_set() for each in SETTINGS),
+        options=tuple(each.for_set() for each in SETTINGS),
     ),
     Command(
         name="voices",

@@ -20,8 +20,8 @@ import click
 from click.shell_completion import CompletionItem, ShellComplete, add_completion_class, split_arg_string
 
 from talkcli.cli.show import show
-from talkcli.engine.voices import is_neural
 from talkcli.errors import TalkError
+from talkcli.goals.options import is_neural
 from talkcli.protocol.events import ServerStatus, unfinished
 from talkcli.terminal.text import printable
 

@@ -17,8 +17,7 @@ from talkcli.cli.command import COMMON_OPTIONS, OUTPUT_FILE, read_value
 from talkcli.cli.commands import COMMANDS
 from talkcli.client.connect import hello, reach, send_early, sender_name, yield_processor
 from talkcli.frozen import TYPE_CHECKING, frozen
-from talkcli.goals.option import FLAG, MAX_ID, MAX_NAME
-from talkcli.goals.options import MAX_CHARACTERS, Cancel, Say, bad_key
+from talkcli.goals.options import FLAG, MAX_ID_CHARS, MAX_SENDER_NAME_CHARS, MAX_TEXT_CHARS, Cancel, Say, key_error
 from talkcli.paths import named_robot, named_socket
 
 if TYPE_CHECKING:
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
     from talkcli.cli.command import Command
     from talkcli.client.connect import ConnectionAttempt
     from talkcli.goals.goal import JsonObject
-    from talkcli.goals.option import Option
+    from talkcli.goals.options import Option
 
     #: The option of each flag, with the value that the flag stands for if it takes none.
     Flags = dict[str, tuple[Option, bool]]
@@ -175,7 +174,7 @@ def early_messages(plain: PlainCommand) -> tuple[JsonObject, JsonObject] | None:
     """Return the hello and the request of a command; None if the request may be refused or needs the library."""
     command, name = plain.command, sender_name(plain.given.get("name"))
     request = _request(command.name, plain.given)
-    if request is None or len(name or "") > MAX_NAME:
+    if request is None or len(name or "") > MAX_SENDER_NAME_CHARS:
         return None
     return hello(name, urgent=command.urgent), request
 
@@ -189,7 +188,7 @@ def _request(command: str, given: dict[str, Any]) -> JsonObject | None:
     if command == "cancel":
         ids, before, key = given["ids"], given["before"], given["key"]
         # Several ids may contain duplicates, or be too many for one request.
-        if len(ids) > 1 or not all(map(_is_full_id, [*ids, before or "-"])) or (key and bad_key(key)):
+        if len(ids) > 1 or not all(map(_is_full_id, [*ids, before or "-"])) or (key and key_error(key)):
             return None
         return write_request(Cancel(ids or None, given["current"], before, key))
     goal_id = given.get("goal_id")
@@ -200,7 +199,7 @@ def _request(command: str, given: dict[str, Any]) -> JsonObject | None:
 
 def _is_full_id(goal_id: str) -> bool:
     """Return whether an id can be sent as it is. A bare number can't, because the library adds the server's boot id."""
-    return 0 < len(goal_id) <= MAX_ID and not goal_id.isdecimal()
+    return 0 < len(goal_id) <= MAX_ID_CHARS and not goal_id.isdecimal()
 
 
 def _say_request(given: dict[str, Any]) -> Say | None:
@@ -212,4 +211,4 @@ def _say_request(given: dict[str, Any]) -> Say | None:
     except UnicodeEncodeError:
         return None
     # A text of this length fits into a request even if each of its characters has to be escaped.
-    return None if len(say.text) + len(say.voice or "") > MAX_CHARACTERS else say
+    return None if len(say.text) + len(say.voice or "") > MAX_TEXT_CHARS else say

@@ -15,7 +15,7 @@ from talkcli.cli.show import note, retry_without_output, show_error, show_if_pos
 from talkcli.cli.wait import GoalReporter, seconds_left, timeout_error
 from talkcli.errors import EXIT_OK, Lost, UsageError
 from talkcli.frozen import TYPE_CHECKING
-from talkcli.goals.options import SOUND
+from talkcli.goals.options import SOUND_OPTIONS
 from talkcli.goals.states import State
 from talkcli.polling import Interrupted
 
@@ -180,7 +180,7 @@ def _write_file(
 def _sound_settings(goal_options: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings for the engine. Like a server, take missing ones from the environment."""
     found = {}
-    for option in SOUND:
+    for option in SOUND_OPTIONS:
         value, text = goal_options[option.name], os.environ.get(option.env) if option.env else None
         if value is None and text:
             import click

@@ -35,7 +35,7 @@ def serve(options: CommonOptions, print_unit: str | None, **given: Any) -> int:
     from talkcli.server import run
 
     goals = Set(**{each.name: given.pop(each.name) for each in SETTINGS})
-    return run.serve(run.Settings(socket=paths.named_socket(options.socket), goals=goals, **given))
+    return run.serve(run.ServerSettings(socket=paths.named_socket(options.socket), goals=goals, **given))
 
 
 def _warn_about_sound(player: str, driver: str | None) -> None:

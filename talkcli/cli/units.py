@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from talkcli.cli.show import CommonOptions
-    from talkcli.goals.option import Option
+    from talkcli.goals.options import Option
 
 #: The group whose members may use the system's server. They may already use the sound card.
 SOCKET_GROUP = "audio"

@@ -12,7 +12,7 @@ from talkcli.cli.interrupts import Interrupts, discard_unread_output
 from talkcli.cli.show import Feedback, retry_without_output, show, show_if_possible, show_json
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, ServerUnavailable, TimedOut
 from talkcli.frozen import TYPE_CHECKING
-from talkcli.goals.option import figure
+from talkcli.goals.options import format_number
 from talkcli.goals.states import State
 from talkcli.polling import Interrupted
 from talkcli.protocol.events import Result
@@ -35,7 +35,7 @@ def seconds_left(end: float | None) -> float | None:
 
 def timeout_error(timeout: float | None, words: str = "") -> TimedOut:
     """Return the error of a command that --timeout has ended. `words` are added to its message."""
-    return TimedOut(f"timed out after {figure(timeout or 0)} s{words and f': {words}'}")
+    return TimedOut(f"timed out after {format_number(timeout or 0)} s{words and f': {words}'}")
 
 
 class GoalReporter:

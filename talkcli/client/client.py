@@ -22,8 +22,7 @@ from talkcli.client.goal import GoalHandle
 from talkcli.errors import Lost, UnknownGoal, UsageError
 from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.goal import Goal
-from talkcli.goals.option import MAX_ID, MAX_IDS, MAX_LOG
-from talkcli.goals.options import Cancel, Say, Set, bad_key, bad_option
+from talkcli.goals.options import MAX_ID_CHARS, MAX_IDS, MAX_LOG_GOALS, Cancel, Say, Set, bad_option, key_error
 from talkcli.goals.states import State
 from talkcli.protocol.events import Canceled, ServerStatus, Snapshot, goal_in, goals
 from talkcli.protocol.lines import MAX_LINE_BYTES, request_line, write_request
@@ -247,7 +246,7 @@ class Client:
         first, *others = [None] if wanted is None else batches(wanted) or [()]
         last = None if before is None else self._full_id(before)
         requests = [Cancel(first, current, last, key), *map(Cancel, others)]
-        if key is not None and (fault := bad_key(key)):
+        if key is not None and (fault := key_error(key)):
             raise UsageError(fault)
         items: list[JsonObject] = []
         unknown: list[str] = []
@@ -272,8 +271,8 @@ class Client:
 
     def log(self, count: int = 20) -> list[Goal]:
         """Return the last `count` goals that ended, including REJECTED ones, oldest first. At most 2,200 are kept."""
-        if not 0 < count <= MAX_LOG:
-            raise UsageError(f"a log has 1 to {MAX_LOG} goals, not {count}")
+        if not 0 < count <= MAX_LOG_GOALS:
+            raise UsageError(f"a log has 1 to {MAX_LOG_GOALS} goals, not {count}")
         _, items = self._connection.request(Log(count))
         return list(goals(items, "goal"))
 
@@ -392,8 +391,8 @@ def check_id(goal_id: str) -> None:
     """Raise UsageError for an empty id, and UnknownGoal for one that no goal can have."""
     if not goal_id:
         raise UsageError("an id is empty: is the variable set that it comes from?")
-    if len(goal_id) > MAX_ID:
-        raise UnknownGoal(f"no goal {goal_id[:MAX_ID]!a}… is known: an id has at most {MAX_ID} characters")
+    if len(goal_id) > MAX_ID_CHARS:
+        raise UnknownGoal(f"no goal {goal_id[:MAX_ID_CHARS]!a}… is known: an id has at most {MAX_ID_CHARS} characters")
 
 
 def batches(ids: Iterable[str]) -> list[tuple[str, ...]]:
@@ -415,7 +414,7 @@ def check(request: Say | Set) -> None:
     """Raise UsageError for options of the wrong type or out of their range, as the server would."""
     for option in request.options:
         try:
-            fault = option.fault(getattr(request, option.name))
+            fault = option.type_error(getattr(request, option.name))
         except (TypeError, ValueError) as error:  # something in `data`
             fault = f"is no JSON: {error}"
         if fault:

@@ -17,8 +17,7 @@ from talkcli.client.connect import ANSWER_LIMIT_S, connect, hello, reach, sender
 from talkcli.client.core import MAX_UNSENT_BYTES, ClientCore, Exchange
 from talkcli.errors import ServerUnavailable, TalkError, UsageError
 from talkcli.frozen import TYPE_CHECKING
-from talkcli.goals.option import MAX_NAME
-from talkcli.goals.options import Cancel, Say
+from talkcli.goals.options import MAX_SENDER_NAME_CHARS, Cancel, Say
 from talkcli.polling import wait_ready
 from talkcli.protocol.lines import request_line
 
@@ -339,8 +338,10 @@ class SocketConnection(BlockingConnection):
         super().__init__(patience)
         self._interrupt = interrupt
         name = sender_name(name)
-        if name and len(name) > MAX_NAME:
-            raise UsageError(f"the name of the sender has {len(name)} characters, the longest allowed is {MAX_NAME}")
+        if name and len(name) > MAX_SENDER_NAME_CHARS:
+            raise UsageError(
+                f"the name of the sender has {len(name)} characters, the longest allowed is {MAX_SENDER_NAME_CHARS}"
+            )
         self._first_words = hello(name, urgent=urgent)
         self._named = paths.named_socket(socket)
         give_up = time.monotonic() + keep_trying

@@ -17,9 +17,10 @@ from talkcli.doctor.report import SENTENCE_QUESTION
 from talkcli.doctor.voice import SENTENCE_TEXT
 from talkcli.engine import models
 from talkcli.engine.players import PLAYERS, is_silent
-from talkcli.engine.voices import find_voice, is_neural, is_own_driver
+from talkcli.engine.voices import find_voice, is_own_driver
 from talkcli.errors import TalkError
 from talkcli.frozen import replace
+from talkcli.goals.options import is_neural
 from talkcli.goals.reasons import Reason
 from talkcli.goals.states import State
 

@@ -19,7 +19,7 @@ from talkcli.doctor.sound import file_owner
 from talkcli.doctor.voice import WORKING_STATES
 from talkcli.errors import TalkError
 from talkcli.frozen import TYPE_CHECKING, fields, frozen
-from talkcli.goals.options import told
+from talkcli.goals.options import describe_settings
 from talkcli.goals.reasons import Reason
 from talkcli.goals.states import State
 from talkcli.paths import PLACE_ABSENT, PLACE_DIRECTORY, PLACE_FILE, PLACE_FORBIDDEN, PLACE_STALE
@@ -256,7 +256,7 @@ def summarize_server(server: JsonObject) -> str:
 def _judge_settings(server: JsonObject) -> Finding:
     volume = server.get("volume")
     lead_in = [f"lead-in {server['lead_in']} ms"] if server.get("lead_in") else []
-    words = ", ".join([*told(server), *lead_in])
+    words = ", ".join([*describe_settings(server), *lead_in])
     if isinstance(volume, int | float) and volume < _FAINT_VOLUME:
         broken = failure if volume <= 0 else warning
         return broken("settings", words, "talk set --volume 1")

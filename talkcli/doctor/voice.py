@@ -23,8 +23,8 @@ from talkcli.doctor.report import Finding, failure, join_names, ok, warning
 from talkcli.doctor.sound import run_program
 from talkcli.engine import models, protocol
 from talkcli.engine.parent.process import EngineFailed, PrivateEngine
-from talkcli.engine.voices import NEURAL_PREFIX, is_neural
 from talkcli.frozen import frozen, replace
+from talkcli.goals.options import NEURAL_PREFIX, is_neural
 from talkcli.goals.reasons import Reason
 
 if TYPE_CHECKING:

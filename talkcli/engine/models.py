@@ -15,9 +15,8 @@ import sys
 
 from talkcli import install
 from talkcli.engine.protocol import Voice
-from talkcli.engine.voices import NEURAL_PREFIX
 from talkcli.frozen import TYPE_CHECKING, frozen
-from talkcli.goals.options import SPEAKER
+from talkcli.goals.options import NEURAL_PREFIX, SPEAKER_MARK
 from talkcli.paths import voice_directories
 
 if TYPE_CHECKING:
@@ -97,7 +96,7 @@ def find_models(environment: Mapping[str, str] | None = None) -> dict[str, str]:
             continue
         for each in names:
             name = each.removesuffix(_MODEL_SUFFIX)
-            if name != each and name and not name.startswith(".") and SPEAKER not in name and name.isprintable():
+            if name != each and name and not name.startswith(".") and SPEAKER_MARK not in name and name.isprintable():
                 result.setdefault(name, os.path.join(directory, each))
     return result
 

@@ -19,7 +19,7 @@ import sys
 
 from talkcli import install
 from talkcli.engine.protocol import Voice
-from talkcli.goals.options import SPEAKER
+from talkcli.goals.options import NEURAL_PREFIX, SPEAKER_MARK, is_neural
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -30,9 +30,6 @@ if TYPE_CHECKING:
 #: default voice, which is English, with that variant.
 VARIANT_PREFIX = "+"
 _DEFAULT_LANGUAGE = "en"
-
-#: The prefix of the ids of neural voices.
-NEURAL_PREFIX = "piper/"
 
 #: The most suggestions for an unknown word, and how similar they must be: "Dutch" is no suggestion for "nosuch".
 _MAX_SUGGESTIONS, _MIN_SIMILARITY = 3, 0.7
@@ -108,7 +105,7 @@ def _matches(wanted: str, voices: tuple[Voice, ...], preferred: str | None = Non
 
 def _readings(wanted: str, voices: tuple[Voice, ...]) -> Iterator[list[str]]:
     """Yield lists of names that an unknown word may stand for, the most likely list first."""
-    name, mark, speaker = wanted.partition(SPEAKER)
+    name, mark, speaker = wanted.partition(SPEAKER_MARK)
     word = _fold(name)
     neural = [each.id for each in voices if is_neural(each.id)]
     if is_neural(wanted):
@@ -178,11 +175,6 @@ def _find_exact(wanted: str, voices: tuple[Voice, ...], preferred: str | None = 
     return Voice(base.id + variant.id, base.language, base.name + variant.id)
 
 
-def is_neural(voice: str) -> bool:
-    """Return whether a word names a neural voice, existing or not."""
-    return voice.casefold().startswith(NEURAL_PREFIX)
-
-
 def neural_language(voice: str) -> str:
     """Return the language in a neural voice's id, in libespeak-ng's form: "en-us" for "piper/en_US-joe"."""
     return voice.removeprefix(NEURAL_PREFIX).partition("-")[0].replace("_", "-").lower()
@@ -211,7 +203,7 @@ def speaker_number(word: str, numbers: Mapping[str, int], count: int) -> int:
 
 
 def _find_neural(wanted: str, voices: tuple[Voice, ...]) -> Voice | None:
-    name, mark, speaker = wanted.partition(SPEAKER)
+    name, mark, speaker = wanted.partition(SPEAKER_MARK)
     found = _by_name(name, [each for each in voices if is_neural(each.id)], by_id=True)
     if found is None or (mark and not speaker):
         return None
@@ -245,7 +237,7 @@ def _suggestions(wanted: str, voices: tuple[Voice, ...]) -> list[str]:
     plain, variants = _split_variants(voices)
     neural = [each for each in voices if is_neural(each.id)]
     if is_neural(wanted):
-        return _similar(wanted.partition(SPEAKER)[0], {each.id: each for each in neural})
+        return _similar(wanted.partition(SPEAKER_MARK)[0], {each.id: each for each in neural})
     name, plus, suffix = wanted.partition(VARIANT_PREFIX)
     if plus and variants and (not name or find_voice(name, (*plain, *variants))):
         near = _similar(suffix, {each.id.removeprefix(VARIANT_PREFIX): each for each in variants})

@@ -11,7 +11,7 @@ from __future__ import annotations
 from talkcli.errors import BadRequest
 from talkcli.fleet import topics
 from talkcli.frozen import TYPE_CHECKING, fields, frozen
-from talkcli.goals.goal import Goal, known, seconds
+from talkcli.goals.goal import Goal, read_fields, read_seconds
 from talkcli.goals.states import EXIT_CODES, State
 from talkcli.protocol.events import StateChanged
 from talkcli.protocol.lines import decode, encode
@@ -71,7 +71,7 @@ class Presence:
             name,
             said.get("online") is True,
             _text(said.get("session")) or "",
-            seconds(said.get("since")),
+            read_seconds(said.get("since")),
             _texts(said.get("groups")),
             _texts(said.get("allow")),
             server if isinstance(server, dict) else None,
@@ -125,7 +125,7 @@ class RobotStatus:
         if said is None:
             return None
         pending, last = said.get("pending"), said.get("last")
-        found = known(LastGoal, last) if isinstance(last, dict) else {}
+        found = read_fields(LastGoal, last) if isinstance(last, dict) else {}
         return cls(
             _text(said.get("active")),
             _text(said.get("text")),

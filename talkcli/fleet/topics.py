@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 
 from talkcli.frozen import frozen
-from talkcli.goals.option import MAX_NAME
+from talkcli.goals.options import MAX_SENDER_NAME_CHARS
 
 PREFIX = "talk"
 ROBOT_LEVEL, _GROUP, _REPLY = "robot", "group", "reply"
@@ -21,7 +21,7 @@ ANY = "+"
 #: Takes the place of the robot in the topic that a desk publishes to itself. No robot can have this name.
 MARKER = "_"
 #: Longest name of a robot, a group or a user: at the server, a remote client is called "mqtt:" and this name.
-MAX_NAME_CHARS = MAX_NAME - len("mqtt:")
+MAX_NAME_CHARS = MAX_SENDER_NAME_CHARS - len("mqtt:")
 _NAME_PATTERN = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{MAX_NAME_CHARS - 1}}}")
 
 # The levels below a robot's name. A client sends to the first three.

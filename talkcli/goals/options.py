@@ -27,7 +27,7 @@ MAX_ID_CHARS = 64
 #: ids in one request; more would not fit into a line
 MAX_IDS = 4096
 #: the name that a client gives itself, which is shown on one line of a terminal
-MAX_NAME_CHARS = 64
+MAX_SENDER_NAME_CHARS = 64
 #: `data` of a goal as JSON: a label for programs, not a store
 MAX_DATA_BYTES = 1024
 #: goals in one reply to `log`: as many as the server keeps

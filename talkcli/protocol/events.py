@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from talkcli.errors import BadRequest, Busy, ProtocolMismatch, Unreadable
 from talkcli.frozen import TYPE_CHECKING, fields, frozen
-from talkcli.goals.goal import By, Goal, known
+from talkcli.goals.goal import By, Goal, read_fields
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -174,7 +174,7 @@ def from_json(message: JsonObject) -> Event | None:
     event = _EVENTS_BY_KIND.get(kind)
     if event is None:
         return None
-    found = known(event, message)
+    found = read_fields(event, message)
     for name, annotation in event.__annotations__.items():
         value = message.get(name)
         # A time that no calendar can show counts as missing, as in a goal; the event is still true.

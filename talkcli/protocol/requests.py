@@ -10,8 +10,19 @@ from __future__ import annotations
 
 from talkcli.errors import BadRequest
 from talkcli.frozen import TYPE_CHECKING, frozen
-from talkcli.goals.option import FLAG, ID, IDS, MAX_IDS, MAX_LOG, MAX_NAME, Kind, Option
-from talkcli.goals.options import Cancel, Say, Set
+from talkcli.goals.options import (
+    FLAG,
+    ID,
+    IDS,
+    MAX_IDS,
+    MAX_LOG_GOALS,
+    MAX_SENDER_NAME_CHARS,
+    Cancel,
+    Kind,
+    Option,
+    Say,
+    Set,
+)
 
 if TYPE_CHECKING:
     from typing import ClassVar
@@ -20,15 +31,15 @@ if TYPE_CHECKING:
 
 
 def _bad_name(value: str) -> str | None:
-    return None if 0 < len(value) <= MAX_NAME else f"must be 1 to {MAX_NAME} characters"
+    return None if 0 < len(value) <= MAX_SENDER_NAME_CHARS else f"must be 1 to {MAX_SENDER_NAME_CHARS} characters"
 
 
 def _bad_count(value: int) -> str | None:
-    return None if 0 < value <= MAX_LOG else f"must be 1 to {MAX_LOG}"
+    return None if 0 < value <= MAX_LOG_GOALS else f"must be 1 to {MAX_LOG_GOALS}"
 
 
-_NAME_TYPE = Kind("string", (str,), "must be a string", fault=_bad_name)
-_COUNT_TYPE = Kind("integer", (int,), "must be an integer", fault=_bad_count)
+_NAME_TYPE = Kind("string", (str,), "must be a string", check=_bad_name)
+_COUNT_TYPE = Kind("integer", (int,), "must be an integer", check=_bad_count)
 
 
 @frozen
@@ -38,7 +49,7 @@ class Hello:
     kind: ClassVar[str] = "hello"
     meaning: ClassVar[str] = "Who connects; send it at once, and the server knows that you are alive"
     options: ClassVar[tuple[Option, ...]] = (
-        Option("name", _NAME_TYPE, "what the sender calls itself", form=f"1 to {MAX_NAME} characters"),
+        Option("name", _NAME_TYPE, "what the sender calls itself", form=f"1 to {MAX_SENDER_NAME_CHARS} characters"),
         Option(
             "urgent",
             FLAG,
@@ -57,7 +68,9 @@ class Wait:
     kind: ClassVar[str] = "wait"
     meaning: ClassVar[str] = "Send the results of these goals, whoever sent them"
     options: ClassVar[tuple[Option, ...]] = (
-        Option("ids", IDS, "null: all that are active or pending now", form=f"of to {MAX_IDS:,} ids", absent="all"),
+        Option(
+            "ids", IDS, "null: all that are active or pending now", form=f"of to {MAX_IDS:,} ids", default_words="all"
+        ),
         Option("feedback", FLAG, "each word as it is heard, too", default=False),
     )
     ids: tuple[str, ...] | None = None
@@ -98,7 +111,9 @@ class Log:
 
     kind: ClassVar[str] = "log"
     meaning: ClassVar[str] = "The last goals that ended, REJECTED ones too, oldest first"
-    options: ClassVar[tuple[Option, ...]] = (Option("count", _COUNT_TYPE, "so many", 20, form=f"1 to {MAX_LOG:,}"),)
+    options: ClassVar[tuple[Option, ...]] = (
+        Option("count", _COUNT_TYPE, "so many", 20, form=f"1 to {MAX_LOG_GOALS:,}"),
+    )
     count: int = 20
 
 
@@ -135,12 +150,16 @@ def read_request(message: JsonObject) -> Request:
     request = REQUEST_TYPES.get(kind)
     if request is None:
         known = ", ".join(REQUEST_TYPES)
-        raise BadRequest(f"this server does not know the request {kind[:MAX_NAME]!r}, but {known}", "unknown_request")
+        raise BadRequest(
+            f"this server does not know the request {kind[:MAX_SENDER_NAME_CHARS]!r}, but {known}", "unknown_request"
+        )
     for name, value in fields.items():
         option = _OPTIONS_BY_KIND[kind].get(name)
         if option is None:
-            raise BadRequest(f"this server does not know the field {name[:MAX_NAME]!r} of {kind}", "unknown_field")
-        fault = option.fault(value)
+            raise BadRequest(
+                f"this server does not know the field {name[:MAX_SENDER_NAME_CHARS]!r} of {kind}", "unknown_field"
+            )
+        fault = option.type_error(value)
         if fault:
             raise BadRequest(f"{name!r} of {kind} {fault}", "bad_field")
         if isinstance(value, list):

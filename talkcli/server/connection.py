@@ -17,7 +17,7 @@ from talkcli.errors import BadRequest
 from talkcli.frozen import replace
 from talkcli.goals.options import Cancel
 from talkcli.protocol.events import busy_greeting, failure, item, ok, take_seq
-from talkcli.protocol.lines import MAX_LINE_BYTES, TruncatedLine, LineSplitter, decode, encode
+from talkcli.protocol.lines import MAX_LINE_BYTES, LineSplitter, TruncatedLine, decode, encode
 from talkcli.protocol.requests import Hello, Request, Status, read_request
 from talkcli.server.stream import ClientStream
 

@@ -54,9 +54,9 @@ VOICES_LIMIT_S = 4.0
 PAUSE_ANSWER_S = 2.0
 #: Waiting requests of one client. The wire's document names this limit. The client is read from all the while, because
 #: a cancel may follow.
-MAX_WAITING_REQUESTS = 1_000
+MAX_CLIENT_REQUESTS = 1_000
 #: Memory for all waiting requests, as much as for unread output.
-MAX_WAITING_BYTES = 64 * 1024 * 1024
+MAX_KEPT_REQUEST_BYTES = 64 * 1024 * 1024
 #: Memory that is counted for each waiting request, beside its values. It is ten times what a request takes, so that at
 #: most 8,000 requests wait and a cancel of all of them is answered within 2 s.
 REQUEST_BYTES = 8 * 1024
@@ -166,10 +166,10 @@ class Requests:
         if pending.kept_bytes:
             return True  # it has waited before
         size = REQUEST_BYTES + sum(map(_memory_of, fields(pending.request).values()))
-        if len(self._unanswered(pending.connection)) > MAX_WAITING_REQUESTS:  # with this one
-            words = f"{MAX_WAITING_REQUESTS:,} requests of this connection are waiting already"
-        elif self._waiting_bytes + size > MAX_WAITING_BYTES:
-            words = f"{MAX_WAITING_BYTES >> 20} MiB of requests are waiting already"
+        if len(self._unanswered(pending.connection)) > MAX_CLIENT_REQUESTS:  # with this one
+            words = f"{MAX_CLIENT_REQUESTS:,} requests of this connection are waiting already"
+        elif self._waiting_bytes + size > MAX_KEPT_REQUEST_BYTES:
+            words = f"{MAX_KEPT_REQUEST_BYTES >> 20} MiB of requests are waiting already"
         else:
             pending.kept_bytes = size
             self._waiting_bytes += size

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from talkcli.server.run import DOOR
+from talkcli.server.run import MAX_EXTRA_CLIENTS
 from tests.conformance.rawsocket import Raw
 
 if TYPE_CHECKING:
@@ -207,7 +207,7 @@ def test_requests_of_a_refused_client_are_not_carried_out(make_talk: MakeTalk) -
     with contextlib.ExitStack() as stack:
         asking = stack.enter_context(talk.connect())
         before = asking.request("status")["server"]
-        for _ in range(DOOR):
+        for _ in range(MAX_EXTRA_CLIENTS):
             stack.enter_context(Raw(talk.socket))
         asking.request("hello", urgent=True)
         send_and_go(talk, b'{"request":"set","volume":0.1,"preempt":true}\n', b'{"request":"pause"}\n')

@@ -160,7 +160,11 @@ def test_lists_that_nobody_reads_take_no_more_memory_than_what_may_wait_of_them(
 def test_slow_clients_are_closed_by_the_limits(make_talk: MakeTalk, tmp_path: pathlib.Path, share: float) -> None:
     """All kinds of slow clients at once, for 12 s or a tenth of it. The longest limit is 10 s."""
     first, line, every = share * FIRST_REQUEST, share * LINE, share * ALIVE_EVERY
-    constants = {"connection__FIRST_REQUEST": first, "connection__LINE_LIMIT": line, "subscribers__ALIVE_EVERY": every}
+    constants = {
+        "connection__FIRST_REQUEST_S": first,
+        "connection__LINE_LIMIT_S": line,
+        "subscribers__CLIENT_ALIVE_INTERVAL_S": every,
+    }
     talk = make_talk(program=patched_serve(tmp_path, **constants))
     with limits(), contextlib.ExitStack() as stack:
         began = time.monotonic()

@@ -11,7 +11,7 @@ import time
 from typing import TYPE_CHECKING, TypeVar
 
 from talkcli.engine import protocol
-from talkcli.engine.voices import is_neural
+from talkcli.goals.options import is_neural
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

@@ -11,5 +11,5 @@ from talkcli.server import run
 from tests.support import scripted_serve
 
 if __name__ == "__main__":
-    run.LOOK_EVERY = 0.05
+    run.SOCKET_CHECK_S = 0.05
     scripted_serve.main()

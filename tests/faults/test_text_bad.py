@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine.parent.render import render
-from talkcli.goals.text import fault
+from talkcli.goals.options import bad_text
 from tests.conformance.hearing import HOME, LOW, assert_aborted, assert_same, begin, send
 from tests.faults.broken import await_end
 from tests.support.compare import assert_heard
@@ -122,7 +122,7 @@ def _every_character(common: bool) -> Iterator[str]:
     ]
     found = found[:: _FEW if common else _FEWER]
     texts = ("".join(found[at : at + _MANY]) for at in range(0, len(found), _MANY))
-    return (text for text in texts if fault(text) is None)  # one of controls alone says nothing
+    return (text for text in texts if bad_text(text) is None)  # one of controls alone says nothing
 
 
 @pytest.mark.slow
@@ -158,7 +158,7 @@ def test_the_longest_words_and_writing_from_right_to_left_are_spoken_whole(tmp_p
 )
 def test_thousands_of_characters_of_one_kind_end(names: list[str]) -> None:
     texts = [ENDLESS[each] for each in names]
-    assert [fault(each) for each in texts] == [None] * len(texts)
+    assert [bad_text(each) for each in texts] == [None] * len(texts)
     tally = speak_all([Case("gmw/en", each) for each in [*texts, LOW]], guarded=True)
     assert (tally.texts, tally.deaths, tally.faults) == (len(texts) + 1, [], [])
     assert set(tally.outcomes) <= {"completed", "nothing_to_say"}

@@ -28,7 +28,7 @@ from unittest import mock
 from talkcli.engine import protocol
 from talkcli.engine.parent import process
 from talkcli.engine.parent.process import EngineFailed, PrivateEngine
-from talkcli.goals.text import fault
+from talkcli.goals.options import bad_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -118,7 +118,7 @@ def cases(seed: int, voices: Sequence[str]) -> Iterator[Case]:
     while True:
         for voice in source.sample(voices, len(voices)):
             for _ in range(20):
-                while fault(text := made(source)) is not None:
+                while bad_text(text := made(source)) is not None:
                     pass
                 yield Case(voice, text)
 

@@ -31,14 +31,14 @@ from talkcli.fleet.bridge.main import Bridge, BridgeSettings
 from talkcli.fleet.bridge.policy import ASKABLE
 from talkcli.fleet.broker import from_environment
 from talkcli.goals.goal import Sender
-from talkcli.goals.options import as_shown
+from talkcli.goals.options import shown_settings
 from talkcli.goals.scheduler import Scheduler
 from talkcli.protocol.events import greeting
 from talkcli.protocol.lines import encode
-from talkcli.server.connection import Connection
+from talkcli.server.connection import ClientConnection
 from talkcli.server.requests import Requests
 from talkcli.server.speech import Speech
-from talkcli.server.stream import Acceptor, make_room
+from talkcli.server.stream import Acceptor, raise_descriptor_limit
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -99,11 +99,11 @@ class Server:
         self._socket.bind(path)
         self._socket.listen()
         loop = asyncio.get_running_loop()
-        self._acceptor = Acceptor(loop, lambda each: Connection(self, speech.streams, each).begin(), descriptors)
+        self._acceptor = Acceptor(loop, lambda each: ClientConnection(self, speech.streams, each).begin(), descriptors)
         self._acceptor.open(self._socket)
 
-    def joined(self, connection: Connection) -> None:
-        connection.sender = Sender()
+    def joined(self, connection: ClientConnection) -> None:
+        connection.client = Sender()
         connection.admit()
 
     def close(self) -> None:
@@ -117,8 +117,8 @@ class Server:
             "version": __version__,
             "boot": scheduler.boot,
             "socket": self._path,
-            "engine": self._speech.engine_words,
-            **as_shown(scheduler.settings),
+            "engine": self._speech.engine_status,
+            **shown_settings(scheduler.settings),
             "paused": scheduler.paused,
             "pending": scheduler.pending_count,
         }
@@ -128,7 +128,7 @@ async def run(names: list[str], broker_url: str, directory: str, spoken: TextIO)
     """Run robots until SIGTERM."""
     loop = asyncio.get_running_loop()
     loop.set_exception_handler(log.handle_loop_error)
-    descriptors = make_room(_DESCRIPTORS * len(names))
+    descriptors = raise_descriptor_limit(_DESCRIPTORS * len(names))
     broker = from_environment({"TALK_BROKER": broker_url})
 
     def note(robot: str, goal_id: str, text: str) -> None:

@@ -23,8 +23,7 @@ from talkcli.fleet.bridge.policy import (
 from talkcli.fleet.payloads import Message
 from talkcli.frozen import replace
 from talkcli.goals.goal import By, Goal, Sender
-from talkcli.goals.option import MAX_NAME, is_clients_id
-from talkcli.goals.options import Cancel, Say
+from talkcli.goals.options import MAX_SENDER_NAME_CHARS, Cancel, Say, is_clients_id
 from talkcli.goals.states import State
 from talkcli.protocol.lines import MAX_LINE_BYTES
 from talkcli.protocol.requests import REQUEST_TYPES
@@ -339,5 +338,9 @@ def test_the_name_of_a_user_from_afar_fits_and_says_so() -> None:
     assert policy.sender_name("bob") == "mqtt:bob"
     assert policy.sender_name("bob", "patrol") == "mqtt:bob patrol"
     assert policy.sender_name(longest) == f"mqtt:{longest}"
-    assert len(policy.sender_name(longest)) == len(policy.sender_name("bob", "n" * MAX_NAME)) == MAX_NAME
+    assert (
+        len(policy.sender_name(longest))
+        == len(policy.sender_name("bob", "n" * MAX_SENDER_NAME_CHARS))
+        == MAX_SENDER_NAME_CHARS
+    )
     assert is_clients_id(f"{longest[:48]}-x{0:012x}")

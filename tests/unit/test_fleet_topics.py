@@ -8,13 +8,13 @@ import pytest
 
 from talkcli.fleet import topics
 from talkcli.fleet.topics import RequestTopic
-from talkcli.goals.option import MAX_NAME
+from talkcli.goals.options import MAX_SENDER_NAME_CHARS
 
 
 @pytest.mark.parametrize("name", ["a", "anna", "wh-07", "r2.d2", "A_1", "0", "a" * 59])
 def test_a_name_is_one_level_of_a_topic(name: str) -> None:
     assert topics.name_fault(name) is None
-    assert len(f"mqtt:{name}") <= MAX_NAME
+    assert len(f"mqtt:{name}") <= MAX_SENDER_NAME_CHARS
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from talkcli.goals.goal import By, Goal, Output, Sender
-from talkcli.goals.goal import seconds as seconds_of
+from talkcli.goals.goal import read_seconds as seconds_of
 from talkcli.goals.states import State
 from tests.unit.test_lines import values
 

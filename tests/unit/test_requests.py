@@ -9,8 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from talkcli.errors import BadRequest
-from talkcli.goals.option import MAX_DATA, MAX_ID, MAX_IDS, MAX_LOG, MAX_NAME
-from talkcli.goals.options import Cancel, Say
+from talkcli.goals.options import (
+    MAX_DATA_BYTES,
+    MAX_ID_CHARS,
+    MAX_IDS,
+    MAX_LOG_GOALS,
+    MAX_SENDER_NAME_CHARS,
+    Cancel,
+    Say,
+)
 from talkcli.protocol.events import failure
 from talkcli.protocol.lines import decode, encode, request_line, write_request
 from talkcli.protocol.requests import REQUEST_TYPES, Log, Request, Status, Wait, read_request
@@ -18,10 +25,10 @@ from tests.unit.test_lines import values
 
 if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
-    from talkcli.goals.option import Option
+    from talkcli.goals.options import Option
 
 integers = st.integers(-(10**18), 10**18)
-goal_ids = st.text(min_size=1, max_size=MAX_ID)
+goal_ids = st.text(min_size=1, max_size=MAX_ID_CHARS)
 #: Values of each kind of option.
 OF_KIND: dict[str, st.SearchStrategy[object]] = {
     "boolean": st.booleans(),
@@ -37,7 +44,10 @@ OF_KIND: dict[str, st.SearchStrategy[object]] = {
 def requests_of(kind: type[Request]) -> st.SearchStrategy[Request]:
     fields = {each.name: OF_KIND[each.kind.name] for each in kind.options}
     optional = {each.name: st.none() | fields[each.name] for each in kind.options if each.default is None}
-    limited = {"name": st.none() | st.text(min_size=1, max_size=MAX_NAME), "count": st.integers(1, MAX_LOG)}
+    limited = {
+        "name": st.none() | st.text(min_size=1, max_size=MAX_SENDER_NAME_CHARS),
+        "count": st.integers(1, MAX_LOG_GOALS),
+    }
     return st.builds(kind, **{**fields, **optional, **{name: limited[name] for name in fields if name in limited}})
 
 
@@ -124,7 +134,7 @@ WRONG: dict[str, list[object]] = {
     "string": [1, True, ["hi"], {}],
     "integer": [1.0, 0.5, "5", True, [5]],
     "number": ["1", True, [1], {}],
-    "object": [1, "a", [], True, {"a": "b" * MAX_DATA}],
+    "object": [1, "a", [], True, {"a": "b" * MAX_DATA_BYTES}],
     "id": ["", 7, True, [], ["4k7f-1"], "a" * 65],
     "list": ["4k7f-1", 7, {"4k7f-1": 1}, [1], [None], [True], [""], ["a" * 65], [["4k7f-1"]], ["a"] * 4_097],
 }
@@ -151,14 +161,14 @@ def test_say_without_a_text_is_refused() -> None:
 
 
 def test_values_at_their_limits_are_taken() -> None:
-    exact: JsonObject = {"a": "b" * (MAX_DATA - len('{"a": ""}'))}
-    assert MAX_DATA == 1024
+    exact: JsonObject = {"a": "b" * (MAX_DATA_BYTES - len('{"a": ""}'))}
+    assert MAX_DATA_BYTES == 1024
     assert read_request({"request": "say", "text": "", "data": exact}) == Say("", data=exact)
-    longest = "a" * MAX_ID
+    longest = "a" * MAX_ID_CHARS
     assert read_request({"request": "status", "id": longest}) == Status(longest)
     assert read_request({"request": "wait", "ids": [longest] * MAX_IDS}) == Wait((longest,) * MAX_IDS)
     assert read_request({"request": "log", "count": 1}) == Log(1)
-    assert read_request({"request": "log", "count": MAX_LOG}) == Log(MAX_LOG)
+    assert read_request({"request": "log", "count": MAX_LOG_GOALS}) == Log(MAX_LOG_GOALS)
 
 
 def test_values_out_of_range_are_read_so_that_the_goal_itself_can_be_rejected() -> None:

@@ -15,10 +15,10 @@ from talkcli.goals.goal import Goal
 from talkcli.goals.history import MAX_RECALLED_GOALS, MAX_REJECTED_GOALS, MAX_SPOKEN_GOALS
 from talkcli.goals.states import State
 from talkcli.protocol import events
-from talkcli.protocol.lines import MAX_LINE
-from talkcli.protocol.requests import KINDS
+from talkcli.protocol.lines import MAX_LINE_BYTES
+from talkcli.protocol.requests import REQUEST_TYPES
 from talkcli.server import connection, stream
-from talkcli.server.requests import MAX_WAITING_BYTES, MAX_WAITING_REQUESTS, RECENT_GOALS, REQUEST_BYTES
+from talkcli.server.requests import MAX_CLIENT_REQUESTS, MAX_KEPT_REQUEST_BYTES, RECENT_GOALS, REQUEST_BYTES
 from talkcli.server.run import MAX_CLIENTS, MAX_QUEUED_GOALS
 from tests.support.documents import FLEET, README, ROOT, WIRE, first_column, tables, words
 from tests.support.surroundings import needs_packages
@@ -36,7 +36,7 @@ def test_states_and_replies_are_in_the_tables() -> None:
     documented = {words(row[0])[0]: (int(row[1]), row[3] == "yes") for row in states[1:]}
     assert documented == {each.name: (int(each), each.terminal) for each in State}
     answered = {each for row in tables(WIRE.section("Requests"))[1][1:] for each in words(row[0])[:1]}
-    assert answered == set(KINDS)
+    assert answered == set(REQUEST_TYPES)
 
 
 def test_keys_and_error_codes_of_the_tables_are_those_of_the_code() -> None:
@@ -67,7 +67,7 @@ def test_numbers_of_kept_goals_are_in_the_text() -> None:
 
 def test_limits_are_those_of_the_code() -> None:
     limits = {row[0]: row[1] for row in LIMITS[1:]}
-    assert limits["a request"].startswith(f"{MAX_LINE:,} bytes")
+    assert limits["a request"].startswith(f"{MAX_LINE_BYTES:,} bytes")
     assert f"within {connection.FIRST_REQUEST_S:g} s" in limits["the first request"]
     assert f"within {connection.LINE_LIMIT_S:g} s" in limits["a line"]
     assert limits["lines that are no requests"].startswith(f"{connection.MAX_BAD_LINES} ")
@@ -78,7 +78,7 @@ def test_limits_are_those_of_the_code() -> None:
     assert limits["clients"].startswith(f"{MAX_CLIENTS} ")
     assert limits["queue"].startswith(f"{MAX_QUEUED_GOALS} ")
     assert limits["requests that wait"].startswith(
-        f"{MAX_WAITING_REQUESTS:,} of one connection, and {MAX_WAITING_BYTES >> 20} MiB for all"
+        f"{MAX_CLIENT_REQUESTS:,} of one connection, and {MAX_KEPT_REQUEST_BYTES >> 20} MiB for all"
     )
     assert f"and {REQUEST_BYTES >> 10} KiB)" in limits["requests that wait"]
 
@@ -86,26 +86,26 @@ def test_limits_are_those_of_the_code() -> None:
 def test_limits_of_a_fleet_are_those_of_the_code() -> None:
     needs_packages("paho")
     from talkcli.fleet import link
-    from talkcli.fleet.bridge import askers, news, session
     from talkcli.fleet.bridge import main as bridge
+    from talkcli.fleet.bridge import publisher, session
 
     limits = {row[0]: row[1] for row in tables(FLEET.section("Limits"))[0][1:]}
-    assert limits["a request"].startswith(f"{MAX_LINE:,} bytes")
-    assert limits["correlation data"] == f"{policy.MAX_CORRELATION} bytes"
-    assert f"past {policy.MAX_CORRELATION} bytes the request" in FLEET.section("Requests and replies")
-    assert f"at most {(link.MAX_PACKET - link.MAX_HEAD) // 1024} KiB" in limits["a reply's payload"]
-    assert limits["goals from afar that are pending"] == str(policy.SHARE)
-    assert limits["askers"].startswith(f"{askers.MAX_SESSIONS}, and {session.MAX_WAITING} requests of each")
-    assert limits["requests that wait"].startswith(f"{session.MAX_HELD >> 20} MiB for all askers")
-    assert limits["an asker that says nothing"] == f"{session.IDLE:g} s"
-    assert limits["ids that are remembered"] == f"{policy.REMEMBERED:,}"
-    assert f"past {bridge.SOFT_OUTPUT // 1024} KiB" in limits["what the broker is slow to take"]
-    assert f"past {bridge.HARD_OUTPUT // 2**20} MiB" in limits["what the broker is slow to take"]
+    assert limits["a request"].startswith(f"{MAX_LINE_BYTES:,} bytes")
+    assert limits["correlation data"] == f"{policy.MAX_CORRELATION_BYTES} bytes"
+    assert f"past {policy.MAX_CORRELATION_BYTES} bytes the request" in FLEET.section("Requests and replies")
+    assert f"at most {(link.MAX_PACKET_BYTES - link.MAX_HEADER_BYTES) // 1024} KiB" in limits["a reply's payload"]
+    assert limits["goals from afar that are pending"] == str(policy.MAX_REMOTE_GOALS)
+    assert limits["askers"].startswith(f"{session.MAX_SESSIONS}, and {session.MAX_WAITING_REQUESTS} requests of each")
+    assert limits["requests that wait"].startswith(f"{session.MAX_WAITING_BYTES >> 20} MiB for all askers")
+    assert limits["an asker that says nothing"] == f"{session.CLIENT_SILENCE_LIMIT_S:g} s"
+    assert limits["ids that are remembered"] == f"{policy.MAX_REMEMBERED_IDS:,}"
+    assert f"past {bridge.SLOW_BROKER_BYTES // 1024} KiB" in limits["what the broker is slow to take"]
+    assert f"past {bridge.STUCK_BROKER_BYTES // 2**20} MiB" in limits["what the broker is slow to take"]
     section = FLEET.section("Topics")
-    assert f"1 to {topics.LONGEST} of" in section
-    assert f"expires after {bridge.PRESENCE_EXPIRY} s, renewed every {bridge.PRESENCE_EVERY:g} s" in section
-    assert f"expires after {news.EVENT_EXPIRY} s" in section
-    assert f"more than {policy.STALE_AFTER:g} s ago" in " ".join(FLEET.section("What is refused").split())
+    assert f"1 to {topics.MAX_NAME_CHARS} of" in section
+    assert f"expires after {bridge.PRESENCE_EXPIRY_S} s, renewed every {bridge.PRESENCE_EVERY_S:g} s" in section
+    assert f"expires after {publisher.EVENT_EXPIRY_S} s" in section
+    assert f"more than {policy.STALE_AFTER_S:g} s ago" in " ".join(FLEET.section("What is refused").split())
 
 
 def test_places_are_those_of_the_code(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -122,7 +122,7 @@ def test_places_are_those_of_the_code(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_events_are_in_the_table() -> None:
     table = {words(row[0])[0]: set(words(row[2])) for row in tables(WIRE.section("Events"))[0][1:]}
-    sent = {kind: set(each.__annotations__) for kind, each in events._KINDS.items() if kind != "snapshot"}
+    sent = {kind: set(each.__annotations__) for kind, each in events._EVENTS_BY_KIND.items() if kind != "snapshot"}
     assert set(table) == {*sent, "alive"}
     assert all(fields <= table[kind] for kind, fields in sent.items())
 

@@ -18,9 +18,9 @@ from talkcli.engine.child.playback import Playback
 from talkcli.engine.child.players.base import CannotSpeak, Stopped
 from talkcli.engine.child.synthesizers.base import NotInstalled, SpeechSettings
 from talkcli.engine.protocol import Ready, StartFailed
-from talkcli.engine.voices import SYNTHESIZERS, UnknownVoice, is_neural, is_own_driver
+from talkcli.engine.voices import SYNTHESIZERS, UnknownVoice, is_own_driver
 from talkcli.frozen import TYPE_CHECKING, fields, replace
-from talkcli.goals.options import model_of
+from talkcli.goals.options import is_neural, model_of
 from talkcli.goals.reasons import Reason
 
 if TYPE_CHECKING:

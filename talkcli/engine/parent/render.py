@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING
 from talkcli.engine import protocol
 from talkcli.engine.parent.process import EngineFailed, PrivateEngine
 from talkcli.errors import EXIT_ERROR, TalkError, UsageError
-from talkcli.goals import text as texts
-from talkcli.goals.options import MAX_CHARACTERS
+from talkcli.goals.options import MAX_TEXT_CHARS, bad_text
 from talkcli.goals.reasons import Reason
 from talkcli.goals.states import EXIT_CODES, State
 from talkcli.polling import wait_ready
@@ -37,7 +36,7 @@ STANDARD_OUTPUT = frozenset({"-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"}
 #: Interval for checking whether a named pipe has a reader, because no event reports that.
 _READER_CHECK_INTERVAL_S = 0.05
 #: Longest piece of text sent at once: as long as a goal may be, because the engine is silent while it prepares one.
-MAX_PIECE_CHARS = MAX_CHARACTERS
+MAX_PIECE_CHARS = MAX_TEXT_CHARS
 #: Ends of sentences and lines. A text that is cut there sounds the same as the whole text.
 _SENTENCE_END = re.compile(r"""[.!?…]["')\]»”’]*\s+|[。！？।]|\n\s*""")
 _BLANK = re.compile(r"\s+")
@@ -93,7 +92,7 @@ def render(
         BrokenPipeError: the reader of standard output is gone.
     """
     deadline = time.monotonic() + (float("inf") if timeout is None else timeout)
-    fault = texts.fault(text, None)
+    fault = bad_text(text, None)
     if fault is not None:
         raise RenderFailed(*fault)
     # A rendering can wait for its voice to load, and a file in another voice would be useless.

@@ -12,8 +12,7 @@ from talkcli.errors import BadRequest, LineTooLong
 from talkcli.fleet import topics
 from talkcli.frozen import frozen, replace
 from talkcli.goals.goal import By, Goal, Sender
-from talkcli.goals.option import MAX_NAME
-from talkcli.goals.options import SHOWN, Say
+from talkcli.goals.options import MAX_SENDER_NAME_CHARS, SHOWN_OPTIONS, Say
 from talkcli.protocol.events import Result, StateChanged, ok, take_seq
 from talkcli.protocol.lines import MAX_DIGITS, MAX_LINE_BYTES, decode
 from talkcli.protocol.requests import REQUEST_TYPES, read_request
@@ -335,7 +334,7 @@ def end_unsent(
         client=Sender(name=sender_name(request.user)),
         queued_at=at,
         ended_at=at,
-        **{name: getattr(say, name) for name in SHOWN},
+        **{name: getattr(say, name) for name in SHOWN_OPTIONS},
     )
     lines = [ok(request.seq, goal=goal.to_json())]
     if say.wait or say.feedback:
@@ -354,7 +353,7 @@ def without_texts(message: JsonObject) -> JsonObject:
 
 def sender_name(user: str, name: str | None = None) -> str:
     """Return what a remote client is called at the server: its user, and the name that it gave itself if any."""
-    return f"{_REMOTE_PREFIX}{user} {name}"[:MAX_NAME] if name else f"{_REMOTE_PREFIX}{user}"
+    return f"{_REMOTE_PREFIX}{user} {name}"[:MAX_SENDER_NAME_CHARS] if name else f"{_REMOTE_PREFIX}{user}"
 
 
 def is_remote(goal: Goal) -> bool:

@@ -22,8 +22,7 @@ from talkcli.fleet.desk.desk import ABSENCE_LIMIT_S, DeskLink
 from talkcli.fleet.desk.request import NoServer
 from talkcli.fleet.link import boottime
 from talkcli.frozen import replace
-from talkcli.goals.option import MAX_NAME
-from talkcli.goals.options import Cancel, Say, Set
+from talkcli.goals.options import MAX_SENDER_NAME_CHARS, Cancel, Say, Set
 from talkcli.polling import wait_ready
 from talkcli.protocol.events import check_greeting
 from talkcli.protocol.lines import decode
@@ -101,8 +100,10 @@ class RobotConnection(BlockingConnection):
         if fault:
             raise UsageError(f"no robot can be called '{printable(robot)}': a name {fault}")
         self._sender = sender_name(name)
-        if self._sender and len(self._sender) > MAX_NAME:
-            raise UsageError(f"the name of the sender has {len(self._sender)} characters, the longest is {MAX_NAME}")
+        if self._sender and len(self._sender) > MAX_SENDER_NAME_CHARS:
+            raise UsageError(
+                f"the name of the sender has {len(self._sender)} characters, the longest is {MAX_SENDER_NAME_CHARS}"
+            )
         self._robot, self._desk = robot, desk
         self._numbers = numbers or self._numbers
         self.path = f"{robot} ({desk.broker.url})"

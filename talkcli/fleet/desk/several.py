@@ -24,7 +24,7 @@ from talkcli.fleet.link import boottime
 from talkcli.fleet.payloads import Presence
 from talkcli.frozen import replace
 from talkcli.goals.goal import Goal
-from talkcli.goals.options import Cancel, Say, Set, bad_key
+from talkcli.goals.options import Cancel, Say, Set, key_error
 from talkcli.goals.states import State
 from talkcli.protocol.events import goals
 from talkcli.protocol.lines import FIRST_NUMBER
@@ -430,7 +430,7 @@ def _check_request(request: Request) -> None:
             raise UsageError("a number is a goal of one server: to several robots name the goal by its whole id")
     if len(batches(ids)) > 1:
         raise UsageError(f"{len(ids):,} ids do not fit into one request: to several robots name fewer, or none for all")
-    if isinstance(request, Cancel) and request.key is not None and (fault := bad_key(request.key)):
+    if isinstance(request, Cancel) and request.key is not None and (fault := key_error(request.key)):
         raise UsageError(fault)
     if isinstance(request, Say | Set):
         check(request)

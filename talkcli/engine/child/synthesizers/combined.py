@@ -12,8 +12,8 @@ from talkcli.engine import models, protocol
 from talkcli.engine.child.players.base import CannotSpeak, Stopped
 from talkcli.engine.child.synthesizers.base import SpeechSettings
 from talkcli.engine.child.synthesizers.espeak import Espeak
-from talkcli.engine.voices import is_neural
 from talkcli.frozen import TYPE_CHECKING, replace
+from talkcli.goals.options import is_neural
 from talkcli.goals.reasons import Reason
 
 if TYPE_CHECKING:

@@ -19,8 +19,8 @@ from talkcli.engine import models
 from talkcli.engine.child.synthesizers.inference import Model, ModelCache, load_libraries
 from talkcli.engine.models import VoiceFileError
 from talkcli.engine.protocol import LOAD_LIMIT_S, VoiceLoaded, VoiceMemory, VoiceUnloaded
-from talkcli.engine.voices import NEURAL_PREFIX
 from talkcli.frozen import TYPE_CHECKING, frozen
+from talkcli.goals.options import NEURAL_PREFIX
 from talkcli.paths import cache_directory
 
 if TYPE_CHECKING:

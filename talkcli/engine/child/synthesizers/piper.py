@@ -17,9 +17,9 @@ from talkcli.engine.child.synthesizers.loader import BackgroundIterator, ModelLo
 from talkcli.engine.child.synthesizers.phonemes import PAUSE_MARKS, split_text
 from talkcli.engine.models import BEGIN_SYMBOL, END_SYMBOL, PAD_SYMBOL, VoiceFileError
 from talkcli.engine.players import SAMPLE_BYTES
-from talkcli.engine.voices import NEURAL_PREFIX, UnknownVoice, neural_language, speaker_number
+from talkcli.engine.voices import UnknownVoice, neural_language, speaker_number
 from talkcli.frozen import TYPE_CHECKING, frozen
-from talkcli.goals.options import SPEAKER
+from talkcli.goals.options import NEURAL_PREFIX, SPEAKER_MARK
 from talkcli.goals.reasons import Reason
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ class Piper:
         missing = models.missing_package()
         if missing is not None:
             raise UnknownVoice(missing)
-        model, _, speaker = voice.partition(SPEAKER)
+        model, _, speaker = voice.partition(SPEAKER_MARK)
         path = models.find_models().get(model.removeprefix(NEURAL_PREFIX)) if voice.startswith(NEURAL_PREFIX) else None
         if path is None:
             raise UnknownVoice("its file is not there any more")
