@@ -353,7 +353,7 @@ async def test_bug_in_a_report_harms_no_other_report(monkeypatch: pytest.MonkeyP
         if len(taken) == 1:
             raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr(log, "bug", lambda what, error: failed.append((what, type(error))))
+    monkeypatch.setattr(log, "write_bug", lambda what, error: failed.append((what, type(error))))
     served = Speech(Scheduler("4k7f", max_queue=1))
     served._take = take  # type: ignore[method-assign, assignment]
     for number in range(3):

@@ -173,6 +173,7 @@ def test_what_the_library_takes_is_what_the_rows_say() -> None:
     asked = declared(Client.say)
     # `wait` is called `follow` there, and is what one mostly wants; no other format than text can be asked for.
     assert asked.pop("follow") == ("bool", True)
+    assert asked.pop("block") == ("bool", True)
     assert asked.pop("text") == ("str", inspect.Parameter.empty)
     own = annotated(Say)
     rows = [each for each in OPTIONS if each.name not in {"text", "wait", "format"}]
@@ -304,5 +305,5 @@ def test_limits_hold_on_the_wire_and_on_the_command_line_alike() -> None:
 def test_a_plain_line_is_read_before_an_option_is_worth_compiling() -> None:
     """It is read before anything is sent: some hundred rows are made for it."""
     code = "import talkcli.cli.plain; from talkcli import frozen; from talkcli.goals.options import Option; "
-    code += "print(Option.__init__ is frozen._init_of_few)"
+    code += "print(Option.__init__ is frozen._generic_init)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "True\n"
