@@ -10,7 +10,7 @@ import re
 import time
 
 from talkcli.frozen import TYPE_CHECKING
-from talkcli.goals.option import figure
+from talkcli.goals.options import format_number
 from talkcli.goals.states import State
 from talkcli.protocol.lines import encode
 from talkcli.terminal.text import (
@@ -107,7 +107,7 @@ def goal_lines(goal: Goal, screen: Screen, now: float) -> list[str]:
         ("from", _describe_sender(goal.client)),
         ("priority", str(goal.priority)),
         ("key", _quote(goal.key or None)),
-        ("ttl", goal.ttl and ", ".join(filter(None, (f"{figure(goal.ttl)} s", _left(goal, now))))),
+        ("ttl", goal.ttl and ", ".join(filter(None, (f"{format_number(goal.ttl)} s", _left(goal, now))))),
         ("data", None if goal.data is None else printable(encode(goal.data).decode().rstrip("\n"))),
         ("queued", _moment(goal.queued_at)),
         ("started", _moment(goal.started_at)),
@@ -364,7 +364,7 @@ def _format_fields(server: JsonObject, *names: str) -> list[str]:
 def _value(value: object) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return figure(value)
+    return format_number(value)
 
 
 def clock_time(seconds: float | None) -> str:
