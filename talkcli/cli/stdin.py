@@ -30,8 +30,7 @@ from talkcli.client.connection import BlockingConnection
 from talkcli.errors import EXIT_OK, ServerUnavailable, TalkError, TimedOut, UnknownGoal, UsageError
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.goal import Goal
-from talkcli.goals.option import figure
-from talkcli.goals.options import MAX_BYTES, MAX_CHARACTERS, Say
+from talkcli.goals.options import MAX_TEXT_BYTES, MAX_TEXT_CHARS, Say, format_number
 from talkcli.goals.states import State
 from talkcli.polling import Interrupted, wait_ready
 from talkcli.protocol.events import Canceled, Result, unfinished
@@ -51,7 +50,7 @@ if TYPE_CHECKING:
 #: The size of one read: the capacity of a pipe.
 _STDIN_READ_BYTES = 65_536
 #: The longest text, with the end of its line.
-_MAX_STDIN_TEXT_BYTES = MAX_BYTES + len("\r\n")
+_MAX_STDIN_TEXT_BYTES = MAX_TEXT_BYTES + len("\r\n")
 #: How much input with a ttl is read before it can be sent.
 _MAX_BUFFERED_BYTES = 1_000_000
 #: How many goals may be pending without --ahead.
@@ -90,7 +89,7 @@ def read_text(end: float | None, *, wait: bool = False, whole: bool = False) -> 
                 return _decode(bytes(data))
             data += more or b""
         raise InputTooLong(
-            f"standard input has more than {MAX_BYTES:,} bytes, and a text at most {MAX_CHARACTERS:,} characters: "
+            f"standard input has more than {MAX_TEXT_BYTES:,} bytes, and a text at most {MAX_TEXT_CHARS:,} characters: "
             "'talk say --lines' speaks it line by line"
         )
     if interrupts.signal_number == signal.SIGINT:
@@ -123,7 +122,7 @@ class LineBuffer:
         """`ttl`: seconds from when a line was read; None for no limit."""
         self._ttl = ttl
         # The longest text, and the CR of a line that ends in CRLF.
-        self._splitter = LineSplitter(MAX_BYTES + 1)
+        self._splitter = LineSplitter(MAX_TEXT_BYTES + 1)
         #: chunks with the time at which each was read; they are split late, so that many short lines stay within 1 MB
         self._chunks: deque[tuple[float, bytes]] = deque()
         self._lines: deque[InputLine] = deque()
@@ -316,7 +315,7 @@ class LineSpeaker:
 
     def _send(self, line: InputLine) -> None:
         if line.excess:
-            words = f"the line has {line.excess:,} bytes, the longest text allowed has {MAX_BYTES:,}"
+            words = f"the line has {line.excess:,} bytes, the longest text allowed has {MAX_TEXT_BYTES:,}"
             self._refuse(line.number, rejected_goal(words))
             return
         self._sending = line.number
@@ -368,7 +367,7 @@ class LineSpeaker:
 
     def _drop(self, line: InputLine) -> None:
         """Report a line that was not sent within its ttl."""
-        words = f"line {line.number} was not sent: its ttl of {figure(self._ttl)} s is over"
+        words = f"line {line.number} was not sent: its ttl of {format_number(self._ttl)} s is over"
         goal = Goal("", State.RECALLED, text=line.text, reason="expired", message=words)
         code = self._show(self._reporter.report_refused, goal)
         if self._wait:

@@ -17,7 +17,7 @@ from talkcli.fleet import topics
 from talkcli.fleet.bridge.local import dial
 from talkcli.fleet.payloads import LastGoal, RobotStatus
 from talkcli.frozen import replace
-from talkcli.goals.option import MAX_LOG
+from talkcli.goals.options import MAX_LOG_GOALS
 from talkcli.goals.states import State
 from talkcli.protocol.events import PausedChanged, ServerStatus, StateChanged, from_json, goals, unfinished
 from talkcli.protocol.lines import decode, encode
@@ -95,7 +95,7 @@ class Publisher:
                 self._connection = await dial(self._sessions.socket, "talk bridge")
                 self._heard_at = self._loop.time()
                 # The log comes first, so that the goals of an earlier bridge are known.
-                self._connection.send(Exchange(Log(MAX_LOG), self._on_log, lambda _: self._watch()))
+                self._connection.send(Exchange(Log(MAX_LOG_GOALS), self._on_log, lambda _: self._watch()))
                 try:
                     while lines := await self._connection.read():
                         self._receive(lines)
