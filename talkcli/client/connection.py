@@ -39,6 +39,8 @@ else:
 _RECEIVE_BYTES = 256 * 1024
 #: Seconds between two attempts to reach a server that went away: the first pause, which doubles up to the second.
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.02, 0.5
+#: Portions that are taken in before a request is sent without waiting.
+_MAX_LOOKS = 4
 #: Seconds after which a thread without a connection looks whether another thread has made one.
 _LOOK_S = 0.1
 
@@ -282,8 +284,12 @@ class BlockingConnection(ClientCore):
                     self.changed.notify_all()
 
     def _look(self) -> None:
-        """Take in what has come, without waiting."""
-        self.wait_until(lambda: False, time.monotonic(), interruptible=False)
+        """Take in what has come, without waiting. The end of the connection may be behind it."""
+        for _ in range(_MAX_LOOKS):
+            heard = self._heard
+            self.wait_until(lambda: False, time.monotonic(), interruptible=False)
+            if heard == self._heard:
+                break
 
     # -- what each transport does in its own way
 
@@ -388,7 +394,7 @@ class SocketConnection(BlockingConnection):
             early, self._received_early = self._received_early, b""
             if early:
                 self._take_in(early, time.monotonic())
-                return
+                timeout = 0.0
             self._flush()
             connected = self._socket
             waits = bool(self.outgoing())
@@ -471,7 +477,10 @@ class ReconnectingConnection(SocketConnection):
             return super().begin(request, on_reply, on_failure, slow=slow)
 
     def post(self, request: Request) -> None:
-        self.submit(request, lambda *_: None, lambda _: None)
+        failures: list[TalkError] = []
+        self.submit(request, lambda *_: None, failures.append)
+        if failures and self.unsent_bytes:  # there is no room for it; after a break nothing waits
+            raise failures[0]
 
     def break_off(self, why: str, now: float) -> None:
         if self.ended is not None:

@@ -1,0 +1,357 @@
+"""The library without waiting, and across breaks: goals that are sent later or never, and a server that comes back."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import socket
+import subprocess
+import sys
+import threading
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli import Client, Result, Snapshot, State, StateChanged
+from talkcli.client.core import MAX_UNSENT_BYTES
+from talkcli.errors import Lost, ServerUnavailable, TalkError, UnknownGoal, UsageError
+from tests.support.connection import PATIENCE
+from tests.support.documents import README
+from tests.support.timing import assert_within, limits
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from talkcli import GoalHandle
+    from talkcli.protocol.events import Event
+    from tests.support.processes import Talk
+
+#: Seconds in which a call counts as one that does not wait.
+AT_ONCE_S = 0.05
+
+
+@pytest.fixture
+def client(scripted: Talk) -> Iterator[Client]:
+    with Client(scripted.socket) as result:
+        yield result
+
+
+def poll_until(handle: GoalHandle, done: Callable[[GoalHandle], bool], limit: float = PATIENCE) -> list[Event]:
+    """Poll a goal as a loop does, until something is true of it, and return its events."""
+    found: list[Event] = []
+    end = time.monotonic() + limit
+    while True:
+        began = time.monotonic()
+        event = handle.poll()
+        assert_within(time.monotonic() - began, AT_ONCE_S, "a poll")
+        if event:
+            found.append(event)
+        elif done(handle):
+            return found
+        else:
+            assert time.monotonic() < end, (handle.goal, found)
+            time.sleep(0.01)
+
+
+def ended(handle: GoalHandle) -> bool:
+    return handle.state.terminal
+
+
+def accepted(handle: GoalHandle) -> bool:
+    return handle.goal.queued_at is not None
+
+
+def cancel_often(handle: GoalHandle) -> None:
+    for _ in range(1_000):
+        handle.request_cancel()
+
+
+def cut(client: Client) -> None:
+    """Break the connection, while the server goes on."""
+    connection = client._connection
+    connection._socket.shutdown(socket.SHUT_RDWR)  # type: ignore[attr-defined]
+
+
+def restart(talk: Talk) -> None:
+    talk.kill()
+    talk.start_server()
+
+
+# Without waiting
+
+
+def test_goal_that_is_said_without_waiting_has_an_id_at_once(client: Client) -> None:
+    handle = client.say("length=0.1 one", feedback=True, block=False)
+    assert (handle.state, handle.goal.text) == (State.PENDING, "length=0.1 one")
+    assert handle.id.startswith("talk:")
+    own = client.say("length=0", id="mine", block=False)
+    assert own.id == "mine"
+    found = poll_until(handle, ended)
+    assert [type(each).__name__ for each in found] == [
+        *("StateChanged", "StateChanged", "WordHeard", "WordHeard", "StateChanged", "Result"),
+    ]
+    assert handle.state is State.SUCCEEDED
+    assert own.wait(PATIENCE).state is State.SUCCEEDED
+    assert client.goal(handle.id).text == "length=0.1 one"
+
+
+def test_goal_that_is_said_without_waiting_can_be_cancelled_at_once(client: Client, scripted: Talk) -> None:
+    handle = client.say("never-ends", block=False)
+    handle.request_cancel()
+    poll_until(handle, ended)
+    assert handle.state in {State.RECALLED, State.PREEMPTED}
+    assert client.say("never-ends", block=False).cancel().state in {State.RECALLED, State.PREEMPTED}
+    assert scripted.watcher.terminal_counts()[handle.id] == 1
+
+
+def test_goal_without_waiting_may_be_rejected_or_followed_by_nobody(client: Client) -> None:
+    handle = client.say("", block=False)
+    assert poll_until(handle, ended)[-1] == Result(handle.goal)
+    assert (handle.state, handle.goal.reason) == (State.REJECTED, "invalid_text")
+    with pytest.raises(UsageError, match="the rate 1000"):
+        client.say("a", rate=1000, block=False)
+    unheard = client.say("length=0", follow=False, block=False)
+    with pytest.raises(UsageError, match="follow=False"):
+        unheard.poll()
+    assert client.goal(unheard.id).text == "length=0"
+    client.close()
+    with pytest.raises(ServerUnavailable, match="closed"):
+        client.say("a", block=False)
+
+
+def test_frozen_server_makes_nobody_wait_and_takes_what_is_left_later(scripted: Talk) -> None:
+    """More is said than the socket holds: what is left is sent by later calls, as long as it may still be sent."""
+    text = "length=0 " + "a" * 8_000
+    with limits(), Client(scripted.socket, timeout=60) as client:
+        client.pause()
+        scripted.freeze()
+        handles: list[GoalHandle] = []
+        while len(handles) < 500 and not (handles and handles[-1].state.terminal):
+            began = time.monotonic()
+            handles.append(client.say(text, priority=len(handles), block=False))
+            assert_within(time.monotonic() - began, AT_ONCE_S, "a say that does not wait")
+        assert (handles[-1].state, handles[-1].goal.reason) == (State.REJECTED, "not_sent")
+        assert f"{MAX_UNSENT_BYTES >> 10} KiB" in (handles[-1].goal.message or "")
+        assert len(handles) > MAX_UNSENT_BYTES / len(text)
+        handles.pop()
+        with pytest.raises(ServerUnavailable, match="KiB"):
+            cancel_often(handles[0])
+        scripted.thaw()
+        for handle in handles:
+            poll_until(handle, lambda each: accepted(each) or ended(each))
+        client.cancel()
+        assert {each.wait(PATIENCE).state for each in handles} == {State.RECALLED}
+
+
+def test_frozen_server_loses_what_was_sent_in_time(scripted: Talk) -> None:
+    with Client(scripted.socket, timeout=0.5) as client:
+        scripted.freeze()
+        began = time.monotonic()
+        handle = client.say("length=0", block=False)
+        found = poll_until(handle, ended)
+        assert 0.5 <= time.monotonic() - began < 2
+        assert (found, handle.state, handle.goal.reason) == ([Result(handle.goal)], State.LOST, "lost")
+        with pytest.raises(Lost, match=r"within 0\.5 s"):
+            client.say("length=0")
+        scripted.thaw()
+        assert client.say("length=0").wait(PATIENCE).state is State.SUCCEEDED
+
+
+def test_partly_sent_goal_is_rejected_and_the_next_connection_is_a_new_one(scripted: Talk) -> None:
+    with Client(scripted.socket, timeout=0.5) as client:
+        followed = client.say("never-ends")
+        scripted.watcher.wait_for(followed.id, "ACTIVE")
+        scripted.freeze()
+        handles = [client.say("length=0 " + "a" * 9_900, block=False) for _ in range(40)]
+        for handle in handles:
+            poll_until(handle, ended)
+        assert [each.state for each in handles] == sorted((each.state for each in handles), key=State.LOST.__ne__)
+        assert {each.goal.reason for each in handles} == {"lost", "not_sent"}
+        scripted.thaw()
+        end = time.monotonic() + PATIENCE
+        while time.monotonic() < end:
+            try:
+                client.cancel()
+                break
+            except TalkError:
+                time.sleep(0.05)
+        assert followed.wait(PATIENCE).state in {State.PREEMPTED, State.LOST}
+
+
+# Across breaks
+
+
+def test_client_goes_on_with_the_next_server_and_its_goals_are_lost(client: Client, scripted: Talk) -> None:
+    active, pending = client.say("never-ends"), client.say("never-ends", block=False)
+    poll_until(pending, accepted)
+    number = active.id.partition("-")[2]
+    watch = client.events()
+    next(watch)
+    restart(scripted)
+    with pytest.raises(Lost, match="nothing more is heard"):
+        list(watch)
+    late = client.say("length=0", block=False)
+    for handle in (active, pending):
+        assert poll_until(handle, ended)[-1] == Result(handle.goal)
+        assert (handle.state, handle.goal.reason) == (State.LOST, "lost")
+    poll_until(late, ended)
+    assert late.state is State.SUCCEEDED
+    assert client.say("length=0").wait(PATIENCE).state is State.SUCCEEDED
+    with pytest.raises(UnknownGoal):
+        client.goal(number)
+    assert client.server_pid == scripted.pid
+
+
+def test_goals_of_the_same_server_are_followed_again(client: Client, scripted: Talk) -> None:
+    active = client.say("length=0.6 one two", feedback=True)
+    pending, ending = client.say("length=0"), client.say("length=0", priority=1)
+    with Client(scripted.socket) as other:
+        scripted.watcher.wait_for_word(active.id)
+        cut(client)
+        other.cancel([ending.id])
+        assert [each.state for each in (pending, ending)] == [State.PENDING] * 2
+        assert client.status().active
+        found = poll_until(active, ended)
+        states = [each.state for each in found if isinstance(each, StateChanged)]
+        assert states == [*dict.fromkeys(states)]
+        assert states[-1] is State.SUCCEEDED
+        assert (ending.wait(PATIENCE).state, pending.wait(PATIENCE).state) == (State.RECALLED, State.SUCCEEDED)
+
+
+def test_watching_goes_on_with_another_snapshot(client: Client, scripted: Talk) -> None:
+    watch = client.events(reconnect=True)
+    assert isinstance(next(watch), Snapshot)
+    cut(client)
+    assert isinstance(next(watch), Snapshot)
+    client.say("length=0", follow=False)
+    assert isinstance(next(watch), StateChanged)
+    seen: list[Event] = []
+    taking = threading.Thread(
+        target=lambda: seen.extend(itertools.takewhile(lambda each: not_of(each, "hello"), watch))
+    )
+    taking.start()
+    restart(scripted)
+    scripted.request("say", text="length=0 hello")
+    taking.join(PATIENCE)
+    assert not taking.is_alive()
+    assert Snapshot in {type(each) for each in seen}
+
+
+def not_of(event: Event, word: str) -> bool:
+    """Return whether an event is not the first of a goal with this word."""
+    return not (isinstance(event, StateChanged) and event.goal and word in (event.goal.text or ""))
+
+
+def test_calls_fail_at_once_while_there_is_no_server(client: Client, scripted: Talk) -> None:
+    scripted.kill()
+    with limits():
+        for act in (client.status, client.cancel, lambda: client.say("a"), client.log):
+            began = time.monotonic()
+            with pytest.raises(ServerUnavailable, match=r"no server|nothing was sent"):
+                act()
+            assert_within(time.monotonic() - began, AT_ONCE_S, "a call without a server")
+    time.sleep(1)  # the pause between two attempts is as long as it can be
+    scripted.start_server()
+    handle = client.say("length=0", block=False)
+    began = time.monotonic()
+    poll_until(handle, ended)
+    with limits():
+        assert_within(time.monotonic() - began, 0.8, "the end of a goal after the server's return")
+    assert handle.state is State.SUCCEEDED
+
+
+def test_cancel_connects_at_once(client: Client, scripted: Talk) -> None:
+    scripted.kill()
+    for _ in range(20):
+        with pytest.raises(ServerUnavailable):
+            client.cancel()
+    scripted.start_server()
+    assert client.cancel().canceled == ()
+
+
+def test_goal_without_a_server_is_rejected_in_time(scripted: Talk) -> None:
+    with Client(scripted.socket, timeout=0.5) as client:
+        scripted.kill()
+        began = time.monotonic()
+        handle = client.say("length=0", block=False)
+        handle.request_cancel()
+        poll_until(handle, ended)
+        assert 0.5 <= time.monotonic() - began < 2
+        assert (handle.state, handle.goal.reason) == (State.REJECTED, "not_sent")
+        assert "no server" in (handle.goal.message or "")
+
+
+@pytest.mark.parametrize("timeout", [0, -1, float("nan")])
+def test_timeout_must_be_positive(timeout: float) -> None:
+    with pytest.raises(UsageError, match="timeout"):
+        Client(timeout=timeout)
+
+
+# A robot's loop
+
+#: A robot that is blocked for all of its ride, except for a moment after it was heard; it notes how late it is.
+ROBOT = """
+import json
+import sys
+import time
+
+class Robot:
+    def __init__(self):
+        self.free_until = 0.0
+        self.due = time.monotonic()
+        self.end = self.due + float(sys.argv[1])
+        self.lateness = []
+
+    def drives(self):
+        self.due += 0.02
+        time.sleep(max(0.0, self.due - time.monotonic()))
+        self.lateness.append(time.monotonic() - self.due)
+        return time.monotonic() < self.end
+
+    @property
+    def blocked(self):
+        return time.monotonic() >= self.free_until
+
+    def wait_for_people(self):
+        self.free_until = time.monotonic() + 0.1
+
+    def move_lips(self, word):
+        pass
+
+    def flash_lights(self):
+        pass
+
+robot = Robot()
+{loop}
+print(json.dumps(robot.lateness))
+"""
+
+
+def test_loop_of_the_readme_is_never_late_and_speaks_again(scripted: Talk) -> None:
+    """The server is stopped for 7 s and killed once, beside the same loop without `talk`."""
+    (example,) = [each for each in README.examples("python", "A tour") if "robot.drives" in each]
+    programs = [ROBOT.format(loop=example), ROBOT.format(loop="while robot.drives():\n    pass")]
+    with limits():
+        loops = [
+            subprocess.Popen([sys.executable, "-c", each, "14"], env=scripted.env, stdout=subprocess.PIPE)
+            for each in programs
+        ]
+        scripted.watcher.wait_for(None, "SUCCEEDED")
+        scripted.freeze()
+        time.sleep(7)
+        scripted.thaw()
+        back = time.monotonic()
+        seen = len(scripted.watcher.events())
+        while not any(each.get("state") == "ACTIVE" for each in scripted.watcher.events()[seen:]):
+            time.sleep(0.01)
+            assert time.monotonic() - back < PATIENCE
+        assert_within(time.monotonic() - back, 1.0, "speaking again after the stop")
+        restart(scripted)
+        back = time.monotonic()
+        scripted.watcher.wait_for(None, "ACTIVE")
+        assert_within(time.monotonic() - back, 1.0, "speaking again after the restart")
+        with_talk, without = (max(json.loads(each.communicate(timeout=30)[0])) for each in loops)
+        assert [each.returncode for each in loops] == [0, 0]
+        assert_within(with_talk, without + 0.02, "the latest iteration of a loop with talk")
+    scripted.unfinished = True
