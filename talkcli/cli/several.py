@@ -12,16 +12,7 @@ from typing import TYPE_CHECKING
 from talkcli import paths
 from talkcli.cli.command import replace_bad_bytes
 from talkcli.cli.interrupts import Interrupts, discard_unread_output
-from talkcli.cli.show import (
-    discard_output,
-    note,
-    reader_is_gone,
-    retry_without_output,
-    show,
-    show_error,
-    show_if_possible,
-    show_json,
-)
+from talkcli.cli.show import note, retry_without_output, show, show_error, show_if_possible, show_json
 from talkcli.cli.wait import CANCEL_TIMEOUT_S, seconds_left, timeout_error
 from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.errors import EXIT_DIFFER, EXIT_OK, EXIT_TIMEOUT, TalkError, UsageError
@@ -52,14 +43,13 @@ def say(
     **chosen: Any,
 ) -> int:
     """Speak a text at each robot, and return the exit code. The arguments are those of `say.say`."""
-    end = None if timeout is None else options.started_at + timeout
     discard_unread_output()
     sentence = " ".join(text)
     if text == ("-",):
         from talkcli.cli.stdin import InputTooLong, read_text
 
         try:
-            read = read_text(end, wait=wait)
+            read = read_text(options.deadline(timeout), wait=wait)
         except InputTooLong as error:
             raise UsageError(str(error)) from error
         if isinstance(read, int):
@@ -112,7 +102,6 @@ def _ask(options: CommonOptions, request: Request, timeout: float | None = None,
         name: what the sender calls itself.
     """
     owns_goals = isinstance(request, Say) and request.wait
-    end = None if timeout is None else options.started_at + timeout
     printer = _OutcomePrinter(options, request)
     with Interrupts(output=owns_goals or isinstance(request, Wait)) as interrupts:
         broker = options.broker()
@@ -126,19 +115,12 @@ def _ask(options: CommonOptions, request: Request, timeout: float | None = None,
         ) as asked:
             is_late = False
             try:
-                printer.show_outcomes(asked, seconds_left(end))
-            except TimeoutError:
-                is_late = True
+                printer.show_outcomes(asked, seconds_left(options.deadline(timeout)))
             except (Interrupted, OSError) as error:
-                if isinstance(error, OSError):
-                    if not reader_is_gone(error):
-                        raise
-                    interrupts.reader_gone = True
-                interrupts.check_reader()
+                interrupts.record(error)
+                is_late = isinstance(error, TimeoutError)
             if not (is_late or interrupts.reader_gone or interrupts.signal_number is not None):
                 return printer.summarize(asked)
-            if interrupts.reader_gone:
-                discard_output()
             if owns_goals:
                 _cancel(asked, interrupts, printer)
             if is_late:
