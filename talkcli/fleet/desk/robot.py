@@ -311,6 +311,8 @@ class RobotConnection(BlockingConnection):
 
     def _resend(self, exchange: RobotExchange) -> None:
         """Send a request again, or fail it if its time is over or too many attempts have failed."""
+        if exchange.number not in self.exchanges:
+            return  # the sender waits no more, and knows that the goal may be lost
         request = exchange.request
         left = 0.0 if exchange.latest is None else exchange.latest - boottime()
         exchange.resends += 1
