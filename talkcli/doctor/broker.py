@@ -45,7 +45,7 @@ _Result = TypeVar("_Result")
 #: Time limit of each step. The broker must answer within `LOGIN_LIMIT_S`, but looking up its host may take longer.
 _STEP_LIMIT_S = 2 * LOGIN_LIMIT_S
 #: Time in which a message must come back after the broker has acknowledged it.
-_ECHO_LIMIT_S = 1.0
+_ECHO_RETURN_LIMIT_S = 1.0
 #: Content of the message that should come back. It differs from the echoes of a bridge.
 _ECHO_PAYLOAD = b"doctor"
 #: A certificate that expires within this time should be renewed.
@@ -223,7 +223,7 @@ class BrokerExamination:
             self._inbox.clear()
             now = time.monotonic()
             if not is_acknowledged and len(codes) == len(tested):
-                is_acknowledged, end = True, min(end, now + _ECHO_LIMIT_S)
+                is_acknowledged, end = True, min(end, now + _ECHO_RETURN_LIMIT_S)
         unwritten = tuple(each for each in tested if codes.get(each) == REASON_NOT_AUTHORIZED)
         missing = [each for each in tested if each not in codes]
         trouble = link.ended or (f"it has acknowledged nothing of {missing[0]}" if missing else None)

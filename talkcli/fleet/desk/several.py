@@ -87,9 +87,7 @@ class FleetRequest:
             raise UsageError(selection.fault)
         _check_request(request)
         self._selection, self._name, self._interrupt, self._patience = selection, name, interrupt, patience
-        self._presences: dict[str, Presence] = {}
-        self._connections: dict[str, RobotConnection] = {}
-        #: the robots that the request is for, by name
+        #: the known robots, by name; some may be too late for the request
         self._robots: dict[str, RobotRequest] = {}
         #: names of the robots that have more outcomes to come
         self._open: set[str] = set()
@@ -127,7 +125,7 @@ class FleetRequest:
 
     def __len__(self) -> int:
         """Return the number of selected robots that are known by now, also of those that can't be asked."""
-        return len(self._robots)
+        return sum(each.is_included for each in self._robots.values())
 
     @property
     def open(self) -> list[str]:
@@ -173,7 +171,7 @@ class FleetRequest:
             if time.monotonic() >= next_check:
                 self._check_all()
                 next_check = time.monotonic() + _CHECK_INTERVAL_S
-        if not self._robots:
+        if not len(self):
             raise self._nobody()
 
     def cancel(self) -> None:
@@ -194,9 +192,9 @@ class FleetRequest:
             self._desk.send(Cancel((goal_id,)), next(self._numbers), group, self._on_refused, is_group=True)
         for name in self._open:
             # A robot that has left the group doesn't receive the message to the group.
-            presence = self._presences.get(name)
-            is_sent = group is not None and presence is not None and self._selection.includes(presence)
-            self._robots[name].connection.cancel_lastingly(goal_id, is_sent=is_sent)
+            robot = self._robots[name]
+            is_sent = group is not None and robot.presence is not None and self._selection.includes(robot.presence)
+            robot.connection.cancel_lastingly(goal_id, is_sent=is_sent)
 
     def close(self) -> None:
         """End the connection to the broker. The robots carry the request out all the same."""
@@ -219,9 +217,9 @@ class FleetRequest:
             self._desk.send(self.request, self._number, group, self._on_refused, is_group=True)
             if self._refused is not None:
                 raise self._refused
-        for each in list(self._presences.values()):
-            if self._selection.includes(each):
-                self._on_presence(each)
+        for robot in list(self._robots.values()):
+            if robot.presence and self._selection.includes(robot.presence):
+                self._on_presence(robot, robot.presence)
 
     def _on_refused(self, error: TalkError) -> None:
         self._refused = error
@@ -254,8 +252,8 @@ class FleetRequest:
     def on_disconnected(self, why: str) -> None:
         """Treat all robots as absent, and accept no more: the broker may be back too late to tell of them."""
         self._complete = self._complete or self._began
-        for each in self._connections.values():
-            each.on_disconnected(why)
+        for each in self._robots.values():
+            each.connection.on_disconnected(why)
 
     def on_message(self, message: Message) -> None:
         """Process a robot's presence, or lines from its server."""
@@ -266,13 +264,14 @@ class FleetRequest:
         presence = Presence.read(name, message.payload)
         if presence is None:
             return  # cleared or malformed
-        self._presences[name] = presence
-        if name in self._connections or self._selection.includes(presence):
-            self._connection(name).on_message(message)
+        if name in self._robots or self._selection.includes(presence):
+            robot = self._robot(name)
+            robot.presence = presence
+            robot.connection.on_message(message)
             if self._began:
-                self._on_presence(presence)
+                self._on_presence(robot, presence)
 
-    def _on_presence(self, presence: Presence) -> None:
+    def _on_presence(self, robot: RobotRequest, presence: Presence) -> None:
         """Send the request to a robot that has just become known, if that is possible.
 
         Once the retained messages are there, other robots are ignored: they came online too late. Before that, each
@@ -280,12 +279,12 @@ class FleetRequest:
         from the others, because some brokers send all retained messages late.
         """
         name = presence.name
-        if name in self._robots:
+        if robot.is_included:
             self._update(name)
             return
         if self._complete:
             return
-        robot = self._add(name)
+        self._include(robot, name)
         if (goal := self._rejected) is not None:
             self._take([Outcome(name, goal.state.name, goal.exit_code or EXIT_OK, goal)])
         elif not presence.online:
@@ -303,29 +302,28 @@ class FleetRequest:
         """Process a robot's lines. A robot that answers a group's request is a member, even if it seemed absent."""
         if topics.name_fault(name) or not self._began:
             return
-        robot = self._robots.get(name)
-        if self._selection.group is not None and not (robot and robot.was_asked):
-            robot = self._add(name)
+        robot = self._robot(name)
+        if self._selection.group is not None and not robot.was_asked:
+            self._include(robot, name)
             robot.expect(self._number, self._latest)
             if self._canceled and isinstance(self.request, Say):
                 robot.connection.cancel_lastingly(str(self.request.id), is_sent=False)
-        if robot:
-            robot.connection.on_message(message)
-            self._update(name)
+        robot.connection.on_message(message)
+        self._update(name)
 
-    def _connection(self, name: str) -> RobotConnection:
-        """Return the connection to a robot. The first call creates it."""
-        if name not in self._connections:
-            self._connections[name] = RobotConnection(
+    def _robot(self, name: str) -> RobotRequest:
+        """Return the request's part for a robot. The first call creates it."""
+        if name not in self._robots:
+            connection = RobotConnection(
                 name, self._desk, name=self._name, patience=self._patience, numbers=self._numbers
             )
-        return self._connections[name]
+            self._robots[name] = RobotRequest(connection, name, self.request)
+        return self._robots[name]
 
-    def _add(self, name: str) -> RobotRequest:
-        """Add a robot that the request is for."""
-        robot = self._robots[name] = RobotRequest(self._connection(name), name, self.request)
+    def _include(self, robot: RobotRequest, name: str) -> None:
+        """Include a robot among those that the request is for."""
+        robot.is_included = True
         self._open.add(name)
-        return robot
 
     def _update(self, name: str, *, check_time: bool = False) -> None:
         """Collect a robot's new outcomes."""
@@ -342,8 +340,10 @@ class RobotRequest:
 
     def __init__(self, connection: RobotConnection, name: str, request: Request) -> None:
         self.connection = connection
-        #: whether the request has been sent to the robot
-        self.was_asked = False
+        #: the robot's last presence; None if unknown
+        self.presence: Presence | None = None
+        #: whether the request is for this robot; whether it has been sent to it
+        self.is_included = self.was_asked = False
         self._name, self._request = name, request
         #: whether the answer may take any time
         self._slow = isinstance(request, Pause) or (isinstance(request, Say) and request.patient)
