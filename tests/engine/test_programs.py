@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import wave
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING
 
 import pytest
@@ -42,6 +43,16 @@ def test_the_players_that_are_there_are_tried_and_the_one_that_worked_comes_firs
     assert _names("pacat", "aplay") == ["pacat"]
     there({"pacat"})
     assert _names(None) == ["pacat"]
+
+
+def test_the_automatic_choice_has_the_players_whose_rows_say_so_and_programs_come_last(there: There) -> None:
+    there({*PACKAGES})
+    tried = []
+    for opens in PlayerChooser(protocol.Configure(0, None, None, None, None)).candidates(22050):
+        assert isinstance(opens, partial)
+        tried.append(opens.args[0] if isinstance(opens.args[0], str) else opens.args[0].name)
+    automatic = [name for name, each in PLAYERS.items() if each.automatic]
+    assert tried == sorted(automatic, key=PACKAGES.__contains__)
 
 
 @pytest.mark.parametrize(

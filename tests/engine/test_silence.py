@@ -190,7 +190,7 @@ def _all_played(rate: int = FAST) -> list[bytes]:
 
 def _changed(gap: HandoverTimes, took: float, player: str = "aplay", *, neural: bool = False) -> None:
     """Have one sentence follow another after so many seconds."""
-    gap.followed = True
+    gap.next_waits = True
     gap.sentence_ended(player, 100.0)
     gap.sentence_started(player, 100.0 + took, neural=neural)
 
@@ -229,7 +229,7 @@ def test_the_longer_change_to_a_neural_voice_counts_for_neural_voices_alone() ->
     _changed(gap, 0.03)
     _changed(gap, 0.1, neural=True)
     assert gap.silence_to_cut("aplay") == pytest.approx(0.03)
-    gap.by_neural = True
+    gap.next_is_neural = True
     assert gap.silence_to_cut("aplay") == pytest.approx(0.1)
 
 

@@ -191,12 +191,12 @@ class Tape:
     def loudest(self) -> int:
         return max(map(abs, array("h", bytes(self.samples))), default=0)
 
-    def begin(self, rate: int, voice: str, why: str | None = None) -> None:
+    def begin(self, rate: int, voice: str, fallback_reason: str | None = None) -> None:
         self._called("begin")
         assert not [*self.words, *self.samples], "the rate comes first"
         assert rate > 0
         assert voice
-        assert why is None, "the voice that was asked for speaks"
+        assert fallback_reason is None, "the voice that was asked for speaks"
         self.rate = rate
 
     def word(self, start: int, length: int, position: float) -> None:

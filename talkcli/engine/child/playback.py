@@ -115,7 +115,7 @@ class Playback:
 
     # -- methods for the synthesizer
 
-    def begin(self, rate: int, voice: str, why: str | None = None) -> None:
+    def begin(self, rate: int, voice: str, fallback_reason: str | None = None) -> None:
         """Set the samples per second and the voice, and start a player.
 
         The player takes 1 to 15 ms to start, while the first samples are made. Its errors are raised by `write`.
@@ -123,7 +123,7 @@ class Playback:
         if self._feed is not None and rate != self._rate:
             self._release_player(0)  # it was started for another rate
         self._rate = rate
-        self._runner.report_voice(voice, why)
+        self._runner.report_voice(voice, fallback_reason)
         if self._players.takes_time and not self._runner.hold_number:
             try:
                 self._with_player(lambda _: None)
@@ -359,7 +359,7 @@ class Playback:
 
     def _audible_end(self, feed: PlayerFeed) -> int:
         """Return the end of the samples to play. Some silence is left out if a goal waits, or may still come."""
-        if not feed.player.real_time or (self._complete and not self._players.handovers.followed):
+        if not feed.player.real_time or (self._complete and not self._players.handovers.next_waits):
             return self._samples.end
         limit = int(self._players.handovers.silence_to_cut(feed.player.name) * self._rate) * SAMPLE_BYTES
         return max(self._sent, self._samples.end - self._samples.trailing_silence(limit))

@@ -223,7 +223,7 @@ class GoalRunner:
         elif isinstance(command, protocol.Stop):
             self._stop_goal()
         elif isinstance(command, protocol.NextGoal):
-            self.players.handovers.followed, self.players.handovers.by_neural = (
+            self.players.handovers.next_waits, self.players.handovers.next_is_neural = (
                 command.next_waits,
                 command.next_is_neural,
             )

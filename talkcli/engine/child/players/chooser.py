@@ -1,4 +1,4 @@
-"""The choice of a player for each sentence, as `--player` and `--device` say.
+"""The choice of a player for each sentence, as `--player` and `--device` command.
 
 No player stays open between two sentences. If a player fails, the playback decides whether the next one is tried.
 """
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from talkcli.engine.protocol import Configure, Speak
     from talkcli.goals.goal import Output
 
-#: The automatic players that are not programs; they are tried first.
+#: The automatic players that run in this process instead of a program; they are tried first.
 _AUTOMATIC = [name for name, each in PLAYERS.items() if each.automatic and each.opens]
 
 #: Seconds without sound after which a device counts as idle, so the next sentence starts with the lead-in. Sound cards
@@ -57,7 +57,7 @@ class HandoverTimes:
 
     def __init__(self) -> None:
         #: whether another goal waits behind the current one, and whether that one needs a neural voice
-        self.followed = self.by_neural = False
+        self.next_waits = self.next_is_neural = False
         self._measured: dict[tuple[str, bool], deque[float]] = {}
         #: the previous sentence's player and the time of its last sample; None if no goal waited behind it
         self._previous: tuple[str, float] | None = None
@@ -69,12 +69,12 @@ class HandoverTimes:
 
     def silence_to_cut(self, player: str) -> float:
         """Return the seconds of silence to cut from the end of a sentence of this player."""
-        measured = sorted(self._measured.get((player, self.by_neural), ()))
+        measured = sorted(self._measured.get((player, self.next_is_neural), ()))
         return min(MAX_CUT_S, measured[len(measured) // 2]) if measured else 0.0
 
     def sentence_ended(self, player: str, last_sample_at: float) -> None:
         """Record the end of a sentence that was played completely."""
-        self._previous = (player, last_sample_at) if self.followed else None
+        self._previous = (player, last_sample_at) if self.next_waits else None
 
     def sentence_started(self, player: str, at: float, *, neural: bool = False) -> None:
         """Record the time at which the player of a new sentence took its first sample."""
@@ -94,10 +94,14 @@ class PlayerChooser:
     def __init__(self, configure: Configure, inherited: Sequence[int] = ()) -> None:
         self._configure = configure
         self._inherited = inherited
-        self._open_fixed = self._fixed_player()
         #: whether playing takes as long as the sound lasts; only files are faster
         self.takes_time = configure.output_fd is None and not (configure.player or "").startswith(FILE_PREFIX)
-        self._automatic = _AUTOMATIC if configure.player is configure.device is None else []
+        #: the names of the players to try that run in this process
+        self._in_process: Sequence[str] = ()
+        if configure.player is configure.device is None:
+            self._in_process = _AUTOMATIC
+        elif configure.player in PLAYERS and PLAYERS[configure.player].opens:
+            self._in_process = [configure.player]
         self._streaming = False
         self.handovers = HandoverTimes()
         #: the current sentence's output; None if it isn't known
@@ -117,23 +121,26 @@ class PlayerChooser:
 
         Programs are searched for only when the caller asks for them.
         """
-        if self._open_fixed is not None:
-            yield partial(self._open_fixed, rate)
+        player, device = self._configure.player, self._configure.device
+        if not self.takes_time:
+            yield partial(self._open_file, rate)
             return
-        yield from (partial(_open, name, rate, None, self._audible) for name in self._automatic)
+        yield from (partial(_open, name, rate, device, self._audible) for name in self._in_process)
+        if player in self._in_process:
+            return
         try:
-            found = player_commands(self._configure.player, self._configure.device, rate, self.worked)
+            found = player_commands(player, device, rate, self.worked)
         except PlayerMissing as error:
             yield partial(_fail, CannotSpeak(Reason.NO_PLAYER, str(error)))
             return
         yield from (partial(ProgramPlayer, command, self._inherited) for command in found)
 
-    def begin(self, say: Speak) -> None:
+    def begin(self, command: Speak) -> None:
         """Prepare for a new sentence."""
-        self._own_lead_in = say.lead_in
-        self._audible = self._configure.audible if say.audible is None else say.audible
+        self._own_lead_in = command.lead_in
+        self._audible = self._configure.audible if command.audible is None else command.audible
         self.output = self.chosen = None
-        self.handovers.followed, self.handovers.by_neural = say.next_waits, say.next_is_neural
+        self.handovers.next_waits, self.handovers.next_is_neural = command.next_waits, command.next_is_neural
 
     def update_output(self, player: Player) -> None:
         """Record where the current sentence is played; once it was muted, it counts as muted to its end."""
@@ -169,7 +176,7 @@ class PlayerChooser:
             return WavStreamPlayer.name
         if self._configure.player is not None:
             return self._configure.player
-        for name in self._automatic:
+        for name in self._in_process:
             with contextlib.suppress(CannotSpeak):
                 _open(name, 1).kill()
                 return name
@@ -178,20 +185,11 @@ class PlayerChooser:
         except PlayerMissing:
             return None
 
-    def _fixed_player(self) -> Callable[[int], Player] | None:
-        """Return a function that opens the configured player for a sample rate; None if the player is a program."""
-        player, output = self._configure.player or "", self._configure.output_fd
-        if output is not None:
-            return partial(self._open_stream, output)
-        if player.startswith(FILE_PREFIX):
-            return partial(WavPlayer, player.removeprefix(FILE_PREFIX))
-        if player in PLAYERS and PLAYERS[player].opens:
-            return lambda rate: _open(player, rate, self._configure.device, self._audible)
-        return None
-
-    def _open_stream(self, output: int, rate: int) -> WavStreamPlayer:
+    def _open_file(self, rate: int) -> Player:
+        if self._configure.output_fd is None:
+            return WavPlayer((self._configure.player or "").removeprefix(FILE_PREFIX), rate)
         first, self._streaming = not self._streaming, True
-        return WavStreamPlayer(output, rate, first=first)
+        return WavStreamPlayer(self._configure.output_fd, rate, first=first)
 
 
 def _open(name: str, rate: int, device: str | None = None, audible: bool = False) -> Player:

@@ -37,7 +37,7 @@ class SampleSink(Protocol):
     CannotSpeak if it can't be played. After that, the sink must not be called again.
     """
 
-    def begin(self, rate: int, voice: str, why: str | None = None) -> None:
+    def begin(self, rate: int, voice: str, fallback_reason: str | None = None) -> None:
         """Announce the sample rate and the voice, before anything else.
 
         It may be called again with corrections as long as there are no words and no samples.
@@ -45,7 +45,7 @@ class SampleSink(Protocol):
         Args:
             rate: Samples per second.
             voice: The id of the voice that speaks.
-            why: Why this is not the voice that was asked for, for people.
+            fallback_reason: Why this is not the voice that was asked for, for people.
         """
 
     def word(self, start: int, length: int, position: float) -> None:

@@ -93,17 +93,17 @@ class _WatchedSink:
 
     Args:
         sink: The sink that gets the sentence.
-        why: Why another voice speaks than was asked for, for people.
+        fallback_reason: Why another voice speaks than was asked for, for people.
     """
 
-    def __init__(self, sink: SampleSink, why: str | None = None) -> None:
+    def __init__(self, sink: SampleSink, fallback_reason: str | None = None) -> None:
         self._sink = sink
-        self._why = why
+        self._fallback_reason = fallback_reason
         self.used = False
         self.wait = sink.wait
 
-    def begin(self, rate: int, voice: str, why: str | None = None) -> None:
-        self._sink.begin(rate, voice, why or self._why)
+    def begin(self, rate: int, voice: str, fallback_reason: str | None = None) -> None:
+        self._sink.begin(rate, voice, fallback_reason or self._fallback_reason)
 
     def word(self, start: int, length: int, position: float) -> None:
         self.used = True
