@@ -69,12 +69,10 @@ def start(configure: Configure, runner: GoalRunner) -> Ready:
         unknown = error.reason == Reason.UNKNOWN_VOICE
         raise CannotStart(str(error), error.reason, permanent=unknown, usage_error=unknown) from error
     runner.attach_engine(engine, properties.apply, None if own else _pump(name), synthesizer)
-    return Ready(
-        driver,
-        version=synthesizer.version if synthesizer else None,
-        player=runner.players.first_player() if own else None,
-        voice=voice if is_neural(voice) else None,
-    )
+    neural_voice = voice if is_neural(voice) else None
+    if synthesizer is None:
+        return Ready(driver, None, None, neural_voice)
+    return Ready(driver, synthesizer.version, runner.players.first_player(), neural_voice)
 
 
 def _register_own(synthesizer_name: str, driver_name: str, runner: GoalRunner) -> CombinedSynthesizer:

@@ -338,10 +338,8 @@ class Supervisor:
         if self._process and not self._process.ready:
             yield self._started_at + START_LIMIT_S, f"the engine was not ready after {START_LIMIT_S:g} s"
         if goal and goal.stop_sent_at is not None:
-            yield (
-                goal.stop_sent_at + STOP_LIMIT_S,
-                f"the engine did not confirm a stop within {STOP_LIMIT_S * 1000:.0f} ms",
-            )
+            limit_ms = STOP_LIMIT_S * 1000
+            yield goal.stop_sent_at + STOP_LIMIT_S, f"the engine did not confirm a stop within {limit_ms:.0f} ms"
         if goal and goal.last_sign_at is not None:
             yield goal.last_sign_at + HANG_LIMIT_S, no_sign
         if self._loading is not None:
@@ -361,9 +359,8 @@ class Supervisor:
             process.gone_by = NEVER  # checked once; it is reaped whenever it goes
             process.kill()  # finds processes that the first kill may have missed for lack of a descriptor
             if self._goal and self._goal.lost_process is process:
-                self._fail_goal(
-                    self._goal, Reason.NOT_SILENT, f"the player could not be ended within {KILL_LIMIT_S:g} s"
-                )
+                message = f"the player could not be ended within {KILL_LIMIT_S:g} s"
+                self._fail_goal(self._goal, Reason.NOT_SILENT, message)
 
     def _handle_ready(self, key: selectors.SelectorKey) -> None:
         if key.fd not in self._selector.get_map():
