@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import protocol
-from talkcli.engine.child.feed import MAX_QUIET_LEVEL, SentenceSamples
+from talkcli.engine.child.playback import MAX_QUIET_LEVEL, SentenceSamples
 from talkcli.engine.child.players import chooser
 from talkcli.engine.child.players.chooser import MAX_CUT_S, MAX_HANDOVER_S, MAX_HANDOVERS, HandoverTimes
 from tests.engine.programs import SWALLOWS, Player
@@ -288,7 +288,7 @@ def test_a_goal_that_waits_counts_if_it_does_at_the_end_of_a_sentence(player: Pl
 
 
 def test_no_sample_that_is_sound_is_left_out(player: Player) -> None:
-    louder_than_nothing = f"{_SAYS_SO}\nfrom talkcli.engine.child import feed\nfeed.MAX_QUIET_LEVEL = -1"
+    louder_than_nothing = f"{_SAYS_SO}\nfrom talkcli.engine.child import playback\nplayback.MAX_QUIET_LEVEL = -1"
     with Spawned(player.plays(), before=louder_than_nothing) as engine:
         assert engine.spoken(TEXTS[0], next_waits=True).outcome == protocol.OUTCOME_COMPLETED
     assert player.heard.read_bytes() == _all_played()[0]
