@@ -1,81 +1,66 @@
-"""The library over a connection that is no socket, but has the interface of a connection."""
+"""The library over a transport that is no socket."""
 
 from __future__ import annotations
 
-import threading
-from typing import TYPE_CHECKING, Any
+import time
+from typing import TYPE_CHECKING
 
 import pytest
 
 from talkcli import Client, State
-from talkcli.client.core import EventListeners
+from talkcli.client.connection import Connection
 from talkcli.client.goal import GoalHandle, merged
 from talkcli.errors import Lost, ServerUnavailable
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import Cancel, Say
 from talkcli.protocol.events import Result, StateChanged
+from talkcli.protocol.lines import encode
 from talkcli.protocol.requests import Log, Status, Wait, Watch
+from tests.support.connection import PATIENCE
 from tests.support.scripted_peer import goal, result
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from talkcli.client.connection import Connection
-    from talkcli.client.core import OnFailure, OnReply
+    from talkcli.client.core import Exchange
     from talkcli.goals.goal import JsonObject
     from talkcli.protocol.requests import Request
 
 
-class Scripted:
+class Scripted(Connection):
     """A server that accepts every goal, and speaks while a client waits."""
 
     def __init__(self) -> None:
+        super().__init__(PATIENCE)
         self.path, self.boot = "nowhere", "fake"
-        self.pid: int | None = None
-        self.listener: int | None = None
-        self.changed = threading.Condition()
-        self.listeners = EventListeners()
-        self.ended: str | None = None
         self.asked: list[Request] = []
         #: events that the next wait receives
         self.coming: list[JsonObject] = []
 
-    def request(
-        self, request: Request, on_reply: OnReply | None = None, *, slow: bool = False
-    ) -> tuple[JsonObject, list[JsonObject]]:
+    def _send(self, exchange: Exchange) -> None:
         if self.ended:
             raise ServerUnavailable(self.ended)
-        self.asked.append(request)
-        reply: JsonObject = {"ok": True, "server": {}, "active": None, "goal": goal("PENDING"), "slow": slow}
-        items: list[JsonObject] = []
-        if isinstance(request, Cancel):
-            items = [{"canceled": goal("RECALLED")}]
-        elif isinstance(request, Wait | Log):
-            items = [{"goal": goal("ACTIVE")}]
-        if on_reply:
-            with self.changed:
-                on_reply(reply, items)
-        return reply, items
+        self.asked.append(exchange.request)
+        exchange.sent = True
+        if isinstance(exchange.request, Cancel):
+            self._answer(exchange, canceled=goal("RECALLED"))
+        elif isinstance(exchange.request, Wait | Log):
+            self._answer(exchange, goal=goal("ACTIVE"))
+        self._answer(exchange, ok=True, server={}, active=None, goal=goal("PENDING"))
 
-    def submit(self, request: Request, on_reply: OnReply, on_failure: OnFailure) -> None:  # noqa: ARG002
-        reply, items = self.request(request)
+    def _answer(self, exchange: Exchange, **fields: object) -> None:
+        self.receive(encode({"seq": exchange.number, **fields}), time.monotonic())
+
+    def _step(self, timeout: float, interruptible: bool) -> None:  # noqa: ARG002 - nothing takes time here
         with self.changed:
-            on_reply(reply, items)
-
-    def post(self, request: Request) -> None:
-        self.asked.append(request)
-
-    def wait_until(self, done: Callable[[], bool], *_: Any, **__: Any) -> bool:
-        with self.changed:  # nothing takes time here
-            while not done():
-                if not self.coming:
-                    self.ended = self.ended or "that was all"
-                    return False
+            if self.coming:
                 self.listeners.hear(self.coming.pop(0))
-        return True
+            elif timeout > 0:
+                self.end("that was all")
 
-    def close(self) -> None:
-        self.ended = self.ended or "the connection was closed"
+    def _hang_up(self) -> None:
+        pass
+
+    def _drop(self) -> None:
+        pass
 
 
 @pytest.fixture
@@ -106,12 +91,11 @@ def test_a_number_is_a_goal_of_the_server_that_was_reached(scripted: Scripted) -
 
 
 def test_a_handle_needs_no_client(scripted: Scripted) -> None:
-    connection: Connection = scripted
-    handle = GoalHandle(connection, Goal("g", State.PENDING))
+    handle = GoalHandle(scripted, Goal("g", State.PENDING))
     handle.request_cancel()
     assert handle.cancel().state is State.RECALLED
     assert scripted.asked == [Cancel(("g",)), Cancel(("g",))]
-    late = GoalHandle(connection, Goal("g", State.PENDING))
+    late = GoalHandle(scripted, Goal("g", State.PENDING))
     late.events()
     assert late.state is State.ACTIVE, "as the server says that it is by now"
     scripted.coming = [result()]

@@ -26,7 +26,7 @@ from talkcli.cli.show import (
     write_error_line,
 )
 from talkcli.cli.wait import CANCEL_TIMEOUT_S, GoalReporter, seconds_left, timeout_error
-from talkcli.client.connection import BlockingConnection
+from talkcli.client.connection import Connection
 from talkcli.errors import EXIT_OK, ServerUnavailable, TalkError, TimedOut, UnknownGoal, UsageError
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.goal import Goal
@@ -235,7 +235,7 @@ class LineSpeaker:
                 interrupts,
                 self._options.connect(self._timeout, name=self._name, interrupt=interrupts.watched) as client,
             ):
-                assert isinstance(client._connection, BlockingConnection)
+                assert isinstance(client._connection, Connection)
                 self._client, self._connection = client, client._connection
                 return self._speak()
         finally:

@@ -1,7 +1,7 @@
 """Blocking connections to a server: shells around the client core, for any number of threads.
 
-`Connection` is the interface that the rest of the library uses, whatever the transport is. `SocketConnection` is a
-connection over a Unix socket. `ReconnectingConnection` is one that connects again after a break.
+`Connection` is what the rest of the library uses, whatever the transport is. `SocketConnection` is a connection over a
+Unix socket. `ReconnectingConnection` is one that connects again after a break.
 """
 
 from __future__ import annotations
@@ -24,16 +24,14 @@ from talkcli.protocol.lines import request_line
 if TYPE_CHECKING:
     import _socket
     from collections.abc import Callable, Iterator, Mapping
-    from typing import Protocol, TypeVar
+    from typing import TypeVar
 
     from talkcli.client.connect import ConnectionAttempt
-    from talkcli.client.core import EventListeners, OnFailure, OnReply
+    from talkcli.client.core import OnFailure, OnReply
     from talkcli.goals.goal import JsonObject
     from talkcli.protocol.requests import Request
 
     _T = TypeVar("_T")
-else:
-    Protocol = object
 
 #: Bytes that are received at once.
 _RECEIVE_BYTES = 256 * 1024
@@ -43,95 +41,6 @@ _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.02, 0.5
 _MAX_LOOKS = 4
 #: Seconds after which a thread without a connection looks whether another thread has made one.
 _LOOK_S = 0.1
-
-
-class Connection(Protocol):
-    """A connection to one server that has greeted. Any number of threads use it.
-
-    The server carries out each request once or not at all, in the order in which they were sent. Nothing that could
-    have an effect is sent twice, except a goal with its id, which is not spoken twice. Replies and events are taken in
-    in the server's order, under `changed` and under it alone, so that a wait whose `done` looks at several things sees
-    them together. That happens while a thread waits in `request` or `wait_until`: it reads for all threads. No lock is
-    held while a thread waits for the server.
-
-    After `close`, or if nothing more can come, `ended` says why. What came before can still be read. Threads that wait
-    are told, and later requests raise ServerUnavailable because nothing is sent.
-    """
-
-    #: where the server is, for people
-    path: str
-    #: the server's boot id, the first half of the ids that it gives
-    boot: str
-    #: the server's process, as the server says
-    pid: int | None
-    #: the lock under which everything is taken in; notified after that
-    changed: threading.Condition
-    #: why nothing more comes; None while something may
-    ended: str | None
-    #: used under `changed`
-    listeners: EventListeners
-
-    @property
-    def listener(self) -> int | None:
-        """The process of this machine that listens there, as its kernel says; None if the server is elsewhere."""
-
-    def request(
-        self, request: Request, on_reply: OnReply | None = None, *, slow: bool = False
-    ) -> tuple[JsonObject, list[JsonObject]]:
-        """Send a request, and return its reply and the lines of its list.
-
-        A wait for the reply can be interrupted as in `wait_until`. The wait for the reply to a goal can't: the goal may
-        be accepted already, and without its id the sender could not cancel it.
-
-        Args:
-            request: the request.
-            on_reply: called with both under `changed`, if the server accepts the request, before any later event.
-            slow: the answer may take any time, during which the server sends signs of life.
-
-        Raises:
-            RequestRefused: the server refuses the request.
-            ServerUnavailable: the request was not sent, or not answered in time.
-            Lost: the request was sent and not answered, and may have an effect.
-        """
-
-    def submit(self, request: Request, on_reply: OnReply, on_failure: OnFailure) -> None:
-        """Send a request without waiting, and call one of the functions later, under `changed`.
-
-        What the server doesn't take now is sent by later calls. `on_failure` is called for a refusal, too, and if there
-        is no answer in time. It may be called at once.
-
-        Raises:
-            ServerUnavailable: the connection has ended.
-        """
-
-    def post(self, request: Request) -> None:
-        """Send a request without waiting, and ignore its answer; ServerUnavailable if it can't be sent."""
-
-    def wait_until(
-        self,
-        done: Callable[[], bool],
-        deadline: float | None,
-        *,
-        since: float | None = None,
-        interruptible: bool = True,
-    ) -> bool:
-        """Take in what comes until `done()` is true, and return True.
-
-        Return False at the deadline, or if the connection has ended. What has arrived by the deadline counts. A server
-        that is silent for SILENCE_LIMIT_S counts as gone.
-
-        Args:
-            done: called under `changed`, and not again after it was true.
-            deadline: monotonic time, or None for no limit.
-            since: the time from which silence counts; the default is now.
-            interruptible: raise Interrupted if what interrupts this connection's waits does so.
-        """
-
-    def close(self) -> None:
-        """Close the connection, from any thread. Goals that were sent are still spoken.
-
-        Closing twice is no error. In a forked child, only the child's copies of the descriptors are closed.
-        """
 
 
 def taken(connection: Connection, take: Callable[[], _T], end: float | None) -> Iterator[_T]:
@@ -158,21 +67,36 @@ def taken(connection: Connection, take: Callable[[], _T], end: float | None) -> 
         yield found
 
 
-class BlockingConnection(ClientCore):
-    """The part of a `Connection` that doesn't depend on the transport: one thread reads, the others wait for it.
+class Connection(ClientCore):
+    """A connection to one server. Any number of threads use it: one of them reads, and the others wait for it.
 
-    The core's methods are called under `changed`.
+    The server carries out each request once or not at all, in the order in which they were sent. Nothing that could
+    have an effect is sent twice, except a goal with its id, which is not spoken twice. Replies and events are taken in
+    in the server's order, under `changed` and under it alone, so that a wait whose `done` looks at several things sees
+    them together. That happens while a thread waits in `request` or `wait_until`: it reads for all threads. No lock is
+    held while a thread waits for the server. The core's methods are called under `changed`, too.
+
+    After `close`, or if nothing more can come, `ended` says why. What came before can still be read. Threads that wait
+    are told, and later requests raise ServerUnavailable because nothing is sent.
     """
+
+    #: the process of this machine that listens there, as its kernel says; None if the server is elsewhere
+    listener: int | None = None
 
     def __init__(self, patience: float) -> None:
         """`patience`: seconds in which the server must answer."""
         super().__init__(patience, time.monotonic())
+        #: the lock under which everything is taken in; notified after that
         self.changed = threading.Condition()
         self._process = os.getpid()
         self._reading = False
         self._closing = False
 
     def close(self) -> None:
+        """Close the connection, from any thread. Goals that were sent are still spoken.
+
+        Closing twice is no error. In a forked child, only the child's copies of the descriptors are closed.
+        """
         if os.getpid() != self._process:
             self.ended = self.ended or "the connection was closed"
             self._drop()
@@ -188,8 +112,21 @@ class BlockingConnection(ClientCore):
     def request(
         self, request: Request, on_reply: OnReply | None = None, *, slow: bool = False
     ) -> tuple[JsonObject, list[JsonObject]]:
-        # A goal whose sender was interrupted before it knew the goal's id could not be cancelled any more. A goal that
-        # waits for room isn't accepted yet: closing the connection takes it back.
+        """Send a request, and return its reply and the lines of its list.
+
+        Args:
+            request: the request.
+            on_reply: called with both under `changed`, if the server accepts the request, before any later event.
+            slow: the answer may take any time, during which the server sends signs of life.
+
+        Raises:
+            RequestRefused: the server refuses the request.
+            ServerUnavailable: the request was not sent, or not answered in time.
+            Lost: the request was sent and not answered, and may have an effect.
+            Interrupted: as in `wait_until`.
+        """
+        # The wait for the reply to a goal can't be interrupted: the goal may be accepted already, and its sender could
+        # not cancel it without its id. A goal that waits for room is different: closing the connection takes it back.
         interruptible = slow or not isinstance(request, Say)
         exchange = self.begin(request, on_reply, slow=slow)
         try:
@@ -217,6 +154,7 @@ class BlockingConnection(ClientCore):
         Raises:
             ServerUnavailable: nothing can be sent.
         """
+        self._prepare(request, attended=on_failure is None)
         exchange = Exchange(request, on_reply, on_failure, slow=slow)
         with self.changed:
             self.register(exchange, time.monotonic())
@@ -228,6 +166,14 @@ class BlockingConnection(ClientCore):
         return exchange
 
     def submit(self, request: Request, on_reply: OnReply, on_failure: OnFailure) -> None:
+        """Send a request without waiting, and call one of the functions later, under `changed`.
+
+        What the server doesn't take now is sent by later calls. `on_failure` is called for a refusal, too, and if there
+        is no answer in time. It may be called at once.
+
+        Raises:
+            ServerUnavailable: the connection has ended.
+        """
         self._look()
         slow = isinstance(request, Say) and request.patient
         with self.changed:
@@ -236,6 +182,7 @@ class BlockingConnection(ClientCore):
             self.begin(request, on_reply, on_failure, slow=slow)
 
     def post(self, request: Request) -> None:
+        """Send a request without waiting, and ignore its answer; ServerUnavailable if it can't be sent."""
         failures: list[TalkError] = []
         self.submit(request, lambda *_: None, failures.append)
         if failures:
@@ -249,6 +196,17 @@ class BlockingConnection(ClientCore):
         since: float | None = None,
         interruptible: bool = True,
     ) -> bool:
+        """Take in what comes until `done()` is true, and return True.
+
+        Return False at the deadline, or if the connection has ended. What has arrived by the deadline counts. A server
+        that is silent for SILENCE_LIMIT_S counts as gone.
+
+        Args:
+            done: called under `changed`, and not again after it was true.
+            deadline: monotonic time, or None for no limit.
+            since: the time from which silence counts; the default is now.
+            interruptible: raise Interrupted if the descriptors that interrupt this connection's waits do so.
+        """
         began = time.monotonic() if since is None else since
         last = False
         while True:
@@ -293,6 +251,9 @@ class BlockingConnection(ClientCore):
 
     # -- what each transport does in its own way
 
+    def _prepare(self, request: Request, *, attended: bool) -> None:
+        """Get ready to send a request; raise an error of `attended` ones, which somebody waits for, if that fails."""
+
     def _send(self, exchange: Exchange) -> None:
         """Send a registered request, or its beginning; ServerUnavailable if nothing can be sent. Under `changed`."""
         raise NotImplementedError
@@ -313,7 +274,7 @@ class BlockingConnection(ClientCore):
         """Make the server see the end of a connection on which a line was sent in part. Under `changed`."""
 
 
-class SocketConnection(BlockingConnection):
+class SocketConnection(Connection):
     """A connection over a Unix socket. It has no thread of its own."""
 
     def __init__(
@@ -361,7 +322,7 @@ class SocketConnection(BlockingConnection):
         self._received_early = attempt.received
 
     @property
-    def listener(self) -> int | None:
+    def listener(self) -> int | None:  # type: ignore[override]
         """The process that listens, as the kernel says; None while there is no connection."""
         return None if self._socket is None else peers.credentials(self._socket)[0]
 
@@ -459,22 +420,14 @@ class ReconnectingConnection(SocketConnection):
         #: why the last attempt failed
         self._failure: TalkError = ServerUnavailable("")
 
-    def begin(
-        self,
-        request: Request,
-        on_reply: OnReply | None = None,
-        on_failure: OnFailure | None = None,
-        *,
-        slow: bool = False,
-    ) -> Exchange:
-        if on_failure is None:
+    def _prepare(self, request: Request, *, attended: bool) -> None:
+        if attended:
             self._look()  # the connection may have broken since the last call
         with self.changed:
             if self.ended is None:
                 self._connect_again(time.monotonic(), at_once=isinstance(request, Cancel))
-            if self._socket is None and self.ended is None and on_failure is None:
+            if self._socket is None and self.ended is None and attended:
                 raise self._failure
-            return super().begin(request, on_reply, on_failure, slow=slow)
 
     def post(self, request: Request) -> None:
         failures: list[TalkError] = []

@@ -293,10 +293,10 @@ def lost(goal: Goal, why: str) -> Goal:
 
 
 def read_greeting(line: bytes, path: str, version: str) -> JsonObject:
-    """Return the greeting in a server's first line.
+    """Return the greeting of a server.
 
     Args:
-        line: without its newline.
+        line: the server's first line, without its newline.
         path: where the server is, for people.
         version: this client's, for people.
 
@@ -318,9 +318,9 @@ def read_greeting(line: bytes, path: str, version: str) -> JsonObject:
     return greeting
 
 
-def identity(greeting: JsonObject) -> tuple[str, int | None]:
-    """Return the boot id and the process of the server that greets."""
-    boot, pid = greeting.get("boot"), greeting.get("pid")
+def identity(server: JsonObject) -> tuple[str, int | None]:
+    """Return the boot id and the process in a greeting, or in another description of a server."""
+    boot, pid = server.get("boot"), server.get("pid")
     return boot if isinstance(boot, str) else "", pid if isinstance(pid, int) else None
 
 
@@ -590,8 +590,7 @@ class ClientCore:
             if self.greeted:
                 self.take_line(line, now)
             else:
-                greeting = read_greeting(line, self.path, self._version)
-                self.connected(*identity(greeting), now)
+                self.connected(*identity(read_greeting(line, self.path, self._version)), now)
 
     def take_line(self, line: bytes, now: float) -> None:
         """Take in one line of the server's."""

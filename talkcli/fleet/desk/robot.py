@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from talkcli import __version__
 from talkcli.client.connect import ANSWER_LIMIT_S, sender_name
-from talkcli.client.connection import BlockingConnection
+from talkcli.client.connection import Connection
 from talkcli.client.core import Exchange, identity
 from talkcli.errors import AccessDenied, BadRequest, Lost, ServerUnavailable, TalkError, UnknownGoal, UsageError
 from talkcli.fleet import topics
@@ -60,7 +60,7 @@ class RobotExchange(Exchange):
     latest: float | None = None
 
 
-class RobotConnection(BlockingConnection):
+class RobotConnection(Connection):
     """A connection to a robot's server through the broker.
 
     It has no thread, except while it connects to the broker.
