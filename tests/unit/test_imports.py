@@ -41,6 +41,11 @@ IMPURE = {
     *("asyncio", "threading", "_thread", "socket", "_socket", "select", "selectors", "signal", "time", "datetime"),
     *("random", "secrets", "click", "pyttsx3", "platformdirs", "os", "io", "pathlib", "subprocess", "multiprocessing"),
 }
+#: What the modules of `goals` may import besides each other: these and nothing else.
+FOR_GOALS = {
+    *("__future__", "bisect", "collections", "dataclasses", "enum", "hashlib", "itertools", "json", "math", "operator"),
+    *("typing", "unicodedata", "talkcli.errors", "talkcli.frozen"),
+}
 #: The files and folders at the top of the project whose names do not begin with a dot.
 TOP = {"pyproject.toml", "talkcli", "tests", "completions", "README.md", "CHANGELOG.md", "LICENSE"}
 #: Who may name these: a module, or the first part of its name.
@@ -188,6 +193,9 @@ def test_a_module_that_decides_is_pure(module: str) -> None:
     shows_times = part(module) == "terminal"
     assert not outside(module) & (IMPURE - {"time"} if shows_times else IMPURE)
     assert not {each for each, _ in inside(module) if each not in pure()}
+    if part(module) == "goals":
+        names = {name if name.startswith("talkcli") else name.partition(".")[0] for name, *_ in imports(module)}
+        assert {each for each in names if not each.startswith("talkcli.goals")} <= FOR_GOALS
 
 
 def test_a_module_that_shows_times_knows_the_time_zone_and_asks_no_clock() -> None:

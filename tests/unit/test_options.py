@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import inspect
 import math
 import re
 import subprocess
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import given as given_any
 from hypothesis import strategies as st
 
+import talkcli
 from talkcli import Client, Goal
 from talkcli.cli.command import FILE_MODE, read_value
 from talkcli.cli.commands import COMMANDS
@@ -40,6 +43,7 @@ from talkcli.goals.options import (
     engine_options,
     given_values,
     is_clients_id,
+    require_fields,
     shown_settings,
 )
 from talkcli.protocol.requests import REQUEST_TYPES
@@ -191,6 +195,32 @@ def test_what_a_goal_shows_and_what_the_engine_is_told_are_what_the_rows_say() -
     assert {name: kind.removesuffix(" | None") for name, kind in told.items()} == {
         name: say[name].removesuffix(" | None") for name in ENGINE_OPTIONS
     }
+
+
+#: Options that only travel with the goal: nothing has to obey them.
+CARRIED = {"data", "format"}
+
+
+@pytest.mark.parametrize("option", [each for each in OPTIONS if each.name not in CARRIED], ids=lambda each: each.name)
+def test_every_option_is_obeyed(option: Option) -> None:
+    """By the scheduler or the server, which have it in a `Say`, or by the engine process, which has it in a command."""
+    places, owners = ["goals", "server"], {"say", "request"}
+    if option.for_engine:
+        places, owners = ["engine/child"], {"command", "say", "settings"}
+    sources = [each for place in places for each in (Path(talkcli.__file__).parent / place).rglob("*.py")]
+    read = {
+        node.attr
+        for path in sources
+        if path.name != "options.py"
+        for node in ast.walk(ast.parse(path.read_text("utf-8")))
+        if isinstance(node, ast.Attribute) and ast.unparse(node.value).rpartition(".")[2] in owners
+    }
+    assert option.name in read, f"nothing obeys the option {option.name!r}: {' and '.join(places)} never read it"
+
+
+def test_a_row_without_its_field_is_named() -> None:
+    with pytest.raises(TypeError, match="the option 'loudness' has a row but Say has no such field"):
+        require_fields(Say, ["text", "loudness"])
 
 
 def test_settings_are_given_whole_at_the_start_and_shown_with_null_for_what_there_is_not() -> None:

@@ -1,0 +1,80 @@
+"""Only `talkcli.goals` writes to the scheduler's state: read from the source of all other packages."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import talkcli
+from talkcli.goals.history import History
+from talkcli.goals.queue import Queue
+from talkcli.goals.record import Record
+from talkcli.goals.scheduler import Scheduler
+from talkcli.goals.voices import NeuralVoice, NeuralVoices
+
+PACKAGE = Path(talkcli.__file__).parent
+#: Attributes of the scheduler, of its records and of what it keeps.
+STATE = {
+    *(name for each in (Record, NeuralVoice) for name in each.__slots__),  # type: ignore[attr-defined]
+    *(name for each in (Scheduler("4k7f", max_queue=1), History(), Queue(), NeuralVoices()) for name in vars(each)),
+}
+#: Parts of the scheduler that others may read, by these methods.
+READ = {"history": {"find", "latest", "log"}, "voices": {"failure", "to_json"}}
+
+
+def writes(source: str) -> list[str]:
+    """Return the places in a module's source that write to the scheduler's state."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store | ast.Del):
+            base = ast.unparse(node.value)
+            own = base in {"self", "cls"}
+            if "scheduler" in base or (not own and node.attr in STATE):
+                found.append(ast.unparse(node))
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            part = node.func.value
+            inner = isinstance(part, ast.Attribute) and "scheduler" in ast.unparse(part.value)
+            if inner and isinstance(part, ast.Attribute) and node.func.attr not in READ.get(part.attr, set()):
+                found.append(ast.unparse(node.func))
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) in {"setattr", "object.__setattr__"}:
+            found.append(ast.unparse(node))
+    return found
+
+
+def users() -> list[Path]:
+    """Return the modules that may get hold of a scheduler or a record: those of the server."""
+    return sorted((PACKAGE / "server").glob("*.py"))
+
+
+def test_only_the_server_knows_the_scheduler() -> None:
+    """So the test below looks at all that could write to it."""
+    names = ("goals.scheduler", "goals.record", "goals.queue", "goals.history", "goals.voices")
+    for path in PACKAGE.rglob("*.py"):
+        if path.parent.name not in {"goals", "server"}:
+            source = path.read_text("utf-8")
+            assert not any(f"talkcli.{each} import" in source for each in names), path
+
+
+@pytest.mark.parametrize("path", users(), ids=lambda each: each.name)
+def test_nothing_outside_goals_writes_to_the_scheduler_s_state(path: Path) -> None:
+    assert writes(path.read_text("utf-8")) == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "self._scheduler.settings = replace(self._scheduler.settings, ttl=1)",
+        "scheduler.active.paused = True",
+        "record.reason = None",
+        "del self.speech.scheduler.active",
+        "active.spoken_end += 1",
+        "speech.scheduler.voices.request('piper/joe', now)",
+        "self._scheduler._queue.remove(record)",
+        "scheduler.history.add(record)",
+        "setattr(record, 'state', state)",
+    ],
+)
+def test_a_write_is_found(line: str) -> None:
+    assert writes(line)
