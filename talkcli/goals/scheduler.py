@@ -32,7 +32,7 @@ from talkcli.goals.queue import Queue
 from talkcli.goals.reasons import Reason, Refusal
 from talkcli.goals.record import Record
 from talkcli.goals.states import IllegalTransition, State
-from talkcli.goals.voices import NeuralVoices, VoiceDropOrder, VoiceLoadOrder, VoiceWarning
+from talkcli.goals.voices import VoiceDropOrder, VoiceLoadOrder, VoiceScheduler, VoiceWarning
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
@@ -124,7 +124,7 @@ class Scheduler:
         max_queue: int,
         max_text: int = MAX_TEXT_CHARS,
         settings: Set = INITIAL,
-        voices: NeuralVoices | None = None,
+        voices: VoiceScheduler | None = None,
     ) -> None:
         """Create a scheduler without goals and without an engine.
 
@@ -140,7 +140,7 @@ class Scheduler:
         self.max_queue = max_queue
         self.max_text = max_text
         self.history = History()
-        self.voices = voices or NeuralVoices()
+        self.voices = voices or VoiceScheduler()
         #: the goal that is ACTIVE or PREEMPTING
         self.active: Record | None = None
         #: whether no goal starts until `resume`

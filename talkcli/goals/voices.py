@@ -27,7 +27,7 @@ VOICE_PATIENCE_S = 10.0
 EXPIRY_MARGIN_S = 0.5
 #: When a goal may have a failed voice loaded again. The delay doubles with each failure, because an attempt that fails
 #: costs a second of processor time, and one that kills the engine costs a sentence.
-FIRST_RETRY_S, LAST_RETRY_S = 5.0, 3600.0
+FIRST_VOICE_RETRY_S, LAST_VOICE_RETRY_S = 5.0, 3600.0
 #: A voice is blamed if the engine dies this many times in a row while it loads the voice.
 MAX_ENGINE_DEATHS = 2
 
@@ -62,7 +62,7 @@ class NeuralVoice:
     def fail(self, why: str, now: float) -> None:
         """Note that it could not be loaded."""
         self.failures += 1
-        self.retry_at = now + min(LAST_RETRY_S, FIRST_RETRY_S * 2 ** (self.failures - 1))
+        self.retry_at = now + min(LAST_VOICE_RETRY_S, FIRST_VOICE_RETRY_S * 2 ** (self.failures - 1))
         self.state, self.why = VoiceState.FAILED, why
 
 
@@ -88,8 +88,8 @@ class VoiceWarning:
     message: str
 
 
-class NeuralVoices:
-    """The neural voices of one server. The scheduler asks it for orders and reports how they went."""
+class VoiceScheduler:
+    """Decides which neural voices the engine loads and drops, and remembers how that went."""
 
     def __init__(self, limit_bytes: int = 0, file_size: Callable[[str], int] = lambda _: 0) -> None:
         """Create the list without any voice.

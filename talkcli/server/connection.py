@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 #: Unread output of a client, past which its feedback is dropped and its requests are left unread.
 CONGESTION_BYTES = 256 * 1024
 #: Unread results of a client, past which it is dropped.
-MAX_OUTPUT_BYTES = 4 * 1024 * 1024
+MAX_CLIENT_OUTPUT_BYTES = 4 * 1024 * 1024
 #: Messages held back while a list is sent to a slow client, past which the client is dropped.
 MAX_HELD_MESSAGES = 10_000
 #: From connecting to the first complete request. Clients send `hello` at once.
@@ -310,7 +310,7 @@ class ClientConnection(asyncio.Protocol):
 
     def _write(self, line: bytes) -> None:
         self.stream.write(line)
-        if self.stream.size > MAX_OUTPUT_BYTES:
+        if self.stream.size > MAX_CLIENT_OUTPUT_BYTES:
             self.stream.abort()
 
     def _take_last_requests(self) -> None:

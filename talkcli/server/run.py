@@ -23,7 +23,7 @@ from talkcli.frozen import frozen
 from talkcli.goals.goal import Sender
 from talkcli.goals.options import INITIAL, MAX_TEXT_CHARS, Say, Set, is_neural, shown_settings
 from talkcli.goals.scheduler import Scheduler
-from talkcli.goals.voices import NeuralVoices
+from talkcli.goals.voices import VoiceScheduler
 from talkcli.protocol.events import PROTOCOL, busy_greeting, greeting
 from talkcli.protocol.lines import encode
 from talkcli.server.connection import ClientConnection
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 #: Clients at the same time. Each takes one of the 1,024 descriptors that a process usually has.
 MAX_CLIENTS = 256
 #: Goals that may be pending. At two seconds a sentence they take three minutes, and nobody wants to wait longer.
-MAX_QUEUED_GOALS = 100
+USUAL_QUEUE_GOALS = 100
 #: Memory for neural voices: four of middle size.
 VOICE_MEMORY_MB = 300
 #: Clients that may connect to a full server, to ask for its status or to silence it.
@@ -59,7 +59,7 @@ class ServerSettings:
 
     #: the values of options that goals don't give; none of them is None
     goals: Set = INITIAL
-    max_queue: int = MAX_QUEUED_GOALS
+    max_queue: int = USUAL_QUEUE_GOALS
     max_text: int = MAX_TEXT_CHARS
     max_clients: int = MAX_CLIENTS
     player: str | None = None
@@ -112,7 +112,7 @@ class Server:
             max_queue=settings.max_queue,
             max_text=settings.max_text,
             settings=settings.goals,
-            voices=NeuralVoices(settings.voice_memory * 1_000_000, VoiceCatalog.file_size),
+            voices=VoiceScheduler(settings.voice_memory * 1_000_000, VoiceCatalog.file_size),
         )
         self.speech = Speech(self._scheduler, settings.player_options)
         self.speech.on_failure = self._end

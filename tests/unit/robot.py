@@ -25,7 +25,7 @@ from talkcli.goals.goal import By, Sender
 from talkcli.goals.options import INITIAL, Cancel, Say
 from talkcli.goals.reasons import Reason
 from talkcli.goals.scheduler import Cancelled, Changed, Effect, Now, Ordered, Scheduler, Submitted
-from talkcli.goals.voices import NeuralVoices, VoiceDropOrder, VoiceLoadOrder
+from talkcli.goals.voices import VoiceDropOrder, VoiceLoadOrder, VoiceScheduler
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -50,7 +50,7 @@ class Robot:
     attached: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        voices = NeuralVoices(limit_bytes=10, file_size=lambda _: 1)
+        voices = VoiceScheduler(limit_bytes=10, file_size=lambda _: 1)
         self.scheduler = Scheduler("4k7f", max_queue=self.max_queue, settings=INITIAL, voices=voices)
         self.scheduler.engine_ready(self.now)
 

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.goals.voices import (
-    FIRST_RETRY_S,
-    LAST_RETRY_S,
+    FIRST_VOICE_RETRY_S,
+    LAST_VOICE_RETRY_S,
     MAX_ENGINE_DEATHS,
-    NeuralVoices,
     VoiceDropOrder,
+    VoiceScheduler,
     VoiceState,
     VoiceWarning,
 )
@@ -118,7 +118,7 @@ a death is forgotten once the voice is loaded
 """
 
 
-class Asked(NeuralVoices):
+class Asked(VoiceScheduler):
     """Voices whose files have one byte each."""
 
     answer = "nothing"
@@ -194,15 +194,15 @@ def test_a_voice_that_fails_is_tried_again_later_and_later() -> None:
         assert voices.play("want a; next a", again - 0.001).outcome() == "nothing; a failed"
         waited.append(again - now)
         now = again
-    assert waited[:3] == pytest.approx([FIRST_RETRY_S, 2 * FIRST_RETRY_S, 4 * FIRST_RETRY_S])
-    assert waited[-1] == pytest.approx(LAST_RETRY_S)
+    assert waited[:3] == pytest.approx([FIRST_VOICE_RETRY_S, 2 * FIRST_VOICE_RETRY_S, 4 * FIRST_VOICE_RETRY_S])
+    assert waited[-1] == pytest.approx(LAST_VOICE_RETRY_S)
     voices.forget_failure("a")
     assert voices.play("want a", now).outcome() == "nothing; a waiting"
 
 
 def test_a_voice_has_failed_while_it_is_tried_again() -> None:
     voices = Asked().play("want a; next a; failed a")
-    assert voices.play("want a; next a", FIRST_RETRY_S).outcome() == "a; a failed"
+    assert voices.play("want a; next a", FIRST_VOICE_RETRY_S).outcome() == "a; a failed"
     assert voices.play("want a", 1000.0)._voices["a"].state is VoiceState.FAILED
     assert not voices.can_load
     assert voices.play("loaded a").to_json() == {"a": {"state": "loaded", "why": None}}
@@ -211,7 +211,7 @@ def test_a_voice_has_failed_while_it_is_tried_again() -> None:
 def test_a_voice_that_no_goal_needs_any_more_keeps_nobody_looking() -> None:
     voices = Asked().play("want a; next : b")
     assert (voices.can_load, voices.outcome()) == (False, "nothing; none")
-    voices.play("want a; next a; failed a").play("want a", FIRST_RETRY_S)
+    voices.play("want a; next a; failed a").play("want a", FIRST_VOICE_RETRY_S)
     assert voices.can_load
     assert (voices.play("next").outcome(), voices.can_load) == ("nothing; a failed", False)
 

@@ -12,13 +12,13 @@ from talkcli.goals.history import History
 from talkcli.goals.queue import Queue
 from talkcli.goals.record import Record
 from talkcli.goals.scheduler import Scheduler
-from talkcli.goals.voices import NeuralVoice, NeuralVoices
+from talkcli.goals.voices import NeuralVoice, VoiceScheduler
 
 PACKAGE = Path(talkcli.__file__).parent
 #: Attributes of the scheduler, of its records and of what it keeps.
 STATE = {
-    *(name for each in (Record, NeuralVoice) for name in each.__slots__),  # type: ignore[attr-defined]
-    *(name for each in (Scheduler("4k7f", max_queue=1), History(), Queue(), NeuralVoices()) for name in vars(each)),
+    *(name for each in (Record, NeuralVoice) for name in each.__slots__),
+    *(name for each in (Scheduler("4k7f", max_queue=1), History(), Queue(), VoiceScheduler()) for name in vars(each)),
 }
 #: Parts of the scheduler that others may read, by these methods.
 READ = {"history": {"find", "latest", "log"}, "voices": {"failure", "to_json"}}
