@@ -144,7 +144,7 @@ def _show_paused(options: CommonOptions, goal: Goal | None, *, paused: bool, wor
 def doctor(options: CommonOptions, silent: bool) -> int:
     """Show the doctor's findings and the next step. Return the exit code."""
     from talkcli.cli.interrupts import Interrupts
-    from talkcli.doctor.report import format_conclusion, format_finding, is_answered_yes
+    from talkcli.doctor.report import format_conclusion, format_finding, has_passed
     from talkcli.goals.states import EXIT_CODES, State
 
     findings = []
@@ -160,7 +160,7 @@ def doctor(options: CommonOptions, silent: bool) -> int:
     if not options.json and not options.quiet:
         note(format_conclusion(findings, screen(), examination.question))
     # A sentence that nobody would hear counts as an aborted goal.
-    return 0 if is_answered_yes(findings, examination.question) else EXIT_CODES[State.ABORTED]
+    return 0 if has_passed(findings, examination.question) else EXIT_CODES[State.ABORTED]
 
 
 def _examination(

@@ -90,8 +90,8 @@ def join_names(names: tuple[str, ...]) -> str:
     return ", ".join(names) if hidden <= 1 else f"{', '.join(names[:_SHOWN_NAMES_COUNT])} and {hidden} more"
 
 
-def is_answered_yes(findings: Sequence[Finding], question: Question = SENTENCE_QUESTION) -> bool:
-    """Return whether the check of the question was made and no check failed."""
+def has_passed(findings: Sequence[Finding], question: Question = SENTENCE_QUESTION) -> bool:
+    """Return whether the answer is yes: the check of the question was made, and no check failed."""
     return any(each.check == question.check for each in findings) and all(each.state != FAILURE for each in findings)
 
 
@@ -115,7 +115,7 @@ def format_finding(finding: Finding, screen: Screen) -> list[str]:
 
 def format_conclusion(findings: Sequence[Finding], screen: Screen, question: Question = SENTENCE_QUESTION) -> str:
     """Return the answer to the question, followed by the next step if something failed."""
-    if is_answered_yes(findings, question):
+    if has_passed(findings, question):
         warned = sum(each.state == WARNING for each in findings)
         return question.yes + ("" if not warned else "; 1 warning" if warned == 1 else f"; {warned} warnings")
     step = next_step(findings)

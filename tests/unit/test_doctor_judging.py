@@ -11,7 +11,7 @@ import pytest
 from talkcli import __version__
 from talkcli.doctor import report, sentence, server, sound, voice
 from talkcli.doctor.examine import LocalExamination
-from talkcli.doctor.report import FAILURE, OK, WARNING, Finding, failure, is_answered_yes, next_step, ok, warning
+from talkcli.doctor.report import FAILURE, OK, WARNING, Finding, failure, has_passed, next_step, ok, warning
 from talkcli.doctor.sentence import SentenceResult, find_playback_step
 from talkcli.doctor.server import SocketPlace, SocketSearch
 from talkcli.doctor.sound import Cards, Devices, MixerLevel, Players, SoundServer, UserSession
@@ -48,9 +48,9 @@ def test_a_sentence_is_heard_if_one_was_played_and_nothing_failed() -> None:
     played, group = ok("sentence", "played"), warning("group", "not in audio", "usermod")
     lost = failure("socket", "no server", "talk serve")
     stuck = failure("sentence", "ABORTED", "look at the loudspeaker")
-    assert is_answered_yes([ok("python", "3"), group, played])
-    assert not is_answered_yes([lost, played])
-    assert not is_answered_yes([ok("python", "3")]), "nothing was proved"
+    assert has_passed([ok("python", "3"), group, played])
+    assert not has_passed([lost, played])
+    assert not has_passed([ok("python", "3")]), "nothing was proved"
     assert next_step([ok("python", "3"), group, stuck]) == "look at the loudspeaker"
     assert next_step([group, lost, stuck]) == "talk serve"
     assert next_step([group, played]) is None
