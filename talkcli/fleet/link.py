@@ -343,17 +343,9 @@ class Link:
         self._socket = None  # paho closes it
 
     def _on_message(self, _client: paho.Client, _data: object, message: paho.MQTTMessage) -> None:
-        properties = message.properties
-        self._deliver(
-            Message(
-                message.topic,
-                bytes(message.payload),
-                message.retain,
-                getattr(properties, "ResponseTopic", None),
-                getattr(properties, "CorrelationData", None),
-                getattr(properties, "MessageExpiryInterval", None),
-            )
-        )
+        names = "ResponseTopic", "CorrelationData", "MessageExpiryInterval"
+        properties = [getattr(message.properties, each, None) for each in names]
+        self._deliver(Message(message.topic, bytes(message.payload), message.retain, *properties))
 
     def _on_publish(self, _client: paho.Client, _data: object, mid: int, code: ReasonCode, _: object) -> None:
         size, acknowledged = self._unacknowledged.pop(mid, (0, None))
@@ -370,18 +362,15 @@ class Link:
 @lru_cache(maxsize=32)
 def _properties(expiry: float | None, response: str | None, correlation: bytes | None) -> Properties | None:
     """Return the MQTT properties of a message, None if it has none. Cached, because paho is slow at making them."""
-    given: dict[str, object] = {}
-    if expiry is not None:
-        given["MessageExpiryInterval"] = max(1, math.ceil(min(expiry, 2**31)))
-    if response is not None:
-        given["ResponseTopic"] = response
-    if correlation is not None:
-        given["CorrelationData"] = correlation
-    if not given:
+    if (expiry, response, correlation) == (None, None, None):
         return None
     properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
-    for name, value in given.items():
-        setattr(properties, name, value)
+    if expiry is not None:
+        properties.MessageExpiryInterval = max(1, math.ceil(min(expiry, 2**31)))
+    if response is not None:
+        properties.ResponseTopic = response
+    if correlation is not None:
+        properties.CorrelationData = correlation
     return properties
 
 

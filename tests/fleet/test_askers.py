@@ -69,7 +69,7 @@ async def test_an_asker_that_is_silent_for_90_s_is_gone_whatever_it_waits_for(
             await anna.ask(say(each), "s2")
         anna.post(say(100, patient=True, wait=True, id="patient"))
         await anna.ask({"seq": 101, "request": "hello"})
-        assert [ask.seq for ask, _ in anna.sessions.waiting] == [100]
+        assert [request.seq for request, _, _ in anna.sessions.waiting] == [100]
     elif waits == "for a result":
         await anna.ask(say(100, wait=True))
     else:

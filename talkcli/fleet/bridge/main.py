@@ -349,8 +349,9 @@ class Bridge:
         acknowledged = self._check_rights if qos else None
         self._publish(topic, payload, qos, correlation=correlation, acknowledged=acknowledged)
 
-    def _publish_to_all(self, topic: str, payload: bytes, *, retain: bool = False, expiry: float | None = None) -> None:
-        """Publish a message for everybody, unless the bridge is offline or the broker too slow for an event."""
+    def _publish_to_all(self, topic: str, payload: bytes, expiry: float | None) -> None:
+        """Publish an event, or retain a message that doesn't expire. If the broker is slow, events are left out."""
+        retain = expiry is None
         if self._owns_name and self._link and (retain or self._link.outstanding_bytes <= SLOW_BROKER_BYTES):
             self._publish(topic, payload, retain=retain, expiry=expiry)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import random
+from functools import partial
 from typing import TYPE_CHECKING
 
 from talkcli.client.core import Exchange
@@ -17,7 +18,7 @@ from talkcli.fleet import topics
 from talkcli.fleet.bridge.local import dial
 from talkcli.fleet.payloads import LastGoal, RobotStatus
 from talkcli.frozen import replace
-from talkcli.goals.options import MAX_LOG_GOALS
+from talkcli.goals.option import MAX_LOG
 from talkcli.goals.states import State
 from talkcli.protocol.events import PausedChanged, ServerStatus, StateChanged, from_json, goals, unfinished
 from talkcli.protocol.lines import decode, encode
@@ -25,18 +26,13 @@ from talkcli.protocol.requests import Log, Watch
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from typing import Protocol
 
     from talkcli.fleet.bridge.local import LocalConnection
     from talkcli.fleet.bridge.session import RemoteSessions
     from talkcli.goals.goal import Goal, JsonObject
 
-    class PublishToAll(Protocol):
-        """Publishes a message for everybody if the broker is there."""
-
-        def __call__(self, topic: str, payload: bytes, *, retain: bool = False, expiry: float | None = None) -> None:
-            """Publish the payload; `expiry` is in seconds."""
-
+    #: Publishes a message for everybody: topic, payload, expiry in seconds. Without an expiry, the message is retained.
+    PublishToAll = Callable[[str, bytes, float | None], None]
 
 #: How long an event is of use.
 EVENT_EXPIRY_S = 60
@@ -88,26 +84,31 @@ class Publisher:
         self._loop = asyncio.get_running_loop()
 
     async def run(self) -> None:
-        """Watch the server, and try again whenever the connection ends."""
+        """Follow the server, and try again whenever the connection ends."""
         self._retry_s = _FIRST_RETRY_S
         while True:
             try:
-                self._connection = await dial(self._sessions.socket, "talk bridge")
-                self._heard_at = self._loop.time()
-                # The log comes first, so that the goals of an earlier bridge are known.
-                self._connection.send(Exchange(Log(MAX_LOG_GOALS), self._on_log, lambda _: self._watch()))
+                server = self._connection = await dial(self._sessions.socket, "talk bridge")
                 try:
-                    while lines := await self._connection.read():
-                        self._receive(lines)
-                    log.write("the server's connection has ended")
+                    await self._follow(server)
                 finally:
-                    self._connection.close()
                     self._connection = None
+                    server.close()
                     self._server_left()
             except TalkError as error:
                 log.write_limited("server", f"no news of the server: {log.sanitize(str(error))}")
             await asyncio.sleep(random.uniform(0, self._retry_s))
             self._retry_s = min(_LAST_RETRY_S, self._retry_s * 2)
+
+    async def _follow(self, server: LocalConnection) -> None:
+        """Watch the server until the connection ends."""
+        self._heard_at = self._loop.time()
+        watch = partial(self._watch, server)
+        # The log comes first, so that the goals of an earlier bridge are known.
+        server.send(Exchange(Log(MAX_LOG), watch, lambda _: watch({}, [])))
+        while lines := await server.read():
+            self._receive(server, lines)
+        log.write("the server's connection has ended")
 
     def schedule_status(self) -> None:
         """Publish the status soon."""
@@ -131,9 +132,7 @@ class Publisher:
 
     # -- from the server
 
-    def _receive(self, lines: list[bytes]) -> None:
-        server = self._connection
-        assert server
+    def _receive(self, server: LocalConnection, lines: list[bytes]) -> None:
         now = self._heard_at = self._loop.time()
         for line in lines:
             try:
@@ -145,24 +144,19 @@ class Publisher:
             except (BadRequest, ValueError) as error:
                 log.write_limited("line", f"what the server says can't be read: {log.sanitize(str(error))}")
 
-    def _on_log(self, _reply: JsonObject, items: list[JsonObject]) -> None:
-        server = self._connection
-        assert server
-        for goal in goals(items, "goal"):
+    def _watch(self, server: LocalConnection, _reply: JsonObject, ended: list[JsonObject]) -> None:
+        """Watch the server, and remember the goals in the reply to `log`."""
+
+        def refuse(error: TalkError) -> None:
+            raise ServerUnavailable(f"the server at {server.path} can't be watched: {error}")
+
+        for goal in goals(ended, "goal"):
             self._sessions.remember(goal, server.boot)
-        self._watch()
+        server.send(Exchange(Watch(), partial(self._server_came, server), refuse))
 
-    def _watch(self) -> None:
-        if self._connection:
-            self._connection.send(Exchange(Watch(), self._on_watch, self._on_refused))
-
-    def _on_refused(self, error: TalkError) -> None:
-        assert self._connection
-        raise ServerUnavailable(f"the server at {self._connection.path} can't be watched: {error}")
-
-    def _on_watch(self, reply: JsonObject, items: list[JsonObject]) -> None:
-        server, status = self._connection, ServerStatus.from_reply(reply, items)
-        assert server
+    def _server_came(self, server: LocalConnection, reply: JsonObject, items: list[JsonObject]) -> None:
+        """Take over what the server says when the watch begins."""
+        status = ServerStatus.from_reply(reply, items)
         self._retry_s = _FIRST_RETRY_S
         for each in unfinished(status):
             self._sessions.remember(each, server.boot)
@@ -198,7 +192,7 @@ class Publisher:
         else:
             return
         topic = topics.robot(self._sessions.name, topics.EVENT, str(message["event"]))
-        self._publish(topic, line + b"\n", expiry=EVENT_EXPIRY_S)
+        self._publish(topic, line + b"\n", EVENT_EXPIRY_S)
         self.schedule_status()
 
     def _note(self, event: StateChanged) -> None:
@@ -219,7 +213,7 @@ class Publisher:
         status = self._status(with_text=self._with_text)
         if len(status) > self._sessions.max_payload():
             status = self._status(with_text=False)
-        self._publish(topics.robot(self._sessions.name, topics.STATUS), status, retain=True)
+        self._publish(topics.robot(self._sessions.name, topics.STATUS), status, None)
 
     def _status(self, *, with_text: bool) -> bytes:
         active, last = self._active, self._last

@@ -87,7 +87,7 @@ class RemoteSessions:
         self.may_read = asyncio.Event()
         self.may_read.set()
         #: goals that wait until fewer are pending, in their order
-        self.waiting: list[tuple[RemoteRequest, RemoteSession]] = []
+        self.waiting: list[tuple[RemoteRequest, Say, RemoteSession]] = []
         self._on_change = on_change
         self._loop = asyncio.get_running_loop()
         self._sessions: dict[tuple[str, str | None], RemoteSession] = {}
@@ -155,14 +155,17 @@ class RemoteSessions:
     def waiting_bytes(self) -> int:
         """Return the size of all requests that wait for anything."""
         in_sessions = sum(each.waiting_bytes for each in self._sessions.values())
-        return in_sessions + sum(request.size_bytes for request, _ in self.waiting)
+        return in_sessions + sum(request.size_bytes for request, _, _ in self.waiting)
 
     def cancel_waiting(self, selection: Cancel, by: By | None) -> list[Goal]:
         """End the selected goals of those that wait for room, and return them."""
-        says = [request.request for request, _ in self.waiting if isinstance(request.request, Say)]
-        selected = [self.waiting[each] for each in selection.of_waiting(says)]
+        selected = [self.waiting[each] for each in selection.of_waiting([say for _, say, _ in self.waiting])]
         self.waiting = [each for each in self.waiting if not any(each is other for other in selected)]
-        return [session.cancel_waiting(request, by) for request, session in selected]
+        words = "canceled before it was spoken"
+        return [
+            session.end_goal(request, say.id, State.RECALLED, "canceled", words, by)
+            for request, say, session in selected
+        ]
 
     def schedule_release(self) -> None:
         """Send goals that wait for room soon, if there is room then.
@@ -179,12 +182,9 @@ class RemoteSessions:
         if canceled_by and not self.goals.pending_count:
             # Somebody canceled all pending goals, so the goals that wait for their places are canceled, too.
             self.cancel_waiting(Cancel(), canceled_by)
-        while self.waiting:
-            request, session = self.waiting[0]
-            if not (isinstance(request.request, Say) and self.goals.has_room(request.request)):
-                break
-            del self.waiting[0]
-            session.release(request)
+        while self.waiting and self.goals.has_room(self.waiting[0][1]):
+            request, say, session = self.waiting.pop(0)
+            session.send_say(request, say, has_room=True)
 
     # -- from the watch of the server
 
@@ -320,15 +320,6 @@ class RemoteSession:
         if self._waiting_for_room():
             self._publish([(_ALIVE, None)])
 
-    def release(self, request: RemoteRequest) -> None:
-        """Send a goal that has waited for room."""
-        assert isinstance(request.request, Say)
-        self._send_say(request, request.request, has_room=True)
-
-    def cancel_waiting(self, request: RemoteRequest, by: By | None) -> Goal:
-        """End a goal that has waited for room, because it was canceled."""
-        return self._end_goal(request, State.RECALLED, "canceled", "canceled before it was spoken", by)
-
     @property
     def _exchanges(self) -> list[_RemoteExchange]:
         exchanges = self._server.exchanges.values() if self._server else ()
@@ -340,10 +331,10 @@ class RemoteSession:
         return [*self._queue, *(each.remote for each in self._exchanges)]
 
     def _waiting_for_room(self) -> list[RemoteRequest]:
-        return [request for request, session in self._sessions.waiting if session is self]
+        return [request for request, _, session in self._sessions.waiting if session is self]
 
     def _leave_waiting(self) -> None:
-        self._sessions.waiting = [each for each in self._sessions.waiting if each[1] is not self]
+        self._sessions.waiting = [each for each in self._sessions.waiting if each[2] is not self]
 
     def _end_if_done(self) -> None:
         """End the session if the client said goodbye and the server has taken all requests."""
@@ -355,7 +346,7 @@ class RemoteSession:
     def _send_request(self, remote: RemoteRequest) -> None:
         request = remote.request
         if isinstance(request, Say):
-            self._send_say(remote, request)
+            self.send_say(remote, request)
         elif isinstance(request, Cancel):
             self._send_cancel(remote, request)
         else:
@@ -365,7 +356,14 @@ class RemoteSession:
             self._watching = self._watching or isinstance(request, Watch)
             self._send(_RemoteExchange(remote, request))
 
-    def _send_say(self, remote: RemoteRequest, say: Say, *, has_room: bool = False) -> None:
+    def send_say(self, remote: RemoteRequest, say: Say, *, has_room: bool = False) -> None:
+        """Send a goal to the server, unless it must wait for room or is refused.
+
+        Args:
+            remote: the request.
+            say: the same.
+            has_room: whether the goal has waited, and has room now.
+        """
         shared, server = self._sessions, self._server
         assert server
         goal_id = say.id or self._new_id()
@@ -379,10 +377,10 @@ class RemoteSession:
                 if counted:
                     shared.goals.add(goal_id, say.key)
         elif say.patient:
-            shared.waiting.append((remote, self))
+            shared.waiting.append((remote, say, self))
         else:
             words = f"{policy.MAX_REMOTE_GOALS} goals from afar are waiting already"
-            self._end_goal(remote, State.REJECTED, "queue_full", words, None)
+            self.end_goal(remote, None, State.REJECTED, "queue_full", words, None)
 
     def _send_cancel(self, remote: RemoteRequest, cancel: Cancel) -> None:
         """Cancel goals that wait for room, then goals at the server, which doesn't know the ids of the former."""
@@ -411,30 +409,26 @@ class RemoteSession:
     # -- from the server
 
     async def _run(self, *, urgent: bool) -> None:
-        try:
-            await self._serve(urgent=urgent)
-        except Exception as error:  # noqa: BLE001 - a bug in one session must not end the others
-            log.write_bug("a session", error)
-        self._clean_up()
-
-    async def _serve(self, *, urgent: bool) -> None:
+        """Connect to the server, send the requests that came meanwhile, and pass on lines until the connection ends."""
         shared = self._sessions
         try:
             self._server = await dial(shared.socket, self._name, urgent=urgent, slots=shared.dialing)
-        except TalkError as error:
+            while self._queue:
+                self._send_request(self._queue.popleft())
+            self._end_if_done()
+            while lines := await self._server.read():
+                self._receive(lines)
+                await shared.may_read.wait()
+            for request in self._waiting_for_room():
+                self._refuse(request, "no_server", _SERVER_GONE)
+            self._send_gone(_SERVER_GONE)
+        except TalkError as error:  # there is no connection
             code = Busy.code if isinstance(error, Busy) else "no_server"
             while self._queue:
                 self._refuse(self._queue.popleft(), code, " ".join(str(error).split()))
-            return
-        while self._queue:
-            self._send_request(self._queue.popleft())
-        self._end_if_done()
-        while lines := await self._server.read():
-            self._receive(lines)
-            await shared.may_read.wait()
-        for request in self._waiting_for_room():
-            self._refuse(request, "no_server", _SERVER_GONE)
-        self._send_gone(_SERVER_GONE)
+        except Exception as error:  # noqa: BLE001 - a bug in one session must not end the others
+            log.write_bug("a session", error)
+        self._clean_up()
 
     def _receive(self, lines: list[bytes]) -> None:
         """Pass the server's lines on to the client."""
@@ -502,12 +496,11 @@ class RemoteSession:
     def _refuse(self, request: RemoteRequest, code: str, words: str) -> None:
         self._publish([(encode(failure(request.seq, code, words)), request.correlation)])
 
-    def _end_goal(self, request: RemoteRequest, state: State, reason: str, words: str, by: By | None) -> Goal:
-        """End a goal that was not sent to the server, and tell the client."""
-        say = request.request
-        assert isinstance(say, Say)
-        own_id = say.id if state is State.RECALLED else None  # as at the server, where a rejected goal gets a new id
-        goal, lines = policy.end_unsent(request, own_id or self._new_id(), state, reason, words, time.time(), by)
+    def end_goal(
+        self, request: RemoteRequest, goal_id: str | None, state: State, reason: str, words: str, by: By | None
+    ) -> Goal:
+        """End a goal that was not sent to the server, and tell the client; the arguments are those of `end_unsent`."""
+        goal, lines = policy.end_unsent(request, goal_id or self._new_id(), state, reason, words, time.time(), by)
         answer, *events = (encode(each) for each in lines)
         self._publish([(answer, request.correlation), *((each, None) for each in events)])
         return goal
