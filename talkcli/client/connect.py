@@ -37,7 +37,7 @@ ANSWER_LIMIT_S = 5.0
 BUSY_LIMIT_S = 5.0
 #: The least and the longest pause between two of these attempts. It is random, so that many clients that were turned
 #: away together don't come back together.
-_BUSY_PAUSE_S = (0.02, 0.2)
+BUSY_PAUSE_S = (0.02, 0.2)
 #: Seconds between two attempts to reach a server that is not there yet: the first pause, which doubles up to the
 #: second.
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.02, 0.25
@@ -248,7 +248,7 @@ def connect(
         if busy:
             import random
 
-            pause = random.uniform(*_BUSY_PAUSE_S)
+            pause = random.uniform(*BUSY_PAUSE_S)
         else:
             next_pause = min(2 * pause, _LONGEST_PAUSE_S)
         wait_ready({}, min(pause, left), interrupt)

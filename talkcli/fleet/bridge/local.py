@@ -21,10 +21,7 @@ if TYPE_CHECKING:
     from talkcli.client.core import Exchange
     from talkcli.goals.goal import JsonObject
 
-_RECEIVE_BYTES = 64 * 1024
-#: Range of the pause before another attempt if the server is busy. It is random, so that many clients don't come back
-#: together.
-_BUSY_PAUSE_S = (0.02, 0.2)
+_CHUNK_BYTES = 64 * 1024
 
 
 class LocalConnection(ClientCore):
@@ -107,7 +104,7 @@ class LocalConnection(ClientCore):
         await asyncio.sleep(0)  # lets other tasks run if the server sends a lot
         while not self._closed:
             try:
-                return self._socket.recv(_RECEIVE_BYTES)
+                return self._socket.recv(_CHUNK_BYTES)
             except BlockingIOError:
                 pass
             except OSError:
@@ -196,4 +193,4 @@ async def _dial(place: str | None, hello: JsonObject) -> LocalConnection:
             error = connect.unreachable(attempt, place)
         if not (attempt.backlog_full or isinstance(error, Busy)) or loop.time() > give_up:
             raise error
-        await asyncio.sleep(random.uniform(*_BUSY_PAUSE_S))
+        await asyncio.sleep(random.uniform(*connect.BUSY_PAUSE_S))

@@ -41,9 +41,9 @@ PRESENCE_EXPIRY_S, PRESENCE_EVERY_S = 150, 60.0
 _RIVAL_LIMIT_S = 1.0
 #: Longest pause before the first try to reach the broker again, and before later tries. The pause is random, so that a
 #: thousand robots don't come back together.
-_FIRST_RETRY_S, _LAST_RETRY_S = 0.5, 10.0
+_FIRST_BROKER_RETRY_S, _LAST_BROKER_RETRY_S = 0.5, 10.0
 #: Time without a returning echo after which the connection counts as dead.
-_ECHO_LIMIT_S = 15.0
+_ECHO_TIMEOUT_S = 15.0
 #: Shortest time between two echoes. A message that is refused as stale causes one.
 _ECHO_PAUSE_S = 1.0
 #: Unsent data above which events are left out and nothing is read from the server.
@@ -52,7 +52,7 @@ SLOW_BROKER_BYTES = 256 * 1024
 STUCK_BROKER_BYTES = 4 * 1024 * 1024
 #: Largest packet that the broker may send: the longest request, and some more, so that longer ones get an error. paho
 #: needs several seconds for 250 kB of MQTT properties, and a tenth of a second for a quarter of that.
-_MAX_INPUT_BYTES = MAX_LINE_BYTES + 8 * 1024
+_MAX_INCOMING_BYTES = MAX_LINE_BYTES + 8 * 1024
 #: A robot answers a Home Assistant that has started after a random delay of at most this time.
 _DEVICE_DELAY_S = 3.0
 #: Time for the broker to take the goodbye.
@@ -201,11 +201,11 @@ class Bridge:
     def _new_link(self) -> Link:
         name, session = self._settings.name, self._session
         will = Will(topics.robot(name, topics.PRESENCE), self._offline_presence())
-        return Link(self._broker, f"talk-{name}-{session}", self._on_message, will, _MAX_INPUT_BYTES)
+        return Link(self._broker, f"talk-{name}-{session}", self._on_message, will, _MAX_INCOMING_BYTES)
 
     async def _stay_connected(self, first: Link) -> None:
         """Connect to the broker, and connect again whenever the connection ends."""
-        retry_s = _FIRST_RETRY_S
+        retry_s = _FIRST_BROKER_RETRY_S
         link: Link | None = first
         while True:
             try:
@@ -214,7 +214,7 @@ class Bridge:
                 self._on_connect(link)
                 await self._disconnected.wait()
                 log.write(f"the connection to the broker has ended: {log.sanitize(str(link.ended))}")
-                retry_s = _FIRST_RETRY_S if self._owns_name else retry_s
+                retry_s = _FIRST_BROKER_RETRY_S if self._owns_name else retry_s
             except TalkError as error:
                 log.write_limited("broker", log.sanitize(str(error)))
             finally:
@@ -222,7 +222,7 @@ class Bridge:
                     self._disconnect(link)
             link = None
             await asyncio.sleep(random.uniform(0, retry_s))
-            retry_s = min(_LAST_RETRY_S, retry_s * 2)
+            retry_s = min(_LAST_BROKER_RETRY_S, retry_s * 2)
             try:
                 self._broker = self._read_broker()
             except TalkError as error:
@@ -492,7 +492,7 @@ class Bridge:
         if self._unanswered_since is not None:
             # If this process itself was stopped, messages that came meanwhile have yet to be read.
             self._unanswered_since += now - due
-            if now - self._unanswered_since > _ECHO_LIMIT_S:
+            if now - self._unanswered_since > _ECHO_TIMEOUT_S:
                 log.write_limited("echo", f"nothing that this robot sends itself comes back: {_RIGHTS}")
                 self._disconnect(link)
                 return

@@ -40,13 +40,13 @@ EVENT_EXPIRY_S = 60
 _STATUS_EVERY_S = 1.0
 #: Time from a change to the status that shows it. A canceled goal is PREEMPTING for some milliseconds. If that was
 #: published at once, the end of the goal would follow a second later.
-_STATUS_DELAY_S = 0.1
+_STATUS_AFTER_CHANGE_S = 0.1
 #: Longest text in the status. The texts of all pending goals are kept for it.
 _MAX_TEXT_CHARS = 1_000
 #: The server sends a sign of life every 5 s. After this silence it counts as hung.
 _SERVER_SILENCE_LIMIT_S = 15.0
 #: Longest pause before the first try to find the server again, and before later tries. The pause is random.
-_FIRST_RETRY_S, _LAST_RETRY_S = 0.2, 5.0
+_FIRST_SERVER_RETRY_S, _LAST_SERVER_RETRY_S = 0.2, 5.0
 
 
 class Publisher:
@@ -85,7 +85,7 @@ class Publisher:
 
     async def run(self) -> None:
         """Follow the server, and try again whenever the connection ends."""
-        self._retry_s = _FIRST_RETRY_S
+        self._retry_s = _FIRST_SERVER_RETRY_S
         while True:
             try:
                 server = self._connection = await dial(self._sessions.socket, "talk bridge")
@@ -98,7 +98,7 @@ class Publisher:
             except TalkError as error:
                 log.write_limited("server", f"no news of the server: {log.sanitize(str(error))}")
             await asyncio.sleep(random.uniform(0, self._retry_s))
-            self._retry_s = min(_LAST_RETRY_S, self._retry_s * 2)
+            self._retry_s = min(_LAST_SERVER_RETRY_S, self._retry_s * 2)
 
     async def _follow(self, server: LocalConnection) -> None:
         """Watch the server until the connection ends."""
@@ -113,7 +113,7 @@ class Publisher:
     def schedule_status(self) -> None:
         """Publish the status soon."""
         if self._timer is None:
-            due = max(self._loop.time() + _STATUS_DELAY_S, self._published_at + _STATUS_EVERY_S)
+            due = max(self._loop.time() + _STATUS_AFTER_CHANGE_S, self._published_at + _STATUS_EVERY_S)
             self._timer = self._loop.call_at(due, self._publish_status)
 
     def tick(self) -> None:
@@ -157,7 +157,7 @@ class Publisher:
     def _server_came(self, server: LocalConnection, reply: JsonObject, items: list[JsonObject]) -> None:
         """Take over what the server says when the watch begins."""
         status = ServerStatus.from_reply(reply, items)
-        self._retry_s = _FIRST_RETRY_S
+        self._retry_s = _FIRST_SERVER_RETRY_S
         for each in unfinished(status):
             self._sessions.remember(each, server.boot)
         self.server = {"boot": server.boot, "pid": server.pid, "version": status.server.get("version")}
