@@ -18,7 +18,7 @@ from talkcli.fleet import topics
 from talkcli.fleet.bridge.local import dial
 from talkcli.fleet.payloads import LastGoal, RobotStatus
 from talkcli.frozen import replace
-from talkcli.goals.option import MAX_LOG
+from talkcli.goals.options import MAX_LOG_GOALS
 from talkcli.goals.states import State
 from talkcli.protocol.events import PausedChanged, ServerStatus, StateChanged, from_json, goals, unfinished
 from talkcli.protocol.lines import decode, encode
@@ -105,7 +105,7 @@ class Publisher:
         self._heard_at = self._loop.time()
         watch = partial(self._watch, server)
         # The log comes first, so that the goals of an earlier bridge are known.
-        server.send(Exchange(Log(MAX_LOG), watch, lambda _: watch({}, [])))
+        server.send(Exchange(Log(MAX_LOG_GOALS), watch, lambda _: watch({}, [])))
         while lines := await server.read():
             self._receive(server, lines)
         log.write("the server's connection has ended")
