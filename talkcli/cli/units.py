@@ -1,8 +1,8 @@
 """The systemd units that `talk serve` and `talk bridge` print, filled in with this program's path and options.
 
-The templates are the files in `systemd`. In a template, a name in braces stands for a value, and a line such as
-`@supervision.conf` for that file. The printed units work unchanged. The system's units give the process access only to
-what it needs. Nothing is installed here.
+The templates are the files in `systemd`, such as `serve-user` for `talk serve --print-unit user`. In a template, a name
+in braces stands for a value, and a line such as `@supervision.conf` includes that file. The printed units work
+unchanged. The system's units give the process access only to what it needs. Nothing is installed here.
 """
 
 from __future__ import annotations
@@ -30,15 +30,6 @@ if TYPE_CHECKING:
 
 #: The group whose members may use the system's server. They may already use the sound card.
 SOCKET_GROUP = "audio"
-#: The template of each unit, by its command and its name for --print-unit.
-_TEMPLATES = {
-    ("serve", "user"): "talk-user.service",
-    ("serve", "system"): "talk-system.service",
-    ("serve", "user-socket"): "talk-user.socket",
-    ("serve", "system-socket"): "talk-system.socket",
-    ("bridge", "user"): "bridge-user.service",
-    ("bridge", "system"): "bridge-system.service",
-}
 #: The files with the broker's address and login.
 _BRIDGE_ENVIRONMENTS = {"user": "%h/.config/talk/bridge.env", "system": "/etc/talk/bridge.env"}
 
@@ -85,7 +76,7 @@ def _print_unit(
     program = _program(sys.argv[0])
     # The files of the program: its script, its interpreter and its package.
     files = (program[0], *map(os.path.realpath, (program[0], sys.executable, __file__)))
-    unit = _template(_TEMPLATES[command, name]).format(
+    unit = _template(f"{command}-{name}").format(
         command=" ".join(map(_quote, (*program, command, *words, *socket_option, *typed))),
         group=SOCKET_GROUP,
         home="read-only" if any(each.startswith(_HOME_DIRECTORIES) for each in files) else "yes",
@@ -136,7 +127,7 @@ def _find_hidden(files: Sequence[str]) -> tuple[str, str] | None:
 
 def _quote(word: str) -> str:
     """Return a word quoted for the command line in a unit."""
-    word = _escape_specifiers(word).replace("$", "$$")
+    word = word.replace("%", "%%").replace("$", "$$")  # specifiers and variables
     if word and all(each.isalnum() or each in "/._-+=:,@%{}" for each in word):
         return word
     escaped = word.replace("\\", "\\\\").replace('"', '\\"')
@@ -151,8 +142,4 @@ def _escape_path(path: str) -> str:
     """Return a path as the value of a setting, which can't be quoted; UsageError if systemd would misread it."""
     if re.search(_UNSAFE_CHARACTERS, path) or path.endswith(("\\", " ")):
         raise UsageError(f"a socket's unit can't name {printable(path)}: name a path without such signs")
-    return _escape_specifiers(path)
-
-
-def _escape_specifiers(word: str) -> str:
-    return word.replace("%", "%%")
+    return path.replace("%", "%%")  # specifiers
