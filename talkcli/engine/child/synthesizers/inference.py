@@ -202,7 +202,7 @@ class Model:
                 return
             except Exception as error:
                 if _is_out_of_memory(error):
-                    raise _no_memory_error(path) from error
+                    raise no_memory_error(path) from error
                 cache.remove(key)  # for example truncated by a full disk; a real fault shows below
         self._set_halves(*_split(path, content, cache, key))
 
@@ -332,7 +332,7 @@ def load_libraries(path: str) -> None:
         import onnxruntime  # noqa: F401
     except Exception as error:
         if _is_out_of_memory(error):
-            raise _no_memory_error(path) from error
+            raise no_memory_error(path) from error
         raise ImportError(_first_line(error)) from error
 
 
@@ -396,11 +396,12 @@ def _session(model: str | bytes, level: Any = None, optimized_path: str | None =
 def _load_error(path: str, what: str, error: Exception) -> VoiceFileError:
     """Return the error for a model that onnxruntime rejects."""
     if _is_out_of_memory(error):
-        return _no_memory_error(path)
+        return no_memory_error(path)
     return VoiceFileError(f"{path} {what} ({_first_line(error)}): get the voice anew")
 
 
-def _no_memory_error(path: str) -> VoiceFileError:
+def no_memory_error(path: str) -> VoiceFileError:
+    """Return the error for a model that needs more memory than there is."""
     return VoiceFileError(f"{path} cannot be spoken with: there is no memory for it; end another program")
 
 

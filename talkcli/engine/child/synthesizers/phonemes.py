@@ -84,9 +84,14 @@ def split_text(phonemizer: Phonemizer, text: str) -> Iterator[SpeechPart]:
     pending = _PendingPart()
     for clause, ipa in phonemizer.clauses(text):
         groups = _phoneme_groups(ipa)
+        clause_words = _locate_words(phonemizer, clause, groups) if groups else []
+        at = 0
         if len(pending.phonemes) > _LONG_PART_PHONEMES:
             yield pending.finish(ends_sentence=False)
-        for group, words in _groups_with_words(phonemizer, clause, groups, offset):
+        for group in groups:
+            inside = [each for each in clause_words if at <= each[0] < at + len(group)]
+            words = [(place - at, offset + start, length) for place, start, length in inside]
+            at += len(group)
             # There must be room for a blank before the group and a pause mark after it.
             if pending.phonemes and len(pending.phonemes) + 1 + len(group) >= MAX_PART_PHONEMES:
                 yield pending.finish(ends_sentence=False)
@@ -131,18 +136,6 @@ class _PendingPart:
 def _phoneme_groups(ipa: str) -> list[str]:
     """Return the groups of phonemes between blanks; each character of a group is a phoneme."""
     return [unicodedata.normalize("NFD", each) for each in _LANGUAGE_MARK.sub(" ", ipa).split()]
-
-
-def _groups_with_words(
-    phonemizer: Phonemizer, clause: str, groups: Sequence[str], offset: int
-) -> Iterator[tuple[str, list[tuple[int, int, int]]]]:
-    """Yield each group with its words: the index in the group, and the start and length in the text."""
-    words = _locate_words(phonemizer, clause, groups) if groups else []
-    at = 0
-    for group in groups:
-        inside = [each for each in words if at <= each[0] < at + len(group)]
-        yield group, [(place - at, offset + start, length) for place, start, length in inside]
-        at += len(group)
 
 
 def _locate_words(phonemizer: Phonemizer, clause: str, groups: Sequence[str]) -> list[tuple[int, int, int]]:

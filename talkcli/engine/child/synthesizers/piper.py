@@ -12,7 +12,7 @@ import itertools
 
 from talkcli.engine import models
 from talkcli.engine.child.players.base import CannotSpeak
-from talkcli.engine.child.synthesizers.inference import Run
+from talkcli.engine.child.synthesizers.inference import Run, no_memory_error
 from talkcli.engine.child.synthesizers.loader import BackgroundIterator, ModelLoader
 from talkcli.engine.child.synthesizers.phonemes import PAUSE_MARKS, split_text
 from talkcli.engine.models import BEGIN_SYMBOL, END_SYMBOL, PAD_SYMBOL, VoiceFileError
@@ -135,15 +135,13 @@ class Piper:
             sink.begin(about.rate, self.voice)
             with self._espeak.lend(about.espeak_voice) as phonemizer:
                 self._write(model, speaker, split_text(phonemizer, text), settings, sink)
-        except VoiceFileError as error:
-            self.loader.suspect(voice)
-            raise CannotSpeak(Reason.VOICE_FAILED, str(error)) from error
         except MemoryError as error:
-            words = f"{self._path} cannot be spoken with: there is no memory for it; end another program"
-            raise CannotSpeak(Reason.VOICE_FAILED, words) from error
-        except UnknownVoice as error:
+            raise CannotSpeak(Reason.VOICE_FAILED, str(no_memory_error(self._path))) from error
+        except (VoiceFileError, UnknownVoice) as error:
             self.loader.suspect(voice)
-            raise CannotSpeak(Reason.VOICE_FAILED, f"{model.path}.json: {error}: get the voice anew") from error
+            known = isinstance(error, VoiceFileError)
+            words = str(error) if known else f"{model.path}.json: {error}: get the voice anew"
+            raise CannotSpeak(Reason.VOICE_FAILED, words) from error
 
     def _wait_for_model(self, voice: str, sink: SampleSink) -> Model:
         loader = self.loader
