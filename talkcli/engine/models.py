@@ -31,7 +31,7 @@ NO_TELEMETRY = {"ORT_DISABLE_TELEMETRY": "1"}
 
 _MODEL_SUFFIX, JSON_SUFFIX = ".onnx", ".json"
 #: How the names of packages with voices end, and where in such a package the models may be.
-_PACKAGE_SUFFIX, _PACKAGE_FOLDERS = "_piper_voice", ("", "data")
+_PACKAGE_SUFFIX, _PACKAGE_DIRS = "_piper_voice", ("", "data")
 #: The largest JSON file; a model with a thousand speakers has 30,000 bytes.
 _MAX_JSON_BYTES = 1 << 20
 #: The most speakers of a model; the largest of Piper's has 904.
@@ -287,9 +287,7 @@ def _model_directories(environment: Mapping[str, str] | None) -> Iterator[str]:
         except OSError:
             continue
         for package in packages:
-            yield from (
-                os.path.join(os.path.abspath(directory), package, each).rstrip("/") for each in _PACKAGE_FOLDERS
-            )
+            yield from (os.path.join(os.path.abspath(directory), package, each).rstrip("/") for each in _PACKAGE_DIRS)
 
 
 def _described_voice(name: str, path: str) -> Voice:
@@ -299,11 +297,10 @@ def _described_voice(name: str, path: str) -> Voice:
         return Voice(NEURAL_PREFIX + name, None, name)
     names = {number: each for each, number in found.speaker_names.items()}
     speakers = [names.get(number, "") for number in range(found.speakers if found.speakers > 1 else 0)]
-    shown = (
-        each if each.isprintable() and 0 < len(each) <= _MAX_SPEAKER_CHARS else str(number)
-        for number, each in enumerate(speakers)
-    )
-    return Voice(NEURAL_PREFIX + name, found.language, found.name, found.quality, tuple(shown) or None)
+    for number, each in enumerate(speakers):
+        if not each.isprintable() or not 0 < len(each) <= _MAX_SPEAKER_CHARS:
+            speakers[number] = str(number)
+    return Voice(NEURAL_PREFIX + name, found.language, found.name, found.quality, tuple(speakers) or None)
 
 
 def _parse_description(found: Any) -> VoiceDescription:

@@ -74,7 +74,7 @@ _ERROR = (
 _SOURCE_LOCATION = r"^(?P<program>[^\s:]+): \w+:\d+: "
 
 #: Signals that Python ignores, and that a program must not inherit as ignored.
-_RESTORED_SIGNALS = [getattr(signal, name) for name in ("SIGPIPE", "SIGXFSZ") if hasattr(signal, name)]
+_RESET_SIGNALS = [getattr(signal, name) for name in ("SIGPIPE", "SIGXFSZ") if hasattr(signal, name)]
 
 
 class PlayerProcess:
@@ -169,9 +169,7 @@ def _spawn(argv: tuple[str, ...], stdin: int, stderr: int, inherited: Sequence[i
     try:
         for each in inherited:
             os.set_inheritable(each, True)
-        return os.posix_spawnp(
-            argv[0], argv, os.environ, file_actions=actions, setpgroup=0, setsigdef=_RESTORED_SIGNALS
-        )
+        return os.posix_spawnp(argv[0], argv, os.environ, file_actions=actions, setpgroup=0, setsigdef=_RESET_SIGNALS)
     finally:
         for each in inherited:
             os.set_inheritable(each, False)

@@ -48,7 +48,7 @@ _NO_MEMORY = (
     "failed to map segment from shared object",
 )
 #: The longest message of onnxruntime that is passed on.
-_MAX_MESSAGE_CHARS = 200
+_MAX_ERROR_CHARS = 200
 #: The version of `vits.split_model` in the keys of the cache. Raise it if that function's result changes.
 _SPLIT_VERSION = 1
 #: The inputs of a model; the second name is there only if it has several speakers.
@@ -232,11 +232,10 @@ class Model:
         durations = durations.reshape(-1)
         if len(durations) != len(ids) or not np.isfinite(durations).all() or (durations < 0).any():
             raise VoiceFileError(f"{self.path} does not tell how long each sound lasts: get the voice anew")
-        most = _MAX_MEAN_FRAMES * len(ids) * max(1.0, about.duration_scale * scale)
-        if durations.sum() > most:
-            raise VoiceFileError(
-                f"{self.path} makes more than {most:.0f} frames of {len(ids)} sounds: get the voice anew"
-            )
+        limit = _MAX_MEAN_FRAMES * len(ids) * max(1.0, about.duration_scale * scale)
+        if durations.sum() > limit:
+            words = f"makes more than {limit:.0f} frames of {len(ids)} sounds"
+            raise VoiceFileError(f"{self.path} {words}: get the voice anew")
         return Frames(tuple(values), tuple(int(each) for each in np.cumsum(durations)))
 
     def decode(self, frames: Frames, begin: int, end: int, run: Run) -> Any:
@@ -276,7 +275,7 @@ class Model:
         names = {each.name for each in encoder.get_inputs()}
         self._has_speakers = _SPEAKER_INPUT in names
         if names - {_SPEAKER_INPUT} != {*_INPUTS}:
-            raise self._not_piper(f"it takes {', '.join(sorted(names))[:_MAX_MESSAGE_CHARS]}")
+            raise self._not_piper(f"it takes {', '.join(sorted(names))[:_MAX_ERROR_CHARS]}")
         if [each.type for each in decoder.get_outputs()] != ["tensor(float)"]:
             raise self._not_piper("it makes no samples")
         if self._has_speakers != (self.description.speakers > 1):
@@ -312,9 +311,7 @@ class Model:
 
     def _mismatch(self, why: str) -> VoiceFileError:
         both = f"{self.path} and {os.path.basename(self.path)}.json"
-        return VoiceFileError(
-            f"{both} do not belong together ({why[:_MAX_MESSAGE_CHARS]}): get both from the same place"
-        )
+        return VoiceFileError(f"{both} do not belong together ({why[:_MAX_ERROR_CHARS]}): get both from the same place")
 
 
 def load_libraries(path: str) -> None:
@@ -410,4 +407,4 @@ def _is_out_of_memory(error: BaseException | None) -> bool:
 
 
 def _first_line(error: Exception) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0][:_MAX_MESSAGE_CHARS]
+    return (str(error).strip() or type(error).__name__).splitlines()[0][:_MAX_ERROR_CHARS]
