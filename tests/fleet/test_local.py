@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import gc
+import os
 import socket
-from typing import TYPE_CHECKING
+import threading
+from typing import TYPE_CHECKING, cast
 
 import pytest
 
@@ -19,12 +21,13 @@ from talkcli.protocol.events import busy_greeting, greeting
 from talkcli.protocol.lines import decode, encode
 from talkcli.protocol.requests import Status
 from tests.fleet.conftest import in_loop
-from tests.support.surroundings import short_directory
+from tests.support.surroundings import needs_packages, short_directory
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
 
     from talkcli.fleet.bridge.local import LocalConnection
+    from talkcli.fleet.link import Link
 
 GREETING = encode(greeting(__version__, 7, "a1b2"))
 PATIENCE = 10.0
@@ -198,3 +201,59 @@ async def test_a_dial_without_a_free_descriptor_gives_its_slot_back(
     with pytest.raises(OSError, match="Too many"):
         await dial(listening.getsockname(), "bob", slots=slots)
     assert not slots.locked()
+
+
+@in_loop
+async def test_a_server_that_refuses_this_user_is_passed_over_for_the_next_place(
+    listening: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("TALK_SOCKET", raising=False)
+    with short_directory() as directory, socket.socket(socket.AF_UNIX) as first:
+        first.bind(f"{directory}/s")
+        first.listen()
+        first.settimeout(PATIENCE)
+        places = [first.getsockname(), listening.getsockname()]
+        monkeypatch.setattr("talkcli.paths.client_sockets", lambda _: places)
+        dialing = asyncio.create_task(dial(None, "bob"))
+        with await accepted(first) as refusing:
+            refusing.sendall(encode({"talk": 1, "error": "forbidden", "message": "not you"}))
+            with await accepted(listening) as server:
+                server.sendall(GREETING)
+                local = await dialing
+                assert local.path == listening.getsockname()
+                local.close()
+
+
+@in_loop
+async def test_a_server_that_does_not_greet_in_time_is_unavailable(
+    listening: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("talkcli.client.connect.ANSWER_LIMIT_S", 0.2)
+    dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
+    with await accepted(listening) as server:
+        server.sendall(GREETING[:9])
+        with pytest.raises(ServerUnavailable, match=f"does not answer; look at process {os.getpid()}"):
+            await dialing
+
+
+@pytest.mark.parametrize("given_up", [False, True])
+def test_a_link_that_nobody_waits_for_any_more_is_closed_once_it_is_open(given_up: bool) -> None:
+    needs_packages("paho")
+    from talkcli.fleet.link import LinkOpener
+
+    class SlowLink:
+        go, closed, done = threading.Event(), threading.Event(), threading.Event()
+
+        def open(self) -> None:
+            self.go.wait(PATIENCE)
+
+        def close(self) -> None:
+            self.closed.set()
+
+    link = SlowLink()
+    opener = LinkOpener(cast("Link", link), link.done.set)
+    if given_up:
+        opener.cancel()
+    link.go.set()
+    assert (link.closed if given_up else link.done).wait(PATIENCE)
+    assert link.closed.is_set() != link.done.is_set()
