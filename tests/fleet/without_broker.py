@@ -1,4 +1,4 @@
-"""The askers of a robot without a broker: the test hands over requests, and looks at what is published."""
+"""The sessions of a robot without a broker: the test hands over requests, and looks at what is published."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from talkcli.fleet.bridge.session import RemoteSessions
 
 
-class AskersWithoutBroker:
-    """The askers of anna, in the running event loop."""
+class SessionsWithoutBroker:
+    """The sessions of anna, in the running event loop."""
 
     def __init__(self, socket: str, room: int = 200_000) -> None:
         """`socket`: the server's; `room`: bytes of the largest payload."""

@@ -24,7 +24,6 @@ from talkcli.fleet.bridge.session import RemoteSessions
 from talkcli.fleet.link import REASON_NOT_AUTHORIZED, Link, LinkOpener, Will, boottime
 from talkcli.fleet.payloads import HOMEASSISTANT_ONLINE, Presence, bridge_rank, homeassistant_device
 from talkcli.frozen import frozen
-from talkcli.protocol.events import failure
 from talkcli.protocol.lines import MAX_LINE_BYTES, encode
 
 if TYPE_CHECKING:
@@ -396,12 +395,10 @@ class Bridge:
             self._sessions.submit(decision)
 
     def _refuse(self, refusal: Refusal, user: str) -> None:
-        code, words = refusal.error.code, refusal.error.message
-        if refusal.reply_topic is not None:
-            line = encode(failure(refusal.seq, code, words))
-            self._publish_reply(refusal.reply_topic, line, 1, refusal.correlation)
-        log.write_limited(code, f"a request of {user} is refused: {log.sanitize(words)}")
-        if code == STALE_CODE and self._loop.time() - self._echo_at >= _ECHO_PAUSE_S:
+        self._sessions.refuse(refusal)
+        error = refusal.error
+        log.write_limited(error.code, f"a request of {user} is refused: {log.sanitize(error.message)}")
+        if error.code == STALE_CODE and self._loop.time() - self._echo_at >= _ECHO_PAUSE_S:
             self._send_echo()
 
     def _handle_echo(self, payload: bytes) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from talkcli.errors import BadRequest, LineTooLong
+from talkcli.errors import BadRequest, LineTooLong, RequestRefused
 from talkcli.fleet import topics
 from talkcli.frozen import frozen, replace
 from talkcli.goals.goal import By, Goal, Sender
@@ -87,7 +87,7 @@ class Refusal:
     reply_topic: str | None
     seq: int | None
     correlation: bytes | None
-    error: BadRequest
+    error: RequestRefused
 
 
 @frozen

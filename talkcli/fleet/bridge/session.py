@@ -102,10 +102,15 @@ class RemoteSessions:
         session = self._sessions.get((request.user, request.reply_topic)) or self._new_session(request)
         if session:
             session.submit(request)
-        elif request.reply_topic is not None:
-            words = f"{self.name} has as many askers as it takes: {MAX_SESSIONS}"
-            line = encode(failure(request.seq, Busy.code, words))
-            self.publish(request.reply_topic, line, 1, request.correlation)
+        else:
+            error = Busy(f"{self.name} has as many askers as it takes: {MAX_SESSIONS}")
+            self.refuse(policy.Refusal(request.reply_topic, request.seq, request.correlation, error))
+
+    def refuse(self, refusal: policy.Refusal) -> None:
+        """Answer a request with an error, if its client wants an answer."""
+        if refusal.reply_topic is not None:
+            line = encode(failure(refusal.seq, refusal.error.code, refusal.error.message))
+            self.publish(refusal.reply_topic, line, 1, refusal.correlation)
 
     def say_goodbye(self, user: str, reply_topic: str) -> None:
         """End a client's session, once the server has taken the client's requests."""

@@ -1,4 +1,4 @@
-"""Sessions of a robot's askers: their ends, their places, and their limits. With a real server and no broker."""
+"""Sessions of remote clients: their ends, their places, and their limits. With a real server and no broker."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.fleet.conftest import in_loop
-from tests.fleet.without_broker import AskersWithoutBroker
+from tests.fleet.without_broker import SessionsWithoutBroker
 from tests.support.surroundings import short_directory
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ async def await_clients(talk: Talk, most: int) -> None:
 async def test_an_asker_that_is_silent_for_90_s_is_gone_whatever_it_waits_for(
     talk: Talk, pass_time: Callable[[float], None], waits: str
 ) -> None:
-    anna = AskersWithoutBroker(talk.socket)
+    anna = SessionsWithoutBroker(talk.socket)
     if waits == "for room":
         for each in range(20):
             await anna.ask(say(each), "s2")
@@ -92,7 +92,7 @@ async def test_an_asker_that_is_silent_for_90_s_is_gone_whatever_it_waits_for(
 
 @in_loop
 async def test_an_asker_that_says_hello_keeps_what_it_waits_for(talk: Talk, pass_time: Callable[[float], None]) -> None:
-    anna = AskersWithoutBroker(talk.socket)
+    anna = SessionsWithoutBroker(talk.socket)
     goal = await anna.ask(say(1, wait=True))
     for each in range(2, 8):
         pass_time(30)
@@ -108,7 +108,7 @@ async def test_an_asker_that_says_hello_keeps_what_it_waits_for(talk: Talk, pass
 async def test_an_asker_to_whom_nothing_is_owed_is_let_go_without_a_word(
     talk: Talk, pass_time: Callable[[float], None]
 ) -> None:
-    anna = AskersWithoutBroker(talk.socket)
+    anna = SessionsWithoutBroker(talk.socket)
     before = talk.request("status")["server"]["clients"]
     await anna.ask({"seq": 1, "request": "status"})
     told = anna.lines()
@@ -121,7 +121,7 @@ async def test_an_asker_to_whom_nothing_is_owed_is_let_go_without_a_word(
 @in_loop
 async def test_requests_before_a_goodbye_are_carried_out_except_goals_that_wait_for_room(talk: Talk) -> None:
     """With and without a connection to the server; an asker that comes back after its goodbye is told again."""
-    anna = AskersWithoutBroker(talk.socket)
+    anna = SessionsWithoutBroker(talk.socket)
     before = talk.request("status")["server"]["clients"]
     await anna.ask({"seq": 1, "request": "hello"}, "s2")
     for session in ("s1", "s2", "s3"):
@@ -143,7 +143,7 @@ async def test_requests_before_a_goodbye_are_carried_out_except_goals_that_wait_
 async def test_a_cancel_takes_the_place_of_the_asker_that_is_silent_for_longest(
     talk: Talk, pass_time: Callable[[float], None]
 ) -> None:
-    anna = AskersWithoutBroker(talk.socket)
+    anna = SessionsWithoutBroker(talk.socket)
     for each in range(32):
         await anna.ask({"seq": 1, "request": "watch"}, f"w{each}")
         pass_time(0.1)
@@ -167,7 +167,7 @@ async def test_askers_that_come_and_go_at_a_server_that_hangs_take_32_connection
         listening.bind(f"{directory}/s")
         listening.listen(256)
         listening.settimeout(5)
-        anna = AskersWithoutBroker(f"{directory}/s")
+        anna = SessionsWithoutBroker(f"{directory}/s")
         before = threading.active_count()
         for _ in range(100):
             for each in range(3):
@@ -189,7 +189,7 @@ async def test_askers_that_come_and_go_at_a_server_that_hangs_take_32_connection
 
 @in_loop
 async def test_all_askers_hold_four_mebibytes_and_a_cancel_is_taken_beyond(talk: Talk) -> None:
-    anna = AskersWithoutBroker(talk.socket)
+    anna = SessionsWithoutBroker(talk.socket)
     for each in range(20):
         await anna.ask(say(each), "full")
     long = {"text": "a", "patient": True, "data": {"more": "x" * 900}}
@@ -211,7 +211,7 @@ async def test_all_askers_hold_four_mebibytes_and_a_cancel_is_taken_beyond(talk:
 
 @in_loop
 async def test_an_answer_that_is_too_long_for_the_broker_has_no_words_or_is_an_error(talk: Talk) -> None:
-    anna = AskersWithoutBroker(talk.socket, room=3_000)
+    anna = SessionsWithoutBroker(talk.socket, room=3_000)
     for each in range(20):
         await anna.ask(say(each), "full")
     goal = (await anna.ask(say(1, text="long " * 1_000, wait=True)))["goal"]
@@ -220,7 +220,7 @@ async def test_an_answer_that_is_too_long_for_the_broker_has_no_words_or_is_an_e
     assert ended["goal"] == goal
     await anna.ask({"seq": 2, "request": "cancel"})
     anna.sessions.end_all()
-    anna = AskersWithoutBroker(talk.socket, room=300)
+    anna = SessionsWithoutBroker(talk.socket, room=300)
     reply = await anna.ask({"seq": 1, "request": "status"})
     assert (reply["ok"], reply["error"]["code"]) == (False, "too_long")
     assert (await anna.ask({"seq": 2, "request": "cancel"}))["count"] == 0
