@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from talkcli.goals.options import Say
     from talkcli.goals.reasons import Reason
 
-require_fields(Goal, SHOWN_OPTIONS)
+#: the fields of a goal that are unknown when it is accepted
+_LATER = ("reason", "by", "message", "started_at", "ended_at", "duration", "voice", "output")
+require_fields(Goal, (*SHOWN_OPTIONS, *_LATER))
 
 
 @dataclass(slots=True, eq=False)
@@ -97,23 +99,17 @@ class Record:
     def snapshot(self, state: State | None = None) -> Goal:
         """Return the goal as it is now, or with PENDING, as it was when it was accepted."""
         state = self.state if state is None else state
-        accepted = state is State.PENDING
-        spoken = None if accepted or self.started_at is None or self.text is None else self.text[: self.spoken_end]
+        shown = {name: getattr(self.say, name) for name in SHOWN_OPTIONS}
+        if state is not State.PENDING:
+            shown |= {name: getattr(self, name) for name in _LATER}
+            if self.started_at is not None and self.text is not None:
+                shown["spoken"] = self.text[: self.spoken_end]
         return Goal(
             id=self.id,
             state=state,
             text=self.text,
-            reason=None if accepted else self.reason,
-            by=None if accepted else self.by,
-            message=None if accepted else self.message,
-            spoken=spoken,
             client=self.sender,
             paused=self.paused and state is self.state,
             queued_at=self.queued_at,
-            started_at=None if accepted else self.started_at,
-            ended_at=None if accepted else self.ended_at,
-            duration=None if accepted else self.duration,
-            voice=None if accepted else self.voice,
-            output=None if accepted else self.output,
-            **{name: getattr(self.say, name) for name in SHOWN_OPTIONS},
+            **shown,
         )

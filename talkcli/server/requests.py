@@ -78,18 +78,6 @@ class Requests:
         self._waiting_bytes = 0
         self._room_check: asyncio.Handle | None = None
         speech.on_queue_change = self._check_room_soon
-        self._by_kind: dict[type[Request], Callable[[PendingRequest, Any], Steps]] = {
-            Say: self._say,
-            Wait: self._wait,
-            Cancel: self._cancel,
-            Status: self._status,
-            Voices: self._voices,
-            Watch: self._watch,
-            Log: self._log,
-            Set: self._set,
-            Pause: self._pause,
-            Resume: self._resume,
-        }
 
     def handle(self, connection: ClientConnection, seq: int | None, request: Request) -> None:
         """Carry out a request, and answer it now or later."""
@@ -124,7 +112,8 @@ class Requests:
                     await pending.wait(self._speech.for_voices, VOICES_LIMIT_S)
                 elif not isinstance(request, Say):
                     self._skip_voices(pending.connection)
-            await self._by_kind[type(request)](pending, request)
+            steps: Callable[[PendingRequest, Any], Steps] = getattr(self, f"_{request.kind}")
+            await steps(pending, request)
         except RequestRefused as error:
             pending.refuse(error.code, str(error))
         except Exception as error:  # noqa: BLE001 - the server goes on for other clients
@@ -229,7 +218,7 @@ class Requests:
         waited = self._speech.now().monotonic - began
         return waited if in_time or ttl is None else max(waited, ttl)
 
-    # -- one coroutine for each request
+    # -- the coroutine of each request is named after its kind
 
     async def _say(self, pending: PendingRequest, say: Say) -> None:
         speech, scheduler, connection = self._speech, self._scheduler, pending.connection
