@@ -147,7 +147,7 @@ async def test_waiting_requests_of_all_connections_have_a_limit_in_bytes() -> No
     assert refused["goal"]["reason"] == "queue_full"
     assert "64 MiB of requests are waiting already" in refused["goal"]["message"]
     server.requests.left(cast("Any", other))
-    assert not server.requests.owes(cast("Any", other))
+    assert not server.requests.is_waiting(cast("Any", other))
     third = Client()
     server.wait(third, "there is room again")
     assert third.told == []
@@ -179,7 +179,7 @@ async def test_client_that_leaves_while_its_goals_are_cancelled_is_forgotten() -
     assert len(other.told) == 100
     assert len(one.told) < 100
     assert server.requests._waiting_bytes == 0
-    assert not server.requests.owes(cast("Any", other))
+    assert not server.requests.is_waiting(cast("Any", other))
 
 
 @in_loop
@@ -201,7 +201,7 @@ async def test_bug_in_a_request_that_waited_harms_no_other_request(monkeypatch: 
     first, second = cast("Any", client.told)
     assert first["error"]["code"] == "internal_error"
     assert second["goal"]["text"] == "two"
-    assert not server.requests.owes(cast("Any", client))
+    assert not server.requests.is_waiting(cast("Any", client))
     assert server.requests._waiting_bytes == 0
 
 

@@ -27,7 +27,6 @@ class Sender:
 
     pid: int | None = None
     uid: int | None = None
-    #: the program that connected
     command: str | None = None
     #: the command line of the program that started it, which is usually a script
     parent: str | None = None
@@ -63,7 +62,6 @@ class By:
 class Output:
     """The audio output of a goal, as the sound server reports it."""
 
-    #: the player's name
     player: str
     #: the sound server's name for the device
     device: str
@@ -117,11 +115,11 @@ class Goal:
     @property
     def exit_code(self) -> int | None:
         """The exit code of a command with this goal; None until the goal has ended."""
-        # A throttled goal did what its sender asked for.
+        # The sender has asked for throttling, so this is no failure.
         return 0 if self.reason == "throttled" else EXIT_CODES.get(self.state)
 
     def to_json(self) -> JsonObject:
-        # Written out, because a busy server does little else.
+        # Written out for speed, because a busy server does little else.
         return {
             "id": self.id,
             "state": self.state.name,

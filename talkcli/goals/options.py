@@ -6,7 +6,7 @@ of the commands and how they are read, the names of a server's settings, and the
 never renamed or given another meaning.
 
 A value may be wrong in two ways. A request with a value of the wrong type is an error and does nothing
-(`Option.type_error`). A goal with a value that can't be had is REJECTED (`Option.value_error`).
+(`Option.type_error`). A goal with a value that is not allowed is REJECTED (`Option.value_error`).
 
 A client imports this module before it sends anything, so it imports nothing heavy. The first sentence of a request's
 docstring is its meaning in the wire's document.
@@ -59,7 +59,7 @@ _MAX_FLOAT = 1.7976931348623157e308
 
 
 def model_of(voice: str | None) -> str:
-    """Return the id of a neural voice without its speaker, which is what has to be loaded; "" for no voice."""
+    """Return the id of a neural voice without its speaker, as the voice is loaded; "" if there is no voice."""
     return (voice or "").partition(SPEAKER_MARK)[0]
 
 
@@ -79,7 +79,7 @@ class Kind:
     wrong_type: str
     #: the placeholder for the value in help
     metavar: str = ""
-    #: returns what is wrong with a value of the right type, for people, or None
+    #: checks a value of the right type; returns an error message or None
     check: Callable[[Any], str | None] | None = None
 
 
@@ -160,7 +160,7 @@ class Option:
 
     name: str
     kind: Kind
-    #: its meaning on the wire; only for documents, like `form` and `default_words`
+    #: its meaning on the wire, for documents
     meaning: str = ""
     #: its value if it isn't given; if this is None, a request may also have null
     default: Any = None
@@ -172,11 +172,11 @@ class Option:
     unit: str = ""
     #: the only possible values
     choices: tuple[str, ...] = ()
-    #: returns what else is wrong with a value, for people, or None
+    #: a further check of a value of the right type; returns an error message or None
     check: Callable[[Any], str | None] | None = None
-    #: what else is said about its values
+    #: a note on its values, for documents
     form: str = ""
-    #: what is said about its default
+    #: a note on its default, for documents
     default_words: str = ""
     #: its spellings on a command line, "-w, --wait"; with one for yes and one for no, "--preempt/--queue"
     flags: str = ""
@@ -194,7 +194,7 @@ class Option:
     in_goal: bool = False
 
     def type_error(self, value: Any) -> str | None:
-        """Return what is wrong with the type or form of a value, as in "must be an integer"; None if it is right."""
+        """Return an error message such as "must be an integer" if a value has the wrong type or form."""
         if value is None and self.default is None:
             return None
         kind = self.kind
@@ -203,7 +203,7 @@ class Option:
         return kind.check(value) if kind.check else None
 
     def value_error(self, value: Any) -> str | None:
-        """Return why a value of the right type can't be had, for people; None if it can."""
+        """Return an error message if a value of the right type is not allowed."""
         if value is None:
             return None
         if self.limits != (None, None) and self.is_out_of_range(value):
@@ -252,7 +252,7 @@ def _priority_error(value: int) -> str | None:
 
 
 def key_error(value: str) -> str | None:
-    """Return why no goal can have this key, for people; None if one can."""
+    """Return an error message if this is no valid key."""
     if 0 < len(value) <= MAX_KEY_CHARS:
         return None
     return f"a key has 1 to {MAX_KEY_CHARS} characters, this one has {len(value)}"
@@ -593,7 +593,7 @@ class Cancel:
         return self.ids is None and not self.current and self.before is None and self.key is None
 
     def of_waiting(self, goals: Sequence[Say]) -> list[int]:
-        """Return the indexes of the selected goals among goals that wait for room.
+        """Return the indexes of the selected goals in a list of goals that wait for room.
 
         `before` selects such goals only if it is the id that a sender has given to one of them.
         """
@@ -607,7 +607,7 @@ class Cancel:
 
 
 def require_fields(cls: type, options: Iterable[str]) -> None:
-    """Raise TypeError if a class has no field for one of these options, so that a mistake in a row shows at import."""
+    """Raise TypeError if a class lacks the field of one of these options. Called at import to find mistakes in rows."""
     for name in options:
         if name not in cls.__annotations__:
             raise TypeError(f"the option {name!r} has a row but {cls.__name__} has no such field")
@@ -626,7 +626,7 @@ _CHECKED = {
 
 
 def bad_option(asked: Say | Set) -> str | None:
-    """Return what is wrong with the options of a goal, or with settings, for people; None if they are right."""
+    """Return an error message if an option of a goal, or a setting, has a value that is not allowed."""
     if isinstance(asked, Say) and asked.flush and asked.preempt is False:
         return "flush preempts: it can't be had together with preempt false"
     for option in _CHECKED[type(asked)]:
@@ -637,9 +637,7 @@ def bad_option(asked: Say | Set) -> str | None:
 
 
 def bad_text(text: str, max_chars: int | None = MAX_TEXT_CHARS) -> Refusal | None:
-    """Return why a text can't be a goal; None if it can.
-
-    Only the engine knows whether there is something to say in it.
+    """Return why a text can't be spoken; None if it can, as far as is known without the engine.
 
     Args:
         text: the text.
@@ -671,7 +669,7 @@ def given_values(asked: Say | Set) -> dict[str, Any]:
 
 
 def engine_options(say: Say, settings: Set) -> dict[str, Any]:
-    """Return the options that the engine is told of a goal, by name: the goal's own value, or the server's."""
+    """Return the options of a goal that the engine is told, by name, with the server's values for missing ones."""
     found = {}
     for name in ENGINE_OPTIONS:
         own = getattr(say, name)

@@ -4,8 +4,8 @@ Pure: it keeps the goals and knows which one a full queue would displace. The sc
 priorities go first. Goals of the same priority keep the order of acceptance, except that a goal may be put at the front
 of its priority, or into the place of another goal.
 
-At most ten thousand goals wait (`--max-queue`). Methods that are called for each goal use binary search. Methods that
-look at all goals say so.
+At most ten thousand goals wait (`--max-queue`). Methods that are called for each goal use binary search, except where
+their docstring says otherwise.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from talkcli.goals.record import Record
 
-    #: a goal in a sorted list, behind its sort key, which no other goal has
+    #: an entry of a sorted list: a unique sort key, and the goal
     _Entry = tuple[float, int, Record]
 
 _record_of = itemgetter(2)
@@ -36,7 +36,7 @@ class Queue:
         self._preempting: list[_Entry] = []
         #: in the order in which a full queue displaces goals, the first one last: negative priority and number
         self._displaceable: list[_Entry] = []
-        #: the goals with a time to live: its end and the number
+        #: the goals with a time to live: when it ends, and their number
         self._expiries: list[_Entry] = []
         self._by_key: dict[str, Record] = {}
 
@@ -55,7 +55,7 @@ class Queue:
         return None if key is None else self._by_key.get(key)
 
     def with_text(self, text: str) -> Record | None:
-        """Return the first goal with this text. Looks at all goals."""
+        """Return the first goal with this text. Slow, because it looks at all goals."""
         return next((each for each in self if each.text == text), None)
 
     def up_to(self, priority: int) -> list[Record]:

@@ -74,11 +74,11 @@ class Reason(str, Enum):
     ENGINE_HUNG = "engine_hung", (_ABORTED,), "the engine process said nothing any more"
     NOTHING_TO_SAY = "nothing_to_say", (_ABORTED,), "nothing in the text can be spoken"
     NOT_SILENT = "not_silent", (_ABORTED,), "it was stopped, and silence was not confirmed within 2 s"
-    # These two only a client gives.
+    # Only a client gives these two.
     NOT_SENT = "not_sent", (_REJECTED,), "the client could not send it: it never reached a server"
     LOST = "lost", (_LOST,), "the connection ended first"
 
-    # Shown and formatted as the string that it is, in every version of Python.
+    # A member is shown and formatted as a plain string, in every version of Python.
     __str__ = str.__str__
     __repr__ = str.__repr__
 

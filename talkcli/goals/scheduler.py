@@ -340,18 +340,18 @@ class Scheduler:
 
     def word_heard(self, goal_id: str, end: int) -> Record:
         """Note that a word is being heard, which ends at this offset of the text. Return the goal."""
-        record = self._spoken(goal_id)
+        record = self._require_active(goal_id)
         record.spoken_end = max(record.spoken_end, end)
         return record
 
     def voice_chosen(self, goal_id: str, voice: str, now: Now) -> list[Effect]:
-        """Note which voice speaks the active goal. Another goal's voice may be loaded in place of its own now."""
-        self._spoken(goal_id).voice = voice
+        """Note which voice speaks the active goal. Its own voice may be dropped for that of another goal now."""
+        self._require_active(goal_id).voice = voice
         return self._load_next(now)
 
     def output_changed(self, goal_id: str, output: Output | None) -> None:
         """Note where the sound of the active goal goes; None if unknown."""
-        self._spoken(goal_id).output = output
+        self._require_active(goal_id).output = output
 
     def completed(
         self, goal_id: str, duration: float | None, now: Now, gaps: int = 0, gap_seconds: float = 0
@@ -365,7 +365,7 @@ class Scheduler:
             gaps: how often the sound was interrupted because it was not made in time.
             gap_seconds: how long all gaps were together.
         """
-        record = self._spoken(goal_id)
+        record = self._require_active(goal_id)
         record.duration = duration
         record.spoken_end = len(record.text or "")
         words = "Talk completed successfully"
@@ -382,7 +382,7 @@ class Scheduler:
 
         If the goal was being stopped, it is silent now and ends PREEMPTED. Only `not_silent` makes it ABORTED.
         """
-        record = self._spoken(goal_id)
+        record = self._require_active(goal_id)
         record.duration = duration
         if record.state is State.PREEMPTING and reason is not Reason.NOT_SILENT:
             return self.stopped(goal_id, now)
@@ -391,18 +391,18 @@ class Scheduler:
 
     def stopped(self, goal_id: str, now: Now) -> list[Effect]:
         """End the active goal, which was being stopped and is silent now."""
-        record = self._spoken(goal_id)
+        record = self._require_active(goal_id)
         effects = self._end(record, State.PREEMPTED, record.reason, "Talk preempted", record.by, now)
         return effects + self._load_next(now)
 
     def voice_load_ended(self, voice: str, error: str | None, now: Now, *, has_libraries: bool) -> list[Effect]:
-        """Note that a voice was loaded, or why it could not be; and whether the engine has the libraries now."""
+        """Note that a voice was loaded, or why it could not be. `has_libraries`: whether the engine imported them."""
         self.voices.has_libraries = self.voices.has_libraries or has_libraries
         self.voices.load_ended(voice, error, now.monotonic)
         return self._drop_excess() + self.tick(now)
 
     def voices_measured(self, voice: str, memory_bytes: int, now: Now) -> list[Effect]:
-        """Note the memory that all voices take, measured after something was done with this one."""
+        """Note the memory that all voices take. `voice`: the voice that was just loaded or has just spoken, if any."""
         self.voices.measured(voice, memory_bytes)
         return self._drop_excess() + self._load_next(now)
 
@@ -459,7 +459,7 @@ class Scheduler:
         return sorted(unique, key=lambda each: (each is self.active, each.number))
 
     def _refuse(self, say: Say, refusal: Refusal | None, first: Record | None) -> Refusal | None:
-        """Return why a goal is refused whatever the other goals do. `first`: an earlier goal with the same id."""
+        """Return why a goal is refused regardless of other goals. `first`: an earlier goal with the same id."""
         if self.closing:
             return Reason.SHUTDOWN, "the server is being stopped"
         if words := bad_option(say):
@@ -632,7 +632,7 @@ class Scheduler:
         record.paused = False
         return [Changed(record, State.PREEMPTING), Ordered(record, Order.STOP)]
 
-    def _spoken(self, goal_id: str) -> Record:
+    def _require_active(self, goal_id: str) -> Record:
         """Return the active goal; IllegalTransition if this is not its id."""
         if self.active is None or self.active.id != goal_id:
             raise IllegalTransition(f"{goal_id} is not being spoken")

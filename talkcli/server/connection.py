@@ -1,7 +1,7 @@
 """One client: its connection with its limits, and its requests in progress. It decides nothing.
 
 Requests go to a `Handler`. Answers come back through `send`, `send_list` and `publish`. A client that doesn't read its
-answers is not read from either. Its feedback is dropped first, and at last the client itself.
+answers is not read from either. First its feedback is dropped, then the client itself.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ MAX_HELD_MESSAGES = 10_000
 FIRST_REQUEST_S = 5.0
 #: From the beginning of a line to its end.
 LINE_LIMIT_S = 10.0
-#: Consecutive lines that are no JSON, after which the other end can't be a client of ours.
+#: Consecutive lines that are not JSON, after which the connection is closed.
 MAX_BAD_LINES = 10
 #: Lines of one client that are read before other clients have a turn. A line takes 0.1 to 0.2 ms, so a hundred busy
 #: clients delay the others by 0.1 s.
@@ -68,7 +68,7 @@ class Handler(Protocol):
     def handle(self, connection: ClientConnection, seq: int | None, request: Request) -> None:
         """Carry out a request, and answer it now or later."""
 
-    def owes(self, connection: ClientConnection) -> bool:
+    def is_waiting(self, connection: ClientConnection) -> bool:
         """Return whether a client waits for an answer or an event, so that its connection must stay open."""
 
 
@@ -329,7 +329,7 @@ class ClientConnection(asyncio.Protocol):
         else:
             self._ask_for_turn()
         idle = not (self._outbox or self._lines or self.stream.congested)
-        if self._half_closed and idle and not self._handler.owes(self):
+        if self._half_closed and idle and not self._handler.is_waiting(self):
             self.stream.close()
         self._set_reading()
 

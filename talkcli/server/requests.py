@@ -85,7 +85,7 @@ class Requests:
         self._pending.setdefault(connection, {})[pending] = None
         pending.start(self._carry_out(pending))
 
-    def owes(self, connection: ClientConnection) -> bool:
+    def is_waiting(self, connection: ClientConnection) -> bool:
         """Return whether a client waits for an answer or an event."""
         return connection in self._pending or self._speech.subscribers.has(connection)
 

@@ -120,7 +120,7 @@ class Server:
         self._systemd = ServiceManager(self._loop, self.speech.status_words)
         self.speech.on_status_change = self._systemd.schedule_status
         self._requests = Requests(self.speech, self._describe)
-        self.handle, self.owes = self._requests.handle, self._requests.owes
+        self.handle, self.is_waiting = self._requests.handle, self._requests.is_waiting
         self.greeting = encode(greeting(__version__, os.getpid(), self._scheduler.boot))
         self.connections: set[ClientConnection] = set()
         #: set while there is no client
