@@ -180,7 +180,7 @@ class DriverProperties:
         return fallback_reason
 
     def set_voice(self, wanted: str | None) -> None:
-        """Set a voice, or with None the driver's default.
+        """Set a voice, or the driver's default if `wanted` is None.
 
         Raises:
             CannotSpeak: there is no such voice.
@@ -200,7 +200,7 @@ class DriverProperties:
         self.set_voice(None)
 
     def voice_id(self, wanted: str) -> str:
-        """Return the id of the voice that the user's word means.
+        """Return the id of the voice that the user asked for.
 
         Raises:
             CannotSpeak: there is no such voice.

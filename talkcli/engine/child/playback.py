@@ -396,7 +396,7 @@ class Playback:
             self._wait((), time.monotonic() + DEVICE_RETRY_INTERVAL_S)
 
     def _is_busy(self, error: CannotSpeak) -> bool:
-        """Return whether another program holds the device, and has not held it for long."""
+        """Return whether the device is busy and should be tried again."""
         if error.reason != Reason.AUDIO_DEVICE or "busy" not in str(error).lower():
             return False
         self._busy_until = self._busy_until or time.monotonic() + DEVICE_BUSY_LIMIT_S
@@ -457,7 +457,7 @@ class Playback:
         while not player.ended():
             self._update(feed)
             now = time.monotonic()
-            # With less sound left than that, it has ended as soon as it could be held.
+            # A player with less sound left ends as soon as it could be held.
             if self._runner.hold_number and feed.buffered(now) > HOLD_SILENCE_LIMIT_S:
                 self._rewind(feed)
                 raise _PlayerReleased
@@ -473,9 +473,10 @@ class Playback:
     # -- samples
 
     def _find_start(self) -> bool:
-        """Return whether it is decided where the sound begins. Zeros before it are left out, because nobody hears them.
+        """Find where the sound begins, and return whether that is known yet.
 
-        Zeros after another sentence belong to the pause between the two, and a file gets all samples.
+        Zeros before it are left out, because nobody hears them. Zeros after another sentence belong to the pause
+        between the two, and a file gets all samples.
         """
         if self._start_known:
             return True
@@ -560,7 +561,7 @@ class Playback:
         feed.progress_at = time.monotonic()
 
     def _await_silence(self, feed: PlayerFeed) -> None:
-        """Wait until all that the player has of the sentence was heard, or it may go on."""
+        """Wait until the player has played what it has of a held sentence, or the sentence goes on."""
         self._update(feed)
         written, now = feed.written, time.monotonic()
         deadline = now + HOLD_SILENCE_LIMIT_S

@@ -377,7 +377,7 @@ class GoalRunner:
         return self._channel.sent_at + protocol.ALIVE_INTERVAL_S
 
     def _is_overdue(self, goal: ActiveGoal) -> bool:
-        """Return whether a foreign driver has had all the time that the text could take.
+        """Return whether a foreign driver is taking longer than the text could need.
 
         This process then sends no signs of life, so the server kills it. There may be no other way to silence the
         driver.

@@ -127,7 +127,7 @@ class WordClock:
         self._silences.append((position, seconds))
 
     def set_elapsed(self, now: float, elapsed: float) -> None:
-        """Set the seconds of the stream that were heard, as the output tells. With 0, the clock is stopped."""
+        """Set the seconds of the stream that were heard, as the output reports. With 0, the clock is stopped."""
         self._zero = now - elapsed if elapsed > 0 else None
 
     def limit_elapsed(self, now: float, elapsed: float) -> None:

@@ -170,7 +170,7 @@ class EngineProcess:
             kill_holders(self.liveness)
 
     def describe_exit(self) -> str:
-        """Return how a process ended that has closed its connection, for people. Whatever is left of it is killed."""
+        """Kill what is left of a process that closed its connection, and return how it ended, for people."""
         end = time.monotonic() + _EXIT_WAIT_S
         # macOS has no waitid before Python 3.13. There, the status may be that of the kill below.
         while hasattr(os, "waitid") and time.monotonic() < end:

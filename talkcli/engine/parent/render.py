@@ -1,4 +1,4 @@
-"""Rendering of a text into a WAV file, for `say -o`, in an engine process of its own, with or without a server.
+"""Rendering of a text into a WAV file, for `say -o`. It has an engine process of its own and needs no server.
 
 A rendering is not a goal. It isn't queued, no other client sees it, and its text may have any length. A regular file
 appears complete or not at all: the engine writes to a hidden file beside it, which is renamed once the engine reports

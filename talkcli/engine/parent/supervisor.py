@@ -253,7 +253,7 @@ class Supervisor:
     # -- methods for other threads
 
     def say(self, command: protocol.GoalCommand) -> None:
-        """Hand in a goal, always from the same thread. The goal before must have ended or been given up.
+        """Hand in a goal. The previous goal must have ended or been given up. Always call this from the same thread.
 
         The caller's thread sends it to the process if possible, because waking the engine thread would take a tenth to
         a fifth of the time that a goal costs.
@@ -288,7 +288,7 @@ class Supervisor:
             process.send(protocol.NextGoal(goal_id, next_waits, next_is_neural))
 
     def load(self, voice: str, drop: tuple[str, ...] = ()) -> None:
-        """Have the process drop some neural voices and load another, which posts `VoiceLoaded` unless it dies."""
+        """Have the process drop some neural voices and load another. `VoiceLoaded` is posted when that is done."""
         for each in drop:
             self.drop(each)
         self._actions.call(lambda: self._send_voice_command(protocol.LoadVoice(voice)))
@@ -405,7 +405,7 @@ class Supervisor:
                 self._goal_not_sent(goal.command.id, process)
 
     def _goal_not_sent(self, goal_id: str, process: EngineProcess) -> None:
-        """Let a goal that its process didn't take wait for the next process."""
+        """Keep a goal for the next process, because this one didn't take it."""
         if process is self._process:
             goal = self._current(goal_id)
             if goal:
@@ -413,7 +413,7 @@ class Supervisor:
             self._handle_refusal(process)
 
     def _send_voice_command(self, command: protocol.LoadVoice | protocol.DropVoice) -> None:
-        """Load or drop a voice if a process is ready. The next process starts without voices and is told anew."""
+        """Send a command about a voice, if a process is ready. The server asks each new process for voices anyway."""
         process = self._process
         if process and process.ready:
             if isinstance(command, protocol.LoadVoice):
@@ -428,7 +428,7 @@ class Supervisor:
             self._lose_process("the engine takes no commands", Reason.ENGINE_HUNG)
 
     def _hold_goal(self, goal_id: str, number: int | None) -> None:
-        """Hold the goal for the pause with this number, or let it go on if there is no number."""
+        """Hold the goal, or let it go on if `number` is None."""
         goal = self._current(goal_id)
         if goal is None or goal.stop_sent_at is not None or goal.end or goal.hold_number is number is None:
             return
@@ -569,7 +569,7 @@ class Supervisor:
             self._plan_after_failed_start(message)
 
     def _handle_lost_goal(self, goal: SupervisedGoal, process: EngineProcess, message: str, reason: Reason) -> None:
-        """Decide how a goal ends whose process is lost.
+        """Decide what happens to a goal whose process was lost.
 
         If the process crashed before it began with the goal, nothing was heard, and the next process gets the goal.
         This happens only once per goal.
@@ -595,7 +595,7 @@ class Supervisor:
             self._post(EngineMissing(message))
 
     def _release_process(self, process: EngineProcess) -> None:
-        """Release a process that is gone with its player, and post the end of its goal, which is silent now."""
+        """Close the descriptors of a process that is gone with its player, and end its goal, which is silent now."""
         self._selector.unregister(process.liveness)
         if process.stderr in self._selector.get_map():
             process.read_stderr()
