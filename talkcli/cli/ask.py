@@ -93,9 +93,9 @@ def voices(options: CommonOptions, language: str | None) -> None:
         from talkcli.engine.protocol import Voice
         from talkcli.engine.voices import matching_languages
 
-        listed = [Voice(str(each.get("id")), _language(each), str(each.get("name"))) for each in every]
+        listed = [Voice(str(each.get("id")), _language_code(each), str(each.get("name"))) for each in every]
         wanted = matching_languages(language, listed)
-        found = [each for each in every if _language(each) in wanted]
+        found = [each for each in every if _language_code(each) in wanted]
         if not found:
             raise TalkError(_no_voice(language, every))
     show_result(options, found, lambda: voice_lines(found))
@@ -209,11 +209,11 @@ def _no_voice(language: str, voices: Iterable[JsonObject]) -> str:
     from talkcli.goals.options import is_neural
     from talkcli.terminal.text import printable
 
-    codes = {_language(each): _language(each) for each in voices}
+    codes = {_language_code(each): _language_code(each) for each in voices}
     # Names are such as "German" or "English_(America)". The first part of the code lists all voices of the language.
     # The name of a neural voice isn't that of a language.
     names = {
-        str(each.get("name") or "").partition(" ")[0]: _language(each).partition("-")[0]
+        str(each.get("name") or "").partition(" ")[0]: _language_code(each).partition("-")[0]
         for each in voices
         if not is_neural(str(each.get("id")))
     }
@@ -222,5 +222,5 @@ def _no_voice(language: str, voices: Iterable[JsonObject]) -> str:
     return f"no voice speaks '{printable(language)}': {hint}"
 
 
-def _language(voice: JsonObject) -> str:
+def _language_code(voice: JsonObject) -> str:
     return str(voice.get("language") or "").lower()

@@ -80,11 +80,11 @@ class _OptionType(click.FloatRange):
         return range_help(self._option)
 
 
-def _option(option: Option, *, common: bool = False) -> click.Option:
+def _click_option(option: Option, *, common: bool = False) -> click.Option:
     flag = option.kind is FLAG
     return click.Option(
         [*option.flags.split(", "), option.name],
-        type=None if flag else _type(option),
+        type=None if flag else _click_type(option),
         is_flag=flag or None,
         default=option.default,
         show_default=not flag and option.default is not None,
@@ -98,13 +98,13 @@ def _option(option: Option, *, common: bool = False) -> click.Option:
     )
 
 
-def _type(option: Option) -> Any:
+def _click_type(option: Option) -> Any:
     if option.choices:
         return click.Choice(option.choices)
     return click.Path(dir_okay=False) if option.kind is OUTPUT_FILE else _OptionType(option)
 
 
-def _argument(argument: Option) -> click.Argument:
+def _click_argument(argument: Option) -> click.Argument:
     return click.Argument(
         [argument.name],
         nargs=-1 if argument.metavar.endswith("...") else 1,
@@ -175,8 +175,8 @@ class ClickCommand(_HelpfulCommand):
     def __init__(self, row: Command) -> None:
         self.row = row
         self.examples, self.exit_codes = row.examples, row.exit_codes
-        arguments: list[click.Parameter] = [_argument(row.argument)] if row.argument else []
-        own, common = map(_option, row.options), [_option(each, common=True) for each in COMMON_OPTIONS]
+        arguments: list[click.Parameter] = [_click_argument(row.argument)] if row.argument else []
+        own, common = map(_click_option, row.options), [_click_option(each, common=True) for each in COMMON_OPTIONS]
         super().__init__(
             row.name,
             params=[*arguments, *own, *common],
@@ -201,7 +201,7 @@ class ClickCommand(_HelpfulCommand):
         except click.UsageError as error:
             error.ctx = error.ctx or ctx  # the note below the error names this command's help
             if isinstance(error, click.NoSuchOption) and self.row.unknown_option_hint:
-                words = _describe(error)
+                words = _describe_error(error)
                 stop = "" if words.endswith("?") else "."
                 raise click.UsageError(f"{words}{stop} {self.row.unknown_option_hint}", ctx) from error
             raise
@@ -242,7 +242,7 @@ class _CommandGroup(_HelpfulCommand, click.Group):
     invoke_without_command=True,
     subcommand_metavar="COMMAND [ARGS]...",
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
-    params=[_option(each, common=True) for each in COMMON_OPTIONS],
+    params=[_click_option(each, common=True) for each in COMMON_OPTIONS],
 )
 @click.version_option(__version__, prog_name="talk", message="%(prog)s %(version)s")
 @click.pass_context
@@ -269,11 +269,11 @@ def run(arguments: list[str]) -> int:
     _signal.signal(_signal.SIGCHLD, _signal.SIG_DFL)
     options = CommonOptions()
     if "_TALK_COMPLETE" in os.environ:
-        return _complete(options)
-    return run_command(lambda: _main(arguments, options), options)
+        return _complete_for_shell(options)
+    return run_command(lambda: _run_group(arguments, options), options)
 
 
-def _main(arguments: list[str], options: CommonOptions) -> object:
+def _run_group(arguments: list[str], options: CommonOptions) -> object:
     try:
         with talk.make_context("talk", [*arguments], obj=options) as context:
             return talk.invoke(context)
@@ -287,7 +287,7 @@ def _main(arguments: list[str], options: CommonOptions) -> object:
 
         # The error may have been found before --json was read.
         json = options.json or "--json" in arguments
-        words = printable(_describe(error))  # the command line may contain text from another program
+        words = printable(_describe_error(error))  # the command line may contain text from another program
         show_error(UsageError(words), json=json)
         if not json and "--help" not in words:
             found = getattr(error, "ctx", None)
@@ -295,7 +295,7 @@ def _main(arguments: list[str], options: CommonOptions) -> object:
         return error.exit_code
 
 
-def _complete(options: CommonOptions) -> int:
+def _complete_for_shell(options: CommonOptions) -> int:
     """Print the completions for a shell, and nothing else."""
     from talkcli.cli import completion
 
@@ -322,18 +322,18 @@ def _unknown_command(words: list[str]) -> str:
         return f"no such command '{name}': write 'talk{f' {meant}' if meant else ''} --help'"
     near = _FOREIGN_NAMES.get(name.lower()) or nearest(name, COMMANDS)
     return f"no such command '{name}': " + (
-        f"did you mean '{near}'?" if near else f"to speak it, write: talk say {_quoted(' '.join(words))}"
+        f"did you mean '{near}'?" if near else f"to speak it, write: talk say {_quote_for_shell(' '.join(words))}"
     )
 
 
-def _quoted(text: str) -> str:
+def _quote_for_shell(text: str) -> str:
     """Return a text quoted for a shell, in double quotes if possible."""
     import shlex
 
     return shlex.quote(text) if any(each in text for each in '"$`\\!') else f'"{text}"'
 
 
-def _describe(error: click.ClickException) -> str:
+def _describe_error(error: click.ClickException) -> str:
     """Return what is wrong with a command line, in our own style."""
     if isinstance(error, click.NoSuchOption):
         # The dashes would make any two options similar.

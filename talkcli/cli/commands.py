@@ -42,12 +42,12 @@ BRIDGE_UNITS = ("user", "system")
 SHELLS = ("bash", "zsh", "fish")
 
 
-def _timeout(words: str) -> Option:
+def _timeout_option(words: str) -> Option:
     """Return the option --timeout. `words` is its help."""
     return option("-t, --timeout", NUMBER, words, limits=(0, None), excludes_minimum=True, metavar="SEC")
 
 
-def _print_unit(names: tuple[str, ...]) -> Option:
+def _print_unit_option(names: tuple[str, ...]) -> Option:
     words = f"Print a systemd unit with these options, and end. One of {', '.join(names)}; it says where it goes."
     return option("--print-unit", TEXT, words, metavar="UNIT", choices=names)
 
@@ -58,7 +58,7 @@ def _say_options() -> Iterator[Option]:
         if each.flags:
             yield replace(each, env="", help=f"{each.help}  [env var, with -o: {each.env}]") if each.env else each
         if each.name == "wait":
-            yield _timeout("With --wait: cancel it after SEC seconds; time in the queue counts; exit code 124.")
+            yield _timeout_option("With --wait: cancel it after SEC seconds; time in the queue counts; exit code 124.")
         elif each.name == "id":
             what = "What the sender calls itself."
             yield Option("name", WORD, flags="--as", metavar="NAME", help=what, env="TALK_NAME")
@@ -147,7 +147,7 @@ _SERVE_OPTIONS = (
     option("--driver", TEXT, "A driver of pyttsx3's. [default: the one for this system]", metavar="NAME"),
     option("--socket-mode", FILE_MODE, "Who may connect: the socket's file mode.", default="0600"),
     option("--greeting", TEXT, "A sentence to speak at the start."),
-    _print_unit(SERVE_UNITS),
+    _print_unit_option(SERVE_UNITS),
 )
 
 
@@ -172,7 +172,7 @@ _BRIDGE_OPTIONS = (
     ),
     option("--no-text", FLAG, "Leave what is said out of status and events."),
     option("--homeassistant", FLAG, "Be a device of Home Assistant's as well."),
-    _print_unit(BRIDGE_UNITS),
+    _print_unit_option(BRIDGE_UNITS),
     option("--print-acl", FLAG, "Print who may do what on the broker; for mosquitto's acl_file."),
 )
 
@@ -280,7 +280,7 @@ _ROWS = (
             "128+n": "ended by signal n, 141: whoever read its output went away meanwhile; the goals go on",
         },
         options=(
-            _timeout("Wait no longer than SEC seconds; the goals go on; exit code 124."),
+            _timeout_option("Wait no longer than SEC seconds; the goals go on; exit code 124."),
             option("-f, --feedback", FLAG, "Show each word as it is heard."),
         ),
         argument=_GOAL_IDS,

@@ -173,24 +173,27 @@ def _quote_for_bash(value: str, quote: str) -> str:
 def goal_ids(context: click.Context, _: click.Parameter, incomplete: str) -> Items:
     """Complete the id of an unfinished goal."""
     status = _status(context)
-    return _ids(unfinished(status), status, incomplete)
+    return _id_items(unfinished(status), status, incomplete)
 
 
 def known_ids(context: click.Context, _: click.Parameter, incomplete: str) -> Items:
     """Complete the id of any goal. Unfinished goals come first, then the newest."""
-    status, ended = _ask(context, lambda client: (client.status(), client.log(_MAX_ENDED_GOALS))) or (_NO_STATUS, [])
-    return _ids([*unfinished(status), *reversed(ended)], status, incomplete)
+    status, ended = _ask_server(context, lambda client: (client.status(), client.log(_MAX_ENDED_GOALS))) or (
+        _NO_STATUS,
+        [],
+    )
+    return _id_items([*unfinished(status), *reversed(ended)], status, incomplete)
 
 
 def keys(context: click.Context, _: click.Parameter, incomplete: str) -> Items:
     """Complete the key of an unfinished or recent goal."""
     status = _status(context)
-    return _keys([*unfinished(status), *reversed(status.recent)], incomplete)
+    return _key_items([*unfinished(status), *reversed(status.recent)], incomplete)
 
 
 def unfinished_keys(context: click.Context, _: click.Parameter, incomplete: str) -> Items:
     """Complete the key of an unfinished goal."""
-    return _keys(unfinished(_status(context)), incomplete)
+    return _key_items(unfinished(_status(context)), incomplete)
 
 
 def voices(context: click.Context, _: click.Parameter, incomplete: str) -> Items:
@@ -198,11 +201,11 @@ def voices(context: click.Context, _: click.Parameter, incomplete: str) -> Items
 
     Neural voices are few and are called by their ids, so these ids are offered together with the languages.
     """
-    found = _ask(context, lambda client: client.voices()) or []
+    found = _ask_server(context, lambda client: client.voices()) or []
     for field in ("language", "id", "name"):
         fields = [("id" if is_neural(str(each.get("id"))) else field, each) for each in reversed(found)]
         offered = {str(each.get(name) or ""): _voice_help(each, name) for name, each in fields}
-        items = _items(reversed(offered.items()), incomplete)
+        items = _matching_items(reversed(offered.items()), incomplete)
         if items:
             return items
     return []
@@ -223,7 +226,7 @@ def robots(context: click.Context, _: click.Parameter, incomplete: str) -> Items
     offered = [(each.name, ", ".join(map(_shorten, each.groups)) or "robot") for each in online]
     members = Counter(f"@{group}" for each in online for group in {*each.groups} if not topics.name_fault(group))
     offered += [(name, f"{count} robot{'' if count == 1 else 's'}") for name, count in sorted(members.items())]
-    return _items(offered, incomplete)
+    return _matching_items(offered, incomplete)
 
 
 def files(_: click.Context, __: click.Parameter, incomplete: str) -> Items:
@@ -235,10 +238,10 @@ def players(_: click.Context, __: click.Parameter, incomplete: str) -> Items:
     """Complete the name of a player."""
     from talkcli.engine.players import PLAYERS
 
-    return _items([(name, each.about) for name, each in PLAYERS.items()], incomplete)
+    return _matching_items([(name, each.about) for name, each in PLAYERS.items()], incomplete)
 
 
-def _ask(context: click.Context, question: Callable[[Client], _Answer]) -> _Answer | None:
+def _ask_server(context: click.Context, question: Callable[[Client], _Answer]) -> _Answer | None:
     """Ask the server something, and return the answer, or None after any error."""
     options: CommonOptions = context.find_root().obj  # with --socket if it was typed before
     options.connect_timeout = None
@@ -250,10 +253,10 @@ def _ask(context: click.Context, question: Callable[[Client], _Answer]) -> _Answ
 
 
 def _status(context: click.Context) -> ServerStatus:
-    return _ask(context, lambda client: client.status()) or _NO_STATUS
+    return _ask_server(context, lambda client: client.status()) or _NO_STATUS
 
 
-def _ids(goals: Iterable[Goal], status: ServerStatus, incomplete: str) -> Items:
+def _id_items(goals: Iterable[Goal], status: ServerStatus, incomplete: str) -> Items:
     """Return the ids. If digits were typed, also return the bare numbers of this server's goals."""
     own = f"{status.server.get('boot')}-"
     digits = incomplete.isascii() and incomplete.isdecimal()
@@ -262,18 +265,18 @@ def _ids(goals: Iterable[Goal], status: ServerStatus, incomplete: str) -> Items:
         number = each.id.removeprefix(own)
         names = [number, each.id] if digits and number != each.id else [each.id]
         offered += [(name, _goal_help(each)) for name in names]
-    return _items(offered, incomplete)
+    return _matching_items(offered, incomplete)
 
 
-def _keys(goals: Iterable[Goal], incomplete: str) -> Items:
+def _key_items(goals: Iterable[Goal], incomplete: str) -> Items:
     offered: dict[str, str] = {}
     for each in goals:
         if each.key is not None:
             offered.setdefault(each.key, _goal_help(each))
-    return _items(offered.items(), incomplete)
+    return _matching_items(offered.items(), incomplete)
 
 
-def _items(offered: Iterable[tuple[str, str]], incomplete: str) -> Items:
+def _matching_items(offered: Iterable[tuple[str, str]], incomplete: str) -> Items:
     # A value with invisible characters couldn't be recognised, and would reach the terminal unescaped.
     fitting = ((value, words) for value, words in offered if value.startswith(incomplete) and value.isprintable())
     return [CompletionItem(value, help=words) for value, words in fitting if value]

@@ -53,20 +53,20 @@ class PlainCommand:
 def read(arguments: list[str], environment: Mapping[str, str]) -> PlainCommand | None:
     """Parse a command line; None if click has to parse it."""
     try:
-        return _read(arguments, environment)
+        return _parse(arguments, environment)
     except (ValueError, StopIteration):  # an option's value is invalid or missing
         return None
 
 
-def _read(arguments: list[str], environment: Mapping[str, str]) -> PlainCommand | None:
+def _parse(arguments: list[str], environment: Mapping[str, str]) -> PlainCommand | None:
     command: Command | None = None
     words: list[str] = []
     given: dict[str, Any] = {}
-    flags, rest = _flags(COMMON_OPTIONS), iter(arguments)
+    flags, rest = _flag_table(COMMON_OPTIONS), iter(arguments)
     for word in rest:
         if command is None and word in COMMANDS:
             command = COMMANDS[word]
-            flags |= _flags(command.options)
+            flags |= _flag_table(command.options)
         elif word == "--" and command:
             words += rest
         elif word[:1] != "-" or word == "-":
@@ -75,10 +75,10 @@ def _read(arguments: list[str], environment: Mapping[str, str]) -> PlainCommand 
             return None
         if command is None and words:
             return None
-    return _complete(command, given, words, environment) if command and command.plain else None
+    return _add_defaults(command, given, words, environment) if command and command.plain else None
 
 
-def _flags(options: Iterable[Option]) -> Flags:
+def _flag_table(options: Iterable[Option]) -> Flags:
     found: Flags = {}
     for option in options:
         yes, _, no = option.flags.partition("/")
@@ -100,7 +100,7 @@ def _read_option(flags: Flags, word: str, rest: Iterator[str], given: dict[str, 
     return True
 
 
-def _complete(
+def _add_defaults(
     command: Command, given: dict[str, Any], words: list[str], environment: Mapping[str, str]
 ) -> PlainCommand | None:
     """Add the argument and the values that were not given; None if click has to report an error."""
@@ -173,13 +173,13 @@ def _connect_early(plain: PlainCommand, before_sending: Callable[[], None]) -> C
 def early_messages(plain: PlainCommand) -> tuple[JsonObject, JsonObject] | None:
     """Return the hello and the request of a command; None if the request may be refused or needs the library."""
     command, name = plain.command, sender_name(plain.given.get("name"))
-    request = _request(command.name, plain.given)
+    request = _early_request(command.name, plain.given)
     if request is None or len(name or "") > MAX_SENDER_NAME_CHARS:
         return None
     return hello(name, urgent=command.urgent), request
 
 
-def _request(command: str, given: dict[str, Any]) -> JsonObject | None:
+def _early_request(command: str, given: dict[str, Any]) -> JsonObject | None:
     from talkcli.protocol.lines import write_request
 
     if command == "say":

@@ -74,10 +74,10 @@ def say(
         sentence = read
     if output is not None:
         return _write_file(output, sentence, goal_options, timeout, options)
-    return _say(sentence, goal_options, name, timeout, options, wait=wait, feedback=feedback)
+    return _say_text(sentence, goal_options, name, timeout, options, wait=wait, feedback=feedback)
 
 
-def _say(
+def _say_text(
     text: str,
     goal_options: dict[str, Any],
     name: str | None,
@@ -96,7 +96,7 @@ def _say(
                 goal = client.say(text, follow=wait, feedback=feedback, **goal_options)
                 reporter = GoalReporter(options, feedback=feedback)
                 if wait and goal.state is not State.REJECTED:
-                    return _wait(goal, interrupts, timeout, options, reporter)
+                    return _wait_for_goal(goal, interrupts, timeout, options, reporter)
                 return retry_without_output(_report_sent, goal, options, reporter)
         except Lost as error:
             if interrupts.signal_number is None:
@@ -127,7 +127,7 @@ def _report_sent(goal: GoalHandle, options: CommonOptions, reporter: GoalReporte
     return code if goal.state.terminal else EXIT_OK
 
 
-def _wait(
+def _wait_for_goal(
     goal: GoalHandle, interrupts: Interrupts, timeout: float | None, options: CommonOptions, reporter: GoalReporter
 ) -> int:
     """Wait for a goal, report its end, and return the exit code.

@@ -299,7 +299,7 @@ class LineSpeaker:
         """Send and drop lines as far as possible, then wait for more."""
         if self._error is None:
             for line in islice(self._buffer.take_late(time.monotonic()), _MAX_DROPPED_LINES):
-                self._drop(line)
+                self._report_expired(line)
             while self._buffer.first and not (self._unanswered or self._full):
                 self._send(self._buffer.take())
             if self._done:
@@ -316,7 +316,7 @@ class LineSpeaker:
     def _send(self, line: InputLine) -> None:
         if line.excess:
             words = f"the line has {line.excess:,} bytes, the longest text allowed has {MAX_TEXT_BYTES:,}"
-            self._refuse(line.number, rejected_goal(words))
+            self._report_refused(line.number, rejected_goal(words))
             return
         self._sending = line.number
         text, problem = replace_bad_bytes(line.text, line.number)
@@ -329,7 +329,7 @@ class LineSpeaker:
         request = Say(text, wait=True, feedback=self._feedback.shows_events, patient=True, **goal_options)
         handle, accepted = self._client._handle(request)
         if handle.state is State.REJECTED:
-            self._refuse(line.number, handle.goal)
+            self._report_refused(line.number, handle.goal)
             return
         if not self._goals:
             self._expected_since = time.monotonic()
@@ -349,7 +349,7 @@ class LineSpeaker:
         self._connection.forget(exchange)
         self._connection.answer(exchange)
         if handle.state is State.REJECTED:
-            self._refuse(number, handle.goal)
+            self._report_refused(number, handle.goal)
             return
         self._sending = None
         self._show(self._reporter.show_accepted, handle, self._pause_known)
@@ -360,20 +360,20 @@ class LineSpeaker:
             self._feedback.begin([handle.goal])
         self._goals.append((number, handle))
 
-    def _refuse(self, number: int, goal: Goal) -> None:
+    def _report_refused(self, number: int, goal: Goal) -> None:
         """Report a line that was rejected."""
         self._sending = None
-        self._count(number, self._show(self._reporter.report_refused, goal, f"line {number}: "))
+        self._count_failure(number, self._show(self._reporter.report_refused, goal, f"line {number}: "))
 
-    def _drop(self, line: InputLine) -> None:
+    def _report_expired(self, line: InputLine) -> None:
         """Report a line that was not sent within its ttl."""
         words = f"line {line.number} was not sent: its ttl of {format_number(self._ttl)} s is over"
         goal = Goal("", State.RECALLED, text=line.text, reason="expired", message=words)
         code = self._show(self._reporter.report_refused, goal)
         if self._wait:
-            self._count(line.number, code)
+            self._count_failure(line.number, code)
 
-    def _count(self, number: int, code: int) -> None:
+    def _count_failure(self, number: int, code: int) -> None:
         """Keep the exit code of the first line that did not succeed."""
         if code and (self._failure is None or number < self._failure[0]):
             self._failure = number, code
@@ -429,7 +429,7 @@ class LineSpeaker:
                 show_if_possible(self._feedback.show, handle.goal, event)
             if not handle.state.terminal:
                 return
-            self._count(number, self._reporter.report(handle.goal))
+            self._count_failure(number, self._reporter.report(handle.goal))
             self._goals.popleft()
             if self._goals:
                 self._feedback.begin([self._goals[0][1].goal])

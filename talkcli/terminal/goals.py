@@ -107,14 +107,14 @@ def goal_lines(goal: Goal, screen: Screen, now: float) -> list[str]:
         ("from", _describe_sender(goal.client)),
         ("priority", str(goal.priority)),
         ("key", _quote(goal.key or None)),
-        ("ttl", goal.ttl and ", ".join(filter(None, (f"{format_number(goal.ttl)} s", _left(goal, now))))),
+        ("ttl", goal.ttl and ", ".join(filter(None, (f"{format_number(goal.ttl)} s", _time_left(goal, now))))),
         ("data", None if goal.data is None else printable(encode(goal.data).decode().rstrip("\n"))),
-        ("queued", _moment(goal.queued_at)),
-        ("started", _moment(goal.started_at)),
-        ("ended at", _moment(goal.ended_at)),
+        ("queued", _date_and_time(goal.queued_at)),
+        ("started", _date_and_time(goal.started_at)),
+        ("ended at", _date_and_time(goal.ended_at)),
         ("duration", None if goal.duration is None else f"{goal.duration:.2f} s of audio"),
         ("voice", goal.voice and printable(goal.voice)),
-        ("output", goal.output and _output(goal.output)),
+        ("output", goal.output and _describe_output(goal.output)),
     ]
     lines = []
     for name, value in rows:
@@ -129,9 +129,9 @@ def status_lines(status: ServerStatus, screen: Screen, now: float) -> list[str]:
     server = status.server
     uptime = server.get("uptime")
     identity = [
-        f"pid {_field(server, 'pid')} on {_field(server, 'socket')}",
+        f"pid {_format_field(server, 'pid')} on {_format_field(server, 'socket')}",
         f"up {format_duration(float(uptime) if isinstance(uptime, int | float) else 0.0)}",
-        f"{_field(server, 'clients')} of {_field(server, 'max_clients')} clients",
+        f"{_format_field(server, 'clients')} of {_format_field(server, 'max_clients')} clients",
     ]
     engine = _format_fields(server, "engine", "driver", "synthesizer", "player", "device", "lead_in")
     settings = _format_fields(server, "rate", "volume", "pitch", "voice", "ttl", "preempt")
@@ -149,7 +149,7 @@ def status_lines(status: ServerStatus, screen: Screen, now: float) -> list[str]:
     widest = max((width(printable(goal.id)) for _, goals, _ in tables for goal in goals), default=0)
     id_columns = min(widest, max_id_columns(screen) or MAX_ID_COLUMNS)
     for label, goals, without in tables:
-        lines += _table(label, goals, id_columns, screen, now) if goals else [_label(label) + without]
+        lines += _goal_table(label, goals, id_columns, screen, now) if goals else [_label(label) + without]
     return lines
 
 
@@ -166,7 +166,7 @@ def setting_lines(settings: Mapping[str, object]) -> list[str]:
     shown = {"voice": "default", "ttl": 0}
     rows = [(name, shown.get(name, "-") if value is None else value) for name, value in settings.items()]
     longest = max((len(name) for name, _ in rows), default=0)
-    return [f"{printable(name):<{longest}}{COLUMN_GAP}{printable(_value(value))}" for name, value in rows]
+    return [f"{printable(name):<{longest}}{COLUMN_GAP}{printable(_format_value(value))}" for name, value in rows]
 
 
 def voice_lines(voices: list[JsonObject]) -> list[str]:
@@ -186,9 +186,11 @@ def format_duration(seconds: float) -> str:
     return f"{whole} s"
 
 
-def _table(label: str, goals: Sequence[Goal], id_columns: int, screen: Screen, now: float) -> list[str]:
+def _goal_table(label: str, goals: Sequence[Goal], id_columns: int, screen: Screen, now: float) -> list[str]:
     """Return one line for each goal of a status, no wider than the terminal."""
-    heads = [_label("" if number else label) + _head(goal, id_columns, screen) for number, goal in enumerate(goals)]
+    heads = [
+        _label("" if number else label) + _head_columns(goal, id_columns, screen) for number, goal in enumerate(goals)
+    ]
     tails = [_tail_forms(goal, now) for goal in goals]
     texts = [quoted_text(goal, _LISTED_TEXT_CHARS) for goal in goals]
     columns = screen.columns_left(max(map(width, heads)))
@@ -198,7 +200,7 @@ def _table(label: str, goals: Sequence[Goal], id_columns: int, screen: Screen, n
     return [head + words for head, words in zip(heads, fitted, strict=True)]
 
 
-def _head(goal: Goal, id_columns: int, screen: Screen) -> str:
+def _head_columns(goal: Goal, id_columns: int, screen: Screen) -> str:
     """Return the columns before a goal's text: the time of its end, its id and its state."""
     goal_id = pad(cut(printable(goal.id), max_id_columns(screen)), id_columns)
     head = f"{goal_id}{COLUMN_GAP}{screen.coloured(pad(goal.state.name, 9), goal.state)}{COLUMN_GAP}"
@@ -208,9 +210,9 @@ def _head(goal: Goal, id_columns: int, screen: Screen) -> str:
 def _tail_forms(goal: Goal, now: float) -> list[str]:
     """Return several wordings for the column after a goal's text, the longest first."""
     if goal.state.terminal:
-        return _muted(goal) if goal.state is State.SUCCEEDED else reason_forms(goal)
+        return _muted_note(goal) if goal.state is State.SUCCEEDED else reason_forms(goal)
     # The sender comes first, because a wording that doesn't fit is cut at its end.
-    return [", ".join([f"from {each}", *_notes(goal, now)]) for each in sender_forms(goal.client)]
+    return [", ".join([f"from {each}", *_pending_details(goal, now)]) for each in sender_forms(goal.client)]
 
 
 def quoted_text(goal: Goal, limit: int | None = None) -> str:
@@ -222,19 +224,19 @@ def _quote(text: str | None, limit: int | None = None) -> str | None:
     return None if text is None else f'"{printable(text, limit)}"'
 
 
-def _notes(goal: Goal, now: float) -> list[str]:
+def _pending_details(goal: Goal, now: float) -> list[str]:
     """Return further details of a goal that has not ended, such as its priority and its key."""
     held = "held, " if goal.paused else ""
     notes = [
         None if goal.started_at is None else f"{held}for {max(0.0, now - goal.started_at):.1f} s",
         f"priority {goal.priority}" if goal.priority else None,
         None if goal.key is None else f'key "{printable(goal.key)}"',
-        _left(goal, now),
+        _time_left(goal, now),
     ]
     return [each for each in notes if each is not None]
 
 
-def _left(goal: Goal, now: float) -> str | None:
+def _time_left(goal: Goal, now: float) -> str | None:
     """Return how long a pending goal may still wait, or None if it has no limit."""
     if goal.state is not State.PENDING or not goal.ttl or goal.queued_at is None:
         return None
@@ -247,7 +249,7 @@ def _describe_sender(sender: Sender | None) -> str:
     if sender is None:
         return _UNKNOWN_SENDER
     parts = [
-        _program(sender),
+        _sender_command(sender),
         None if sender.pid is None else f"pid {sender.pid}",
         None if sender.uid is None else f"uid {sender.uid}",
         f"calls itself {_quote(sender.name)}" if sender.name else None,
@@ -262,9 +264,9 @@ def sender_forms(sender: Sender | None) -> list[str]:
     """
     if sender is None:
         return [_UNKNOWN_SENDER]
-    script = _script(sender)
+    script = _script_name(sender)
     number = "" if sender.pid is None else f", pid {sender.pid}"
-    forms = [f"{_program(sender)}{number}", f"{script}{number}", script]
+    forms = [f"{_sender_command(sender)}{number}", f"{script}{number}", script]
     if sender.name:
         name = f'"{printable(sender.name)}"'
         forms = [*(f"{name} ({each})" for each in forms), name]
@@ -279,13 +281,13 @@ def _describe_cause(by: By) -> str:
 def reason_forms(goal: Goal) -> list[str]:
     """Return several wordings that say why a goal ended and who ended it, the longest first."""
     if goal.state is State.SUCCEEDED:
-        return [", ".join([*([] if goal.duration is None else [f"{goal.duration:.1f} s"]), *_muted(goal)])]
+        return [", ".join([*([] if goal.duration is None else [f"{goal.duration:.1f} s"]), *_muted_note(goal)])]
     reason = printable(goal.reason or goal.state.name.lower())
     by = []
     if goal.by is not None:
         by = [printable(goal.by.goal)] if goal.by.goal is not None else sender_forms(goal.by.client)
     forms = [f"{reason} by {each}" for each in by] or [reason]
-    words = _details(goal)
+    words = _message_details(goal)
     # With little room, show who ended the goal instead of the reason, because the state hints at the reason.
     shortest = f"by {by[-1]}" if by else reason
     if not words:
@@ -295,7 +297,7 @@ def reason_forms(goal: Goal) -> list[str]:
     return forms if goal.state in {State.ABORTED, State.REJECTED} else [*forms, shortest]
 
 
-def _details(goal: Goal) -> str:
+def _message_details(goal: Goal) -> str:
     """Return the details in a goal's message. They are empty if the reason and `by` say the same."""
     if goal.state not in {State.ABORTED, State.REJECTED} and goal.by is not None:
         return ""
@@ -303,33 +305,33 @@ def _details(goal: Goal) -> str:
     return printable(words) if colon and head.startswith("Talk ") else ""
 
 
-def _output(output: Output) -> str:
+def _describe_output(output: Output) -> str:
     muted = ", muted" if output.muted else ""
     return f"{printable(output.device)}, by {printable(output.player)}, volume {output.volume:g}{muted}"
 
 
-def _muted(goal: Goal) -> list[str]:
+def _muted_note(goal: Goal) -> list[str]:
     """Return a note if the goal was played on a muted output."""
     return ["muted"] if goal.output and goal.output.muted else []
 
 
-def _program(sender: Sender) -> str:
+def _sender_command(sender: Sender) -> str:
     return printable(sender.parent or sender.command or "a program", _SENDER_COMMAND_CHARS)
 
 
-def _script(sender: Sender) -> str:
+def _script_name(sender: Sender) -> str:
     """Return the name of the sender's script, without its directory, its arguments and its launchers."""
     words = (sender.parent or "").split()
     if not words:
-        return _program(sender)
-    while launched := _launched(words):
+        return _sender_command(sender)
+    while launched := _launched_command(words):
         words = launched
-    return printable(_base(words[0]), _SENDER_COMMAND_CHARS)
+    return printable(_file_name(words[0]), _SENDER_COMMAND_CHARS)
 
 
-def _launched(words: list[str]) -> list[str]:
+def _launched_command(words: list[str]) -> list[str]:
     """Return the command that a launcher starts. It is empty for other commands and for scripts without a name."""
-    name = _base(words[0]).rstrip("0123456789.")
+    name = _file_name(words[0]).rstrip("0123456789.")
     if name not in _LAUNCHERS:
         return []
     valued, nameless, arguments = _LAUNCHERS[name]
@@ -352,16 +354,16 @@ def _launched(words: list[str]) -> list[str]:
     return []
 
 
-def _base(path: str) -> str:
+def _file_name(path: str) -> str:
     return path.rstrip("/").rpartition("/")[2] or path
 
 
 def _format_fields(server: JsonObject, *names: str) -> list[str]:
     shown = [each for each in names if server.get(each) or each not in _OPTIONAL_FIELDS]
-    return [_FIELD_FORMATS.get(each, f"{each} {{}}").format(_field(server, each)) for each in shown]
+    return [_FIELD_FORMATS.get(each, f"{each} {{}}").format(_format_field(server, each)) for each in shown]
 
 
-def _value(value: object) -> str:
+def _format_value(value: object) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     return format_number(value)
@@ -372,10 +374,10 @@ def clock_time(seconds: float | None) -> str:
     return "--:--:--" if seconds is None else time.strftime("%H:%M:%S", time.localtime(seconds))
 
 
-def _moment(seconds: float | None) -> str | None:
+def _date_and_time(seconds: float | None) -> str | None:
     return None if seconds is None else time.strftime("%Y-%m-%d %H:%M:%S %z", time.localtime(seconds))
 
 
-def _field(server: JsonObject, name: str) -> str:
+def _format_field(server: JsonObject, name: str) -> str:
     value = server.get(name)
-    return "default" if value is None else printable(_value(value), _LISTED_TEXT_CHARS)
+    return "default" if value is None else printable(_format_value(value), _LISTED_TEXT_CHARS)

@@ -195,7 +195,7 @@ class MeasuredText:
 
     def split(self, heard: int) -> tuple[str, str]:
         """Return the first `heard` characters and the rest, both escaped."""
-        return self._part(0, heard), self._part(heard, len(self._shown))
+        return self._slice(0, heard), self._slice(heard, len(self._shown))
 
     def view(self, start: int, end: int, columns: int) -> tuple[str, str, str]:
         """Return the part of the text around a word that fits into this many columns.
@@ -224,9 +224,9 @@ class MeasuredText:
         before = ELLIPSIS if first > 0 else ""
         after = ELLIPSIS if stop < last else ""
         start, end = min(start, stop), min(end, stop)
-        return before + self._part(first, start), self._part(start, end), self._part(end, stop) + after
+        return before + self._slice(first, start), self._slice(start, end), self._slice(end, stop) + after
 
-    def _part(self, start: int, end: int) -> str:
+    def _slice(self, start: int, end: int) -> str:
         return "".join(self._shown[start:end])
 
     def _first_shown(self, column: int, start: int) -> int:

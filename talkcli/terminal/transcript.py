@@ -100,7 +100,7 @@ class Transcript:
             return [self._pause_line(event, screen, now)]
         if isinstance(event, WordHeard) and self._with_words:
             word = f"{printable(event.word)}{COLUMN_GAP}{event.time:.2f} s"
-            return [self._head(event.at or now, "word", None, event.id, screen) + word]
+            return [self._head_columns(event.at or now, "word", None, event.id, screen) + word]
         return []  # only clients that wait for a goal get its result
 
     def _snapshot_lines(self, event: Snapshot, screen: Screen, now: float) -> list[str]:
@@ -134,19 +134,19 @@ class Transcript:
             return []
         at = event.at or now
         if goal is None:
-            return [self._head(at, event.state.name, event.state, event.id, screen).rstrip()]
+            return [self._head_columns(at, event.state.name, event.state, event.id, screen).rstrip()]
         return self._goal_lines(goal, event.state, at, screen)
 
     def _pause_line(self, event: PausedChanged, screen: Screen, now: float) -> str:
         self._paused = event.paused
         name = "paused" if event.paused else "resumed"
-        head = self._head(event.at or now, name, State.PREEMPTING, event.id or "", screen)
+        head = self._head_columns(event.at or now, name, State.PREEMPTING, event.id or "", screen)
         by = event.by.client if event.by else None
         forms = [f"by {each}" for each in sender_forms(by)] if by else [""]
         return (head + longest_fitting(forms, screen.columns_left(width(head)))).rstrip()
 
     def _goal_lines(self, goal: Goal, state: State, at: float, screen: Screen) -> list[str]:
-        head = self._head(at, state.name, state, goal.id, screen)
+        head = self._head_columns(at, state.name, state, goal.id, screen)
         ended = state.terminal
         forms = reason_forms(goal) if ended else sender_forms(goal.client)
         if state is State.REJECTED:  # no earlier line has named its sender
@@ -174,7 +174,7 @@ class Transcript:
         tail = longest_fitting(forms, screen.columns_left(_INDENT_COLUMNS))
         return [head + shorten(text, columns), " " * _INDENT_COLUMNS + tail]
 
-    def _head(self, at: float, word: str, state: State | None, goal_id: str, screen: Screen) -> str:
+    def _head_columns(self, at: float, word: str, state: State | None, goal_id: str, screen: Screen) -> str:
         robot = [] if self._robot is None else [self._widths.robot(self._robot, screen)]
         cells = (screen.coloured(pad(word, 10), state), self._widths.goal_id(goal_id, screen))
         return COLUMN_GAP.join((clock_time(at), *robot, *cells, ""))
