@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 class _BusyEngine:
     """An engine that accepts every goal and reports nothing."""
 
-    def say(self, goal: protocol.Speak) -> None:
+    def speak(self, goal: protocol.Speak) -> None:
         """Do nothing."""
 
     def announce_next(self, goal_id: str, next_waits: bool, next_is_neural: bool) -> None:

@@ -63,7 +63,7 @@ class Client:
 class Engine:
     """An engine that accepts every goal and reports nothing."""
 
-    def say(self, _: object) -> None:
+    def speak(self, _: object) -> None:
         pass
 
     def stop(self, _: str) -> None:
@@ -305,7 +305,7 @@ class _Written:
     def __init__(self, written: list[str]) -> None:
         self.written = written
 
-    def say(self, goal: protocol.Speak) -> None:
+    def speak(self, goal: protocol.Speak) -> None:
         self.written.append(f"say {goal.text}")
 
     def stop(self, _: str) -> None:

@@ -170,7 +170,8 @@ class Speech:
             case VoiceLoadOrder(voice=voice, dropped=dropped):
                 for each in dropped:
                     log.write(f"voice {log.sanitize(each)} dropped, to make room for {log.sanitize(voice)}")
-                self.engine.load(voice, dropped)
+                    self.engine.drop(each)
+                self.engine.load(voice)
             case VoiceDropOrder(voice=voice):
                 log.write(f"voice {log.sanitize(voice)} dropped: the voices take more than --voice-memory allows")
                 self.engine.drop(voice)
@@ -200,7 +201,7 @@ class Speech:
                 self.report(protocol.Ended(record.id, protocol.OUTCOME_FAILED, Reason.VOICE_FAILED, why))
                 return
             options["pitch"] = INITIAL.pitch  # a neural voice has no other
-        self.engine.say(
+        self.engine.speak(
             protocol.Speak(
                 record.id, record.text or "", next_waits=next_waits, next_is_neural=next_is_neural, **options
             )

@@ -257,7 +257,7 @@ def test_the_answer_to_a_goal_is_understood_before_the_goal_is_noted(monkeypatch
     swift = SimpleNamespace(send=send, receive=lambda: [protocol.Ended("g1", OUTCOME_COMPLETED)] * said.count(YES))
     for name in ("_process", "_direct_process"):
         monkeypatch.setattr(engine, name, swift)
-    engine.say(YES)
+    engine.speak(YES)
     engine._receive(cast("EngineProcess", swift))
     assert posted == [protocol.Ended("g1", OUTCOME_COMPLETED)]
     engine._actions.close()

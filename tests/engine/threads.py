@@ -59,7 +59,7 @@ class Thread:
         self.engine.thread.start()
 
     def say(self, text: str, goal: str = "g1") -> None:
-        self.engine.say(protocol.Speak(goal, text, 200, 1.0, None, 50))
+        self.engine.speak(protocol.Speak(goal, text, 200, 1.0, None, 50))
 
     def next(self, seconds: float = PATIENCE) -> Report | None:
         """Return the next report, None if there is none for so long."""

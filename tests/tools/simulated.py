@@ -61,12 +61,12 @@ class SilentEngine:
         self._report, self._begun = report, begun
         self._goal = ""
 
-    def say(self, say: protocol.Speak) -> None:
-        self._begun(say.id, say.text)
-        found = _LENGTH.search(say.text)
+    def speak(self, command: protocol.Speak) -> None:
+        self._begun(command.id, command.text)
+        found = _LENGTH.search(command.text)
         length = float(found.group(1)) if found else _USUAL_LENGTH_S
-        self._goal = say.id
-        asyncio.get_running_loop().call_later(length, self._end, say.id, protocol.OUTCOME_COMPLETED, length)
+        self._goal = command.id
+        asyncio.get_running_loop().call_later(length, self._end, command.id, protocol.OUTCOME_COMPLETED, length)
 
     def stop(self, goal_id: str) -> None:
         self._end(goal_id, protocol.OUTCOME_STOPPED, None)

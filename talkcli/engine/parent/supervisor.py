@@ -237,7 +237,7 @@ class Supervisor:
         self._actions = ActionQueue(nap_s=HANG_LIMIT_S)
         self._selector = self._actions.selector
         self._process: EngineProcess | None = None
-        #: the process to which `say` sends goals directly; None if only the engine thread may decide
+        #: the process to which `speak` sends goals directly; None if only the engine thread may decide
         self._direct_process: EngineProcess | None = None
         self._started_at = 0.0
         self._restarts = RestartPolicy(time.monotonic())
@@ -252,7 +252,7 @@ class Supervisor:
 
     # -- methods for other threads
 
-    def say(self, command: protocol.GoalCommand) -> None:
+    def speak(self, command: protocol.GoalCommand) -> None:
         """Hand in a goal. The previous goal must have ended or been given up. Always call this from the same thread.
 
         The caller's thread sends it to the process if possible, because waking the engine thread would take a tenth to
@@ -287,10 +287,8 @@ class Supervisor:
         if process:
             process.send(protocol.NextGoal(goal_id, next_waits, next_is_neural))
 
-    def load(self, voice: str, drop: tuple[str, ...] = ()) -> None:
-        """Have the process drop some neural voices and load another. `VoiceLoaded` is posted when that is done."""
-        for each in drop:
-            self.drop(each)
+    def load(self, voice: str) -> None:
+        """Have the process load a neural voice. `VoiceLoaded` is posted when that is done."""
         self._actions.call(lambda: self._send_voice_command(protocol.LoadVoice(voice)))
 
     def drop(self, voice: str) -> None:
