@@ -90,7 +90,7 @@ def _show_robots(options: CommonOptions, broker: Broker, selection: Selection | 
     found = read_robots(broker, ANSWER_LIMIT_S, selection.name if selection else None)
     selected = [each for each in found if selection is None or selection.includes(each.presence)]
     if not selected:
-        raise _no_robot(broker, selection)
+        raise _no_robot_error(broker, selection)
     show_result(
         options,
         (each.to_json() for each in selected),
@@ -98,7 +98,7 @@ def _show_robots(options: CommonOptions, broker: Broker, selection: Selection | 
     )
 
 
-def _no_robot(broker: Broker, selection: Selection | None) -> ServerUnavailable:
+def _no_robot_error(broker: Broker, selection: Selection | None) -> ServerUnavailable:
     """Return the error for a selection without any robot."""
     if selection is None:
         return ServerUnavailable(f"no robot is known at {broker.url}; on each robot: talk bridge --name NAME")

@@ -134,7 +134,7 @@ def _cancel(asked: FleetRequest, interrupts: Interrupts, printer: _OutcomePrinte
     """Cancel the goals that have not ended, and wait a moment for silence."""
     interrupts.reset()
     try:
-        if asked.open:
+        if asked.unfinished_robots:
             asked.cancel()
         retry_without_output(printer.show_outcomes, asked, CANCEL_TIMEOUT_S)
     except (Interrupted, TimeoutError):
@@ -151,7 +151,7 @@ class _OutcomePrinter:
         #: the outcome that counts for each robot: its first failure, or else its last outcome
         self._outcomes: dict[str, Outcome] = {}
         #: robots that have more outcomes to come
-        self._open: set[str] = set()
+        self._unfinished: set[str] = set()
         shows_count = not options.quiet and sys.stderr is not None and sys.stderr.isatty()
         self._terminal = sys.stderr if shows_count else None
 
@@ -170,12 +170,12 @@ class _OutcomePrinter:
     def _add(self, outcome: Outcome) -> None:
         # The answer of a robot that seemed to be absent replaces its failure.
         robot = outcome.robot
-        if robot not in self._open or not self._outcomes[robot].exit_code:
+        if robot not in self._unfinished or not self._outcomes[robot].exit_code:
             self._outcomes[robot] = outcome
         if outcome.last:
-            self._open.discard(robot)
+            self._unfinished.discard(robot)
         else:
-            self._open.add(robot)
+            self._unfinished.add(robot)
 
     def summarize(self, asked: FleetRequest, unknown: str = "not done") -> int:
         """Show how many robots did as asked and why others failed. Return the exit code.
@@ -185,12 +185,14 @@ class _OutcomePrinter:
             unknown: how to describe robots that have more outcomes to come.
         """
         failures = [each for each in self._outcomes.values() if each.exit_code]
-        done = [robot for robot, each in self._outcomes.items() if not each.exit_code and robot not in self._open]
+        done = [robot for robot, each in self._outcomes.items() if not each.exit_code and robot not in self._unfinished]
         if not self._options.quiet:
             for words in _failure_notes(failures)[:_MAX_NOTES]:
                 note(words)
-            if asked.open:
-                note(f"{unknown}: {_listed(asked.open)}{f': {asked.away}' if asked.away else ''}")
+            if asked.unfinished_robots:
+                note(
+                    f"{unknown}: {_listed(asked.unfinished_robots)}{f': {asked.why_disconnected}' if asked.why_disconnected else ''}"
+                )
             note(f"{len(done)} of {len(asked)} as asked")
         codes = {each.exit_code for each in failures}
         return EXIT_DIFFER if len(codes) > 1 else next(iter(codes), EXIT_OK)
@@ -209,7 +211,7 @@ class _OutcomePrinter:
     def _show_count(self, asked: FleetRequest) -> None:
         """Show how many robots are done, if standard error is a terminal."""
         if self._terminal:
-            self._terminal.write(f"\r{len(self._outcomes) - len(self._open)} of {len(asked)}")
+            self._terminal.write(f"\r{len(self._outcomes) - len(self._unfinished)} of {len(asked)}")
             self._terminal.flush()
 
     def _clear_count(self) -> None:

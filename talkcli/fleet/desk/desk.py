@@ -43,7 +43,7 @@ ABSENCE_LIMIT_S = 30.0
 _REQUEST_EXPIRY_S = 5
 #: Time allowed for late retained messages: some brokers send them a moment after the others.
 RETAINED_GRACE_S = 0.3
-#: Bounds of the pause before the next attempt to connect. The pause is random, and doubles on average each time.
+#: Bounds of the pause before the next attempt to connect. The pause is random, and its average doubles.
 _FIRST_RECONNECT_PAUSE_S, _MAX_RECONNECT_PAUSE_S = 0.5, 10.0
 
 
@@ -85,7 +85,7 @@ class DeskLink:
         #: when the marker came back, which the broker sends after its retained messages; None if it hasn't
         self.marker_at: float | None = None
         self._inbox: deque[Message] = deque()
-        #: errors of refused requests with the functions to call, which `poll` does: the link is locked when it reports
+        #: refusals that `poll` will report, each with the function to call; the link is locked when they come
         self._refusals: deque[tuple[Callable[[TalkError], None], TalkError]] = deque()
         self._opening: LinkOpener | None = None
         self._failed_attempts = 0
@@ -96,8 +96,8 @@ class DeskLink:
             each.setblocking(False)
 
     @property
-    def has_retained(self) -> bool:
-        """Whether the broker has had time to send all its retained messages."""
+    def retained_received(self) -> bool:
+        """Whether all retained messages should have been received by now."""
         return self.marker_at is not None and time.monotonic() > self.marker_at + RETAINED_GRACE_S
 
     def reply_topic(self, robot: str) -> str:
@@ -155,12 +155,12 @@ class DeskLink:
             AccessDenied: The broker doesn't let this user log in, or read its own replies.
         """
         end = time.monotonic() + timeout
-        while not (self.has_retained or (self.marker_at is not None and is_enough())):
+        while not (self.retained_received or (self.marker_at is not None and is_enough())):
             if self.failure is not None:
                 raise self.failure
             left = end - time.monotonic()
             if left <= 0:
-                raise self.no_answer(timeout)
+                raise self.no_answer_error(timeout)
             self.poll(left, interrupt)
 
     def send(
@@ -241,7 +241,7 @@ class DeskLink:
             return self._access_error(action)
         return ServerUnavailable(f"nothing was sent: the broker at {self.broker.url} refuses it, reason 0x{code:02x}")
 
-    def no_answer(self, timeout: float) -> TalkError:
+    def no_answer_error(self, timeout: float) -> TalkError:
         """Return the error for a broker that has sent no retained messages within `timeout` seconds."""
         if self.link is None or self.marker_at is not None:
             return ServerUnavailable(f"the broker at {self.broker.url} does not answer within {timeout:g} s")
@@ -256,7 +256,9 @@ class DeskLink:
         if link is not None:
             link.tick()
             return (
-                TICK_EVERY_S if self.marker_at is None or self.has_retained else self.marker_at + RETAINED_GRACE_S - now
+                TICK_EVERY_S
+                if self.marker_at is None or self.retained_received
+                else self.marker_at + RETAINED_GRACE_S - now
             )
         if self._opening is not None and self._opening.done:
             self._end_attempt(self._opening)

@@ -139,7 +139,13 @@ def reply_outcomes(robot: str, request: Request, reply: JsonObject, items: list[
 
 
 def cancel_outcomes(robot: str, items: list[JsonObject], *, last: bool = True) -> list[Outcome]:
-    """Return the outcome of each goal in the answer to a cancel; `last` is false if other outcomes follow."""
+    """Return the outcome of each goal in the answer to a cancel.
+
+    Args:
+        robot: the robot's name.
+        items: the lines of the answer's list.
+        last: whether the robot has no other outcomes after these.
+    """
     done = Canceled.from_items(items)
     goals = (*done.canceled, *done.ended)
     return [Outcome(robot, each.state.name, EXIT_OK, each, last=last and each is goals[-1]) for each in goals]

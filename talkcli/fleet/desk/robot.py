@@ -41,11 +41,11 @@ if TYPE_CHECKING:
 
 #: Interval of the messages that keep the bridge's session alive, which ends after 90 s of silence.
 _KEEP_ALIVE_INTERVAL_S = 30.0
-#: Limit for sending a request again: the request itself may make the broker end the connection.
+#: How often a request is sent again at most. The request itself may be what makes the broker disconnect.
 _MAX_RESENDS = 5
 #: Pause between two attempts to connect while `keep_trying` lasts.
 _CONNECT_PAUSE_S = 0.25
-#: The user's part of a new goal id, which may have 64 characters.
+#: Length of the user's name in a new goal id. An id has 64 characters at most.
 _ID_USER_CHARS = 48
 #: Goals that are looked up at once after an absence. A bridge takes 64 open requests of each client.
 _MAX_OPEN_LOOKUPS = 32
@@ -56,7 +56,7 @@ class RobotExchange(Exchange):
 
     #: how often the request was sent again
     resends = 0
-    #: by when a sentence must be sent, by the clock of `boottime`; None for no limit
+    #: the latest `boottime` at which a sentence may be sent; None for no limit
     latest: float | None = None
 
 
@@ -142,7 +142,7 @@ class RobotConnection(Connection):
             self._desk.wake()  # it will be sent when the robot is back
         return exchange
 
-    def expect(self, exchange: RobotExchange) -> None:
+    def expect_reply(self, exchange: RobotExchange) -> None:
         """Expect an answer to a request that was sent to the robot's group."""
         exchange.sent = True
         self._published_at = time.monotonic()
@@ -152,7 +152,7 @@ class RobotConnection(Connection):
         if not self._post(request):
             raise ServerUnavailable(f"nothing was sent to the server at {self.path}: {self.ended or self.absence}")
 
-    def cancel_lastingly(self, goal_id: str, *, is_sent: bool) -> None:
+    def cancel_permanently(self, goal_id: str, *, is_sent: bool) -> None:
         """Cancel a goal now and after each absence, and never send it again.
 
         Args:
@@ -245,7 +245,7 @@ class RobotConnection(Connection):
             self.absent_since = time.monotonic()
 
     def _update_presence(self, payload: bytes) -> None:
-        """Process a presence message. It is from the robot's bridge, or it is the bridge's will."""
+        """Process a presence message from the robot's bridge, or the bridge's will."""
         try:
             presence = decode(payload.strip())
         except BadRequest:
@@ -265,7 +265,7 @@ class RobotConnection(Connection):
     # -- connecting
 
     def wait_online(self, give_up: float) -> None:
-        """Wait for the robot's presence, and until `give_up` (monotonic) for an offline robot to come online.
+        """Wait until the robot is known. If it is offline, wait for it until `give_up` (monotonic).
 
         The errors are those of `connect_robot`.
         """
@@ -288,7 +288,7 @@ class RobotConnection(Connection):
     # -- after an absence
 
     def _resend_all(self) -> None:
-        """Send open requests again, and look up the goals."""
+        """Send open requests again, and look up goals that were sent before."""
         now = time.monotonic()
         if self._sender:
             self._post(Hello(self._sender))

@@ -90,13 +90,13 @@ class FleetRequest:
         #: the known robots, by name; some may be too late for the request
         self._robots: dict[str, RobotRequest] = {}
         #: names of the robots that have more outcomes to come
-        self._open: set[str] = set()
+        self._unfinished: set[str] = set()
         self._outcomes: deque[Outcome] = deque()
         self._numbers = itertools.count(FIRST_NUMBER)
         self._number = next(self._numbers)
         #: why the broker has refused the message to the group
         self._refused: TalkError | None = None
-        #: whether the request was sent; whether no more robots can join; whether it was cancelled; whether it is closed
+        #: whether the request was sent; whether all robots are known; whether it was cancelled; whether it is closed
         self._began = self._complete = self._canceled = self._closed = False
         self._desk = DeskLink(broker)
         self._desk.handler = self
@@ -124,16 +124,16 @@ class FleetRequest:
         return self.results()
 
     def __len__(self) -> int:
-        """Return the number of selected robots that are known by now, also of those that can't be asked."""
+        """Return the number of selected robots, as far as they are known, including those that can't be asked."""
         return sum(each.is_included for each in self._robots.values())
 
     @property
-    def open(self) -> list[str]:
+    def unfinished_robots(self) -> list[str]:
         """The names of the robots that have more outcomes to come, sorted."""
-        return sorted(self._open)
+        return sorted(self._unfinished)
 
     @property
-    def away(self) -> str | None:
+    def why_disconnected(self) -> str | None:
         """The reason why nothing can be sent now; None if the broker is connected."""
         return None if self._desk.link else f"the broker at {self._desk.broker.url} went away"
 
@@ -159,20 +159,20 @@ class FleetRequest:
             if self._refused is not None:
                 self.close()
                 raise self._refused
-            self._complete = self._complete or self._desk.has_retained
-            if self._complete and not self._open:
+            self._complete = self._complete or self._desk.retained_received
+            if self._complete and not self._unfinished:
                 self.close()
                 break
             now = time.monotonic()
             if end is not None and now >= end:
-                done = len(self) - len(self._open)
+                done = len(self) - len(self._unfinished)
                 raise TimeoutError(f"{done} of {len(self)} robots are done after {round(timeout or 0.0, 1):g} s")
             self._desk.poll(min(next_check, end or next_check) - now, self._interrupt)
             if time.monotonic() >= next_check:
                 self._check_all()
                 next_check = time.monotonic() + _CHECK_INTERVAL_S
         if not len(self):
-            raise self._nobody()
+            raise self._no_robot_error()
 
     def cancel(self) -> None:
         """Cancel the sentence at every robot where it has not ended, also at absent robots when they come back.
@@ -190,11 +190,11 @@ class FleetRequest:
         group, goal_id = self._selection.group, str(self.request.id)
         if group is not None:
             self._desk.send(Cancel((goal_id,)), next(self._numbers), group, self._on_refused, is_group=True)
-        for name in self._open:
+        for name in self._unfinished:
             # A robot that has left the group doesn't receive the message to the group.
             robot = self._robots[name]
             is_sent = group is not None and robot.presence is not None and self._selection.includes(robot.presence)
-            robot.connection.cancel_lastingly(goal_id, is_sent=is_sent)
+            robot.connection.cancel_permanently(goal_id, is_sent=is_sent)
 
     def close(self) -> None:
         """End the connection to the broker. The robots carry the request out all the same."""
@@ -229,14 +229,14 @@ class FleetRequest:
         for _ in range(_MAX_MESSAGES_PER_CHECK):
             if not self._desk.poll(0.0, self._interrupt):
                 break
-        for name in list(self._open):
+        for name in list(self._unfinished):
             self._update(name, check_time=True)
 
-    def _nobody(self) -> TalkError:
+    def _no_robot_error(self) -> TalkError:
         """Return the error for a selection without any robot."""
         selection, url = self._selection, self._desk.broker.url
-        if selection.group is not None and self.away:
-            words = f"{self.request.kind} was sent to the group '{selection.group}', but {self.away}"
+        if selection.group is not None and self.why_disconnected:
+            words = f"{self.request.kind} was sent to the group '{selection.group}', but {self.why_disconnected}"
             return Lost(f"{words}; it may be carried out")
         group = selection.group
         which = f"is in the group '{group}'" if group is not None else f"matches '{selection.text}'"
@@ -250,7 +250,8 @@ class FleetRequest:
         link.subscribe(topics.robot(topics.ANY, topics.PRESENCE), retained=True)
 
     def on_disconnected(self, why: str) -> None:
-        """Treat all robots as absent, and accept no more: the broker may be back too late to tell of them."""
+        """Treat all robots as absent."""
+        # No more robots are included, because the broker may be back too late to tell of them.
         self._complete = self._complete or self._began
         for each in self._robots.values():
             each.connection.on_disconnected(why)
@@ -290,7 +291,7 @@ class FleetRequest:
         elif not presence.online:
             self._take([failure_outcome(name, ServerUnavailable(f"{name} is offline: nothing was sent"), "OFFLINE")])
         elif self._selection.group is not None:
-            robot.expect(self._number, self._latest)
+            robot.expect_reply(self._number, self._latest)
         elif presence.server is None:
             words = f"{name} has no talk server at this moment: nothing was sent"
             self._take([failure_outcome(name, NoServer(words))])
@@ -305,14 +306,14 @@ class FleetRequest:
         robot = self._robot(name)
         if self._selection.group is not None and not robot.was_asked:
             self._include(robot, name)
-            robot.expect(self._number, self._latest)
+            robot.expect_reply(self._number, self._latest)
             if self._canceled and isinstance(self.request, Say):
-                robot.connection.cancel_lastingly(str(self.request.id), is_sent=False)
+                robot.connection.cancel_permanently(str(self.request.id), is_sent=False)
         robot.connection.on_message(message)
         self._update(name)
 
     def _robot(self, name: str) -> RobotRequest:
-        """Return the request's part for a robot. The first call creates it."""
+        """Return the RobotRequest of a robot, and create it if the robot is new."""
         if name not in self._robots:
             connection = RobotConnection(
                 name, self._desk, name=self._name, patience=self._patience, numbers=self._numbers
@@ -321,18 +322,18 @@ class FleetRequest:
         return self._robots[name]
 
     def _include(self, robot: RobotRequest, name: str) -> None:
-        """Include a robot among those that the request is for."""
+        """Add a robot to those that the request is for."""
         robot.is_included = True
-        self._open.add(name)
+        self._unfinished.add(name)
 
     def _update(self, name: str, *, check_time: bool = False) -> None:
         """Collect a robot's new outcomes."""
-        if name in self._open:
+        if name in self._unfinished:
             self._take(self._robots[name].new_outcomes(check_time=check_time))
 
     def _take(self, outcomes: list[Outcome]) -> None:
         self._outcomes += outcomes
-        self._open -= {each.robot for each in outcomes if each.last}
+        self._unfinished -= {each.robot for each in outcomes if each.last}
 
 
 class RobotRequest:
@@ -342,7 +343,7 @@ class RobotRequest:
         self.connection = connection
         #: the robot's last presence; None if unknown
         self.presence: Presence | None = None
-        #: whether the request is for this robot; whether it has been sent to it
+        #: whether the request is for this robot, and whether it has been sent there
         self.is_included = self.was_asked = False
         self._name, self._request = name, request
         #: whether the answer may take any time
@@ -361,7 +362,7 @@ class RobotRequest:
         except TalkError as error:
             self._on_failure(error)
 
-    def expect(self, number: int, latest: float | None) -> None:
+    def expect_reply(self, number: int, latest: float | None) -> None:
         """Expect an answer to the request that was sent to the robot's group.
 
         Args:
@@ -370,7 +371,7 @@ class RobotRequest:
         """
         exchange = RobotExchange(self._request, self._on_reply, self._on_failure, slow=self._slow)
         exchange.number, exchange.latest = number, latest
-        self.connection.expect(exchange)
+        self.connection.expect_reply(exchange)
         self.was_asked = True
 
     def new_outcomes(self, *, check_time: bool) -> list[Outcome]:
@@ -396,7 +397,7 @@ class RobotRequest:
         return outcomes
 
     def _on_reply(self, reply: JsonObject, items: list[JsonObject]) -> None:
-        """Follow the goals that have to be waited for; if there are none, the reply has all outcomes."""
+        """Follow the goals that have to be waited for. If there are none, the reply has all outcomes."""
         request = self._request
         found: list[Goal] = []
         if isinstance(request, Say):

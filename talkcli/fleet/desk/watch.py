@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from talkcli.fleet.payloads import Message
     from talkcli.goals.goal import JsonObject
 
-#: Bridges are back within this time after their broker. A robot without retained presence counts as gone then.
+#: Time for bridges to reconnect after the broker has come back. Robots without a presence count as gone after it.
 BRIDGES_BACK_LIMIT_S = 15.0
 
 
@@ -227,14 +227,14 @@ class FleetWatch:
 
     def _check_limits(self, now: float) -> None:
         """Do everything that is due."""
-        if self._retained and self._desk.has_retained:
+        if self._retained and self._desk.retained_received:
             self._process_retained(self._retained, now)
         if not self._began and self._desk.failure:
             raise self._desk.failure
         if self._away_since is not None:
             away = now - self._away_since
             if not self._began and away >= ANSWER_LIMIT_S:
-                raise self._desk.no_answer(ANSWER_LIMIT_S)
+                raise self._desk.no_answer_error(ANSWER_LIMIT_S)
             if away >= ABSENCE_LIMIT_S:
                 raise Lost(f"the broker at {self._broker.url} was away for {ABSENCE_LIMIT_S:g} s: {self._away_why}")
         for name in [name for name, until in self._missing.items() if now >= until]:
