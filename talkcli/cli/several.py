@@ -190,9 +190,8 @@ class _OutcomePrinter:
             for words in _failure_notes(failures)[:_MAX_NOTES]:
                 note(words)
             if asked.unfinished_robots:
-                note(
-                    f"{unknown}: {_listed(asked.unfinished_robots)}{f': {asked.why_disconnected}' if asked.why_disconnected else ''}"
-                )
+                why = f": {asked.why_disconnected}" if asked.why_disconnected else ""
+                note(f"{unknown}: {_listed(asked.unfinished_robots)}{why}")
             note(f"{len(done)} of {len(asked)} as asked")
         codes = {each.exit_code for each in failures}
         return EXIT_DIFFER if len(codes) > 1 else next(iter(codes), EXIT_OK)

@@ -255,11 +255,9 @@ class DeskLink:
         """Connect, or keep the connection alive. Return the seconds until the next call is due."""
         if link is not None:
             link.tick()
-            return (
-                TICK_EVERY_S
-                if self.marker_at is None or self.retained_received
-                else self.marker_at + RETAINED_GRACE_S - now
-            )
+            if self.marker_at is None or self.retained_received:
+                return TICK_EVERY_S
+            return self.marker_at + RETAINED_GRACE_S - now
         if self._opening is not None and self._opening.done:
             self._end_attempt(self._opening)
             return 0.0
