@@ -59,8 +59,8 @@ class VoiceDescription:
     rate: int  # samples per second
     #: the libespeak-ng voice that provides the phonemes
     espeak_voice: str
-    #: the language by the voice's author, in libespeak-ng's form: "en-us". `espeak_voice` may name the same language
-    #: by another code, such as "cmn" for "zh-cn".
+    #: the language that the voice's author states, in libespeak-ng's form: "en-us". `espeak_voice` may have another
+    #: code for the same language, such as "cmn" for "zh-cn".
     language: str
     name: str  # for people: "joe, medium", "thorsten, medium, 8 speakers"
     quality: str | None  # "medium"
@@ -73,7 +73,7 @@ class VoiceDescription:
 
 
 def missing_package() -> str | None:
-    """Return which package for neural voices is missing, and how to install it; None if none is."""
+    """Return the error for a missing package, or None if all packages for neural voices are installed."""
     from importlib.util import find_spec
 
     missing = next((each for each in MODEL_PACKAGES if find_spec(each) is None), None)

@@ -48,12 +48,15 @@ class UnknownVoice(Exception):
 
 
 def is_own_driver(driver: str | None) -> bool:
-    """Return whether a driver is a synthesizer of `talk`, which plays through a player; others play by themselves."""
+    """Return whether a driver is one of `talk`'s synthesizers.
+
+    These play through a player. All other drivers play by themselves.
+    """
     return sys.platform.startswith("linux") and driver in (None, *SYNTHESIZERS)
 
 
 def list_voices(engine: Any) -> tuple[Voice, ...]:
-    """Return all voices of a pyttsx3 engine, and after libespeak-ng's voices its variants, such as "+f3"."""
+    """Return all voices of a pyttsx3 engine; libespeak-ng's variants, such as "+f3", come last."""
     return tuple(_to_voice(each) for each in engine.getProperty("voices") or ())
 
 
@@ -88,7 +91,7 @@ def matching_languages(wanted: str, voices: Sequence[Voice]) -> set[str]:
 
 
 def _matches(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> dict[str, Voice]:
-    """Return the voices that a word may mean, each by a name that means it alone."""
+    """Return the voices that a word may mean, by unambiguous names."""
     found = _find_exact(wanted, voices, preferred)
     if found is not None:
         return {wanted: found}
@@ -274,7 +277,7 @@ def _split_variants(voices: Sequence[Voice]) -> tuple[list[Voice], list[Voice]]:
 
 
 def _by_name(wanted: str, voices: Sequence[Voice], *, by_id: bool = False) -> Voice | None:
-    """Return the voice with a name; if several match, one with the same case and dashes wins."""
+    """Return the voice that a word names; if several match, one with the same case and dashes wins."""
     word = _fold(wanted)
     found = [
         (called != wanted, place, voice)
@@ -295,7 +298,10 @@ def _names_of(voice: Voice) -> tuple[str, str, str, str]:
 
 
 def _find_variant(suffix: str, variants: list[Voice]) -> Voice | None:
-    """Return a variant by the word after the "+"; like in libespeak-ng, numbers are male, and female from 11."""
+    """Return the variant for the word after a "+".
+
+    As in libespeak-ng, small numbers mean male variants, and numbers from 11 on female ones.
+    """
     word = suffix.casefold()
     if word.isdecimal() and word.isascii() and len(word) < 3:
         number = int(word)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.engine.child.synthesizers.inference import CONTEXT_FRAMES, Model, ModelCache, Run
+from talkcli.engine.child.synthesizers.inference import CONTEXT_FRAMES, Model, ModelCache, ModelRun
 from talkcli.engine.models import MODEL_PACKAGES, VoiceFileError, read_description
 from tests.support import tiny_voice
 from tests.support.real_voice import real_voice, silence_noise
@@ -68,10 +68,11 @@ def _whole(path: Path, speaker: int | None = None) -> Any:
 def _in_pieces(model: Model, speaker: int = 0, piece: int = 20) -> Any:
     import numpy as np
 
-    frames = model.encode(NUMBERS, speaker, 1.0, Run())
+    frames = model.encode(NUMBERS, speaker, 1.0, ModelRun())
     assert len(frames.ends) == len(NUMBERS)
     parts = [
-        model.decode(frames, begin, min(frames.count, begin + piece), Run()) for begin in range(0, frames.count, piece)
+        model.decode(frames, begin, min(frames.count, begin + piece), ModelRun())
+        for begin in range(0, frames.count, piece)
     ]
     return np.concatenate(parts)
 
@@ -189,7 +190,7 @@ def test_a_file_that_is_larger_than_any_model_is_not_read(tmp_path: Path) -> Non
 #: Encodes far more sounds than a piece has, with 20 MB left, and then a few.
 _WITH_LITTLE_MEMORY = """
 import resource, sys
-from talkcli.engine.child.synthesizers.inference import Model, Run
+from talkcli.engine.child.synthesizers.inference import Model, ModelRun
 from talkcli.engine.models import VoiceFileError, read_description
 sys.argv[1:] = {arguments!r}
 model = Model(sys.argv[1], read_description(sys.argv[1]))
@@ -198,11 +199,11 @@ with open("/proc/self/statm") as file:
     used = int(file.read().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (used + 20_000_000, before[1]))
 try:
-    model.encode([1, 0, *[14, 0] * 500, 2], 0, 1.0, Run())
+    model.encode([1, 0, *[14, 0] * 500, 2], 0, 1.0, ModelRun())
 except VoiceFileError as error:
     print(error)
 resource.setrlimit(resource.RLIMIT_AS, before)
-print(len(model.encode([1, 0, 14, 0, 2], 0, 1.0, Run()).ends))
+print(len(model.encode([1, 0, 14, 0, 2], 0, 1.0, ModelRun()).ends))
 """
 
 
@@ -216,7 +217,7 @@ def test_inference_without_memory_says_so_and_the_model_can_be_run_again() -> No
 
 @limits()
 def test_a_run_that_is_ended_raises_at_once(joe: Model) -> None:
-    run = Run()
+    run = ModelRun()
     ended: list[tuple[float, BaseException]] = []
 
     def encode() -> None:

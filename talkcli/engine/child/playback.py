@@ -316,7 +316,7 @@ class Playback:
         self._report_words(self._clock.take_rest())
         if self._feed is not None:
             name, now = self._feed.player.name, time.monotonic()
-            self._players.worked = name
+            self._players.last_player = name
             self._players.handovers.sentence_ended(name, now + self._feed.time_left(self._feed.written, now))
         return self._seconds(self._sent - self._left_out)
 
@@ -406,7 +406,7 @@ class Playback:
         """End the player. Any player may go on from the place `begin`."""
         feed, self._begin, self._sent = self._feed, begin, begin
         if feed is not None and feed.player.proven:
-            self._players.worked = feed.player.name  # tried first again
+            self._players.last_player = feed.player.name  # tried first again
         self._untried = self._first_error = None
         self.silence()
 

@@ -111,7 +111,7 @@ class PlayerChooser:
         #: whether the current sentence fails if the output is muted
         self._audible = configure.audible
         #: the name of the player that last played a sentence to its end
-        self.worked = configure.last_player
+        self.last_player = configure.last_player
         #: the name of the player that plays the current sentence, if the choice is automatic
         self.chosen: str | None = None
         self._last_used_at: float | None = None
@@ -129,7 +129,7 @@ class PlayerChooser:
         if player in self._in_process:
             return
         try:
-            found = player_commands(player, device, rate, self.worked)
+            found = player_commands(player, device, rate, self.last_player)
         except PlayerMissing as error:
             yield partial(_fail, CannotSpeak(Reason.NO_PLAYER, str(error)))
             return
@@ -181,7 +181,7 @@ class PlayerChooser:
                 _open(name, 1).kill()
                 return name
         try:
-            return player_commands(None, None, 1, self.worked)[0].name
+            return player_commands(None, None, 1, self.last_player)[0].name
         except PlayerMissing:
             return None
 

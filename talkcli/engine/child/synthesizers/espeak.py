@@ -153,7 +153,7 @@ def _preload() -> tuple[str, bytes | None]:
 
 
 def _is_temporary(error: Exception) -> bool:
-    """Return whether a library couldn't be loaded for lack of memory or descriptors, by the end of the message."""
+    """Return whether loading failed for lack of memory or descriptors, judging by the end of the message."""
     return str(error).endswith(tuple(map(os.strerror, (errno.EMFILE, errno.ENFILE, errno.ENOMEM))))
 
 

@@ -115,7 +115,7 @@ def _unsafe_characters(language: str) -> re.Pattern[str]:
 
 
 def _split_number(number: str, least: int, most: int) -> str:
-    """Return a number, split by a digit that is spoken separately if it has `least` to `most` digits."""
+    """Return a number; if it has `least` to `most` digits, one of them is replaced so that it splits the number."""
     if not least <= sum(map(str.isdigit, number)) <= most:
         return number
     middle = next(place for place in range(len(number) // 2, len(number)) if number[place].isdigit())

@@ -2,8 +2,8 @@
 
 The encoder turns phoneme ids into frames, and the decoder turns any part of the frames into samples. A model runs only
 in the thread that calls it: onnxruntime must not start any, so a voice uses one processor, and none while nobody
-speaks. Another thread can end a run within milliseconds. This is the only module that imports onnxruntime. Faults of a
-model are VoiceFileError, with the file's name in the text.
+speaks. Another thread can end a run within milliseconds. This is the only module that imports onnxruntime. A faulty
+model raises VoiceFileError, whose text names the file.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ class Frames:
         return self.ends[-1]
 
 
-class Run:
+class ModelRun:
     """The handle of all runs of a model for one sentence, which can end them."""
 
     def __init__(self) -> None:
@@ -206,7 +206,7 @@ class Model:
                 cache.remove(key)  # for example truncated by a full disk; a real fault shows below
         self._set_halves(*_split(path, content, cache, key))
 
-    def encode(self, ids: Sequence[int], speaker: int, scale: float, run: Run) -> Frames:
+    def encode(self, ids: Sequence[int], speaker: int, scale: float, run: ModelRun) -> Frames:
         """Return the frames of some phoneme ids.
 
         Args:
@@ -238,7 +238,7 @@ class Model:
             raise VoiceFileError(f"{self.path} {words}: get the voice anew")
         return Frames(tuple(values), tuple(int(each) for each in np.cumsum(durations)))
 
-    def decode(self, frames: Frames, begin: int, end: int, run: Run) -> Any:
+    def decode(self, frames: Frames, begin: int, end: int, run: ModelRun) -> Any:
         """Return the samples of the frames from `begin` up to `end` as floats, 1.0 for full scale.
 
         Raises:
@@ -283,7 +283,7 @@ class Model:
         self._frame_inputs = [each.name for each in decoder.get_inputs()]
         self._samples_per_frame = self._try_out()
 
-    def _run_half(self, half: Any, feed: dict[str, Any], run: Run) -> list[Any]:
+    def _run_half(self, half: Any, feed: dict[str, Any], run: ModelRun) -> list[Any]:
         try:
             found: list[Any] = half.run(None, feed, run.options)
         except Exception as error:
@@ -295,7 +295,7 @@ class Model:
         ids = self.description.phoneme_ids
         highest = max(each for every in ids.values() for each in every)
         phonemes = [*ids[BEGIN_SYMBOL], *ids[PAD_SYMBOL], highest, *ids[PAD_SYMBOL], *ids[END_SYMBOL]]
-        run = Run()
+        run = ModelRun()
         try:
             frames = self.encode(phonemes, 0, 1.0, run)
         except VoiceFileError as error:

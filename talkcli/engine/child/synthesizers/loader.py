@@ -273,7 +273,7 @@ def _model_path(voice: str) -> str:
 
 
 def _stamps(path: str) -> tuple[tuple[int, int, int], ...]:
-    """Return values that differ once a voice's files have changed; empty if the files can't be examined."""
+    """Return the identities of a voice's files, which change with the files; () if a file can't be examined."""
     try:
         found = [os.stat(each) for each in (path, path + models.JSON_SUFFIX)]
     except OSError:

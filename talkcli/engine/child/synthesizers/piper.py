@@ -12,7 +12,7 @@ import itertools
 
 from talkcli.engine import models
 from talkcli.engine.child.players.base import CannotSpeak
-from talkcli.engine.child.synthesizers.inference import Run, no_memory_error
+from talkcli.engine.child.synthesizers.inference import ModelRun, no_memory_error
 from talkcli.engine.child.synthesizers.loader import BackgroundIterator, ModelLoader
 from talkcli.engine.child.synthesizers.phonemes import PAUSE_MARKS, split_text
 from talkcli.engine.models import BEGIN_SYMBOL, END_SYMBOL, PAD_SYMBOL, VoiceFileError
@@ -159,7 +159,7 @@ class Piper:
         self, model: Model, speaker: int, parts: Iterator[SpeechPart], settings: SpeechSettings, sink: SampleSink
     ) -> None:
         """Write the sound of a text's parts, which a background thread makes."""
-        run = Run()
+        run = ModelRun()
         rate = model.description.rate
         write_bytes = int(_WRITE_S * rate) * SAMPLE_BYTES
         seconds = 0.0
@@ -178,7 +178,7 @@ class Piper:
 
 
 def _speak_parts(
-    model: Model, parts: Iterator[SpeechPart], speaker: int, settings: SpeechSettings, run: Run
+    model: Model, parts: Iterator[SpeechPart], speaker: int, settings: SpeechSettings, run: ModelRun
 ) -> Iterator[SpokenPart]:
     """Yield the sound of a text's parts.
 

@@ -225,12 +225,12 @@ def _tensor_name(reader: _Reader, raw: Buffer) -> str:
 
 
 def _messages(fields: Iterable[Field], wanted: int) -> list[Buffer]:
-    """Return the values of the fields with a number."""
+    """Return the messages in the fields with a given number."""
     return [value for number, kind, value in fields if (number, kind) == (wanted, _BYTES)]
 
 
 def _names(fields: Iterable[Field], wanted: int) -> list[str]:
-    """Return the texts in the fields with a number."""
+    """Return the names in the fields with a given number."""
     found = _messages(fields, wanted)
     if any(len(value) > _MAX_NAME_BYTES for value in found):
         raise NotSplit("is none of Piper's models: it has names that are too long")
