@@ -82,6 +82,8 @@ class Connection(ClientCore):
 
     #: the process of this machine that listens there, as its kernel says; None if the server is elsewhere
     listener: int | None = None
+    #: the class of exchanges; a transport's own class can have more attributes
+    exchange_type = Exchange
 
     def __init__(self, patience: float) -> None:
         """`patience`: seconds in which the server must answer."""
@@ -155,7 +157,7 @@ class Connection(ClientCore):
             ServerUnavailable: nothing can be sent.
         """
         self._prepare(request, attended=on_failure is None)
-        exchange = Exchange(request, on_reply, on_failure, slow=slow)
+        exchange = self.exchange_type(request, on_reply, on_failure, slow=slow)
         with self.changed:
             self.register(exchange, time.monotonic())
             try:

@@ -32,7 +32,6 @@ from talkcli.terminal.text import printable
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from talkcli.client.core import OnFailure, OnReply
     from talkcli.fleet.broker import Broker
     from talkcli.fleet.link import Link
     from talkcli.fleet.payloads import Message
@@ -67,8 +66,7 @@ class RobotConnection(Connection):
     """
 
     lasting = (Say, Cancel, Set, Pause, Resume)
-    #: the server's process isn't on this machine
-    listener: int | None = None
+    exchange_type = RobotExchange
 
     def __init__(
         self,
@@ -122,35 +120,19 @@ class RobotConnection(Connection):
 
     # -- requests
 
-    def begin(
-        self,
-        request: Request,
-        on_reply: OnReply | None = None,
-        on_failure: OnFailure | None = None,
-        *,
-        slow: bool = False,
-    ) -> RobotExchange:
-        if isinstance(request, Say) and request.id is None:
-            request = replace(request, id=new_goal_id(self._desk))
-        exchange = RobotExchange(request, on_reply, on_failure, slow=slow)
-        if isinstance(request, Say) and request.ttl:
-            exchange.latest = boottime() + request.ttl
-        with self.changed:  # so that `_resend_all` doesn't send it at the same time
-            self.register(exchange, time.monotonic())
-            self._publish(exchange)
-        if not exchange.sent:
+    def _send(self, exchange: Exchange) -> None:
+        request = exchange.request
+        if isinstance(request, Say) and isinstance(exchange, RobotExchange):
+            exchange.request = replace(request, id=request.id or new_goal_id(self._desk))
+            exchange.latest = boottime() + request.ttl if request.ttl else None
+        if not self._publish(exchange):
             self._desk.wake()  # it will be sent when the robot is back
-        return exchange
 
     def expect_reply(self, exchange: RobotExchange) -> None:
         """Expect an answer to a request that was sent to the robot's group."""
         exchange.sent = True
         self._published_at = time.monotonic()
         self.register(exchange, self._published_at)
-
-    def post(self, request: Request) -> None:
-        if not self._post(request):
-            raise ServerUnavailable(f"nothing was sent to the server at {self.path}: {self.ended or self.absence}")
 
     def cancel_permanently(self, goal_id: str, *, is_sent: bool) -> None:
         """Cancel a goal now and after each absence, and never send it again.
