@@ -104,23 +104,18 @@ def read_robots(
     desk = DeskLink(broker)
     desk.handler = reader
     try:
-        desk.wait_for_retained(timeout, lambda: bool(reader.payloads))
+        desk.wait_for_retained(timeout, lambda: bool(reader.messages))
     finally:
         desk.close()
-    robots = []
-    for each, payloads in sorted(reader.payloads.items()):
-        presence = Presence.read(each, payloads.get(topics.PRESENCE, b""))
-        if presence:
-            robots.append(RobotInfo(presence, RobotStatus.read(payloads.get(topics.STATUS, b""))))
-    return robots
+    return _robots_in(reader.messages)
 
 
 class _RetainedReader:
-    """A handler that collects the payloads of retained messages, by robot and kind."""
+    """A handler that collects messages on some topics."""
 
     def __init__(self, wanted: list[str]) -> None:
         self._wanted = wanted
-        self.payloads: dict[str, dict[str, bytes]] = {}
+        self.messages: list[Message] = []
 
     def on_connected(self, link: Link) -> None:
         link.subscribe(*self._wanted, retained=True)
@@ -129,8 +124,21 @@ class _RetainedReader:
         pass  # the desk has it as `failure`
 
     def on_message(self, message: Message) -> None:
-        _, _, name, kind = message.topic.split("/")
-        self.payloads.setdefault(name, {})[kind] = message.payload
+        self.messages.append(message)
+
+
+def _robots_in(messages: list[Message]) -> list[RobotInfo]:
+    """Return the robots whose presence is among these messages, sorted by name."""
+    payloads: dict[str, dict[str, bytes]] = {}
+    for message in messages:
+        _, _, name, kind, *_ = message.topic.split("/")
+        payloads.setdefault(name, {})[kind] = message.payload
+    robots = []
+    for name, found in sorted(payloads.items()):
+        presence = Presence.read(name, found.get(topics.PRESENCE, b""))
+        if presence:
+            robots.append(RobotInfo(presence, RobotStatus.read(found.get(topics.STATUS, b""))))
+    return robots
 
 
 class FleetWatch:
@@ -152,7 +160,7 @@ class FleetWatch:
         #: robots that may have spoken while their events were missed; their next status tells
         self._unheard: set[str] = set()
         #: the messages on a new connection, until all retained messages are there; then None
-        self._retained: _Retained | None = None
+        self._retained: list[Message] | None = None
         self._began = False
         #: since when (monotonic) there is no broker, and why; None if it is connected
         self._away_since: float | None = time.monotonic()
@@ -183,7 +191,7 @@ class FleetWatch:
 
     def on_connected(self, link: Link) -> None:
         """Subscribe to the retained messages, and to events."""
-        self._retained = _Retained()
+        self._retained = []
         robot = (self._selection and self._selection.name) or topics.ANY
         link.subscribe(topics.robot(robot, topics.EVENT, topics.ANY), retained=False)
         link.subscribe(*(topics.robot(robot, each) for each in (topics.PRESENCE, topics.STATUS)), retained=True)
@@ -197,37 +205,29 @@ class FleetWatch:
 
     def on_message(self, message: Message) -> None:
         """Process a robot's presence, status or event."""
+        if self._retained is not None:
+            self._retained.append(message)
+            return
         _, _, name, kind, *_ = message.topic.split("/")
         if kind == topics.PRESENCE:
-            self._on_presence(name, message.payload)
+            presence = Presence.read(name, message.payload)
+            if presence or not message.payload:  # else malformed
+                self._missing.pop(name, None)
+                self._set_presence(name, presence if presence and self._selects(presence) else None)
         elif kind == topics.STATUS:
-            if self._retained:
-                self._retained.statuses[name] = RobotStatus.read(message.payload)
-            elif name in self._unheard:  # otherwise its events say more
+            if name in self._unheard:  # otherwise its events say more
                 self._report_missed(name, RobotStatus.read(message.payload))
-        elif (event := _read_event(name, message.payload)) is not None:
-            if self._retained:
-                self._retained.events.append(event)
-            else:
-                self._report(event)
+        elif (event := _read_event(message)) is not None:
+            self._report(event)
 
-    def _on_presence(self, name: str, payload: bytes) -> None:
-        presence = Presence.read(name, payload)
-        if payload and presence is None:
-            return  # malformed
-        if presence and self._selection and not self._selection.includes(presence):
-            presence = None
-        if self._retained:
-            self._retained.presences[name] = presence
-        else:
-            self._missing.pop(name, None)
-            self._set_presence(name, presence)
+    def _selects(self, presence: Presence) -> bool:
+        return self._selection is None or self._selection.includes(presence)
 
     # -- time limits
 
     def _check_limits(self, now: float) -> None:
         """Do everything that is due."""
-        if self._retained and self._desk.retained_received:
+        if self._retained is not None and self._desk.retained_received:
             self._process_retained(self._retained, now)
         if not self._began and self._desk.failure:
             raise self._desk.failure
@@ -250,27 +250,27 @@ class FleetWatch:
 
     # -- changes
 
-    def _process_retained(self, retained: _Retained, now: float) -> None:
+    def _process_retained(self, messages: list[Message], now: float) -> None:
         """Report the first snapshot, or the changes since the connection broke."""
         self._retained = None
-        present = {name: each for name, each in sorted(retained.presences.items()) if each}
+        robots = {each.presence.name: each for each in _robots_in(messages) if self._selects(each.presence)}
+        events = [event for each in messages if (event := _read_event(each))]
         if self._began:
             self._events.append(BrokerBack(now - (self._away_since or now)))
-            gone = [name for name, each in self._presences.items() if each.online and name not in present]
+            gone = [name for name, each in self._presences.items() if each.online and name not in robots]
             self._missing = dict.fromkeys(gone, now + BRIDGES_BACK_LIMIT_S)
-            for name, presence in present.items():
-                self._set_presence(name, presence)
+            for name, robot in robots.items():
+                self._set_presence(name, robot.presence)
         else:
             self._began = True
-            self._presences = present
-            robots = (RobotInfo(each, retained.statuses.get(name)) for name, each in present.items())
-            self._events.append(FleetSnapshot(tuple(robots)))
+            self._presences = {name: each.presence for name, each in robots.items()}
+            self._events.append(FleetSnapshot(tuple(robots.values())))
         self._away_since = None
         self._unheard = set(self._presences)
-        coming = {each.event.id for each in retained.events}
-        for name in present:
-            self._report_missed(name, retained.statuses.get(name), coming)
-        for event in retained.events:
+        coming = {each.event.id for each in events}
+        for name, robot in robots.items():
+            self._report_missed(name, robot.status, coming)
+        for event in events:
             self._report(event)
 
     def _set_presence(self, name: str, now: Presence | None) -> None:
@@ -312,25 +312,17 @@ class FleetWatch:
         self._events.append(robot_event)
 
 
-class _Retained:
-    """Messages on a new connection, before all retained messages are there."""
-
-    def __init__(self) -> None:
-        self.presences: dict[str, Presence | None] = {}
-        self.statuses: dict[str, RobotStatus | None] = {}
-        self.events: list[RobotEvent] = []
-
-
-def _read_event(name: str, payload: bytes) -> RobotEvent | None:
-    """Return the event in a payload; None if it is malformed or of an unknown kind."""
-    if topics.name_fault(name):
+def _read_event(message: Message) -> RobotEvent | None:
+    """Return the event in a message; None if it is something else, malformed, or of an unknown kind."""
+    _, _, name, kind, *_ = message.topic.split("/")
+    if kind != topics.EVENT or topics.name_fault(name):
         return None
     try:
-        message = decode(payload.strip())
-        event = from_json(message)
+        content = decode(message.payload.strip())
+        event = from_json(content)
     except (BadRequest, ValueError):
         return None
-    return RobotEvent(name, event, message) if isinstance(event, StateChanged | PausedChanged) else None
+    return RobotEvent(name, event, content) if isinstance(event, StateChanged | PausedChanged) else None
 
 
 def _identity(presence: Presence | None) -> tuple[object, ...]:
