@@ -1,7 +1,7 @@
-"""The library: from nothing to a server that has greeted, requests out, replies and events in, goals as handles.
+"""The client library: it connects to a server, sends requests, and returns goals as handles with their events.
 
-It blocks, in any number of threads, and every start of a command pays for it: neither click nor asyncio, nothing heavy.
-It may import protocol, goals and the ground, and of terminal what makes others' words fit to be shown. What a program
-can ask for goes to `client`, what it can do with one goal to `goal`; another way to a server is another `Connection`,
-beside that by a socket in `connection`.
+It blocks, and any number of threads may use it. Every start of a command pays for it, so it imports neither click nor
+asyncio nor anything heavy. It may import protocol, goals and the ground, and from terminal the functions that make
+foreign text safe to show. Requests are methods of `client`, operations on one goal methods of `goal`. `core` has the
+client's side of the protocol without I/O. Another transport is another subclass of `Connection` in `connection`.
 """

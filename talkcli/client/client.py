@@ -38,20 +38,20 @@ if TYPE_CHECKING:
 
 __all__ = ["Client", "GoalHandle"]
 
-#: Bytes of a request's line that are left for everything except its list of ids: another id, a key, the field names.
+#: The part of a request's line that is reserved for everything except the list of ids.
 _REST_OF_LINE_BYTES = 4096
-#: Bytes of JSON that one character may take: a quote with its backslash, or an escaped surrogate pair.
+#: The longest JSON of one character: a quote with its backslash in ASCII, or else an escaped surrogate pair.
 _LONGEST_ASCII_BYTES, _LONGEST_CHARACTER_BYTES = 2, 12
-#: The longest number that a request is given.
+#: A number as long as any that requests are given.
 _LONGEST_NUMBER = 10**15
 
 
 class Client:
-    """A connection to a talk server, which is found as the command `talk` finds it.
+    """A connection to a talk server, which is found in the same way as by the command `talk`.
 
-    After a break, for example because the server was restarted, the next call connects again. Goals go on being
-    followed if the server is still the same process, else they are LOST. Attempts are at most half a second apart, and
-    a call between two attempts raises ServerUnavailable at once; `cancel` always tries.
+    After a break, for example because the server was restarted, the next call reconnects. Goals are still followed if
+    the server is the same as before. Otherwise they are LOST. While there is no server, a call tries to connect at most
+    every half second, and otherwise raises ServerUnavailable at once. `cancel` always tries.
     """
 
     def __init__(self, socket: str | None = None, *, name: str | None = None, timeout: float = ANSWER_LIMIT_S) -> None:
@@ -81,7 +81,7 @@ class Client:
 
     def _use(self, connection: Connection) -> None:
         self._connection = connection
-        #: of the server that was reached first: a bare number means one of its goals
+        #: the boot id of the first server, whose goals can be named by bare numbers
         self._first_boot = connection.boot
 
     @property
@@ -91,7 +91,7 @@ class Client:
 
     @property
     def server_pid(self) -> int | None:
-        """The server's process id, as the server says."""
+        """The process id that the server reports."""
         return self._connection.pid
 
     def close(self) -> None:
@@ -128,45 +128,44 @@ class Client:
         patient: bool = False,
         block: bool = True,
     ) -> GoalHandle:
-        """Send a goal, and return its handle after the server has accepted it, or REJECTED it with a reason.
+        """Send a goal, and return its handle when the server has accepted or REJECTED it.
 
         Args:
             text: the sentence, up to 10,000 characters.
-            preempt: stop what is being spoken, and go first. None leaves that to the server's settings.
-            flush: as `preempt`, and also recall all pending goals of the same or a lower priority.
+            preempt: stop the goal that is being spoken, and go first. None means the server's setting.
+            flush: like `preempt`, and also recall all pending goals of the same or a lower priority.
             priority: goals with a higher priority go first.
             ttl: seconds in which the goal must begin, or it is RECALLED; 0 for no limit, None for the server's setting.
             key: a label of 1 to 64 characters. The goal replaces the pending goal with the same key.
-            throttle: REJECT the goal if one with the same key, or else with the same text, began less than this many
-                seconds ago.
+            throttle: reject the goal if another one with the same key began less than this many seconds ago. Without a
+                key, goals with the same text count.
             id: the sender's own id, 1 to 64 of A-Z a-z 0-9 . _ : / -. A text that is sent twice with the same id is
                 spoken once, and the second handle is `attached` to the first goal.
-            rate: 80 to 450 words per minute. None means the server's setting, as for the next three.
+            rate: 80 to 450 words per minute. For this and the next three, None means the server's setting.
             volume: 0 to 1.
             voice: id, name or language of a voice.
             pitch: 0 to 100.
-            voice_only: wait until a neural voice is loaded, and be ABORTED with `voice_failed` if it can't be loaded.
-                Otherwise espeak may speak instead.
+            voice_only: wait until a neural voice is loaded, and abort the goal with `voice_failed` if that fails. By
+                default, espeak may speak instead.
             lead_in: 0 to 5,000 milliseconds of silence before the goal, even if the output was not idle. None means the
-                server's, if the output was idle.
-            audible: abort the goal with `muted` if its output is muted. None leaves that to the server.
+                server's setting, which applies if the output was idle.
+            audible: abort the goal with `muted` if its output is muted. None means the server's setting.
             data: an object of at most 1 KiB of JSON that travels with the goal.
-            follow: have the server send this client the goal's states and result.
-            feedback: and each word as it is heard, for `GoalHandle.feedback` and `events`.
-            patient: if the queue is full, wait until there is room, for any time.
-            block: wait for the server's answer. If False, the call returns at once, and so do `poll` and
-                `request_cancel` of the handle. The client then chooses the id. What the server doesn't take at once,
-                at most 256 KiB, is sent by later calls. The goal ends as REJECTED with the reason `not_sent` if it
-                could not be sent, and as LOST if it was sent but the connection broke or no answer came within the
-                client's timeout.
+            follow: receive the goal's states and its result.
+            feedback: also receive each word as it is heard, for `GoalHandle.feedback` and `events`.
+            patient: if the queue is full, wait for room, however long it takes.
+            block: wait for the server's answer. If False, the call returns at once, and the client chooses the id if
+                none is given. Bytes that the server doesn't accept yet, up to 256 KiB, are sent by later calls. The
+                goal ends as REJECTED with the reason `not_sent` if it could not be sent. It ends as LOST if it was
+                sent, but the connection broke or no answer came within the client's timeout.
 
         Raises:
             UsageError: a value is out of its range. Nothing was sent.
-            ServerUnavailable: the server can't be reached; nothing was sent. Without `block` only if the client is
-                closed.
+            ServerUnavailable: the server can't be reached. Nothing was sent. With `block=False`, this is raised only
+                if the client is closed.
             Lost: the goal was sent, but no answer came. It may be spoken.
-            Interrupted: only while a patient goal waits for room. Close the client, and the goal is not spoken after
-                the server has noticed, which takes up to 5 s.
+            Interrupted: a patient goal was waiting for room. It is not spoken if the client is closed; the server
+                notices that within 5 s.
         """
         request = Say(
             text,
@@ -206,7 +205,7 @@ class Client:
 
         Args:
             ids: the goals' ids; None for all goals that have not ended.
-            feedback: have the server send each of their words, too.
+            feedback: also receive each of their words.
 
         Raises:
             UnknownGoal: the server doesn't know one of them.
@@ -240,7 +239,7 @@ class Client:
             key: the goals with this key, pending or active.
 
         Raises:
-            UnknownGoal: an id is not known. The other goals are cancelled all the same, and are in the error's `items`.
+            UnknownGoal: an id is unknown. The other goals are cancelled, and are listed in the error's `items`.
         """
         wanted = None if ids is None else [self._full_id(each) for each in ids]
         first, *others = [None] if wanted is None else batches(wanted) or [()]
@@ -279,8 +278,8 @@ class Client:
     def voices(self) -> list[JsonObject]:
         """Return the voices of the server's engine: objects with id, language, name, quality and speakers.
 
-        Only neural voices have the last two. `quality` is what the voice's maker calls it, for example "medium".
-        `speakers` lists the names of the speakers, by number, if there are several. Both may be None.
+        Only neural voices have a quality and speakers; for others, both are None. The quality is a word such as
+        "medium". The speakers are a list of names, or None if there is only one.
         """
         _, items = self._connection.request(Voices())
         return [each["voice"] for each in items if isinstance(each.get("voice"), dict)]  # type: ignore[misc]
@@ -303,12 +302,12 @@ class Client:
     ) -> JsonObject:
         """Change the running server's settings for goals that have not begun, and return all of them.
 
-        Settings that are not given stay. The values are those of `say`; besides, the voice "default" is the driver's
+        Settings that are not given stay the same. The values are those of `say`. The voice "default" is the driver's
         own, and a ttl of 0 means no limit.
 
         Raises:
             UsageError: a value is out of its range.
-            BadOption: this server doesn't take a value, for example because its engine doesn't have the voice.
+            BadOption: the server refuses a value, for example a voice that its engine doesn't have.
         """
         request = Set(rate, volume, voice, pitch, preempt, ttl)
         check(request)
@@ -317,30 +316,30 @@ class Client:
         return settings if isinstance(settings, dict) else {}
 
     def pause(self) -> Goal | None:
-        """Pause speech, and return once it is silent: the paused goal, or None if none was being spoken.
+        """Pause speech, and return the paused goal once it is silent; None if no goal was being spoken.
 
         Nothing is spoken until `resume`, whoever sends it. Pausing twice is no error.
         """
         return goal_in(self._connection.request(Pause(), slow=True)[0])
 
     def resume(self) -> Goal | None:
-        """Resume speech: return the goal that goes on, or None if none was paused. Resuming twice is no error."""
+        """Resume speech, and return the goal that goes on; None if no goal was paused. Resuming twice is no error."""
         return goal_in(self._connection.request(Resume())[0])
 
     def events(self, *, reconnect: bool = False) -> Iterator[Event]:
         """Iterate over everything that happens to any goal from now on.
 
-        The first event is a Snapshot. StateChanged follows for each state, with the whole goal when it begins and ends;
-        WordHeard; and PausedChanged. Stop iterating whenever you like.
+        The first event is a Snapshot. It is followed by StateChanged, WordHeard and PausedChanged events. The first and
+        the last StateChanged of a goal have the whole goal. The iteration can be stopped at any time.
 
-        Words that nobody takes in time are dropped, the oldest first; `n` has gaps then. States are never dropped. They
-        pile up if other threads use this client and nobody takes them.
+        If the events are not taken in time because other threads use the client, the oldest words are dropped, and `n`
+        has gaps. States are never dropped.
 
         Args:
-            reconnect: go on after a break of the connection, with another Snapshot.
+            reconnect: after a break of the connection, go on with another Snapshot.
 
         Raises:
-            Lost: the connection broke, without `reconnect`, or 10,000 states waited to be taken.
+            Lost: the connection broke and `reconnect` is not set, or more than 10,000 states were not taken.
         """
         buffer = EventBuffer(reconnects=reconnect)
 
@@ -354,9 +353,9 @@ class Client:
     # -- inside
 
     def _handle(self, request: Say) -> tuple[GoalHandle, OnReply]:
-        """Return a handle of a goal that is still to be sent, and the function to be called with the server's reply.
+        """Return the handle of a goal that will be sent, and the function that processes the reply.
 
-        The handle is REJECTED if the text is too long to be sent.
+        If the text is too long to be sent, the goal is already REJECTED.
 
         Raises:
             UsageError: a value is out of its range.
@@ -372,7 +371,7 @@ class Client:
         return handle, accepted
 
     def _full_id(self, goal_id: str) -> str:
-        """Return the whole id for a bare number, and any other id as it is; errors are those of `check_id`."""
+        """Return the whole id for a bare number, and any other id unchanged. The errors are those of `check_id`."""
         if goal_id.isascii() and goal_id.isdecimal():
             goal_id = f"{self._first_boot}-{goal_id}"
         check_id(goal_id)

@@ -1,4 +1,4 @@
-"""Connecting: every place is tried, a failure at each is explained, and a first request can be sent early.
+"""How a client connects: it tries the usual places, explains failures, and may send its first request early.
 
 There are two stages. `reach` opens a connection, and a caller that already knows its request sends it with
 `send_early`, before the rest of the client is imported: the server works meanwhile. This stage imports next to nothing,
@@ -40,37 +40,37 @@ BUSY_LIMIT_S = 5.0
 BUSY_PAUSE_S = (0.02, 0.2)
 #: Seconds between two attempts to reach a server that is not there yet: the first pause, which doubles up to the
 #: second.
-_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.02, 0.25
-#: What to do next if nobody answers.
-_START = "start one with: talk serve"
-_LET_IN = "have its owner let you in, with `talk serve --socket-mode 0660` and the socket's group"
-_OWN = "or start your own with: talk serve"
+_FIRST_RETRY_PAUSE_S, _LONGEST_RETRY_PAUSE_S = 0.02, 0.25
+#: The next step if there is no server, and if the server refuses this user.
+_START_STEP = "start one with: talk serve"
+_LET_IN_STEP = "have its owner let you in, with `talk serve --socket-mode 0660` and the socket's group"
+_START_OWN_STEP = "or start your own with: talk serve"
 
 
 @frozen
 class ConnectionAttempt:
-    """How far a connection to a server has come."""
+    """The progress of connecting to a server."""
 
-    #: non-blocking; None if no place accepted a connection
+    #: non-blocking; None if no place has accepted a connection
     socket: _socket.socket | None
-    #: the place that it leads to
+    #: the place of the socket
     path: str = ""
-    #: the places before it, each with its error: the system's, or that the server belongs to somebody else
+    #: the places that failed before it, each with its error
     failures: tuple[tuple[str, Exception], ...] = ()
     #: whether `hello` was sent
     hello_sent: bool = False
-    #: what the server has sent and nobody has read: a part of its greeting, or more
+    #: received bytes that have not been processed; before the greeting was read, they begin with it
     received: bytes = b""
-    #: the part of the first request that was sent
+    #: the part of the first request that has been sent
     request_sent: bytes = b""
-    #: the server's boot id, the first half of the ids that it gives; empty before the greeting was read
+    #: the server's boot id, the first half of the ids that it gives; empty until the greeting is read
     boot: str = ""
-    #: the server's process, as the server says
+    #: the process id that the server reports
     pid: int | None = None
 
     @property
     def backlog_full(self) -> bool:
-        """Whether there is a server at the last place that accepts no connection at this moment."""
+        """Whether the server at the last place has a full backlog and accepts no connection now."""
         return self.socket is None and bool(self.failures) and isinstance(self.failures[-1][1], BlockingIOError)
 
 
@@ -98,7 +98,7 @@ def reach(
             return ConnectionAttempt(connected, path, failures)
         connected.close()
         failures = (*failures, (path, error))
-        if isinstance(error, BlockingIOError):  # the server that is there is the right one, not the next
+        if isinstance(error, BlockingIOError):  # a busy server is still the right one
             break
     return ConnectionAttempt(None, failures=failures)
 
@@ -120,7 +120,7 @@ def send_early(
 ) -> ConnectionAttempt | None:
     """Send hello, and the first request as soon as the server has greeted.
 
-    The request is not sent if the server greets in another way than expected, or not at once.
+    The request is not sent if the greeting is late, or differs from the expected one.
 
     Args:
         attempt: an open connection.
@@ -129,7 +129,7 @@ def send_early(
         before: called before the request is sent.
 
     Returns:
-        How far the connection has come; None if it broke before anything was sent that could have an effect.
+        The connection; None if it broke before a request was sent.
     """
     from talkcli.protocol.lines import FIRST_NUMBER, request_line
 
@@ -183,13 +183,13 @@ def yield_processor(attempt: ConnectionAttempt, timeout: float | None) -> Connec
 
 def sender_name(name: str | None) -> str | None:
     """Return the name that a sender goes by: the given one, or else TALK_NAME."""
-    # A variable that is not UTF-8 keeps nobody from cancelling.
+    # A variable that is not UTF-8 must not make a cancel fail.
     variable = os.environ.get("TALK_NAME", "").encode(errors="surrogateescape").decode(errors="replace")
     return name or variable or None
 
 
 def hello(name: str | None, *, urgent: bool) -> JsonObject:
-    """Return the first message, as `requests.Hello` is written, without that import; a test compares the two."""
+    """Return the first message of a client. It avoids importing `requests.Hello`; a test compares the two."""
     return {"request": "hello", **({"name": name} if name else {}), **({"urgent": True} if urgent else {})}
 
 
@@ -209,8 +209,8 @@ def connect(
         hello: the first message.
         patience: seconds in which the server must greet.
         interrupt: descriptors with the poll events that interrupt the wait, as in `polling.wait_ready`.
-        attempt: how far the connection has come already.
-        keep_trying: seconds for which a server that is not there yet is tried again, and for which it may greet.
+        attempt: a connection that has already been opened.
+        keep_trying: seconds for which to try again if there is no server yet, and in which a server may greet.
         end: the monotonic time by which the server must have greeted in any case, or None.
 
     Raises:
@@ -219,7 +219,7 @@ def connect(
     from talkcli.errors import AccessDenied, Busy, ServerUnavailable
 
     give_up = time.monotonic() + (keep_trying or min(BUSY_LIMIT_S, patience))
-    attempt, next_pause = attempt or reach(named), _FIRST_PAUSE_S
+    attempt, next_pause = attempt or reach(named), _FIRST_RETRY_PAUSE_S
     while True:
         error: TalkError | None = None
         busy = attempt.backlog_full
@@ -250,13 +250,13 @@ def connect(
 
             pause = random.uniform(*BUSY_PAUSE_S)
         else:
-            next_pause = min(2 * pause, _LONGEST_PAUSE_S)
+            next_pause = min(2 * pause, _LONGEST_RETRY_PAUSE_S)
         wait_ready({}, min(pause, left), interrupt)
         attempt = reach(named)
 
 
 def _may_start(attempt: ConnectionAttempt) -> bool:
-    """Return whether a server may still start at one of the places that were tried."""
+    """Return whether a server may soon start at one of the places that were tried."""
     found = (paths.describe_place(path, error) for path, error in attempt.failures if isinstance(error, OSError))
     return any(each in {paths.PLACE_ABSENT, paths.PLACE_STALE} for each in found)
 
@@ -284,7 +284,7 @@ def _greet(
             try:
                 connected.send(request_line(hello))
             except (BrokenPipeError, ConnectionResetError):
-                pass  # it has hung up already, but it may have said why
+                pass  # the server has closed it, but its reason can be read
         while b"\n" not in received:
             received += _receive(connected, attempt.path, end, interrupt)
         line, _, received = received.partition(b"\n")
@@ -296,7 +296,7 @@ def _greet(
 
 
 def _receive(connected: _socket.socket, path: str, end: float, interrupt: Mapping[int, int] | None) -> bytes:
-    """Return what a server sends before its greeting is complete, and by `end`."""
+    """Return the next bytes of a greeting, which must be received by `end`."""
     from select import POLLIN
 
     from talkcli import peers
@@ -330,7 +330,9 @@ def unreachable(attempt: ConnectionAttempt, named: str | None) -> TalkError:
                 words += f": name the one in it, {_inside(path)}"
         denied = denied or isinstance(error, AccessDenied) or found == paths.PLACE_FORBIDDEN
         tried += f"  {path}: {words}\n"
-    step = _named_step(named, found, denied=denied) if named else f"{_LET_IN}\n{_OWN}" if denied else _START
+    step = f"{_LET_IN_STEP}\n{_START_OWN_STEP}" if denied else _START_STEP
+    if named:
+        step = _named_step(named, found, denied=denied)
     hint = paths.sudo_hint()
     if hint and not os.environ.get("TALK_SOCKET"):
         step += f"\nthe server of the user who called sudo would be reached with: talk --socket {hint}"
@@ -348,16 +350,16 @@ def _named_step(named: str, found: str, *, denied: bool) -> str:
     by_variable = named == os.environ.get("TALK_SOCKET")
     place = shlex.quote(printable(_inside(named) if found == paths.PLACE_DIRECTORY else named))
     if denied:
-        step = _LET_IN if by_variable else f"{_LET_IN}\n{_OWN}"
+        step = _LET_IN_STEP if by_variable else f"{_LET_IN_STEP}\n{_START_OWN_STEP}"
     elif found == paths.PLACE_FILE:
         step = "name a socket" if by_variable else "name a socket, or leave out --socket"
     elif by_variable:
-        step = f"set TALK_SOCKET to {place}" if found == paths.PLACE_DIRECTORY else _START
+        step = f"set TALK_SOCKET to {place}" if found == paths.PLACE_DIRECTORY else _START_STEP
     else:
-        step = f"{_START} --socket {place}"
+        step = f"{_START_STEP} --socket {place}"
     return f"{step}\nor unset TALK_SOCKET, which names this place: no other was tried" if by_variable else step
 
 
 def _inside(directory: str) -> str:
-    """Return the socket in a directory that was named instead of it."""
+    """Return the path of the socket in a directory."""
     return f"{directory.rstrip('/')}/{paths.SOCKET_NAME}"

@@ -33,21 +33,21 @@ if TYPE_CHECKING:
 
     _T = TypeVar("_T")
 
-#: Bytes that are received at once.
+#: The most bytes that are received at once.
 _RECEIVE_BYTES = 256 * 1024
-#: Seconds between two attempts to reach a server that went away: the first pause, which doubles up to the second.
-_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.02, 0.5
-#: Portions that are taken in before a request is sent without waiting.
-_MAX_LOOKS = 4
-#: Seconds after which a thread without a connection looks whether another thread has made one.
-_LOOK_S = 0.1
+#: Seconds between two attempts to reconnect: the first pause, and the limit up to which it is doubled.
+_FIRST_RECONNECT_PAUSE_S, _LONGEST_RECONNECT_PAUSE_S = 0.02, 0.5
+#: Reads before a request is sent, which are enough to find the end of a connection behind events.
+_MAX_READS = 4
+#: Seconds after which a waiting thread notices that another thread has reconnected.
+_RECONNECT_CHECK_S = 0.1
 
 
 def taken(connection: Connection, take: Callable[[], _T], end: float | None) -> Iterator[_T]:
-    """Call `take` under `changed` whenever something has come, and yield what it returns, unless that is empty.
+    """Iterate over the non-empty results of `take`, which is called under `changed` after each read.
 
-    At `end` (monotonic), or when nothing more can come, yield once what is there, even if it is empty. What arrives
-    after `end` doesn't count: a goal may go on for ever.
+    At `end` (monotonic), or when the connection has ended, yield the result even if it is empty. Events received after
+    `end` don't count, because a goal may go on for ever.
     """
     found: _T
 
@@ -68,27 +68,27 @@ def taken(connection: Connection, take: Callable[[], _T], end: float | None) -> 
 
 
 class Connection(ClientCore):
-    """A connection to one server. Any number of threads use it: one of them reads, and the others wait for it.
+    """A connection to one server, for any number of threads. One of them reads, and the others wait for it.
 
-    The server carries out each request once or not at all, in the order in which they were sent. Nothing that could
-    have an effect is sent twice, except a goal with its id, which is not spoken twice. Replies and events are taken in
-    in the server's order, under `changed` and under it alone, so that a wait whose `done` looks at several things sees
-    them together. That happens while a thread waits in `request` or `wait_until`: it reads for all threads. No lock is
-    held while a thread waits for the server. The core's methods are called under `changed`, too.
+    The server carries out each request at most once, in the order of sending. A request that could have an effect is
+    never sent twice, except a goal with its id, which is spoken once. Messages are processed in the server's order and
+    under `changed`, so that a waiting thread sees a consistent state. They are only read while a thread is in `request`
+    or `wait_until`, which reads for all threads. No lock is held during a wait. The core's methods must be called under
+    `changed`.
 
-    After `close`, or if nothing more can come, `ended` says why. What came before can still be read. Threads that wait
-    are told, and later requests raise ServerUnavailable because nothing is sent.
+    When the connection has ended, `ended` gives the reason. Events that were received before can still be read. Waiting
+    threads return, and later requests raise ServerUnavailable.
     """
 
-    #: the process of this machine that listens there, as its kernel says; None if the server is elsewhere
+    #: the process on this machine that listens at the socket, according to the kernel; None if the server is elsewhere
     listener: int | None = None
     #: the class of exchanges; a transport's own class can have more attributes
     exchange_type = Exchange
 
     def __init__(self, patience: float) -> None:
-        """`patience`: seconds in which the server must answer."""
+        """`patience` is the time in seconds in which the server must answer."""
         super().__init__(patience, time.monotonic())
-        #: the lock under which everything is taken in; notified after that
+        #: the lock under which messages are processed; notified after that
         self.changed = threading.Condition()
         self._process = os.getpid()
         self._reading = False
@@ -107,7 +107,7 @@ class Connection(ClientCore):
             self.end("the connection was closed")
             self._closing = True
             self._hang_up()
-            if not self._reading:  # else it would poll a descriptor that may be another file's by now
+            if not self._reading:  # the reader would poll a descriptor that may belong to another file by now
                 self._drop()
             self.changed.notify_all()
 
@@ -118,17 +118,17 @@ class Connection(ClientCore):
 
         Args:
             request: the request.
-            on_reply: called with both under `changed`, if the server accepts the request, before any later event.
+            on_reply: called with both under `changed` if the server accepts the request, before any later event.
             slow: the answer may take any time, during which the server sends signs of life.
 
         Raises:
-            RequestRefused: the server refuses the request.
+            RequestRefused: the server refused the request.
             ServerUnavailable: the request was not sent, or not answered in time.
-            Lost: the request was sent and not answered, and may have an effect.
+            Lost: the request was sent and not answered, so it may have taken effect.
             Interrupted: as in `wait_until`.
         """
-        # The wait for the reply to a goal can't be interrupted: the goal may be accepted already, and its sender could
-        # not cancel it without its id. A goal that waits for room is different: closing the connection takes it back.
+        # A goal may be accepted before its reply is read. Without the reply, the sender has no id to cancel it with, so
+        # this wait can't be interrupted. Closing the connection cancels a goal that is still waiting for room.
         interruptible = slow or not isinstance(request, Say)
         exchange = self.begin(request, on_reply, slow=slow)
         try:
@@ -151,12 +151,12 @@ class Connection(ClientCore):
         *,
         slow: bool = False,
     ) -> Exchange:
-        """Send a request and don't wait for the answer; `forget` the exchange when it is over.
+        """Send a request without waiting for the answer. If `on_failure` is None, `forget` the exchange in the end.
 
         Raises:
             ServerUnavailable: nothing can be sent.
         """
-        self._prepare(request, attended=on_failure is None)
+        self._prepare(request, awaited=on_failure is None)
         exchange = self.exchange_type(request, on_reply, on_failure, slow=slow)
         with self.changed:
             self.register(exchange, time.monotonic())
@@ -168,15 +168,15 @@ class Connection(ClientCore):
         return exchange
 
     def submit(self, request: Request, on_reply: OnReply, on_failure: OnFailure) -> None:
-        """Send a request without waiting, and call one of the functions later, under `changed`.
+        """Send a request without waiting. One of the two functions is called under `changed`, now or later.
 
-        What the server doesn't take now is sent by later calls. `on_failure` is called for a refusal, too, and if there
-        is no answer in time. It may be called at once.
+        Bytes that the server doesn't accept now are sent by later calls. A refusal, and an answer that doesn't come in
+        time, count as failures.
 
         Raises:
             ServerUnavailable: the connection has ended.
         """
-        self._look()
+        self._read_available()
         slow = isinstance(request, Say) and request.patient
         with self.changed:
             if self.ended is not None:
@@ -184,7 +184,7 @@ class Connection(ClientCore):
             self.begin(request, on_reply, on_failure, slow=slow)
 
     def post(self, request: Request) -> None:
-        """Send a request without waiting, and ignore its answer; ServerUnavailable if it can't be sent."""
+        """Send a request without waiting and ignore the answer; ServerUnavailable if it can't be sent."""
         failures: list[TalkError] = []
         self.submit(request, lambda *_: None, failures.append)
         if failures:
@@ -198,16 +198,16 @@ class Connection(ClientCore):
         since: float | None = None,
         interruptible: bool = True,
     ) -> bool:
-        """Take in what comes until `done()` is true, and return True.
-
-        Return False at the deadline, or if the connection has ended. What has arrived by the deadline counts. A server
-        that is silent for SILENCE_LIMIT_S counts as gone.
+        """Read until `done()` is true. A server that is silent for SILENCE_LIMIT_S counts as gone.
 
         Args:
-            done: called under `changed`, and not again after it was true.
-            deadline: monotonic time, or None for no limit.
-            since: the time from which silence counts; the default is now.
-            interruptible: raise Interrupted if the descriptors that interrupt this connection's waits do so.
+            done: called under `changed`, and not again after it has returned True.
+            deadline: monotonic time, or None for no limit. Messages that have arrived by then count.
+            since: the monotonic time from which silence counts; the default is now.
+            interruptible: raise Interrupted if one of the connection's interrupting descriptors is ready.
+
+        Returns:
+            False if the deadline has passed, or if the connection has ended.
         """
         began = time.monotonic() if since is None else since
         last = False
@@ -227,7 +227,7 @@ class Connection(ClientCore):
                         return False
                     self.break_off(why, now)
                     continue
-                # What has arrived by the deadline counts: one more look, that doesn't wait.
+                # Read once more at the deadline, without waiting, because messages that have arrived count.
                 last = now >= end
                 wait_s = max(0.0, min(end, self.next_expiry()) - now)
                 if self._reading:
@@ -243,37 +243,37 @@ class Connection(ClientCore):
                         self._drop()
                     self.changed.notify_all()
 
-    def _look(self) -> None:
-        """Take in what has come, without waiting. The end of the connection may be behind it."""
-        for _ in range(_MAX_LOOKS):
+    def _read_available(self) -> None:
+        """Read the messages that have arrived, without waiting. The end of the connection may follow them."""
+        for _ in range(_MAX_READS):
             heard = self._heard
             self.wait_until(lambda: False, time.monotonic(), interruptible=False)
             if heard == self._heard:
                 break
 
-    # -- what each transport does in its own way
+    # -- to be implemented by each transport
 
-    def _prepare(self, request: Request, *, attended: bool) -> None:
-        """Get ready to send a request; raise an error of `attended` ones, which somebody waits for, if that fails."""
+    def _prepare(self, request: Request, *, awaited: bool) -> None:
+        """Prepare the connection for a request. Raise a failure only if the answer will be awaited."""
 
     def _send(self, exchange: Exchange) -> None:
-        """Send a registered request, or its beginning; ServerUnavailable if nothing can be sent. Under `changed`."""
+        """Send or queue a registered request, under `changed`; ServerUnavailable if nothing can be sent."""
         raise NotImplementedError
 
     def _step(self, timeout: float, interruptible: bool) -> None:
-        """Wait until something comes, for the timeout at most, and take it in; Interrupted. By one thread at a time."""
+        """Wait for messages, up to the timeout, and process them; Interrupted. One thread at a time calls this."""
         raise NotImplementedError
 
     def _hang_up(self) -> None:
-        """End the connection so that a thread that reads finds that out. Under `changed`."""
+        """Disconnect under `changed`, so that the reading thread notices it."""
         raise NotImplementedError
 
     def _drop(self) -> None:
-        """Close this process's descriptors, whoever else has them open."""
+        """Close the descriptors of this process. A parent process keeps its own."""
         raise NotImplementedError
 
     def _cut_off(self) -> None:
-        """Make the server see the end of a connection on which a line was sent in part. Under `changed`."""
+        """Disconnect under `changed`, after a line was sent only in part."""
 
 
 class SocketConnection(Connection):
@@ -296,13 +296,13 @@ class SocketConnection(Connection):
         Args:
             socket: path of the server's socket. The default is TALK_SOCKET, then the usual places.
             name: what the sender calls itself. The default is TALK_NAME.
-            urgent: the connection is for status and cancel alone, for which a full server keeps some places.
+            urgent: only `status` and `cancel` will be sent, for which a full server keeps some places.
             interrupt: descriptors with the poll events that interrupt any wait, as in `polling.wait_ready`.
-            patience: seconds in which the server must greet, and answer each request.
-            attempt: how far the connection has come already. Its first request may have been sent.
-            keep_trying: seconds for which a server that is not there yet is tried again. What is left of them counts
-                as patience if it is more.
-            end: the monotonic time by which the server must have greeted, if it is tried again; or None.
+            patience: seconds in which the server must greet, and must answer each request.
+            attempt: a connection that has already been opened. Its first request may have been sent.
+            keep_trying: seconds for which to try again if there is no server yet. The rest of this time replaces
+                `patience` if it is longer.
+            end: with `keep_trying`, the monotonic time by which the server must have greeted; None for no limit.
         """
         super().__init__(patience)
         self._interrupt = interrupt
@@ -320,12 +320,12 @@ class SocketConnection(Connection):
         self._socket: _socket.socket | None = attempt.socket
         self.path, self.boot, self.pid = attempt.path, attempt.boot, attempt.pid
         self._sent_early = attempt.request_sent
-        #: received with the greeting: it may answer the request that was sent early, which is still to be registered
+        #: received together with the greeting, and processed after the request that was sent early is registered
         self._received_early = attempt.received
 
     @property
     def listener(self) -> int | None:  # type: ignore[override]
-        """The process that listens, as the kernel says; None while there is no connection."""
+        """The process that listens at the socket, according to the kernel; None while disconnected."""
         return None if self._socket is None else peers.credentials(self._socket)[0]
 
     def _send(self, exchange: Exchange) -> None:
@@ -342,13 +342,13 @@ class SocketConnection(Connection):
         self._flush()
 
     def _flush(self) -> None:
-        """Send as much of what waits as the server takes now. Under `changed`."""
+        """Send as many of the outgoing bytes as the server accepts now, under `changed`."""
         try:
             while self._socket is not None and (data := self.outgoing()):
                 self.mark_sent(self._socket.send(data))
         except BlockingIOError:
             pass
-        except OSError as error:  # the reader finds what the server has sent before that, and the end
+        except OSError as error:  # the reader will find the end, after the server's last messages
             if self.greeted:
                 self.stop_sending("the server went away", f"the server at {self.path} went away: {error.strerror}")
 
@@ -356,7 +356,7 @@ class SocketConnection(Connection):
         with self.changed:
             early, self._received_early = self._received_early, b""
             if early:
-                self._take_in(early, time.monotonic())
+                self._receive(early, time.monotonic())
                 timeout = 0.0
             self._flush()
             connected = self._socket
@@ -370,26 +370,26 @@ class SocketConnection(Connection):
                 return
             data = connected.recv(_RECEIVE_BYTES)
         except BlockingIOError:
-            return  # it takes more of what waits
-        except ConnectionResetError:  # it left without having read all that was sent
+            return  # the socket is ready for sending only
+        except ConnectionResetError:  # the server closed it without reading everything
             pass
-        except (OSError, ValueError) as error:  # ValueError: another thread closed it meanwhile
+        except (OSError, ValueError) as error:  # ValueError: another thread has closed it
             why = f"the connection broke: {error}"
         with self.changed:
             if connected is not self._socket:
-                return  # another thread has given it up
+                return  # another thread has disconnected
             now = time.monotonic()
             if data:
-                self._take_in(data, now)
+                self._receive(data, now)
                 self._flush()
             else:
                 self.break_off(why, now)
 
-    def _take_in(self, data: bytes, now: float) -> None:
+    def _receive(self, data: bytes, now: float) -> None:
         self.receive(data, now)
 
     def _hang_up(self) -> None:
-        self._shut(SHUT_RDWR)  # wakes a thread that reads; closing alone would not
+        self._shut(SHUT_RDWR)  # this wakes the reading thread, unlike closing the socket
 
     def _drop(self) -> None:
         if self._socket is not None:
@@ -404,37 +404,40 @@ class SocketConnection(Connection):
             if self._socket is not None:
                 self._socket.shutdown(direction)
         except OSError:
-            pass  # the server has hung up
+            pass  # the server has closed it
 
 
 class ReconnectingConnection(SocketConnection):
-    """A connection that is made again after it broke, by whatever call comes next. It never ends by itself."""
+    """A connection over a Unix socket that reconnects after a break. Only `close` ends it.
+
+    It has no thread of its own, so it reconnects during the next calls.
+    """
 
     def __init__(self, socket: str | None = None, *, name: str | None = None, patience: float = ANSWER_LIMIT_S) -> None:
         """Connect; the arguments are those of `SocketConnection`."""
         super().__init__(socket, name=name, patience=patience)
-        #: given up while another thread was polling it, which closes it
+        #: sockets that the reading thread is to close, because it may be polling them
         self._given_up: list[_socket.socket] = []
-        #: when the next attempt may be made, and the pause after it (monotonic, seconds)
-        self._retry_at, self._pause_s = 0.0, _FIRST_PAUSE_S
-        #: when the server must have greeted on a new connection (monotonic)
+        #: the earliest time of the next attempt (monotonic), and the pause after it
+        self._retry_at, self._pause_s = 0.0, _FIRST_RECONNECT_PAUSE_S
+        #: by when the server must greet on a new connection (monotonic)
         self._greet_by = 0.0
         #: why the last attempt failed
         self._failure: TalkError = ServerUnavailable("")
 
-    def _prepare(self, request: Request, *, attended: bool) -> None:
-        if attended:
-            self._look()  # the connection may have broken since the last call
+    def _prepare(self, request: Request, *, awaited: bool) -> None:
+        if awaited:
+            self._read_available()  # finds a break since the last call
         with self.changed:
             if self.ended is None:
                 self._connect_again(time.monotonic(), at_once=isinstance(request, Cancel))
-            if self._socket is None and self.ended is None and attended:
+            if self._socket is None and self.ended is None and awaited:
                 raise self._failure
 
     def post(self, request: Request) -> None:
         failures: list[TalkError] = []
         self.submit(request, lambda *_: None, failures.append)
-        if failures and self.unsent_bytes:  # there is no room for it; after a break nothing waits
+        if failures and self.unsent_bytes:  # the buffer is full; after a break it would be empty
             raise failures[0]
 
     def break_off(self, why: str, now: float) -> None:
@@ -444,7 +447,7 @@ class ReconnectingConnection(SocketConnection):
         self._give_up_socket()
         if was_greeted:
             self.disconnected(why, now)
-            self._retry_at, self._pause_s = now, _FIRST_PAUSE_S
+            self._retry_at, self._pause_s = now, _FIRST_RECONNECT_PAUSE_S
         else:
             self._not_connected(ServerUnavailable(f"nothing was sent to the server at {self.path}: {why}"), now)
 
@@ -457,7 +460,7 @@ class ReconnectingConnection(SocketConnection):
             if self.ended is None:
                 self._connect_again(now)
             if self._socket is None:
-                timeout = max(0.0, min(timeout, self._retry_at - now, _LOOK_S))
+                timeout = max(0.0, min(timeout, self._retry_at - now, _RECONNECT_CHECK_S))
             elif not self.greeted:
                 timeout = max(0.0, min(timeout, self._greet_by - now))
             absent = self._socket is None
@@ -470,15 +473,15 @@ class ReconnectingConnection(SocketConnection):
                 each.close()
             self._given_up.clear()
 
-    def _take_in(self, data: bytes, now: float) -> None:
+    def _receive(self, data: bytes, now: float) -> None:
         try:
-            super()._take_in(data, now)
-        except TalkError as error:  # of the greeting
+            super()._receive(data, now)
+        except TalkError as error:  # the greeting
             self._give_up_socket()
             self._not_connected(error, now)
 
     def _connect_again(self, now: float, *, at_once: bool = False) -> None:
-        """Try to connect, unless there is a connection or, not `at_once`, the last attempt is too recent."""
+        """Try to connect if there is no connection. Wait for the end of the pause, unless `at_once` is set."""
         if self._socket is not None or (now < self._retry_at and not at_once):
             return
         found = reach(self._named, only=self.path)
@@ -491,11 +494,11 @@ class ReconnectingConnection(SocketConnection):
 
     def _not_connected(self, error: TalkError, now: float) -> None:
         self._failure = error
-        self._retry_at, self._pause_s = now + self._pause_s, min(2 * self._pause_s, _LONGEST_PAUSE_S)
+        self._retry_at, self._pause_s = now + self._pause_s, min(2 * self._pause_s, _LONGEST_RECONNECT_PAUSE_S)
         self.not_connected(error, " ".join(error.message.split()))
 
     def _give_up_socket(self) -> None:
-        """Close the socket, or have the thread that polls it close it. Under `changed`."""
+        """Disconnect under `changed`, and leave closing the socket to the reading thread if there is one."""
         self._hang_up()
         if self._socket is not None and self._reading:
             self._given_up.append(self._socket)

@@ -1,14 +1,14 @@
-"""The client's side of the wire, without I/O: requests become bytes, received bytes become replies and events.
+"""The client's side of the protocol, without I/O: requests become bytes, received bytes become replies and events.
 
-A transport is a shell around `ClientCore`. The shell connects, owns the lock or the event loop, and does this:
+A transport is a shell around `ClientCore`. It connects, owns the lock or the event loop, and has these duties:
 
-- send the bytes of `outgoing()`, and report with `mark_sent()` how many were taken;
-- pass received bytes to `receive()`;
-- call `expire()` at the time that `next_expiry()` returns, if not earlier;
-- call `end()` when nothing more can come, or `disconnected()` if it will connect again.
+- Send the bytes that `outgoing()` returns, and report with `mark_sent()` how many were accepted.
+- Pass received bytes to `receive()`.
+- Call `expire()` at the time that `next_expiry()` returns, or earlier.
+- Call `end()` when the connection has ended for good, or `disconnected()` if the shell is going to connect again.
 
-Rules for this file: no socket, thread, lock, asyncio or clock. Times are seconds of a monotonic clock and come in as
-arguments. The methods must be called by one thread at a time.
+Rules for this file: no socket, thread, lock, asyncio or clock. Times are seconds of a monotonic clock, and are passed
+as arguments. Only one thread at a time may call a method.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ MAX_STATE_EVENTS = 10_000
 
 @frozen
 class GoalLost:
-    """Nothing more will be heard of a goal."""
+    """The end of a goal for its listeners, because the server sends no more events for it."""
 
-    #: for people
+    #: the reason, for people
     why: str
 
 
@@ -72,7 +72,7 @@ class EventBuffer:
         self._feedback: deque[tuple[int, Event]] = deque(maxlen=MAX_FEEDBACK_EVENTS)
         self._count = 0
         self._last_number: int | None = None
-        #: why no more events are added; None while they are
+        #: why no more events are added; None while the buffer is open
         self.closed: str | None = None
         #: whether the buffer stays in use after the connection has broken
         self.reconnects = reconnects
@@ -108,55 +108,55 @@ class EventBuffer:
 
 
 class EventListeners:
-    """The listeners to single goals, and the buffers of those who watch all goals."""
+    """The listeners for single goals, and the buffers of readers that watch all goals."""
 
     def __init__(self) -> None:
         self._goals: dict[str, list[Callable[[Event | Goal | GoalLost], None]]] = {}
-        #: the goals whose words are wanted, too
+        #: the goals whose listeners also want each word
         self._with_feedback: set[str] = set()
-        #: weak: watching ends when the reader drops its iterator
+        #: weak references, because watching ends when the reader drops its iterator
         self._watches: WeakSet[EventBuffer] = WeakSet()
 
     def add(self, goal_id: str, listener: Callable[[Event | Goal | GoalLost], None], *, feedback: bool = False) -> None:
-        """Pass the events of a goal, and all pauses, to a listener. The last one is a Result or GoalLost."""
+        """Pass the events of a goal, and all pauses, to a listener, until its Result or GoalLost."""
         self._goals.setdefault(goal_id, []).append(listener)
         self.want_feedback(goal_id, feedback=feedback)
 
     def want_feedback(self, goal_id: str, *, feedback: bool) -> None:
-        """Note that the words of a goal are wanted, too."""
+        """Record that a listener wants each word of a goal, if `feedback` is set."""
         if feedback:
             self._with_feedback.add(goal_id)
 
     def watch(self, buffer: EventBuffer) -> None:
-        """Add all events to this buffer, for as long as somebody else refers to it."""
+        """Add all events to this buffer, for as long as its reader keeps a reference to it."""
         self._watches.add(buffer)
 
     @property
     def watched(self) -> bool:
-        """Whether anybody watches all goals."""
+        """Whether there is a reader that watches all goals."""
         return bool(self._watches)
 
     @property
     def goals(self) -> dict[str, bool]:
-        """The ids of the goals with listeners, and whether their words are wanted."""
+        """The ids of the goals with listeners, and whether one of these wants each word."""
         return {each: each in self._with_feedback for each in self._goals}
 
     def lose(self, goal_id: str, why: str) -> None:
-        """Tell the listeners that nothing more will be heard of a goal."""
+        """Tell a goal's listeners that it is lost, and remove them."""
         for listener in self._remove(goal_id):
             listener(GoalLost(why))
 
     def update(self, goal: Goal) -> None:
-        """Tell the listeners how a goal stands now."""
+        """Pass the current state of a goal to its listeners."""
         for listener in self._goals.get(goal.id, []):
             listener(goal)
 
     def end_watches(self, why: str, *, all_of_them: bool) -> None:
-        """Close the buffers of those who watch all goals.
+        """Close the buffers of the readers that watch all goals.
 
         Args:
             why: the reason, for people.
-            all_of_them: close those buffers, too, that stay in use after a break.
+            all_of_them: also close the buffers that stay in use after a break.
         """
         for buffer in list(self._watches):
             if all_of_them or not buffer.reconnects:
@@ -164,7 +164,7 @@ class EventListeners:
                 self._watches.discard(buffer)
 
     def hear(self, message: JsonObject) -> None:
-        """Pass on an event as the server sent it; ValueError if it is malformed."""
+        """Pass an event in the server's JSON form to its listeners; ValueError if it is malformed."""
         event = events.from_json(message)
         if isinstance(event, Result):
             for listener in self._remove(event.goal.id):
@@ -181,7 +181,7 @@ class EventListeners:
                 listener(event)
             state = event.state if isinstance(event, StateChanged) and not event.goal else None
             if state is State.PENDING or (state and state.terminal):
-                return  # the server sends it once more, with the whole goal, to those who watch
+                return  # for watching clients, the server sends this event again with the whole goal
             for buffer in self._watches:
                 buffer.add(event)
 
@@ -191,39 +191,39 @@ class EventListeners:
 
 
 class TrackedGoal:
-    """A goal as far as its client knows it, and its events that nobody has taken yet."""
+    """A client's knowledge of one goal, with a buffer of its events."""
 
     def __init__(self, goal: Goal) -> None:
-        #: the goal as it was last heard of
+        #: the goal as the server last described it
         self.goal = goal
-        #: whether an earlier `say` with the same id had sent this goal; the text isn't spoken a second time
+        #: whether an earlier `say` with the same id sent this goal, so that the text is not spoken again
         self.attached = False
         #: whether the server has paused all speech, as far as is known
         self.speech_paused = False
-        #: since when the server sends the goal's events to this connection (monotonic); None if it doesn't
+        #: when the server began to send the goal's events to this connection (monotonic); None if it doesn't
         self._followed_at: float | None = None
-        #: whether the words are among them
+        #: whether each word is kept, too
         self._with_feedback = False
-        #: whether the events come here
+        #: whether this object is among the goal's listeners
         self._listening = False
         self._buffer = EventBuffer()
         #: whether the Result has been taken
         self._result_taken = False
 
     def _expect(self, request: Say, now: float) -> None:
-        """Stand for a goal whose `say` has not been answered yet, with the id that its sender has chosen."""
+        """Take the goal's id from a `say` that has not been answered yet."""
         self.goal = replace(self.goal, id=request.id or "", text=request.text)
         if request.wait:
             self._followed_at = now
 
     def _accept(self, reply: JsonObject) -> None:
-        """Take in the reply to the goal's `say`."""
+        """Update the goal from the reply to its `say`."""
         self.goal = Goal.from_json(reply.get("goal"))
         self.attached = reply.get("attached") is True
         self.speech_paused = reply.get("paused") is True
 
     def _listen_to(self, listeners: EventListeners, *, feedback: bool, now: float) -> None:
-        """Take in the goal's events, which the server sends to this connection from `now` on."""
+        """Become a listener for the goal's events, which the server sends from `now` on."""
         self._with_feedback = self._with_feedback or feedback
         if self._followed_at is None:
             self._followed_at = now
@@ -234,7 +234,7 @@ class TrackedGoal:
             listeners.add(self.goal.id, self._hear, feedback=feedback)
 
     def _fail(self, error: TalkError) -> None:
-        """Conclude from an error that the goal was never queued, or that it is lost."""
+        """End the goal because its `say` failed: as LOST if it may be spoken, otherwise as REJECTED."""
         from talkcli.goals.reasons import Reason  # no start pays for it
 
         if self.goal.state.terminal:
@@ -247,12 +247,12 @@ class TrackedGoal:
             self.goal = replace(self.goal, state=State.REJECTED, reason=reason, message=message)
 
     def _settle(self, goal: Goal) -> None:
-        """Take over what the server says of the goal now, unless the goal is known to have ended."""
+        """Replace the goal with the server's current description, unless it has already ended."""
         if not self.goal.state.terminal:
             self.goal = goal
 
     def _hear(self, event: Event | Goal | GoalLost) -> None:
-        """Take in an event of this goal, or a pause of all speech."""
+        """Update the goal from an event of its own, or from a pause of all speech."""
         if self.goal.state.terminal:
             return
         if isinstance(event, Goal):
@@ -264,7 +264,7 @@ class TrackedGoal:
         elif isinstance(event, Result):
             self.goal = event.goal
         elif isinstance(event, StateChanged):
-            # The result, which follows a terminal state, says how and why the goal ended.
+            # A terminal state is followed by the result, which has the details.
             if not event.state.terminal:
                 self.goal = replace(self.goal, state=event.state)
             self._buffer.add(event)
@@ -277,11 +277,11 @@ class TrackedGoal:
                 self._buffer.add(event)
 
     def _has_event(self) -> bool:
-        """Return whether `_take` would return an event."""
+        """Return whether there is an event to take."""
         return self.goal.state.terminal or bool(self._buffer)
 
     def _take(self) -> Event | None:
-        """Remove the oldest event and return it. After the last one return the Result, every time."""
+        """Remove and return the oldest event. An ended goal without events returns its Result, every time."""
         return self._buffer.take() or (Result(self.goal) if self.goal.state.terminal else None)
 
 
@@ -337,88 +337,97 @@ class Exchange:
         *,
         slow: bool = False,
     ) -> None:
-        """`on_failure` makes it an exchange that nobody waits for. `slow`: the answer may take any time."""
+        """Describe an exchange that is still to be registered.
+
+        Args:
+            request: the request.
+            on_reply: called with the reply and the lines of the list, if the request was accepted.
+            on_failure: called if there is no such reply. Nobody waits for an exchange with this function.
+            slow: the answer may take any time.
+        """
         self.request = request
         self.on_reply, self.on_failure = on_reply, on_failure
         self.slow = slow
         #: the `seq` of its lines
         self.number = 0
-        #: whether the whole line may have reached the server
+        #: whether the whole line was sent, so that the server may carry out the request
         self.sent = False
         self.items: list[JsonObject] = []
         self.reply: JsonObject | None = None
-        #: why there will be no reply
+        #: why there is no reply
         self.error: TalkError | None = None
-        #: when it began, or the last line of its answer came (monotonic)
+        #: when the exchange began, or when its last line was received (monotonic)
         self.heard_at = 0.0
 
     @property
     def over(self) -> bool:
-        """Whether nothing more will come."""
+        """Whether the exchange has ended, with a reply or an error."""
         return self.reply is not None or self.error is not None
 
 
 class ClientCore:
-    """One client's connection to a server, without the connection itself."""
+    """The protocol state of one client's connection to a server."""
 
-    #: requests that may have an effect even if the client never learns of it
+    #: requests that may take effect although the client gets no answer
     lasting: tuple[type[Request], ...] = (Say,)
 
     def __init__(self, patience: float, now: float) -> None:
-        """`patience`: seconds in which the server must answer; `now`: the monotonic time."""
+        """`patience` is the time in seconds in which the server must answer."""
         #: where the server is, for people
         self.path = ""
         #: the server's boot id, the first half of the ids that it gives
         self.boot = ""
-        #: the server's process, as the server says
+        #: the process id that the server reports
         self.pid: int | None = None
         self.listeners = EventListeners()
-        #: why nothing more will come, ever; None while something may
+        #: why the connection has ended for good; None until then
         self.ended: str | None = None
-        #: the requests that have not been answered, by number
+        #: the open exchanges by their numbers
         self.exchanges: dict[int, Exchange] = {}
-        #: bytes that wait to be sent, without the first line of a connection
+        #: bytes of requests that are waiting to be sent
         self.unsent_bytes = 0
-        #: whether requests may be sent: the server has greeted
+        #: whether the server has greeted, so that requests may be sent
         self.greeted = True
         #: since when there has been no connection (monotonic); None while there is one
         self.absent_since: float | None = None
-        #: why there is none, or was none the last time
+        #: why the connection broke the last time
         self.absence = ""
-        #: why the last attempt to connect again has failed; empty after a success
+        #: why the last attempt to reconnect failed; empty after a success
         self._attempt_failure = ""
         self._patience = patience
         self._numbers: Iterator[int] = itertools.count(FIRST_NUMBER)
         self._splitter = LineSplitter()
-        #: when the server was last heard
+        #: when the last bytes were received (monotonic)
         self._heard = now
-        #: lines to be sent, each with its exchange; and how many bytes of the first one were sent
+        #: lines that are waiting to be sent, each with its exchange
         self._unsent: deque[tuple[bytes, Exchange | None]] = deque()
+        #: bytes of the first of these lines that have been sent
         self._first_sent_bytes = 0
-        #: what is left of the first line of a connection, which goes out before the greeting
+        #: the unsent part of the hello line, which is sent before the server greets
         self._hello = b""
+        #: this client's version, for people
         self._version = ""
-        #: the beginning of the first request, if that was sent before this object was made
+        #: the part of the first request that was sent before this object was created
         self._sent_early = b""
-        #: why nothing more can be sent; answers may still come
+        #: why nothing more can be sent, although answers may still be received; None while sending is possible
         self._sending_ended: str | None = None
-        #: the server's last error that answered no request: why it closes the connection
+        #: the server's last error that was no answer to a request, which tells why it closes the connection
         self._last_words: str | None = None
 
     # -- requests
 
     def register(self, exchange: Exchange, now: float) -> None:
-        """Give an exchange a number, unless it has one, and expect its answer from now on."""
+        """Expect the answer to a request. The exchange gets a number, unless it has one."""
         exchange.number = exchange.number or next(self._numbers)
         exchange.heard_at = now
         self.exchanges[exchange.number] = exchange
 
     def line(self, exchange: Exchange) -> bytes:
-        """Return the line of a registered exchange's request."""
+        """Return the request of a registered exchange as a line."""
         return request_line({"seq": exchange.number, **write_request(exchange.request)})
 
     def queue(self, line: bytes, exchange: Exchange | None = None) -> None:
-        """Append a line to the bytes to be sent; ServerUnavailable if nothing more can be sent."""
+        """Append a line to the outgoing bytes; ServerUnavailable if nothing more can be sent."""
         why = self.ended or self._sending_ended
         if why:
             raise ServerUnavailable(f"nothing was sent to the server at {self.path}: {why}")
@@ -431,7 +440,7 @@ class ClientCore:
             self.mark_sent(len(early))
 
     def outgoing(self) -> bytes:
-        """Return bytes to be sent now, none if there are none. Requests wait for the server's greeting."""
+        """Return the bytes to be sent now. Requests wait until the server has greeted."""
         if self._hello or not self.greeted:
             return self._hello
         if not self._unsent:
@@ -441,7 +450,7 @@ class ClientCore:
         return b"".join(line for line, _ in self._unsent)[self._first_sent_bytes :]
 
     def mark_sent(self, count: int) -> None:
-        """Note that this many bytes of `outgoing` were taken by the transport."""
+        """Record that the transport has accepted this number of outgoing bytes."""
         if self._hello:
             self._hello = self._hello[count:]
             return
@@ -455,10 +464,11 @@ class ClientCore:
         self._first_sent_bytes = count
 
     def forget(self, exchange: Exchange) -> bool:
-        """Expect no answer any more, and don't send the request if it can still be held back.
+        """Stop expecting an answer. If the request has not been sent, don't send it.
 
-        Return False if a part of the line was sent already: the connection is useless then, and the server must see it
-        end. A request without its newline is never carried out.
+        Returns:
+            False if only a part of the line has been sent. The connection must be closed then. The server never carries
+            out a request without its newline.
         """
         self.exchanges.pop(exchange.number, None)
         for place, (line, owner) in enumerate(self._unsent):
@@ -471,11 +481,11 @@ class ClientCore:
         return True
 
     def stop_sending(self, why: str, message: str) -> None:
-        """Give up all lines that are not sent; what was sent may still be answered.
+        """Fail the requests that have not been sent, and all later ones. Answers can still be received.
 
         Args:
-            why: the reason, for requests to come.
-            message: the error of those requests that were waiting to be sent.
+            why: the reason, for the errors of later requests.
+            message: the error message of the requests that were waiting to be sent.
         """
         self._sending_ended = self._sending_ended or why
         unsent = [exchange for _, exchange in self._unsent if exchange]
@@ -487,9 +497,9 @@ class ClientCore:
         """Return the reply to a request, and the lines of its list.
 
         Raises:
-            RequestRefused: the server refuses the request.
-            ServerUnavailable: the request was not sent, or it was not answered and has no effect that lasts.
-            Lost: the request was sent and not answered. It may have an effect.
+            RequestRefused: the server refused the request.
+            ServerUnavailable: the request was not sent, or a request without lasting effect was not answered.
+            Lost: the request was sent and not answered, so it may have taken effect.
         """
         if exchange.error is not None:
             raise exchange.error
@@ -500,7 +510,7 @@ class ClientCore:
         return exchange.reply, exchange.items
 
     def unanswered(self, exchange: Exchange) -> TalkError:
-        """Return the error of a request to which no answer will come."""
+        """Return the error for a request without an answer."""
         request = exchange.request
         why = self.ended or (self.absence if self.absent_since is not None else "")
         if not exchange.sent:
@@ -515,11 +525,11 @@ class ClientCore:
 
     @property
     def no_reply(self) -> str:
-        """Why no answer is waited for any longer."""
+        """Why the wait for an answer has ended, for people."""
         return f"it did not reply within {self._patience:g} s"
 
     def refusal(self, reply: JsonObject, items: list[JsonObject]) -> TalkError:
-        """Return the error for a reply that is not ok; `items`: the lines of its list."""
+        """Return the error for a reply that is not ok. It gets the lines of the list as its `items`."""
         from talkcli.terminal.text import printable  # no start pays for it
 
         error = reply.get("error")
@@ -529,33 +539,34 @@ class ClientCore:
     # -- limits
 
     def answer_by(self, exchange: Exchange) -> float:
-        """Return by when (monotonic) the request must be sent; once it was, by when more of its answer must come."""
+        """Return the time limit for sending the request, or for the next line of the answer once it was sent."""
         if exchange.sent:
             return float("inf") if exchange.slow else exchange.heard_at + self._patience
         ttl = exchange.request.ttl if isinstance(exchange.request, Say) else None
         return exchange.heard_at + min(self._patience, ttl or self._patience)
 
     def silent_by(self, began: float) -> tuple[float, str]:
-        """Return when a silent server counts as gone for a client that waits since `began`, and why it does."""
+        """Return when a silent server counts as gone for a caller that has waited since `began`, and the reason."""
         if self.absent_since is not None:
             return float("inf"), ""
         return max(began, self._heard) + SILENCE_LIMIT_S, f"it has said nothing for {SILENCE_LIMIT_S:g} s"
 
     def goals_lost_at(self) -> float:
-        """Return when the goals that are followed are lost, because no connection was made again."""
+        """Return when the followed goals are lost if there is no new connection."""
         return float("inf") if self.absent_since is None else self.absent_since + self._patience
 
     def next_expiry(self) -> float:
-        """Return when `expire` has something to do at the latest."""
+        """Return the time at which `expire` must be called."""
         times = [self.answer_by(each) for each in self.exchanges.values() if each.on_failure]
         if self.listeners.goals:
             times.append(self.goals_lost_at())
         return min(times, default=float("inf"))
 
     def expire(self, now: float) -> bool:
-        """Fail what has waited too long: requests that nobody waits for, and goals without a connection.
+        """Fail what is over its time limit: exchanges with an `on_failure`, and followed goals without a connection.
 
-        Return False if a request's line was sent in part, as `forget` does.
+        Returns:
+            False if the connection must be closed, see `forget`.
         """
         intact = True
         for exchange in [each for each in self.exchanges.values() if each.on_failure and self.answer_by(each) <= now]:
@@ -565,47 +576,50 @@ class ClientCore:
             self._lose_goals(f"{self.absence}; it may still be spoken")
         return intact
 
-    # -- what comes
+    # -- receiving
 
     def split(self, data: bytes, now: float) -> list[bytes]:
-        """Return the lines that are complete with these bytes, for a shell that passes them on."""
+        """Return the lines that received bytes complete. For shells that pass lines on undecoded."""
         self._heard = now
         return self._splitter.feed(data)
 
     def begin_stream(self) -> None:
-        """Forget the beginning of a line: what comes next begins another stream."""
+        """Discard an incomplete line, because the next bytes are the beginning of another stream."""
         self._splitter = LineSplitter()
 
     def receive(self, data: bytes, now: float) -> None:
-        """Take in received bytes. A malformed line breaks the connection.
+        """Process received bytes. A malformed line breaks the connection.
 
         Raises:
-            ServerUnavailable, AccessDenied, Busy, ProtocolMismatch: the greeting of a new connection, after
-                `connecting`, is that of a server that can't be used.
+            ServerUnavailable, AccessDenied, Busy, ProtocolMismatch: according to the greeting on a new connection, the
+                server can't be used.
         """
         splitter = self._splitter
         for line in self.split(data, now):
             if self.ended is not None or self._splitter is not splitter:
-                return  # the line before has broken the connection
+                return  # the previous line has broken the connection
             if self.greeted:
                 self.take_line(line, now)
             else:
                 self.connected(*identity(read_greeting(line, self.path, self._version)), now)
 
     def take_line(self, line: bytes, now: float) -> None:
-        """Take in one line of the server's."""
+        """Process a received line."""
         try:
             self.dispatch(decode(line), now)
         except (BadRequest, ValueError) as error:  # ValueError: a malformed goal or event
             self.break_off(f"it sent what is no message: {error}", now)
 
     def match(self, message: JsonObject) -> Exchange | None:
-        """Return the exchange that a line belongs to, None for an event or an answer that nobody expects."""
+        """Return the open exchange that a message belongs to; None if there is none."""
         number = message.get("seq")
         return self.exchanges.get(number) if isinstance(number, int) else None
 
     def dispatch(self, message: JsonObject, now: float) -> Exchange | None:
-        """Pass on an event or a line of an answer; return the exchange that ended with it.
+        """Process a received message.
+
+        Returns:
+            The exchange that has ended with this message, or None.
 
         Raises:
             ValueError: the event, or a goal in the reply, is malformed.
@@ -635,21 +649,21 @@ class ClientCore:
             try:
                 exchange.on_reply(reply, exchange.items)
             except Unreadable as error:
-                if not isinstance(exchange.request, self.lasting):  # else the request may have had its effect
+                if not isinstance(exchange.request, self.lasting):  # otherwise the request may have taken effect
                     exchange.error = error
                 if exchange.on_failure:
                     exchange.on_failure(exchange.error or self.unanswered(exchange))
                 raise
-        exchange.reply = reply  # only now: a reply that can't be read is none
+        exchange.reply = reply  # a malformed reply doesn't count
 
-    # -- the end, and another beginning
+    # -- disconnecting and reconnecting
 
-    def break_off(self, why: str, now: float) -> None:  # noqa: ARG002 - for those that connect again
-        """Give up this connection: end, unless a subclass connects again."""
+    def break_off(self, why: str, now: float) -> None:  # noqa: ARG002 - for subclasses that reconnect
+        """Give up the connection. Here, that is its end; a subclass may reconnect instead."""
         self.end(why)
 
     def end(self, why: str) -> None:
-        """Note that nothing more will come. What has come before can still be read."""
+        """End the connection for good. Events that were received before can still be read."""
         if self.ended is not None:
             return
         self.ended = self._last_words or why
@@ -658,7 +672,7 @@ class ClientCore:
             self.fail(exchange, self.unanswered(exchange))
 
     def disconnected(self, why: str, now: float) -> None:
-        """Note that the connection broke, and will be made again: nothing that waits for an answer gets one."""
+        """Record that the connection has broken and is going to be made again. All open exchanges fail."""
         self.absence = self._last_words or why
         self.absent_since, self._last_words, self._sending_ended = now, None, None
         self.greeted, self._hello, self._splitter = False, b"", LineSplitter()
@@ -668,17 +682,17 @@ class ClientCore:
         self.listeners.end_watches(self._nothing_heard(), all_of_them=False)
 
     def connecting(self, hello: bytes, version: str) -> None:
-        """Begin a new connection: requests wait for the server's greeting.
+        """Begin a new connection, on which requests wait for the server's greeting.
 
         Args:
-            hello: the first line.
-            version: this client's, for people.
+            hello: the line to be sent first.
+            version: this client's version, for people.
         """
         self.greeted, self._hello, self._version, self._splitter = False, hello, version, LineSplitter()
         self._sending_ended = None
 
     def not_connected(self, error: TalkError, why: str) -> None:
-        """Note that no new connection was made: requests that somebody waits for fail, others wait for the next one."""
+        """Record that an attempt to reconnect has failed. Exchanges that somebody waits for fail, too."""
         self._attempt_failure = why
         self.greeted, self._hello = False, b""
         for exchange in [each for each in self.exchanges.values() if not each.on_failure]:
@@ -686,9 +700,9 @@ class ClientCore:
             self.fail(exchange, error)
 
     def connected(self, boot: str, pid: int | None, now: float) -> None:
-        """Note that the server has greeted on a new connection.
+        """Record that the server has greeted on a new connection.
 
-        If it is the server of the last connection, its goals are followed again; else they are lost.
+        Goals are followed again if the server is still the one of the last connection. Otherwise they are lost.
         """
         restarted = boot != self.boot
         self.boot, self.pid, self.greeted, self._attempt_failure = boot, pid, True, ""
@@ -704,7 +718,7 @@ class ClientCore:
             self.queue(line if exchange is None else self._line_now(exchange, now), exchange)
 
     def _line_now(self, exchange: Exchange, now: float) -> bytes:
-        """Return the line of a request that has waited for the connection; its limits count from now on."""
+        """Return the line of a request that has waited for the connection, with the rest of its ttl."""
         request = exchange.request
         if isinstance(request, Say) and request.ttl:
             exchange.request = replace(request, ttl=max(_LEAST_TTL_S, request.ttl - (now - exchange.heard_at)))
@@ -714,11 +728,11 @@ class ClientCore:
     def _follow_again(self, goal_id: str, *, feedback: bool, now: float) -> None:
         def on_reply(_: JsonObject, items: list[JsonObject]) -> None:
             for goal in goals(items, "goal"):
-                if not goal.state.terminal:  # else its result follows
+                if not goal.state.terminal:  # an ended goal's result follows
                     self.listeners.update(goal)
 
         def on_failure(error: TalkError) -> None:
-            if self.absent_since is None:  # else it is followed again after the next connection
+            if self.absent_since is None:  # otherwise the next connection follows it again
                 self.listeners.lose(goal_id, f"{error.message}; it may have been spoken")
 
         self._begin(Exchange(Wait((goal_id,), feedback), on_reply, on_failure), now)
@@ -738,7 +752,7 @@ class ClientCore:
         self.queue(self.line(exchange), exchange)
 
     def fail(self, exchange: Exchange, error: TalkError) -> None:
-        """End an exchange with an error."""
+        """End an exchange with an error, unless it has already ended."""
         if exchange.over:
             return
         exchange.error = error

@@ -1,7 +1,7 @@
-"""Handles of goals: the state of each, its events and its end; and the events of several goals as one stream.
+"""Handles of goals, and the merged events of several goals.
 
-A handle needs a connection and no client. It reads nothing by itself: a thread that waits on the connection reads for
-all handles. Handles change under the connection's lock only, and never after their goal has ended.
+A handle needs a connection, but no client. Handles don't read: a thread that waits on the connection reads for all of
+them. They only change under the connection's lock, and never after their goal has ended.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 class GoalHandle(TrackedGoal):
     """A goal that was sent or is followed. Any number of threads may use it.
 
-    Its events are kept until they are taken, including the last 5,000 words and pauses. `events`, `feedback` and `poll`
-    take from the same store, so each event is returned once. After a loop over `events` was left, the next call goes on
-    where it ended. An iterator is for one thread; another thread calls the method again.
+    Events are kept until they are taken; of words and pauses, the last 5,000. `events`, `feedback` and `poll` take from
+    the same buffer, so each event is returned once, and a loop that was left can be continued by a new one. An iterator
+    is for one thread. Another thread needs its own.
     """
 
     def __init__(self, connection: Connection, goal: Goal) -> None:
@@ -40,12 +40,12 @@ class GoalHandle(TrackedGoal):
 
     @property
     def id(self) -> str:
-        """The goal's id; empty if the goal was REJECTED before it was sent and has no id of the sender's."""
+        """The goal's id; empty if the goal was REJECTED before it had one."""
         return self.goal.id
 
     @property
     def state(self) -> State:
-        """The goal's state, as far as it is known: `wait`, `poll` and any other call of the client update it."""
+        """The goal's last known state. It is updated by `wait`, `poll` and all other calls of the client."""
         return self.goal.state
 
     def wait(self, timeout: float | None = None) -> Goal:
@@ -68,9 +68,9 @@ class GoalHandle(TrackedGoal):
     def events(self, timeout: float | None = None) -> Iterator[Event]:
         """Iterate over the goal's events as they happen. The last one is its Result.
 
-        The events are StateChanged for each state and, if the goal was sent or followed with `feedback`, WordHeard for
-        each word as it is heard and PausedChanged when speech is paused or resumed. If the server goes away first, the
-        Result is that of a LOST goal.
+        There is a StateChanged for each state. A goal that was sent or followed with `feedback` also has a WordHeard
+        for each word as it is heard, and a PausedChanged when speech is paused or resumed. If the server goes away
+        first, the goal ends as LOST.
 
         Args:
             timeout: seconds from this call in which the goal must end; None for no limit.
@@ -85,21 +85,20 @@ class GoalHandle(TrackedGoal):
     def feedback(self, timeout: float | None = None) -> Iterator[WordHeard]:
         """Iterate over the goal's words as they are heard, until it has ended.
 
-        If the goal was sent without `feedback`, the words are those from this call on. The timeout is that of `events`.
+        A goal that was sent without `feedback` yields the words from this call on. The timeout is that of `events`.
         """
         end = _end(timeout)
         self._follow(feedback=True)
         return (each for each in self._events(end, timeout) if isinstance(each, WordHeard))
 
     def poll(self) -> Event | None:
-        """Return the goal's next event, None if there is none now. The last event is the Result. It never waits.
+        """Return the goal's next event without waiting, None if there is none now. The last event is the Result.
 
-        It is made for loops that must not wait. It also sends what is left of earlier requests, and reads what the
-        server has sent, so call it again and again.
+        It is for loops that must not wait. Each call reads from the server, and sends the rest of earlier requests, so
+        call it regularly.
 
         Raises:
-            UsageError: the goal was sent with `follow=False`, so its events don't come before `wait` or `events` has
-                asked for them.
+            UsageError: the goal was sent with `follow=False`, and neither `wait` nor `events` has been called.
         """
         if self._followed_at is None and not self.state.terminal:
             raise UsageError(f"nothing is heard of {self.id}, which was sent with follow=False: leave that out")
@@ -113,7 +112,11 @@ class GoalHandle(TrackedGoal):
         return event
 
     def request_cancel(self) -> None:
-        """Ask the server to cancel the goal. It never waits: `wait` or `poll` tells how the goal ended."""
+        """Ask the server to cancel the goal, without waiting. `wait` or `poll` tells how the goal ended.
+
+        Raises:
+            ServerUnavailable: the client is closed, or 256 KiB of requests are waiting to be sent.
+        """
         if self.id and (not self.state.terminal or self.state is State.LOST):
             self._connection.post(Cancel((self.id,)))
 
@@ -130,7 +133,7 @@ class GoalHandle(TrackedGoal):
     # -- inside
 
     def _listen(self, *, feedback: bool) -> None:
-        """Take in the goal's events from now on, which the server sends to this connection. Under its lock."""
+        """Become a listener for the goal's events, under the connection's lock."""
         self._listen_to(self._connection.listeners, feedback=feedback, now=time.monotonic())
 
     def _events(self, end: float | None, timeout: float | None) -> Iterator[Event]:
@@ -156,12 +159,12 @@ class GoalHandle(TrackedGoal):
         self._connection.request(Wait((self.id,), feedback), accepted)
 
     def _give_up(self, timeout: float | None) -> None:
-        """Conclude that the goal is lost if the connection has ended; else raise TimeoutError."""
+        """End the goal as LOST if the connection has ended; otherwise raise TimeoutError."""
         if not self._lose():
             raise TimeoutError(f"{self.id} has not ended after {0 if timeout is None else round(timeout, 1):g} s")
 
     def _lose(self) -> bool:
-        """Conclude that the goal is lost if the connection has ended, and return whether it has."""
+        """End the goal as LOST if the connection has ended, and return whether it has."""
         ended = self._connection.ended
         if ended is not None:
             with self._connection.changed:
@@ -172,11 +175,11 @@ class GoalHandle(TrackedGoal):
 def merged(handles: Sequence[GoalHandle], timeout: float | None = None) -> Iterator[tuple[GoalHandle, Event]]:
     """Iterate over the events of several goals of one connection, each with its handle, until all goals have ended.
 
-    The last event of each goal is its Result. A pause of all speech comes once. If the server goes away, the goals that
-    have not ended are LOST.
+    The last event of each goal is its Result. A pause of all speech is yielded once. If the server goes away, the
+    remaining goals end as LOST.
 
     Raises:
-        TimeoutError: not all goals have ended `timeout` seconds after the first step.
+        TimeoutError: some goals have not ended `timeout` seconds after the iteration began.
     """
     stream = _EventStream(handles)
     if not handles:
@@ -191,17 +194,17 @@ def merged(handles: Sequence[GoalHandle], timeout: float | None = None) -> Itera
 
 
 class _EventStream:
-    """The events of several goals in the server's order."""
+    """The merged events of several goals, in the server's order."""
 
     def __init__(self, handles: Sequence[GoalHandle]) -> None:
-        #: the goals whose Result was not found yet, each once
+        #: the goals that have not ended, without duplicates
         self.going = list({each.id: each for each in handles}.values())
         #: the number of each goal's last event, which its Result follows
         self._last_numbers = dict.fromkeys((each.id for each in self.going), 0)
         self._pause_number: int | None = None
 
     def take(self) -> list[tuple[GoalHandle, Event]]:
-        """Remove and return the events that have come for all goals. Under the connection's lock."""
+        """Remove and return the events of all goals, under the connection's lock."""
         found = []
         for handle in self.going:
             event: Event | None = None
@@ -215,10 +218,10 @@ class _EventStream:
                     self._last_numbers[handle.id] = number
                 found.append((self._last_numbers.get(handle.id, 0), handle, event))
         self.going = [each for each in self.going if not each.state.terminal]
-        # A stable sort: a Result has the number of its goal's last event, and was found after that.
+        # The sort is stable, so a Result stays behind its goal's last event, whose number it shares.
         return [(handle, event) for _, handle, event in sorted(found, key=lambda each: each[0])]
 
 
 def _end(timeout: float | None) -> float | None:
-    """Return when a timeout from now is over (monotonic)."""
+    """Return the monotonic time of a timeout's end."""
     return None if timeout is None else time.monotonic() + timeout
