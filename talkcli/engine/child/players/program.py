@@ -33,7 +33,6 @@ import time
 from talkcli.engine.child.players.base import CannotSpeak, Player
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.reasons import Reason
-from talkcli.polling import wait_ready
 from talkcli.processes import close, is_held, kill, kill_holders, open_pipes, signal_name
 from talkcli.protocol.lines import LineSplitter
 
@@ -137,7 +136,10 @@ class PlayerProcess:
     def await_end(self, seconds: float) -> None:
         """Block until the program ends, for a limited time; return at once if the system can't report the end."""
         if self.exit is not None and self._status is None:
-            wait_ready({self.exit: select.POLLIN}, seconds)
+            # Not `wait_ready`: this may run while the interpreter ends, when nothing can be imported any more.
+            wait = select.poll()
+            wait.register(self.exit, select.POLLIN)
+            wait.poll(seconds * 1000)
 
     def close_stdin(self) -> None:
         """Close the program's standard input."""
