@@ -162,7 +162,7 @@ async def test_waiting_requests_of_all_connections_have_a_limit_in_bytes() -> No
 @in_loop
 async def test_small_values_count_with_the_memory_that_they_take(request_: Say | Wait) -> None:
     server = Server()
-    assert server.requests._keep(PendingRequest(cast("Any", Client()), None, request_))
+    assert server.requests._count_waiting(PendingRequest(cast("Any", Client()), None, request_))
     assert server.requests._waiting_bytes > REQUEST_BYTES + 16_000
 
 

@@ -57,7 +57,7 @@ class Now:
 
 
 @frozen
-class Changed:
+class StateChange:
     """Effect: publish that a goal is in a new state."""
 
     record: Record
@@ -78,18 +78,18 @@ class Order(Enum):
 
 
 @frozen
-class Ordered:
+class EngineOrder:
     """Effect: give the engine an order about a goal."""
 
     record: Record
     order: Order
 
 
-Effect = Changed | Ordered | VoiceLoadOrder | VoiceDropOrder | VoiceWarning
+Effect = StateChange | EngineOrder | VoiceLoadOrder | VoiceDropOrder | VoiceWarning
 
 
 @frozen
-class Submitted:
+class Submission:
     """The result of `Scheduler.submit`."""
 
     #: the new goal, or the earlier goal with the same id and text
@@ -100,7 +100,7 @@ class Submitted:
 
 
 @dataclass(slots=True)
-class Cancelled:
+class Cancellation:
     """The result of `Scheduler.cancel`."""
 
     #: goals that have ended at once
@@ -200,7 +200,7 @@ class Scheduler:
         refusal: Refusal | None = None,
         canceled: By | None = None,
         waited_s: float = 0.0,
-    ) -> Submitted:
+    ) -> Submission:
         """Accept or reject a goal. A rejected goal has no effect on the others.
 
         Args:
@@ -213,7 +213,7 @@ class Scheduler:
         """
         first = self.find(say.id) if say.id is not None and is_clients_id(say.id) else None
         if first is not None and first.has_text(say.text):
-            return Submitted(first, [], attached=True)
+            return Submission(first, [], attached=True)
         self._count += 1
         ttl = (self.settings.ttl if say.ttl is None else say.ttl) or None
         expires_at = None if ttl is None else now.monotonic + ttl - waited_s
@@ -229,23 +229,23 @@ class Scheduler:
             record.reason, words = refused
             record.state, record.message, record.ended_at = State.REJECTED, f"Talk rejected: {words}", now.wall
             self.history.add(record)
-            return Submitted(record, [Changed(record, State.REJECTED)])
+            return Submission(record, [StateChange(record, State.REJECTED)])
         record.id = say.id or record.id
         self._by_id[record.id] = record
-        effects: list[Effect] = [Changed(record, State.PENDING)]
+        effects: list[Effect] = [StateChange(record, State.PENDING)]
         if by:
             words = "canceled before it was spoken" if canceled else "canceled before it arrived"
-            return Submitted(record, effects + self._end_unqueued(record, Reason.CANCELED, words, by, now))
+            return Submission(record, effects + self._end_unqueued(record, Reason.CANCELED, words, by, now))
         if expired:
             words = _expiry_message(record)
-            return Submitted(record, effects + self._end_unqueued(record, Reason.EXPIRED, words, None, now))
+            return Submission(record, effects + self._end_unqueued(record, Reason.EXPIRED, words, None, now))
         effects += self._enqueue(record, recalled or [], now)
         self._request_voice(self.wanted_voice(record), now)
-        return Submitted(record, effects + self._start_next(now) + self._load_next(now))
+        return Submission(record, effects + self._start_next(now) + self._load_next(now))
 
     def cancel(
         self, selection: Cancel, sender: Sender | None, now: Now, waiting: Collection[str | None] = ()
-    ) -> Cancelled:
+    ) -> Cancellation:
         """End the selected goals: the pending ones at once, the active one when the engine is silent.
 
         Args:
@@ -254,7 +254,7 @@ class Scheduler:
             now: the time.
             waiting: the ids of selected goals that wait for room and have not been submitted yet.
         """
-        result = Cancelled()
+        result = Cancellation()
         by = By(client=sender)
         chosen = self._select(selection, result, waiting)
         for goal_id in filter(is_clients_id, result.unknown):
@@ -290,7 +290,7 @@ class Scheduler:
             return []
         self.active.paused = True
         self.active.pause_count += 1
-        return [Ordered(self.active, Order.HOLD)]
+        return [EngineOrder(self.active, Order.HOLD)]
 
     def resume(self, now: Now) -> list[Effect]:
         """Continue the goal that is held, or start the next one."""
@@ -300,7 +300,7 @@ class Scheduler:
         if not (self.active and self.active.paused):
             return self._start_next(now)
         self.active.paused = False
-        return [Ordered(self.active, Order.RESUME)]
+        return [EngineOrder(self.active, Order.RESUME)]
 
     def shutdown(self, now: Now) -> list[Effect]:
         """End all goals, and reject every new one."""
@@ -427,13 +427,13 @@ class Scheduler:
                 effects = self._stop(record, Reason.EXPIRED, None, now)
             else:
                 words = f"Talk aborted: silence could not be confirmed within {CONFIRM_SILENCE_S:g} s"
-                effects = [Ordered(record, Order.GIVE_UP)]
+                effects = [EngineOrder(record, Order.GIVE_UP)]
                 effects += self._end(record, State.ABORTED, Reason.NOT_SILENT, words, record.by, now)
         return effects + self._expire(now) + self._start_next(now) + self._load_next(now)
 
     # -- admission
 
-    def _select(self, selection: Cancel, result: Cancelled, waiting: Collection[str | None]) -> list[Record]:
+    def _select(self, selection: Cancel, result: Cancellation, waiting: Collection[str | None]) -> list[Record]:
         """Return the selected goals that have not ended; note the others in `result`."""
         chosen = self.unfinished() if selection.everything else []
         for goal_id in dict.fromkeys(selection.ids or ()):
@@ -594,7 +594,7 @@ class Scheduler:
         if not self.has_engine:
             return []
         record, effects = self._activate_next(now)
-        return [*effects, Ordered(record, Order.START)] if record else effects
+        return [*effects, EngineOrder(record, Order.START)] if record else effects
 
     def _activate_next(self, now: Now) -> tuple[Record | None, list[Effect]]:
         """Make the next goal the active one, and return it; None if no goal can start."""
@@ -611,7 +611,7 @@ class Scheduler:
         self._queue.remove(record)
         record.started_at, record.began_at = now.wall, now.monotonic
         self.active = record
-        return record, [*effects, Changed(record, State.ACTIVE)]
+        return record, [*effects, StateChange(record, State.ACTIVE)]
 
     def _recall(self, record: Record, reason: Reason, words: str, by: By | None, now: Now) -> list[Effect]:
         """End a pending goal."""
@@ -630,7 +630,7 @@ class Scheduler:
         record.become(State.PREEMPTING)
         record.reason, record.by, record.stop_requested_at = reason, by, now.monotonic
         record.paused = False
-        return [Changed(record, State.PREEMPTING), Ordered(record, Order.STOP)]
+        return [StateChange(record, State.PREEMPTING), EngineOrder(record, Order.STOP)]
 
     def _require_active(self, goal_id: str) -> Record:
         """Return the active goal; IllegalTransition if this is not its id."""
@@ -650,9 +650,9 @@ class Scheduler:
         self._by_id.pop(record.id)
         self.history.add(record)
         if record is not self.active:
-            return [Changed(record, state)]
+            return [StateChange(record, state)]
         self.active = None
-        return [Changed(record, state), *self._start_next(now)]
+        return [StateChange(record, state), *self._start_next(now)]
 
 
 def _expiry_message(record: Record) -> str:

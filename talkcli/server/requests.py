@@ -99,7 +99,7 @@ class Requests:
         """End all goals, also those that wait for room."""
         notifications = self._cancel_waiting(self._select_waiting(Cancel()), None)
         self._speech.shut_down()
-        resume_all(self._speech.for_voices)
+        resume_all(self._speech.waiting_for_voices)
         self._speech.notifications.add([*notifications, self._speech.check_finished])
 
     async def _carry_out(self, pending: PendingRequest) -> None:
@@ -108,8 +108,8 @@ class Requests:
             if isinstance(request, Cancel | Pause):
                 self._skip_voices(pending.connection)  # never delayed, but earlier requests come first
             elif self._needs_voices(pending):
-                if self._keep(pending):
-                    await pending.wait(self._speech.for_voices, VOICES_LIMIT_S)
+                if self._count_waiting(pending):
+                    await pending.wait(self._speech.waiting_for_voices, VOICES_LIMIT_S)
                 elif not isinstance(request, Say):
                     self._skip_voices(pending.connection)
             steps: Callable[[PendingRequest, Any], Steps] = getattr(self, f"_{request.kind}")
@@ -131,13 +131,14 @@ class Requests:
     def _unanswered(self, connection: ClientConnection) -> list[PendingRequest]:
         return list(self._pending.get(connection, ()))
 
-    def _waiting_for_voices(self, connection: ClientConnection) -> list[PendingRequest]:
-        return [each for each in self._unanswered(connection) if each.waiting_list is self._speech.for_voices]
+    def _held_requests(self, connection: ClientConnection) -> list[PendingRequest]:
+        """Return the requests of a connection that wait for the voices."""
+        return [each for each in self._unanswered(connection) if each.waiting_list is self._speech.waiting_for_voices]
 
     def _needs_voices(self, pending: PendingRequest) -> bool:
         """Return whether a request must wait for the voices, or for an earlier request that does."""
         request = pending.request
-        if self._speech.for_voices and (isinstance(request, Say) or self._waiting_for_voices(pending.connection)):
+        if self._speech.waiting_for_voices and (isinstance(request, Say) or self._held_requests(pending.connection)):
             return True
         if not self._speech.awaits_voices:
             return False
@@ -147,10 +148,10 @@ class Requests:
 
     def _skip_voices(self, connection: ClientConnection) -> None:
         """Continue the requests of a connection that wait for the voices."""
-        for each in self._waiting_for_voices(connection):
+        for each in self._held_requests(connection):
             each.resume()
 
-    def _keep(self, pending: PendingRequest) -> bool:
+    def _count_waiting(self, pending: PendingRequest) -> bool:
         """Count a request that is about to wait. Return False if it can't wait, and note why."""
         if pending.kept_bytes:
             return True  # it has waited before
@@ -168,7 +169,7 @@ class Requests:
 
     def _check_room_soon(self) -> None:
         """Schedule a check of the goals that wait for room, because the queue has changed."""
-        if self._speech.for_room and self._room_check is None:
+        if self._speech.waiting_for_room and self._room_check is None:
             # In the next turn, because the caller may be in the middle of other changes.
             self._room_check = asyncio.get_running_loop().call_soon(self._check_room)
 
@@ -177,7 +178,7 @@ class Requests:
         self._room_check = None
         without_room: set[object] = set()
         resumed = False
-        for each in list(self._speech.for_room):
+        for each in list(self._speech.waiting_for_room):
             say = each.request
             assert isinstance(say, Say)
             # Room depends on these values alone if the goal has no id. One check answers for a thousand such goals.
@@ -195,7 +196,7 @@ class Requests:
 
     def _select_waiting(self, selection: Cancel) -> list[PendingRequest]:
         """Return the selected goals among those that wait."""
-        waiting = (*self._canceled, *self._speech.for_room, *self._speech.for_voices)
+        waiting = (*self._canceled, *self._speech.waiting_for_room, *self._speech.waiting_for_voices)
         goals = [(each, each.request) for each in waiting if isinstance(each.request, Say)]
         selected = (goals[index][0] for index in selection.of_waiting([say for _, say in goals]))
         # A client that has hung up has withdrawn its goals.
@@ -214,7 +215,7 @@ class Requests:
         ttl = (self._scheduler.settings.ttl if say.ttl is None else say.ttl) or None
         began = self._speech.now().monotonic
         self._speech.subscribers.keep_alive()
-        in_time = await pending.wait(self._speech.for_room, ttl)
+        in_time = await pending.wait(self._speech.waiting_for_room, ttl)
         waited = self._speech.now().monotonic - began
         return waited if in_time or ttl is None else max(waited, ttl)
 
@@ -229,7 +230,7 @@ class Requests:
                 self._room_check.cancel()
                 self._check_room()
             refusal = pending.refusal or speech.voices.refusal(say.voice, scheduler.settings.voice)
-            if say.patient and scheduler.lacks_room(say, now, refusal) and self._keep(pending):
+            if say.patient and scheduler.lacks_room(say, now, refusal) and self._count_waiting(pending):
                 waited = await self._await_room(pending, say)
         now, usual = speech.now(), scheduler.settings.voice
         refusal = pending.refusal or speech.voices.refusal(say.voice, usual)
@@ -285,15 +286,15 @@ class Requests:
         speech.notifications.add(notifications)
         if result.stopping:
             while not result.stopping.state.terminal:
-                await pending.wait(speech.for_silence(result.stopping))
+                await pending.wait(speech.waiting_for_silence(result.stopping))
         else:
             await speech.notifications.wait_done(pending)
         ended = result.recalled + [each.canceled_goal for each in waiting if each.canceled_goal]
         if result.stopping and result.stopping.state is not State.SUCCEEDED:
             ended.append(result.stopping)
-        goals = chain(_listed("canceled", ended), _listed("ended", result.ended))
+        goals = chain(_goal_lines("canceled", ended), _goal_lines("ended", result.ended))
         if result.unknown:
-            pending.refuse(UnknownGoal.code, _unknown(*result.unknown), goals)
+            pending.refuse(UnknownGoal.code, _unknown_message(*result.unknown), goals)
         else:
             pending.answer(goals, count=len(ended))
 
@@ -307,8 +308,8 @@ class Requests:
         active = scheduler.active
         if (
             active
-            and active is not speech.silent
-            and not await pending.wait(speech.for_silence(active), PAUSE_ANSWER_S)
+            and active is not speech.silent_goal
+            and not await pending.wait(speech.waiting_for_silence(active), PAUSE_ANSWER_S)
         ):
             words = f"speech is paused, but {active.id} was not known to be silent within {PAUSE_ANSWER_S:g} s"
             raise RequestRefused(words, Reason.NOT_SILENT)
@@ -320,13 +321,13 @@ class Requests:
         changed, active = scheduler.paused, scheduler.active
         if active and active.state is not State.ACTIVE:
             active = None  # it is being stopped
-        speech.silent = None
+        speech.silent_goal = None
         effects = scheduler.resume(now)
         if changed:
             self._publish_pause(active, pending)
         speech.apply(effects)
         if active:
-            resume_all(speech.for_silence(active))  # these requests will not see it silent any more
+            resume_all(speech.waiting_for_silence(active))  # these requests will not see it silent any more
         self._answer_pause(pending, active)
 
     def _publish_pause(self, held: Record | None, pending: PendingRequest) -> None:
@@ -355,7 +356,7 @@ class Requests:
         recent = list(self._scheduler.history.latest(RECENT_GOALS))
         active = self._scheduler.active
         now = active.snapshot().to_json() if active else None
-        goals = chain(_listed("pending", list(self._scheduler.pending())), _listed("recent", reversed(recent)))
+        goals = chain(_goal_lines("pending", list(self._scheduler.pending())), _goal_lines("recent", reversed(recent)))
         pending.answer(goals, server=self._describe(), active=now)
 
     async def _voices(self, pending: PendingRequest, _: Voices) -> None:
@@ -370,7 +371,7 @@ class Requests:
 
     async def _log(self, pending: PendingRequest, request: Log) -> None:
         records = list(self._scheduler.history.log(request.count))
-        pending.answer(_listed("goal", reversed(records)), count=len(records))
+        pending.answer(_goal_lines("goal", reversed(records)), count=len(records))
 
     async def _set(self, pending: PendingRequest, request: Set) -> None:
         speech, scheduler = self._speech, self._scheduler
@@ -391,11 +392,11 @@ class Requests:
     def _find(self, goal_id: str) -> Record:
         record = self._scheduler.find(goal_id)
         if record is None:
-            raise UnknownGoal(_unknown(goal_id))
+            raise UnknownGoal(_unknown_message(goal_id))
         return record
 
 
-def _unknown(*ids: str) -> str:
+def _unknown_message(*ids: str) -> str:
     return f"no goal {', '.join(map(repr, ids))} is known: see `talk status`"
 
 
@@ -407,7 +408,7 @@ def _refuse_pitch(say: Say) -> Refusal | None:
     return Reason.BAD_OPTION, words
 
 
-def _listed(name: str, records: Iterable[Record]) -> Iterator[JsonObject]:
+def _goal_lines(name: str, records: Iterable[Record]) -> Iterator[JsonObject]:
     """Return the lines of a list of goals. Each snapshot is made when it is sent."""
     return ({name: each.snapshot().to_json()} for each in records)
 

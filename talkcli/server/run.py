@@ -48,9 +48,9 @@ MAX_EXTRA_CLIENTS = 16
 #: check costs two system calls.
 SOCKET_CHECK_S = 10.0
 #: How long clients may take to read their last answers.
-_CLIENT_GOODBYE_S = 0.3
+_CLIENT_CLOSE_S = 0.3
 #: How long the engine process may take to end before the server leaves it to the system.
-_ENGINE_GOODBYE_S = 1.0
+_ENGINE_CLOSE_S = 1.0
 
 
 @frozen
@@ -124,10 +124,10 @@ class Server:
         self.greeting = encode(greeting(__version__, os.getpid(), self._scheduler.boot))
         self.connections: set[ClientConnection] = set()
         #: set while there is no client
-        self._deserted = asyncio.Event()
-        self._deserted.set()
+        self._no_clients = asyncio.Event()
+        self._no_clients.set()
         #: why the server must end at once, if it must
-        self._fatal: TalkError | None = None
+        self._fatal_error: TalkError | None = None
         self._started_at = time.time(), time.monotonic()
         #: why clients can't reach the server, as last logged
         self._unreachable = ""
@@ -180,13 +180,13 @@ class Server:
             await speech.finished.wait()
             self._socket_check.cancel()
             self._acceptor.close()
-            await self._say_goodbye()
+            await self._close_connections()
         finally:
             speech.engine.close()
-            speech.engine.thread.join(_ENGINE_GOODBYE_S)
+            speech.engine.thread.join(_ENGINE_CLOSE_S)
             self._systemd.close()
-        if self._fatal:
-            raise self._fatal
+        if self._fatal_error:
+            raise self._fatal_error
 
     def _start_voice(self) -> str | None:
         """Return the voice that the engine process checks when it starts; raise UsageError for an unknown neural voice.
@@ -243,7 +243,7 @@ class Server:
             if len(self.connections) < self._settings.max_clients:
                 connection.admit()
             self.connections.add(connection)
-            self._deserted.clear()
+            self._no_clients.clear()
             return
         connection.close_with(refusal)
 
@@ -251,7 +251,7 @@ class Server:
         """Forget a client, and admit one that waits. The goals of the client go on."""
         self.connections.discard(connection)
         if not self.connections:
-            self._deserted.set()
+            self._no_clients.set()
         waiting = [each for each in self.connections if not each.admitted]
         if waiting and len(self.connections) - len(waiting) < self._settings.max_clients:
             waiting[0].admit()
@@ -290,16 +290,16 @@ class Server:
 
     def _end(self, fatal: TalkError | None = None) -> None:
         """End all goals, and then the server. `fatal`: the error to raise, if the server can't go on."""
-        self._fatal = fatal or self._fatal
+        self._fatal_error = fatal or self._fatal_error
         self._systemd.notify_stopping()
         self._requests.shut_down()
 
-    async def _say_goodbye(self) -> None:
+    async def _close_connections(self) -> None:
         """Give clients a short time to read their last answers."""
         for connection in list(self.connections):
             connection.stream.close()
         with contextlib.suppress(asyncio.TimeoutError):
-            await asyncio.wait_for(self._deserted.wait(), _CLIENT_GOODBYE_S)
+            await asyncio.wait_for(self._no_clients.wait(), _CLIENT_CLOSE_S)
         for connection in list(self.connections):
             connection.stream.abort()
 

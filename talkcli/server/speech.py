@@ -22,7 +22,7 @@ from talkcli.frozen import replace
 from talkcli.goals.goal import Output
 from talkcli.goals.options import ENGINE_OPTIONS, INITIAL, engine_options, is_neural, model_of, require_fields
 from talkcli.goals.reasons import Reason
-from talkcli.goals.scheduler import Changed, Effect, Now, Order, Ordered
+from talkcli.goals.scheduler import Effect, EngineOrder, Now, Order, StateChange
 from talkcli.goals.states import State
 from talkcli.goals.voices import VoiceDropOrder, VoiceLoadOrder, VoiceWarning
 from talkcli.server import log as server_log
@@ -84,22 +84,22 @@ class Speech:
         self.ready: protocol.Ready | None = None
         self.voices = VoiceCatalog()
         #: requests that wait until the voices are known, or won't be
-        self.for_voices: WaitingList = {}
+        self.waiting_for_voices: WaitingList = {}
         #: goals that wait for room in the queue
-        self.for_room: WaitingList = {}
+        self.waiting_for_room: WaitingList = {}
         #: the status of the engine, for people
         self.engine_status = "starting"
         #: set when an engine is ready, when it is known that none will be, and when the server ends
         self.engine_known = asyncio.Event()
         self._loop = asyncio.get_running_loop()
-        self.subscribers = Subscribers(self._loop, lambda: (each.connection for each in self.for_room))
+        self.subscribers = Subscribers(self._loop, lambda: (each.connection for each in self.waiting_for_room))
         self.streams = ClientStreams(self._loop)
         self.notifications = Notifications(self.streams)
         self._timer: asyncio.TimerHandle | None = None
         #: requests that wait until a goal is silent or its end has been published
-        self._for_silence: dict[Record, WaitingList] = {}
+        self._waiting_for_silence: dict[Record, WaitingList] = {}
         #: the goal that is held and known to be silent
-        self.silent: Record | None = None
+        self.silent_goal: Record | None = None
         #: reports of the engine thread that have not been taken
         self._reports: deque[Report] = deque()
         #: whether the loop will take them. To wake it costs as much as to take a report.
@@ -125,9 +125,9 @@ class Speech:
         """Whether the engine has not listed its voices yet and will."""
         return self.voices.listed is None and self.engine_status in {"starting", READY}
 
-    def for_silence(self, record: Record) -> WaitingList:
+    def waiting_for_silence(self, record: Record) -> WaitingList:
         """Return the list of requests that wait until the active goal is silent, resumed or ended."""
-        return self._for_silence.setdefault(record, {})
+        return self._waiting_for_silence.setdefault(record, {})
 
     # -- the scheduler's effects
 
@@ -147,14 +147,14 @@ class Speech:
         """Carry out the scheduler's effects: first the orders for the engine, so that it works meanwhile."""
         changes, queue_changed, at = [], False, time.time()
         for effect in effects:
-            if isinstance(effect, Changed):
+            if isinstance(effect, StateChange):
                 changes.append(partial(self._publish_change, effect.record, effect.state, at))
                 queue_changed = queue_changed or effect.state is not State.REJECTED
                 continue
             try:
                 self._carry_out(effect)
             except Exception as error:  # noqa: BLE001 - the other effects must not be lost
-                log.write_bug(effect.order.value if isinstance(effect, Ordered) else type(effect).__name__, error)
+                log.write_bug(effect.order.value if isinstance(effect, EngineOrder) else type(effect).__name__, error)
         if queue_changed:
             self.on_queue_change()
         self.notifications.add(changes)
@@ -163,9 +163,9 @@ class Speech:
         self.on_status_change()
         self.check_finished()
 
-    def _carry_out(self, effect: Ordered | VoiceLoadOrder | VoiceDropOrder | VoiceWarning) -> None:
+    def _carry_out(self, effect: EngineOrder | VoiceLoadOrder | VoiceDropOrder | VoiceWarning) -> None:
         match effect:
-            case Ordered(record=record, order=order):
+            case EngineOrder(record=record, order=order):
                 self._give_order(record, order)
             case VoiceLoadOrder(voice=voice, dropped=dropped):
                 for each in dropped:
@@ -223,7 +223,7 @@ class Speech:
         self.subscribers.state_changed(record, state, at)
         if state.terminal:
             server_log.goal_ended(record, elapsed() - record.began_at)
-            resume_all(self._for_silence.pop(record, {}))
+            resume_all(self._waiting_for_silence.pop(record, {}))
             self.check_finished()
 
     def _set_timer(self) -> None:
@@ -290,8 +290,8 @@ class Speech:
                 self.apply(scheduler.voice_chosen(event.id, event.voice, now))
             case protocol.Held():
                 if active.paused and active.pause_count == event.number:
-                    self.silent = active
-                    resume_all(self.for_silence(active))
+                    self.silent_goal = active
+                    resume_all(self.waiting_for_silence(active))
 
     def _take_voice_event(self, event: Report, now: Now) -> bool:
         """Take an event about voices. Return False for every other event."""
@@ -299,7 +299,7 @@ class Speech:
         match event:
             case protocol.VoiceList():
                 self.voices.listed = event.voices
-                resume_all(self.for_voices)
+                resume_all(self.waiting_for_voices)
             case protocol.VoiceLoaded():
                 server_log.voice_load_ended(event)
                 imported = event.seconds > 0
@@ -367,7 +367,7 @@ class Speech:
         if words != self.engine_status:
             log.write(log.sanitize(words))
         self.engine_status = words
-        resume_all(self.for_voices)
+        resume_all(self.waiting_for_voices)
         self.on_status_change()
 
     # -- the end

@@ -24,7 +24,7 @@ import pytest
 from talkcli.goals.goal import By, Sender
 from talkcli.goals.options import INITIAL, Cancel, Say
 from talkcli.goals.reasons import Reason
-from talkcli.goals.scheduler import Cancelled, Changed, Effect, Now, Ordered, Scheduler, Submitted
+from talkcli.goals.scheduler import Cancellation, Effect, EngineOrder, Now, Scheduler, StateChange, Submission
 from talkcli.goals.voices import VoiceDropOrder, VoiceLoadOrder, VoiceScheduler
 
 if TYPE_CHECKING:
@@ -60,9 +60,9 @@ class Robot:
 
     def see(self, effects: list[Effect]) -> list[Effect]:
         for effect in effects:
-            if isinstance(effect, Changed):
+            if isinstance(effect, StateChange):
                 self.seen.append(f"{self.name_of(effect.record)} {effect.state.name}")
-            elif isinstance(effect, Ordered):
+            elif isinstance(effect, EngineOrder):
                 self.seen.append(f"{self.name_of(effect.record)} {effect.order.value}")
             elif isinstance(effect, VoiceLoadOrder):
                 self.seen += [*(f"drop {each}" for each in effect.dropped), f"load {effect.voice}"]
@@ -75,7 +75,7 @@ class Robot:
 
     # -- one step each
 
-    def submits(self, say: Say, name: str = "", **known: Any) -> Submitted:
+    def submits(self, say: Say, name: str = "", **known: Any) -> Submission:
         done = self.scheduler.submit(say, ARM, self.now, **known)
         if name and done.attached:
             self.attached.append(f"{name} is {self.name_of(done.record)}")
@@ -90,7 +90,7 @@ class Robot:
     def says(self, text: str = "door open", *, preempt: bool | None = None, priority: int = 0) -> Record:
         return self.asks(Say(text, preempt=preempt, priority=priority))
 
-    def cancels(self, *ids: str, waiting: tuple[str, ...] = (), **selection: Any) -> Cancelled:
+    def cancels(self, *ids: str, waiting: tuple[str, ...] = (), **selection: Any) -> Cancellation:
         done = self.scheduler.cancel(Cancel(ids or None, **selection), DOOR, self.now, waiting)
         self.see(done.effects)
         return done

@@ -9,7 +9,7 @@ from talkcli.goals.goal import By, Output
 from talkcli.goals.history import EARLY_CANCEL_S, MAX_EARLY_CANCELS, MAX_SPEECH_TIMES
 from talkcli.goals.options import Cancel, Say
 from talkcli.goals.reasons import Reason
-from talkcli.goals.scheduler import CONFIRM_SILENCE_S, Cancelled, Now
+from talkcli.goals.scheduler import CONFIRM_SILENCE_S, Cancellation, Now
 from talkcli.goals.states import State
 from tests.unit.robot import ARM, DOOR, Robot, play
 
@@ -186,12 +186,12 @@ def test_a_cancel_tells_what_it_ended_and_what_it_did_not_find() -> None:
     assert (c.by, b.by) == (By(client=DOOR), By(client=DOOR))
     again = robot.cancels(b.id)
     assert (again.stopping, again.effects) == (b, [])
-    assert Robot().cancels() == Robot().cancels(current=True) == Robot().cancels(key="k") == Cancelled()
+    assert Robot().cancels() == Robot().cancels(current=True) == Robot().cancels(key="k") == Cancellation()
 
 
 def test_an_id_that_waits_for_room_is_known_to_a_cancel() -> None:
     robot = play("a; b")
-    assert robot.cancels("mine", waiting=("mine",)) == Cancelled()
+    assert robot.cancels("mine", waiting=("mine",)) == Cancellation()
     done = robot.cancels(before="mine", waiting=("mine",))
     assert (done.unknown, done.recalled, done.stopping) == ([], [robot.goals["b"]], robot.goals["a"])
     assert robot.play("c id=mine").goals["c"].state is State.PENDING

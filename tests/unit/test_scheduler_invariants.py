@@ -15,7 +15,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from talkcli.goals.scheduler import CONFIRM_SILENCE_S, Changed, Now, Order, Ordered
+from talkcli.goals.scheduler import CONFIRM_SILENCE_S, EngineOrder, Now, Order, StateChange
 from talkcli.goals.states import TRANSITIONS, IllegalTransition, State
 from tests.unit.robot import Robot
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import Goal
     from talkcli.goals.options import Say
     from talkcli.goals.record import Record
-    from talkcli.goals.scheduler import Cancelled, Effect, Submitted
+    from talkcli.goals.scheduler import Cancellation, Effect, Submission
 
 #: Few values of each, so that goals meet. Times are multiples of the clock's steps, so that they fall together.
 OPTIONS = [
@@ -91,7 +91,7 @@ class Checked(Robot):
         """The wall clock jumps, and nothing may depend on it."""
         return Now(self.seconds, 1.7e9 + self.seconds * 7_919 % 7_200)
 
-    def submits(self, say: Say, name: str = "", **known: Any) -> Submitted:
+    def submits(self, say: Say, name: str = "", **known: Any) -> Submission:
         before = self.scheduler.unfinished()
         full = self.scheduler.lacks_room(say, self.now)
         done = super().submits(say, name, **known)
@@ -105,7 +105,7 @@ class Checked(Robot):
         assert full or done.record.reason != "queue_full", "refused for want of room that there was"
         return done
 
-    def cancels(self, *ids: str, waiting: tuple[str, ...] = (), **selection: Any) -> Cancelled:
+    def cancels(self, *ids: str, waiting: tuple[str, ...] = (), **selection: Any) -> Cancellation:
         done = super().cancels(*ids, waiting=waiting, **selection)
         assert all(each.state is State.RECALLED for each in done.recalled)
         assert done.stopping is None or done.stopping.state is State.PREEMPTING
@@ -134,9 +134,9 @@ class Checked(Robot):
 
     def see(self, effects: list[Effect]) -> list[Effect]:
         for effect in effects:
-            if isinstance(effect, Changed):
+            if isinstance(effect, StateChange):
                 self._see_state(effect.record, effect.state)
-            elif isinstance(effect, Ordered):
+            elif isinstance(effect, EngineOrder):
                 self._see_order(effect.record, effect.order)
         return effects
 
