@@ -308,6 +308,7 @@ def test_a_file_that_the_shell_has_open_for_our_output_is_not_replaced(tmp_path:
 #: Code that turns root, who may write everywhere, into nobody.
 AS_NOBODY = """
 import os
+import unicodedata  # needed later, and nobody may not read an interpreter in root's home
 if os.geteuid() == 0:
     os.setgroups([])
     os.setgid(65534)

@@ -302,7 +302,7 @@ def speak_all(texts: Iterable[Case], *, guarded: bool, seconds: float = float("i
     with (
         tempfile.TemporaryDirectory(prefix="talk-") as directory,
         mock.patch.multiple(
-            process, engine_command=lambda: command, START_LIMIT=_START_LIMIT_S, HANG_AFTER=_HANG_LIMIT_S
+            process, engine_command=lambda: command, START_LIMIT_S=_START_LIMIT_S, HANG_LIMIT_S=_HANG_LIMIT_S
         ),
     ):
         while _speak_until_death(left, end, f"{directory}/spoken.wav", tally):
