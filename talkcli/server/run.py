@@ -126,7 +126,7 @@ class Server:
         #: set while there is no client
         self._no_clients = asyncio.Event()
         self._no_clients.set()
-        #: why the server must end at once, if it must
+        #: the error that ends the server, if there is one
         self._fatal_error: TalkError | None = None
         self._started_at = time.time(), time.monotonic()
         #: why clients can't reach the server, as last logged
@@ -168,7 +168,7 @@ class Server:
             self._acceptor.open(self._listener.socket)
             self._socket_check = self._loop.call_later(SOCKET_CHECK_S, self._check_socket)
             if voice or settings.driver:
-                # An unknown voice or driver must be the only message.
+                # If the voice or the driver is unknown, the error must be the only message.
                 with contextlib.suppress(asyncio.TimeoutError):
                     await asyncio.wait_for(speech.engine_known.wait(), START_LIMIT_S)
             if not self._scheduler.closing:

@@ -54,7 +54,7 @@ require_fields(protocol.Speak, ENGINE_OPTIONS)
 
 
 def elapsed() -> float:
-    """Return the time in seconds by a clock that goes on in a suspend and is never set."""
+    """Return the time in seconds of a clock that goes on in a suspend and is never set."""
     return time.clock_gettime(_CLOCK)
 
 
@@ -108,7 +108,7 @@ class Speech:
         self._told_following = False, False
 
     def status_words(self) -> str:
-        """Return what the server does, for people. It contains no text of a goal, because any user may read it."""
+        """Return a short status for people. It contains no text of a goal, because every user may read it."""
         scheduler, ready = self.scheduler, self.ready
         if self.engine_status != READY:
             doing = f"engine: {self.engine_status}"
@@ -122,7 +122,7 @@ class Speech:
 
     @property
     def awaits_voices(self) -> bool:
-        """Whether the engine has not listed its voices yet and will."""
+        """Whether the engine has yet to list its voices."""
         return self.voices.listed is None and self.engine_status in {"starting", READY}
 
     def waiting_for_silence(self, record: Record) -> WaitingList:
@@ -240,7 +240,7 @@ class Speech:
     # -- the engine's reports
 
     def report(self, report: Report) -> None:
-        """Take a report of the engine thread, after the earlier ones. May be called in any thread.
+        """Queue a report of the engine thread. May be called in any thread.
 
         Only a few reports are taken in one turn, so that clients don't wait for a sentence of many words.
         """

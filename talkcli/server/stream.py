@@ -1,9 +1,9 @@
 """The sockets of clients, in the event loop's thread: accepted, read and written. It knows no lines and no requests.
 
 A stream is used like a transport of asyncio, and replaces it for three reasons. No request is lost: asyncio's transport
-stops reading when it can't write, and drops what a client sent before it closed. It is faster: a client is greeted and
-its first request carried out in the turn of the loop in which it connects, which takes two thirds of the time. And what
-is written in one turn is sent in one piece, because sending a message costs as much as making it.
+stops reading when it can't write, and drops the last requests of a client that closes. It is faster: a client is
+greeted in the turn of the loop in which it connects, a third sooner, and its first request is carried out in the same
+turn. And all messages of one turn are sent together, because sending a message costs as much as making it.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 
 #: Bytes that are read at once: the longest request.
 _READ_BYTES = 64 * 1024
-#: Written bytes that are sent before the turn ends.
+#: Written bytes of a stream, past which they are sent before the turn ends.
 _FLUSH_BYTES = 64 * 1024
 #: Unread output of all clients together. 250 clients could hold a gigabyte within their own limits.
 MAX_TOTAL_OUTPUT_BYTES = 64 * 1024 * 1024
-#: Streams with new output that are flushed before the turn ends. Of a thousand clients, the first can read their result
-#: while the others' is still being written.
+#: Streams with new output, past which they are flushed before the turn ends. With a thousand clients, the first ones
+#: can read their result while those of the others are being written.
 _FLUSH_STREAMS = 128
 
 #: Connections that are accepted before other clients have a turn. Each is greeted, and may send requests at once.

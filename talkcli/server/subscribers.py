@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 #: The interval of signs of life. A client gives a server up after three of them.
 CLIENT_ALIVE_INTERVAL_S = 5.0
 
-#: Notifications that are made before other work has a turn. They take three milliseconds.
+#: Notifications before other work has a turn. They take three milliseconds.
 _MAX_PER_TURN = 64
-#: Unread output of the notifications of one turn, past which clients are given time to read.
+#: Unread output of the notifications of one turn, past which clients get time to read.
 _UNREAD_LIMIT_BYTES = 1024 * 1024
-#: How long clients are given to read, and how often it is checked whether they have.
+#: How long clients get to read, and how often to check whether they have.
 _READ_TIME_S = 0.05
 _READ_CHECK_S = 0.002
 #: The factor by which the time to read shrinks each time that clients don't read. The sum is 0.8 s, so that a cancel
@@ -113,7 +113,7 @@ class Subscribers:
             self._alive_timer = self._loop.call_later(CLIENT_ALIVE_INTERVAL_S, self._send_alive)
 
     def _listeners(self, waiting: Iterable[dict[ClientConnection, bool]]) -> dict[ClientConnection, None]:
-        """Return the connections that get the feedback of goals, from the connections that wait for these goals."""
+        """Return the watchers, and the connections that wait for goals with feedback."""
         listeners = dict(self._watchers)
         for each in waiting:
             listeners.update((connection, None) for connection, feedback in each.items() if feedback)
@@ -135,9 +135,10 @@ def _publish(event: JsonObject, connections: Iterable[ClientConnection], *, feed
 
 
 class Notifications:
-    """The notifications of all clients, made one after another.
+    """A queue of functions that notify clients.
 
-    They are made at once. After a certain number, other work has a turn and the clients get time to read.
+    They are called at once, up to a limit in each turn of the event loop. Then other work has a turn, and the clients
+    get time to read.
     """
 
     def __init__(self, streams: ClientStreams) -> None:
@@ -150,31 +151,31 @@ class Notifications:
 
     @property
     def done(self) -> bool:
-        """Whether all notifications have been made."""
+        """Whether the queue is empty."""
         return not self._pending
 
     def add(self, notifications: Iterable[Callable[[], None]]) -> None:
-        """Make notifications after all pending ones. A notification that adds others makes them at once."""
+        """Add functions to the queue. If one of them adds others, these are called at once."""
         if self._working:
             for each in notifications:
-                self._make(each)
+                self._call(each)
             return
         self._pending.extend(notifications)
         if self._turn is None:
             self._work(self._streams.unread_bytes)
 
     async def wait_done(self, request: PendingRequest) -> None:
-        """Wait until the notifications that are pending now have been made."""
+        """Wait until the functions that are in the queue now have been called."""
         if self._pending:
             self._pending.append(request.resume)
             await request.wait({})
 
     def _work(self, unread_before: int) -> None:
-        """Make some notifications. `unread_before`: the unread output before those that clients shall read first."""
+        """Call some functions. `unread_before`: the unread output of clients before the latest functions."""
         self._turn = None
         self._working = True
         for _ in range(min(_MAX_PER_TURN, len(self._pending))):
-            self._make(self._pending.popleft())
+            self._call(self._pending.popleft())
             if self._streams.unread_bytes > unread_before + _UNREAD_LIMIT_BYTES:
                 break
         self._working = False
@@ -196,8 +197,8 @@ class Notifications:
             self._read_time_s *= _READ_TIME_FACTOR
             self._work(self._streams.unread_bytes)
 
-    def _make(self, notification: Callable[[], None]) -> None:
+    def _call(self, notification: Callable[[], None]) -> None:
         try:
             notification()
-        except Exception as error:  # noqa: BLE001 - the others are still made
+        except Exception as error:  # noqa: BLE001 - the others are still called
             log.write_bug("telling clients", error)

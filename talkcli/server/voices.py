@@ -41,7 +41,7 @@ class VoiceCatalog:
         return (Reason.UNKNOWN_VOICE, f"the voice {voice[:60]} cannot be spoken: {missing}") if missing else None
 
     def resolve(self, voice: str | None, settings_voice: str | None = None) -> str | None:
-        """Return the id of the neural voice that a word means, or the word itself for every other voice."""
+        """Return the id of the neural voice that a word means. Return the word itself if it means another voice."""
         if self._is_unchecked(voice):
             return voice
         assert voice
@@ -49,7 +49,7 @@ class VoiceCatalog:
         return found.id if found and is_neural(found.id) else voice
 
     def find_new_files(self) -> None:
-        """Update the list with the neural voices that were installed or removed since the engine listed its voices."""
+        """Update the list of neural voices to those that are installed now."""
         from talkcli.engine import models
 
         if self.listed and is_own_driver(self.driver):
