@@ -36,7 +36,7 @@ _MAX_PASSWORD_BYTES = 65_535
 
 @frozen
 class Broker:
-    """The address of a broker, and the login."""
+    """A broker's address and the login for it."""
 
     host: str
     port: int

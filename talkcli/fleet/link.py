@@ -1,4 +1,4 @@
-"""A connection to the broker by paho-mqtt, without a loop or a thread of its own.
+"""A connection to the broker, made with paho-mqtt. It has no loop and no thread of its own.
 
 The owner polls its descriptor, and calls `read`, `write` and `tick`. Each connection needs a new `Link`, because paho
 would send the old connection's unacknowledged messages again, and one of them may be a sentence. Nothing here knows
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     #: Called with the reason code of a PUBACK.
     OnAcknowledged = Callable[[int], None]
 
-#: The broker drops a client that has sent nothing for one and a half times as long.
+#: After one and a half times this time without data, the broker counts a client as gone.
 KEEPALIVE_S = 10
 #: Time for the broker to answer the login.
 LOGIN_LIMIT_S = 5.0
@@ -211,7 +211,7 @@ class Link:
             self.write()
 
     def write(self) -> None:
-        """Send as much unsent data as possible without waiting. During `on_message`, it is sent after the return."""
+        """Send as much unsent data as possible without waiting. During `on_message`, leave that to `read`."""
         with self._lock:
             if self.wants_write and not self._delivering:
                 self._paho.loop_write()
@@ -234,7 +234,7 @@ class Link:
         correlation: bytes | None = None,
         acknowledged: OnAcknowledged | None = None,
     ) -> bool:
-        """Publish a message, and return whether the connection still accepted it.
+        """Publish a message. Return False if the connection has ended.
 
         Args:
             topic: where to publish.
@@ -272,7 +272,8 @@ class Link:
 
         Args:
             topics: the topics, with wildcards if needed.
-            retained: whether the broker also sends the messages that it keeps. `Message.retained` is right either way.
+            retained: whether the broker also sends the messages that it keeps. In both cases, `Message.retained` shows
+                whether the publisher asked to retain a message.
         """
         handling = SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE if retained else SubscribeOptions.RETAIN_DO_NOT_SEND
         options = SubscribeOptions(qos=1, retainAsPublished=True, retainHandling=handling)
@@ -302,7 +303,7 @@ class Link:
     # -- inside
 
     def _tls_pending(self) -> bool:
-        """Return whether TLS holds decrypted data, which no poll reports."""
+        """Return whether TLS holds decrypted data. Polling the descriptor doesn't show that."""
         return isinstance(self._socket, ssl.SSLSocket) and self._socket.pending() > 0
 
     def _login_fault(self) -> TalkError | None:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @frozen
 class Message:
-    """A message that came from the broker."""
+    """A message from the broker."""
 
     topic: str
     payload: bytes
@@ -107,7 +107,7 @@ class LastGoal:
 
 @frozen
 class RobotStatus:
-    """What a robot is speaking, how many goals wait, and which goal ended last."""
+    """The goals of a robot: the one that is being spoken, how many wait, and which one ended last."""
 
     #: id of the goal that is being spoken
     active: str | None = None
@@ -156,7 +156,7 @@ class RobotInfo:
     """A robot's presence together with its last status."""
 
     presence: Presence
-    #: of a robot that is offline, the status before it left; None if there was none
+    #: the last known status, also if the robot is offline; None if there is none
     status: RobotStatus | None
 
     def to_json(self) -> JsonObject:

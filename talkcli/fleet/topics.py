@@ -20,7 +20,7 @@ ALL_ROBOTS = "all"
 ANY = "+"
 #: Takes the place of the robot in the topic that a desk publishes to itself. No robot can have this name.
 MARKER = "_"
-#: Longest name of a robot, a group or a user: at the server, a remote client is called "mqtt:" and this name.
+#: Longest name of a robot, a group or a user. The server knows a remote client by "mqtt:" and the user's name.
 MAX_NAME_CHARS = MAX_SENDER_NAME_CHARS - len("mqtt:")
 _NAME_PATTERN = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{MAX_NAME_CHARS - 1}}}")
 
@@ -54,7 +54,7 @@ def group(name: str, *levels: str) -> str:
 def reply(user: str, session: str, *robot_name: str) -> str:
     """Return the topic on which a robot answers a session of this user.
 
-    Without a robot's name, it is the response topic that several robots can be given.
+    Without a robot's name, return the response topic for a request to several robots.
     """
     return "/".join((PREFIX, _REPLY, user, session, *robot_name))
 
@@ -77,7 +77,7 @@ class RequestTopic:
 
     #: REQUEST, PLAIN_SAY or PLAIN_CANCEL
     kind: str
-    #: the client's user name at the broker, as far as its access rules check it
+    #: the client's user name, which the broker's access rules check
     user: str
 
 
@@ -109,13 +109,14 @@ def access_rules(
     """Return the content of mosquitto's `acl_file` for a fleet.
 
     Robots are covered by patterns, because each logs in by its own name. Operators are listed by name: mosquitto
-    applies patterns to everybody, so a pattern for operators would let each robot command the others. The robots'
-    patterns give an operator nothing but the topics of a robot that has the operator's name, and what groups are asked.
+    applies patterns to everybody, so a pattern for operators would let each robot command the others. The patterns for
+    robots do no harm to that: they let operators read requests to groups, and use the topics of a robot that has the
+    operator's name, which doesn't exist.
 
     Args:
         operators: the users who may command every robot.
         homeassistant: whether to add the rules for Home Assistant.
-        name: a robot for Home Assistant. It gets a line of its own if its name has a dot, because no pattern fits.
+        name: a robot that Home Assistant knows. If its name has a dot, no pattern matches, so it gets its own rule.
     """
     lines = [
         "# Robots: each logs in by its own name, %u, and is heard under that alone.",

@@ -1,1 +1,1 @@
-"""The robot's side of a fleet: a process beside the server that connects it to the broker."""
+"""The robot's side of a fleet: a process that connects the robot's server to the broker."""

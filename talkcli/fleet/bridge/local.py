@@ -1,6 +1,6 @@
 """The bridge's connections to the robot's own server: shells around the client core, in the event loop.
 
-They pass lines undecoded, so that their owner decides which lines to read.
+They don't decode lines, except the greeting, because most lines are only passed on.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class LocalConnection(ClientCore):
         self.connected(*identity(greeting), self._loop.time())
 
     async def read(self) -> list[bytes]:
-        """Return the lines that have come, without their newlines. Wait for the first; none if the connection ended."""
+        """Wait for lines, and return them without their newlines. Return none if the connection has ended."""
         while not self._lines:
             data = await self._receive()
             if not data:
