@@ -22,7 +22,7 @@ STATUS_DELAY_S = 0.5
 #: Delay before a failed notification is sent again.
 NOTIFY_RETRY_DELAY_S = 0.5
 #: Watchdog notifications per watchdog timeout. With this many, one can be late.
-_WATCHDOGS_PER_TIMEOUT_COUNT = 2.5
+_NOTIFICATIONS_PER_TIMEOUT_COUNT = 2.5
 
 
 class ServiceManager:
@@ -129,4 +129,4 @@ def _watchdog_interval() -> float | None:
         return None
     if os.environ.get("WATCHDOG_PID", own_pid) != own_pid:
         return None  # the watchdog watches another process of this unit
-    return int(timeout) / 1e6 / _WATCHDOGS_PER_TIMEOUT_COUNT
+    return int(timeout) / 1e6 / _NOTIFICATIONS_PER_TIMEOUT_COUNT
