@@ -17,11 +17,20 @@ from talkcli.client.core import (
     Exchange,
     TrackedGoal,
 )
-from talkcli.errors import AccessDenied, Busy, Lost, ProtocolMismatch, ServerUnavailable, TalkError, UnknownGoal
+from talkcli.errors import (
+    AccessDenied,
+    Busy,
+    Lost,
+    ProtocolMismatch,
+    RequestRefused,
+    ServerUnavailable,
+    TalkError,
+    UnknownGoal,
+)
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import Cancel, Say
 from talkcli.goals.states import State
-from talkcli.protocol.events import Result, Snapshot, StateChanged, WordHeard
+from talkcli.protocol.events import PausedChanged, Result, Snapshot, StateChanged, WordHeard
 from talkcli.protocol.lines import decode, encode
 from talkcli.protocol.requests import Pause, Status, Wait
 
@@ -142,6 +151,14 @@ def test_a_refusal_is_an_error_with_the_lines_of_its_list(core: ClientCore) -> N
     assert len(refused.value.items) == 1
 
 
+@pytest.mark.parametrize("error", [None, "no", {}, {"code": "bad_text", "message": None}, {"message": ""}])
+def test_a_refusal_without_a_reason_says_so(core: ClientCore, error: object) -> None:
+    exchange = begin(core, Pause())
+    hear(core, {"seq": 1, "ok": False, "error": error})
+    with pytest.raises(RequestRefused, match=r"^refused: the server gives no reason$"):
+        core.answer(exchange)
+
+
 @given(st.lists(st.integers(1, 40)))
 def test_bytes_may_be_taken_in_any_portions(counts: list[int]) -> None:
     core = core_of()
@@ -241,9 +258,16 @@ def test_the_servers_last_words_are_the_reason_of_the_end(core: ClientCore) -> N
     assert core.ended == "the server closed it: you are too slow"
 
 
-@pytest.mark.parametrize(
-    "line", [b"{\n", b'{"event": "state", "id": "g", "state": "BORED"}\n', b'{"event": "result"}\n']
-)
+MALFORMED = [
+    *(b"{", b"[]", b'{"event": "state", "id": "g", "state": "BORED"}', b'{"event": "result"}'),
+    *(
+        encode({**word(1), **each}).strip()
+        for each in ({"word": 1}, {"start": "0"}, {"number": True}, {"time": None}, {"id": None})
+    ),
+]
+
+
+@pytest.mark.parametrize("line", MALFORMED)
 def test_a_malformed_line_ends_the_connection_and_nothing_after_it_counts(core: ClientCore, line: bytes) -> None:
     exchange = begin(core, Status())
     core.receive(line + b"\n" + encode({"seq": 1, "ok": True}), 0.0)
@@ -491,6 +515,36 @@ def test_buffer_hands_out_in_order_and_drops_the_oldest_feedback() -> None:
     buffer.add(heard)
     assert "take them faster" in (buffer.closed or "")
     assert len(taken(buffer)) == MAX_STATE_EVENTS  # nothing that came after what is missing
+
+
+def test_words_are_kept_only_for_a_goal_with_feedback_and_other_kinds_of_events_never(core: ClientCore) -> None:
+    plain, fed = say(core), say(core, feedback=True)
+    for number in (1, 2):
+        hear(core, {"seq": number, "ok": True, "goal": goal()})
+    paused: JsonObject = {"event": "paused", "paused": True, "id": "g", "by": None, "n": 3}
+    hear(core, {"event": "viseme", "id": "g"}, {"event": None}, {**word(1), "viseme": "o"}, paused)
+    hear(core, {"event": "result", "goal": goal("SUCCEEDED")})
+    for tracked, kinds in ((plain, [Result]), (fed, [WordHeard, PausedChanged, Result])):
+        assert [type(tracked._take()) for _ in kinds] == kinds
+        assert tracked.speech_paused
+
+
+def test_a_reader_of_all_goals_gets_each_state_once_and_with_the_whole_goal(core: ClientCore) -> None:
+    """A connection that waits for a goal and watches all goals receives each state twice."""
+    watching = EventBuffer()
+    core.listeners.watch(watching)
+    tracked = say(core)
+    hear(core, {"seq": 1, "ok": True, "goal": goal()})
+    for number, name in enumerate(("PENDING", "ACTIVE", "SUCCEEDED"), 1):
+        whole: JsonObject = {} if name == "ACTIVE" else {"goal": goal(name)}
+        hear(core, state(name, number), {**state(name, number), **whole})
+    hear(core, {"event": "result", "goal": goal("SUCCEEDED")})
+    states = [State.PENDING, State.ACTIVE, State.SUCCEEDED]
+    own = [tracked._take() for _ in range(4)]
+    assert [each.state for each in own if isinstance(each, StateChanged)] == states
+    assert isinstance(own[-1], Result)
+    seen = [event for event in iter(watching.take, None) if isinstance(event, StateChanged)]
+    assert [(each.state, each.goal is not None) for each in seen] == list(zip(states, (True, False, True), strict=True))
 
 
 def test_event_that_comes_twice_is_kept_once() -> None:
