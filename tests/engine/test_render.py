@@ -460,7 +460,7 @@ def test_a_kill_at_any_moment_leaves_no_half_file(tmp_path: Path, how: signal.Si
     assert False in outcomes
 
 
-# -- a conversation with an engine process, and as doctor tells it
+# -- a private engine process, and as doctor tells it
 
 
 CONFIGURE = protocol.Configure(os.getpid(), None, None, None, None, list_voices=False)

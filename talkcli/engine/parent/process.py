@@ -121,9 +121,9 @@ class EngineProcess:
                 return False
 
     def receive(self) -> Iterator[protocol.Event | None]:
-        """Read once without waiting and yield the events, with a final None if the conversation is over.
+        """Read once without waiting, and yield the events.
 
-        It is over if the process has closed the connection or sent a malformed message.
+        A final None means that the process has closed the connection or sent a malformed message.
         """
         try:
             data = self.socket.recv(65536)
