@@ -20,8 +20,10 @@ ALL_ROBOTS = "all"
 ANY = "+"
 #: Takes the place of the robot in the topic that a desk publishes to itself. No robot can have this name.
 MARKER = "_"
-#: Longest name of a robot, a group or a user. The server knows a remote client by "mqtt:" and the user's name.
-MAX_NAME_CHARS = MAX_SENDER_NAME_CHARS - len("mqtt:")
+#: Beginning of the name by which the server knows a remote client; the client's user name follows.
+REMOTE_PREFIX = "mqtt:"
+#: Longest name of a robot, a group or a user.
+MAX_NAME_CHARS = MAX_SENDER_NAME_CHARS - len(REMOTE_PREFIX)
 _NAME_PATTERN = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{MAX_NAME_CHARS - 1}}}")
 
 # The levels below a robot's name. A client sends to the first three.

@@ -32,8 +32,6 @@ ALWAYS_ALLOWED = ("hello", "watch")
 #: Requests that the option `--allow` can name.
 ASKABLE = tuple(each for each in REQUEST_TYPES if each not in ALWAYS_ALLOWED)
 
-#: At the server, the name of a remote client begins with this.
-_REMOTE_PREFIX = "mqtt:"
 #: Time between two echoes that the bridge sends to itself.
 ECHO_EVERY_S = 5.0
 #: If the newest echo that returned was sent longer ago, messages are stale: one interval, and a second for the way.
@@ -353,9 +351,9 @@ def without_texts(message: JsonObject) -> JsonObject:
 
 def sender_name(user: str, name: str | None = None) -> str:
     """Return what a remote client is called at the server: its user, and the name that it gave itself if any."""
-    return f"{_REMOTE_PREFIX}{user} {name}"[:MAX_SENDER_NAME_CHARS] if name else f"{_REMOTE_PREFIX}{user}"
+    return f"{topics.REMOTE_PREFIX}{user} {name}"[:MAX_SENDER_NAME_CHARS] if name else f"{topics.REMOTE_PREFIX}{user}"
 
 
 def is_remote(goal: Goal) -> bool:
     """Return whether a goal came over the broker."""
-    return goal.client is not None and (goal.client.name or "").startswith(_REMOTE_PREFIX)
+    return goal.client is not None and (goal.client.name or "").startswith(topics.REMOTE_PREFIX)

@@ -365,8 +365,8 @@ class RemoteSession:
         """Send a goal to the server, unless it must wait for room or is refused.
 
         Args:
-            remote: the request.
-            say: the same.
+            remote: the client's request.
+            say: the goal in it.
             has_room: whether the goal has waited, and has room now.
         """
         shared, server = self._sessions, self._server
