@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from talkcli.goals.scheduler import CONFIRM_SILENCE_S, EngineOrder, Now, Order, StateChange
 from talkcli.goals.states import TRANSITIONS, IllegalTransition, State
+from talkcli.goals.voices import VoiceLoadOrder
 from tests.unit.robot import Robot
 
 if TYPE_CHECKING:
@@ -138,6 +139,11 @@ class Checked(Robot):
                 self._see_state(effect.record, effect.state)
             elif isinstance(effect, EngineOrder):
                 self._see_order(effect.record, effect.order)
+            elif isinstance(effect, VoiceLoadOrder):
+                assert self.scheduler.has_engine
+                assert effect.voice not in effect.dropped, "a voice was dropped to load it"
+                loading = str(self.scheduler.voices.to_json()).count("'loading'")
+                assert loading <= 1, "two voices are loaded at once"
         return effects
 
     def _see_state(self, record: Record, state: State) -> None:
