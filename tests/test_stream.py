@@ -146,7 +146,7 @@ async def test_congestion_is_told_once_and_all_output_arrives() -> None:
         while not pair.told.congested:
             written += b"%08d" % len(written) * 1_000
             pair.stream.write(written[-8_000:])
-        assert pair.stream.size > HIGH
+        assert pair.stream.unsent_bytes > HIGH
         written += b"the rest"
         pair.stream.write(b"the rest")
         received = b""
@@ -154,7 +154,7 @@ async def test_congestion_is_told_once_and_all_output_arrives() -> None:
             received += pair.receive()
             await turn()
         assert received == written
-        assert (pair.told.congested, pair.stream.size) == ([True, False], 0)
+        assert (pair.told.congested, pair.stream.unsent_bytes) == ([True, False], 0)
 
 
 @in_loop
@@ -278,20 +278,20 @@ async def test_past_the_limit_for_all_output_the_largest_backlog_is_dropped(monk
         for pair in pairs:
             pair.stream = ClientStream(streams, pair.socket, pair.told, HIGH)
             pair.stream.write(b"x" * 1_000_000)  # more than the system takes
-        taken = 1_000_000 - pairs[0].stream.size
+        taken = 1_000_000 - pairs[0].stream.unsent_bytes
         monkeypatch.setattr(stream, "MAX_TOTAL_OUTPUT_BYTES", streams.unread_bytes + 3_000)
         pairs[0].stream.write(b"x" * 1_000)
-        pairs[1].stream.hold(1_500)  # as for a list that its client doesn't read
-        pairs[1].stream.hold(500)
+        pairs[1].stream.count_held(1_500)  # as for a list that its client doesn't read
+        pairs[1].stream.count_held(500)
         assert not any(each.stream.closing for each in pairs)
         pairs[2].stream.write(b"x" * 1_000)
         await until_lost(pairs[1])
         assert [each.stream.closing for each in pairs] == [False, True, False]
         assert streams.unread_bytes == 2 * (1_000_000 - taken) + 2_000
-        pairs[1].stream.hold(-2_000)  # released after its end
+        pairs[1].stream.count_held(-2_000)  # released after its end
         assert len(pairs[0].receive()) == taken
         await turn()
-        assert streams.unread_bytes == pairs[0].stream.size + pairs[2].stream.size
+        assert streams.unread_bytes == pairs[0].stream.unsent_bytes + pairs[2].stream.unsent_bytes
         for pair in (pairs[0], pairs[2]):
             pair.stream.abort()
         assert (streams.unread_bytes, streams.open) == (0, set())

@@ -58,7 +58,7 @@ _ID_CHARACTERS = _DIGITS | _LETTERS | frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZ._:/-
 _MAX_FLOAT = 1.7976931348623157e308
 
 
-def model_of(voice: str | None) -> str:
+def without_speaker(voice: str | None) -> str:
     """Return the id of a neural voice without its speaker, as the voice is loaded; "" if there is no voice."""
     return (voice or "").partition(SPEAKER_MARK)[0]
 
@@ -588,11 +588,11 @@ class Cancel:
     key: str | None = None
 
     @property
-    def everything(self) -> bool:
+    def selects_all(self) -> bool:
         """Whether it selects all goals."""
         return self.ids is None and not self.current and self.before is None and self.key is None
 
-    def of_waiting(self, goals: Sequence[Say]) -> list[int]:
+    def select_waiting(self, goals: Sequence[Say]) -> list[int]:
         """Return the indexes of the selected goals in a list of goals that wait for room.
 
         `before` selects such goals only if it is the id that a sender has given to one of them.
@@ -602,7 +602,7 @@ class Cancel:
         return [
             index
             for index, say in enumerate(goals)
-            if self.everything or say.id in ids or index <= last or say.key == self.key is not None
+            if self.selects_all or say.id in ids or index <= last or say.key == self.key is not None
         ]
 
 

@@ -58,15 +58,15 @@ class Queue:
         """Return the first goal with this text. Slow, because it looks at all goals."""
         return next((each for each in self if each.text == text), None)
 
-    def up_to(self, priority: int) -> list[Record]:
+    def goals_up_to(self, priority: int) -> list[Record]:
         """Return the goals of this priority and of lower ones."""
         return list(map(_record_of, self._goals[bisect_left(self._goals, (-priority,)) :]))
 
-    def preempting_up_to(self, priority: int) -> list[Record]:
+    def preempting_goals_up_to(self, priority: int) -> list[Record]:
         """Return the goals of this priority and of lower ones that preempt."""
         return list(map(_record_of, self._preempting[bisect_left(self._preempting, (-priority,)) :]))
 
-    def newest_of_lowest(self) -> Record | None:
+    def displaceable_goal(self) -> Record | None:
         """Return the goal that a full queue displaces: the newest one of the lowest priority."""
         return self._displaceable[-1][2] if self._displaceable else None
 

@@ -83,7 +83,7 @@ class Record:
         """The label by which a later goal replaces this one, if it has one."""
         return self.say.key
 
-    def become(self, state: State) -> None:
+    def change_state(self, state: State) -> None:
         """Change the state, or raise IllegalTransition and change nothing."""
         self.state = check_transition(self.state, state)
 

@@ -26,7 +26,7 @@ from talkcli.goals.options import (
     format_number,
     is_clients_id,
     is_neural,
-    model_of,
+    without_speaker,
 )
 from talkcli.goals.queue import Queue
 from talkcli.goals.reasons import Reason, Refusal
@@ -277,7 +277,7 @@ class Scheduler:
         self.settings = replace(self.settings, **changes)
         voice = changes.get("voice")
         if isinstance(voice, str):
-            self.voices.forget_failure(model_of(voice))
+            self.voices.forget_failure(without_speaker(voice))
             self._request_voice(voice, now)
         return self.tick(now)  # the next goal may not have to wait for its voice any more
 
@@ -435,7 +435,7 @@ class Scheduler:
 
     def _select(self, selection: Cancel, result: Cancellation, waiting: Collection[str | None]) -> list[Record]:
         """Return the selected goals that have not ended; note the others in `result`."""
-        chosen = self.unfinished() if selection.everything else []
+        chosen = self.unfinished() if selection.selects_all else []
         for goal_id in dict.fromkeys(selection.ids or ()):
             record = self.find(goal_id)
             if record and record.state.terminal:
@@ -494,15 +494,15 @@ class Scheduler:
         replaced = self._queue.with_key(say.key)
         preempted: list[Record] = []
         if say.flush:
-            preempted = self._queue.up_to(say.priority)
+            preempted = self._queue.goals_up_to(say.priority)
         elif self._preempts(say):
-            preempted = self._queue.preempting_up_to(say.priority)
+            preempted = self._queue.preempting_goals_up_to(say.priority)
         recalled = [(replaced, Reason.REPLACED)] if replaced else []
         recalled += [(each, Reason.PREEMPTED) for each in preempted if each is not replaced]
         # The queue never holds too many goals, so one recalled goal makes enough room.
         if recalled or len(self._queue) < self.max_queue:
             return recalled
-        last = self._queue.newest_of_lowest()
+        last = self._queue.displaceable_goal()
         # A goal that brings `preempt` also displaces its own priority. Goals that preempt are in `recalled` already.
         limit = say.priority if say.preempt else say.priority - 1
         return [(last, Reason.DISPLACED)] if last and last.priority <= limit else None
@@ -525,7 +525,7 @@ class Scheduler:
 
     def _request_voice(self, voice: str, now: Now) -> None:
         """Have a voice loaded for a goal, if it is a neural one and there is an engine."""
-        if self._loads_voices and is_neural(model := model_of(voice)):
+        if self._loads_voices and is_neural(model := without_speaker(voice)):
             self.voices.request(model, now.monotonic)
 
     def _needed_voices(self) -> list[str]:
@@ -533,7 +533,7 @@ class Scheduler:
 
         The active goal needs none once it is heard: its voice is kept until it has spoken.
         """
-        voices = (model_of(self.wanted_voice(each)) for each in self.unfinished() if each.voice is None)
+        voices = (without_speaker(self.wanted_voice(each)) for each in self.unfinished() if each.voice is None)
         return list(filter(is_neural, dict.fromkeys(voices)))
 
     def _load_next(self, now: Now) -> list[Effect]:
@@ -546,13 +546,13 @@ class Scheduler:
             return []
         if self.active and not self.voices.has_libraries:
             return []
-        order = self.voices.load_next(self._needed_voices(), model_of(self.settings.voice), now.monotonic)
+        order = self.voices.load_next(self._needed_voices(), without_speaker(self.settings.voice), now.monotonic)
         return [order] if order else []
 
     def _drop_excess(self) -> list[Effect]:
         """Return orders to drop voices if they take more memory than allowed."""
         needed = self._needed_voices()
-        speaking = model_of(self.active.voice) if self.active else ""
+        speaking = without_speaker(self.active.voice) if self.active else ""
         if is_neural(speaking) and not self.voices.is_loaded(speaking):
             return []  # it was dropped but keeps its memory until it has spoken, and the engine measures again then
         return [*self.voices.drop_excess(next(iter(needed), speaking), needed)]
@@ -607,7 +607,7 @@ class Scheduler:
         record.next_since = min(record.next_since, now.monotonic)
         if self._start_time(record) > now.monotonic:
             return None, effects
-        record.become(State.ACTIVE)
+        record.change_state(State.ACTIVE)
         self._queue.remove(record)
         record.started_at, record.began_at = now.wall, now.monotonic
         self.active = record
@@ -620,14 +620,14 @@ class Scheduler:
 
     def _end_unqueued(self, record: Record, reason: Reason, words: str, by: By | None, now: Now) -> list[Effect]:
         """End a PENDING goal that is not in the queue."""
-        record.become(State.RECALLING)
+        record.change_state(State.RECALLING)
         return self._end(record, State.RECALLED, reason, f"Talk recalled: {words}", by, now)
 
     def _stop(self, record: Record, reason: Reason, by: By | None, now: Now) -> list[Effect]:
         """Have the engine stop the active goal."""
         if record.state is State.PREEMPTING:
             return []  # the first stop gives the reason
-        record.become(State.PREEMPTING)
+        record.change_state(State.PREEMPTING)
         record.reason, record.by, record.stop_requested_at = reason, by, now.monotonic
         record.paused = False
         return [StateChange(record, State.PREEMPTING), EngineOrder(record, Order.STOP)]
@@ -642,7 +642,7 @@ class Scheduler:
         self, record: Record, state: State, reason: Reason | None, message: str, by: By | None, now: Now
     ) -> list[Effect]:
         """End a goal. If it was the active one, start the next."""
-        record.become(state)
+        record.change_state(state)
         record.reason, record.message, record.by = reason, message, by
         record.ended_at, record.paused = now.wall, False
         if record.spoken_end and state is not State.ABORTED:

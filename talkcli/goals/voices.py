@@ -13,7 +13,7 @@ from math import inf
 from typing import TYPE_CHECKING
 
 from talkcli.frozen import frozen
-from talkcli.goals.options import model_of
+from talkcli.goals.options import without_speaker
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence
@@ -137,7 +137,7 @@ class VoiceScheduler:
             record: the next goal.
             default_voice: the voice of goals that name none.
         """
-        found = self._voices.get(model_of(record.say.voice or default_voice)) if self._voices else None
+        found = self._voices.get(without_speaker(record.say.voice or default_voice)) if self._voices else None
         if found is None or found.state not in {VoiceState.WAITING, VoiceState.LOADING}:
             return 0.0
         if record.say.voice_only:

@@ -114,7 +114,7 @@ class PendingRequest:
         if self._leave():
             self._step(in_time)
 
-    def move(self, waiting_list: WaitingList) -> None:
+    def move_to(self, waiting_list: WaitingList) -> None:
         """Have the request wait in this list instead of another."""
         self._leave()
         self.waiting_list = waiting_list
@@ -148,7 +148,7 @@ class PendingRequest:
 
     def _step(self, value: bool | None) -> None:
         with contextlib.suppress(StopIteration):  # it has been answered
-            self.move(self._steps.send(value))
+            self.move_to(self._steps.send(value))
 
     def _leave(self) -> bool:
         """Leave the list where the request waits. Return False if it doesn't wait."""
@@ -257,7 +257,7 @@ class ClientConnection(asyncio.Protocol):
             self._write(line)
         elif len(self._outbox) < MAX_HELD_MESSAGES:
             self._outbox.append(line)
-            self.stream.hold(len(line))
+            self.stream.count_held(len(line))
         else:
             self.stream.abort()
 
@@ -310,7 +310,7 @@ class ClientConnection(asyncio.Protocol):
 
     def _write(self, line: bytes) -> None:
         self.stream.write(line)
-        if self.stream.size > MAX_CLIENT_OUTPUT_BYTES:
+        if self.stream.unsent_bytes > MAX_CLIENT_OUTPUT_BYTES:
             self.stream.abort()
 
     def _take_last_requests(self) -> None:
@@ -348,7 +348,7 @@ class ClientConnection(asyncio.Protocol):
             first = self._outbox[0]
             if isinstance(first, bytes):
                 self._outbox.popleft()
-                self.stream.hold(-len(first))
+                self.stream.count_held(-len(first))
                 self._write(first)
             elif (message := next(first, None)) is None:
                 self._outbox.popleft()

@@ -87,7 +87,7 @@ class Requests:
 
     def is_waiting(self, connection: ClientConnection) -> bool:
         """Return whether a client waits for an answer or an event."""
-        return connection in self._pending or self._speech.subscribers.has(connection)
+        return connection in self._pending or self._speech.subscribers.is_subscribed(connection)
 
     def left(self, connection: ClientConnection) -> None:
         """Forget the requests and subscriptions of a client that is gone."""
@@ -198,7 +198,7 @@ class Requests:
         """Return the selected goals among those that wait."""
         waiting = (*self._canceled, *self._speech.waiting_for_room, *self._speech.waiting_for_voices)
         goals = [(each, each.request) for each in waiting if isinstance(each.request, Say)]
-        selected = (goals[index][0] for index in selection.of_waiting([say for _, say in goals]))
+        selected = (goals[index][0] for index in selection.select_waiting([say for _, say in goals]))
         # A client that has hung up has withdrawn its goals.
         return [each for each in selected if not each.connection.has_hung_up()]
 
@@ -207,7 +207,7 @@ class Requests:
         new = [each for each in goals if each.waiting_list is not self._canceled]
         for each in new:
             each.canceled_by = by
-            each.move(self._canceled)
+            each.move_to(self._canceled)
         return [each.resume for each in new]
 
     async def _await_room(self, pending: PendingRequest, say: Say) -> float:

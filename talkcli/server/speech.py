@@ -20,7 +20,7 @@ from talkcli.engine.parent.supervisor import EngineDied, EngineMissing, EngineSa
 from talkcli.errors import TalkError, UsageError
 from talkcli.frozen import replace
 from talkcli.goals.goal import Output
-from talkcli.goals.options import ENGINE_OPTIONS, INITIAL, engine_options, is_neural, model_of, require_fields
+from talkcli.goals.options import ENGINE_OPTIONS, INITIAL, engine_options, is_neural, require_fields, without_speaker
 from talkcli.goals.reasons import Reason
 from talkcli.goals.scheduler import Effect, EngineOrder, Now, Order, StateChange
 from talkcli.goals.states import State
@@ -197,7 +197,7 @@ class Speech:
         if not is_neural(options["voice"] or ""):
             options["voice_only"] = False
         elif options["voice_only"]:
-            if why := self.scheduler.voices.failure(model_of(options["voice"])):
+            if why := self.scheduler.voices.failure(without_speaker(options["voice"])):
                 self.report(protocol.Ended(record.id, protocol.OUTCOME_FAILED, Reason.VOICE_FAILED, why))
                 return
             options["pitch"] = INITIAL.pitch  # a neural voice has no other

@@ -70,7 +70,7 @@ class ClientStreams:
     def shed_load(self) -> None:
         """Drop the clients with the most unread output until the rest is within the limit."""
         while self.unread_bytes > MAX_TOTAL_OUTPUT_BYTES and self.open:
-            max(self.open, key=lambda each: each.size + each.held_bytes).abort()
+            max(self.open, key=lambda each: each.unsent_bytes + each.held_bytes).abort()
             total = MAX_TOTAL_OUTPUT_BYTES >> 20
             log.write_limited("output", f"a client that doesn't read is let go: {total} MiB wait for all together")
 
@@ -167,11 +167,11 @@ class ClientStream:
     # -- output
 
     @property
-    def size(self) -> int:
+    def unsent_bytes(self) -> int:
         """The number of bytes that are written and not sent."""
         return len(self._unread)
 
-    def hold(self, size_bytes: int) -> None:
+    def count_held(self, size_bytes: int) -> None:
         """Count bytes that the receiver keeps for the client, or with a negative size, no longer keeps."""
         if self in self._streams.open:
             self.held_bytes += size_bytes

@@ -72,7 +72,7 @@ class Subscribers:
         self._watchers[connection] = None
         self.keep_alive()
 
-    def has(self, connection: ClientConnection) -> bool:
+    def is_subscribed(self, connection: ClientConnection) -> bool:
         """Return whether a connection waits for a goal or watches."""
         return connection in self._watchers or any(connection in each for each in self._waiters.values())
 

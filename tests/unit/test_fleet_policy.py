@@ -81,7 +81,7 @@ def test_a_plain_text_is_literal_and_anything_cancels_everything(topic: str, pay
     found = asked(judge(request(payload, topic, None)))
     assert (found.request, found.reply_topic) == (wanted, None)
     assert found.size_bytes == (0 if topic == CANCEL else len(payload))
-    assert not isinstance(found.request, Cancel) or found.request.everything
+    assert not isinstance(found.request, Cancel) or found.request.selects_all
 
 
 def test_an_empty_request_is_the_goodbye_of_the_session_that_it_names() -> None:

@@ -95,9 +95,9 @@ def test_fields_at_their_defaults_are_not_written(kind: str) -> None:
 
 
 def test_a_cancel_that_selects_is_not_of_everything() -> None:
-    assert Cancel().everything
+    assert Cancel().selects_all
     for selection in ({"ids": ("4k7f-1",)}, {"ids": ()}, {"current": True}, {"before": "4k7f-1"}, {"key": ""}):
-        assert not Cancel(**selection).everything
+        assert not Cancel(**selection).selects_all
 
 
 @pytest.mark.parametrize("kind", REQUEST_TYPES)

@@ -213,7 +213,7 @@ def test_an_id_that_waits_for_room_is_known_to_a_cancel() -> None:
 )
 def test_a_cancel_selects_among_goals_that_wait_for_room(selection: Cancel, chosen: list[int]) -> None:
     waiting = [Say("1", key="k"), Say("2", id="b", key="k"), Say("3", id="c"), Say("4")]
-    assert selection.of_waiting(waiting) == chosen
+    assert selection.select_waiting(waiting) == chosen
 
 
 def test_a_goal_lacks_room_if_nothing_else_is_wrong_with_it() -> None:

@@ -45,11 +45,11 @@ def test_a_transition_of_the_table_is_made_and_any_other_is_refused(state: str, 
     before = record.snapshot()
     if target in ALLOWED.get(state, []):
         assert check_transition(State[state], State[target]) is State[target]
-        record.become(State[target])
+        record.change_state(State[target])
         assert record.state is State[target]
     else:
         with pytest.raises(IllegalTransition, match=rf"{state}.*{target}") as refused:
-            record.become(State[target])
+            record.change_state(State[target])
         assert refused.value.code == "illegal_transition"
         assert record.snapshot() == before
 

@@ -20,7 +20,7 @@ from talkcli.engine.child.synthesizers.base import NotInstalled, SpeechSettings
 from talkcli.engine.protocol import Ready, StartFailed
 from talkcli.engine.voices import SYNTHESIZERS, UnknownVoice, is_own_driver
 from talkcli.frozen import TYPE_CHECKING, fields, replace
-from talkcli.goals.options import is_neural, model_of
+from talkcli.goals.options import is_neural, without_speaker
 from talkcli.goals.reasons import Reason
 
 if TYPE_CHECKING:
@@ -206,7 +206,7 @@ class DriverProperties:
             CannotSpeak: there is no such voice.
         """
         found = voices.find_voice(wanted, self._voices)
-        if found is not None and is_neural(found.id) and model_of(wanted) != model_of(found.id):
+        if found is not None and is_neural(found.id) and without_speaker(wanted) != without_speaker(found.id):
             found = None  # only a part of its name matches, so a voice added since then may match better
         if found is None:  # listing takes some milliseconds, so it is only done for voices that are not known yet
             self._voices = voices.list_voices(self._engine)

@@ -164,7 +164,7 @@ class RemoteSessions:
 
     def cancel_waiting(self, selection: Cancel, by: By | None) -> list[Goal]:
         """End the selected goals of those that wait for room, and return them."""
-        selected = [self.waiting[each] for each in selection.of_waiting([say for _, say, _ in self.waiting])]
+        selected = [self.waiting[each] for each in selection.select_waiting([say for _, say, _ in self.waiting])]
         self.waiting = [each for each in self.waiting if not any(each is other for other in selected)]
         words = "canceled before it was spoken"
         return [
