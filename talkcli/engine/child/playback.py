@@ -549,15 +549,28 @@ class Playback:
         """Play silence while the sentence is held.
 
         Raises:
-            _PlayerReleased: the player had to be released.
+            _PlayerReleased: the player failed, or was held for too long.
         """
         if not feed.player.real_time:
             self._await_continue()
             return
         self._await_silence(feed)
-        if self._runner.hold_number and not self._play_silence(feed):
-            self._release_player(self._sent)  # all that it held was heard
-            raise _PlayerReleased
+        self._silent_at = time.monotonic()
+        release_at = self._silent_at + RELEASE_DELAY_S
+        while self._runner.hold_number:
+            self._runner.confirm_hold()
+            taken = 0
+            try:
+                taken = self._offer_silence(feed)
+            except CannotSpeak:
+                release_at = 0.0  # a failure during a hold is no reason to end the sentence
+            due = min(release_at, feed.progress_at + STALL_LIMIT_S)
+            if time.monotonic() >= due:
+                self._release_player(self._sent)  # all that it held was heard
+                raise _PlayerReleased
+            if not taken:
+                self._wait_for(feed, due)
+        self._silent_at = None
         feed.progress_at = time.monotonic()
 
     def _await_silence(self, feed: PlayerFeed) -> None:
@@ -574,24 +587,6 @@ class Playback:
                 self._wait_for(feed, min(deadline, now + left))
             self._update(feed)
             now = time.monotonic()
-
-    def _play_silence(self, feed: PlayerFeed) -> bool:
-        """Play silence until the sentence goes on. Return False if the player failed, or is to be released first."""
-        self._silent_at = time.monotonic()
-        release_at = self._silent_at + RELEASE_DELAY_S
-        while self._runner.hold_number:
-            self._runner.confirm_hold()
-            try:
-                taken = self._offer_silence(feed)
-            except CannotSpeak:
-                return False  # a failure during a hold is no reason to end the sentence
-            due = min(release_at, feed.progress_at + STALL_LIMIT_S)
-            if time.monotonic() >= due:
-                return False
-            if not taken:
-                self._wait_for(feed, due)
-        self._silent_at = None
-        return True
 
     def _offer_silence(self, feed: PlayerFeed) -> int:
         """Offer a piece of silence, unless the player has enough. Without this limit, some would take it endlessly."""

@@ -223,10 +223,8 @@ class GoalRunner:
         elif isinstance(command, protocol.Stop):
             self._stop_goal()
         elif isinstance(command, protocol.NextGoal):
-            self.players.handovers.next_waits, self.players.handovers.next_is_neural = (
-                command.next_waits,
-                command.next_is_neural,
-            )
+            handovers = self.players.handovers
+            handovers.next_waits, handovers.next_is_neural = command.next_waits, command.next_is_neural
         elif isinstance(command, protocol.Continue):
             self.hold_number = 0
         elif not goal.stop_requested:

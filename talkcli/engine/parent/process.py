@@ -103,11 +103,8 @@ class EngineProcess:
                 start_new_session=True,
             )
             kept.pop_all()
+        self.pid = self._process.pid
         self.send(configure)
-
-    @property
-    def pid(self) -> int:
-        return self._process.pid
 
     def send(self, command: protocol.Command) -> bool:
         """Send a command without waiting, from any thread. Return False if the process can't take it."""
