@@ -117,6 +117,8 @@ class Bridge:
     def __init__(self, settings: BridgeSettings, read_broker: Callable[[], Broker]) -> None:
         """Start offline; the arguments are those of `run_bridge`."""
         self._settings = settings
+        self._echo_topic = topics.robot(settings.name, topics.ECHO)
+        self._presence_topic = topics.robot(settings.name, topics.PRESENCE)
         self._broker, self._read_broker = settings.broker, read_broker
         self._groups = tuple(dict.fromkeys((topics.ALL_ROBOTS, *settings.groups)))
         self._loop = asyncio.get_running_loop()
@@ -152,10 +154,10 @@ class Bridge:
 
     async def run(self) -> None:
         """Run until `end` is called."""
-        link = self._new_link()
+        self._broker.ssl_context()  # raises UsageError before anything is started
         log.write(f"robot {self._settings.name}, by the broker at {self._settings.broker.url}")
         self._systemd.notify_ready()
-        tasks = [asyncio.create_task(each) for each in (self._stay_connected(link), self._publisher.run())]
+        tasks = [asyncio.create_task(each) for each in (self._stay_connected(), self._publisher.run())]
         for task in tasks:
             task.add_done_callback(self._on_task_done)
         self._tick_timer = self._loop.call_later(ECHO_EVERY_S, self._tick, self._loop.time() + ECHO_EVERY_S)
@@ -198,28 +200,26 @@ class Bridge:
     # -- the connection
 
     def _new_link(self) -> Link:
-        name, session = self._settings.name, self._session
-        will = Will(topics.robot(name, topics.PRESENCE), self._offline_presence())
-        return Link(self._broker, f"talk-{name}-{session}", self._on_message, will, _MAX_INCOMING_BYTES)
+        client_id = f"talk-{self._settings.name}-{self._session}"
+        will = Will(self._presence_topic, self._offline_presence())
+        return Link(self._broker, client_id, self._on_message, will, _MAX_INCOMING_BYTES)
 
-    async def _stay_connected(self, first: Link) -> None:
+    async def _stay_connected(self) -> None:
         """Connect to the broker, and connect again whenever the connection ends."""
         retry_s = _FIRST_BROKER_RETRY_S
-        link: Link | None = first
         while True:
             try:
-                link = link or self._new_link()
-                await self._open(link)
-                self._on_connect(link)
-                await self._disconnected.wait()
+                link = self._new_link()
+                try:
+                    await self._open(link)
+                    self._on_connect(link)
+                    await self._disconnected.wait()
+                finally:
+                    self._disconnect(link)
                 log.write(f"the connection to the broker has ended: {log.sanitize(str(link.ended))}")
                 retry_s = _FIRST_BROKER_RETRY_S if self._owns_name else retry_s
             except TalkError as error:
                 log.write_limited("broker", log.sanitize(str(error)))
-            finally:
-                if link:
-                    self._disconnect(link)
-            link = None
             await asyncio.sleep(random.uniform(0, retry_s))
             retry_s = min(_LAST_BROKER_RETRY_S, retry_s * 2)
             try:
@@ -243,15 +243,14 @@ class Bridge:
         self._disconnected.clear()
         self._link, self._descriptor = link, link.fileno()
         self._owns_name, self._rival_seen, self._rival_timer = False, False, None
-        self._loop.add_reader(self._descriptor, self._read)
+        self._loop.add_reader(self._descriptor, self._use, Link.read)
         self._echoes = EchoTracker(boottime())
         self._unanswered_since = None
-        name = self._settings.name
-        link.subscribe(topics.robot(name, topics.PRESENCE), retained=True)
-        link.subscribe(topics.robot(name, topics.ECHO), retained=False)
+        link.subscribe(self._presence_topic, retained=True)
+        link.subscribe(self._echo_topic, retained=False)
         # The broker sends the retained presence of another bridge before this question returns. If that bridge is
         # still alive, its answer comes after that.
-        self._publish(topics.robot(name, topics.ECHO), _RIVAL_QUESTION + self._session.encode())
+        self._publish(self._echo_topic, _RIVAL_QUESTION + self._session.encode())
         self._send_echo()
 
     def _take_name(self) -> None:
@@ -292,16 +291,11 @@ class Bridge:
                     forget(self._descriptor)
             self._descriptor, self._writing = -1, False
 
-    def _read(self) -> None:
+    def _use(self, action: Callable[[Link], None]) -> None:
+        """Read or write, when the loop says that it is possible."""
         link = self._link
         if link:
-            link.read()
-            self._check_link(link)
-
-    def _write(self) -> None:
-        link = self._link
-        if link:
-            link.write()
+            action(link)
             self._check_link(link)
 
     def _check_link(self, link: Link) -> None:
@@ -327,7 +321,7 @@ class Bridge:
         if link.wants_write != self._writing:
             self._writing = link.wants_write
             if self._writing:
-                self._loop.add_writer(self._descriptor, self._write)
+                self._loop.add_writer(self._descriptor, self._use, Link.write)
             else:
                 self._loop.remove_writer(self._descriptor)
 
@@ -370,11 +364,10 @@ class Bridge:
             log.write_bug("what came from the broker", error)
 
     def _handle(self, message: Message) -> None:
-        name = self._settings.name
-        if message.topic == topics.robot(name, topics.ECHO):
+        if message.topic == self._echo_topic:
             self._handle_echo(message.payload)
             return
-        if message.topic == topics.robot(name, topics.PRESENCE):
+        if message.topic == self._presence_topic:
             self._handle_presence(message.payload)
             return
         if message.topic == topics.HOMEASSISTANT_STATUS and message.payload == HOMEASSISTANT_ONLINE:
@@ -439,7 +432,6 @@ class Bridge:
 
     def _publish_presence(self) -> None:
         self._presence_at = self._loop.time()
-        settings = self._settings
         presence: JsonObject = {
             "talk": 1,
             "version": __version__,
@@ -447,11 +439,13 @@ class Bridge:
             "session": self._session,
             "since": self._since,
             "groups": list(self._groups),
-            "allow": list(settings.allow),
+            "allow": list(self._settings.allow),
             "server": self._publisher.server,
         }
-        topic = topics.robot(settings.name, topics.PRESENCE)
-        self._publish(topic, encode(presence), retain=True, expiry=PRESENCE_EXPIRY_S, acknowledged=self._check_rights)
+        line = encode(presence)
+        self._publish(
+            self._presence_topic, line, retain=True, expiry=PRESENCE_EXPIRY_S, acknowledged=self._check_rights
+        )
 
     def _offline_presence(self) -> bytes:
         return encode({"talk": 1, "online": False, "session": self._session, "groups": list(self._groups)})
@@ -473,7 +467,7 @@ class Bridge:
         if self._unanswered_since is None:
             self._unanswered_since = now
         number = self._echoes.add(boottime())
-        self._publish(topics.robot(self._settings.name, topics.ECHO), f"{self._session} {number}".encode())
+        self._publish(self._echo_topic, f"{self._session} {number}".encode())
 
     def _tick(self, due: float) -> None:
         """Do the regular work, which was due at this time."""
@@ -502,16 +496,16 @@ class Bridge:
         link = self._link
         if link is None:
             return
-        name, taken = self._settings.name, asyncio.Event()
+        taken = asyncio.Event()
         was_online = self._owns_name and not isinstance(self._error, AddressInUse)
         self._owns_name = False  # before its own message comes back, which it would contradict
         if was_online:
-            topic, payload, retain = topics.robot(name, topics.PRESENCE), self._offline_presence(), True
+            topic, payload = self._presence_topic, self._offline_presence()
         else:
             # Once the broker has acknowledged this, the connection can end with a DISCONNECT. Otherwise, the broker
             # would publish the will, and the robot would be offline for a moment although another bridge is online.
-            topic, payload, retain = topics.robot(name, topics.ECHO), f"{self._session} 0".encode(), False
-        self._publish(topic, payload, retain=retain, acknowledged=lambda _: taken.set())
+            topic, payload = self._echo_topic, f"{self._session} 0".encode()
+        self._publish(topic, payload, retain=was_online, acknowledged=lambda _: taken.set())
         with contextlib.suppress(asyncio.TimeoutError):
             await asyncio.wait_for(taken.wait(), _OFFLINE_LIMIT_S)
         self._disconnect(link)
