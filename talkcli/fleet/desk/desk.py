@@ -43,7 +43,7 @@ ABSENCE_LIMIT_S = 30.0
 _REQUEST_EXPIRY_S = 5
 #: Time allowed for late retained messages: some brokers send them a moment after the others.
 RETAINED_GRACE_S = 0.3
-#: Bounds of the pause before the next attempt to connect. The pause is random, and its average doubles.
+#: Bounds of the pause before the next attempt to connect. It is random, and doubles on average each time.
 _FIRST_RECONNECT_PAUSE_S, _MAX_RECONNECT_PAUSE_S = 0.5, 10.0
 
 

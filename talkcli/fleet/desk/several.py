@@ -93,6 +93,7 @@ class FleetRequest:
         self._unfinished: set[str] = set()
         self._outcomes: deque[Outcome] = deque()
         self._numbers = itertools.count(FIRST_NUMBER)
+        #: the number of a request to a group
         self._number = next(self._numbers)
         #: why the broker has refused the message to the group
         self._refused: TalkError | None = None
@@ -108,6 +109,7 @@ class FleetRequest:
             #: the goal that every server would make of a text that is too long for a request
             self._rejected = too_long(request) if isinstance(request, Say) else None
             self._desk.wait_for_retained(patience, interrupt=interrupt)
+            #: the latest `boottime` at which the sentence may be sent; None for no limit
             self._latest = boottime() + request.ttl if isinstance(request, Say) and request.ttl else None
             self._begin()
         except BaseException:
