@@ -93,7 +93,7 @@ def robots(broker: Broker) -> Iterator[Listener]:
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A desk that reconnects soon after its broker is back."""
-    monkeypatch.setattr(desk, "_MAX_RECONNECT_PAUSE_S", 0.1)
+    monkeypatch.setattr(desk, "_MAX_BROKER_PAUSE_S", 0.1)
 
 
 def names(events: list[FleetEvent]) -> list[str]:

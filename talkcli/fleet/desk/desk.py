@@ -44,7 +44,7 @@ _REQUEST_EXPIRY_S = 5
 #: Time allowed for late retained messages: some brokers send them a moment after the others.
 RETAINED_GRACE_S = 0.3
 #: Bounds of the pause before the next attempt to connect. It is random, and doubles on average each time.
-_FIRST_RECONNECT_PAUSE_S, _MAX_RECONNECT_PAUSE_S = 0.5, 10.0
+_FIRST_BROKER_PAUSE_S, _MAX_BROKER_PAUSE_S = 0.5, 10.0
 
 
 class DeskHandler(Protocol):
@@ -273,7 +273,7 @@ class DeskLink:
         self._opening = None
         if opening.error is not None:
             self._failed_attempts += 1
-            longest = min(_MAX_RECONNECT_PAUSE_S, _FIRST_RECONNECT_PAUSE_S * 2**self._failed_attempts)
+            longest = min(_MAX_BROKER_PAUSE_S, _FIRST_BROKER_PAUSE_S * 2**self._failed_attempts)
             self._next_attempt_at = time.monotonic() + random.uniform(0, longest)
             self.failure = opening.error
             self.handler.on_disconnected(str(opening.error))
@@ -293,7 +293,7 @@ class DeskLink:
     def _disconnect(self, link: Link) -> None:
         link.close()
         self.link, self.marker_at = None, None
-        self._next_attempt_at = time.monotonic() + random.uniform(0, _FIRST_RECONNECT_PAUSE_S)
+        self._next_attempt_at = time.monotonic() + random.uniform(0, _FIRST_BROKER_PAUSE_S)
         self.handler.on_disconnected(f"the broker at {self.broker.url} went away")
 
     def _close_wake_sockets(self) -> None:
