@@ -155,7 +155,7 @@ class Publisher:
         server.send(Exchange(Watch(), partial(self._server_came, server), refuse))
 
     def _server_came(self, server: LocalConnection, reply: JsonObject, items: list[JsonObject]) -> None:
-        """Take over what the server says when the watch begins."""
+        """Take over the server's state at the start of the watch."""
         status = ServerStatus.from_reply(reply, items)
         self._retry_s = _FIRST_SERVER_RETRY_S
         for each in unfinished(status):

@@ -83,7 +83,7 @@ class RemoteSessions:
         self.ids, self.goals = policy.SentIds(), policy.RemoteGoals()
         #: limits how many sessions wait for the server's greeting
         self.dialing = asyncio.Semaphore(MAX_SESSIONS)
-        #: set while the broker is fast enough for more lines of the server
+        #: cleared while the broker is slow, so that nothing more is read from the server
         self.may_read = asyncio.Event()
         self.may_read.set()
         #: goals that wait until fewer are pending, in their order
@@ -175,7 +175,7 @@ class RemoteSessions:
     def schedule_release(self) -> None:
         """Send goals that wait for room soon, if there is room then.
 
-        Call it whenever the number of pending goals has changed. Events that came together all count.
+        Call it whenever the number of pending goals has changed. All events that came together are counted first.
         """
         self._on_change()
         if self.waiting and self._release_handle is None:
@@ -226,17 +226,20 @@ class RemoteSessions:
 class _RemoteExchange(Exchange):
     """An exchange with the server for a remote client."""
 
-    __slots__ = ("canceled", "fresh", "goal_id", "remote")
+    __slots__ = ("canceled", "is_new", "remote")
 
-    def __init__(
-        self, remote: RemoteRequest, request: Request, goal_id: str | None = None, *, fresh: bool = False
-    ) -> None:
+    def __init__(self, remote: RemoteRequest, request: Request, *, is_new: bool = False) -> None:
         super().__init__(request)
         self.remote = remote
-        #: for a goal: the id that it was sent with, and whether it was never sent before
-        self.goal_id, self.fresh = goal_id, fresh
+        #: for a goal: whether it was never sent before
+        self.is_new = is_new
         #: for a cancel: the goals that it ended before they reached the server
         self.canceled: list[Goal] = []
+
+    @property
+    def goal_id(self) -> str | None:
+        """The id of the goal that is sent, None for other requests."""
+        return self.request.id if isinstance(self.request, Say) else None
 
 
 class RemoteSession:
@@ -377,7 +380,7 @@ class RemoteSession:
             words = f"{goal_id} was sent to a server that has ended since: it may have been spoken"
             self._refuse(remote, "lost", words)
         elif has_room or (shared.goals.has_room(say) and not (counted and shared.waiting)):
-            if self._send(_RemoteExchange(remote, remote.say(goal_id, boottime()), goal_id, fresh=boot is None)):
+            if self._send(_RemoteExchange(remote, remote.say(goal_id, boottime()), is_new=boot is None)):
                 shared.ids.add(goal_id, server.boot, counted=counted)
                 if counted:
                     shared.goals.add(goal_id, say.key)
@@ -485,15 +488,15 @@ class RemoteSession:
         if waits and state is not None and not state.terminal:
             self._awaited.add(str(goal.get("id")))
 
-    def _count_goal(self, sent: _RemoteExchange, reply: JsonObject) -> None:
+    def _count_goal(self, exchange: _RemoteExchange, reply: JsonObject) -> None:
         """Update the number of pending goals after the server's reply to a `say`."""
-        if sent.goal_id is None:
+        if exchange.goal_id is None:
             return
         goal = reply.get("goal")
         state = goal.get("state") if isinstance(goal, dict) else None
-        self._sessions.goals.answered(sent.goal_id, pending=state == State.PENDING.name)
-        if sent.fresh and state in (None, State.REJECTED.name):
-            self._sessions.ids.discard(sent.goal_id)
+        self._sessions.goals.answered(exchange.goal_id, pending=state == State.PENDING.name)
+        if exchange.is_new and state in (None, State.REJECTED.name):
+            self._sessions.ids.discard(exchange.goal_id)
         self._sessions.schedule_release()
 
     # -- to the client
