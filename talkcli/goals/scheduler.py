@@ -126,7 +126,7 @@ class Scheduler:
         settings: Set = INITIAL,
         voices: VoiceScheduler | None = None,
     ) -> None:
-        """Create a scheduler without goals and without an engine.
+        """Start without goals and without an engine.
 
         Args:
             boot: four characters that begin the ids of this server's goals.
@@ -205,11 +205,11 @@ class Scheduler:
 
         Args:
             say: the goal.
-            sender: its sender.
+            sender: the sender of the goal.
             now: the time.
             refusal: why the server refuses the goal, if it does.
-            canceled: who cancelled the goal while it waited for room. It is recalled at once.
-            waited_s: how long the goal waited for room. It is recalled at once if its time to live is over.
+            canceled: the client that cancelled the goal while it waited for room. The goal is recalled at once.
+            waited_s: how long the goal waited for room. The goal is recalled at once if its time to live is over.
         """
         first = self.find(say.id) if say.id is not None and is_clients_id(say.id) else None
         if first is not None and first.has_text(say.text):
@@ -250,7 +250,7 @@ class Scheduler:
 
         Args:
             selection: the goals to end.
-            sender: who cancels them.
+            sender: the client that cancels them.
             now: the time.
             waiting: the ids of selected goals that wait for room and have not been submitted yet.
         """
@@ -359,7 +359,7 @@ class Scheduler:
         """End the active goal: all of it was played.
 
         Args:
-            goal_id: its id.
+            goal_id: the id of the goal.
             duration: the seconds of audio, if known.
             now: the time.
             gaps: how often the sound was interrupted because it was not made in time.

@@ -92,7 +92,7 @@ class VoiceScheduler:
     """Decides which neural voices the engine loads and drops, and remembers how that went."""
 
     def __init__(self, limit_bytes: int = 0, file_size: Callable[[str], int] = lambda _: 0) -> None:
-        """Create the list without any voice.
+        """Start without any voice.
 
         Args:
             limit_bytes: memory that the loaded voices may take. One voice alone may take more.

@@ -66,7 +66,7 @@ class Requests:
     """Carries out the requests of a server's clients."""
 
     def __init__(self, speech: Speech, describe: Callable[[], JsonObject]) -> None:
-        """Create it without any request. `describe` returns what `status` shows about the server."""
+        """Start with no requests. `describe` returns what `status` shows about the server."""
         self._speech = speech
         self._scheduler = speech.scheduler
         self._describe = describe

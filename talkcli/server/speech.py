@@ -62,7 +62,7 @@ class Speech:
     """The goals of one server, and the engine that speaks them."""
 
     def __init__(self, scheduler: Scheduler, player_options: Sequence[str] = ()) -> None:
-        """Create it without an engine.
+        """Start without an engine.
 
         Args:
             scheduler: the server's scheduler.

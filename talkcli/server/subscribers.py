@@ -46,7 +46,7 @@ class Subscribers:
     def __init__(
         self, loop: asyncio.AbstractEventLoop, waiting_for_room: Callable[[], Iterable[ClientConnection]]
     ) -> None:
-        """Create it without any connection.
+        """Start with no connections.
 
         Args:
             loop: the event loop.
