@@ -66,6 +66,7 @@ class VoiceCatalog:
             return 0
 
     def _is_unchecked(self, voice: str | None) -> bool:
+        """Return whether a voice can't be checked: it is the default, or the voices are not listed yet."""
         return not voice or voice == DEFAULT_VOICE or not (self.listed or is_neural(voice))
 
     def _find(self, voice: str, settings_voice: str | None) -> Voice | None:
