@@ -182,11 +182,8 @@ def _without_long_initials(text: str) -> str:
         room = sum(map(_max_bytes, word))
         words += len(word) if word[0] >= _IDEOGRAPHS else 1
         single = sum(map(_is_letter, word)) < 2
-        if looked_up and (
-            looked_up + room > _LOOKUP_BYTES
-            or (single and spelled + room > _SPELLING_BYTES)
-            or words > _MAX_CLAUSE_WORDS
-        ):
+        too_long = looked_up + room > _LOOKUP_BYTES or (single and spelled + room > _SPELLING_BYTES)
+        if looked_up and (too_long or words > _MAX_CLAUSE_WORDS):
             for at in dots:
                 result[at] = " "
             looked_up = spelled = 0
@@ -235,12 +232,10 @@ def _without_long_words(text: str) -> str:
 
 
 def _split_word(piece: re.Match[str]) -> str:
-    word = piece.group(1)
+    word = piece.group(1) or ""
     # Scripts without capital letters can only be split at an apostrophe.
-    if word is None or (
-        word.count("'") + word.count("’") <= _MAX_WORD_APOSTROPHES
-        and (len(word.encode()) <= _MAX_WORD_BYTES or word.lower() == word.upper())
-    ):
+    short = len(word.encode()) <= _MAX_WORD_BYTES or word.lower() == word.upper()
+    if short and word.count("'") + word.count("’") <= _MAX_WORD_APOSTROPHES:
         return piece.group()
     result = list(word)
     size = endings = 0

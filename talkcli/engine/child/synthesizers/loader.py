@@ -7,6 +7,7 @@ ids without a speaker.
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 import time
@@ -222,15 +223,11 @@ class ModelLoader:
         self._load = None
         self._start_next()
 
-    def _measure(self, voice: str, min_growth: int = 0) -> None:
+    def _measure(self, voice: str, min_growth: float = -math.inf) -> None:
         """Report by how much the process has grown, unless a voice that spoke grew it by less than `min_growth`."""
         self._unmeasured = None
         before, now = self._initial_bytes, _own_bytes()
-        if (
-            before is None
-            or now is None
-            or (voice and min_growth and now - before - self._reported_growth < min_growth)
-        ):
+        if before is None or now is None or (voice and now - before - self._reported_growth < min_growth):
             return
         _trim_heap()
         self._reported_growth = max(0, (_own_bytes() or now) - before)

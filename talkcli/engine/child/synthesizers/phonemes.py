@@ -150,13 +150,9 @@ def _locate_words(phonemizer: Phonemizer, clause: str, groups: Sequence[str]) ->
     positions = _increasing(positions)
     next_starts = [*(start for start, _ in positions[1:]), len(clause)]
     # Each word is spoken alone, and the result is aligned with the phonemes of the whole clause.
-    alone = [
-        "".join(
-            "".join(_phoneme_groups(ipa))
-            for _, ipa in phonemizer.clauses(clause[start : min(start + length, next_start)])
-        )
-        for (start, length), next_start in zip(positions, next_starts, strict=True)
-    ]
+    limits = zip(positions, next_starts, strict=True)
+    words = [clause[start : min(start + length, next_start)] for (start, length), next_start in limits]
+    alone = ["".join(itertools.chain(*(_phoneme_groups(ipa) for _, ipa in phonemizer.clauses(word)))) for word in words]
     ends = [0, *itertools.accumulate(map(len, alone))]
     found = _align("".join(alone), "".join(groups), ends[:-1])
     last = max(0, group_starts[-1] - 1)
