@@ -32,6 +32,9 @@ if TYPE_CHECKING:
     from talkcli.engine.child.synthesizers.phonemes import SpeechPart
     from talkcli.engine.protocol import Voice
 
+    #: for each word: its start and length in the text, and its time from the first sample of a part in seconds
+    WordTimes = tuple[tuple[int, int, float], ...]
+
 #: The numbers of frames that are decoded at a time, at first and at most. The first 0.23 s of sound are ready soon.
 #: Later parts have up to 0.93 s, because each also decodes some frames on both sides (`inference.CONTEXT_FRAMES`).
 _MIN_DECODED_FRAMES, _MAX_DECODED_FRAMES = 20, 80
@@ -65,8 +68,7 @@ class SpokenPart:
     """Some sound, and the words that begin in it or later."""
 
     samples: bytes
-    #: for each word: its position and length in the text, and its time from the first of these samples in seconds
-    words: tuple[tuple[int, int, float], ...] = ()
+    words: WordTimes = ()
 
 
 class Piper:
@@ -247,9 +249,7 @@ def _word_time(model: Model, part: SpeechPart, places: Sequence[int], begins: Se
     return model.seconds(own)
 
 
-def _cut_leading_silence(
-    samples: Any, levels: Any, words: tuple[tuple[int, int, float], ...], rate: int
-) -> tuple[Any, tuple[tuple[int, int, float], ...]]:
+def _cut_leading_silence(samples: Any, levels: Any, words: WordTimes, rate: int) -> tuple[Any, WordTimes]:
     """Return the start of a sentence without its inaudible beginning, and the words with their new times."""
     audible = (levels > _LEADING_LEVEL).nonzero()[0]
     cut = max(0, int(audible[0]) - int(_LEADING_S * rate)) if len(audible) else 0
