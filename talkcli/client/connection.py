@@ -10,7 +10,7 @@ import os
 import select
 import threading
 import time
-from _socket import SHUT_RDWR, SHUT_WR  # see `peers`
+from _socket import MSG_PEEK, SHUT_RDWR, SHUT_WR  # see `peers`
 
 from talkcli import __version__, paths, peers
 from talkcli.client.connect import ANSWER_LIMIT_S, connect, hello, reach, sender_name, unreachable
@@ -340,6 +340,17 @@ class SocketConnection(Connection):
                 raise
             self.fail(exchange, error)
         self._flush()
+
+    def _read_available(self) -> None:
+        try:
+            if self._socket is None:
+                return
+            self._socket.recv(1, MSG_PEEK)
+        except BlockingIOError:
+            return  # there is nothing to read, and the connection is open
+        except OSError:
+            pass  # the connection broke
+        super()._read_available()
 
     def _flush(self) -> None:
         """Send as many of the outgoing bytes as the server accepts now, under `changed`."""
