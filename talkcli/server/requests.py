@@ -229,14 +229,11 @@ class Requests:
             if self._room_check:  # a new goal must not take the room of one that waits
                 self._room_check.cancel()
                 self._check_room()
-            refusal = pending.refusal or speech.voices.refusal(say.voice, scheduler.settings.voice)
+            _, refusal = self._resolve_voice(pending, say)
             if say.patient and scheduler.lacks_room(say, now, refusal) and self._count_waiting(pending):
                 waited = await self._await_room(pending, say)
-        now, usual = speech.now(), scheduler.settings.voice
-        refusal = pending.refusal or speech.voices.refusal(say.voice, usual)
-        if not refusal:
-            say = replace(say, voice=speech.voices.resolve(say.voice, usual))
-            refusal = _refuse_pitch(say)
+        now = speech.now()
+        say, refusal = self._resolve_voice(pending, say)
         submitted = scheduler.submit(say, connection.client, now, refusal, pending.canceled_by, waited)
         record = submitted.record
         extra: JsonObject = {"paused": True} if scheduler.paused else {}
@@ -256,6 +253,15 @@ class Requests:
         if ended and (say.wait or say.feedback):
             connection.publish(encode({"event": "result", "goal": goal}))
         speech.apply(submitted.effects)
+
+    def _resolve_voice(self, pending: PendingRequest, say: Say) -> tuple[Say, Refusal | None]:
+        """Return a goal with the id of its voice, and why it is refused, if it is."""
+        voice, refusal = self._speech.voices.look_up(say.voice, self._scheduler.settings.voice)
+        say = replace(say, voice=voice)
+        if say.pitch not in {None, INITIAL.pitch} and is_neural(voice or ""):
+            words = f"the voice {voice} has no pitch but its own: leave the pitch out, or take one of espeak's"
+            refusal = refusal or (Reason.BAD_OPTION, words)
+        return say, pending.refusal or refusal
 
     async def _wait(self, pending: PendingRequest, request: Wait) -> None:
         await self._speech.notifications.wait_done(pending)  # the result must be the last event of a goal
@@ -377,10 +383,10 @@ class Requests:
         speech, scheduler = self._speech, self._scheduler
         if words := bad_option(request):
             raise RequestRefused(words, Reason.BAD_OPTION)
-        if refusal := speech.voices.refusal(request.voice):
-            code, words = refusal
-            raise RequestRefused(words, code)
-        changes = given_values(replace(request, voice=speech.voices.resolve(request.voice)))
+        voice, refusal = speech.voices.look_up(request.voice)
+        if refusal:
+            raise RequestRefused(refusal[1], refusal[0])
+        changes = given_values(replace(request, voice=voice))
         effects = scheduler.change_settings(changes, speech.now())
         self._check_room_soon()  # goals that preempt now may have room
         speech.apply(effects)
@@ -398,14 +404,6 @@ class Requests:
 
 def _unknown_message(*ids: str) -> str:
     return f"no goal {', '.join(map(repr, ids))} is known: see `talk status`"
-
-
-def _refuse_pitch(say: Say) -> Refusal | None:
-    """Return why a goal is refused if it asks for another pitch of a neural voice."""
-    if say.pitch in {None, INITIAL.pitch} or not is_neural(say.voice or ""):
-        return None
-    words = f"the voice {say.voice} has no pitch but its own: leave the pitch out, or take one of espeak's"
-    return Reason.BAD_OPTION, words
 
 
 def _goal_lines(name: str, records: Iterable[Record]) -> Iterator[JsonObject]:

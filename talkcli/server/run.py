@@ -194,10 +194,9 @@ class Server:
         A neural voice is loaded later, so that its problems don't delay speech.
         """
         voices = self.speech.voices
-        voice = voices.resolve(self._settings.goals.voice)
+        voice, refusal = voices.look_up(self._settings.goals.voice)
         if voice is None or not is_neural(voice):
             return voice
-        refusal = voices.refusal(voice)
         if refusal:
             raise UsageError(refusal[1])
         self.speech.apply(self._scheduler.change_settings({"voice": voice}, self.speech.now()))

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 class VoiceCatalog:
     """The voices of a server's engine, and the neural voices whose files are installed.
 
-    `settings_voice` in its methods is the voice that the server speaks with. Its language may mean a neural voice then.
+    `settings_voice` is the voice that the server speaks with. If it is neural, its language means this voice, too.
     """
 
     def __init__(self) -> None:
@@ -29,24 +29,23 @@ class VoiceCatalog:
         #: the driver that speaks; None for the default, until it is known
         self.driver: str | None = None
 
-    def refusal(self, voice: str | None, settings_voice: str | None = None) -> Refusal | None:
-        """Return why a voice can't be had; None if it can or if that isn't known yet."""
-        if self._is_unchecked(voice):
-            return None
-        assert voice
+    def look_up(self, voice: str | None, settings_voice: str | None = None) -> tuple[str | None, Refusal | None]:
+        """Return the voice that a word means, and why it can't be had, if it can't.
+
+        A neural voice is returned by its id, and every other voice as the word itself. A voice is not checked if it is
+        the default, or if the voices are not listed yet.
+        """
+        if not voice or voice == DEFAULT_VOICE or not (self.listed or is_neural(voice)):
+            return voice, None
         found = self._find(voice, settings_voice)
         if found is None:
-            return Reason.UNKNOWN_VOICE, unknown_voice_message(voice, self._candidates(voice), self._foreign_driver)
-        missing = self._missing(found.id) if is_neural(found.id) else None
-        return (Reason.UNKNOWN_VOICE, f"the voice {voice[:60]} cannot be spoken: {missing}") if missing else None
-
-    def resolve(self, voice: str | None, settings_voice: str | None = None) -> str | None:
-        """Return the id of the neural voice that a word means. Return the word itself if it means another voice."""
-        if self._is_unchecked(voice):
-            return voice
-        assert voice
-        found = self._find(voice, settings_voice)
-        return found.id if found and is_neural(found.id) else voice
+            words = unknown_voice_message(voice, self._candidates(voice), self._foreign_driver)
+            return voice, (Reason.UNKNOWN_VOICE, words)
+        if not is_neural(found.id):
+            return voice, None
+        missing = self._missing(found.id)
+        words = f"the voice {voice[:60]} cannot be spoken: {missing}"
+        return found.id, (Reason.UNKNOWN_VOICE, words) if missing else None
 
     def find_new_files(self) -> None:
         """Update the list of neural voices to those that are installed now."""
@@ -64,10 +63,6 @@ class VoiceCatalog:
             return os.path.getsize(models.find_models()[voice.removeprefix(NEURAL_PREFIX)])
         except (KeyError, OSError):  # the engine will report it
             return 0
-
-    def _is_unchecked(self, voice: str | None) -> bool:
-        """Return whether a voice can't be checked: it is the default, or the voices are not listed yet."""
-        return not voice or voice == DEFAULT_VOICE or not (self.listed or is_neural(voice))
 
     def _find(self, voice: str, settings_voice: str | None) -> Voice | None:
         if not (is_neural(voice) or is_neural(settings_voice or "")):
