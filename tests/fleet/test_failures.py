@@ -93,11 +93,14 @@ async def test_a_connection_that_breaks_under_an_answer_is_made_again(
     bridge = Bridge(settings, lambda: settings.broker)
     work = asyncio.create_task(bridge.run())
     await asyncio.wait_for(until(lambda: bridge.ready), PATIENCE)
-    with Asker(broker, "olga") as olga:
+    with Asker(broker, "olga") as olga, Listener(broker, "talk/robot/anna/presence") as listener:
         monkeypatch.setattr(paho.Client, "_sock_send", send)
         olga.send({"seq": 1, "request": "set", "rate": 200})
-        await asyncio.wait_for(until(lambda: not bridge.ready), PATIENCE)
-        await asyncio.wait_for(until(lambda: bridge.ready), PATIENCE)
+        gone = await asyncio.to_thread(listener.await_message, lambda each: not each.json["online"], PATIENCE)
+        # Once the broker has passed on the new presence, it has processed the robot's subscriptions, too.
+        await asyncio.to_thread(
+            listener.await_message, lambda each: each.json["online"] and each.arrived > gone.arrived, PATIENCE
+        )
         olga.send({"seq": 2, "request": "say", "text": "hello"})
         assert (await asyncio.to_thread(olga.reply, 2))["ok"]
     bridge.end()

@@ -42,7 +42,7 @@ _STATUS_EVERY_S = 1.0
 #: published at once, the end of the goal would follow a second later.
 _STATUS_AFTER_CHANGE_S = 0.1
 #: Longest text in the status. The texts of all pending goals are kept for it.
-_MAX_TEXT_CHARS = 1_000
+_MAX_STATUS_TEXT_CHARS = 1_000
 #: The server sends a sign of life every 5 s. After this silence it counts as hung.
 _SERVER_SILENCE_LIMIT_S = 15.0
 #: Longest pause before the first try to find the server again, and before later tries. The pause is random.
@@ -228,7 +228,7 @@ class Publisher:
 
 def _shown_text(goal: Goal | None) -> str | None:
     """Return the beginning of a goal's text, for the status."""
-    return goal.text[:_MAX_TEXT_CHARS] if goal and goal.text else None
+    return goal.text[:_MAX_STATUS_TEXT_CHARS] if goal and goal.text else None
 
 
 def _without_text(goal: Goal) -> Goal:
