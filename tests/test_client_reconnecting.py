@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import socket
@@ -332,11 +333,12 @@ def test_loop_of_the_readme_is_never_late_and_speaks_again(scripted: Talk) -> No
     """The server is stopped for 7 s and killed once, beside the same loop without `talk`."""
     (example,) = [each for each in README.examples("python", "A tour") if "robot.drives" in each]
     programs = [ROBOT.format(loop=example), ROBOT.format(loop="while robot.drives():\n    pass")]
-    with limits():
-        loops = [
-            subprocess.Popen([sys.executable, "-c", each, "14"], env=scripted.env, stdout=subprocess.PIPE)
-            for each in programs
-        ]
+    with limits(), contextlib.ExitStack() as stack:
+        loops = []
+        for each in programs:
+            loop = subprocess.Popen([sys.executable, "-c", each, "14"], env=scripted.env, stdout=subprocess.PIPE)
+            loops.append(stack.enter_context(loop))
+            stack.callback(loop.kill)  # it ends by itself, unless the test fails
         scripted.watcher.wait_for(None, "SUCCEEDED")
         scripted.freeze()
         time.sleep(7)
