@@ -430,7 +430,7 @@ def too_long(request: Say) -> Goal | None:
         raise UsageError(f"'data' is no JSON: {error}") from None
     if len(line) <= MAX_LINE_BYTES:
         return None
-    from talkcli.goals.reasons import Reason  # no start pays for it
+    from talkcli.goals.reasons import Reason  # rarely needed, and slow to import
 
     message = f"Talk rejected: the text has {len(request.text):,} characters, more than a request can hold"
     return Goal("", State.REJECTED, request.text, reason=Reason.TEXT_TOO_LONG.value, message=message)

@@ -9,7 +9,7 @@ waits, tries the other places, and explains what is wrong. A request that could 
 
 from __future__ import annotations
 
-import _socket  # see `peers`
+import _socket  # lighter than `socket`, see `peers`
 import os
 import time
 
@@ -153,7 +153,7 @@ def send_early(
 
 
 def yield_processor(attempt: ConnectionAttempt, timeout: float | None) -> ConnectionAttempt:
-    """Leave the processor to the server for a while, and return the connection with what the server sends meanwhile.
+    """Leave the processor to the server for a moment. Return the connection with the bytes received in that time.
 
     It is for a client that waits for its goal to end and has nothing else to do. Until the first sound, the server, the
     engine, the player and the sound server together take about as much processor time as this process has taken so far,
@@ -175,7 +175,7 @@ def yield_processor(attempt: ConnectionAttempt, timeout: float | None) -> Connec
             received += data
             if not data or any(each in data for each in _REFUSED):
                 break
-    except OSError:  # the time is up, or the connection broke, which the next reader will find
+    except OSError:  # the time is up, or the connection broke, as the next read will show
         pass
     connected.setblocking(False)
     return replace(attempt, received=received)
@@ -343,7 +343,7 @@ def unreachable(attempt: ConnectionAttempt, named: str | None) -> TalkError:
 
 def _named_step(named: str, found: str, *, denied: bool) -> str:
     """Return the next step if only the place that the user named was tried."""
-    import shlex  # it loads `re`
+    import shlex  # slow to import
 
     from talkcli.terminal.text import printable
 

@@ -235,7 +235,7 @@ class TrackedGoal:
 
     def _fail(self, error: TalkError) -> None:
         """End the goal because its `say` failed: as LOST if it may be spoken, otherwise as REJECTED."""
-        from talkcli.goals.reasons import Reason  # no start pays for it
+        from talkcli.goals.reasons import Reason  # rarely needed, and slow to import
 
         if self.goal.state.terminal:
             return
@@ -287,7 +287,7 @@ class TrackedGoal:
 
 def lost(goal: Goal, why: str) -> Goal:
     """Return a goal as LOST."""
-    from talkcli.goals.reasons import Reason  # no start pays for it
+    from talkcli.goals.reasons import Reason  # rarely needed, and slow to import
 
     return replace(goal, state=State.LOST, reason=Reason.LOST.value, message=f"Talk lost: {why}")
 
@@ -312,7 +312,7 @@ def read_greeting(line: bytes, path: str, version: str) -> JsonObject:
         raise ServerUnavailable(f"what answers at {path} is no talk server")
     events.check_greeting(greeting, version)
     if "error" in greeting:
-        from talkcli.terminal.text import printable  # no start pays for it
+        from talkcli.terminal.text import printable  # rarely needed, and slow to import
 
         raise AccessDenied(f"the server refuses: {printable(str(greeting.get('message') or greeting['error']))}")
     return greeting
@@ -530,7 +530,7 @@ class ClientCore:
 
     def refusal(self, reply: JsonObject, items: list[JsonObject]) -> TalkError:
         """Return the error for a reply that is not ok. It gets the lines of the list as its `items`."""
-        from talkcli.terminal.text import printable  # no start pays for it
+        from talkcli.terminal.text import printable  # rarely needed, and slow to import
 
         error = reply.get("error")
         code, message = (error.get("code"), error.get("message")) if isinstance(error, dict) else (None, None)

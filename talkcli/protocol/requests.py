@@ -63,7 +63,7 @@ class Hello:
 
 @frozen
 class Wait:
-    """A subscription to the results of these goals, whoever sent them."""
+    """A request for the results of goals, whoever sent them."""
 
     kind: ClassVar[str] = "wait"
     meaning: ClassVar[str] = "Send the results of these goals, whoever sent them"
@@ -79,7 +79,7 @@ class Wait:
 
 @frozen
 class Status:
-    """A question about the server and its goals, or about one goal."""
+    """A request for the state of the server and its goals, or of one goal."""
 
     kind: ClassVar[str] = "status"
     meaning: ClassVar[str] = "The server, and what it says, will say and said; or one goal"
@@ -89,7 +89,7 @@ class Status:
 
 @frozen
 class Voices:
-    """A question about the engine's voices."""
+    """A request for the list of the engine's voices."""
 
     kind: ClassVar[str] = "voices"
     meaning: ClassVar[str] = "The engine's voices"
@@ -98,7 +98,7 @@ class Voices:
 
 @frozen
 class Watch:
-    """A subscription to the events of all goals, after an overview."""
+    """A request for the state of the server, and then for the events of all goals."""
 
     kind: ClassVar[str] = "watch"
     meaning: ClassVar[str] = "Everything as it is now, and then all that happens to any goal"
@@ -107,7 +107,7 @@ class Watch:
 
 @frozen
 class Log:
-    """A question about the last goals that ended, oldest first."""
+    """A request for the last goals that ended, oldest first."""
 
     kind: ClassVar[str] = "log"
     meaning: ClassVar[str] = "The last goals that ended, REJECTED ones too, oldest first"
@@ -119,7 +119,7 @@ class Log:
 
 @frozen
 class Pause:
-    """A pause of all speech. The answer comes when it is silent."""
+    """A request to pause all speech, which is answered when it is silent."""
 
     kind: ClassVar[str] = "pause"
     meaning: ClassVar[str] = "Hold speech where it is"
@@ -128,7 +128,7 @@ class Pause:
 
 @frozen
 class Resume:
-    """The end of a pause."""
+    """A request to resume speech after a pause."""
 
     kind: ClassVar[str] = "resume"
     meaning: ClassVar[str] = "Go on where speech was held"
