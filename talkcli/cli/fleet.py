@@ -1,4 +1,4 @@
-"""The commands for fleets: `talk bridge`, which a robot runs, and `talk fleet`, which shows all robots."""
+"""The commands for fleets: `talk bridge` connects a robot to a broker, and `talk fleet` shows all robots."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 def bridge(options: CommonOptions, print_unit: str | None, print_acl: bool, **given: Any) -> int:
-    """Run the bridge, or print its systemd unit or the broker's access rules. Return the exit code."""
+    """Run the bridge, or print its systemd unit or the access rules for the broker. Return the exit code."""
     _check_names("--name", [] if given["name"] is None else [given["name"]])
     if print_acl:
         show(topics.access_rules(homeassistant=given["homeassistant"], name=given["name"]))
@@ -73,7 +73,7 @@ def _check_names(option: str, names: Sequence[str]) -> None:
 
 
 def fleet(options: CommonOptions, what: str) -> int | None:
-    """Show the state of the robots, or watch them. Return the exit code, None for 0."""
+    """Show the state of the robots, or watch them. Return the exit code, or None for 0."""
     broker = options.broker()
     text = paths.named_robot(options.robot, options.socket)
     selection = None if text is None else Selection(text)
@@ -99,7 +99,7 @@ def _show_robots(options: CommonOptions, broker: Broker, selection: Selection | 
 
 
 def _no_robot_error(broker: Broker, selection: Selection | None) -> ServerUnavailable:
-    """Return the error for a selection without any robot."""
+    """Return the error for a selection that matches no robot."""
     if selection is None:
         return ServerUnavailable(f"no robot is known at {broker.url}; on each robot: talk bridge --name NAME")
     if selection.group is not None:
@@ -116,7 +116,7 @@ def _watch(options: CommonOptions, broker: Broker, selection: Selection | None) 
     if not has_reader():
         return EXIT_SIGPIPE
     transcript = FleetTranscript(full=screen().width is None)
-    # Without watching the output, a reader that is gone would be noticed only at the next event.
+    # If the output were not watched, a closed pipe would be noticed only at the next event.
     with Interrupts(output=True) as interrupts:
         for event in FleetWatch(broker, selection).events(interrupts.watched):
             _show_event(options, broker, transcript, event)
@@ -124,7 +124,7 @@ def _watch(options: CommonOptions, broker: Broker, selection: Selection | None) 
 
 
 def _show_event(options: CommonOptions, broker: Broker, transcript: FleetTranscript, event: FleetEvent) -> None:
-    """Show an event. Events of the broker itself are shown as notes on standard error."""
+    """Show an event on standard output. A lost or recovered broker is reported on standard error."""
     from talkcli.fleet.desk.watch import BrokerAway, EventsMissed, FleetSnapshot, RobotChanged, RobotEvent
 
     now = time.time()

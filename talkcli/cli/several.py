@@ -1,7 +1,7 @@
 """The commands that `--robot` can send to several robots: say, wait, cancel, status, set, pause and resume.
 
-Each robot's outcome is a line `ROBOT ID STATE CODE`, shown as soon as it is known. The last line counts the robots that
-did as asked. The same commands for one server are in `say`, `wait` and `ask`. Click is not used here.
+Each outcome is shown as a line `ROBOT ID STATE CODE` as soon as it arrives. The last line counts the robots that have
+carried out the request. The same commands for a single server are in `say`, `wait` and `ask`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from talkcli.fleet.desk.several import FleetRequest
     from talkcli.protocol.requests import Request
 
-#: Limits for notes about failures: names in a note, and number of notes. Standard output has all of them.
+#: Limits for the notes about failures: names per note, and notes. Standard output has all failures.
 _MAX_NAMES, _MAX_NOTES = 5, 10
 
 
@@ -42,7 +42,7 @@ def say(
     name: str | None,
     **chosen: Any,
 ) -> int:
-    """Speak a text at each robot, and return the exit code. The arguments are those of `say.say`."""
+    """Speak a text on each robot, and return the exit code. The arguments are those of `say.say`."""
     discard_unread_output()
     sentence = " ".join(text)
     if text == ("-",):
@@ -62,33 +62,33 @@ def say(
 
 
 def wait(options: CommonOptions, ids: tuple[str, ...], timeout: float | None) -> int:
-    """Wait until these goals, or all goals, have ended at each robot. Return the exit code."""
+    """Wait until these goals, or all goals, have ended on each robot. Return the exit code."""
     discard_unread_output()
     return _ask(options, Wait(ids or None), timeout)
 
 
 def cancel(options: CommonOptions, ids: tuple[str, ...], current: bool, before: str | None, key: str | None) -> int:
-    """Cancel the selected goals, or all goals, at each robot. Return the exit code."""
+    """Cancel the selected goals, or all goals, on each robot. Return the exit code."""
     return _ask(options, Cancel(ids or None, current, before, key))
 
 
 def status(options: CommonOptions, goal_id: str | None) -> int:
-    """Show the state of each robot, or of one goal at each robot. Return the exit code."""
+    """Show the state of each robot, or of one goal on each robot. Return the exit code."""
     return _ask(options, Status(goal_id))
 
 
 def change(options: CommonOptions, **settings: Any) -> int:
-    """Change the settings that aren't None at each robot; if all are None, show them. Return the exit code."""
+    """Change the given settings on each robot, or show all settings if none is given. Return the exit code."""
     return _ask(options, Set(**settings))
 
 
 def pause(options: CommonOptions) -> int:
-    """Hold speech at each robot, and return the exit code."""
+    """Pause speech on each robot, and return the exit code."""
     return _ask(options, Pause())
 
 
 def resume(options: CommonOptions) -> int:
-    """Continue held speech at each robot, and return the exit code."""
+    """Resume paused speech on each robot, and return the exit code."""
     return _ask(options, Resume())
 
 
@@ -98,8 +98,8 @@ def _ask(options: CommonOptions, request: Request, timeout: float | None = None,
     Args:
         options: the options of every command.
         request: the request.
-        timeout: seconds for all of it; None for no limit.
-        name: what the sender calls itself.
+        timeout: seconds for the whole command; None for no limit.
+        name: the sender's name.
     """
     owns_goals = isinstance(request, Say) and request.wait
     printer = _OutcomePrinter(options, request)
@@ -131,32 +131,32 @@ def _ask(options: CommonOptions, request: Request, timeout: float | None = None,
 
 
 def _cancel(asked: FleetRequest, interrupts: Interrupts, printer: _OutcomePrinter) -> None:
-    """Cancel the goals that have not ended, and wait a moment for silence."""
+    """Cancel the goals that haven't ended, and wait briefly for silence."""
     interrupts.reset()
     try:
         if asked.unfinished_robots:
             asked.cancel()
         retry_without_output(printer.show_outcomes, asked, CANCEL_TIMEOUT_S)
     except (Interrupted, TimeoutError):
-        pass  # the summary names the robots without an outcome
+        pass  # the summary names the robots that haven't answered
     except TalkError as error:
         note(f"could not be cancelled: {error}")
 
 
 class _OutcomePrinter:
-    """Shows outcomes as they come, and a summary at the end."""
+    """Shows outcomes as they arrive, and a summary at the end."""
 
     def __init__(self, options: CommonOptions, request: Request) -> None:
         self._options, self._request = options, request
-        #: the outcome that counts for each robot: its first failure, or else its last outcome
+        #: the decisive outcome of each robot: its first failure, or its last outcome if it has no failure
         self._outcomes: dict[str, Outcome] = {}
-        #: robots that have more outcomes to come
+        #: robots whose last outcome hasn't arrived
         self._unfinished: set[str] = set()
         shows_count = not options.quiet and sys.stderr is not None and sys.stderr.isatty()
         self._terminal = sys.stderr if shows_count else None
 
     def show_outcomes(self, asked: FleetRequest, timeout: float | None) -> None:
-        """Show all outcomes as they come. The errors are those of `FleetRequest.results`."""
+        """Show all outcomes as they arrive. Raises the same errors as `FleetRequest.results`."""
         try:
             self._show_count(asked)
             for each in asked.results(timeout):
@@ -168,7 +168,7 @@ class _OutcomePrinter:
             self._clear_count()
 
     def _add(self, outcome: Outcome) -> None:
-        # The answer of a robot that seemed to be absent replaces its failure.
+        # If a robot seemed absent but then answers, its answer replaces the failure.
         robot = outcome.robot
         if robot not in self._unfinished or not self._outcomes[robot].exit_code:
             self._outcomes[robot] = outcome
@@ -178,11 +178,11 @@ class _OutcomePrinter:
             self._unfinished.add(robot)
 
     def summarize(self, asked: FleetRequest, unknown: str = "not done") -> int:
-        """Show how many robots did as asked and why others failed. Return the exit code.
+        """Show how many robots carried out the request, and why others failed. Return the exit code.
 
         Args:
             asked: the request.
-            unknown: how to describe robots that have more outcomes to come.
+            unknown: how to describe the robots whose last outcome hasn't arrived.
         """
         failures = [each for each in self._outcomes.values() if each.exit_code]
         done = [robot for robot, each in self._outcomes.items() if not each.exit_code and robot not in self._unfinished]
@@ -208,7 +208,7 @@ class _OutcomePrinter:
             show_if_possible(show, f"{outcome.robot} {goal} {outcome.state} {outcome.exit_code}")
 
     def _show_count(self, asked: FleetRequest) -> None:
-        """Show how many robots are done, if standard error is a terminal."""
+        """Show how many robots have finished, if standard error is a terminal."""
         if self._terminal:
             self._terminal.write(f"\r{len(self._outcomes) - len(self._unfinished)} of {len(asked)}")
             self._terminal.flush()
@@ -220,7 +220,7 @@ class _OutcomePrinter:
 
 
 def _failure_notes(failures: list[Outcome]) -> list[str]:
-    """Return a note for each kind of failure, with names of robots and the reason that one of them gave."""
+    """Return a note for each kind of failure, with the robots' names and the first robot's reason."""
     alike: dict[tuple[str, int], list[Outcome]] = {}
     for each in failures:
         alike.setdefault((each.state, each.exit_code), []).append(each)
@@ -230,13 +230,13 @@ def _failure_notes(failures: list[Outcome]) -> list[str]:
 
 
 def _listed(names: list[str]) -> str:
-    """Return the first few names, and the number of the others."""
+    """Return the first names as text, followed by the number of the remaining ones."""
     more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
     return ", ".join(names[:_MAX_NAMES]) + more
 
 
 def _reason(outcome: Outcome) -> str:
-    """Return the reason for a failure, for people."""
+    """Return a human-readable reason for a failure."""
     if outcome.error is not None:
-        return outcome.error.message.removeprefix(f"{outcome.robot}: ")  # the note names it already
+        return outcome.error.message.removeprefix(f"{outcome.robot}: ")  # the note already names the robot
     return describe_end(outcome.goal) if outcome.goal else outcome.state

@@ -1,7 +1,7 @@
-"""The checks of a fleet's broker and of one robot there: connection, login, access rights, and the robot's answer.
+"""The checks of a fleet's broker and of one robot: connection, login, access rights, and the robot's answer.
 
-The checks are made as an operator, or as the robot itself if its name is the login. They leave nothing behind: messages
-that test the access rights are empty and not retained, and bridges ignore them.
+The checks use the rights of an operator, or those of the robot's bridge if the login is the robot's name. They have no
+side effects, because the messages that test access rights are not retained, and bridges ignore them.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ if TYPE_CHECKING:
 
 _Result = TypeVar("_Result")
 
-#: Time limit of each step. The broker must answer within `LOGIN_LIMIT_S`, but looking up its host may take longer.
+#: Time limit for each check. The broker must answer within `LOGIN_LIMIT_S`, but resolving its host may take longer.
 _STEP_LIMIT_S = 2 * LOGIN_LIMIT_S
-#: Time in which a message must come back after the broker has acknowledged it.
+#: Time limit for a test message to come back after the broker has acknowledged it.
 _ECHO_RETURN_LIMIT_S = 1.0
-#: Content of the message that should come back. It differs from the echoes of a bridge.
+#: Payload of the test message that should come back. It differs from the payload that bridges use for their echoes.
 _ECHO_PAYLOAD = b"doctor"
-#: A certificate that expires within this time should be renewed.
+#: A certificate that expires within this time causes a warning.
 _RENEWAL_LIMIT_S = 14 * 86400
 #: The next step for each reason why the broker can't be reached.
 _NO_ANSWER = "no answer"
@@ -58,20 +58,20 @@ _UNREACHABLE_STEPS = {
     "no such host": "spell the host in TALK_BROKER rightly: getent hosts {host}",
     _NO_ANSWER: "see whether {host} is up, and no firewall is between: ping {host}",
 }
-#: OpenSSL's error codes: certificate not yet valid or expired, and certificate of another host or address.
+#: OpenSSL's error codes for a certificate that is not yet valid or has expired, and for one of another host.
 _DATE_CODES, _HOST_CODES = (9, 10), (62, 64)
 _LOG_STEP = "see what the broker's log says: journalctl -u mosquitto"
 
 
 @frozen
 class BrokerConnection:
-    """The result of connecting to the broker without a login.
+    """The result of a connection to the broker without a login.
 
     Attributes:
-        took: seconds that it took to connect, TLS included.
-        trouble: why the broker can't be reached; None if it can.
-        untrusted: why there is no TLS; None if there is, or should be none.
-        fault: OpenSSL's error code for the certificate; 0 if the certificate is not the reason.
+        took: seconds that it took to connect, including TLS.
+        trouble: why the broker can't be reached, or None if it can.
+        untrusted: why TLS failed; None if it succeeded or is not used.
+        fault: OpenSSL's error code if the certificate was rejected, otherwise 0.
         until: when the certificate expires, in seconds since 1970; None without TLS.
     """
 
@@ -84,13 +84,13 @@ class BrokerConnection:
 
 @frozen
 class AccessRights:
-    """The access rights of the user, as test messages have shown them.
+    """The user's access rights, found out with test messages.
 
     Attributes:
-        presence: the robot's presence; None if the broker has none, or doesn't send it to this user.
-        unwritten: topics on which this user may not publish.
-        unread: topics that this user may not read, because no message came back.
-        trouble: why the rights could not be tested; None if they could.
+        presence: the robot's presence; None if it is unknown to the broker, or if the user may not read it.
+        unwritten: topics to which the user must not publish.
+        unread: topics from which no message came back, so that the user can't read them.
+        trouble: why the rights could not be tested, or None if they could.
     """
 
     presence: Presence | None
@@ -100,7 +100,7 @@ class AccessRights:
 
 
 class BrokerExamination:
-    """The examination of a broker and one robot."""
+    """Checks a broker and one robot for `talk doctor`."""
 
     def __init__(
         self,
@@ -114,12 +114,12 @@ class BrokerExamination:
 
         Args:
             robot: the robot's name.
-            environment: the variables with the broker's settings.
+            environment: the environment variables, which contain the broker's settings.
             insecure: whether a password may be sent without TLS, as in `from_environment`.
-            interrupt: descriptors that end the examination with Interrupted, see `wait_ready`.
+            interrupt: descriptors that interrupt the examination, as in `wait_ready`.
 
         Raises:
-            UsageError: No robot can have this name.
+            UsageError: The robot's name is not allowed.
         """
         fault = topics.name_fault(robot)
         if fault:
@@ -127,14 +127,14 @@ class BrokerExamination:
         self._robot = robot
         self._environment, self._insecure = environment, insecure
         self._interrupt = interrupt
-        #: whether the login is that of the robot's own bridge
+        #: whether the login belongs to the robot's bridge
         self._is_robot = environment.get(USER) == robot
         self._session = os.urandom(8).hex()
         self._inbox: list[Message] = []
 
     @property
     def question(self) -> Question:
-        """The question to answer. It depends on the login: a robot's own login can't send requests to robots."""
+        """The question that the report answers. With a robot's own login, no requests can be sent to robots."""
         return BRIDGE_QUESTION if self._is_robot else ROBOT_QUESTION
 
     def findings(self) -> Iterator[Finding]:
@@ -178,7 +178,7 @@ class BrokerExamination:
             yield self._ask_robot(broker)
 
     def _log_in(self, broker: Broker, on_message: Callable[[Message], None]) -> Link:
-        """Connect to the broker and log in. The errors are those of `Link.open`."""
+        """Connect to the broker and log in. Raises the same errors as `Link.open`."""
         link = Link(broker, f"talk-doctor-{os.urandom(8).hex()}", on_message)
         try:
             self._wait_for(link.open)
@@ -187,7 +187,7 @@ class BrokerExamination:
         return link
 
     def _anonymous_refusal(self, broker: Broker) -> str | None:
-        """Return the reason why the broker refuses a client without credentials; None if it accepts it."""
+        """Return why the broker refuses a client without credentials, or None if it accepts one."""
         try:
             self._log_in(replace(broker, user=None, password=None, cert=None, key=None), lambda _: None).close()
         except TalkError as error:
@@ -195,7 +195,7 @@ class BrokerExamination:
         return None
 
     def _test_rights(self, link: Link, name: str) -> AccessRights:
-        """Test the access rights that an operator needs for this robot, or those that the robot's bridge needs."""
+        """Test the access rights that an operator or the bridge of this robot needs."""
         robot, replies = partial(topics.robot, self._robot), partial(topics.reply, name, self._session)
         if self._is_robot:
             echo = robot(topics.ECHO)
@@ -230,7 +230,7 @@ class BrokerExamination:
         return AccessRights(presence, unwritten, () if is_back or echo in unwritten else (echo,), trouble)
 
     def _known_robots(self, broker: Broker) -> tuple[str, ...]:
-        """Return the names of all robots that the broker knows. If the broker doesn't tell, return none."""
+        """Return the names of all robots that the broker knows, or an empty tuple if they can't be read."""
         try:
             found = self._wait_for(partial(read_robots, broker, LOGIN_LIMIT_S, with_status=False))
             return tuple(each.presence.name for each in found)
@@ -238,7 +238,7 @@ class BrokerExamination:
             return ()
 
     def _ask_robot(self, broker: Broker) -> Finding:
-        """Ask the robot's server for its status."""
+        """Request the status of the robot's server, and return the finding."""
         end = time.monotonic() + _STEP_LIMIT_S
         try:
             connection = connect_robot(
@@ -257,7 +257,7 @@ class BrokerExamination:
         """Run blocking work in a thread, and return its result.
 
         Raises:
-            TimeoutError: The work takes too long. Its thread goes on, and its result is dropped.
+            TimeoutError: The work takes too long. The thread continues, but its result is ignored.
             Interrupted: The examination was interrupted.
         """
         result: Future[_Result] = Future()
@@ -310,10 +310,10 @@ def _trouble(error: OSError) -> str:
 
 
 def judge_settings(words: str, *, named: bool) -> Finding:
-    """Judge settings that don't name a usable broker.
+    """Return the finding for settings that don't name a usable broker.
 
     Args:
-        words: the error, for people.
+        words: the error message.
         named: whether TALK_BROKER is set.
     """
     if not named:
@@ -322,7 +322,7 @@ def judge_settings(words: str, *, named: bool) -> Finding:
 
 
 def judge_connection(broker: Broker, connection: BrokerConnection) -> Finding:
-    """Judge whether the broker can be reached."""
+    """Return the finding about the connection to the broker."""
     if connection.trouble is None:
         return ok("broker", f"{broker.url} takes connections, in {connection.took * 1000:.0f} ms")
     step = _UNREACHABLE_STEPS.get(connection.trouble, _UNREACHABLE_STEPS[_NO_ANSWER])
@@ -330,12 +330,12 @@ def judge_connection(broker: Broker, connection: BrokerConnection) -> Finding:
 
 
 def judge_certificate(broker: Broker, connection: BrokerConnection, now: float, *, near: bool) -> list[Finding]:
-    """Judge the broker's certificate, or the lack of one.
+    """Return the findings about the broker's certificate, or its absence.
 
     Args:
         broker: the broker.
-        connection: a first connection to it.
-        now: seconds since 1970.
+        connection: the result of the first connection to the broker.
+        now: the current time in seconds since 1970.
         near: whether the broker is on this machine.
     """
     check = "certificate"
@@ -358,7 +358,7 @@ def judge_certificate(broker: Broker, connection: BrokerConnection, now: float, 
 
 
 def _trust_step(broker: Broker, connection: BrokerConnection, now: float) -> str:
-    """Return the next step for a certificate that is not trusted, or is missing."""
+    """Return the next step if TLS failed."""
     if connection.fault in _DATE_CODES:
         clock = time.strftime("%Y-%m-%d %H:%M", time.gmtime(now))
         return f"renew the certificate of {broker.host}; or set this machine's clock: it says {clock} UTC"
@@ -373,13 +373,13 @@ def _trust_step(broker: Broker, connection: BrokerConnection, now: float) -> str
 
 
 def judge_login(broker: Broker, refusal: str | None) -> Finding:
-    """Judge the login. If the broker has refused it, `refusal` is the reason."""
+    """Return the finding about the login. `refusal` is the reason if the broker refused it."""
     if refusal is not None:
         wrong, _, remedy = refusal.partition("; ")
         step = _LOG_STEP
         if remedy:
             step = f"log in as somebody whom it knows: {remedy}"
-        elif broker.tls and broker.cert is None:  # the broker's reason may be lost, as it disconnects at once
+        elif broker.tls and broker.cert is None:  # the broker disconnects at once, so its reason may be lost
             step += "; where it wants a certificate, TALK_MQTT_CERT and TALK_MQTT_KEY name it"
         elif not broker.tls:
             step += f"; where port {broker.port} is for TLS: {URL}=mqtts://{broker.host}:{broker.port}"
@@ -390,7 +390,7 @@ def judge_login(broker: Broker, refusal: str | None) -> Finding:
 
 
 def judge_anonymous(refusal: str | None) -> Finding:
-    """Judge a login without credentials. If the broker has refused it, `refusal` is the reason."""
+    """Return the finding about a login without credentials. `refusal` is the reason if the broker refused it."""
     if refusal is not None:
         return ok("anonymous", "who has no credentials is not let in")
     words = "the broker lets in who has no credentials: anybody on the network can make the robots speak"
@@ -398,7 +398,7 @@ def judge_anonymous(refusal: str | None) -> Finding:
 
 
 def judge_presence(presence: Presence, now: float) -> Finding:
-    """Judge the robot's presence."""
+    """Return the finding about the robot's presence."""
     robot = presence.name
     if not presence.online:
         step = f"see on {robot}: systemctl status talk-bridge; it has lost its network, its power, or its bridge"
@@ -416,13 +416,13 @@ def judge_presence(presence: Presence, now: float) -> Finding:
 
 
 def judge_unknown(robot: str, known: tuple[str, ...], name: str, *, may: bool) -> Finding:
-    """Judge a robot whose presence the broker doesn't have or doesn't send.
+    """Return the finding for a robot whose presence the broker doesn't have or doesn't send.
 
     Args:
         robot: the robot's name.
         known: the names of the robots that the broker knows.
-        name: the user who asks.
-        may: whether this user passed the test of all other rights.
+        name: the user's name.
+        may: whether the user has all other rights.
     """
     words = f"the broker knows no robot '{robot}'"
     by_lower = {each.lower(): each for each in known}
@@ -439,9 +439,9 @@ def judge_unknown(robot: str, known: tuple[str, ...], name: str, *, may: bool) -
 
 
 def judge_rights(name: str, rights: AccessRights) -> Finding:
-    """Judge the user's access rights."""
+    """Return the finding about the user's access rights."""
     parts = [f"write {' and '.join(rights.unwritten)}"] if rights.unwritten else []
-    # After a broken connection, a message that has not come back means nothing.
+    # If the connection has broken, a missing message doesn't show that reading is forbidden.
     parts += [f"read {' and '.join(rights.unread)}"] if rights.unread and rights.trouble is None else []
     if parts:
         words = f"the broker does not let '{name}' {', nor '.join(parts)}"
@@ -452,7 +452,7 @@ def judge_rights(name: str, rights: AccessRights) -> Finding:
 
 
 def judge_bridge(robot: str, server: JsonObject, took: float) -> Finding:
-    """Judge the robot's answer, which took so many seconds."""
+    """Return the finding about the robot's answer, which took `took` seconds."""
     words = f"{robot} answers in {took * 1000:.0f} ms: {summarize_server(server)}"
     if server.get("paused") is True:
         return warning("bridge", f"speech is paused; {words}", f"talk --robot {robot} resume")

@@ -1,4 +1,4 @@
-"""The library for a fleet: list its robots, use one robot as a client, or send a request to several at once.
+"""The library's interface to a fleet: list its robots, connect to one, or send a request to several at once.
 
 from talkcli import Fleet
 
@@ -29,29 +29,30 @@ if TYPE_CHECKING:
 
 
 class Fleet:
-    """The robots that use one broker.
+    """A fleet: all robots that are connected to one broker.
 
     The argument `to` of most methods selects robots. It is a robot's name, a glob that matches names (`wh-*`), or a
     group (`@warehouse`). The group `@all` contains every robot.
 
-    These methods return a FleetRequest. Iterate over it to get the robots' outcomes as they come: one from each robot,
-    or one for each goal if the request is about several. The outcome of an offline robot has exit code 3, and the
-    request is not kept for it.
+    These methods return a FleetRequest. Iterating over it yields the outcomes as they arrive: one for each robot, or
+    one for each goal if the request affects several goals. An offline robot has an outcome with exit code 3, and doesn't
+    receive the request later.
 
-    Every request has its own connection to the broker, which ends with the last outcome. To end it earlier, use the
-    FleetRequest in a `with` block or call its `close`. Always exhaust or close it, or the request may not be sent.
+    Each request opens its own connection to the broker, and closes it after the last outcome. To close it earlier, use
+    the FleetRequest in a `with` block or call its `close`. Always exhaust or close the FleetRequest, or the request may
+    not be sent.
 
     Several threads may use the same Fleet. Only one thread may use a FleetRequest.
     """
 
     def __init__(self, broker: str | None = None, *, name: str | None = None, insecure: bool = False) -> None:
-        """Read the settings. No connection is made yet.
+        """Read the settings, without connecting to the broker.
 
         The login and the certificates come from the environment variables TALK_MQTT_*.
 
         Args:
             broker: URL of the broker, mqtts://HOST or mqtt://HOST; default TALK_BROKER.
-            name: what the sender calls itself; default TALK_NAME.
+            name: the sender's name; default TALK_NAME.
             insecure: whether a password may be sent to another machine without TLS.
 
         Raises:
@@ -63,39 +64,39 @@ class Fleet:
         self._name = name
 
     def robots(self) -> list[Presence]:
-        """Return all robots that the broker knows, also those that are offline, sorted by name.
+        """Return all robots that the broker knows, including offline ones, sorted by name.
 
         Raises:
-            ServerUnavailable: There is no broker.
-            AccessDenied: The broker doesn't let this user log in, or ask.
+            ServerUnavailable: The broker can't be reached.
+            AccessDenied: The broker rejected the login, or its access rules don't allow the request.
         """
         from talkcli.fleet.desk.watch import read_robots
 
         return [each.presence for each in read_robots(self._broker, ANSWER_LIMIT_S, with_status=False)]
 
     def robot(self, name: str) -> Client:
-        """Return a client of one robot's server, which is used like a client of a local server.
+        """Return a client that is connected to one robot's server. It works like a client of a local server.
 
         Raises:
-            ServerUnavailable: There is no broker or no such robot, or the robot is offline or has no server.
-            AccessDenied: The broker doesn't let this user log in, or ask.
+            ServerUnavailable: The broker can't be reached, or the robot is unknown, offline or without a server.
+            AccessDenied: The broker rejected the login, or its access rules don't allow the request.
         """
         from talkcli.fleet.desk.robot import connect_robot
 
         return Client.over(connect_robot(name, self._broker, name=self._name))
 
     def say(self, to: str, text: str, *, wait: bool = True, ttl: float | None = None, **options: Any) -> FleetRequest:
-        """Speak a text at each robot. All robots' goals have the same id.
+        """Speak a text on each robot. The goals of all robots have the same id.
 
-        To cancel the goals, call `cancel` of the returned FleetRequest. After its last outcome, use `Fleet.cancel` with
-        the id instead.
+        To cancel the goals, call `cancel` on the returned FleetRequest. After its last outcome, call `Fleet.cancel`
+        with the id instead.
 
         Args:
-            to: the robots.
+            to: the name of a robot, a glob or a group.
             text: the text.
-            wait: whether to wait for the end of each goal. Without it, outcomes tell whether the goal was accepted.
-            ttl: seconds in which each robot must start to speak, 0 for no limit; default 10.
-            options: the other options of `Client.say`, except `follow`.
+            wait: whether to wait until each goal has ended. Otherwise, wait only until each robot has accepted it.
+            ttl: seconds within which each robot must start speaking; 0 for no limit, default 10.
+            options: further options of `Client.say`, except `follow`.
         """
         return self._ask(to, Say(text, wait=wait, ttl=ttl, **options))
 
@@ -108,30 +109,30 @@ class Fleet:
         before: str | None = None,
         key: str | None = None,
     ) -> FleetRequest:
-        """Cancel the goals that the arguments select, as in `Client.cancel`. Without arguments, cancel all goals.
+        """Cancel goals on each robot. The arguments are those of `Client.cancel`; by default, cancel all goals.
 
-        A robot's outcome comes when the robot is silent.
+        A robot's outcome arrives once the robot is silent.
         """
         return self._ask(to, Cancel(None if ids is None else tuple(ids), current, before, key))
 
     def wait(self, to: str, ids: Iterable[str] | None = None) -> FleetRequest:
-        """Wait until these goals have ended. Without ids, wait for all present goals."""
+        """Wait until these goals have ended. By default, wait for all goals that each robot currently has."""
         return self._ask(to, Wait(None if ids is None else tuple(ids)))
 
     def status(self, to: str) -> FleetRequest:
-        """Ask for the status of each robot's server. `said["status"]` of an outcome has all details."""
+        """Request the status of each robot's server. The field `said["status"]` of an outcome has the details."""
         return self._ask(to, Status())
 
     def pause(self, to: str) -> FleetRequest:
-        """Hold speech until `resume`."""
+        """Pause speech on each robot until `resume` is called."""
         return self._ask(to, Pause())
 
     def resume(self, to: str) -> FleetRequest:
-        """Continue held speech."""
+        """Resume paused speech on each robot."""
         return self._ask(to, Resume())
 
     def set(self, to: str, **settings: Any) -> FleetRequest:
-        """Change settings, as in `Client.set`, if the robots' bridges allow it."""
+        """Change settings, as in `Client.set`, on each robot whose bridge allows it."""
         return self._ask(to, Set(**settings))
 
     def _ask(self, to: str, request: Request) -> FleetRequest:

@@ -1,4 +1,4 @@
-"""The robots of a fleet as a table, and what happens to them as lines. Pure.
+"""Output about a fleet: a table of the robots, and lines about events. Pure.
 
 The caller passes the time and the properties of the terminal.
 """
@@ -16,35 +16,35 @@ if TYPE_CHECKING:
 
     from talkcli.protocol.events import Event
 
-    #: The text of a cell, and the state that has the text's colour; None for no colour.
+    #: The text of a cell, and the state whose colour is used; None for no colour.
     Cell = tuple[str, State | None]
 
 COLUMN_NAMES = ("ROBOT", "ONLINE", "SERVER", "SPEAKING", "QUEUE", "LAST", "SINCE")
-#: ColumnWidths to omit, one after the other, if the texts of sentences would have less room than this.
+#: If the column SPEAKING would be narrower than the minimum, these columns are omitted in turn.
 _OPTIONAL_COLUMNS = ("SINCE", "LAST", "SERVER", "QUEUE")
 _MIN_TEXT_CHARS = 12
-#: Width of the texts' column if the output is no terminal. Longer texts are not cut.
+#: Width of the column SPEAKING if the output isn't a terminal. Longer texts are not cut.
 _USUAL_TEXT_CHARS = 40
 _MAX_VERSION_CHARS = 12
-#: The cell for nothing, and for what is not known.
+#: The cell for a value that is missing or unknown.
 _EMPTY_CELL: Cell = ("-", None)
 
 
 @frozen
 class RobotRow:
-    """A robot as the table shows it.
+    """The values that the table shows about a robot.
 
     Attributes:
         name: the robot's name.
         online: whether the robot is online.
-        server: the version of its server; None if it has none.
-        active: the id of the goal that is spoken; None if there is none.
-        text: the goal's text; None if the robot doesn't publish texts.
+        server: the version of the robot's server; None if the robot has no server.
+        active: the id of the active goal; None if there is none.
+        text: the active goal's text; None if the robot doesn't publish texts.
         pending: the number of waiting goals.
         paused: whether speech is paused.
-        last: the state of the goal that ended last; None if unknown.
-        last_at: when that goal ended, in seconds since 1970.
-        since: since when the robot is online, in seconds since 1970.
+        last: the state in which the last goal ended; None if unknown.
+        last_at: when the last goal ended, in seconds since 1970.
+        since: when the robot came online, in seconds since 1970.
     """
 
     name: str
@@ -62,12 +62,12 @@ class RobotRow:
 def robot_lines(robots: Sequence[RobotRow], screen: Screen, now: float) -> list[str]:
     """Return the lines of the table, with a heading.
 
-    To fit a terminal, the texts of sentences are shorten first, then columns are omitted.
+    If a terminal is too narrow, the texts of sentences are shortened first. Then columns are omitted.
 
     Args:
         robots: the rows.
         screen: the properties of the terminal.
-        now: seconds since 1970, to show ages.
+        now: the current time in seconds since 1970, to show ages.
     """
     rows = [_cells(each, screen, now) for each in robots]
     widths = {name: max(map(width, (name, *(cells[name][0] for cells in rows)))) for name in COLUMN_NAMES}
@@ -77,7 +77,7 @@ def robot_lines(robots: Sequence[RobotRow], screen: Screen, now: float) -> list[
 
 
 def _cells(robot: RobotRow, screen: Screen, now: float) -> dict[str, Cell]:
-    """Return the cells of a row, by column."""
+    """Return the cells of a row, by column name."""
     has_server = robot.online and robot.server is not None
     return {
         "ROBOT": (cut(printable(robot.name), max_id_columns(screen)), None),
@@ -113,7 +113,7 @@ def _last_cell(robot: RobotRow, now: float) -> Cell:
 
 
 def _age(seconds: float) -> str:
-    """Return a duration in its largest unit; 0 s if it is negative, because the robot's clock may be ahead."""
+    """Return a duration in its largest unit. It may be negative if the robot's clock is ahead; then return `0 s`."""
     whole = max(0, int(seconds))
     for size, name in ((86400, "d"), (3600, "h"), (60, "min")):
         if whole >= size:
@@ -122,7 +122,7 @@ def _age(seconds: float) -> str:
 
 
 def _fit(widths: dict[str, int], room: int | None) -> None:
-    """Narrow the column of texts, and remove other columns, until a line fits into `room` characters."""
+    """Narrow the column SPEAKING, and remove other columns, until a line fits into `room` characters."""
     longest = widths["SPEAKING"]
     if room is None:
         widths["SPEAKING"] = min(longest, _USUAL_TEXT_CHARS)
@@ -148,18 +148,18 @@ def _line(cells: dict[str, Cell], widths: dict[str, int], screen: Screen) -> str
 
 
 class FleetTranscript:
-    """Turns events of robots into lines, each with the robot's name after the time."""
+    """Formats events of robots as lines. Each line has the time, then the robot's name."""
 
     def __init__(self, *, full: bool) -> None:
-        """Create a transcript; `full` is that of `Transcript`."""
+        """Create a transcript. `full` has the same meaning as for `Transcript`."""
         self._full = full
         self._columns = ColumnWidths()
         self._transcripts: dict[str, Transcript] = {}
 
     def begin(self, robots: Sequence[RobotRow], broker: str, screen: Screen, now: float) -> list[str]:
-        """Return the first line, which counts the robots at this broker."""
+        """Return the first line, which has the number of robots and the broker's URL."""
         for each in robots:
-            self._columns.robot(each.name, screen)  # so that all lines are aligned
+            self._columns.robot(each.name, screen)  # before the first line, so that all lines are aligned
         offline = sum(not each.online for each in robots)
         serverless = sum(each.online and each.server is None for each in robots)
         parts = [f"{len(robots)} robot{'' if len(robots) == 1 else 's'}"]
@@ -168,19 +168,19 @@ class FleetTranscript:
         return [cut(f"{clock_time(now)}{COLUMN_GAP}{', '.join(parts)}; {printable(broker)}", screen.columns_left(0))]
 
     def lines(self, name: str, event: Event, screen: Screen, now: float) -> list[str]:
-        """Return the lines for an event of a robot, see `Transcript.lines`."""
+        """Return the lines for an event of a robot, as `Transcript.lines` does."""
         if name not in self._transcripts:
             self._transcripts[name] = Transcript(full=self._full, words=False, robot=name, widths=self._columns)
         return self._transcripts[name].lines(event, screen, now)
 
     def change(self, before: RobotRow | None, robot: RobotRow, screen: Screen, now: float) -> list[str]:
-        """Return the line for a robot that has come or gone, or whose server has; forget the robot's goals.
+        """Return the line for a robot that has come or gone, or whose server has. Goals seen before are forgotten.
 
         Args:
-            before: the robot before the change; None if it was not known, or had another bridge.
-            robot: the robot now.
+            before: the robot before the change; None if it was unknown or had another bridge.
+            robot: the robot after the change.
             screen: the properties of the terminal.
-            now: seconds since 1970.
+            now: the current time in seconds since 1970.
         """
         self._transcripts.pop(robot.name, None)
         server = "no server" if robot.server is None else f"talk {printable(robot.server, _MAX_VERSION_CHARS)}"

@@ -1,1 +1,1 @@
-"""The operator's side of a fleet: it sends requests to one or more robots through the broker."""
+"""The operator's side of a fleet, which sends requests to robots through the broker."""

@@ -1,6 +1,6 @@
-"""The desk's connection to the broker, which reconnects after every break.
+"""An operator's connection to the broker. It reconnects after every break.
 
-A handler subscribes to topics and processes the messages. Nothing is queued while the broker is unreachable.
+A handler subscribes to topics and processes messages. Requests are not queued while the broker is unreachable.
 """
 
 from __future__ import annotations
@@ -36,25 +36,26 @@ if TYPE_CHECKING:
     from talkcli.fleet.payloads import Message
     from talkcli.protocol.requests import Request
 
-#: A broker or a robot that is absent for this long counts as gone, and open requests as lost. Bridges come back within
-#: 15 s after their broker, and systemd restarts a bridge after two.
+#: Longest absence of a broker or a robot. After it, open requests count as lost. A bridge reconnects within 15 s after
+#: its broker is back, and systemd restarts a bridge after 2 s.
 ABSENCE_LIMIT_S = 30.0
-#: Lifetime of all requests except sentences: nobody waits for a later answer.
+#: The broker discards any request except a sentence after this time, because nobody waits for a later answer.
 _REQUEST_EXPIRY_S = 5
-#: Time allowed for late retained messages: some brokers send them a moment after the others.
+#: How long to wait for more retained messages after the marker. Some brokers send a few of them late.
 RETAINED_GRACE_S = 0.3
-#: Bounds of the pause before the next attempt to connect. It is random, and doubles on average each time.
+#: The pause before an attempt to connect is random. These are its first upper limit, which doubles after each failed
+#: attempt, and the highest value of that limit.
 _FIRST_BROKER_PAUSE_S, _MAX_BROKER_PAUSE_S = 0.5, 10.0
 
 
 class DeskHandler(Protocol):
-    """The receiver of a desk's messages. `DeskLink.poll` calls its methods."""
+    """Interface of an object that processes the messages of a DeskLink. `DeskLink.poll` calls its methods."""
 
     def on_connected(self, link: Link) -> None:
         """Subscribe to topics on a new connection."""
 
     def on_disconnected(self, why: str) -> None:
-        """Called when the connection breaks and whenever an attempt to connect fails."""
+        """Handle a broken connection, or a failed attempt to connect."""
 
     def on_message(self, message: Message) -> None:
         """Process a message from the broker."""
@@ -66,26 +67,26 @@ class DeskLink:
     Only one thread at a time may call `poll`. Any thread may call the other methods.
     """
 
-    #: must be set before the first `poll`
+    #: processes all messages; must be set before the first `poll`
     handler: DeskHandler
 
     def __init__(self, broker: Broker) -> None:
-        """Prepare the connection. `poll` will open it.
+        """Prepare the connection. The first call of `poll` opens it.
 
         Raises:
-            UsageError: The user's name can't be part of a topic.
+            UsageError: The user name can't be part of a topic.
         """
         self.broker, self.user = broker, client_user(broker)
-        #: part of this desk's topics, to tell it from the user's other desks
+        #: random part of the reply topics. It differs from that of the same user's other connections.
         self.session = os.urandom(8).hex()
         #: the current MQTT connection; None while disconnected
         self.link: Link | None = None
-        #: why the last attempt to connect failed, or what the broker refused
+        #: error of the last attempt to connect, or the broker's refusal of the marker
         self.failure: TalkError | None = None
-        #: when the marker came back, which the broker sends after its retained messages; None if it hasn't
+        #: when the marker arrived, which follows the retained messages (monotonic); None before that
         self.marker_at: float | None = None
         self._inbox: deque[Message] = deque()
-        #: refusals that `poll` will report, each with the function to call; the link is locked when they come
+        #: refused requests: each callback with its error. They are called in `poll`, after the link is unlocked.
         self._refusals: deque[tuple[Callable[[TalkError], None], TalkError]] = deque()
         self._opening: LinkOpener | None = None
         self._failed_attempts = 0
@@ -105,11 +106,13 @@ class DeskLink:
         return topics.reply(self.user, self.session, robot)
 
     def poll(self, timeout: float, interrupt: Mapping[int, int] | None = None) -> bool:
-        """Wait until something happens, pass new messages to the handler, and return whether there were any.
+        """Wait for messages, pass them to the handler, and return whether there were any.
+
+        This also connects, reconnects and keeps the connection alive.
 
         Args:
             timeout: seconds to wait at most.
-            interrupt: descriptors that end the wait with Interrupted, see `wait_ready`.
+            interrupt: descriptors that interrupt the wait, as in `wait_ready`.
         """
         link = self.link
         now = time.monotonic()
@@ -120,7 +123,7 @@ class DeskLink:
         wake = self._wake_reader.fileno()
         watched = {wake: select.POLLIN}
         descriptor = -1 if link is None else link.fileno()
-        if link is not None and descriptor >= 0:  # it is -1 if another thread has closed the link
+        if link is not None and descriptor >= 0:  # it is -1 after another thread has closed the link
             watched[descriptor] = select.POLLIN | (select.POLLOUT if link.wants_write else 0)
         ready = wait_ready(watched, min(timeout, due), interrupt)
         if wake in ready:
@@ -143,16 +146,16 @@ class DeskLink:
     def wait_for_retained(
         self, timeout: float, is_enough: Callable[[], bool] = lambda: True, interrupt: Mapping[int, int] | None = None
     ) -> None:
-        """Wait for the broker's retained messages.
+        """Wait until the broker has sent its retained messages.
 
         Args:
             timeout: seconds to wait at most.
-            is_enough: if this returns true, there is no wait for late retained messages.
+            is_enough: returns whether the messages so far are enough, so that late ones are not waited for.
             interrupt: as in `poll`.
 
         Raises:
             ServerUnavailable: The broker can't be reached, or doesn't answer in time.
-            AccessDenied: The broker doesn't let this user log in, or read its own replies.
+            AccessDenied: The broker rejected the login, or doesn't let this user read replies.
         """
         end = time.monotonic() + timeout
         while not (self.retained_received or (self.marker_at is not None and is_enough())):
@@ -166,13 +169,13 @@ class DeskLink:
     def send(
         self, request: Request, number: int, to: str, on_refused: Callable[[TalkError], None], *, is_group: bool = False
     ) -> bool:
-        """Send a request, and return whether that was possible.
+        """Send a request. Return whether it was sent.
 
         Args:
             request: the request.
-            number: the number that answers to the request will have.
+            number: the request's number, which its answers repeat.
             to: the name of a robot, or of a group.
-            on_refused: called with the error if the request is too long, or later if the broker refuses it.
+            on_refused: called with the error, now if the request is too long, or later if the broker refuses it.
             is_group: whether `to` is a group.
         """
         if self.link is None:
@@ -192,13 +195,13 @@ class DeskLink:
         return self.link.publish(topic, line, expiry=expiry, response=response, acknowledged=on_acknowledged)
 
     def end_session(self, to: str, *, is_group: bool = False) -> None:
-        """Tell the bridges of a robot or a group that this desk sends nothing more."""
+        """End this desk's session with the bridge of a robot, or with all bridges of a group."""
         if self.link is not None:
             topic, response = self._topics(to, is_group=is_group)
             self.link.publish(topic, b"", 0, response=response)
 
     def _topics(self, to: str, *, is_group: bool) -> tuple[str, str]:
-        """Return the topics for requests to a robot or a group, and for the replies."""
+        """Return the topic for requests to a robot or a group, and the topic for the replies."""
         topic = topics.group if is_group else topics.robot
         response = topics.reply(self.user, self.session) if is_group else self.reply_topic(to)
         return topic(to, topics.REQUEST, self.user), response
@@ -208,16 +211,16 @@ class DeskLink:
         try:
             self._wake_writer.send(b"\0")
         except OSError:
-            pass  # already awake, or closed
+            pass  # another wake-up is pending, or the sockets are closed
 
     def flush(self, timeout: float) -> None:
-        """Wait until the broker has acknowledged everything that was sent."""
+        """Wait, up to the timeout, until the broker has acknowledged all messages."""
         end = time.monotonic() + timeout
         while self.link is not None and self.link.outstanding_bytes and (left := end - time.monotonic()) > 0:
             self.poll(left)
 
     def close(self) -> None:
-        """Disconnect for good."""
+        """Close the connection permanently."""
         if self._opening is not None:
             self._opening.cancel()
         if self.link is not None:
@@ -225,7 +228,7 @@ class DeskLink:
         self._close_wake_sockets()
 
     def drop(self) -> None:
-        """Close a forked child's copies of the descriptors. The parent's connection goes on."""
+        """Close a forked child's copies of the descriptors. The parent's connection stays open."""
         if self.link is not None:
             self.link.drop()
         self._close_wake_sockets()
@@ -235,7 +238,7 @@ class DeskLink:
 
         Args:
             code: the reason code of the broker's acknowledgement.
-            action: what the user is not allowed to do, for people.
+            action: what the user is not allowed to do, as the message will say it.
         """
         if code == REASON_NOT_AUTHORIZED:
             return self._access_error(action)
@@ -262,14 +265,14 @@ class DeskLink:
             self._end_attempt(self._opening)
             return 0.0
         if self._opening is None and now >= self._next_attempt_at:
-            # A thousand robots may answer at once.
+            # A thousand robots may answer at the same time. By default, the broker would drop some of their messages.
             name = f"talk-desk-{self.user}-{self.session}"
             new = Link(self.broker, name, self._inbox.append, receive_maximum=MAX_RECEIVE_COUNT)
             self._opening = LinkOpener(new, self.wake)
         return TICK_EVERY_S if self._opening else max(0.0, self._next_attempt_at - now)
 
     def _end_attempt(self, opening: LinkOpener) -> None:
-        """Start to use the new connection. If the attempt failed, schedule the next one."""
+        """Use the new connection, or schedule the next attempt if this one has failed."""
         self._opening = None
         if opening.error is not None:
             self._failed_attempts += 1
@@ -283,7 +286,7 @@ class DeskLink:
         self._inbox.clear()
         link.subscribe(self.reply_topic(topics.MARKER), retained=False)
         self.handler.on_connected(link)
-        # The marker comes back after all retained messages.
+        # The broker delivers this message to this desk after the retained messages.
         link.publish(self.reply_topic(topics.MARKER), b"\n", acknowledged=self._on_marker_acknowledged)
 
     def _on_marker_acknowledged(self, code: int) -> None:

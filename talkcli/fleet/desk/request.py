@@ -1,4 +1,4 @@
-"""The robots that a request is for, and its outcome at each of them. Pure."""
+"""The selection of robots for a request, and the outcome on each robot. Pure."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ if TYPE_CHECKING:
     from talkcli.protocol.requests import Request
 
 _GROUP_PREFIX, _WILDCARDS = "@", "*?["
-#: Characters of globs that can match a robot's name.
+#: A glob that matches a robot's name has only these characters.
 _GLOB = re.compile(r"[A-Za-z0-9._*?\[\]!-]+")
 
 
 def selects_several(text: str) -> bool:
-    """Return whether this value of `--robot` is a glob or a group."""
+    """Return whether a value of `--robot` is a glob or a group."""
     return text.startswith(_GROUP_PREFIX) or any(each in text for each in _WILDCARDS)
 
 
 class Selection:
-    """The robots that `--robot` selects: one by its name, all that match a glob, or a group.
+    """The robots that a value of `--robot` selects.
 
     Attributes:
         text: the value of `--robot`: a name, a glob (`*`, `?` and `[abc]`, as in a shell), or `@GROUP`.
-        group: the group's name; None if the value is not a group. All robots are in the group `all`.
+        group: the group's name; None if the value is not a group. Every robot belongs to the group `all`.
         name: the robot's name; None if the value may select several robots.
     """
 
@@ -46,12 +46,12 @@ class Selection:
 
     @property
     def fault(self) -> str | None:
-        """The reason why no robot can match, for people; None if one can."""
+        """The reason why the selection can't match any robot, or None if it can."""
         for kind, name in (("group", self.group), ("robot", self.name)):
             if name is not None:
                 fault = topics.name_fault(name)
                 return fault and f"no {kind} can be called '{name}': a name {fault}"
-        # An unclosed bracket would match a bracket, which no name has.
+        # An unclosed bracket matches only a literal bracket, and no robot's name has one.
         if not _GLOB.fullmatch(self.text) or "[" in re.sub(r"\[!?[^]]+\]", "", self.text):
             return f"the glob '{self.text}' matches no robot's name: it has A-Z a-z 0-9 . _ - with *, ? and [ ] alone"
         return None
@@ -71,18 +71,18 @@ class NoServer(ServerUnavailable):
 
 @frozen
 class Outcome:
-    """The outcome of a request at one robot.
+    """The outcome of a request on one robot.
 
-    A robot has an outcome for each goal of the request, and always at least one.
+    A robot has one outcome for each goal of the request, or a single outcome if the request affects no goals.
 
     Attributes:
         robot: the robot's name.
         state: the name of the goal's state. Without a goal, one of IDLE, PAUSED, RESUMED and SET, or the reason for a
             failure: OFFLINE, NO_SERVER, UNREACHABLE, UNKNOWN (no such goal), REFUSED or LOST.
-        exit_code: 0 if the robot did as requested, else the exit code that `talk` has for this failure.
-        goal: the goal; None if the request was not about one.
-        error: why the request failed; None if it didn't.
-        said: the rest of the server's reply: `status`, `settings` or `paused`; None if there is none.
+        exit_code: 0 if the robot carried out the request, otherwise the exit code of `talk` for the failure.
+        goal: the goal; None if the outcome concerns no goal.
+        error: the error if the request failed, otherwise None.
+        said: the `status`, `settings` or `paused` field of the server's reply; None if the reply has none of them.
         last: whether this is the robot's last outcome.
     """
 
@@ -103,20 +103,20 @@ class Outcome:
 
 
 def failure_outcome(robot: str, error: TalkError, state: str | None = None) -> Outcome:
-    """Return the outcome of a failed request. By default, its state follows from the error."""
+    """Return the outcome of a failed request. By default, the error's class determines the state."""
     states = {UnknownGoal: "UNKNOWN", Lost: State.LOST.name, NoServer: "NO_SERVER", ServerUnavailable: "UNREACHABLE"}
     default = next((name for kind, name in states.items() if isinstance(error, kind)), "REFUSED")
     return Outcome(robot, state or default, error.exit_code, error=error)
 
 
 def reply_outcomes(robot: str, request: Request, reply: JsonObject, items: list[JsonObject]) -> list[Outcome]:
-    """Return the outcomes that a reply stands for.
+    """Return the outcomes that a reply contains.
 
     Args:
         robot: the robot's name.
-        request: the request, which has no goals left to wait for.
+        request: the request. None of its goals has to be waited for any more.
         reply: the server's reply.
-        items: the lines of the reply's list.
+        items: the lines of the list that came before the reply.
     """
     if isinstance(request, Cancel):
         return cancel_outcomes(robot, items) or [Outcome(robot, "IDLE")]
@@ -132,7 +132,7 @@ def reply_outcomes(robot: str, request: Request, reply: JsonObject, items: list[
         state = "PAUSED" if status.server.get("paused") is True else goal.state.name if goal else "IDLE"
         return [Outcome(robot, state, goal=goal, said={"status": status.to_json()})]
     if isinstance(request, Status):
-        goal = Goal.from_json(reply.get("goal"))  # a reply without it is malformed
+        goal = Goal.from_json(reply.get("goal"))  # raises Unreadable if there is no goal
     if goal is None:
         return [Outcome(robot, "IDLE")]
     return [Outcome(robot, goal.state.name, (isinstance(request, Say) and goal.exit_code) or EXIT_OK, goal)]
@@ -143,8 +143,8 @@ def cancel_outcomes(robot: str, items: list[JsonObject], *, last: bool = True) -
 
     Args:
         robot: the robot's name.
-        items: the lines of the answer's list.
-        last: whether the robot has no other outcomes after these.
+        items: the lines of the list that came before the reply.
+        last: whether these are the robot's last outcomes.
     """
     done = Canceled.from_items(items)
     goals = (*done.canceled, *done.ended)

@@ -1,8 +1,8 @@
-"""A desk's connection to one robot's server, through the broker and the robot's bridge.
+"""A connection to one robot's server, through the broker and the robot's bridge.
 
-A broker or a bridge can disappear for a while, and the robot goes on speaking. This connection survives that. When the
-robot is back, open requests are sent again unless that could have a second effect. A goal is first looked up by its id,
-and sent again only if the robot doesn't know it. Listeners to a goal are told what has happened to it in the meantime.
+The robot keeps speaking while its bridge or the broker is away, and this connection survives such an absence. When the
+robot is back, open requests are sent again, except those that could take effect twice. A goal is first looked up by its
+id, and sent again only if the robot doesn't know it. A goal's listeners receive its current state.
 """
 
 from __future__ import annotations
@@ -40,30 +40,27 @@ if TYPE_CHECKING:
 
 #: Interval of the messages that keep the bridge's session alive, which ends after 90 s of silence.
 _KEEP_ALIVE_INTERVAL_S = 30.0
-#: How often a request is sent again at most. The request itself may be what makes the broker disconnect.
+#: How many times a request is sent again. There is a limit because the request itself may break the connection.
 _MAX_RESENDS = 5
-#: Pause between two attempts to connect while `keep_trying` lasts.
+#: Pause between two attempts to connect with `keep_trying`.
 _CONNECT_PAUSE_S = 0.25
-#: Length of the user's name in a new goal id. An id has 64 characters at most.
+#: A new goal id begins with so much of the user's name. An id has 64 characters at most.
 _ID_USER_CHARS = 48
-#: Goals that are looked up at once after an absence. A bridge takes 64 open requests of each client.
+#: Limit for simultaneous lookups of goals after an absence. A bridge accepts 64 open requests from each client.
 _MAX_OPEN_LOOKUPS = 32
 
 
 class RobotExchange(Exchange):
-    """A request and its answer, which may come after an absence of the robot."""
+    """A request to a robot and its answer. It stays open while the robot is absent."""
 
-    #: how often the request was sent again
+    #: how many times the request was sent again
     resends = 0
-    #: the latest `boottime` at which a sentence may be sent; None for no limit
+    #: the time by `boottime` after which a sentence is not sent again; None for no limit
     latest: float | None = None
 
 
 class RobotConnection(Connection):
-    """A connection to a robot's server through the broker.
-
-    It has no thread, except while it connects to the broker.
-    """
+    """A connection to a robot's server through the broker. A thread exists only while connecting to the broker."""
 
     lasting = (Say, Cancel, Set, Pause, Resume)
     exchange_type = RobotExchange
@@ -79,19 +76,19 @@ class RobotConnection(Connection):
         end: float | None = None,
         numbers: Iterator[int] | None = None,
     ) -> None:
-        """Prepare the connection. Requests wait until the robot is known to be online.
+        """Prepare the connection. Requests are held until the robot is known to be online.
 
         Args:
             robot: the robot's name.
             desk: the connection to the broker; its handler passes the robot's messages to `on_message`.
-            name: what the sender calls itself; default TALK_NAME.
-            interrupt: descriptors that end any wait with Interrupted, see `wait_ready`.
+            name: the sender's name; default TALK_NAME.
+            interrupt: descriptors that interrupt any wait, as in `wait_ready`.
             patience: seconds in which the server must answer.
-            end: monotonic time by which every answer must have come, even if the robot is absent; None for no limit.
-            numbers: source of request numbers, shared by all connections of the desk; default one of its own.
+            end: time limit for all answers (monotonic), even if the robot is absent; None for no limit.
+            numbers: source of the request numbers, if several connections share one. By default, this one counts alone.
 
         Raises:
-            UsageError: One of the names is not allowed.
+            UsageError: The robot's or the sender's name is not allowed.
         """
         super().__init__(patience)
         fault = topics.name_fault(robot)
@@ -109,13 +106,13 @@ class RobotConnection(Connection):
         self._published_at = time.monotonic()
         #: the robot's presence as received on the current connection to the broker; empty if unknown
         self._presence: JsonObject = {}
-        #: the session id of the bridge that has the open requests; None if there is none
+        #: session id of the bridge that has received the open requests; None if there is none
         self._bridge_session: object = None
-        #: since when (monotonic) the robot can't be asked; None if it can
+        #: when the robot became absent (monotonic); None while requests can be sent
         self.absent_since = self._published_at
-        #: goals to cancel again after every absence
+        #: ids of the goals to cancel again after each absence
         self._canceled: set[str] = set()
-        #: lookups of goals that are to be sent when others have been answered
+        #: lookups to send when earlier ones have been answered
         self._lookups: deque[Exchange] = deque()
 
     # -- requests
@@ -126,10 +123,10 @@ class RobotConnection(Connection):
             exchange.request = replace(request, id=request.id or new_goal_id(self._desk))
             exchange.latest = boottime() + request.ttl if request.ttl else None
         if not self._publish(exchange):
-            self._desk.wake()  # it will be sent when the robot is back
+            self._desk.wake()  # the request will be sent when the robot is back
 
     def expect_reply(self, exchange: RobotExchange) -> None:
-        """Expect an answer to a request that was sent to the robot's group."""
+        """Wait for the robot's answer to a request that was sent to its group."""
         exchange.sent = True
         self._published_at = time.monotonic()
         self.register(exchange, self._published_at)
@@ -169,7 +166,7 @@ class RobotConnection(Connection):
 
     def answer_by(self, exchange: Exchange) -> float:
         if not isinstance(exchange, RobotExchange):
-            return float("inf")  # a lookup ends with the answer, or is repeated after the next absence
+            return float("inf")  # a lookup needs no limit, because it is repeated after each absence
         if self.absent_since is None:
             by = super().answer_by(exchange)
         else:
@@ -231,7 +228,7 @@ class RobotConnection(Connection):
         try:
             presence = decode(payload.strip())
         except BadRequest:
-            return  # somebody has cleared it
+            return  # the retained message was cleared
         self._presence = presence
         server = presence.get("server")
         if presence.get("online") is not True:
@@ -247,9 +244,9 @@ class RobotConnection(Connection):
     # -- connecting
 
     def wait_online(self, give_up: float) -> None:
-        """Wait until the robot is known. If it is offline, wait for it until `give_up` (monotonic).
+        """Wait for the robot's presence. If the robot is offline, wait for it until `give_up` (monotonic).
 
-        The errors are those of `connect_robot`.
+        Raises the same errors as `connect_robot`.
         """
         left = self._patience if self._end is None else max(0.0, self._end - time.monotonic())
         self._desk.wait_for_retained(min(self._patience, left), lambda: bool(self._presence), self._interrupt)
@@ -262,7 +259,7 @@ class RobotConnection(Connection):
         self.check_online()
 
     def check_online(self) -> None:
-        """Raise ServerUnavailable or ProtocolMismatch if the robot can't take requests now."""
+        """Raise ServerUnavailable or ProtocolMismatch if the robot can't receive requests now."""
         check_greeting(self._presence, __version__)
         if self.absent_since is not None:
             raise ServerUnavailable(f"{self.absence}: nothing was sent")
@@ -284,7 +281,7 @@ class RobotConnection(Connection):
             if exchange.sent and isinstance(exchange.request, Say):
                 self._look_up(exchange, exchange.request, now)
             elif exchange.sent and isinstance(exchange.request, self.lasting):
-                # Sent again, the request could affect newer goals.
+                # If the request were sent again, it could affect newer goals.
                 self.fail(exchange, self._lost(exchange, self.absence))
             else:
                 self._resend(exchange)
@@ -294,7 +291,7 @@ class RobotConnection(Connection):
     def _resend(self, exchange: RobotExchange) -> None:
         """Send a request again, or fail it if its time is over or too many attempts have failed."""
         if exchange.number not in self.exchanges:
-            return  # the sender waits no more, and knows that the goal may be lost
+            return  # the sender has stopped waiting and reported that the goal may be lost
         request = exchange.request
         left = 0.0 if exchange.latest is None else exchange.latest - boottime()
         exchange.resends += 1
@@ -315,7 +312,7 @@ class RobotConnection(Connection):
         return Lost(f"{words}; it may have been carried out")
 
     def _look_up(self, exchange: RobotExchange, request: Say, now: float) -> None:
-        """Look up a goal whose acceptance is not known. If the robot doesn't know the goal, send it again."""
+        """Look up a goal that may have been accepted. If the robot doesn't know the goal, send it again."""
 
         def on_reply(_: JsonObject, items: list[JsonObject]) -> None:
             for each in items:
@@ -337,7 +334,7 @@ class RobotConnection(Connection):
         self._send_lookups(now)
 
     def _send_lookups(self, now: float) -> None:
-        """Send as many lookups as the bridge takes at once."""
+        """Send waiting lookups until the limit for open ones is reached."""
         open_count = sum(not isinstance(each, RobotExchange) for each in self.exchanges.values())
         for _ in range(min(len(self._lookups), _MAX_OPEN_LOOKUPS - open_count)):
             exchange = self._lookups.popleft()
@@ -356,7 +353,7 @@ class RobotConnection(Connection):
     # -- closing
 
     def end_session(self) -> None:
-        """Tell the bridge to end the session of this desk."""
+        """End this desk's session with the robot's bridge."""
         if self._bridge_session is not None:
             self._desk.end_session(self._robot)
 
@@ -377,13 +374,13 @@ def connect_robot(robot: str, broker: Broker, *, keep_trying: float = 0.0, **opt
     Args:
         robot: the robot's name.
         broker: the broker that the robot's bridge uses.
-        keep_trying: seconds in which to try again if the broker can't be reached, and to wait for an offline robot.
-        options: as for `RobotConnection`.
+        keep_trying: seconds for which to retry if the broker can't be reached, and to wait for an offline robot.
+        options: further arguments of `RobotConnection`.
 
     Raises:
-        ServerUnavailable: There is no broker or no such robot, or the robot is offline or has no server.
-        AccessDenied: The broker doesn't let this user in, or its certificate is not trusted.
-        UsageError: A name is not allowed.
+        ServerUnavailable: The broker can't be reached, or the robot is unknown, offline or without a server.
+        AccessDenied: The broker rejected the login, or its certificate is not trusted.
+        UsageError: The robot's or the sender's name is not allowed.
     """
     give_up = time.monotonic() + keep_trying
     while True:
@@ -401,5 +398,5 @@ def connect_robot(robot: str, broker: Broker, *, keep_trying: float = 0.0, **opt
 
 
 def new_goal_id(desk: DeskLink) -> str:
-    """Return a new id for a goal, which differs in form from a server's own ids."""
+    """Return a new goal id. It contains a colon, unlike the ids that servers give."""
     return f"{desk.user[:_ID_USER_CHARS]}:{os.urandom(5).hex()}"

@@ -1,8 +1,8 @@
-"""A request to several robots at once, and its outcome at each of them.
+"""A request to several robots at once, and its outcome on each robot.
 
-Robots that a glob selects are sent one request each. A group is sent a single message, which the broker delivers to all
-its members. The members are known from their presence, or because they answer. An outcome is a success only if the
-robot itself has said so.
+If a glob selects the robots, each robot is sent its own request. If the robots are a group, a single message is sent,
+which the broker delivers to all members. A member is recognized by its presence or by its answer. A request counts as
+successful only if the robot itself has confirmed that.
 """
 
 from __future__ import annotations
@@ -40,21 +40,21 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
     from talkcli.protocol.requests import Request
 
-#: Default of a sentence's ttl. The last robot should not say what was true a minute ago.
+#: Default ttl of a sentence, so that no robot says something that was true a minute ago.
 DEFAULT_TTL_S = 10.0
-#: Interval of the checks for robots that have not answered in time.
+#: Interval of the checks for robots that haven't answered in time.
 _CHECK_INTERVAL_S = 0.25
-#: Messages to process before such a check. They may have arrived while this process was stopped.
+#: How many messages to process before such a check, because they may have arrived while this process was stopped.
 _MAX_MESSAGES_PER_CHECK = 5000
-#: Time for the broker to acknowledge the request if the caller closes it early.
+#: How long `close` waits until the broker has acknowledged the request.
 _FLUSH_LIMIT_S = 1.0
 
 
 class FleetRequest:
-    """A request to several robots. Iterate over it to get the robots' outcomes as they come.
+    """A request to several robots. Iterating over it yields the robots' outcomes as they arrive.
 
-    The connection to the broker ends with the last outcome, with `close`, or at the end of a `with` block. The robots
-    carry the request out in any case. Only one thread may use this object.
+    The connection to the broker is closed after the last outcome, by `close`, or at the end of a `with` block. Closing
+    it doesn't cancel the request. Only one thread may use this object.
     """
 
     def __init__(
@@ -72,32 +72,32 @@ class FleetRequest:
         Args:
             broker: the broker of the fleet.
             selection: the robots.
-            request: the request. It must not name goals by their numbers, which differ from robot to robot.
-            name: what the sender calls itself; default TALK_NAME.
-            interrupt: descriptors that end any wait with Interrupted, see `wait_ready`.
+            request: the request. It must name goals by their ids, because a goal's number differs from robot to robot.
+            name: the sender's name; default TALK_NAME.
+            interrupt: descriptors that interrupt any wait, as in `wait_ready`.
             patience: seconds in which the broker and each robot must answer.
 
         Raises:
             UsageError: The selection or the request is not valid.
             UnknownGoal: The request has an id that no goal can have.
-            ServerUnavailable: There is no broker.
-            AccessDenied: The broker doesn't let this user in, or ask.
+            ServerUnavailable: The broker can't be reached.
+            AccessDenied: The broker rejected the login, or its access rules don't allow the request.
         """
         if selection.fault:
             raise UsageError(selection.fault)
         _check_request(request)
         self._selection, self._name, self._interrupt, self._patience = selection, name, interrupt, patience
-        #: the known robots, by name; some may be too late for the request
+        #: the known robots by name, including those that came online too late for the request
         self._robots: dict[str, RobotRequest] = {}
-        #: names of the robots that have more outcomes to come
+        #: names of the robots whose last outcome hasn't arrived
         self._unfinished: set[str] = set()
         self._outcomes: deque[Outcome] = deque()
         self._numbers = itertools.count(FIRST_NUMBER)
-        #: the number of a request to a group
+        #: the number of the request, if it goes to a group
         self._number = next(self._numbers)
-        #: why the broker has refused the message to the group
+        #: the error if the broker has refused the message to the group
         self._refused: TalkError | None = None
-        #: whether the request was sent; whether all robots are known; whether it was cancelled; whether it is closed
+        #: whether the request has begun, whether all its robots are known, whether it was canceled or closed
         self._began = self._complete = self._canceled = self._closed = False
         self._desk = DeskLink(broker)
         self._desk.handler = self
@@ -106,10 +106,10 @@ class FleetRequest:
                 ttl = DEFAULT_TTL_S if request.ttl is None else request.ttl
                 request = replace(request, id=request.id or new_goal_id(self._desk), ttl=ttl)
             self.request = request
-            #: the goal that every server would make of a text that is too long for a request
+            #: the rejected goal, if the text is too long for any server; such a request is not sent
             self._rejected = too_long(request) if isinstance(request, Say) else None
             self._desk.wait_for_retained(patience, interrupt=interrupt)
-            #: the latest `boottime` at which the sentence may be sent; None for no limit
+            #: the time by `boottime` after which the sentence is not sent again; None for no limit
             self._latest = boottime() + request.ttl if isinstance(request, Say) and request.ttl else None
             self._begin()
         except BaseException:
@@ -126,21 +126,21 @@ class FleetRequest:
         return self.results()
 
     def __len__(self) -> int:
-        """Return the number of selected robots, as far as they are known, including those that can't be asked."""
+        """Return the number of selected robots that are known so far, including offline ones."""
         return sum(each.is_included for each in self._robots.values())
 
     @property
     def unfinished_robots(self) -> list[str]:
-        """The names of the robots that have more outcomes to come, sorted."""
+        """The names of the robots whose last outcome hasn't arrived, sorted."""
         return sorted(self._unfinished)
 
     @property
     def why_disconnected(self) -> str | None:
-        """The reason why nothing can be sent now; None if the broker is connected."""
+        """The reason why nothing can be sent now, or None if the broker is connected."""
         return None if self._desk.link else f"the broker at {self._desk.broker.url} went away"
 
     def results(self, timeout: float | None = None) -> Iterator[Outcome]:
-        """Yield outcomes as they come. After a TimeoutError or Interrupted, call this again for the others.
+        """Yield outcomes as they arrive. After a TimeoutError or Interrupted, call this again for the remaining ones.
 
         Args:
             timeout: seconds for all outcomes; None for no limit.
@@ -149,7 +149,7 @@ class FleetRequest:
             TimeoutError: Not all robots have answered in time.
             Interrupted: One of the `interrupt` descriptors is ready.
             ServerUnavailable: No robot is selected.
-            AccessDenied: The broker doesn't let this user ask the group.
+            AccessDenied: The broker's access rules don't allow requests to the group.
         """
         end = None if timeout is None else time.monotonic() + timeout
         next_check = time.monotonic() + _CHECK_INTERVAL_S
@@ -177,9 +177,9 @@ class FleetRequest:
             raise self._no_robot_error()
 
     def cancel(self) -> None:
-        """Cancel the sentence at every robot where it has not ended, also at absent robots when they come back.
+        """Cancel the sentence on each robot on which it hasn't ended. Absent robots cancel it when they are back.
 
-        The outcomes tell how it ended. Requests other than sentences are not affected.
+        Further outcomes report how the goals ended. Only sentences can be canceled; for other requests, do nothing.
 
         Raises:
             UsageError: All outcomes have been returned. Cancel the goal by its id instead.
@@ -199,7 +199,7 @@ class FleetRequest:
             robot.connection.cancel_permanently(goal_id, is_sent=is_sent)
 
     def close(self) -> None:
-        """End the connection to the broker. The robots carry the request out all the same."""
+        """Close the connection to the broker. The robots still carry out the request."""
         began, self._began, self._closed = self._began, False, True
         if began:
             self._desk.flush(_FLUSH_LIMIT_S)
@@ -227,7 +227,7 @@ class FleetRequest:
         self._refused = error
 
     def _check_all(self) -> None:
-        """Process the messages that have arrived, then fail the robots that have not answered in time."""
+        """Process all messages that have arrived. Then record a failure for each robot that is too late."""
         for _ in range(_MAX_MESSAGES_PER_CHECK):
             if not self._desk.poll(0.0, self._interrupt):
                 break
@@ -235,7 +235,7 @@ class FleetRequest:
             self._update(name, check_time=True)
 
     def _no_robot_error(self) -> TalkError:
-        """Return the error for a selection without any robot."""
+        """Return the error for a selection that matches no robot."""
         selection, url = self._selection, self._desk.broker.url
         if selection.group is not None and self.why_disconnected:
             words = f"{self.request.kind} was sent to the group '{selection.group}', but {self.why_disconnected}"
@@ -253,7 +253,7 @@ class FleetRequest:
 
     def on_disconnected(self, why: str) -> None:
         """Treat all robots as absent."""
-        # No more robots are included, because the broker may be back too late to tell of them.
+        # Later robots are not included, because the broker may be back too late to report them.
         self._complete = self._complete or self._began
         for each in self._robots.values():
             each.connection.on_disconnected(why)
@@ -275,11 +275,11 @@ class FleetRequest:
                 self._on_presence(robot, presence)
 
     def _on_presence(self, robot: RobotRequest, presence: Presence) -> None:
-        """Send the request to a robot that has just become known, if that is possible.
+        """Include a robot in the request when its presence first arrives, and send the request if possible.
 
-        Once the retained messages are there, other robots are ignored: they came online too late. Before that, each
-        member of a group is expected to answer, even if it came online after the request was sent. It can't be told
-        from the others, because some brokers send all retained messages late.
+        After all retained messages have arrived, further robots are ignored, because they came online too late. Before
+        that, every member of a group is expected to answer, even if it came online after the request was sent. Such a
+        member looks like any other one, because some brokers send all retained messages late.
         """
         name = presence.name
         if robot.is_included:
@@ -302,7 +302,7 @@ class FleetRequest:
             self._update(name)
 
     def _on_reply(self, name: str, message: Message) -> None:
-        """Process a robot's lines. A robot that answers a group's request is a member, even if it seemed absent."""
+        """Process a robot's lines. A robot that answers the group's request is a member, even if it seemed absent."""
         if topics.name_fault(name) or not self._began:
             return
         robot = self._robot(name)
@@ -315,7 +315,7 @@ class FleetRequest:
         self._update(name)
 
     def _robot(self, name: str) -> RobotRequest:
-        """Return the RobotRequest of a robot, and create it if the robot is new."""
+        """Return the RobotRequest of a robot. Create it if there is none."""
         if name not in self._robots:
             connection = RobotConnection(
                 name, self._desk, name=self._name, patience=self._patience, numbers=self._numbers
@@ -324,12 +324,12 @@ class FleetRequest:
         return self._robots[name]
 
     def _include(self, robot: RobotRequest, name: str) -> None:
-        """Add a robot to those that the request is for."""
+        """Include a robot in the request."""
         robot.is_included = True
         self._unfinished.add(name)
 
     def _update(self, name: str, *, check_time: bool = False) -> None:
-        """Collect a robot's new outcomes."""
+        """Collect the new outcomes of a robot."""
         if name in self._unfinished:
             self._take(self._robots[name].new_outcomes(check_time=check_time))
 
@@ -345,13 +345,13 @@ class RobotRequest:
         self.connection = connection
         #: the robot's last presence; None if unknown
         self.presence: Presence | None = None
-        #: whether the request is for this robot, and whether it has been sent there
+        #: whether the request includes this robot, and whether it was sent to the robot
         self.is_included = self.was_asked = False
         self._name, self._request = name, request
-        #: whether the answer may take any time
+        #: whether the answer may take any amount of time
         self._slow = isinstance(request, Pause) or (isinstance(request, Say) and request.patient)
         self._outcomes: list[Outcome] = []
-        #: the goals that have not ended, and since when they are waited for
+        #: the goals that haven't been reported as ended, and the start of the wait for them (monotonic)
         self._handles: deque[GoalHandle] = deque()
         self._since = time.monotonic()
 
@@ -365,11 +365,11 @@ class RobotRequest:
             self._on_failure(error)
 
     def expect_reply(self, number: int, latest: float | None) -> None:
-        """Expect an answer to the request that was sent to the robot's group.
+        """Wait for the robot's answer to the request that was sent to its group.
 
         Args:
             number: the number of that request.
-            latest: time by `boottime` after which a sentence must not be sent again; None for no limit.
+            latest: the time by `boottime` after which a sentence is not sent again; None for no limit.
         """
         exchange = RobotExchange(self._request, self._on_reply, self._on_failure, slow=self._slow)
         exchange.number, exchange.latest = number, latest
@@ -377,10 +377,10 @@ class RobotRequest:
         self.was_asked = True
 
     def new_outcomes(self, *, check_time: bool) -> list[Outcome]:
-        """Return the outcomes since the last call.
+        """Return the outcomes that have arrived since the last call.
 
         Args:
-            check_time: whether to fail if the robot has not answered in time.
+            check_time: whether to record a failure if the robot hasn't answered in time.
         """
         self.connection.keep_alive()
         if check_time:
@@ -391,7 +391,7 @@ class RobotRequest:
                 self.connection.end(why)
         while self._handles and (self._handles[0].state.terminal or self._handles[0]._lose()):
             handle = self._handles.popleft()
-            # A wait without ids succeeds however the goals end.
+            # A wait without ids succeeds even if the goals fail.
             any_end = isinstance(self._request, Wait) and self._request.ids is None and handle.state is not State.LOST
             code = EXIT_OK if any_end else handle.goal.exit_code or EXIT_OK
             self._outcomes.append(Outcome(self._name, handle.state.name, code, handle.goal, last=not self._handles))
@@ -399,11 +399,11 @@ class RobotRequest:
         return outcomes
 
     def _on_reply(self, reply: JsonObject, items: list[JsonObject]) -> None:
-        """Follow the goals that have to be waited for. If there are none, the reply has all outcomes."""
+        """Follow the goals that the request waits for. If there are none, the reply has all outcomes."""
         request = self._request
         found: list[Goal] = []
         if isinstance(request, Say):
-            goal = Goal.from_json(reply.get("goal"))  # a reply without it is malformed
+            goal = Goal.from_json(reply.get("goal"))  # raises Unreadable if there is no goal
             found = [goal] if request.wait else []
         elif isinstance(request, Wait):
             found = list(goals(items, "goal"))

@@ -1,7 +1,8 @@
-"""The state of all robots of a fleet: read it once, or watch it change. Nothing is sent to the robots.
+"""The state of all robots of a fleet: `read_robots` reads it once, and FleetWatch watches it change.
 
-After its connection to the broker has broken, a watch compares the retained messages with what it knew before: each
-robot's presence, the goal that it is speaking, and the goal that ended last. It misses goals that ended before that.
+Nothing is sent to the robots. After the connection to the broker has broken, FleetWatch compares the new retained
+messages with the state before. They contain each robot's presence, active goal and last ended goal. If several goals of
+a robot ended during the break, only the last one is reported.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from talkcli.fleet.payloads import Message
     from talkcli.goals.goal import JsonObject
 
-#: Time for bridges to reconnect after the broker has come back. Robots without a presence count as gone after it.
+#: Time for bridges to reconnect after the broker is back. Robots without a presence then count as gone.
 BRIDGES_BACK_LIMIT_S = 15.0
 
 
@@ -42,7 +43,7 @@ class FleetSnapshot:
 
 @frozen
 class RobotChanged:
-    """A robot or its server has come or gone; `before` or `now` is None if the broker doesn't know the robot."""
+    """A robot or its server has come or gone. `before` and `now` are None if the robot was or is unknown."""
 
     name: str
     before: Presence | None
@@ -51,7 +52,7 @@ class RobotChanged:
 
 @frozen
 class RobotEvent:
-    """An event of one robot, and the message it was read from."""
+    """An event of one robot, and the JSON message that it was read from."""
 
     name: str
     event: StateChanged | PausedChanged
@@ -60,7 +61,7 @@ class RobotEvent:
 
 @frozen
 class EventsMissed:
-    """The state of a robot whose events were missed for a while, and those events that its state reveals."""
+    """The state of a robot after some of its events were missed, and the events that can be derived from the state."""
 
     robot: RobotInfo
     events: tuple[StateChanged, ...]
@@ -76,7 +77,7 @@ class BrokerAway:
 
 @frozen
 class BrokerBack:
-    """The broker is connected again, after so many seconds."""
+    """The broker is connected again. `after` is the length of the break in seconds."""
 
     after: float
 
@@ -93,11 +94,11 @@ def read_robots(
         broker: the broker of the fleet.
         timeout: seconds in which the broker must answer.
         name: the only robot to return; None for all.
-        with_status: whether to read the robots' statuses, too.
+        with_status: whether to read the robots' status as well.
 
     Raises:
-        ServerUnavailable: There is no broker, or it doesn't answer in time.
-        AccessDenied: The broker doesn't let this user log in, or ask.
+        ServerUnavailable: The broker can't be reached, or doesn't answer in time.
+        AccessDenied: The broker rejected the login, or its access rules don't allow the request.
     """
     kinds = (topics.PRESENCE, topics.STATUS) if with_status else (topics.PRESENCE,)
     reader = _RetainedReader([topics.robot(name or topics.ANY, each) for each in kinds])
@@ -111,7 +112,7 @@ def read_robots(
 
 
 class _RetainedReader:
-    """A handler that collects messages on some topics."""
+    """A desk handler that collects all messages on some topics."""
 
     def __init__(self, wanted: list[str]) -> None:
         self._wanted = wanted
@@ -121,7 +122,7 @@ class _RetainedReader:
         link.subscribe(*self._wanted, retained=True)
 
     def on_disconnected(self, why: str) -> None:
-        pass  # the desk has it as `failure`
+        pass  # `wait_for_retained` raises the desk's failure
 
     def on_message(self, message: Message) -> None:
         self.messages.append(message)
@@ -142,40 +143,40 @@ def _robots_in(messages: list[Message]) -> list[RobotInfo]:
 
 
 class FleetWatch:
-    """A watch over all robots of a fleet, or over a selection of them. Only one thread may use it."""
+    """Watches all robots of a fleet, or a selection of them. Only one thread may use it."""
 
     def __init__(self, broker: Broker, selection: Selection | None = None) -> None:
-        """Prepare the watch. `events` will connect to the broker.
+        """Prepare the watch. `events` connects to the broker.
 
         Raises:
-            UsageError: The user's name can't be part of a topic.
+            UsageError: The user name can't be part of a topic.
         """
         self._broker, self._selection = broker, selection
         self._desk = DeskLink(broker)
         self._desk.handler = self
         self._events: deque[FleetEvent] = deque()
         self._presences: dict[str, Presence] = {}
-        #: for each robot, the id of the goal that was last reported as ended (True) and as started (False)
+        #: for each robot, the ids of the goals that were last reported as ended (key True) and as started (key False)
         self._reported: dict[str, dict[bool, str]] = {}
-        #: robots that may have spoken while their events were missed; their next status tells
+        #: robots that may have spoken while their events were missed, which their next status shows
         self._unheard: set[str] = set()
-        #: the messages on a new connection, until all retained messages are there; then None
+        #: the first messages on a new connection, until all retained ones have arrived; None after that
         self._retained: list[Message] | None = None
         self._began = False
-        #: since when (monotonic) there is no broker, and why; None if it is connected
+        #: since when the broker has been disconnected (monotonic), and why; None while it is connected
         self._away_since: float | None = time.monotonic()
         self._away_why = ""
-        #: robots that have not come back with the broker, and how long to wait for them (monotonic)
+        #: robots that haven't come back with the broker, each with the time limit (monotonic)
         self._missing: dict[str, float] = {}
 
     def events(self, interrupt: Mapping[int, int] | None = None) -> Iterator[FleetEvent]:
-        """Yield events, beginning with a FleetSnapshot, until one of the `interrupt` descriptors ends it.
+        """Yield events, starting with a FleetSnapshot, until one of the `interrupt` descriptors is ready.
 
         Raises:
             Interrupted: One of the descriptors is ready, see `wait_ready`.
-            ServerUnavailable: There is no broker when the watch starts.
-            AccessDenied: The broker doesn't let this user log in, or ask.
-            Lost: The broker was away for too long later on.
+            ServerUnavailable: The broker can't be reached when the watch starts.
+            AccessDenied: The broker rejected the login, or its access rules don't allow the request.
+            Lost: The broker was lost later, and was not back in time.
         """
         try:
             while True:
@@ -190,7 +191,7 @@ class FleetWatch:
     # -- messages from the broker
 
     def on_connected(self, link: Link) -> None:
-        """Subscribe to the retained messages, and to events."""
+        """Subscribe to presence, status and events."""
         self._retained = []
         robot = (self._selection and self._selection.name) or topics.ANY
         link.subscribe(topics.robot(robot, topics.EVENT, topics.ANY), retained=False)
@@ -211,11 +212,11 @@ class FleetWatch:
         _, _, name, kind, *_ = message.topic.split("/")
         if kind == topics.PRESENCE:
             presence = Presence.read(name, message.payload)
-            if presence or not message.payload:  # else malformed
+            if presence or not message.payload:  # malformed messages are ignored
                 self._missing.pop(name, None)
                 self._set_presence(name, presence if presence and self._selects(presence) else None)
         elif kind == topics.STATUS:
-            if name in self._unheard:  # otherwise its events say more
+            if name in self._unheard:  # otherwise its events have more details
                 self._report_missed(name, RobotStatus.read(message.payload))
         elif (event := _read_event(message)) is not None:
             self._report(event)
@@ -226,7 +227,7 @@ class FleetWatch:
     # -- time limits
 
     def _check_limits(self, now: float) -> None:
-        """Do everything that is due."""
+        """Handle every time limit that has passed."""
         if self._retained is not None and self._desk.retained_received:
             self._process_retained(self._retained, now)
         if not self._began and self._desk.failure:
@@ -242,7 +243,7 @@ class FleetWatch:
             self._set_presence(name, None)
 
     def _until_next_limit(self, now: float) -> float:
-        """Return the seconds until `_check_limits` has something to do."""
+        """Return the seconds until the next time limit that `_check_limits` handles."""
         limits = list(self._missing.values())
         if self._away_since is not None:
             limits.append(self._away_since + (ABSENCE_LIMIT_S if self._began else ANSWER_LIMIT_S))
@@ -251,7 +252,7 @@ class FleetWatch:
     # -- changes
 
     def _process_retained(self, messages: list[Message], now: float) -> None:
-        """Report the first snapshot, or the changes since the connection broke."""
+        """Report the first snapshot, or the changes during a break of the connection."""
         self._retained = None
         robots = {each.presence.name: each for each in _robots_in(messages) if self._selects(each.presence)}
         events = [event for each in messages if (event := _read_event(each))]
@@ -284,12 +285,12 @@ class FleetWatch:
             self._events.append(RobotChanged(name, before, now))
 
     def _report_missed(self, name: str, status: RobotStatus | None, coming: Container[str | None] = ()) -> None:
-        """Report the events that a robot's status reveals, if they were missed.
+        """Report the missed events that can be derived from a robot's status.
 
         Args:
             name: the robot's name.
-            status: its status; None if unknown.
-            coming: ids of goals whose events have been received and will be reported next.
+            status: the robot's status; None if unknown.
+            coming: ids of goals whose events have arrived and will be reported next.
         """
         if status is None:
             return
@@ -313,7 +314,7 @@ class FleetWatch:
 
 
 def _read_event(message: Message) -> RobotEvent | None:
-    """Return the event in a message; None if it is something else, malformed, or of an unknown kind."""
+    """Return the event in a message. Return None for any other message, and if the event is malformed or unknown."""
     _, _, name, kind, *_ = message.topic.split("/")
     if kind != topics.EVENT or topics.name_fault(name):
         return None
@@ -326,7 +327,7 @@ def _read_event(message: Message) -> RobotEvent | None:
 
 
 def _identity(presence: Presence | None) -> tuple[object, ...]:
-    """Return a value that differs if a robot has come or gone, or has another bridge or server."""
+    """Return a value that changes when the robot comes or goes, or when its bridge or server is replaced."""
     if presence is None or not presence.online:
         return (False,)
     return True, presence.session, presence.server and presence.server.get("boot")
