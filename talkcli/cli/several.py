@@ -148,7 +148,7 @@ class _OutcomePrinter:
 
     def __init__(self, options: CommonOptions, request: Request) -> None:
         self._options, self._request = options, request
-        #: the decisive outcome of each robot: its first failure, or its last outcome if it has no failure
+        #: the first failure of each robot, or its last outcome if nothing has failed
         self._outcomes: dict[str, Outcome] = {}
         #: robots whose last outcome hasn't arrived
         self._unfinished: set[str] = set()
@@ -230,7 +230,7 @@ def _failure_notes(failures: list[Outcome]) -> list[str]:
 
 
 def _listed(names: list[str]) -> str:
-    """Return the first names as text, followed by the number of the remaining ones."""
+    """Return the first few names, and the number of the remaining ones, as text."""
     more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
     return ", ".join(names[:_MAX_NAMES]) + more
 

@@ -35,8 +35,8 @@ class Fleet:
     group (`@warehouse`). The group `@all` contains every robot.
 
     These methods return a FleetRequest. Iterating over it yields the outcomes as they arrive: one for each robot, or
-    one for each goal if the request affects several goals. An offline robot has an outcome with exit code 3, and doesn't
-    receive the request later.
+    one for each goal if the request affects several goals. The outcome of an offline robot has exit code 3. The robot
+    doesn't receive the request later.
 
     Each request opens its own connection to the broker, and closes it after the last outcome. To close it earlier, use
     the FleetRequest in a `with` block or call its `close`. Always exhaust or close the FleetRequest, or the request may

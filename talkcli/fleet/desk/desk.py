@@ -150,7 +150,8 @@ class DeskLink:
 
         Args:
             timeout: seconds to wait at most.
-            is_enough: returns whether the messages so far are enough, so that late ones are not waited for.
+            is_enough: function that returns whether to stop as soon as the marker has arrived, without waiting for late
+                messages.
             interrupt: as in `poll`.
 
         Raises:
@@ -175,7 +176,8 @@ class DeskLink:
             request: the request.
             number: the request's number, which its answers repeat.
             to: the name of a robot, or of a group.
-            on_refused: called with the error, now if the request is too long, or later if the broker refuses it.
+            on_refused: called with the error. A request that is too long is refused at once, and the broker may refuse
+                any request later.
             is_group: whether `to` is a group.
         """
         if self.link is None:
@@ -238,7 +240,7 @@ class DeskLink:
 
         Args:
             code: the reason code of the broker's acknowledgement.
-            action: what the user is not allowed to do, as the message will say it.
+            action: the forbidden action, as it appears in the message.
         """
         if code == REASON_NOT_AUTHORIZED:
             return self._access_error(action)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from talkcli.protocol.requests import Request
 
 _GROUP_PREFIX, _WILDCARDS = "@", "*?["
-#: A glob that matches a robot's name has only these characters.
+#: Globs that consist of valid characters. Other globs can't match a robot's name.
 _GLOB = re.compile(r"[A-Za-z0-9._*?\[\]!-]+")
 
 
@@ -114,7 +114,7 @@ def reply_outcomes(robot: str, request: Request, reply: JsonObject, items: list[
 
     Args:
         robot: the robot's name.
-        request: the request. None of its goals has to be waited for any more.
+        request: the request. If it waits for goals, they have ended.
         reply: the server's reply.
         items: the lines of the list that came before the reply.
     """

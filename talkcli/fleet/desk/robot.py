@@ -40,11 +40,11 @@ if TYPE_CHECKING:
 
 #: Interval of the messages that keep the bridge's session alive, which ends after 90 s of silence.
 _KEEP_ALIVE_INTERVAL_S = 30.0
-#: How many times a request is sent again. There is a limit because the request itself may break the connection.
+#: How many times a request is sent again at most, because the request itself may be what breaks the connection.
 _MAX_RESENDS = 5
 #: Pause between two attempts to connect with `keep_trying`.
 _CONNECT_PAUSE_S = 0.25
-#: A new goal id begins with so much of the user's name. An id has 64 characters at most.
+#: Maximum length of the user name at the start of a new goal id. An id has 64 characters at most.
 _ID_USER_CHARS = 48
 #: Limit for simultaneous lookups of goals after an absence. A bridge accepts 64 open requests from each client.
 _MAX_OPEN_LOOKUPS = 32
@@ -60,7 +60,7 @@ class RobotExchange(Exchange):
 
 
 class RobotConnection(Connection):
-    """A connection to a robot's server through the broker. A thread exists only while connecting to the broker."""
+    """A connection to a robot's server through the broker. It uses a thread only to connect to the broker."""
 
     lasting = (Say, Cancel, Set, Pause, Resume)
     exchange_type = RobotExchange
@@ -85,7 +85,7 @@ class RobotConnection(Connection):
             interrupt: descriptors that interrupt any wait, as in `wait_ready`.
             patience: seconds in which the server must answer.
             end: time limit for all answers (monotonic), even if the robot is absent; None for no limit.
-            numbers: source of the request numbers, if several connections share one. By default, this one counts alone.
+            numbers: source of request numbers that several connections share; default one of its own.
 
         Raises:
             UsageError: The robot's or the sender's name is not allowed.
@@ -144,13 +144,13 @@ class RobotConnection(Connection):
                 self._post(Cancel((goal_id,)))
 
     def _post(self, request: Request) -> bool:
-        """Send a request and ignore its answer. Return whether it could be sent."""
+        """Send a request if possible, and ignore its answer. Return whether it was sent."""
         exchange = RobotExchange(request)
         exchange.number = next(self._numbers)
         return self._publish(exchange)
 
     def _publish(self, exchange: Exchange) -> bool:
-        """Send a request to the robot, and return whether that was possible."""
+        """Send a request to the robot if possible. Return whether it was sent."""
 
         def on_refused(error: TalkError) -> None:
             with self.changed:

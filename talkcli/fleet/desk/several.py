@@ -97,8 +97,11 @@ class FleetRequest:
         self._number = next(self._numbers)
         #: the error if the broker has refused the message to the group
         self._refused: TalkError | None = None
-        #: whether the request has begun, whether all its robots are known, whether it was canceled or closed
-        self._began = self._complete = self._canceled = self._closed = False
+        #: whether the request was sent and is not closed yet
+        self._began = False
+        #: whether all robots are known, so that later ones are ignored
+        self._complete = False
+        self._canceled = self._closed = False
         self._desk = DeskLink(broker)
         self._desk.handler = self
         try:
@@ -345,7 +348,7 @@ class RobotRequest:
         self.connection = connection
         #: the robot's last presence; None if unknown
         self.presence: Presence | None = None
-        #: whether the request includes this robot, and whether it was sent to the robot
+        #: whether the request is for this robot, and whether it was sent to the robot
         self.is_included = self.was_asked = False
         self._name, self._request = name, request
         #: whether the answer may take any amount of time

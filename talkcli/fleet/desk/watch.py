@@ -1,8 +1,8 @@
 """The state of all robots of a fleet: `read_robots` reads it once, and FleetWatch watches it change.
 
-Nothing is sent to the robots. After the connection to the broker has broken, FleetWatch compares the new retained
-messages with the state before. They contain each robot's presence, active goal and last ended goal. If several goals of
-a robot ended during the break, only the last one is reported.
+Nothing is sent to the robots. After a break of the connection to the broker, FleetWatch compares the retained messages
+with the state before the break. They contain each robot's presence, active goal and last ended goal. If several goals
+of a robot ended during the break, only the last one is reported.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class RobotEvent:
 
 @frozen
 class EventsMissed:
-    """The state of a robot after some of its events were missed, and the events that can be derived from the state."""
+    """The state of a robot whose events were missed for a while, with the events that can be derived from the state."""
 
     robot: RobotInfo
     events: tuple[StateChanged, ...]
