@@ -37,22 +37,19 @@ __all__ = [
 ]
 
 
+#: The modules of the names that are not in `protocol.events`.
+_MODULES = {
+    "Client": "client.client",
+    "Fleet": "fleet.api",
+    "Goal": "goals.goal",
+    "GoalHandle": "client.client",
+    "Outcome": "fleet.desk.request",
+    "Presence": "fleet.payloads",
+    "State": "goals.states",
+}
+
+
 def __getattr__(name: str) -> object:
-    if name in {"Client", "GoalHandle"}:
-        from talkcli.client import client
-
-        return getattr(client, name)
-    if name in {"Fleet", "Outcome", "Presence"}:
-        from talkcli.fleet import api, payloads
-        from talkcli.fleet.desk import request
-
-        return {"Fleet": api.Fleet, "Outcome": request.Outcome, "Presence": payloads.Presence}[name]
-    if name in {"Goal", "State"}:
-        from talkcli.goals import goal
-
-        return getattr(goal, name)
-    if name in __all__:
-        from talkcli.protocol import events
-
-        return getattr(events, name)
-    raise AttributeError(f"module 'talkcli' has no attribute {name!r}")
+    if name not in __all__:
+        raise AttributeError(f"module 'talkcli' has no attribute {name!r}")
+    return getattr(__import__(f"talkcli.{_MODULES.get(name, 'protocol.events')}", fromlist=[name]), name)

@@ -15,15 +15,7 @@ import click
 from click.core import ParameterSource
 
 from talkcli import __version__
-from talkcli.cli.command import (
-    ALL_EXIT_CODES,
-    COMMON_OPTIONS,
-    OUTPUT_FILE,
-    nearest,
-    range_help,
-    read_value,
-    spelling,
-)
+from talkcli.cli.command import ALL_EXIT_CODES, COMMON_OPTIONS, OUTPUT_FILE, nearest, range_help, read_value, spelling
 from talkcli.cli.commands import COMMANDS
 from talkcli.cli.show import CommonOptions, note, run_command, show_error, write_error_line
 from talkcli.errors import EXIT_ERROR, UsageError
@@ -116,13 +108,12 @@ def _click_argument(argument: Option) -> click.Argument:
 
 
 def _completer(name: str) -> Callable[..., list[CompletionItem]] | None:
-    """Return the function of this name in `completion`, which is only imported when called. None for an empty name."""
+    """Return a function for click that calls the completer of this name; None for an empty name."""
 
-    def complete(*arguments: Any) -> list[CompletionItem]:
+    def complete(context: click.Context, _: click.Parameter, incomplete: str) -> list[CompletionItem]:
         from talkcli.cli import completion
 
-        found: list[CompletionItem] = getattr(completion, name)(*arguments)
-        return found
+        return completion.complete(name, context.find_root().obj, incomplete)
 
     return complete if name else None
 
@@ -297,9 +288,8 @@ def _run_group(arguments: list[str], options: CommonOptions) -> object:
 
 def _complete_for_shell(options: CommonOptions) -> int:
     """Print the completions for a shell, and nothing else."""
-    from talkcli.cli import completion
+    from talkcli.cli import completion  # noqa: F401 - this tells click about our classes for the shells
 
-    completion.register()
     try:
         talk.main([], prog_name="talk", standalone_mode=False, obj=options)  # exits after completing
     except Exception:

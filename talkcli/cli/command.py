@@ -104,24 +104,31 @@ class Command:
             typed: the names of the options on the command line.
             common: the values of the common options on the command line, by name.
         """
-        robot, connect_timeout = common.get("robot"), common.get("connect_timeout")
+        robot = common.get("robot")
         if robot is not None and common.get("socket"):
             return "--robot is a robot of a fleet, --socket a server of this machine: leave out one of them"
-        fault = self._connection_fault(given, robot, connect_timeout)
-        refusals = (words for each in self.options if (words := each.value_error(given[each.name])))
-        return fault or next(refusals, None) or (self.rule(given, typed) if self.rule else None)
+        if fault := self._connection_fault(given, robot, common.get("connect_timeout")):
+            return fault
+        for each in self.options:
+            if fault := each.value_error(given[each.name]):
+                return fault
+        return self.rule(given, typed) if self.rule else None
+
+    def _is_local(self, given: Mapping[str, Any]) -> bool:
+        """Return whether the command needs no server."""
+        return not self.uses_server or given.get("output") is not None
 
     def _connection_fault(
         self, given: Mapping[str, Any], robot: str | None, connect_timeout: float | None
     ) -> str | None:
         """Return what is wrong with naming a robot or waiting for a server, or None."""
-        is_local, is_several = not self.uses_server or given.get("output") is not None, False
+        local_name = f"{self.name}{' --output' * (given.get('output') is not None)}"
+        is_several = False
         if robot is not None:
             from talkcli.fleet.desk.request import Selection, selects_several
 
-            if is_local:
-                what = f"{self.name} --output" if self.uses_server else self.name
-                return f"'talk {what}' is of this machine alone: leave out --robot"
+            if self._is_local(given):
+                return f"'talk {local_name}' is of this machine alone: leave out --robot"
             is_several = selects_several(robot)
             single = [f"--{each}" for each in _SINGLE_ROBOT_OPTIONS if given.get(each)]
             if is_several and (single or not self.fleet_function):
@@ -133,17 +140,15 @@ class Command:
                 return fault
         if connect_timeout is None:
             return None
-        if is_local or not self.connects:
-            what = f"{self.name}{' --output' * (given.get('output') is not None)}"
-            return f"'talk {what}' does not wait for a server: leave out --connect-timeout"
+        if self._is_local(given) or not self.connects:
+            return f"'talk {local_name}' does not wait for a server: leave out --connect-timeout"
         return "--connect-timeout waits for one robot: name it, or leave out --connect-timeout" if is_several else None
 
     def run(self, options: CommonOptions, given: Mapping[str, Any]) -> int | None:
         """Run the command with the given values, and return its exit code, or None for 0."""
         options.urgent = self.urgent
         function = self.function
-        is_local = not self.uses_server or given.get("output") is not None
-        robot = None if is_local else named_robot(options.robot, options.socket)
+        robot = None if self._is_local(given) else named_robot(options.robot, options.socket)
         if robot:
             # The robot can also come from the environment, so it is checked again.
             if fault := self._connection_fault(given, robot, options.connect_timeout):

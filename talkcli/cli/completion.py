@@ -7,6 +7,9 @@ The scripts and their output format are our own, on top of click's classes. clic
 shell has split. bash also splits at `:` and `=`, which ids may contain, and values with a space, a comma, a quote or a
 `*` don't survive the way back. Here the shell sends the line up to the cursor as it was typed, and gets back quoted
 values that start where it inserts them. The scripts are files in this directory, which `talk completion` prints.
+
+An option or an argument names its completer in its row. A completer is a function of this module that takes the common
+options and the incomplete word, and returns the values to choose from, each with its help.
 """
 
 from __future__ import annotations
@@ -14,7 +17,7 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import click
 from click.shell_completion import CompletionItem, ShellComplete, add_completion_class, split_arg_string
@@ -22,20 +25,19 @@ from click.shell_completion import CompletionItem, ShellComplete, add_completion
 from talkcli.cli.show import show
 from talkcli.errors import TalkError
 from talkcli.goals.options import is_neural
-from talkcli.protocol.events import ServerStatus, unfinished
+from talkcli.protocol.events import unfinished
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Iterable
     from typing import ClassVar
 
     from talkcli.cli.show import CommonOptions
-    from talkcli.client.client import Client
     from talkcli.goals.goal import Goal, JsonObject
+    from talkcli.protocol.events import ServerStatus
 
-    Items = list[CompletionItem[str]]
-
-_Answer = TypeVar("_Answer")
+    #: Values that a shell may offer, each with its help.
+    Offers = list[tuple[str, str]]
 
 #: How long the server may take to answer, because a person has pressed a key and is waiting.
 COMPLETION_TIMEOUT_S = 0.5
@@ -43,9 +45,6 @@ COMPLETION_TIMEOUT_S = 0.5
 _MAX_ENDED_GOALS = 100
 #: Longer texts are cut in the help of a value.
 _HELP_TEXT_CHARS = 60
-#: Used if no server answers.
-_NO_STATUS = ServerStatus({}, None, (), ())
-
 #: Characters that bash needs escaped. Letters and digits of all scripts can stay as they are.
 _BASH_SPECIAL = re.compile(r"[^\w@%+=:,./-]")
 
@@ -73,10 +72,11 @@ class _LineCompletion(ShellComplete):
         return "file" if item.type == "file" else self.line(item.value, item.help)
 
     def line(self, value: str, words: str | None) -> str:  # noqa: ARG002
-        """Return the line for a value: its kind and the text to insert. `words` is its help."""
+        """Return the line that tells the shell to offer a value. `words` is the value's help."""
         return f"plain,{value}"
 
 
+@add_completion_class
 class BashCompletion(_LineCompletion):
     """Completion for bash, which replaces the text in COMP_CWORD and doesn't quote."""
 
@@ -93,6 +93,7 @@ class BashCompletion(_LineCompletion):
         return f"plain,{_quote_for_bash(_with_flag(value, typed).removeprefix(kept), quote)}"
 
 
+@add_completion_class
 class ZshCompletion(_LineCompletion):
     """Completion for zsh, which quotes by itself and takes help after a colon."""
 
@@ -107,6 +108,7 @@ class ZshCompletion(_LineCompletion):
         return f"described,{value}:{words}"
 
 
+@add_completion_class
 class FishCompletion(_LineCompletion):
     """Completion for fish, which quotes by itself and takes help after a tab."""
 
@@ -118,21 +120,12 @@ class FishCompletion(_LineCompletion):
         return f"plain,{_with_flag(value, typed)}" + (f"\t{words}" if words else "")
 
 
-SHELL_COMPLETIONS: dict[str, type[ShellComplete]] = {
-    each.name: each for each in (BashCompletion, ZshCompletion, FishCompletion)
-}
-
-
 def completion(_: CommonOptions, shell: str) -> None:
     """Print the completion script of a shell."""
+    shell_class = click.shell_completion.get_completion_class(shell)
+    assert shell_class
     talk = click.get_current_context().find_root().command
-    show(SHELL_COMPLETIONS[shell](talk, {}, "talk", "_TALK_COMPLETE").source().rstrip("\n"))
-
-
-def register() -> None:
-    """Make click use these classes."""
-    for each in SHELL_COMPLETIONS.values():
-        add_completion_class(each)
+    show(shell_class(talk, {}, "talk", "_TALK_COMPLETE").source().rstrip("\n"))
 
 
 def _last_word(line: str) -> tuple[str, str]:
@@ -155,14 +148,14 @@ def _last_word(line: str) -> tuple[str, str]:
 
 
 def _with_flag(value: str, typed: str) -> str:
-    """Return a value together with its flag if --option=VALUE is being typed."""
+    """Return a value, with the flag in front of it if the user is typing --option=VALUE."""
     word = "".join(split_arg_string(typed))
     option, equals, _ = word.partition("=")
     return f"{option}={value}" if equals and option.startswith("-") else value
 
 
 def _quote_for_bash(value: str, quote: str) -> str:
-    """Return the value so that bash reads it as one word within an open quote."""
+    """Return a value quoted for bash. `quote` is the quotation mark that is still open; empty if there is none."""
     if quote == "'":
         return value.replace("'", "'\\''")
     if quote:
@@ -170,116 +163,111 @@ def _quote_for_bash(value: str, quote: str) -> str:
     return _BASH_SPECIAL.sub(lambda found: f"\\{found[0]}", value)
 
 
-def goal_ids(context: click.Context, _: click.Parameter, incomplete: str) -> Items:
-    """Complete the id of an unfinished goal."""
-    status = _status(context)
-    return _id_items(unfinished(status), status, incomplete)
+def complete(completer: str, options: CommonOptions, incomplete: str) -> list[CompletionItem[str]]:
+    """Return the completions of an incomplete word.
+
+    Args:
+        completer: the name of the completer; "files" lets the shell complete a file.
+        options: the common options that were typed before the word.
+        incomplete: the beginning of the word.
+
+    Returns:
+        The matching values, each once. After an error, for example without a server, there are none.
+    """
+    if completer == "files":
+        return [CompletionItem(incomplete, type="file")]
+    options.connect_timeout = None
+    try:
+        offers: Offers = globals()[completer](options, incomplete)
+    except (TalkError, OSError, ValueError):
+        return []
+    matching: dict[str, str] = {}
+    for value, words in offers:
+        if _matches(value, incomplete):
+            matching.setdefault(value, words)
+    return [CompletionItem(value, help=words) for value, words in matching.items()]
 
 
-def known_ids(context: click.Context, _: click.Parameter, incomplete: str) -> Items:
-    """Complete the id of any goal. Unfinished goals come first, then the newest."""
-    status, ended = _ask_server(context, lambda client: (client.status(), client.log(_MAX_ENDED_GOALS))) or (
-        _NO_STATUS,
-        [],
-    )
-    return _id_items([*unfinished(status), *reversed(ended)], status, incomplete)
+def _matches(value: str, incomplete: str) -> bool:
+    # A value with invisible characters couldn't be recognised, and would reach the terminal unescaped.
+    return bool(value) and value.startswith(incomplete) and value.isprintable()
 
 
-def keys(context: click.Context, _: click.Parameter, incomplete: str) -> Items:
-    """Complete the key of an unfinished or recent goal."""
-    status = _status(context)
-    return _key_items([*unfinished(status), *reversed(status.recent)], incomplete)
+def goal_ids(options: CommonOptions, incomplete: str) -> Offers:
+    """Offer the ids of unfinished goals."""
+    status = _status(options)
+    return _offer_ids(unfinished(status), status, incomplete)
 
 
-def unfinished_keys(context: click.Context, _: click.Parameter, incomplete: str) -> Items:
-    """Complete the key of an unfinished goal."""
-    return _key_items(unfinished(_status(context)), incomplete)
+def known_ids(options: CommonOptions, incomplete: str) -> Offers:
+    """Offer the ids of all goals: first those of unfinished goals, then the newest."""
+    with options.connect(COMPLETION_TIMEOUT_S) as client:
+        status, ended = client.status(), client.log(_MAX_ENDED_GOALS)
+    return _offer_ids([*unfinished(status), *reversed(ended)], status, incomplete)
 
 
-def voices(context: click.Context, _: click.Parameter, incomplete: str) -> Items:
-    """Complete a voice by its language, or by its id or name if no language starts with the word.
+def keys(options: CommonOptions, _: str) -> Offers:
+    """Offer the keys of unfinished and recent goals."""
+    status = _status(options)
+    return _offer_keys([*unfinished(status), *reversed(status.recent)])
+
+
+def unfinished_keys(options: CommonOptions, _: str) -> Offers:
+    """Offer the keys of unfinished goals."""
+    return _offer_keys(unfinished(_status(options)))
+
+
+def voices(options: CommonOptions, incomplete: str) -> Offers:
+    """Offer the languages of the voices. If none of them matches, offer the ids, or else the names.
 
     Neural voices are few and are called by their ids, so these ids are offered together with the languages.
     """
-    found = _ask_server(context, lambda client: client.voices()) or []
+    with options.connect(COMPLETION_TIMEOUT_S) as client:
+        found = client.voices()
+    offers: Offers = []
     for field in ("language", "id", "name"):
-        fields = [("id" if is_neural(str(each.get("id"))) else field, each) for each in reversed(found)]
-        offered = {str(each.get(name) or ""): _voice_help(each, name) for name, each in fields}
-        items = _matching_items(reversed(offered.items()), incomplete)
-        if items:
-            return items
-    return []
+        named = [("id" if is_neural(str(each.get("id"))) else field, each) for each in found]
+        offers = [(str(each.get(name) or ""), _voice_help(each, name)) for name, each in named]
+        if any(_matches(value, incomplete) for value, _ in offers):
+            break
+    return offers
 
 
-def robots(context: click.Context, _: click.Parameter, incomplete: str) -> Items:
-    """Complete an online robot of the fleet, or a group of such robots."""
-    options: CommonOptions = context.find_root().obj
-    try:
-        broker = options.broker()
-        from talkcli.fleet import topics
-        from talkcli.fleet.desk.watch import read_robots
+def robots(options: CommonOptions, _: str) -> Offers:
+    """Offer the robots of the fleet that are online, and their groups."""
+    broker = options.broker()
+    from talkcli.fleet import topics
+    from talkcli.fleet.desk.watch import read_robots
 
-        found = read_robots(broker, COMPLETION_TIMEOUT_S, with_status=False)
-    except (TalkError, OSError, ValueError):
-        return []
+    found = read_robots(broker, COMPLETION_TIMEOUT_S, with_status=False)
     online = [each.presence for each in found if each.presence.online]
-    offered = [(each.name, ", ".join(map(_shorten, each.groups)) or "robot") for each in online]
     members = Counter(f"@{group}" for each in online for group in {*each.groups} if not topics.name_fault(group))
-    offered += [(name, f"{count} robot{'' if count == 1 else 's'}") for name, count in sorted(members.items())]
-    return _matching_items(offered, incomplete)
+    return [
+        *((each.name, ", ".join(map(_shorten, each.groups)) or "robot") for each in online),
+        *((name, f"{count} robot{'' if count == 1 else 's'}") for name, count in sorted(members.items())),
+    ]
 
 
-def files(_: click.Context, __: click.Parameter, incomplete: str) -> Items:
-    """Let the shell complete a file."""
-    return [CompletionItem(incomplete, type="file")]
-
-
-def players(_: click.Context, __: click.Parameter, incomplete: str) -> Items:
-    """Complete the name of a player."""
+def players(_: CommonOptions, __: str) -> Offers:
+    """Offer the names of the players."""
     from talkcli.engine.players import PLAYERS
 
-    return _matching_items([(name, each.about) for name, each in PLAYERS.items()], incomplete)
+    return [(name, each.about) for name, each in PLAYERS.items()]
 
 
-def _ask_server(context: click.Context, question: Callable[[Client], _Answer]) -> _Answer | None:
-    """Ask the server something, and return the answer, or None after any error."""
-    options: CommonOptions = context.find_root().obj  # with --socket if it was typed before
-    options.connect_timeout = None
-    try:
-        with options.connect(COMPLETION_TIMEOUT_S) as client:
-            return question(client)
-    except (TalkError, OSError, ValueError):
-        return None
+def _status(options: CommonOptions) -> ServerStatus:
+    with options.connect(COMPLETION_TIMEOUT_S) as client:
+        return client.status()
 
 
-def _status(context: click.Context) -> ServerStatus:
-    return _ask_server(context, lambda client: client.status()) or _NO_STATUS
+def _offer_ids(goals: Iterable[Goal], status: ServerStatus, incomplete: str) -> Offers:
+    """Offer the ids of goals. If digits were typed, also offer the bare numbers of this server's goals."""
+    own = f"{status.server.get('boot')}-" if incomplete.isascii() and incomplete.isdecimal() else ""
+    return [(name, _goal_help(each)) for each in goals for name in dict.fromkeys((each.id.removeprefix(own), each.id))]
 
 
-def _id_items(goals: Iterable[Goal], status: ServerStatus, incomplete: str) -> Items:
-    """Return the ids. If digits were typed, also return the bare numbers of this server's goals."""
-    own = f"{status.server.get('boot')}-"
-    digits = incomplete.isascii() and incomplete.isdecimal()
-    offered = []
-    for each in goals:
-        number = each.id.removeprefix(own)
-        names = [number, each.id] if digits and number != each.id else [each.id]
-        offered += [(name, _goal_help(each)) for name in names]
-    return _matching_items(offered, incomplete)
-
-
-def _key_items(goals: Iterable[Goal], incomplete: str) -> Items:
-    offered: dict[str, str] = {}
-    for each in goals:
-        if each.key is not None:
-            offered.setdefault(each.key, _goal_help(each))
-    return _matching_items(offered.items(), incomplete)
-
-
-def _matching_items(offered: Iterable[tuple[str, str]], incomplete: str) -> Items:
-    # A value with invisible characters couldn't be recognised, and would reach the terminal unescaped.
-    fitting = ((value, words) for value, words in offered if value.startswith(incomplete) and value.isprintable())
-    return [CompletionItem(value, help=words) for value, words in fitting if value]
+def _offer_keys(goals: Iterable[Goal]) -> Offers:
+    return [(each.key, _goal_help(each)) for each in goals if each.key is not None]
 
 
 def _shorten(text: str) -> str:

@@ -1,4 +1,4 @@
-"""The displays of `--feedback`: JSON objects, lines, or a sentence with each word lit up as it is heard.
+"""The displays of `--feedback`: JSON objects, lines, or the sentence with the current word highlighted.
 
 These classes only show the events that they are given. They never wait, and don't know which client owns a goal.
 """
@@ -17,7 +17,7 @@ from talkcli.goals.states import State
 from talkcli.polling import wait_ready
 from talkcli.protocol.events import PausedChanged, Result, StateChanged, WordHeard
 from talkcli.terminal.goals import TEXT_NOT_KEPT
-from talkcli.terminal.text import MeasuredText, Screen, printable
+from talkcli.terminal.text import MeasuredText, Screen, printable, width
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import Goal
     from talkcli.protocol.events import Event
 
-#: Id and state are left out if they leave the text fewer columns than this.
+#: The goal's id and state are left out if they would leave fewer columns than this for the text.
 _MIN_SENTENCE_COLUMNS = 20
-#: Terminal codes for the word that is heard, for the text after it, and for normal text.
+#: Terminal codes for the current word, for the text after it, and for normal text.
 _WORD_STYLE, _UNHEARD_STYLE, _NORMAL_STYLE = "\x1b[1;7m", "\x1b[2m", "\x1b[0m"
 #: Moves to the start of the line and clears it.
 _CLEAR_LINE = "\r\x1b[2K"
@@ -74,14 +74,14 @@ class _LineFeedback(Feedback):
             self._shown.pop(event.goal.id, None)
 
     def _show_state(self, goal_id: str, state: State) -> None:
-        # A goal's end usually comes as a state and a result, but only as a result if it ended earlier or was lost.
+        # The end of a goal is a state and a result. If the goal had ended before or was lost, it is only a result.
         if self._shown.get(goal_id) is not state:
             self._shown[goal_id] = state
             show(f"{printable(goal_id)} {state.name}")
 
 
 class _TerminalFeedback(Feedback):
-    """Feedback that shows the sentence on one line of a terminal and lights up each word as it is heard.
+    """Feedback that shows the sentence on one line of a terminal and highlights each word as it is heard.
 
     The line is rewritten in place and is never wider than the terminal, so only a part of a long text is shown. When
     the goal ends, the whole sentence is written.
@@ -91,8 +91,8 @@ class _TerminalFeedback(Feedback):
 
     def __init__(self) -> None:
         self._line: _GoalLine | None = None
+        #: held while anything is written, because resizing also repaints the line, in a thread of its own
         self._writing = threading.Lock()
-        self._needs_paint = False
         self._resizes = _ResizeWatcher(self._paint)
 
     def begin(self, goals: Sequence[Goal]) -> None:
@@ -151,15 +151,10 @@ class _TerminalFeedback(Feedback):
             )
 
     def _paint(self) -> None:
-        # If another thread is painting, it paints again for this one.
-        self._needs_paint = True
-        while self._needs_paint and self._writing.acquire(blocking=False):
-            try:
-                self._needs_paint = False
-                line = self._line  # another thread may remove it
-                _write(line.painted() if line else "")
-            finally:
-                self._writing.release()
+        with self._writing:
+            line = self._line  # another thread may remove it
+            if line:
+                _write(line.painted())
 
 
 class _ResizeWatcher(threading.Thread):
@@ -194,7 +189,7 @@ class _ResizeWatcher(threading.Thread):
 
 
 class _GoalLine:
-    """The goal on the line: its state, and the word that is heard."""
+    """The content of the line: a goal, its state, and the current word."""
 
     def __init__(self, goal: Goal) -> None:
         self.goal = goal
@@ -202,27 +197,26 @@ class _GoalLine:
         self.state = State.PENDING if goal.state.terminal else goal.state
         self.text = MeasuredText(TEXT_NOT_KEPT if goal.text is None else goal.text)
         heard = len(goal.spoken or "")
-        #: the indices at which the word that is heard begins and ends
+        #: the indices in the text at which the current word begins and ends
         self.word = (heard, heard)
 
     def update(self, event: Event) -> None:
-        """Take over the word or the state of an event."""
+        """Update the word or the state from an event of the goal."""
         if isinstance(event, WordHeard):
             self.word = (event.start, event.end)
         elif isinstance(event, StateChanged) and event.state is not State.PENDING:
-            # The goal may already be in a later state than PENDING.
+            # PENDING may be reported late, after the goal was read in a later state.
             self.state = event.state
 
     def painted(self) -> str:
-        """Return the line for the terminal, with its colours."""
+        """Return the line with its colours and its position on the terminal."""
         # The last column stays free, because some terminals move to the next line as soon as it is written.
         columns = (terminal_columns(sys.stdout) or DEFAULT_COLUMNS) - 1
         state = "PAUSED" if self.paused and self.state is State.ACTIVE else self.state.name
-        head = f"{printable(self.goal.id)}  {state:<9}  "
-        if columns - len(head) < _MIN_SENTENCE_COLUMNS:
+        head = f"{printable(self.goal.id)}  {Screen(colour=True).coloured(f'{state:<9}', self.state)}  "
+        if columns - width(head) < _MIN_SENTENCE_COLUMNS:
             head = ""
-        heard, word, unheard = self.text.view(*self.word, columns - len(head))
-        head = head.replace(state, Screen(colour=True).coloured(state, self.state), 1) if head else ""
+        heard, word, unheard = self.text.view(*self.word, columns - width(head))
         lit = f"{_WORD_STYLE}{word}{_NORMAL_STYLE}" if word else ""
         return f"{_CLEAR_LINE}{head}{heard}{lit}{_UNHEARD_STYLE}{unheard}{_NORMAL_STYLE}"
 

@@ -85,14 +85,14 @@ class CommonOptions:
         began, end = time.monotonic(), self.deadline(timeout)
         options = {"patience": min(ANSWER_LIMIT_S, timeout or ANSWER_LIMIT_S), "end": end, **options}
         connect_timeout, self.connect_timeout = self.connect_timeout, None
-        if connect_timeout is None:
-            return Client.over(self._connection(**options))
-        seconds = connect_timeout if end is None else min(connect_timeout, max(0.0, end - began))
+        seconds = connect_timeout or 0.0
+        if end is not None:
+            seconds = min(seconds, max(0.0, end - began))
         try:
             return Client.over(self._connection(keep_trying=seconds, **options))
         except ServerUnavailable as error:
             now = time.monotonic()
-            if now < began + seconds:  # it is no use to try this server again
+            if connect_timeout is None or now < began + seconds:  # it is no use to try this server again
                 raise
             words = f"waited for {round(seconds, 1):g} s: {error.message}"
             if end is not None and now >= end:

@@ -17,14 +17,7 @@ from itertools import islice
 
 from talkcli.cli.command import replace_bad_bytes
 from talkcli.cli.interrupts import Interrupts
-from talkcli.cli.show import (
-    note,
-    reader_is_gone,
-    retry_without_output,
-    show_error,
-    show_if_possible,
-    write_error_line,
-)
+from talkcli.cli.show import note, retry_without_output, show_error, show_if_possible, write_error_line
 from talkcli.cli.wait import CANCEL_TIMEOUT_S, GoalReporter, seconds_left, timeout_error
 from talkcli.client.connection import Connection
 from talkcli.errors import EXIT_OK, ServerUnavailable, TalkError, TimedOut, UnknownGoal, UsageError
@@ -254,8 +247,6 @@ class LineSpeaker:
                         raise
                     self._error = error
         except (Interrupted, OSError) as error:
-            if isinstance(error, OSError) and not (self._wait and reader_is_gone(error)):
-                raise
             self._interrupts.record(error)
             self._stop()
             raise Interrupted from None
