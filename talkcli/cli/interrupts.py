@@ -1,7 +1,7 @@
-"""Signals, timeouts and closed output, which end a command's wait.
+"""Signals and closed output, which end a command's wait.
 
-A signal or a timeout makes a descriptor readable, so it never interrupts a read or a write halfway. Standard output is
-polled together with this descriptor. If a goal was sent early, `plain` blocks signals until `Interrupts` is entered.
+A signal makes a descriptor readable, so it never interrupts a read or a write halfway. Standard output is polled
+together with this descriptor. If a goal was sent early, `plain` blocks signals until `Interrupts` is entered.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import signal
 import sys
 
 from talkcli.cli.show import STDOUT_FD, discard_output, reader_is_gone
-from talkcli.errors import EXIT_SIGNAL, EXIT_SIGPIPE, EXIT_TIMEOUT
+from talkcli.errors import EXIT_SIGNAL, EXIT_SIGPIPE
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.polling import Interrupted
 
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from types import FrameType, TracebackType
 
 _HANDLED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-#: Three years. The system's timer may not accept longer times.
-_MAX_TIMER_S = 1e8
 
 
 def discard_unread_output() -> None:
@@ -45,35 +43,31 @@ def _poll_output() -> int:
 
 
 class Interrupts:
-    """A context in which SIGINT, SIGTERM, SIGHUP, a timeout or closed output ends a wait.
+    """A context in which SIGINT, SIGTERM, SIGHUP or closed output ends a wait.
 
     Pass `watched` to `wait_ready` as `interrupt`. The context suppresses the Interrupted that is raised then, and
-    `exit_code` tells the reason. A second signal ends the process at once. A second SIGHUP is ignored, because the
-    shell and the system both send one when a terminal is closed.
+    `exit_code` is the exit code of the command. A second signal ends the process at once. A second SIGHUP is ignored,
+    because the shell and the system both send one when a terminal is closed.
     """
 
-    def __init__(self, timeout: float | None = None, blocked: Iterable[int] = (), *, output: bool = False) -> None:
+    def __init__(self, blocked: Iterable[int] = (), *, output: bool = False) -> None:
         """Prepare the context.
 
         Args:
-            timeout: seconds from entering the context until the wait ends.
             blocked: signals that were blocked earlier and can be handled now.
             output: whether the wait ends if the reader of standard output goes away.
         """
         #: the signal that was received, or None
         self.signal_number: int | None = None
-        self.timed_out = False
+        #: whether the reader of standard output has gone away
         self.reader_gone = False
-        self._timeout = timeout
         self._blocked = blocked
         self._output = output
 
     @property
     def exit_code(self) -> int:
-        """The exit code for the signal, the missing reader or the timeout that has ended the wait."""
-        if self.signal_number is not None:
-            return EXIT_SIGNAL + self.signal_number
-        return EXIT_SIGPIPE if self.reader_gone else EXIT_TIMEOUT
+        """The exit code for the signal or the missing reader that has ended the wait."""
+        return EXIT_SIGPIPE if self.signal_number is None else EXIT_SIGNAL + self.signal_number
 
     def __enter__(self) -> Interrupts:
         self._descriptor, self._write = os.pipe()
@@ -82,8 +76,8 @@ class Interrupts:
         self.watched = {self._descriptor: select.POLLIN}
         if self._output and not _poll_output() & select.POLLNVAL:  # this event would end every wait at once
             self.watched[STDOUT_FD] = 0
-        # Python runs handlers later, in the main thread, so a handler alone might not end a wait that is just starting.
-        # The wakeup descriptor is written at once.
+        # Python runs handlers later, in the main thread, so a handler couldn't end a wait that is just starting. The
+        # wakeup descriptor is written at once.
         self._old_wakeup_fd = signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
         # A shell starts background commands with SIGINT ignored. Ignored signals stay ignored.
         self._old_handlers = {
@@ -91,9 +85,6 @@ class Interrupts:
             for each in _HANDLED_SIGNALS
             if signal.getsignal(each) != signal.SIG_IGN
         }
-        if self._timeout is not None:
-            self._old_handlers[signal.SIGALRM] = signal.signal(signal.SIGALRM, self._handle_timeout)
-            signal.setitimer(signal.ITIMER_REAL, max(1e-6, min(self._timeout, _MAX_TIMER_S)))  # 0 would stop the timer
         if self._blocked:
             signal.pthread_sigmask(signal.SIG_UNBLOCK, self._blocked)
         return self
@@ -103,8 +94,6 @@ class Interrupts:
     ) -> bool:
         if kind is Interrupted:
             self.check_reader()
-        if self._timeout is not None:
-            signal.setitimer(signal.ITIMER_REAL, 0)
         for each, handler in self._old_handlers.items():
             signal.signal(each, handler)
         signal.set_wakeup_fd(self._old_wakeup_fd)
@@ -119,7 +108,7 @@ class Interrupts:
     def record(self, error: Interrupted | OSError) -> None:
         """Record why the wait has ended, and discard all output if its reader is gone.
 
-        An error that is neither an interrupt, a timeout nor a missing reader is raised again.
+        Any error other than an interrupt, a timeout or a missing reader is raised again.
         """
         if isinstance(error, OSError) and not isinstance(error, TimeoutError):
             if not reader_is_gone(error):
@@ -131,7 +120,8 @@ class Interrupts:
 
     def reset(self) -> None:
         """Stop watching everything but the first signal, so that the command can clean up."""
-        signal.set_wakeup_fd(-1)  # so that a second SIGHUP does nothing
+        if self.signal_number is not None:
+            signal.set_wakeup_fd(-1)  # so that a second SIGHUP does nothing
         self.check_reader()
         self.watched.pop(STDOUT_FD, None)
         os.set_blocking(self._descriptor, False)
@@ -140,20 +130,9 @@ class Interrupts:
         except BlockingIOError:
             pass
 
-    def _wake(self) -> None:
-        try:
-            os.write(self._write, b"\0")
-        except BlockingIOError:
-            pass  # the pipe is full, so the descriptor is readable
-
     def _handle_signal(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
         if self.signal_number is not None:
             if number == signal.SIGHUP:
                 return
             os._exit(EXIT_SIGNAL + number)
         self.signal_number = number
-        self._wake()
-
-    def _handle_timeout(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
-        self.timed_out = True
-        self._wake()

@@ -19,7 +19,6 @@ from talkcli.cli.command import replace_bad_bytes
 from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.show import note, retry_without_output, show_error, show_if_possible, write_error_line
 from talkcli.cli.wait import CANCEL_TIMEOUT_S, GoalReporter, seconds_left, timeout_error
-from talkcli.client.connection import Connection
 from talkcli.errors import EXIT_OK, ServerUnavailable, TalkError, TimedOut, UnknownGoal, UsageError
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.goal import Goal
@@ -52,6 +51,8 @@ _DEFAULT_PENDING_GOALS = 10
 _MAX_UNREPORTED_GOALS = 1_000
 #: How many late lines are dropped before signals and the server are looked at again.
 _MAX_DROPPED_LINES = 1_000
+#: Stands for the end of an unlimited time.
+_NO_LIMIT = float("inf")
 #: The shortest ttl that is sent, because 0 would mean no limit.
 _MIN_TTL_S = 0.01
 
@@ -104,8 +105,8 @@ class InputLine:
     text: str
     #: the size in bytes of a line that is too long to be spoken; 0 for any other line
     excess: int = 0
-    #: the monotonic time at which its ttl ends; None without a ttl
-    end: float | None = None
+    #: the monotonic time at which its ttl ends
+    end: float = _NO_LIMIT
 
 
 class LineBuffer:
@@ -136,7 +137,7 @@ class LineBuffer:
         while not self._lines and self._chunks:
             now, data = self._chunks.popleft()
             self.size -= len(data)
-            end = now + self._ttl if self._ttl else None
+            end = now + (self._ttl or _NO_LIMIT)
             for line in self._splitter.feed(data) if data else [self._splitter.take_rest()]:
                 self._number += 1
                 text, excess = _decode(line), line.size if isinstance(line, TruncatedLine) else 0
@@ -150,7 +151,7 @@ class LineBuffer:
 
     def take_late(self, now: float) -> Iterator[InputLine]:
         """Remove the lines whose ttl is over."""
-        while (line := self.first) and line.end is not None and line.end <= now:
+        while (line := self.first) and line.end <= now:
             yield self.take()
 
 
@@ -199,10 +200,11 @@ class LineSpeaker:
         self._wait = wait
         self._reporter = GoalReporter(options, feedback=feedback)
         self._feedback = self._reporter.feedback
-        self._timeout = timeout
+        self._timeout, self._end = timeout, options.deadline(timeout) or _NO_LIMIT
         self._max_pending = ahead or _DEFAULT_PENDING_GOALS
         self._ttl: float | None = goal_options["ttl"] or None
         self._buffer = LineBuffer(self._ttl)
+        self._interrupts = Interrupts(output=wait)
         #: the number of the line that is being sent, until it is accepted or refused
         self._sending: int | None = None
         #: the goal that was sent and not answered yet, and its request
@@ -222,19 +224,20 @@ class LineSpeaker:
 
     def run(self) -> int:
         """Send all lines, and return the exit code. With --wait, also wait until the goals have ended."""
-        interrupts = self._interrupts = Interrupts(self._timeout, output=self._wait)
+        interrupts = self._interrupts
         try:
             with (
                 interrupts,
                 self._options.connect(self._timeout, name=self._name, interrupt=interrupts.watched) as client,
             ):
-                assert isinstance(client._connection, Connection)
                 self._client, self._connection = client, client._connection
                 return self._speak()
+        except ServerUnavailable:
+            if time.monotonic() >= self._end:
+                raise timeout_error(self._timeout) from None
+            raise
         finally:
             retry_without_output(self._feedback.close)
-        if interrupts.timed_out and interrupts.signal_number is None and not interrupts.reader_gone:
-            raise timeout_error(self._timeout)
         return interrupts.exit_code
 
     def _speak(self) -> int:
@@ -247,9 +250,12 @@ class LineSpeaker:
                         raise
                     self._error = error
         except (Interrupted, OSError) as error:
-            self._interrupts.record(error)
+            interrupts = self._interrupts
+            interrupts.record(error)
             self._stop()
-            raise Interrupted from None
+            if interrupts.signal_number is None and not interrupts.reader_gone:
+                raise timeout_error(self._timeout) from None
+            return interrupts.exit_code
         code = self._failure[1] if self._failure else EXIT_OK
         if self._error is not None:
             self._feedback.close()
@@ -287,7 +293,7 @@ class LineSpeaker:
         return not (self._buffer.first or self._unanswered or self._full)
 
     def _step(self) -> None:
-        """Send and drop lines as far as possible, then wait for more."""
+        """Send and drop lines as far as possible, then wait for more; TimeoutError if the timeout is over."""
         if self._error is None:
             for line in islice(self._buffer.take_late(time.monotonic()), _MAX_DROPPED_LINES):
                 self._report_expired(line)
@@ -295,6 +301,8 @@ class LineSpeaker:
                 self._send(self._buffer.take())
             if self._done:
                 return
+        if time.monotonic() >= self._end:
+            raise TimeoutError
         self._wait_for_news()
         self._take_answer()
         self._report_goals()
@@ -314,7 +322,7 @@ class LineSpeaker:
         if problem and not self._options.quiet:
             self._feedback.note(problem)
         goal_options = self._goal_options
-        if line.end is not None:
+        if self._ttl:
             goal_options = {**goal_options, "ttl": max(_MIN_TTL_S, round(line.end - time.monotonic(), 2))}
         # The goal is followed even without --wait, because its state shows when it is no longer pending.
         request = Say(text, wait=True, feedback=self._feedback.shows_events, patient=True, **goal_options)
@@ -376,10 +384,10 @@ class LineSpeaker:
     # -- waiting
 
     def _wait_for_news(self) -> None:
-        """Wait for input, an answer, an event of a goal, or the end of a line's ttl."""
+        """Wait for input, an answer, an event of a goal, or the end of a line's ttl or of the timeout."""
         watched = self._interrupts.watched
         first = self._buffer.first
-        end = first.end if first and self._error is None else None
+        end = min(first.end, self._end) if first and self._error is None else self._end
         was_full = self._full
 
         def has_news() -> bool:
