@@ -63,25 +63,23 @@ def command_for(environment: Environment, packages: Sequence[str], *, again: boo
 
     sudo = "sudo " if environment.needs_sudo else ""
     names = join(packages)
+    python = quote(environment.python)
     if environment.pipx is not None:
         home = os.path.dirname(os.path.dirname(environment.pipx))
-        own = home.startswith(f"{environment.user_home}/")
-        named = "" if own else f"PIPX_HOME={quote(home)} "
+        named = "" if home.startswith(f"{environment.user_home}/") else f"PIPX_HOME={quote(home)} "
         force = "--force " if again else ""
         return f"{sudo}{named}pipx inject {force}{quote(os.path.basename(environment.pipx))} {names}"
-    python = quote(environment.python)
     if environment.made_by_uv and not environment.has_pip:
         return f"{sudo}uv pip install {'--reinstall ' if again else ''}--python {python} {names}"
     names = f"--force-reinstall {names}" if again else names
-    pip = f"{sudo}{python} -m pip install {names}"
-    before = f"{sudo}{python} -m ensurepip"
-    if environment.externally_managed:
-        pip = f"{sudo}{python} -m pip install --break-system-packages {names}"
-        before = "sudo apt-get install -y python3-pip"
-    return pip if environment.has_pip else f"{before} && {pip}"
+    managed = environment.externally_managed
+    pip = f"{sudo}{python} -m pip install {'--break-system-packages ' if managed else ''}{names}"
+    get_pip = "sudo apt-get install -y python3-pip" if managed else f"{sudo}{python} -m ensurepip"
+    return pip if environment.has_pip else f"{get_pip} && {pip}"
 
 
 def _environment() -> Environment:
+    """Return the facts about the environment of this process."""
     from importlib.util import find_spec
 
     is_virtual = sys.prefix != sys.base_prefix
@@ -93,7 +91,7 @@ def _environment() -> Environment:
         pipx=sys.prefix if os.path.exists(os.path.join(sys.prefix, "pipx_metadata.json")) else None,
         user_home=os.path.expanduser("~"),
         has_pip=find_spec("pip") is not None,
-        made_by_uv=is_virtual and _is_made_by_uv(),
+        made_by_uv=_is_made_by_uv(),
         externally_managed=not is_virtual
         and os.path.exists(os.path.join(os.path.dirname(os.__file__), "EXTERNALLY-MANAGED")),
         needs_sudo=os.geteuid() not in {0, owner},
@@ -101,8 +99,9 @@ def _environment() -> Environment:
 
 
 def _is_made_by_uv() -> bool:
+    """Return whether uv made this virtual environment."""
     try:
         with open(os.path.join(sys.prefix, "pyvenv.cfg"), encoding="utf-8") as file:
             return any(line.startswith("uv =") for line in file)
-    except FileNotFoundError:
+    except FileNotFoundError:  # this is no virtual environment
         return False

@@ -6,6 +6,7 @@ a line or send control characters to a terminal.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import sys
@@ -13,43 +14,47 @@ import time
 import traceback
 from typing import TYPE_CHECKING
 
+from talkcli.polling import wait_ready
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from typing import Any
 
-#: The longest line. If poll reports a pipe as writable, this many bytes never block (PIPE_BUF on Linux).
+#: Length limit for a line. Writing this many bytes never blocks if poll reports a pipe as writable (PIPE_BUF on Linux).
 _MAX_LOG_LINE_BYTES = 4096
+#: Length limit for text from other programs.
 _MAX_LOGGED_TEXT_CHARS = 200
-#: Time between two lines of the same kind, for events that can happen many times a second.
+#: Time between two lines of the same kind that are written by `write_limited`.
 _REPEAT_AFTER_S = 60.0
 
 
 class RateLimit:
-    """A limit for events that can happen many times a second. The time is an argument."""
+    """A limit for events that can happen many times a second: at most `max_events` in each period."""
 
     def __init__(self, max_events: int, period_s: float) -> None:
         self._max_events = max_events
         self._period_s = period_s
-        self._period_start = float("-inf")
-        self._allowed = 0
-        self._suppressed = 0
+        self._period_end = float("-inf")
+        #: events in this period, allowed or not
+        self._event_count = 0
 
     def allow(self, now: float) -> int | None:
-        """Count an event. Return None to suppress it, or else the number of events suppressed before it."""
-        if now >= self._period_start + self._period_s:
-            suppressed, self._suppressed = self._suppressed, 0
-            self._period_start, self._allowed = now, 1
+        """Count an event at this time. Return None to suppress it.
+
+        If the event is allowed, return how many events were suppressed since the last event that was allowed.
+        """
+        if now >= self._period_end:
+            suppressed = max(0, self._event_count - self._max_events)
+            self._period_end, self._event_count = now + self._period_s, 1
             return suppressed
-        if self._allowed < self._max_events:
-            self._allowed += 1
-            return 0
-        self._suppressed += 1
-        return None
+        self._event_count += 1
+        return 0 if self._event_count <= self._max_events else None
 
 
+#: How many lines could not be written since the last line that was.
 _lost_lines = 0
+#: The limits of `write_limited`, by the kind of line.
 _rate_limits: dict[str, RateLimit] = {}
 
 
@@ -61,21 +66,17 @@ def write(message: str) -> None:
     data = f"talk: {message}\n".encode(errors="backslashreplace")
     if len(data) > _MAX_LOG_LINE_BYTES:
         data = data[: _MAX_LOG_LINE_BYTES - 1] + b"\n"
-    try:
+    with contextlib.suppress(OSError, ValueError):  # ValueError: standard error has been closed
         fd = sys.stderr.fileno() if sys.stderr else 2
-        poll = select.poll()
-        poll.register(fd, select.POLLOUT)
-        if not poll.poll(0):
-            _lost_lines += 1
+        if wait_ready({fd: select.POLLOUT}, 0):
+            os.write(fd, data)
+            _lost_lines = 0
             return
-        os.write(fd, data)
-        _lost_lines = 0
-    except (OSError, ValueError):
-        _lost_lines += 1
+    _lost_lines += 1
 
 
 def write_limited(kind: str, message: str) -> None:
-    """Write at most one line of each kind per minute. The next line gives the number of lines left out."""
+    """Write at most one line of each kind per minute. The next line of this kind gives the number of those left out."""
     suppressed = _rate_limits.setdefault(kind, RateLimit(1, _REPEAT_AFTER_S)).allow(time.monotonic())
     if suppressed is not None:
         write(f"{message} ({suppressed} more of these were not logged)" if suppressed else message)

@@ -1,8 +1,8 @@
 """Notifications for the service manager: that the process is ready, works, is alive or is about to end.
 
 The notifications are datagrams as in sd_notify(3), for systemd and others. Without NOTIFY_SOCKET nothing is sent.
-Sending never waits. If the service manager can't take a notification now, it gets the text with the next one. The
-status contains no text of goals, because every user of the machine can read it.
+Sending never waits. If the service manager can't accept a notification, its fields are sent again later. The status
+contains no text of goals, because every user of the machine can read it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 STATUS_DELAY_S = 0.5
 #: Delay before a failed notification is sent again.
 NOTIFY_RETRY_DELAY_S = 0.5
-#: Watchdog notifications per watchdog timeout. With this many, one can be late.
+#: Watchdog notifications per watchdog timeout. With more than two, one of them can be late.
 _NOTIFICATIONS_PER_TIMEOUT_COUNT = 2.5
 
 
@@ -45,10 +45,12 @@ class ServiceManager:
         self._watchdog_interval = _watchdog_interval()
         #: fields that could not be sent yet, with the newest value of each
         self._unsent: dict[str, str] = {}
+        #: the status that was reported last
         self._status = ""
+        #: timers of notifications that are due later, by name
         self._timers: dict[str, asyncio.TimerHandle] = {}
         if self._address:
-            # Opened only once: a process without free descriptors must still reach its watchdog.
+            # Opened at the start, because a process without free descriptors must still reach its watchdog.
             self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
             self._socket.setblocking(False)
 
@@ -125,8 +127,6 @@ def _notify_address(name: str) -> str:
 def _watchdog_interval() -> float | None:
     """Return the seconds between two watchdog notifications, or None if there is no watchdog."""
     timeout, own_pid = os.environ.get("WATCHDOG_USEC", ""), str(os.getpid())
-    if not (timeout.isascii() and timeout.isdecimal() and int(timeout)):
-        return None
-    if os.environ.get("WATCHDOG_PID", own_pid) != own_pid:
-        return None  # the watchdog watches another process of this unit
-    return int(timeout) / 1e6 / _NOTIFICATIONS_PER_TIMEOUT_COUNT
+    is_for_us = os.environ.get("WATCHDOG_PID", own_pid) == own_pid  # and not for another process of this unit
+    timeout_us = int(timeout) if timeout.isdecimal() and is_for_us else 0
+    return timeout_us / 1e6 / _NOTIFICATIONS_PER_TIMEOUT_COUNT or None

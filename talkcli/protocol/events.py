@@ -1,9 +1,9 @@
 """The messages of a server and their JSON form: the greeting, replies with their lists, and events.
 
-Rules for this file: form only, no I/O. `to_json` returns the object of the wire, which is also what the commands print.
-A field means the same in each event. It may be added, but never renamed or given another meaning. Readers ignore fields
-that they don't know. A change that an older peer could not read needs another PROTOCOL number. `{"request": "cancel"}`
-and `{"request": "status"}` stay the same in every protocol.
+Rules for this file: it only defines the form of messages, without I/O. `to_json` returns the object for the wire, and
+the commands print the same object. A field means the same in each event. Fields may be added, but never renamed or
+given another meaning. Readers ignore fields that they don't know. A change that an older peer could not read needs
+another PROTOCOL number. `{"request": "cancel"}` and `{"request": "status"}` stay the same in every protocol.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ PROTOCOL = 1
 class ServerStatus:
     """The state of a server and its goals."""
 
-    #: the server's description of itself, see `server` in the wire's document
+    #: the server's description of itself, which the wire's document lists under `server`
     server: JsonObject
     #: the goal that is ACTIVE or PREEMPTING
     active: Goal | None
@@ -45,7 +45,7 @@ class ServerStatus:
 
     @classmethod
     def from_json(cls, message: JsonObject) -> ServerStatus:
-        """Return the status in an object; Unreadable if one of its goals is malformed."""
+        """Return the status in an object. Raises Unreadable if one of its goals is malformed."""
         server, pending, recent = message.get("server"), message.get("pending"), message.get("recent")
         return cls(
             server if isinstance(server, dict) else {},
@@ -56,13 +56,13 @@ class ServerStatus:
 
     @classmethod
     def from_reply(cls, reply: JsonObject, items: list[JsonObject]) -> ServerStatus:
-        """Return the status in a reply and the lines of its list."""
+        """Return the status in a reply and in the lines of the list before it."""
         lists = {name: [each[name] for each in items if name in each] for name in ("pending", "recent")}
         return cls.from_json({**reply, **lists})
 
 
 def unfinished(status: ServerStatus) -> list[Goal]:
-    """Return the goals of a status that have not ended: the active one, then the pending ones in their order."""
+    """Return the goals of a status that have not ended: the active goal, then the pending goals in their order."""
     return [*([status.active] if status.active else []), *status.pending]
 
 
@@ -70,14 +70,14 @@ def unfinished(status: ServerStatus) -> list[Goal]:
 class Canceled:
     """The effect of a cancel."""
 
-    #: the goals that it ended
+    #: the goals that the cancel ended
     canceled: tuple[Goal, ...]
-    #: the goals that were named and had ended before
+    #: goals that the request named, but that had ended before
     ended: tuple[Goal, ...]
 
     @classmethod
     def from_items(cls, items: list[JsonObject]) -> Canceled:
-        """Return the effect as the lines of a cancel's list tell it."""
+        """Return the effect that the lines of a cancel's list describe."""
         return cls(tuple(goals(items, "canceled")), tuple(goals(items, "ended")))
 
 
@@ -89,14 +89,14 @@ class StateChanged:
     state: State
     #: the time of the event, in seconds since 1970 UTC
     at: float | None = None
-    #: the number of the event; gaps are events for other clients, or words that were dropped for a slow reader
+    #: the number of the event. Missing numbers belong to events for other clients, or to words that were dropped
+    #: because this client reads slowly.
     n: int | None = None
-    #: the whole goal, with the first and the last state, for clients that watch all goals
+    #: the whole goal, for clients that watch all goals. It comes with the first and the last state.
     goal: Goal | None = None
 
     def to_json(self) -> JsonObject:
         message = {**_numbered("state", self), "state": self.state.name}
-        del message["goal"]
         return message if self.goal is None else {**message, "goal": self.goal.to_json()}
 
 
@@ -106,7 +106,7 @@ class WordHeard:
 
     id: str
     word: str
-    #: the word's place in the goal's text, `text[start:end]`, in characters
+    #: position of the word in the goal's text, in characters: the word is `text[start:end]`
     start: int
     end: int
     #: 1 for the first word of the goal that was heard
@@ -122,12 +122,12 @@ class WordHeard:
 
 @frozen
 class PausedChanged:
-    """A pause of all speech, or its end."""
+    """The beginning or the end of a pause of all speech."""
 
     paused: bool
-    #: the goal that is paused or goes on; None if none was being spoken
+    #: the goal that is paused or goes on, or None if nothing was being spoken
     id: str | None = None
-    #: the client that asked for it
+    #: the client that asked for the change
     by: By | None = None
     at: float | None = None
     n: int | None = None
@@ -148,7 +148,7 @@ class Result:
 
 @frozen
 class Snapshot:
-    """The state of the server and its goals at the time when watching begins."""
+    """The state of the server and its goals at the moment when a client starts to watch."""
 
     status: ServerStatus
 
@@ -158,16 +158,13 @@ class Snapshot:
 
 Event = StateChanged | WordHeard | PausedChanged | Result | Snapshot
 
-_EVENTS_BY_KIND: dict[str, type[StateChanged | WordHeard | PausedChanged | Result]] = {
-    "state": StateChanged,
-    "word": WordHeard,
-    "paused": PausedChanged,
-    "result": Result,
-}
+#: The events that have the same fields as their messages. The message of a snapshot has the fields of its status.
+_EVENTS_BY_KIND: dict[str, type[Event]]
+_EVENTS_BY_KIND = {"state": StateChanged, "word": WordHeard, "paused": PausedChanged, "result": Result}
 
 
 def from_json(message: JsonObject) -> Event | None:
-    """Return the event in a message, None for an unknown kind of event; Unreadable if a field is malformed."""
+    """Return the event in a message, or None if its kind is unknown. Raises Unreadable if a field is malformed."""
     kind = str(message.get("event"))
     if kind == "snapshot":
         return Snapshot(ServerStatus.from_json(message))
@@ -177,7 +174,7 @@ def from_json(message: JsonObject) -> Event | None:
     found = read_fields(event, message)
     for name, annotation in event.__annotations__.items():
         value = message.get(name)
-        # A time that no calendar can show counts as missing, as in a goal; the event is still true.
+        # A time that no calendar can show counts as missing, as in a goal. The rest of the event is still valid.
         missing = value is None or (annotation.startswith("float") and type(value) in (int, float))
         if name not in found and not (missing and annotation.endswith(" | None")):
             raise Unreadable(f"the {name!r} of a {kind!a} event is {value!a}")
@@ -185,19 +182,18 @@ def from_json(message: JsonObject) -> Event | None:
 
 
 def _numbered(kind: str, event: StateChanged | WordHeard | PausedChanged) -> JsonObject:
-    """Return an event as an object: the kind first, the number and the time last."""
-    own = fields(event)
-    at, n = own.pop("at"), own.pop("n")
-    return {"event": kind, **own, "n": n, "at": at}
+    """Return an event as an object without its goal: the kind first, the number and the time last."""
+    own = {name: value for name, value in fields(event).items() if name not in {"at", "n", "goal"}}
+    return {"event": kind, **own, "n": event.n, "at": event.at}
 
 
 def goals(items: list[JsonObject], name: str) -> Iterator[Goal]:
-    """Return the goals under this name in the lines of a list; Unreadable if one is malformed."""
+    """Yield the goals with this name in the lines of a list. Raises Unreadable if a goal is malformed."""
     return (Goal.from_json(each[name]) for each in items if name in each)
 
 
 def goal_in(reply: JsonObject, name: str = "goal") -> Goal | None:
-    """Return the goal in a reply, None if it is null; Unreadable if it is malformed."""
+    """Return the goal in a reply, or None if it is null. Raises Unreadable if the goal is malformed."""
     return None if reply.get(name) is None else Goal.from_json(reply[name])
 
 
@@ -209,7 +205,7 @@ def greeting(version: str, pid: int, boot: str) -> JsonObject:
 def busy_greeting(message: str | None = None) -> JsonObject:
     """Return the greeting of a server that has too many clients.
 
-    `message` gives the reason and the next step; None if the limit is `--max-clients`.
+    `message` gives the reason and the next step. It is None if the server has reached `--max-clients`.
     """
     return {"talk": PROTOCOL, "error": "busy", **({} if message is None else {"message": message})}
 
@@ -238,17 +234,17 @@ def item(seq: int | None, **fields: object) -> JsonObject:
 
 
 def ok(seq: int | None, **fields: object) -> JsonObject:
-    """Return the reply to a request that was carried out."""
+    """Return the reply to a request that succeeded."""
     return item(seq, ok=True, **fields)
 
 
 def failure(seq: int | None, code: str, message: str) -> JsonObject:
-    """Return the reply to a request that was not carried out."""
+    """Return the reply to a request that failed."""
     return item(seq, ok=False, error={"code": code, "message": message})
 
 
 def take_seq(message: JsonObject) -> int | None:
-    """Remove the number from a request and return it, None if there is none; BadRequest if it is no integer."""
+    """Remove the number from a request, and return it or None. Raises BadRequest if it isn't an integer."""
     seq = message.pop("seq", None)
     if seq is not None and (isinstance(seq, bool) or not isinstance(seq, int)):
         raise BadRequest('"seq" must be an integer', "bad_field")

@@ -1,8 +1,8 @@
 """Lines of JSON in UTF-8, one object per line: how a stream is split into lines, and how a line is read and written.
 
-Rules for this file: no I/O. It knows lines and their limits, never what a request means. Any received bytes become an
-object or a BadRequest. The engine process and its players split lines, too, and a client writes its first request
-before the rest of it is imported, so `json` and the errors are imported by the functions that need them.
+Rules for this file: no I/O. It knows lines and their limits, but not what a request means. Any received bytes become an
+object or a BadRequest. The functions that need `json` or the errors import them, for two reasons: a client writes its
+first request before most of its modules are imported, and the engine process only splits lines.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
     from talkcli.protocol.requests import Request
 
-#: The longest request line, including its newline. The longest text (40,000 bytes of UTF-8) fits with room for quotes,
-#: and so do 10,000 characters that are all escaped as \uXXXX.
+#: Length limit for a request, including its newline. The longest text has 40,000 bytes of UTF-8. A text of 10,000
+#: characters also fits if all of them are escaped as \uXXXX.
 MAX_LINE_BYTES = 64 * 1024
 
 #: The number of the first request on a connection.
 FIRST_NUMBER = 1
 
-#: The longest JSON integer: no count or time is longer, and converting thousands of digits takes quadratic time.
+#: Length limit for a JSON integer. No count or time is longer, and converting thousands of digits takes quadratic time.
 MAX_DIGITS = 20
 
 
 class TruncatedLine(bytes):
     """The beginning of a line that is longer than the limit of its `LineSplitter`."""
 
-    #: bytes of the whole line
+    #: length of the whole line in bytes
     size: int
 
 
@@ -44,11 +44,11 @@ class LineSplitter:
     def __init__(self, max_bytes: int = sys.maxsize) -> None:
         self._max_bytes = max_bytes
         self._rest = bytearray()
-        #: bytes of the line that is not complete yet, including those that are not kept
+        #: length of the incomplete line in bytes, including the bytes that are not kept
         self.size = 0
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Return the lines that are complete now, without their newlines; a line that is too long is truncated."""
+        """Return the lines that are complete now, without their newlines. Lines that are too long are truncated."""
         *lines, rest = data.split(b"\n")
         for place, line in enumerate(lines):
             if self.size or len(line) > self._max_bytes:
@@ -58,7 +58,7 @@ class LineSplitter:
         return lines
 
     def take_rest(self) -> bytes:
-        """Return the line that is not complete, as if it ended here; empty if there is none."""
+        """Return the incomplete line as if it ended here, or b"" if there is none."""
         line = bytes(self._rest)
         if self.size > self._max_bytes:
             line = TruncatedLine(line)
@@ -83,7 +83,7 @@ def write_request(request: Request) -> JsonObject:
 
 
 def request_line(message: JsonObject) -> bytes:
-    """Return an object as a line, as `encode` does, without importing `json` if the values are plain."""
+    """Return an object as a line, like `encode`, but without importing `json` if all values are plain."""
     try:
         shown = ", ".join(f'"{name}": {_plain(value)}' for name, value in message.items())
         return f"{{{shown}}}\n".encode()
@@ -92,7 +92,7 @@ def request_line(message: JsonObject) -> bytes:
 
 
 def _plain(value: object) -> str:
-    """Return a value as JSON; TypeError if only `json` can write it."""
+    """Return a value as JSON. Raises TypeError if only `json` can write it."""
     if isinstance(value, str):
         if value.isprintable() and '"' not in value and "\\" not in value:
             return f'"{value}"'
@@ -111,20 +111,19 @@ def _plain(value: object) -> str:
 
 
 def encode(message: JsonObject) -> bytes:
-    """Return an object as a line; ValueError or TypeError if it has no JSON form.
+    """Return an object as a line. Raises ValueError or TypeError if it has no JSON form.
 
     Text is written as UTF-8. Only lone surrogates, which UTF-8 can't hold, are escaped.
     """
-    text: str = _json("encode")(message)
     try:
-        return text.encode() + b"\n"
+        line: bytes = _json("encode")(message).encode()
     except UnicodeEncodeError:
-        text = _json("escape")(message)
-        return text.encode() + b"\n"
+        line = _json("escape")(message).encode()
+    return line + b"\n"
 
 
 def decode(line: bytes) -> JsonObject:
-    """Return the object in a line; BadRequest, with a code that says why, if there is none."""
+    """Return the object in a line. Raises BadRequest if there is none. Its code gives the reason."""
     from talkcli.errors import BadRequest, LineTooLong
 
     if isinstance(line, TruncatedLine):
@@ -142,13 +141,13 @@ def decode(line: bytes) -> JsonObject:
     return value
 
 
-#: Functions that write and read JSON. With arguments, `json.dumps` and `json.loads` make new ones for each line, which
-#: takes half as long as writing the line of an event.
+#: Functions that write and read JSON. If `json.dumps` and `json.loads` have options, they make new functions for each
+#: line. This takes half as long as writing the line of an event.
 _json_functions: dict[str, Callable[[Any], Any]] = {}
 
 
 def _json(name: str) -> Callable[[Any], Any]:
-    """Return one of the functions `decode`, `encode` and `escape`, which are made at the first call."""
+    """Return the function with this name: `decode`, `encode` or `escape`. The first call makes all three."""
     if not _json_functions:
         import json
 

@@ -1,9 +1,10 @@
 """The requests of a client as frozen values, and how they are read from JSON.
 
-Rules for this file: form only. The scheduler decides whether a goal is admitted. A request is one class with a row for
-each of its fields; `say`, `cancel` and `set` are in `goals.options`. A field may be added, but never renamed or given
-another meaning. A field that is not in the rows is an error: an option that this server doesn't know is refused, never
-ignored. `meaning` is the text of the wire's table; without it, the table has the first sentence of the docstring.
+Rules for this file: it only defines the form of requests. The scheduler decides whether a goal is admitted. A request
+is a class with a row for each of its fields. The classes of `say`, `cancel` and `set` are in `goals.options`. Fields
+may be added, but never renamed or given another meaning. A field without a row is refused and never ignored, because a
+client must know that a server doesn't support it. `meaning` is the text in the wire's table. Without it, the table has
+the first sentence of the docstring.
 """
 
 from __future__ import annotations
@@ -119,7 +120,7 @@ class Log:
 
 @frozen
 class Pause:
-    """A request to pause all speech, which is answered when it is silent."""
+    """A request to pause all speech. The reply comes when the speech has stopped."""
 
     kind: ClassVar[str] = "pause"
     meaning: ClassVar[str] = "Hold speech where it is"
@@ -142,7 +143,7 @@ _OPTIONS_BY_KIND = {kind: {each.name: each for each in request.options} for kind
 
 
 def read_request(message: JsonObject) -> Request:
-    """Return the request in a decoded line without its `seq`; BadRequest, with a code, if it is malformed."""
+    """Return the request in a decoded line without its `seq`. Raises BadRequest, with a code, if it is malformed."""
     fields = dict(message)
     kind = fields.pop("request", None)
     if not isinstance(kind, str):
