@@ -7,7 +7,6 @@ compares the two. Both work without XDG_RUNTIME_DIR, which cron, sudo, systemd a
 
 from __future__ import annotations
 
-import errno
 import os
 import stat
 import sys
@@ -61,11 +60,11 @@ def describe_place(path: str, error: OSError) -> str:
         return PLACE_DIRECTORY
     if not stat.S_ISSOCK(mode):
         return PLACE_FILE
-    if error.errno in {errno.ENOENT, errno.ENOTDIR}:
+    if isinstance(error, FileNotFoundError | NotADirectoryError):
         return PLACE_ABSENT
-    if error.errno == errno.ECONNREFUSED:
+    if isinstance(error, ConnectionRefusedError):
         return PLACE_STALE
-    if error.errno in {errno.EACCES, errno.EPERM}:
+    if isinstance(error, PermissionError):
         return PLACE_FORBIDDEN
     return error.strerror or str(error)
 

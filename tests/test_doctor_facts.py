@@ -235,7 +235,8 @@ def _runs(pid: int) -> bool:
 def test_the_players_that_are_installed_are_found_in_their_order(tmp_path: Path) -> None:
     env = env_with(tmp_path, **dict.fromkeys(("pacat", "aplay", "mine"), "exit 0"))
     assert sound.find_players({"PATH": "/nowhere"}, None, None) == Players((), None, runs=False)
-    assert sound.find_players(env, None, "aplay") == Players(("aplay", "pacat"), None, runs=False, first="aplay")
+    assert sound.find_players(env, None) == Players(("aplay", "pacat"), None, runs=False, first="aplay")
+    assert sound.find_players(env, None, "pulse").first == "pulse"
     runs = {each: sound.find_players(env, each, None).runs for each in ("pulse", "mine -x", "theirs", "'")}
     assert runs == {"pulse": True, "mine -x": True, "theirs": False, "'": False}
 

@@ -166,7 +166,7 @@ def test_only_a_voice_that_is_used_is_tried(home: str, monkeypatch: pytest.Monke
 
     def find_neural(used: str | None, *_: object) -> NeuralVoices:
         asked.append(used)
-        return NeuralVoices(None)
+        return NeuralVoices()
 
     monkeypatch.setattr(voice, "find_neural", find_neural)
 
@@ -214,7 +214,7 @@ assert not {"onnxruntime", "numpy"} & {*sys.modules}, sys.modules.keys()
 def test_a_voice_that_takes_too_long_is_given_up(alone: dict[str, str]) -> None:
     tried = voice.find_neural("piper/tiny", EngineOptions(env=alone), 0.01).trial
     assert tried
-    assert tried.message == "it was not loaded, and had not spoken, after 0.01 s"
+    assert tried.fault[0] == "it was not loaded, and had not spoken, after 0.01 s"
 
 
 def test_a_voice_that_kills_the_engine_process_is_a_fact(home: str, tmp_path: Path) -> None:
@@ -226,7 +226,7 @@ def test_a_voice_that_kills_the_engine_process_is_a_fact(home: str, tmp_path: Pa
     )
     tried = voice.find_neural("piper/tiny", EngineOptions(env=_environment(home, tmp_path, dies)), LIMIT).trial
     assert tried
-    assert "SIGABRT" in (tried.message or "")
+    assert "SIGABRT" in tried.fault[0]
 
 
 def test_a_signal_ends_the_trial(alone: dict[str, str]) -> None:
@@ -256,14 +256,14 @@ def test_a_server_s_words_about_its_voices_are_told_if_they_cannot_be_examined()
 
 
 def test_a_voice_that_speaks_here_and_that_the_server_has_given_up_is_a_warning() -> None:
-    facts = NeuralVoices(None, used="piper/b", trial=VoiceTrial(load_s=0.5, speed=9.0))
+    facts = NeuralVoices(used="piper/b", trial=VoiceTrial(load_s=0.5, speed=9.0))
     assert voice.judge_neural(facts, has_server=True, server_voices=FAILED_THEN)[-1].state == WARNING
     assert voice.judge_neural(facts, has_server=True, server_voices={})[-1].state == OK
 
 
 def _judged(**tried: object) -> Finding:
     trial = VoiceTrial(**tried)  # type: ignore[arg-type]
-    facts = NeuralVoices(None, used="piper/a", trial=trial)
+    facts = NeuralVoices(used="piper/a", trial=trial)
     return voice.judge_neural(facts, has_server=False, server_voices={})[-1]
 
 
@@ -279,8 +279,8 @@ def test_on_a_slow_machine_another_voice_is_the_next_step() -> None:
 
 
 def test_a_voice_that_fails_is_a_warning_if_a_server_speaks_with_espeak_instead() -> None:
-    facts = NeuralVoices(None, used="piper/a", trial=VoiceTrial(message="x is no model", step="get it anew"))
-    without = NeuralVoices("onnxruntime is missing: install it", used="piper/a")
+    facts = NeuralVoices(used="piper/a", trial=VoiceTrial(fault=("x is no model", "get it anew")))
+    without = NeuralVoices(("onnxruntime is missing", "install it"), used="piper/a")
     for has_server, state in ((False, FAILURE), (True, WARNING)):
         assert voice.judge_neural(facts, has_server=has_server, server_voices={})[-1].state == state
         assert voice.judge_neural(without, has_server=has_server, server_voices={})[0].state == state

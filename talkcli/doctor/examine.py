@@ -92,7 +92,8 @@ class LocalExamination:
         yield from self._check_neural()
         if client is not None and self._server_pid is None:
             yield sound.SESSION_ELSEWHERE
-            yield from sound.judge_silent_player(self._player, by_server=True)
+            if is_silent(self._player):
+                yield sound.judge_silent_player(self._player, by_server=True)
         elif sys.platform.startswith("linux"):
             yield sound.judge_session(self._session)
             yield from self._check_sound()
@@ -131,16 +132,19 @@ class LocalExamination:
         if not is_own_driver(self._setting("driver")):
             return  # other drivers of pyttsx3 play on their own
         env, session, device, by_server = self._env, self._session, self._setting("device"), self._client is not None
-        players = sound.find_players(env, self._player, None if by_server else self._engine.player, by_server=by_server)
-        cards, found = sound.find_cards(session), sound.find_sound_server(env, session)
-        automatic = "pulse" if found.name and found.accepts_pulse else next(iter(players.found), None)
-        used = self._player or players.first or automatic
-        devices = None if used == "pulse" and found.hangs else sound.find_devices(env, used, device)
+        found = sound.find_sound_server(env, session)
         self._hangs = found.hangs
+        if is_silent(self._player):
+            yield sound.judge_silent_player(self._player, by_server=by_server)
+            return
+        chosen = None if by_server else self._engine.player
+        first = chosen or ("pulse" if found.name and found.accepts_pulse else None)
+        players = sound.find_players(env, self._player, first, by_server=by_server)
+        used, cards = self._player or players.first, sound.find_cards(session)
+        devices = None if used == "pulse" and found.hangs else sound.find_devices(env, used, device)
         yield from sound.judge_sound(players, devices, cards, found, session)
-        if not is_silent(self._player):
-            levels = sound.find_levels(env, found, cards)
-            yield from sound.judge_levels(levels, is_used=device is None and used in PLAYERS)
+        levels = sound.find_levels(env, found, cards)
+        yield from sound.judge_levels(levels, is_used=device is None and used in PLAYERS)
 
     def _check_sentence(self) -> Finding:
         client, engine, player = self._client, self._engine, self._player

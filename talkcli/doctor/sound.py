@@ -133,7 +133,7 @@ class Players:
     configured: str | None
     #: whether the configured player can be run
     runs: bool = True
-    #: the player that the engine tries first in an automatic choice, or None if unknown
+    #: the player that an automatic choice tries first, or None if there is none
     first: str | None = None
     #: whether a server plays, and not the doctor's own engine
     by_server: bool = False
@@ -195,7 +195,8 @@ def find_session(server_pid: int | None) -> tuple[UserSession, Mapping[str, str]
     environment = None if server_pid is None else _environment(server_pid)
     if environment is None:
         server_pid, environment = None, dict(os.environ)
-    uid, gids = os.getuid(), _group_ids(server_pid)
+    pid = os.getpid() if server_pid is None else server_pid
+    uid, gids = os.getuid(), _group_ids(pid)
     caller = environment.get("SUDO_UID", "")
     runtime = environment.get("XDG_RUNTIME_DIR") or None
     usual = f"/run/user/{uid}"
@@ -206,7 +207,7 @@ def find_session(server_pid: int | None) -> tuple[UserSession, Mapping[str, str]
         groups=tuple(_name(grp.getgrgid, each) for each in gids),
         gids=gids,
         sudo_uid=int(caller) if uid == 0 and caller.isdecimal() else None,
-        origins=tuple(_origins(environment, os.getpid() if server_pid is None else server_pid)),
+        origins=tuple(_origins(environment, pid)),
         runtime_dir=runtime,
         runtime_owner=None if runtime is None else file_owner(runtime),
         usual_runtime_dir=usual if os.path.isdir(usual) else None,
@@ -246,8 +247,9 @@ def _name(look_up: Callable[[int], tuple[Any, ...]], number: int) -> str:
         return str(number)
 
 
-def _group_ids(pid: int | None) -> tuple[int, ...]:
-    status = "" if pid is None else _read_text(f"/proc/{pid}/status")
+def _group_ids(pid: int) -> tuple[int, ...]:
+    """Return the group ids of a process. Without /proc, return those of this process."""
+    status = _read_text(f"/proc/{pid}/status")
     found = re.search(r"^Gid:\s+\d+\s+(\d+).*?^Groups:([\d \t]*)$", status, re.MULTILINE | re.DOTALL)
     groups = map(int, " ".join(found.groups()).split()) if found else (os.getegid(), *os.getgroups())
     return tuple(sorted(set(groups)))
@@ -268,6 +270,7 @@ def _origins(environment: Mapping[str, str], pid: int) -> Iterable[str]:
 
 
 def _parent_names(pid: int) -> Iterable[str]:
+    """Yield the names of the programs that a process's parents run, the nearest first."""
     for _ in range(_MAX_PARENTS_COUNT):
         parent = process_stat(pid)[1:2]
         pid = int(parent[0]) if parent else 0
@@ -318,7 +321,7 @@ def _access_list(path: str) -> list[tuple[int, int, int]]:
     """Return the entries of a file's access control list as tuples of tag, permission bits and user or group id."""
     with contextlib.suppress(OSError):
         data = os.getxattr(path, "system.posix_acl_access")
-        return list(struct.iter_unpack("<HHI", data[4 : 4 + (len(data) - 4) // 8 * 8]))
+        return list(struct.iter_unpack("<HHI", data[4:]))  # after a version number of four bytes
     return []
 
 
@@ -345,12 +348,13 @@ def run_program(program: str, *arguments: str, env: Mapping[str, str], limit: fl
             )
         except OSError as error:
             return ProgramOutput(str(error))
-        try:
-            code: int | None = process.wait(limit)
-        except subprocess.TimeoutExpired:
-            code = None
-        finally:
-            _kill_group(process)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(limit)
+        code = process.returncode
+        if code is None:
+            kill([-process.pid])  # its own group, whose id is not reused before the process is reaped
+            with contextlib.suppress(subprocess.TimeoutExpired):  # stuck in a driver: init will reap it
+                process.wait(1)
         stdout, stderr = (os.pread(each.fileno(), _MAX_OUTPUT_BYTES, 0).decode(errors="replace") for each in (out, err))
     if code is None:
         return ProgramOutput(f"no answer within {limit:g} s", stdout, timed_out=True)
@@ -358,13 +362,6 @@ def run_program(program: str, *arguments: str, env: Mapping[str, str], limit: fl
         return ProgramOutput(f"it was killed by {signal_name(-code)}", stdout)
     lines = filter(None, map(str.strip, (stderr or stdout).splitlines()))
     return ProgramOutput(next(lines, "it said nothing") if code else None, stdout)
-
-
-def _kill_group(process: subprocess.Popen[bytes]) -> None:
-    if process.returncode is None:
-        kill([-process.pid])  # its own group, and the id can't have been reused because the process isn't reaped yet
-        with contextlib.suppress(subprocess.TimeoutExpired):  # stuck in a driver: init will reap it
-            process.wait(1)
 
 
 def is_custom(player: str | None) -> bool:
@@ -388,7 +385,7 @@ def find_players(
     found = tuple(each for each in PACKAGES if on_path(each, env))
     program = _program_of(configured or "")
     runs = program == "pulse" or bool(program and on_path(program, env))
-    return Players(found, configured, runs, first, by_server)
+    return Players(found, configured, runs, first or next(iter(found), None), by_server)
 
 
 def find_devices(env: Mapping[str, str], player: str | None, configured: str | None) -> Devices | None:
@@ -516,16 +513,13 @@ def parse_level(name: str, text: str, unmute_command: str, louder_command: str) 
 
 def judge_session(session: UserSession) -> Finding:
     """Judge whether players can find the sound server of the user."""
-    who = f"user {session.user} (uid {session.uid})"
-    if session.sudo_uid is not None:
-        who += f" by sudo from uid {session.sudo_uid}"
-    if session.origins:
-        who += f", in {' and '.join(session.origins)}"
-    if session.server_pid is not None:
-        who = f"the server's: {who}"
+    who = "" if session.server_pid is None else "the server's: "
+    who += f"user {session.user} (uid {session.uid})"
+    who += "" if session.sudo_uid is None else f" by sudo from uid {session.sudo_uid}"
+    who += f", in {' and '.join(session.origins)}" if session.origins else ""
     if session.runtime_dir is None:
         if session.usual_runtime_dir is None:
-            # Without logind, as on many robots, there is no such directory and nothing is wrong.
+            # Robots often have no logind, which makes this directory. Then nothing is wrong.
             return ok("session", f"{who}; no XDG_RUNTIME_DIR, as there is no session of this user")
         again = "" if session.server_pid is None else " where the server is started, and start it again"
         return warning(
@@ -545,20 +539,18 @@ def judge_session(session: UserSession) -> Finding:
     return ok("session", words)
 
 
-def judge_silent_player(player: str | None, *, by_server: bool) -> list[Finding]:
-    """Judge a configured player by its name alone. The result is empty unless the player makes no sound."""
-    if not is_silent(player):
-        return []
+def judge_silent_player(player: str | None, *, by_server: bool) -> Finding:
+    """Return the finding about a configured player that makes no sound."""
     step = "start the server without --player" if by_server else "unset TALK_PLAYER"
-    return [failure("player", f"{player} ({_set_by(by_server)}): it keeps the time and makes no sound", step)]
+    return failure("player", f"{player} ({_set_by(by_server)}): it keeps the time and makes no sound", step)
 
 
 def judge_sound(
     players: Players, devices: Devices | None, cards: Cards, server: SoundServer, session: UserSession
 ) -> list[Finding]:
-    """Judge everything between samples and loudspeaker, except the volume."""
-    return judge_silent_player(players.configured, by_server=players.by_server) or [
-        _judge_player(players, server),
+    """Judge everything between the engine and the loudspeaker, except the volume."""
+    return [
+        _judge_player(players),
         *([] if devices is None else [_judge_device(devices)]),
         _judge_cards(cards, server, session),
         _judge_access(cards, server, session),
@@ -567,14 +559,15 @@ def judge_sound(
 
 
 def _set_by(by_server: bool) -> str:
+    """Return what configured the player, for people."""
     return "the server's" if by_server else "TALK_PLAYER"
 
 
-def _judge_player(players: Players, server: SoundServer) -> Finding:
+def _judge_player(players: Players) -> Finding:
     configured, found = players.configured, players.found
     broken = warning if players.by_server else failure
     if configured is None:
-        pulse = players.first == "pulse" if players.first else server.name is not None and server.accepts_pulse
+        pulse = players.first == "pulse"
         if not pulse and not found:
             package = next(iter(PACKAGES.values()))
             return broken("player", f"none is on the PATH: {', '.join(PACKAGES)}", f"sudo apt-get install -y {package}")

@@ -26,9 +26,10 @@ from talkcli.engine.parent.process import EngineFailed, PrivateEngine
 from talkcli.frozen import frozen, replace
 from talkcli.goals.options import NEURAL_PREFIX, is_neural
 from talkcli.goals.reasons import Reason
+from talkcli.peers import read_proc_file
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
     from typing import Any
 
 #: The sentence that the doctor speaks, and its rate in words per minute.
@@ -111,17 +112,16 @@ class VoiceTrial:
     speed: float | None = None
     #: memory of the engine process afterwards, or None if unknown
     memory_bytes: int | None = None
-    #: why the voice failed, and the next step if it is known
-    message: str | None = None
-    step: str | None = None
+    #: why the voice failed, and the next step
+    fault: tuple[str, str] = ("", "")
 
 
 @frozen
 class NeuralVoices:
     """Facts about neural voices and the packages that they need."""
 
-    #: message about a missing package, or None
-    missing: str | None
+    #: message and next step if a package is missing or can't be imported, or None
+    package_fault: tuple[str, str] | None = None
     #: installed packages with their versions, such as "onnxruntime 1.23.2"
     installed: tuple[str, ...] = ()
     #: ids of the voices whose files look valid
@@ -132,8 +132,6 @@ class NeuralVoices:
     used: str | None = None
     #: result of speaking with that voice, or None if it was not tried
     trial: VoiceTrial | None = None
-    #: message about a package that can't be imported, or None
-    import_error: str | None = None
 
 
 def installed_version(package: str) -> str | None:
@@ -166,9 +164,8 @@ def find_engine(options: EngineOptions) -> EngineReport:
         with start_engine(options) as engine:
             ready = engine.wait_for(protocol.Ready)
             report = EngineReport(ready.driver, ready.version, player=ready.player, neural_voice=ready.voice)
-            voices = engine.wait_for(protocol.VoiceList).voices
-            neural = sum(is_neural(each.id) for each in voices)
-            return replace(report, voice_count=len(voices), neural_count=neural)
+            ids = [each.id for each in engine.wait_for(protocol.VoiceList).voices]
+            return replace(report, voice_count=len(ids), neural_count=sum(map(is_neural, ids)))
     except EngineFailed as error:
         if report.driver is None or error.reason == Reason.ENGINE_CRASHED:
             reason, message = explain_failure(error)
@@ -238,7 +235,7 @@ def find_neural(used: str | None, options: EngineOptions, limit: float) -> Neura
         options: environment and interrupt of the processes that are started.
         limit: time in seconds for the trial.
     """
-    missing = models.missing_package()
+    fault = _find_package_fault(os.environ if options.env is None else options.env)
     valid, invalid = [], []
     for name, path in models.find_models(options.env).items():
         try:
@@ -247,20 +244,23 @@ def find_neural(used: str | None, options: EngineOptions, limit: float) -> Neura
             valid.append(NEURAL_PREFIX + name)
         except models.VoiceFileError as error:
             invalid.append((NEURAL_PREFIX + name, *_split_step(str(error))))
-    import_error = None if missing else _find_import_error(os.environ if options.env is None else options.env)
-    trial = None if used is None or missing or import_error else _try_voice(used, options, limit)
+    trial = None if used is None or fault else _try_voice(used, options, limit)
     installed = tuple(map(_with_version, models.MODEL_PACKAGES))
-    return NeuralVoices(missing, installed, tuple(valid), tuple(invalid), used, trial, import_error)
+    return NeuralVoices(fault, installed, tuple(valid), tuple(invalid), used, trial)
 
 
-def _find_import_error(env: Mapping[str, str]) -> str | None:
-    """Return a message about the first package that can't be imported, or None if all can be."""
+def _find_package_fault(env: Mapping[str, str]) -> tuple[str, str] | None:
+    """Return a message about the first package that is missing or can't be imported, and the next step."""
+    missing = models.missing_package()
+    if missing is not None:
+        return _split_step(missing)
     env = {**env, **models.NO_TELEMETRY}
     for package in reversed(models.MODEL_PACKAGES):  # onnxruntime imports numpy, so numpy is first
         output = run_program(sys.executable, "-c", _IMPORT_PROGRAM + package, env=env, limit=_IMPORT_LIMIT_S)
         if output.error is not None:
-            error = _IMPORT_TIMED_OUT if output.timed_out else output.error
-            return f"{_with_version(package)} cannot be imported: {error}"
+            message = f"{_with_version(package)} cannot be imported: "
+            message += _IMPORT_TIMED_OUT if output.timed_out else output.error
+            return message, next(step for clue, step in _IMPORT_ADVICE.items() if clue in message)
     return None
 
 
@@ -285,14 +285,13 @@ def _try_voice(used: str, options: EngineOptions, limit: float) -> VoiceTrial:
             if ended.outcome == protocol.OUTCOME_COMPLETED:
                 ended, _ = _speak(engine, used, SENTENCE_TEXT)
             if ended.outcome != protocol.OUTCOME_COMPLETED or ended.duration is None:
-                fault = _split_step(ended.message or f"the sentence ended {ended.outcome}")
-                return VoiceTrial(None, None, None, *fault)
+                return VoiceTrial(fault=_split_step(ended.message or f"the sentence ended {ended.outcome}"))
             speed = ended.duration / (time.monotonic() - began)
             return VoiceTrial(load_s, speed, _memory_of(engine._process.pid))
     except EngineFailed as error:
-        return VoiceTrial(message=explain_failure(error)[1], step=_CHOOSE_ESPEAK)
+        return VoiceTrial(fault=(explain_failure(error)[1], _CHOOSE_ESPEAK))
     except TimeoutError:
-        return VoiceTrial(message=f"it was not loaded, and had not spoken, after {limit:g} s", step=_CHOOSE_ESPEAK)
+        return VoiceTrial(fault=(f"it was not loaded, and had not spoken, after {limit:g} s", _CHOOSE_ESPEAK))
     finally:
         os.close(nowhere)
 
@@ -312,9 +311,8 @@ def _speak(engine: PrivateEngine, voice: str, text: str) -> tuple[protocol.Ended
 
 def _memory_of(pid: int) -> int | None:
     """Return the resident memory of a process in bytes, or None if it is unknown."""
-    with contextlib.suppress(OSError, ValueError, IndexError), open(f"/proc/{pid}/statm") as file:
-        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    return None
+    statm = read_proc_file(f"/proc/{pid}/statm")  # the first two numbers are the total and the resident pages
+    return int(statm.split()[1]) * os.sysconf("SC_PAGE_SIZE") if statm else None
 
 
 def judge_server_voices(voices: dict[str, Any]) -> list[Finding]:
@@ -342,11 +340,8 @@ def judge_neural(neural: NeuralVoices, *, has_server: bool, server_voices: dict[
     """
     trial = neural.trial
     broken = warning if has_server or neural.used is None else failure
-    if neural.missing is not None:
-        found = [broken(_PACKAGES_CHECK, *_split_step(neural.missing))]
-    elif neural.import_error is not None:
-        step = next(step for clue, step in _IMPORT_ADVICE.items() if clue in neural.import_error)
-        found = [broken(_PACKAGES_CHECK, neural.import_error, step)]
+    if neural.package_fault is not None:
+        found = [broken(_PACKAGES_CHECK, *neural.package_fault)]
     else:
         found = [ok(_PACKAGES_CHECK, ", ".join(neural.installed))]
     if neural.invalid:
@@ -360,18 +355,19 @@ def judge_neural(neural: NeuralVoices, *, has_server: bool, server_voices: dict[
         return found
     if trial.speed is not None and _failed_voices(server_voices):
         return [*found, *judge_server_voices(server_voices)]  # the voice works here, but the server could not load it
-    return [*found, _judge_trial(neural.used or "", trial, broken)]
-
-
-def _judge_trial(used: str, trial: VoiceTrial, broken: Callable[[str, str, str], Finding]) -> Finding:
     if trial.speed is None:
-        message = trial.message or "it was not spoken with"
-        return broken(_NEURAL_CHECK, f"{used} is in use: {message}", trial.step or _CHOOSE_ESPEAK)
+        message, step = trial.fault
+        return [*found, broken(_NEURAL_CHECK, f"{neural.used} is in use: {message}", step)]
+    return [*found, _judge_speed(f"{neural.used} is in use", trial, trial.speed)]
+
+
+def _judge_speed(words: str, trial: VoiceTrial, speed: float) -> Finding:
+    """Judge whether a voice that works is fast enough for this machine."""
     facts = [] if trial.load_s is None else [f"loaded in {trial.load_s:.1f} s"]
-    facts.append(f"makes a sentence {trial.speed:.1f} times as fast as it is heard")
+    facts.append(f"makes a sentence {speed:.1f} times as fast as it is heard")
     facts += [] if trial.memory_bytes is None else [f"takes {trial.memory_bytes / 1e6:.0f} MB with its engine"]
-    words = f"{used} is in use: {', '.join(facts)}"
-    if trial.speed < _MIN_REAL_TIME_FACTOR:
+    words = f"{words}: {', '.join(facts)}"
+    if speed < _MIN_REAL_TIME_FACTOR:
         step = "choose a voice whose quality is low or x_low, or one of espeak's: talk set --voice en"
         return warning(_NEURAL_CHECK, f"{words}: this machine is too slow for it, or too busy", step)
     return ok(_NEURAL_CHECK, words)

@@ -248,7 +248,7 @@ def test_a_voice_that_can_speak_is_told_with_its_version_and_voices() -> None:
 def test_a_library_that_the_server_lacks_comes_before_its_silent_player() -> None:
     for engine in (ENGINE, EngineReport(reason="engine_failed", message=MISSING)):
         judged = voice.judge_engine("2.99", engine, server=MISSING)
-        assert next_step([*judged, *sound.judge_silent_player("null", by_server=True)]) == voice.INSTALL_LIBRARY
+        assert next_step([*judged, sound.judge_silent_player("null", by_server=True)]) == voice.INSTALL_LIBRARY
 
 
 PATH = "/run/user/1000/talk/talk.sock"
@@ -400,7 +400,7 @@ def test_in_a_pipe_a_finding_is_one_line_without_colour() -> None:
 
 
 PI = UserSession(1000, "pi", groups=("pi", "audio"), gids=(1000, 29), runtime_dir="/run/user/1000", runtime_owner=1000)
-PLAYERS = Players(("aplay", "pacat"), None)
+PLAYERS = Players(("aplay", "pacat"), None, first="aplay")
 DEVICES = Devices("aplay -L", ("default", "plughw:CARD=Device,DEV=0"))
 CARDS = Cards(in_kernel=True, names=("USB Audio Device",), nodes=("/dev/snd/pcmC0D0p",), group="audio")
 NO_CARDS = Cards(in_kernel=True)
@@ -432,15 +432,33 @@ def test_a_robot_with_a_card_and_nothing_else_is_well() -> None:
 
 
 def test_a_sound_server_that_answers_needs_no_program() -> None:
-    assert judged("player", server=PULSE).message == "pulse is used, by the sound server; then aplay, pacat"
-    alone = judged("player", Players((), None), server=PULSE)
+    chosen = replace(PLAYERS, first="pulse")
+    assert judged("player", chosen).message == "pulse is used, by the sound server; then aplay, pacat"
+    alone = judged("player", replace(chosen, found=()))
     assert (alone.state, alone.message) == (OK, "pulse is used, by the sound server")
-    assert judged("player", Players((), "pulse"), server=PULSE, by_server=True).message == "pulse (the server's)"
-    assert judged("player", server=WIRE).message == "aplay is used; then pacat"
-    # The choice of an engine process counts more than the sound server's answer.
-    chosen = replace(PLAYERS, first="aplay")
-    assert judged("player", chosen, server=PULSE).message == "aplay is used; then pacat"
-    assert judged("player", replace(PLAYERS, first="pulse"), server=WIRE).message.startswith("pulse is used")
+    assert judged("player", Players((), "pulse"), by_server=True).message == "pulse (the server's)"
+    assert judged("player").message == "aplay is used; then pacat"
+
+
+def test_the_player_is_chosen_by_the_engine_process_or_else_by_the_sound_server(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(sound, "on_path", lambda program, _: program in {"aplay", "pacat"})
+    monkeypatch.setattr(sound, "find_levels", lambda *_: ())
+    monkeypatch.setattr(sound, "run_program", lambda *_, **__: sound.ProgramOutput("it is not there"))
+
+    def first(server: SoundServer, chosen: str | None = None, *, by_server: bool = False) -> str:
+        monkeypatch.setattr(sound, "find_sound_server", lambda *_: server)
+        examination = LocalExamination(None, silent=True)
+        examination._engine, examination._env = replace(ENGINE, player=chosen), {}
+        examination._client = CLIENT if by_server else None
+        found = of(list(examination._check_sound()), "player").message
+        return found.partition(" is used")[0]
+
+    monkeypatch.delenv("TALK_PLAYER", raising=False)
+    assert first(PULSE) == first(WIRE, "pulse") == "pulse"
+    assert first(PULSE, "aplay") == first(WIRE) == first(NO_SERVER) == "aplay"
+    assert first(PULSE, "aplay", by_server=True) == "pulse", "the server's engine is another one"
 
 
 def test_a_sound_server_with_only_a_dummy_output_is_not_heard() -> None:
@@ -461,12 +479,14 @@ def test_a_missing_player_is_named_with_its_package() -> None:
     assert (found.state, "/opt/play (TALK_PLAYER)" in found.message) == (FAILURE, True)
 
 
-def test_a_player_without_sound_is_not_heard() -> None:
+def test_a_player_without_sound_is_not_heard(monkeypatch: pytest.MonkeyPatch) -> None:
     for player in ("null", "file:/tmp/x.wav"):
-        found = sound.judge_sound(Players((), player, by_server=True), None, CARDS, PULSE, PI)
-        assert [each.state for each in found] == [FAILURE]
-        assert found == sound.judge_silent_player(player, by_server=True)
-    assert sound.judge_silent_player("aplay", by_server=True) == []
+        monkeypatch.setenv("TALK_PLAYER", player)
+        examination = LocalExamination(None, silent=True)
+        examination._env = {"PATH": "/nowhere"}
+        (found,) = examination._check_sound()
+        assert (found.check, found.state, found.next) == ("player", FAILURE, "unset TALK_PLAYER")
+        assert "without --player" in str(sound.judge_silent_player(player, by_server=True).next)
 
 
 def test_a_device_is_looked_up_in_the_player_s_list() -> None:
