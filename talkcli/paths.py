@@ -70,6 +70,7 @@ def describe_place(path: str, error: OSError) -> str:
 
 
 def _runtime_directories(uid: int) -> list[str]:
+    """Return the directories that platformdirs may use if XDG_RUNTIME_DIR isn't set."""
     if sys.platform == "darwin":
         return [os.path.expanduser("~/Library/Caches/TemporaryItems")]
     # Without systemd's directory, platformdirs uses the first writable one of these temporary directories. A client
@@ -81,12 +82,16 @@ def _runtime_directories(uid: int) -> list[str]:
     return [f"/run/user/{uid}", *fallbacks]
 
 
+def sudo_caller(environment: Mapping[str, str]) -> int | None:
+    """Return the id of the user who called sudo, or None if this process isn't root under sudo."""
+    caller = environment.get("SUDO_UID", "")
+    return int(caller) if os.getuid() == 0 and caller.isdecimal() else None
+
+
 def sudo_hint() -> str | None:
-    """Return the usual socket of the user who called sudo, or None if this process doesn't run under sudo."""
-    caller = os.environ.get("SUDO_UID", "")
-    if os.getuid() != 0 or not caller.isdecimal():
-        return None
-    return f"/run/user/{caller}/talk/{SOCKET_NAME}"
+    """Return the usual socket of the user who called sudo, or None if this process isn't root under sudo."""
+    caller = sudo_caller(os.environ)
+    return None if caller is None else f"/run/user/{caller}/talk/{SOCKET_NAME}"
 
 
 def server_socket(named: str | None) -> str:

@@ -12,7 +12,7 @@ import sys
 #: Length limit for a command line. It leaves room for an interpreter, a script and its first arguments.
 _MAX_COMMAND_LINE_CHARS = 200
 
-#: Programs that run another program and wait for it. Their parent is the interesting process.
+#: Programs that run another program and wait for it. Their parents say more about where a request comes from.
 _WRAPPER_PROGRAMS = frozenset({b"timeout", b"time", b"flock", b"xargs", b"sudo"})
 #: How many wrapper programs to skip at most.
 _MAX_WRAPPERS_COUNT = 8

@@ -25,7 +25,7 @@ def wait_ready(
     Raises:
         Interrupted: one of the descriptors in `interrupt` is ready.
     """
-    # No start of a client pays for these imports.
+    # Imported here, so that they do not slow down commands that never wait.
     import math
     import select
 

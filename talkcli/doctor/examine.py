@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from talkcli.doctor.report import Finding
     from talkcli.goals.goal import JsonObject
 
-#: Time limit for the sentence, including its time in the queue. A long sentence may be spoken before it.
+#: Time limit for the sentence, including the time that it waits for other goals.
 SENTENCE_LIMIT_S = 20.0
 
 
@@ -60,7 +60,7 @@ class LocalExamination:
         #: session and environment of the player
         self._session = sound.UserSession(0, "")
         self._env: Mapping[str, str] = os.environ
-        #: whether the sound server hangs, so that every question to it takes long
+        #: whether the sound server accepts connections but doesn't answer
         self._hangs = False
         self._findings: list[Finding] = []
 
@@ -74,6 +74,7 @@ class LocalExamination:
                 yield finding
 
     def _run_checks(self, client: Client | None, search: server.SocketSearch) -> Iterator[Finding]:
+        """Run the checks with this connection to the server, or without a server."""
         of_server: list[Finding] = []
         if client is not None:
             try:
@@ -108,6 +109,7 @@ class LocalExamination:
 
     @property
     def _player(self) -> str | None:
+        """The configured player, or None for the automatic choice."""
         return self._setting("player", "TALK_PLAYER")
 
     def _check_neural(self) -> Iterator[Finding]:
@@ -129,6 +131,7 @@ class LocalExamination:
         yield from voice.judge_neural(facts, has_server=self._client is not None, server_voices=server_voices)
 
     def _check_sound(self) -> Iterator[Finding]:
+        """Check everything between the engine and the loudspeaker."""
         if not is_own_driver(self._setting("driver")):
             return  # other drivers of pyttsx3 play on their own
         env, session, device, by_server = self._env, self._session, self._setting("device"), self._client is not None
@@ -143,17 +146,18 @@ class LocalExamination:
         used, cards = self._player or players.first, sound.find_cards(session)
         devices = None if used == "pulse" and found.hangs else sound.find_devices(env, used, device)
         yield from sound.judge_sound(players, devices, cards, found, session)
-        levels = sound.find_levels(env, found, cards)
+        levels = tuple(sound.find_levels(env, found, cards))
         yield from sound.judge_levels(levels, is_used=device is None and used in PLAYERS)
 
     def _check_sentence(self) -> Finding:
+        """Speak the sentence, and judge how it ended."""
         client, engine, player = self._client, self._engine, self._player
         if client is not None and self._silent:
             if self._server_pid is None:
                 return sentence.SENTENCE_ELSEWHERE
             result = sentence.speak_beside_server(client, self._server_options(self._server_pid), SENTENCE_LIMIT_S)
         elif client is not None:
-            result = replace(sentence.speak_by_server(client, SENTENCE_TEXT, SENTENCE_LIMIT_S), by_server=True)
+            result = sentence.speak_by_server(client, SENTENCE_TEXT, SENTENCE_LIMIT_S)
         elif engine.reason is not None:
             result = sentence.SentenceResult(State.ABORTED, engine.reason, engine.message)
         else:

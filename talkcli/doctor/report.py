@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 OK, WARNING, FAILURE = "ok", "warning", "failed"
 #: The check that speaks a sentence.
 SENTENCE_CHECK = "sentence"
-#: How many names of a long list to show.
+#: How many names to show of a list that is shortened.
 _SHOWN_NAMES_COUNT = 4
 #: Widths of the first two columns, for the longest state and the longest name of a check.
 _STATE_WIDTH_CHARS, _CHECK_WIDTH_CHARS = 7, 12
 _MESSAGE_INDENT = " " * (_STATE_WIDTH_CHARS + _CHECK_WIDTH_CHARS + 2 * len(COLUMN_GAP))
 _ARROW = "-> "
 _FINAL_STEP_INDENT = "  "
-#: The goal state whose colour a finding has.
+#: For each state of a finding, the goal state that is shown in the same colour.
 _FINDING_COLOURS = {OK: State.SUCCEEDED, WARNING: State.PREEMPTED, FAILURE: State.ABORTED}
 
 
@@ -101,7 +101,7 @@ def next_step(findings: Sequence[Finding]) -> str | None:
 
 
 def format_finding(finding: Finding, screen: Screen) -> list[str]:
-    """Return the lines that show a finding. In a pipe it is one line; a terminal gets the next step below."""
+    """Return the lines that show a finding: a single line in a pipe. On a terminal, the next step has its own lines."""
     state = screen.coloured(pad(finding.state, _STATE_WIDTH_CHARS), _FINDING_COLOURS[finding.state])
     head = COLUMN_GAP.join((state, pad(finding.check, _CHECK_WIDTH_CHARS), ""))
     room = screen.columns_left(len(_MESSAGE_INDENT))

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from talkcli.doctor.voice import EngineOptions
     from talkcli.goals.goal import Goal
 
-#: A silent sentence beside a server. It is short and fast, because some devices accept only one player at a time. It is
-#: long enough to show whether the player really plays.
+#: The silent sentence that is played while the server may speak. It is short and fast, because some devices accept only
+#: one player at a time. It is long enough to show whether the player really plays.
 SILENT_TEXT, _SILENT_RATE_WPM = "talk works well", 450
 #: The next step for the reasons of goals, and for two reasons that only the doctor gives. A test checks that no reason
 #: of an aborted goal is missing.
@@ -58,12 +58,12 @@ SENTENCE_ELSEWHERE = failure(
     "not played: the server runs on another machine or in a container, and so does its player",
     "run talk doctor --silent there; or here without --silent, so that the server plays",
 )
-#: The next step if the server of another user could not play.
+#: The next step if a player of another user's server failed. The doctor can't use that server's environment.
 RUN_AS_OWNER = "play as the server's own user, who may have another sound: sudo -u '#{}' talk doctor --silent"
 _BUSY_STEP = "another program holds the device: close it, or play through a sound server (PipeWire, PulseAudio)"
 _PLAYER_REASONS = {Reason.AUDIO_DEVICE, Reason.AUDIO_LOST, Reason.AUDIO_STALLED}
 _START_REASONS = {Reason.ENGINE_FAILED, Reason.ENGINE_HUNG}
-#: The checks of what the engine plays to, the most likely cause of a fault first.
+#: The checks that can explain why a player fails, the most likely cause first.
 _PLAYBACK_CHECKS = ("player", "device", "sound server", "group", "cards", "session")
 
 
@@ -72,7 +72,7 @@ class SentenceResult:
     """How the doctor's sentence ended."""
 
     state: State
-    #: a goal's reason, or "late" if the sentence was canceled because it took too long
+    #: the goal's reason, or "late" or "paused" if the doctor canceled the sentence
     reason: str | None = None
     message: str | None = None
     #: seconds of sound
@@ -80,9 +80,9 @@ class SentenceResult:
     player: str | None = None
     #: whether the server spoke the sentence
     by_server: bool = False
-    #: whether the server spoke something else on the same device meanwhile
+    #: whether the server spoke at the same time as the doctor's own engine
     beside_speech: bool = False
-    #: suspended sinks after the end
+    #: the sinks that were suspended after the sentence
     suspended: tuple[str, ...] = ()
 
 
@@ -123,7 +123,8 @@ def _cancel_late(client: Client, goal: GoalHandle, limit: float) -> SentenceResu
 
 
 def _goal_result(goal: Goal) -> SentenceResult:
-    return SentenceResult(goal.state, goal.reason, goal.message, goal.duration)
+    """Return how a goal of the server ended."""
+    return SentenceResult(goal.state, goal.reason, goal.message, goal.duration, by_server=True)
 
 
 def speak_beside_server(client: Client, options: EngineOptions, limit: float) -> SentenceResult:

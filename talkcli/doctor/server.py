@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 #: The client name that the doctor sends to the server.
 DOCTOR_NAME = "talk doctor"
-#: The start of an error message that lists all places. `SocketSearch` has more details about them.
+#: The start of a client's error message that lists the places. `SocketSearch` describes them in more detail.
 _NO_SERVER_PREFIX = "no server"
 #: How many goals of the log to check for failures.
 _LOG_GOALS_COUNT = 100
@@ -51,7 +51,7 @@ _REFUSAL_ADVICE = {
     "busy": "end some of its clients, or raise the limit that is named: talk serve --max-clients 512, or LimitNOFILE=",
     "permission_denied": "have its owner let you in: talk serve --socket-mode 0660, and join the socket's group",
 }
-#: The next step for each kind of place, the most likely cause first.
+#: The next step for each kind of place, in the order in which they count if there are several.
 _PLACE_ADVICE = {
     PLACE_FORBIDDEN: "have {whose} let you in: talk serve --socket-mode 0660, and join the socket's group; "
     "or start your own",
@@ -62,10 +62,10 @@ _PLACE_ADVICE = {
     PLACE_DIRECTORY: "remove {path}, and: talk serve",
     PLACE_STALE: "talk serve (it takes the place of what was left over)",
 }
-#: How to name a socket, and how to stop naming it, by the option or variable that does it.
+#: For the option and the variable that name a socket, the words that name one and the step that stops it.
 _NAMING = {"TALK_SOCKET": "TALK_SOCKET=", "--socket": "--socket "}
 _UNNAMING: dict[str | None, str] = {"TALK_SOCKET": "unset TALK_SOCKET", "--socket": "leave --socket out"}
-#: A lower volume setting may be the reason why nobody hears a server. Volumes are between 0 and 1.
+#: Below this volume setting, speech may be inaudible. The loudest setting is 1.
 _FAINT_VOLUME = 0.2
 
 
@@ -110,7 +110,7 @@ def connect(option: str | None, interrupt: Mapping[int, int] | None) -> tuple[Cl
     named = paths.named_socket(option)
     named_by = "--socket" if option else "TALK_SOCKET" if named else None
     tried = paths.client_sockets(named)
-    #: places where a client trusts the server of any user
+    # Places where a client trusts a server of any user.
     trusted = {named, paths.SYSTEM_SOCKET}
     try:
         client = Client.over(SocketConnection(option, name=DOCTOR_NAME, interrupt=interrupt))
@@ -137,6 +137,7 @@ def _client_message(lines: list[str], found: tuple[SocketPlace, ...]) -> str | N
 
 
 def _find_place(path: str, trusted: Container[str | None]) -> SocketPlace:
+    """Connect to a socket and disconnect at once, to find out what is there."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         try:
@@ -177,7 +178,7 @@ def local_pid(client: Client) -> int | None:
 
 
 def judge_search(search: SocketSearch) -> Finding:
-    """Judge whether the server was found, and whether something is in its way."""
+    """Judge whether the server was found, and whether clients may be stopped by what is at the places before it."""
     *before, last = search.places
     if last.what == PLACE_SERVER:
         obstacles = [each for each in before if each.what != PLACE_ABSENT]

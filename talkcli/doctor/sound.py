@@ -19,6 +19,7 @@ import subprocess
 import tempfile
 from typing import TYPE_CHECKING
 
+from talkcli import paths
 from talkcli.doctor.report import Finding, failure, join_names, ok, warning
 from talkcli.engine.players import (
     DUMMY_SINK,
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
 _AUDIO_GROUP = "audio"
 #: Files that container runtimes create in every container.
 _CONTAINER_FILES = ("/.dockerenv", "/run/.containerenv", "/run/systemd/container")
-#: How many parents of a process to look at. A shell in a script in cron is three levels below cron.
+#: How many parents of a process to look at. A shell that a script runs is three levels below cron.
 _MAX_PARENTS_COUNT = 8
 _CRON_PROGRAMS = frozenset({"cron", "crond", "cronie", "anacron"})
 _SSH_PROGRAMS = frozenset({"ssh", "sshd"})
@@ -65,8 +66,8 @@ _ALSA_CONTROLS = ("Master", "PCM", "Speaker", "Headphone", "Digital")
 #: The name for people of the output that a sound server's mixer controls.
 _DEFAULT_SINK = "the default sink"
 #: For each mixer program, the commands that unmute the default sink and make it louder.
-_PACTL = ("pactl set-sink-mute @DEFAULT_SINK@ 0", "pactl set-sink-volume @DEFAULT_SINK@ 70%")
-_WPCTL = ("wpctl set-mute @DEFAULT_AUDIO_SINK@ 0", "wpctl set-volume @DEFAULT_AUDIO_SINK@ 0.7")
+_PACTL_COMMANDS = ("pactl set-sink-mute @DEFAULT_SINK@ 0", "pactl set-sink-volume @DEFAULT_SINK@ 70%")
+_WPCTL_COMMANDS = ("wpctl set-mute @DEFAULT_AUDIO_SINK@ 0", "wpctl set-volume @DEFAULT_AUDIO_SINK@ 0.7")
 #: Time limit for a program. Every program answers within milliseconds, unless the sound server hangs.
 PROGRAM_LIMIT_S = 3.0
 #: How much of a program's output to read. The device list of a large machine is a tenth of this.
@@ -100,7 +101,7 @@ class UserSession:
 class Cards:
     """The sound cards that the kernel knows."""
 
-    #: whether the kernel supports sound, which it may not in a container
+    #: whether /proc/asound exists. Containers can hide it.
     in_kernel: bool
     names: tuple[str, ...] = ()
     #: device files for playback, such as /dev/snd/pcmC0D0p
@@ -125,7 +126,7 @@ class ProgramOutput:
 
 @frozen
 class Players:
-    """The installed players, and the one to use."""
+    """The installed players, and the choice between them."""
 
     #: installed player programs, best first
     found: tuple[str, ...]
@@ -135,7 +136,7 @@ class Players:
     runs: bool = True
     #: the player that an automatic choice tries first, or None if there is none
     first: str | None = None
-    #: whether a server plays, and not the doctor's own engine
+    #: whether the server plays, or else the doctor's own engine
     by_server: bool = False
 
 
@@ -197,7 +198,6 @@ def find_session(server_pid: int | None) -> tuple[UserSession, Mapping[str, str]
         server_pid, environment = None, dict(os.environ)
     pid = os.getpid() if server_pid is None else server_pid
     uid, gids = os.getuid(), _group_ids(pid)
-    caller = environment.get("SUDO_UID", "")
     runtime = environment.get("XDG_RUNTIME_DIR") or None
     usual = f"/run/user/{uid}"
     session = UserSession(
@@ -206,7 +206,7 @@ def find_session(server_pid: int | None) -> tuple[UserSession, Mapping[str, str]
         server_pid=server_pid,
         groups=tuple(_name(grp.getgrgid, each) for each in gids),
         gids=gids,
-        sudo_uid=int(caller) if uid == 0 and caller.isdecimal() else None,
+        sudo_uid=paths.sudo_caller(environment),
         origins=tuple(_origins(environment, pid)),
         runtime_dir=runtime,
         runtime_owner=None if runtime is None else file_owner(runtime),
@@ -256,7 +256,7 @@ def _group_ids(pid: int) -> tuple[int, ...]:
 
 
 def _origins(environment: Mapping[str, str], pid: int) -> Iterable[str]:
-    """Yield what started a process, the most telling first."""
+    """Yield what started a process, the most specific first."""
     if environment.get("container") or any(map(os.path.exists, _CONTAINER_FILES)):
         yield _CONTAINER
     unit = re.search(r"system\.slice/(?:[^\n]*/)?([^/\n]+)\.service", _read_text(f"/proc/{pid}/cgroup"))
@@ -401,6 +401,7 @@ def find_devices(env: Mapping[str, str], player: str | None, configured: str | N
 
 
 def _parse_alsa(output: ProgramOutput) -> list[str]:
+    """Return the devices in a list by aplay. The lines below each device are indented."""
     return [each for each in output.stdout.splitlines() if each and not each[0].isspace() and each not in _NOT_DEVICES]
 
 
@@ -411,6 +412,7 @@ def _parse_sinks(output: ProgramOutput) -> dict[str, str]:
 
 
 def _parse_nodes(output: ProgramOutput) -> list[str]:
+    """Return the sinks in a list of PipeWire's nodes."""
     nodes = re.split(r"^\s*id \d+,", output.stdout, flags=re.MULTILINE)
     found = [re.search(r'node\.name = "([^"]*)"', each) for each in nodes if '"Audio/Sink"' in each]
     return [each[1] for each in found if each]
@@ -476,26 +478,25 @@ def _pulse_address(env: Mapping[str, str]) -> str | None:
     return None
 
 
-def find_levels(env: Mapping[str, str], server: SoundServer, cards: Cards) -> tuple[MixerLevel, ...]:
-    """Return the volume of the default output, from the first mixer program that reports it."""
+def find_levels(env: Mapping[str, str], server: SoundServer, cards: Cards) -> Iterable[MixerLevel]:
+    """Yield the volume of the default sink, or of the sound cards' controls if there is no sound server."""
     if server.hangs:
-        return ()
+        return
     if server.name is not None:
         mute = run_program("pactl", "get-sink-mute", "@DEFAULT_SINK@", env=env)
         if mute.error is None:
             volume = run_program("pactl", "get-sink-volume", "@DEFAULT_SINK@", env=env)
-            return (parse_level(_DEFAULT_SINK, mute.stdout + volume.stdout, *_PACTL),)
+            yield parse_level(_DEFAULT_SINK, mute.stdout + volume.stdout, *_PACTL_COMMANDS)
+            return
         both = run_program("wpctl", "get-volume", "@DEFAULT_AUDIO_SINK@", env=env)
-        return (parse_level(_DEFAULT_SINK, both.stdout, *_WPCTL),) if both.error is None else ()
-    if not cards.names:
-        return ()
-    controls = re.findall(r"control '([^']*)'", run_program("amixer", "scontrols", env=env).stdout)
-    outputs = [(each, run_program("amixer", "sget", each, env=env)) for each in _ALSA_CONTROLS if each in controls]
-    return tuple(
-        parse_level(name, output.stdout, f"amixer sset {name} unmute", f"amixer sset {name} 70%")
-        for name, output in outputs
-        if output.error is None
-    )
+        if both.error is None:
+            yield parse_level(_DEFAULT_SINK, both.stdout, *_WPCTL_COMMANDS)
+    elif cards.names:
+        found = re.findall(r"control '([^']*)'", run_program("amixer", "scontrols", env=env).stdout)
+        for each in filter(found.__contains__, _ALSA_CONTROLS):
+            output = run_program("amixer", "sget", each, env=env)
+            if output.error is None:
+                yield parse_level(each, output.stdout, f"amixer sset {each} unmute", f"amixer sset {each} 70%")
 
 
 def parse_level(name: str, text: str, unmute_command: str, louder_command: str) -> MixerLevel:

@@ -181,7 +181,7 @@ def explain_failure(error: EngineFailed) -> tuple[str, str]:
 
 
 def judge_python() -> Finding:
-    """Return the finding about the Python interpreter, which is never a fault."""
+    """Return a finding that names the Python interpreter."""
     return ok("python", f"Python {platform.python_version()} ({sys.executable})")
 
 
@@ -265,6 +265,7 @@ def _find_package_fault(env: Mapping[str, str]) -> tuple[str, str] | None:
 
 
 def _with_version(package: str) -> str:
+    """Return the name and version of an installed package."""
     return f"{package} {installed_version(package) or 'of an unknown version'}"
 
 
