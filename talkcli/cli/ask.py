@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from talkcli.doctor import broker, examine
     from talkcli.goals.goal import Goal, JsonObject
 
-#: How much of the last words heard is shown when a goal is paused.
+#: How many of the last characters that were heard are shown when a goal is paused.
 _PAUSED_TEXT_CHARS = 40
 
 
@@ -205,7 +205,7 @@ def _suggest_key(key: str, client: Client) -> None:
 
 
 def _no_voice(language: str, voices: Iterable[JsonObject]) -> str:
-    """Return the error for a language without a voice. The user may have typed a language's code or its name."""
+    """Return the error for a language without a voice. It suggests a similar name or code of a language, if any."""
     from talkcli.goals.options import is_neural
     from talkcli.terminal.text import printable
 

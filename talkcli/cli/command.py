@@ -115,7 +115,7 @@ class Command:
         return self.rule(given, typed) if self.rule else None
 
     def _is_local(self, given: Mapping[str, Any]) -> bool:
-        """Return whether the command needs no server."""
+        """Return whether the command runs without a server, such as `talk say --output`."""
         return not self.uses_server or given.get("output") is not None
 
     def _connection_fault(

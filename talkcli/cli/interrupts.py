@@ -72,9 +72,9 @@ class Interrupts:
     def __enter__(self) -> Interrupts:
         self._descriptor, self._write = os.pipe()
         os.set_blocking(self._write, False)
-        #: poll events by descriptor; may change while the context is open
+        #: the poll events to wait for, by descriptor; callers may add descriptors of their own
         self.watched = {self._descriptor: select.POLLIN}
-        if self._output and not _poll_output() & select.POLLNVAL:  # this event would end every wait at once
+        if self._output and not _poll_output() & select.POLLNVAL:  # POLLNVAL would end every wait at once
             self.watched[STDOUT_FD] = 0
         # Python runs handlers later, in the main thread, so a handler couldn't end a wait that is just starting. The
         # wakeup descriptor is written at once.

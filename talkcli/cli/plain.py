@@ -1,7 +1,7 @@
 """A lightweight parser for plain command lines, which need no help text and no error message.
 
-It reads the same rows as click's parser, and reads values by the same function. Any line that it isn't sure about is
-left to click: unknown options, several flags in one word, invalid values, and options that contradict each other.
+It uses the same rows as click's parser, and the same function to read values. It leaves any doubtful line to click:
+unknown options, several flags in one word, invalid values, and options that contradict each other.
 
 For some commands the request is sent before the rest of the program is imported. This is only done if the request can't
 be wrong, so that no error is found after it was sent. It is the same request that the client library would send (a test
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     Flags = dict[str, tuple[Option, bool]]
 
 _COMMON_NAMES = {each.name for each in COMMON_OPTIONS}
-#: The commands whose request may be sent early.
+#: The commands whose request may be sent before the rest of the program is imported.
 _EARLY_COMMANDS = ("say", "cancel", "status", "pause", "resume")
 
 

@@ -141,14 +141,13 @@ def _wait_for_goal(
     except (Interrupted, OSError) as error:
         interrupts.record(error)
         timed_out = interrupts.signal_number is None and not interrupts.reader_gone
-        code = interrupts.exit_code if goal.attached else reporter.cancel(goal, interrupts)
+        if not goal.attached:
+            reporter.cancel(goal, interrupts)
         if not timed_out:
             return interrupts.exit_code
-        if goal.attached:
-            raise timeout_error(timeout, f"{goal.id} goes on: it was sent before") from None
-        if goal.state is not State.SUCCEEDED:
-            raise timeout_error(timeout) from None
-        return code
+        if goal.state is State.SUCCEEDED:
+            return EXIT_OK
+        raise timeout_error(timeout, f"{goal.id} goes on: it was sent before" if goal.attached else "") from None
     finally:
         retry_without_output(reporter.feedback.close)
     return reporter.report(goal.goal)

@@ -1,6 +1,6 @@
 """Code shared by all commands: the common options, the connection to the server, output, notes and exit codes.
 
-Every error of a command becomes a message on standard error and an exit code.
+Every error that ends a command becomes a message on standard error and an exit code.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ if TYPE_CHECKING:
 STDOUT_FD = 1
 #: Errors of writing to a full or broken disk.
 _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
-#: Whether output was lost because of such an error. The command then fails even if it could go on.
+#: Whether output was lost because of such an error. The command goes on, but its exit code is not 0.
 _output_lost = False
 #: The width of a terminal that doesn't report one.
 DEFAULT_COLUMNS = 80
-#: Stands for a space at which a line must not be broken.
+#: Replaces a space at which a line must not be broken.
 _NO_BREAK_SPACE = "\0"
 
 
@@ -92,7 +92,7 @@ class CommonOptions:
             return Client.over(self._connection(keep_trying=seconds, **options))
         except ServerUnavailable as error:
             now = time.monotonic()
-            if connect_timeout is None or now < began + seconds:  # it is no use to try this server again
+            if connect_timeout is None or now < began + seconds:  # trying this server again is of no use
                 raise
             words = f"waited for {round(seconds, 1):g} s: {error.message}"
             if end is not None and now >= end:
@@ -153,7 +153,7 @@ def discard_output() -> None:
     """Send all further output to /dev/null."""
     _redirect_to_null(STDOUT_FD)
     if sys.stdout is None:
-        # It stays open as long as the process runs.
+        # This file stays open as long as the process runs.
         sys.stdout = open(STDOUT_FD, "w", closefd=False, encoding="utf-8")  # noqa: SIM115
 
 
@@ -200,7 +200,7 @@ def _is_read_only(error: OSError) -> bool:
 
 
 def show_if_possible(put: Callable[..., None], *what: object) -> None:
-    """Call a function that writes output. A full disk is reported and ignored, but a missing reader is an error."""
+    """Call a function that writes output. A full disk is reported and ignored; if the reader is gone, OSError."""
     try:
         put(*what)
     except OSError as error:
@@ -352,7 +352,7 @@ def screen() -> Screen:
 
     if sys.stdout is None or not sys.stdout.isatty():
         return Screen()
-    # Ask the terminal first, because an exported COLUMNS stays the same when a window is resized.
+    # COLUMNS comes second, because an exported value doesn't change when the window is resized.
     width = terminal_columns(sys.stdout)
     if not width:
         columns = os.environ.get("COLUMNS", "")

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 #: The size of one read: the capacity of a pipe.
 _STDIN_READ_BYTES = 65_536
-#: The longest text, with the end of its line.
+#: The size of the longest text and its line ending.
 _MAX_STDIN_TEXT_BYTES = MAX_TEXT_BYTES + len("\r\n")
 #: How much input with a ttl is read before it can be sent.
 _MAX_BUFFERED_BYTES = 1_000_000
@@ -104,7 +104,7 @@ class InputLine:
     #: without the end of the line; only the beginning of a line that is too long
     text: str
     #: the size in bytes of a line that is too long to be spoken; 0 for any other line
-    excess: int = 0
+    oversize_bytes: int = 0
     #: the monotonic time at which its ttl ends
     end: float = _NO_LIMIT
 
@@ -115,13 +115,13 @@ class LineBuffer:
     def __init__(self, ttl: float | None = None) -> None:
         """`ttl`: seconds from when a line was read; None for no limit."""
         self._ttl = ttl
-        # The longest text, and the CR of a line that ends in CRLF.
+        # One more byte than the longest text, because a line may end in CRLF.
         self._splitter = LineSplitter(MAX_TEXT_BYTES + 1)
-        #: chunks with the time at which each was read; they are split late, so that many short lines stay within 1 MB
+        #: chunks that are not split yet, with the time at which each was read; many short lines would take more memory
         self._chunks: deque[tuple[float, bytes]] = deque()
         self._lines: deque[InputLine] = deque()
         self._number = 0
-        #: bytes that have not been split into lines
+        #: the number of bytes that have not been split into lines
         self.size = 0
         self.ended = False
 
@@ -140,9 +140,9 @@ class LineBuffer:
             end = now + (self._ttl or _NO_LIMIT)
             for line in self._splitter.feed(data) if data else [self._splitter.take_rest()]:
                 self._number += 1
-                text, excess = _decode(line), line.size if isinstance(line, TruncatedLine) else 0
-                if excess or text.strip():
-                    self._lines.append(InputLine(self._number, text, excess, end))
+                text, oversize_bytes = _decode(line), line.size if isinstance(line, TruncatedLine) else 0
+                if oversize_bytes or text.strip():
+                    self._lines.append(InputLine(self._number, text, oversize_bytes, end))
         return self._lines[0] if self._lines else None
 
     def take(self) -> InputLine:
@@ -171,7 +171,7 @@ def _decode(data: bytes) -> str:
 
 
 class LineSpeaker:
-    """One run of `say --lines`: it sends the lines of standard input as goals, and follows these goals."""
+    """One run of `say --lines`, which sends the lines of standard input as goals and follows these goals."""
 
     def __init__(
         self,
@@ -207,15 +207,16 @@ class LineSpeaker:
         self._interrupts = Interrupts(output=wait)
         #: the number of the line that is being sent, until it is accepted or refused
         self._sending: int | None = None
-        #: the goal that was sent and not answered yet, and its request
+        #: the goal that was sent and has not been answered yet, with its request
         self._unanswered: tuple[GoalHandle, Exchange] | None = None
-        #: the last goal that was answered, in the state of that answer
+        #: the last goal that was accepted, as the server's answer described it
         self._accepted = Goal("", State.PENDING)
-        #: goals with their line numbers, in the order of the lines; with --wait until they were reported, otherwise
-        #: until they have ended
+        #: the goals that have not ended, with their line numbers, in the order of the lines; with --wait also the ended
+        #: goals that have not been reported
         self._goals: deque[tuple[int, GoalHandle]] = deque()
-        #: since when an answer or a sign of life is expected from the server (monotonic)
+        #: the time from which the server must send answers or signs of life (monotonic)
         self._expected_since = 0.0
+        #: whether a note has already said that speech is paused
         self._pause_known = False
         #: the error after which nothing more is read or sent
         self._error: TalkError | None = None
@@ -266,6 +267,7 @@ class LineSpeaker:
 
     @property
     def _done(self) -> bool:
+        """Whether nothing is left to send or, with --wait, to wait for."""
         if self._wait and self._goals:
             return False
         return self._error is not None or not (self._unanswered or self._has_lines)
@@ -285,7 +287,7 @@ class LineSpeaker:
 
     @property
     def _wants_input(self) -> bool:
-        """Whether to read more. Without a ttl that is only what can be sent at once, and the rest waits in the pipe."""
+        """Whether to read more input. Without a ttl, input stays in the pipe until its first line can be sent."""
         if self._buffer.ended or self._error is not None:
             return False
         if self._ttl:
@@ -313,8 +315,8 @@ class LineSpeaker:
     # -- sending
 
     def _send(self, line: InputLine) -> None:
-        if line.excess:
-            words = f"the line has {line.excess:,} bytes, the longest text allowed has {MAX_TEXT_BYTES:,}"
+        if line.oversize_bytes:
+            words = f"the line has {line.oversize_bytes:,} bytes, the longest text allowed has {MAX_TEXT_BYTES:,}"
             self._report_refused(line.number, rejected_goal(words))
             return
         self._sending = line.number
@@ -394,7 +396,7 @@ class LineSpeaker:
             if self._unanswered and self._unanswered[1].over:
                 return True
             if not self._wait and any(each.state.terminal for _, each in self._goals):
-                return True  # the server sends no signs of life if it has no goal
+                return True  # without a goal, the server sends no signs of life
             return self._full != was_full or (self._wait and bool(self._goals) and self._goals[0][1]._has_event())
 
         wait = partial(self._connection.wait_until, has_news, since=self._expected_since)
@@ -412,7 +414,7 @@ class LineSpeaker:
             data = _read_available(_STDIN_READ_BYTES)
             if data is not None:
                 self._buffer.feed(data, time.monotonic())
-            if self._unanswered or self._goals:  # read from the server even if the input never pauses
+            if self._unanswered or self._goals:  # the server must be read even if the input never pauses
                 wait(time.monotonic(), interruptible=False)
         finally:
             watched.pop(0, None)

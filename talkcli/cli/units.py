@@ -2,7 +2,7 @@
 
 The templates are the files in `systemd`, such as `serve-user` for `talk serve --print-unit user`. In a template, a name
 in braces stands for a value, and a line such as `@supervision.conf` includes that file. The printed units work
-unchanged. The system's units give the process access only to what it needs. Nothing is installed here.
+unchanged. The system's units give the process access only to what it needs. This module doesn't install them.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from talkcli.cli.show import CommonOptions
     from talkcli.goals.options import Option
 
-#: The group whose members may use the system's server. They may already use the sound card.
+#: The group whose members may use the system's server. Its members may already use the sound card.
 SOCKET_GROUP = "audio"
 #: The files with the broker's address and login.
 _BRIDGE_ENVIRONMENTS = {"user": "%h/.config/talk/bridge.env", "system": "/etc/talk/bridge.env"}

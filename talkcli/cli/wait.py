@@ -1,4 +1,4 @@
-"""Waiting for goals and reporting their ends, for `say` and `wait`, and the command `talk wait` itself.
+"""The command `talk wait`, and how `say` and `wait` wait for goals and report their ends.
 
 Goals are handled in the same way whether or not standard output can be written. This module must not need click,
 because plain command lines are run without it.
@@ -91,31 +91,26 @@ class GoalReporter:
             self.feedback.note(f"{prefix}{words}")
         return EXIT_TIMEOUT if goal.exit_code is None else goal.exit_code
 
-    def cancel(self, goal: GoalHandle, interrupts: Interrupts) -> int:
-        """Cancel a goal, wait a moment for silence, report the goal's end, and return its exit code.
+    def cancel(self, goal: GoalHandle, interrupts: Interrupts) -> None:
+        """Cancel a goal, wait a moment for silence, and report the goal's end.
 
         Output may fail, because Ctrl-C may have ended its reader, too, and SIGHUP means that the terminal is gone.
         """
         interrupts.reset()
+        problem = "could not be cancelled"
         try:
             goal.request_cancel()
-        except ServerUnavailable as error:
-            problem = f"could not be cancelled: {error}"
-        else:
-            problem = self._wait_for_silence(goal)
-        if problem:
-            retry_without_output(self.feedback.note, f"{goal.id}: {problem}")
-        return retry_without_output(self.report, goal.goal)
-
-    def _wait_for_silence(self, goal: GoalHandle) -> str:
-        """Wait a moment for a cancelled goal to end. Return a note if it may not be silent, else an empty text."""
-        try:
+            problem = "cancelled, but it is not known whether it is silent"
             retry_without_output(self.follow, [goal], CANCEL_TIMEOUT_S)
         except TimeoutError:
-            return f"cancelled, but the server did not confirm within {CANCEL_TIMEOUT_S:g} s that it is silent"
+            problem = f"cancelled, but the server did not confirm within {CANCEL_TIMEOUT_S:g} s that it is silent"
         except (Interrupted, ServerUnavailable) as error:
-            return f"cancelled, but it is not known whether it is silent: {error or 'interrupted'}"
-        return ""
+            problem += f": {error or 'interrupted'}"
+        else:
+            problem = ""
+        if problem:
+            retry_without_output(self.feedback.note, f"{goal.id}: {problem}")
+        retry_without_output(self.report, goal.goal)
 
 
 def wait(options: CommonOptions, ids: tuple[str, ...], timeout: float | None, feedback: bool) -> int:
@@ -132,9 +127,9 @@ def wait(options: CommonOptions, ids: tuple[str, ...], timeout: float | None, fe
             for goal in goals:
                 ended = goal.wait(seconds_left(end))
                 # Without ids, only the loss of the server is a failure.
-                counts = bool(ids) or ended.state is State.LOST
-                code = reporter.report(ended) if counts or options.json else EXIT_OK
-                if counts:
+                may_fail = bool(ids) or ended.state is State.LOST
+                code = reporter.report(ended) if may_fail or options.json else EXIT_OK
+                if may_fail:
                     first_failure = first_failure or code
             return first_failure
         except TimeoutError:

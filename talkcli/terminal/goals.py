@@ -43,7 +43,7 @@ _VOICE_NAME_CHARS = 80
 #: Shown instead of a text that the server no longer keeps.
 TEXT_NOT_KEPT = "(text no longer kept)"
 
-#: How to show fields of a server if it isn't by name and value.
+#: The formats of a server's fields. A field without a format is shown with its name and its value.
 _FIELD_FORMATS = {
     "engine": "{}",
     "synthesizer": "{}",
@@ -52,12 +52,12 @@ _FIELD_FORMATS = {
     "ttl": "ttl {} s",
     "preempt": "preempts",
 }
-#: Fields that are left out if they have no value.
+#: Fields of a server that are only shown if they have a value.
 _OPTIONAL_FIELDS = frozenset({"synthesizer", "device", "lead_in", "ttl", "preempt"})
 
 _UNKNOWN_SENDER = "nobody known"
-#: Programs that start another program or script, without their version. The values are the options with a value, the
-#: options after which no script follows, and the number of arguments before the script.
+#: Programs that start another program or a script, by their names without a version. The values are the options that
+#: take a value, the options that replace the script, and the number of arguments before the script.
 _LAUNCHERS = {
     **dict.fromkeys(("sh", "bash", "dash", "ash", "zsh", "ksh", "fish"), ("o O rcfile init-file", "c s", 0)),
     "python": ("W X", "c", 0),
@@ -79,9 +79,9 @@ _LAUNCHERS = {
     "timeout": ("s k signal kill-after", "", 1),
     "xargs": ("n P I L s d a E max-args max-procs arg-file", "", 0),
 }
-#: A variable that is set for the program that is started.
+#: An argument such as NAME=VALUE, which sets a variable for the started program.
 _ASSIGNMENT = re.compile(r"\w+=.*")
-#: The path of an open file, which doesn't name the script.
+#: The path of an open descriptor. It doesn't tell the name of the script.
 _DESCRIPTOR_PATH = re.compile(r"/dev/(fd/\d+|stdin)|/proc/(self|\d+)/fd/\d+")
 
 
@@ -120,7 +120,7 @@ def goal_lines(goal: Goal, screen: Screen, now: float) -> list[str]:
     for name, value in rows:
         if value:
             # JSON isn't wrapped here, so that it stays valid when it is copied from the terminal.
-            lines += _labelled(name, value.split(" "), Screen() if name == "data" else screen)
+            lines += wrap(value.split(" "), _label(name), Screen() if name == "data" else screen)
     return lines
 
 
@@ -137,11 +137,11 @@ def status_lines(status: ServerStatus, screen: Screen, now: float) -> list[str]:
     settings = _format_fields(server, "rate", "volume", "pitch", "voice", "ttl", "preempt")
     lines = []
     for label, parts in (("server", identity), ("engine", engine), ("settings", settings)):
-        lines += _labelled(label, [*(f"{each}," for each in parts[:-1]), parts[-1]], screen)
+        lines += wrap([*(f"{each}," for each in parts[:-1]), parts[-1]], _label(label), screen)
     neural = server.get("neural_voices")
     for voice, found in neural.items() if isinstance(neural, dict) else ():
         state, why = (found.get(each) for each in ("state", "why"))
-        lines += _labelled("voice", printable(f"{voice} {state}{f': {why}' if why else ''}").split(" "), screen)
+        lines += wrap(printable(f"{voice} {state}{f': {why}' if why else ''}").split(" "), _label("voice"), screen)
     if server.get("paused"):
         lines.append(f"{_label('paused')}{screen.coloured('speech is held', State.PREEMPTING)}: talk resume")
     active = [status.active] if status.active else []
@@ -153,11 +153,8 @@ def status_lines(status: ServerStatus, screen: Screen, now: float) -> list[str]:
     return lines
 
 
-def _labelled(label: str, pieces: Sequence[str], screen: Screen) -> list[str]:
-    return wrap(pieces, _label(label), screen)
-
-
 def _label(name: str) -> str:
+    """Return a label padded to the width of all labels."""
     return f"{name:<{_LABEL_COLUMNS}}"
 
 
@@ -212,7 +209,7 @@ def _tail_forms(goal: Goal, now: float) -> list[str]:
     if goal.state.terminal:
         return _muted_note(goal) if goal.state is State.SUCCEEDED else reason_forms(goal)
     # The sender comes first, because a wording that doesn't fit is cut at its end.
-    return [", ".join([f"from {each}", *_pending_details(goal, now)]) for each in sender_forms(goal.client)]
+    return [", ".join([f"from {each}", *_unfinished_details(goal, now)]) for each in sender_forms(goal.client)]
 
 
 def quoted_text(goal: Goal, limit: int | None = None) -> str:
@@ -224,7 +221,7 @@ def _quote(text: str | None, limit: int | None = None) -> str | None:
     return None if text is None else f'"{printable(text, limit)}"'
 
 
-def _pending_details(goal: Goal, now: float) -> list[str]:
+def _unfinished_details(goal: Goal, now: float) -> list[str]:
     """Return further details of a goal that has not ended, such as its priority and its key."""
     held = "held, " if goal.paused else ""
     notes = [
@@ -288,17 +285,17 @@ def reason_forms(goal: Goal) -> list[str]:
         by = [printable(goal.by.goal)] if goal.by.goal is not None else sender_forms(goal.by.client)
     forms = [f"{reason} by {each}" for each in by] or [reason]
     words = _message_details(goal)
-    # With little room, show who ended the goal instead of the reason, because the state hints at the reason.
+    # The shortest wording only says who ended the goal, because the state hints at the reason.
     shortest = f"by {by[-1]}" if by else reason
     if not words:
         return [*forms, shortest]
     forms = [f"{each}: {words}" for each in forms]
-    # The words of an engine or a player are worth more than the reason alone, even if they are cut.
+    # The details from an engine or a player are more useful than the reason alone, even if they are cut.
     return forms if goal.state in {State.ABORTED, State.REJECTED} else [*forms, shortest]
 
 
 def _message_details(goal: Goal) -> str:
-    """Return the details in a goal's message. They are empty if the reason and `by` say the same."""
+    """Return the details in a goal's message; empty if its reason and `by` already say everything."""
     if goal.state not in {State.ABORTED, State.REJECTED} and goal.by is not None:
         return ""
     head, colon, words = (goal.message or "").partition(": ")
@@ -330,11 +327,11 @@ def _script_name(sender: Sender) -> str:
 
 
 def _launched_command(words: list[str]) -> list[str]:
-    """Return the command that a launcher starts. It is empty for other commands and for scripts without a name."""
+    """Return the command that a launcher starts. It is empty for any other command, and for a script without a name."""
     name = _file_name(words[0]).rstrip("0123456789.")
     if name not in _LAUNCHERS:
         return []
-    valued, nameless, arguments = _LAUNCHERS[name]
+    valued, nameless, arguments_left = _LAUNCHERS[name]
     rest = iter(range(1, len(words)))
     for place in rest:
         word = words[place]
@@ -348,9 +345,9 @@ def _launched_command(words: list[str]) -> list[str]:
                         next(rest, None)
                     break
         elif not _ASSIGNMENT.fullmatch(word):
-            if arguments == 0:
+            if arguments_left == 0:
                 return [] if _DESCRIPTOR_PATH.fullmatch(word) else words[place:]
-            arguments -= 1
+            arguments_left -= 1
     return []
 
 

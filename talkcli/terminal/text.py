@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 #: The space between two columns of a table.
 COLUMN_GAP = "  "
-#: Ids chosen by a client can have 64 characters. A column that wide would leave no room for the text.
+#: The widest column of ids. A client can choose an id of 64 characters, which would leave no room for the text.
 MAX_ID_COLUMNS = 20
-#: A terminal that reports fewer columns is treated as this wide, because shorter lines would show nothing.
+#: A narrower terminal is treated as this wide, because shorter lines would show nothing useful.
 MIN_COLUMNS = 40
-#: Marks a place where text was left out.
+#: Stands for text that was left out.
 ELLIPSIS = "…"
 
 #: The East Asian width classes of characters that take two columns. They include most emoji.
@@ -144,12 +144,12 @@ def share_columns(wanted: Sequence[int], weights: Sequence[int], columns: int) -
 def fit_columns(
     texts: Sequence[str], *others: Sequence[Sequence[str]], weights: Sequence[int], columns: int
 ) -> list[str]:
-    """Return one line for each text, with the other columns of the table beside it.
+    """Return the rows of a table: each text, with its cells in the other columns beside it.
 
     Args:
         texts: the first column.
         others: the other columns. Each cell has several wordings, the longest first.
-        weights: the share of each column. Whatever the others don't use of theirs goes to the texts.
+        weights: the share of each column. Space that the other columns don't need goes to the texts.
         columns: the width of the whole line.
     """
     columns -= len(COLUMN_GAP) * len(others)
@@ -218,9 +218,9 @@ class MeasuredText:
         first = self._first_shown(min(self._columns[start] - columns // 3, excess), start)
         # An ellipsis takes one column at each end that is cut.
         room = columns - (first > 0)
-        stop = self._ending_by(self._columns[first] + room)
+        stop = self._count_fitting(self._columns[first] + room)
         if stop < last:
-            stop = self._ending_by(self._columns[first] + room - 1)
+            stop = self._count_fitting(self._columns[first] + room - 1)
         before = ELLIPSIS if first > 0 else ""
         after = ELLIPSIS if stop < last else ""
         start, end = min(start, stop), min(end, stop)
@@ -230,16 +230,16 @@ class MeasuredText:
         return "".join(self._shown[start:end])
 
     def _first_shown(self, column: int, start: int) -> int:
-        """Return the first character to show if the columns up to `column` are cut. It is `start` at the latest."""
+        """Return the index of the first character to show if all columns before `column` are cut; at most `start`."""
         if column <= 0:
             return 0
         # The ellipsis needs one more column. The first character must not be a mark drawn over the one before it.
         begins = (place for place in range(start) if column < self._columns[place] < self._columns[place + 1])
         return next(begins, start)
 
-    def _ending_by(self, column: int) -> int:
-        """Return the number of characters that end at this column or before it."""
-        return sum(each <= column for each in self._columns) - 1
+    def _count_fitting(self, columns: int) -> int:
+        """Return how many characters, from the first one on, fit into this many columns."""
+        return sum(each <= columns for each in self._columns) - 1
 
 
 def _is_hidden(character: str) -> bool:

@@ -32,10 +32,9 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import Goal
     from talkcli.protocol.events import Event
 
-#: The width of the text if lines can have any length. Most sentences of a robot are shorter, so that the columns after
-#: them line up.
+#: The least width of the text if lines can have any length. Most sentences are shorter, so the next columns line up.
 _TEXT_COLUMNS = 40
-#: A long reason is shown beside the text only if this much of the text stays visible.
+#: A long reason is only shown beside the text if this many columns remain for the text.
 _MIN_TEXT_COLUMNS = 16
 #: The first width of the id column. It fits the ids of a server's first 999 goals.
 _FIRST_ID_COLUMNS = 8
@@ -43,7 +42,7 @@ _FIRST_ID_COLUMNS = 8
 _FIRST_ROBOT_COLUMNS = 8
 #: The indent of a continued line: the width of the time.
 _INDENT_COLUMNS = 10
-#: Only so many goals are remembered until they end.
+#: How many unfinished goals are remembered. The oldest is forgotten first.
 _MAX_REMEMBERED_GOALS = 1000
 
 
@@ -101,7 +100,7 @@ class Transcript:
         if isinstance(event, WordHeard) and self._with_words:
             word = f"{printable(event.word)}{COLUMN_GAP}{event.time:.2f} s"
             return [self._head_columns(event.at or now, "word", None, event.id, screen) + word]
-        return []  # only clients that wait for a goal get its result
+        return []  # a result, which only clients that wait for the goal receive
 
     def _snapshot_lines(self, event: Snapshot, screen: Screen, now: float) -> list[str]:
         status = event.status
@@ -123,7 +122,7 @@ class Transcript:
     def _state_lines(self, event: StateChanged, screen: Screen, now: float) -> list[str]:
         if event.goal is not None:
             self._goals[event.id] = event.goal
-            if len(self._goals) > _MAX_REMEMBERED_GOALS:  # the end of the oldest goal was probably missed
+            if len(self._goals) > _MAX_REMEMBERED_GOALS:  # the end of the oldest goal was probably not received
                 del self._goals[next(iter(self._goals))]
         starts_at_once = not self._paused and len(self._goals) == 1
         goal = self._goals.get(event.id)
@@ -155,7 +154,7 @@ class Transcript:
         if columns is None:
             return [(head + pad(quoted_text(goal), _TEXT_COLUMNS) + COLUMN_GAP + forms[0]).rstrip()]
         tail_columns = columns // 3
-        # The shortest wording lacks the reason. If no other one fits, the end gets more room in `_long_end_lines`.
+        # The last wording lacks the reason. If no other wording fits, `_long_end_lines` gives them more room.
         complete = forms[:-1] if ended and goal.by is not None and len(forms) > 1 else forms
         if ended and all(width(each) > tail_columns for each in complete):
             return self._long_end_lines(head, goal, complete, screen)
@@ -164,7 +163,10 @@ class Transcript:
         return [(head + pad(shorten(quoted_text(goal), text_columns), text_columns) + COLUMN_GAP + tail).rstrip()]
 
     def _long_end_lines(self, head: str, goal: Goal, forms: list[str], screen: Screen) -> list[str]:
-        """Return the end of a goal whose reason is too long for its column: beside the text if it fits, else below."""
+        """Return the lines for the end of a goal whose reason is too long for its column.
+
+        The reason stands beside a shortened text if it fits there, otherwise below the text.
+        """
         text = quoted_text(goal)
         columns = screen.columns_left(width(head)) or 0
         beside = columns - len(COLUMN_GAP) - min(width(text), _MIN_TEXT_COLUMNS)
@@ -193,7 +195,7 @@ def log_lines(goals: Sequence[Goal], screen: Screen, now: float) -> list[str]:
     reasons = [reason_forms(goal) for goal in goals]
     columns = screen.columns_left(sum(widths) + 3 * len(COLUMN_GAP))
     if columns is None:
-        # Most lines are aligned. A longer line isn't cut, so its last columns are not.
+        # Most lines are aligned. In a line with longer text, nothing is cut and the last columns move to the right.
         details = [
             COLUMN_GAP.join((pad(text, _TEXT_COLUMNS), pad(sender[0], _TEXT_COLUMNS), reason[0])).rstrip()
             for text, sender, reason in zip(texts, senders, reasons, strict=True)

@@ -32,7 +32,7 @@ def test_lines_without_a_word_and_lines_that_are_too_long_keep_their_numbers() -
     buffer.feed(b"", 0.0)
     assert buffer.first is not None
     found = [buffer.take() for _ in range(2) if buffer.first]
-    assert [(each.number, each.excess) for each in found] == [(4, 300_000), (5, 0)]
+    assert [(each.number, each.oversize_bytes) for each in found] == [(4, 300_000), (5, 0)]
 
 
 def test_what_waits_is_counted_until_it_is_cut_into_lines() -> None:
