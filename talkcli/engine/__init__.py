@@ -1,7 +1,7 @@
-"""The engine, which speaks the goals, one at a time.
+"""The engine, which speaks the goals one at a time.
 
-`parent` runs in the server: it starts the engine process, sends it goals and watches it. `child` runs in the engine
-process: the driver, the synthesizers and the players. They exchange the messages in `protocol` and import nothing of
-each other. The other modules here are tables for both, and for the server, doctor and the commands: `voices`, `models`
-and `players`.
+`parent` runs in the server. It starts the engine process, sends goals to it and monitors it. `child` runs in the engine
+process and contains the driver, the synthesizers and the players. The two exchange the messages in `protocol` and never
+import each other. The tables in `voices`, `models` and `players` are shared with the server, `talk doctor` and the
+command line.
 """

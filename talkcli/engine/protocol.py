@@ -1,13 +1,18 @@
-"""The messages between the server's engine thread and the engine process: one JSON object per line, over a socket pair.
+"""Messages between the server's engine thread and the engine process.
 
-The engine thread has one end of the socket pair. The other end is the standard input of the engine process (file
-descriptor 0), which it reads and writes. This module only defines the messages and opens nothing, so tests can use it
-to write a scripted engine process.
+Each message is one line with a JSON object. The messages travel over a socket pair. One end belongs to the engine
+thread. The other end is the standard input of the engine process, which both reads and writes it. This module only
+defines the messages and opens nothing, so tests can use it to script an engine process.
 
-The engine process must keep this order. It first receives one `Configure`. It then sends `Ready`, or it sends
-`StartFailed` and ends. For each `Speak` it sends one `Started`, then any number of `Word`, `Alive`, `OutputChanged`,
-`VoiceChosen` and `Held`, then exactly one `Ended`. It answers each `LoadVoice` with a `VoiceLoaded`, at any time. If
-the server closes its end, the engine process stops the current sentence and ends.
+The engine process follows this sequence:
+
+1. It receives one `Configure`.
+2. It sends `Ready`, or it sends `StartFailed` and exits.
+3. For each `Speak`, it sends one `Started`, then any number of `Word`, `Alive`, `OutputChanged`, `VoiceChosen` and
+   `Held` messages, and finally exactly one `Ended`.
+
+It answers each `LoadVoice` with one `VoiceLoaded`, which may be sent at any time. If the server closes its end of the
+socket, the engine process stops speaking and exits.
 """
 
 from __future__ import annotations
@@ -25,125 +30,126 @@ if TYPE_CHECKING:
 
     from talkcli.goals.goal import JsonObject
 
-#: Longest time between two messages of an engine process that is speaking or loading a voice. It is far below
-#: `HANG_LIMIT_S`, so one late message doesn't count as a hang. An idle process sends nothing, to let the robot sleep.
+#: Maximum interval between two messages of an engine process that is speaking or loading a voice. It is far below
+#: `HANG_LIMIT_S`, so that a late message isn't mistaken for a hang. An idle process sends nothing, so that the robot
+#: can sleep.
 ALIVE_INTERVAL_S = 0.5
 
-#: Environment variable with the number of the liveness pipe's writing end, which the player must inherit. When the pipe
-#: is closed, the server knows that the process and the player are gone.
+#: Environment variable with the file descriptor of the liveness pipe's write end. The player must inherit this
+#: descriptor. Once the process and the player have exited, the pipe is closed, which the server detects.
 LIVENESS_VARIABLE = "TALK_LIVENESS_FD"
 
-#: Name of the player that writes to `Configure.output_fd`, as it appears in the messages of `Ended`.
+#: Name that error messages use for the player that writes to `Configure.output_fd`.
 OUTPUT_STREAM_NAME = "the output"
 
-# Time limits for the engine process. The server, `say -o` and `talk doctor` all use them.
+# Time limits for the engine process, shared by the server, `say -o` and `talk doctor`.
 
-#: Limit for a new process to become ready. A cold start from an SD card takes two or three seconds.
+#: Time allowed for a new process to become ready. A cold start from an SD card takes two to three seconds.
 START_LIMIT_S = 10.0
-#: Longest silence of a process that is speaking or loading a voice, before it counts as hung.
+#: Time without a message after which a process that is speaking or loading a voice counts as hung.
 HANG_LIMIT_S = 3.0
-#: Limit for loading a neural voice. It takes three seconds on a small machine.
+#: Time allowed for loading a neural voice, which takes three seconds on a small machine.
 LOAD_LIMIT_S = 60.0
-#: Limit for confirming a stop, after which the process is killed.
+#: Time allowed for confirming a stop. After that, the process is killed.
 STOP_LIMIT_S = 0.15
-#: Limit for a killed process and its player to be gone.
+#: Time allowed for a killed process and its player to exit.
 KILL_LIMIT_S = 2.0
-#: Limit for confirming a hold, after which the process is killed. It is twice as long as a client waits for a pause,
-#: because a foreign driver may first finish its word or more.
+#: Time allowed for confirming a hold. After that, the process is killed. This limit is twice the time that a client
+#: waits for a pause, because a third-party driver may finish a word or more first.
 HOLD_LIMIT_S = 4.0
 
 # Outcomes of a `Speak`.
-OUTCOME_COMPLETED = "completed"  # the player took every sample and ended well
-OUTCOME_STOPPED = "stopped"  # a `Stop` ended it, and it is silent now
-OUTCOME_FAILED = "failed"  # an error ended it; `reason` and `message` describe the error
+OUTCOME_COMPLETED = "completed"  # the player played every sample
+OUTCOME_STOPPED = "stopped"  # a `Stop` ended the goal
+OUTCOME_FAILED = "failed"  # an error ended the goal; see `Ended.reason` and `Ended.message`
 
 
 @frozen
 class Configure:
-    """The settings of a new engine process."""
+    """The settings for a new engine process."""
 
-    #: process id of the server. If the process has another parent, the server is gone and the process ends.
+    #: process ID of the server; the engine process exits if its parent is another process
     server_pid: int
-    #: name of a pyttsx3 driver; None for the usual one (`talk`'s own on Linux)
+    #: name of a pyttsx3 driver; None for the default, which is `talk`'s own driver on Linux
     driver: str | None
-    #: "aplay", "pacat", "pw-cat", "null", "file:PATH" or a command line; None to try the installed ones
+    #: "aplay", "pacat", "pw-cat", "null", "file:PATH" or a command line; None to try the installed players
     player: str | None
-    #: device in the player's own notation; None for its default
+    #: output device in the player's own notation; None for the player's default
     device: str | None
-    #: voice to check at the start, by id, name or language; None for the driver's default
+    #: ID, name or language of a voice to check at startup; None for the driver's default
     voice: str | None
-    #: milliseconds of silence before a sentence if the device was idle
+    #: milliseconds of silence to play before a sentence if the device was idle
     lead_in: int = 0
     #: whether to send a `VoiceList` right after `Ready`
     list_voices: bool = True
-    #: inherited descriptor to write a WAV file of all sentences to instead of playing them
+    #: inherited descriptor that receives all sentences as a WAV stream; None to play them
     output_fd: int | None = None
-    #: whether a sentence fails if the output is muted, unless its `Speak` says otherwise
+    #: whether a sentence fails if the output is muted; `Speak.audible` takes precedence
     audible: bool = False
-    #: program that worked last, which is tried first if `player` is None; None for the usual order
+    #: player that last worked, which is tried first if `player` is None; None for the default order
     last_player: str | None = None
 
 
 @frozen
 class Speak:
-    """Speak a text. Settings are absolute."""
+    """Speak a text. Rate, volume and pitch are absolute values."""
 
     id: str
     text: str
     rate: int  # words per minute, 80 to 450
     volume: float  # 0.0 to 1.0
-    voice: str | None  # id, name or language; None for the driver's default
-    pitch: int  # 0 to 100; 50 is the voice's own
-    next_waits: bool = False  # whether another goal waits behind this one
-    next_is_neural: bool = False  # whether the waiting goal asks for a neural voice
-    lead_in: int | None = None  # milliseconds of silence before it, even if the device wasn't idle; None as configured
-    audible: bool | None = None  # whether it fails if the output is muted; None as configured
-    voice_only: bool = False  # whether it waits for its neural voice to load, and fails without it
+    voice: str | None  # ID, name or language; None for the driver's default
+    pitch: int  # 0 to 100; 50 is the voice's natural pitch
+    next_waits: bool = False  # whether another goal is waiting in the queue
+    next_is_neural: bool = False  # whether the waiting goal has a neural voice
+    lead_in: int | None = None  # milliseconds of silence to play first, on any device; None to use `Configure.lead_in`
+    audible: bool | None = None  # whether to fail if the output is muted; None to use `Configure.audible`
+    voice_only: bool = False  # whether to wait for the neural voice to load, and to fail without it
 
 
 @frozen
 class Stop:
-    """Be silent now. Ignored if this goal is not being spoken, because it may have ended before the stop arrived."""
+    """Stop speaking at once. Ignored if this goal is not being spoken, because it may have just ended."""
 
     id: str
 
 
 @frozen
 class Hold:
-    """Hold the sentence where it is and send `Held` once it is silent. Ignored if this goal is not being spoken."""
+    """Hold the sentence, and send `Held` once it is silent. Ignored if this goal is not being spoken."""
 
     id: str
-    number: int  # of the hold within the goal, from 1
+    number: int  # number of this hold within the goal, starting at 1
 
 
 @frozen
 class Continue:
-    """Go on where the sentence was held. Ignored if it is not held."""
+    """Continue a held sentence. Ignored if the sentence is not held."""
 
     id: str
 
 
 @frozen
 class NextGoal:
-    """Note whether another goal waits behind the one being spoken."""
+    """Update `next_waits` and `next_is_neural` of the current goal."""
 
-    id: str  # of the goal being spoken
-    next_waits: bool
-    next_is_neural: bool = False  # whether the waiting goal asks for a neural voice
+    id: str  # ID of the current goal
+    next_waits: bool  # whether another goal is waiting in the queue
+    next_is_neural: bool = False  # whether the waiting goal has a neural voice
 
 
 @frozen
 class LoadVoice:
-    """Load a neural voice while speech goes on. Answered by one `VoiceLoaded`."""
+    """Load a neural voice in the background. Answered by one `VoiceLoaded`."""
 
-    voice: str  # id without a speaker
+    voice: str  # voice ID without a speaker
 
 
 @frozen
 class DropVoice:
-    """Remove a neural voice from memory, after the current sentence if that uses it. Answered by `VoiceMemory`."""
+    """Unload a neural voice, or do so after the current sentence if it uses the voice. Answered by `VoiceMemory`."""
 
-    voice: str  # id without a speaker
+    voice: str  # voice ID without a speaker
 
 
 @frozen
@@ -153,154 +159,158 @@ class Voice:
     id: str
     language: str | None
     name: str
-    quality: str | None = None  # of a neural voice, in its maker's word: "medium"
-    #: names of a neural voice's speakers, in the order of their numbers; None from the engine process, because
-    #: pyttsx3's list has no room for them
+    quality: str | None = None  # quality level of a neural voice, such as "medium"
+    #: speakers of a neural voice, ordered by number; None if the engine process sent the voice, because pyttsx3's list
+    #: has no field for them
     speakers: tuple[str, ...] | None = None
 
 
 @frozen
 class Ready:
-    """The engine is initialised and accepts a `Speak`."""
+    """The engine is initialized and accepts `Speak` messages."""
 
     driver: str
-    version: str | None  # of the synthesizer, for people: "eSpeak NG 1.51 (system)"
-    player: str | None  # player that is tried first, for people
-    voice: str | None = None  # id of the neural voice named by `Configure.voice`; None for any other voice
+    version: str | None  # human-readable version of the synthesizer, such as "eSpeak NG 1.51 (system)"
+    player: str | None  # display name of the player that is tried first
+    voice: str | None = None  # ID of the voice in `Configure.voice` if it is neural, otherwise None
 
 
 @frozen
 class StartFailed:
-    """The engine can't start. The process ends after this message."""
+    """The engine can't start. The process exits after sending this message."""
 
     reason: Reason  # ENGINE_FAILED or UNKNOWN_VOICE
-    message: str  # names what is missing and what to install
-    permanent: bool = True  # whether the next start will fail too unless somebody changes something
-    usage_error: bool = False  # whether an option asked for something that doesn't exist
+    message: str  # human-readable error, including what to install
+    permanent: bool = True  # whether each new start will also fail until the user fixes something
+    usage_error: bool = False  # whether an option names something that doesn't exist
 
 
 @frozen
 class VoiceList:
-    """All voices of the driver. Sent once, right after `Ready`, if `Configure` asks for it."""
+    """All voices of the driver. Sent once, right after `Ready`, if `Configure.list_voices` is true."""
 
     voices: tuple[Voice, ...]
 
 
 @frozen
 class VoiceLoaded:
-    """A neural voice is loaded, or can't be loaded."""
+    """A neural voice was loaded, or loading failed."""
 
-    voice: str  # id without a speaker
-    seconds: float  # time it took
-    error: str | None = None  # reason why it can't be loaded, for people; None if it is loaded
+    voice: str  # voice ID without a speaker
+    seconds: float  # duration of the loading
+    error: str | None = None  # human-readable error; None if the voice was loaded
 
 
 @frozen
 class VoiceUnloaded:
-    """A neural voice is no longer loaded because its files have changed."""
+    """A neural voice was unloaded because its files have changed."""
 
-    voice: str  # id without a speaker
+    voice: str  # voice ID without a speaker
 
 
 @frozen
 class VoiceMemory:
-    """Memory taken by neural voices. Sent when it changes: before `VoiceLoaded`, after a sentence or a `DropVoice`."""
+    """The memory used by neural voices. Sent before `VoiceLoaded`, and after a sentence or a `DropVoice`."""
 
-    voice: str  # id, without a speaker, of the voice that was loaded or has spoken; "" after `DropVoice`
-    memory: int  # bytes by which the process has grown since before its first neural voice
+    voice: str  # ID (without a speaker) of the voice that was loaded or has spoken; empty after `DropVoice`
+    memory: int  # growth of the process in bytes since just before it loaded its first neural voice
 
 
 @frozen
 class Started:
-    """The engine process has begun with the goal."""
+    """The engine process has started to process the goal."""
 
     id: str
 
 
 @frozen
 class Alive:
-    """A sign of life from a process that is speaking or loading a voice, `ALIVE_INTERVAL_S` after its last message."""
+    """A heartbeat from a process that is busy but has sent nothing else for `ALIVE_INTERVAL_S`."""
 
-    id: str  # of the goal; "" if there is none
+    id: str  # ID of the current goal; empty if a voice is loading without a goal
 
 
 @frozen
 class Word:
-    """A word is beginning to be heard now, according to the playback clock."""
+    """The start of a word in the output. Sent when the word becomes audible."""
 
     id: str
-    start: int  # character offset in the text
+    start: int  # offset of the word's first character in the text
     end: int  # offset after the word's last character
-    number: int  # of the word in the sentence, from 1
-    time: float  # seconds into the sentence's audio
+    number: int  # number of the word in the sentence, starting at 1
+    time: float  # position in the sentence's audio, in seconds
 
 
 @frozen
 class OutputChanged:
-    """Where the sentence is played and how loud. Sent once that is known and whenever it changes."""
+    """The device, volume and mute state of the current output. Sent when they become known or change."""
 
     id: str
-    output: JsonObject | None  # in the form that a goal has; None if the player in use can't tell
+    output: JsonObject | None  # a goal's `output` as JSON; None if the player can't determine it
 
 
 @frozen
 class VoiceChosen:
-    """The voice that speaks the sentence. Sent again if another voice takes over before the first word."""
+    """The voice that speaks the sentence. Sent again if a fallback voice replaces it before the first word."""
 
     id: str
-    voice: str  # id of the voice
-    fallback_reason: str | None = None  # why it isn't the voice that was asked for, for people; None if it is
+    voice: str  # voice ID
+    fallback_reason: str | None = None  # human-readable reason for a fallback voice; None for the requested voice
 
 
 @frozen
 class Held:
-    """The sentence is held and silent, until `Continue` or `Stop`."""
+    """The sentence is held, and stays silent until `Continue` or `Stop`."""
 
     id: str
-    number: int  # of the `Hold` that this answers
+    number: int  # number of the confirmed `Hold`
 
 
 @frozen
 class Ended:
-    """The `Speak` is over and silent. Its player is reaped or its stream is closed."""
+    """The goal has ended and is silent. Its player has exited, or the player's stream is closed."""
 
     id: str
     outcome: str  # OUTCOME_COMPLETED, OUTCOME_STOPPED or OUTCOME_FAILED
-    reason: Reason | None = None  # of a failure
-    message: str | None = None  # of a failure: the message of the player or the engine
-    duration: float | None = None  # seconds of audio; None if part of it wasn't synthesized
-    gaps: int = 0  # number of silences within it because its sound was not made in time
-    gap_seconds: float = 0.0  # total length of these silences
-    player: str | None = None  # player that took the sound, if `Configure` names none
+    reason: Reason | None = None  # reason for the failure, if any
+    message: str | None = None  # error message of the player or the engine, if the goal failed
+    duration: float | None = None  # length of the audio in seconds; None unless the goal was completed
+    gaps: int = 0  # number of pauses caused by audio that was synthesized too late
+    gap_seconds: float = 0.0  # total length of these pauses
+    player: str | None = None  # name of the player, if it was chosen automatically
 
 
-#: Commands that begin a goal: one for each kind of goal.
+#: Commands that start a goal, one for each kind of goal.
 GoalCommand = Speak
 Command = Configure | GoalCommand | Stop | Hold | Continue | NextGoal | LoadVoice | DropVoice
-#: Events that belong to the goal given by their `id`.
+#: Events about the goal with the given `id`.
 GoalEvent = Started | Alive | Word | OutputChanged | VoiceChosen | Held | Ended
 Event = Ready | StartFailed | VoiceList | VoiceLoaded | VoiceUnloaded | VoiceMemory | GoalEvent
 
-#: Classes of the messages in each direction, by name. A line has the name as its "kind".
+#: Message classes of each direction by name. A line contains the name as its "kind".
 COMMAND_CLASSES: dict[str, type[Command]] = {each.__name__: each for each in Command.__args__}
 EVENT_CLASSES: dict[str, type[Event]] = {each.__name__: each for each in Event.__args__}
 
-# Created once. `json.dumps` creates an encoder for each line with a `default`, and `json.loads` guesses the encoding of
-# each line. Together that is a third of the cost of a line at both ends of the socket.
+# Reused for speed. `json.dumps` with a `default` would create an encoder for each line, and `json.loads` would detect
+# the encoding of each line. Together they would be a third of the cost of a message.
 _JSON_ENCODER = json.JSONEncoder(default=fields)
 _JSON_DECODER = json.JSONDecoder()
 
 
 def encode(message: Command | Event) -> bytes:
-    """Return a message as a line."""
+    """Return a message as a line of JSON."""
     return _JSON_ENCODER.encode({"kind": type(message).__name__, **fields(message)}).encode() + b"\n"
 
 
 def decode(line: bytes, classes: Mapping[str, type[_M]]) -> _M:
-    """Return the message in a line, as one of `COMMAND_CLASSES` or `EVENT_CLASSES`.
+    """Parse a message.
+
+    Args:
+        line: the line of JSON.
+        classes: `COMMAND_CLASSES` or `EVENT_CLASSES`.
 
     Raises:
-        ValueError, TypeError, KeyError: the line is no such message.
+        ValueError, TypeError, KeyError: the line is not a valid message.
     """
     content = _JSON_DECODER.decode(line.decode())
     if not isinstance(content, dict):

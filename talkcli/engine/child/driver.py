@@ -1,7 +1,6 @@
-"""pyttsx3's engine: starting its driver, setting the properties for a goal, and `talk`'s own driver.
+"""The use of pyttsx3: starting an engine, setting its properties for each goal, and `talk`'s own driver.
 
-`talk`'s own driver puts a synthesizer and the players behind pyttsx3's interface. If something is missing, the error
-says what to install.
+`talk`'s own driver makes a synthesizer and the players available through pyttsx3's interface.
 """
 
 from __future__ import annotations
@@ -33,24 +32,28 @@ if TYPE_CHECKING:
     from talkcli.engine.child.words import TimedWord
     from talkcli.engine.protocol import Configure, Speak, Voice
 
-#: Drivers of macOS that speak in Apple's run loop, which this process has to run.
+#: Drivers for macOS that speak in Apple's run loop, so this process has to run that loop.
 _RUN_LOOP_DRIVERS = ("nsss", "avspeech")
 
 
 class CannotStart(Exception):
-    """The engine can't start. `failure` is the message for the server; it says what to install or to change."""
+    """The engine can't start.
+
+    Attributes:
+        failure: the message for the server, which says what to install or to change.
+    """
 
     def __init__(self, message: str, reason: Reason = Reason.ENGINE_FAILED, **more: bool) -> None:
-        """Build the message for the server. `more` are further fields of `StartFailed`."""
+        """Build the message for the server. `more` contains further fields of `StartFailed`."""
         super().__init__(message)
         self.failure = StartFailed(reason, message, **more)
 
 
 def start(configure: Configure, runner: GoalRunner) -> Ready:
-    """Build the engine, start its loop, and attach it to the runner.
+    """Start pyttsx3's engine and attach it to the runner.
 
     Raises:
-        CannotStart: something is missing or unknown.
+        CannotStart: a driver, a voice or a library is missing or unknown.
     """
     try:
         import pyttsx3
@@ -76,7 +79,7 @@ def start(configure: Configure, runner: GoalRunner) -> Ready:
 
 
 def _register_own(synthesizer_name: str, driver_name: str, runner: GoalRunner) -> CombinedSynthesizer:
-    """Make a synthesizer and register a driver for it."""
+    """Create a synthesizer and register a driver for it."""
     module, _, function = SYNTHESIZERS[synthesizer_name].partition(":")
     try:
         synthesizer: CombinedSynthesizer = getattr(
@@ -84,21 +87,27 @@ def _register_own(synthesizer_name: str, driver_name: str, runner: GoalRunner) -
         )()
     except NotInstalled as error:
         raise CannotStart(str(error)) from error
-    except UnknownVoice as error:  # even its own voice is missing
+    except UnknownVoice as error:  # even the default voice is missing
         raise CannotStart(_start_error(driver_name, error), permanent=False) from error
     register(driver_name, synthesizer, runner)
     return synthesizer
 
 
 def register(name: str, synthesizer: Synthesizer, runner: GoalRunner) -> None:
-    """Add a driver to pyttsx3's own, so that `pyttsx3.init(name)` finds it."""
+    """Register a driver, so that `pyttsx3.init(name)` finds it."""
     module: Any = types.ModuleType(f"pyttsx3.drivers.{name}")
     module.buildDriver = lambda proxy: Driver(proxy, synthesizer, runner)
     sys.modules[module.__name__] = module
 
 
 def _start_engine(pyttsx3: Any, name: str, *, named: bool) -> Any:
-    """Return pyttsx3's engine for a driver, with its loop started. `named` says that an option named the driver."""
+    """Return pyttsx3's engine for a driver, with its loop started.
+
+    Args:
+        pyttsx3: the module.
+        name: name of the driver.
+        named: whether an option named the driver, which makes an unknown name a usage error.
+    """
     try:
         engine = pyttsx3.init(name)
     except ModuleNotFoundError as error:
@@ -110,7 +119,7 @@ def _start_engine(pyttsx3: Any, name: str, *, named: bool) -> Any:
         raise CannotStart(_start_error(name, error), permanent=False) from error
     try:
         engine.startLoop(False)
-        engine.iterate()  # fails with some drivers, which would hang at the first goal
+        engine.iterate()  # drivers that fail here would hang at the first goal
     except TypeError as error:
         message = f'the driver "{name}" cannot be stepped (its iterate() is no generator): leave --driver out'
         raise CannotStart(message, usage_error=True) from error
@@ -130,7 +139,7 @@ def _driver_names(pyttsx3: Any) -> list[str]:
 
 
 def _pump(driver_name: str) -> Callable[[], None]:
-    """Return the function that lets a foreign driver go on between two steps."""
+    """Return a function that gives a third-party driver time to work between two steps."""
     if sys.platform != "darwin" or driver_name not in _RUN_LOOP_DRIVERS:
         return lambda: None
     from Foundation import NSDate, NSRunLoop  # type: ignore[import-not-found,unused-ignore]
@@ -139,10 +148,10 @@ def _pump(driver_name: str) -> Callable[[], None]:
 
 
 class DriverProperties:
-    """The properties of the engine, set for each goal.
+    """The voice, rate, volume and pitch of the engine.
 
-    A property is only set if its value changes, because a foreign driver may not know a property that nobody asked
-    for. A voice is always set by an id that the driver itself lists.
+    A property is only set if its value changes, because a third-party driver may not support all of them. The voice is
+    always set by an ID from the driver's own list.
     """
 
     def __init__(self, engine: Any, driver: str) -> None:
@@ -156,10 +165,13 @@ class DriverProperties:
         engine.connect("error", self._note_error)
 
     def apply(self, command: Speak) -> str | None:
-        """Set the properties for a goal, and return why another voice speaks; None if none does.
+        """Set the properties for a goal.
 
-        A neural voice may have disappeared since the goal was accepted. Then, unless the goal is to be spoken by that
-        voice only, the driver speaks with a voice of its own, in the same language if possible.
+        If a neural voice has disappeared since the goal was accepted, the driver falls back to one of its other voices,
+        preferably in the same language. It doesn't do so if `voice_only` is set.
+
+        Returns:
+            The reason for the fallback, or None if the goal has the requested voice.
 
         Raises:
             CannotSpeak: the driver doesn't have the voice or the property.
@@ -180,7 +192,7 @@ class DriverProperties:
         return fallback_reason
 
     def set_voice(self, wanted: str | None) -> None:
-        """Set a voice, or the driver's default if `wanted` is None.
+        """Set a voice, or the driver's default voice if `wanted` is None.
 
         Raises:
             CannotSpeak: there is no such voice.
@@ -200,15 +212,15 @@ class DriverProperties:
         self.set_voice(None)
 
     def voice_id(self, wanted: str) -> str:
-        """Return the id of the voice that the user asked for.
+        """Return the ID of the voice that best matches the user's input.
 
         Raises:
             CannotSpeak: there is no such voice.
         """
         found = voices.find_voice(wanted, self._voices)
         if found is not None and is_neural(found.id) and without_speaker(wanted) != without_speaker(found.id):
-            found = None  # only a part of its name matches, so a voice added since then may match better
-        if found is None:  # listing takes some milliseconds, so it is only done for voices that are not known yet
+            found = None  # not an exact match, and a new voice may match better
+        if found is None:  # listing takes some milliseconds, so it is only done for unknown voices
             self._voices = voices.list_voices(self._engine)
             found = voices.find_voice(wanted, self._voices)
         if found is None:
@@ -217,7 +229,16 @@ class DriverProperties:
         return found.id
 
     def _set(self, name: str, value: Any, shown: str) -> None:
-        """Set a property. pyttsx3 reports errors by a notification instead of an exception."""
+        """Set a property. pyttsx3 reports an error through a notification instead of an exception.
+
+        Args:
+            name: name of the property.
+            value: the new value.
+            shown: description of the property and its value for the error message.
+
+        Raises:
+            CannotSpeak: the property can't be set.
+        """
         self._error = None
         self._engine.setProperty(name, value)
         error, self._error = self._error, None
@@ -233,14 +254,14 @@ class DriverProperties:
 
 
 class Driver:
-    """`talk`'s own driver, with the methods that pyttsx3's DriverProxy calls.
+    """`talk`'s own driver for pyttsx3, which connects a synthesizer with a playback.
 
-    It plays what a synthesizer makes. It can stop and hold, and it reports each word. It speaks inside `iterate`, where
-    the synthesizer writes to the playback in the same thread, and the playback waits for the player. No exception may
-    leave it, because pyttsx3 would lose the sentence silently.
+    pyttsx3's DriverProxy calls its methods. It speaks a whole sentence in one step of `iterate`: the synthesizer writes
+    to the playback, which waits for the player. It must not raise exceptions while speaking, because pyttsx3 would drop
+    the sentence without an error.
 
-    Its notifications are pyttsx3's. Anything else is set as an attribute of the runner. Beyond pyttsx3's interface, it
-    has the property "pitch" (0 to 100).
+    It sends pyttsx3's notifications. Results for which pyttsx3 has no field are set as attributes of the runner. It has
+    one property beyond pyttsx3's own: "pitch" (0 to 100).
     """
 
     def __init__(self, proxy: Any, synthesizer: Synthesizer, runner: GoalRunner) -> None:
@@ -252,10 +273,10 @@ class Driver:
         self._playback: Playback | None = None
 
     def iterate(self) -> Iterator[None]:
-        """Speak the waiting text, if there is one, and yield. pyttsx3 takes one step at a time."""
+        """Yield repeatedly. Each step speaks the waiting text, if there is one."""
         while True:
             if self._text is None:
-                self._proxy.setBusy(False)  # pyttsx3 starts busy; this makes it call `say` with a text that waits
+                self._proxy.setBusy(False)  # pyttsx3 starts busy, and calls `say` with a waiting text only if not busy
             if self._text is None:
                 yield
                 continue
@@ -263,12 +284,12 @@ class Driver:
             self._speak(text)
 
     def say(self, text: str) -> None:
-        """Take a text to be spoken by the next step of `iterate`."""
+        """Store a text, which the next step of `iterate` speaks."""
         self._proxy.setBusy(True)
         self._text = text
 
     def stop(self) -> None:
-        """Be silent now."""
+        """Stop speaking at once."""
         self._text = None
         if self._playback is not None:
             self._playback.stop()
@@ -277,10 +298,10 @@ class Driver:
     destroy = stop
 
     def getProperty(self, name: str) -> Any:  # noqa: N802 - pyttsx3's name
-        """Return a property.
+        """Return the value of a property.
 
         Raises:
-            KeyError: it is unknown.
+            KeyError: the property is unknown.
         """
         if name == "voices":
             from pyttsx3.voice import Voice
@@ -293,7 +314,7 @@ class Driver:
         """Set a property.
 
         Raises:
-            KeyError: it is unknown.
+            KeyError: the property is unknown.
             UnknownVoice: the voice can't be loaded.
         """
         if name == "voice":
@@ -303,7 +324,7 @@ class Driver:
             self._sound = replace(self._sound, **{name: kind(value)})
 
     def _speak(self, text: str) -> None:
-        """Speak a text, and notify pyttsx3 exactly once that it is finished."""
+        """Speak a text. Notify pyttsx3 exactly once that the text is finished."""
         runner = self._runner
         self._proxy.notify("started-utterance")
         self._playback = playback = Playback(runner, self._report_word)
@@ -315,7 +336,7 @@ class Driver:
             runner.gaps = playback.gaps
         except Stopped:
             pass
-        except Exception as error:  # noqa: BLE001 - pyttsx3 would drop it, whatever it is
+        except Exception as error:  # noqa: BLE001 - pyttsx3 would drop any exception
             failure = error
         playback.silence()
         self._playback = None

@@ -1,7 +1,8 @@
-"""The engine process: the server starts it, in a session of its own, to speak through pyttsx3.
+"""Entry point of the engine process, which the server starts in its own session to speak through pyttsx3.
 
-Its standard input is the socket to the server, which it reads and writes. Its state is of no further use, so the server
-may kill it at any time. When the server is gone, the process and its player must end too.
+The standard input of the process is the socket to the server. The process both reads and writes it. The server may kill
+the process at any time, because the process has no state worth keeping. If the server exits, the process and its player
+must exit too.
 """
 
 from __future__ import annotations
@@ -13,24 +14,24 @@ import sys
 
 from talkcli.engine import protocol
 
-#: Memory that the process may use on any machine. With a voice of 63 MB it uses 0.4 billion bytes.
+#: Minimum value of the memory limit, for small machines. With a voice of 63 MB, the process uses 0.4 GB.
 _MIN_MEMORY_BYTES = 1 << 30
-#: Linux's number for the prctl that kills this process when the thread that started it ends.
+#: Linux's number of the prctl operation that sets a signal for the death of the parent thread.
 _PR_SET_PDEATHSIG = 1
 
 
 def main() -> None:
-    """Run the engine process to its end."""
+    """Run the engine process until the server is gone or an error ends it."""
     _die_with_parent()
     _limit_core_dump()
     _limit_memory()
-    # Ctrl-C in the server's terminal, and the end of that terminal, are for the server to handle. A server or a player
-    # that stops reading is noticed by the write that fails.
+    # The server handles Ctrl-C and the closing of its terminal. A failed write, instead of SIGPIPE, shows that the
+    # server or the player has stopped reading.
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGPIPE):
         signal.signal(number, signal.SIG_IGN)
-    # The server may have inherited that SIGCHLD is ignored. Then no exit status of a player could be read.
+    # If SIGCHLD was inherited as ignored, the exit status of a player could not be read.
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-    # Imported now, because they take some time and the process must not outlive its server meanwhile.
+    # These imports take time. By now, the kernel kills this process if the server exits in the meantime.
     from talkcli.engine.child.driver import CannotStart, start
     from talkcli.engine.child.players.base import CannotEnd
     from talkcli.engine.child.players.chooser import PlayerChooser
@@ -40,7 +41,7 @@ def main() -> None:
     configure = None
     while configure is None and not channel.closed:
         configure = next(iter(channel.receive()), None)
-    # The server may have ended before the kernel was asked to watch it.
+    # The server may have exited before `_die_with_parent` took effect.
     if not isinstance(configure, protocol.Configure) or os.getppid() != configure.server_pid:
         return
     runner = GoalRunner(channel, PlayerChooser(configure, _inherited_descriptors()))
@@ -49,19 +50,19 @@ def main() -> None:
         runner.run(send_voices=configure.list_voices)
     except CannotStart as error:
         channel.send(error.failure)
-    except CannotEnd as error:  # the server sees that a player is left, and starts another process
+    except CannotEnd as error:  # the server detects that a player is left, and starts another process
         sys.stderr.write(f"{error}\n")
     threading = sys.modules.get("threading")
-    if threading and threading.active_count() > 1:  # don't wait for a voice being loaded or a model being run
+    if threading and threading.active_count() > 1:  # a thread may still be loading a voice or running a model
         sys.stderr.flush()
         os._exit(0)
 
 
 def _die_with_parent() -> None:
-    """Have the kernel kill this process when the thread that started it ends.
+    """Have the kernel kill this process when the thread that started it exits.
 
-    That thread may have ended before, so the caller must then check who the parent is. Only Linux can do this.
-    Elsewhere, the process ends with the socket to the server.
+    That thread may have exited before this call, so the caller must check the parent's ID afterwards. Only Linux
+    supports this. On other systems, the process exits when the server's end of the socket is closed.
     """
     if not sys.platform.startswith("linux"):
         return
@@ -73,19 +74,18 @@ def _die_with_parent() -> None:
 
 
 def _limit_core_dump() -> None:
-    """Prevent a core dump when a text crashes the library. It would take longer than the restart, and wear SD cards.
+    """Prevent core dumps if a text crashes the library. A dump takes longer than a restart, and wears out SD cards.
 
-    The limit is one byte, because with a limit of 0 the core would still be piped to a program that collects cores.
+    The limit is one byte. With a limit of 0, the kernel would still pipe the core to a program that collects cores.
     """
     _, hard = resource.getrlimit(resource.RLIMIT_CORE)
     resource.setrlimit(resource.RLIMIT_CORE, (1 if hard else 0, hard))
 
 
 def _limit_memory() -> None:
-    """Limit this process to half of the machine's memory, because a voice's model can ask for any amount.
+    """Limit this process to half of the machine's memory, because a voice model may request any amount.
 
-    A library reports memory that it can't have. Without the limit the machine would stall, and the kernel would kill
-    some process.
+    With the limit, the library reports an error. Without it, the machine would stall until the kernel kills a process.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
     limit = max(_MIN_MEMORY_BYTES, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2)
@@ -94,11 +94,11 @@ def _limit_memory() -> None:
 
 
 def _inherited_descriptors() -> list[int]:
-    """Return the descriptors that a player must inherit; none if the process was started by hand."""
+    """Return the descriptors that a player must inherit. The list is empty if the process was started by hand."""
     value = os.environ.get(protocol.LIVENESS_VARIABLE)
     if value is None:
         return []
     descriptor = int(value)
-    os.fstat(descriptor)  # fail now if it isn't open, or every sentence would fail
+    os.fstat(descriptor)  # if it isn't open, fail now instead of at every sentence
     os.set_inheritable(descriptor, False)
     return [descriptor]

@@ -1,8 +1,7 @@
-"""The playback of one sentence: it feeds a player, holds the sentence on request, and judges whether all was heard.
+"""Playback of one sentence: sending samples to a player, holding the sentence, and checking that all of it was heard.
 
-It only waits in `GoalRunner.wait`, where a stop or a hold can arrive, and tells the runner once the sentence is silent.
-It knows nothing about synthesis or processes. A player reports what it takes, and the playback decides what that means.
-`SentenceSamples` and `PlayerFeed` never wait.
+`Playback` waits only in `GoalRunner.wait`, so that a stop or a hold can arrive at any time. `SentenceSamples` and
+`PlayerFeed` never wait. Nothing here depends on how the samples are synthesized or which kind of player plays them.
 """
 
 from __future__ import annotations
@@ -23,83 +22,84 @@ if TYPE_CHECKING:
     from talkcli.engine.child.players.base import Interest, Player
     from talkcli.engine.child.runner import GoalRunner
 
-#: Limit for a player to take the first sound. A sleeping Bluetooth or USB device needs one or two seconds, and a null
-#: sink that nobody records up to two.
+#: Time allowed for a player to play its first sound. A sleeping Bluetooth or USB device needs one to two seconds, and a
+#: null sink that isn't being recorded needs up to two.
 FIRST_SOUND_LIMIT_S = 5.0
 
-#: Longest time without any sound taken, after which a player has stalled. Healthy waits are below 0.04 s on a busy
-#: machine, and up to 2 s on a null sink that nobody records.
+#: Time after which a player that accepts no samples counts as stalled. Normally, a player accepts samples within 0.04 s
+#: on a busy machine. A null sink that isn't being recorded may take 2 s.
 STALL_LIMIT_S = 3.0
 
-#: Interval for checking how much a player has taken. The start of a stall is known as exactly as this.
+#: Interval for checking how much a player has consumed. It is also the precision with which a stall is detected.
 PROGRESS_CHECK_INTERVAL_S = 0.1
 
-#: Time that a player may take beyond the rest of the audio to drain and end, for the same reasons.
+#: Time allowed for a player to exit after the end of the audio. It covers the same delays as `STALL_LIMIT_S`.
 DRAIN_LIMIT_S = 3.0
 
-#: Most that a sentence may end before its audio does. Clocks of sound cards differ, and players cut trailing silence.
-#: The pause at the end of a sentence is longer than this, so nothing audible can be missing.
+#: Maximum time by which a player may end before its audio should. Sound cards have inexact clocks, and players cut off
+#: silence at the end. A sentence ends with a longer pause, so nothing audible is missing.
 EARLY_END_LIMIT_S = 0.25
 
-#: Time for which a busy device is tried again, so that the sound of another program, or `talk doctor --silent`, doesn't
-#: cost a sentence.
+#: Time for which opening a busy device is retried, because another program, such as `talk doctor --silent`, may use the
+#: device only briefly.
 DEVICE_BUSY_LIMIT_S = 1.0
 DEVICE_RETRY_INTERVAL_S = 0.05
 
-#: Most zeros that can be left out before a sentence. libespeak-ng makes 0 to 11 ms. More silence is intended, as from a
-#: voice with volume 0.
+#: Maximum length of the zero samples that may be skipped at the beginning of a sentence. libespeak-ng produces 0 to
+#: 11 ms. More silence is intended, for example at volume 0.
 LEADING_ZEROS_LIMIT_S = 0.1
 
-#: Limit for a killed player to be gone. It takes 1 ms unless the player hangs in a device driver.
+#: Time allowed for a killed player to exit. It usually takes 1 ms, unless the player hangs in a device driver.
 PLAYER_KILL_LIMIT_S = 1.0
 
-#: Limit for a held sentence to be silent. A player has 42 to 98 ms of sound left. A player that has more, or stands
-#: still, is ended, and the sentence later goes on with another.
+#: Time allowed for a held sentence to become silent. Players usually have 42 to 98 ms of sound buffered. A player that
+#: has more or is stalled is killed, and the sentence later continues with a new player.
 HOLD_SILENCE_LIMIT_S = 0.15
 
-#: Most that the word clock may be ahead of what is heard. 4 to 8 ms were measured.
+#: Maximum time by which the word clock may be ahead of the sound. Measurements show 4 to 8 ms.
 CLOCK_ERROR_S = 0.01
 
-#: Longest silence within a sentence that doesn't count as a gap when its sound is not made in time. Clocks are no more
-#: exact, and nobody hears it.
+#: Maximum length of a pause caused by late samples that doesn't count as a gap. It is inaudible, and the clock isn't
+#: more precise.
 INAUDIBLE_GAP_S = 0.05
 
-#: Sound that is repeated after a player had to be ended before all it held was heard, so that nothing is lost. The
-#: clock is no more exact.
+#: Length of the sound that is repeated after a player was killed with sound in its buffer. It compensates for the
+#: limited precision of the clock, so that no sound is lost.
 REPEATED_SOUND_S = 0.03
 
-#: Length of a hold after which the player is released. Up to then, the next sample is heard at once after a short
-#: question. After a longer hold, other programs can use the device, and it can sleep.
+#: Length of a hold after which the player is released. After a shorter hold, the sentence can continue immediately.
+#: During a longer one, other programs can use the device, and the device can sleep.
 RELEASE_DELAY_S = 10.0
 
-#: Least sound that a player holds between taking and playing it. Asked to hold 60 ms, aplay was seen to hold 42 to 78,
-#: and pacat 25 to 60.
+#: Minimum amount of sound that a player has buffered. With a configured buffer of 60 ms, measurements show 42 to 78 ms
+#: for aplay and 25 to 60 ms for pacat.
 MIN_PLAYER_BUFFER_S = 0.02
 
-#: Loudest sample that counts as silence, out of 32,768: 66 dB below the loudest. libespeak-ng adds 235 to 275 ms of
-#: zeros at the end of a sentence. With a voice that has an echo ("f3"), about the last 100 ms are quiet.
+#: Maximum absolute value of a sample that counts as silence. It is 66 dB below the loudest sample (32,768).
+#: libespeak-ng ends a sentence with 235 to 275 ms of zeros. With a voice that has an echo ("f3"), about the last 100 ms
+#: aren't zero but quiet.
 MAX_QUIET_LEVEL = 16
 
 
 class SentenceSamples:
-    """The samples of one sentence that may still be needed.
+    """A buffer for the samples of one sentence.
 
-    Places are in bytes from the beginning of the sentence. Samples are added at the end and dropped from the beginning
-    once they were heard, so that a text of minutes takes no more memory than a word.
+    Places are in bytes from the beginning of the sentence. Samples are added at the end, and dropped from the beginning
+    after they were heard. A long text therefore takes no more memory than a short one.
     """
 
     def __init__(self) -> None:
         self._kept = bytearray()
-        #: whether there was any sound, or a word that should have made some
+        #: whether the sentence has had any sound or any word
         self.audible = False
-        #: place of the first sample that is kept
+        #: place of the first sample in the buffer
         self.begin = 0
-        #: bytes of silence at the end, including dropped ones
+        #: number of bytes of silence at the end, including samples already dropped
         self._quiet = 0
 
     @property
     def end(self) -> int:
-        """Place after the last sample so far."""
+        """Place after the last sample added so far."""
         return self.begin + len(self._kept)
 
     def add(self, samples: bytes) -> None:
@@ -111,7 +111,7 @@ class SentenceSamples:
         self._quiet = self._quiet + len(samples) if quiet_count is None else quiet_count * SAMPLE_BYTES
 
     def leading_zeros(self) -> int:
-        """Return the number of bytes of zero samples at the beginning."""
+        """Return the length in bytes of the zero samples at the beginning."""
         return (len(self._kept) - len(self._kept.lstrip(b"\0"))) // SAMPLE_BYTES * SAMPLE_BYTES
 
     def part(self, begin: int, end: int) -> memoryview:
@@ -124,44 +124,44 @@ class SentenceSamples:
         self.begin = place
 
     def trailing_silence(self, limit: int) -> int:
-        """Return the number of bytes of silence at the end, but at most `limit`."""
+        """Return the length in bytes of the silence at the end of the buffer, at most `limit`."""
         return min(self._quiet, limit, len(self._kept))
 
 
 class PlayerFeed:
-    """The stream of one player. It counts what was written and taken, and drives the word clock with that."""
+    """The stream of samples to one player. It counts the bytes written and consumed, and adjusts the word clock."""
 
     def __init__(self, player: Player, rate: int, clock: WordClock, begin: float, lead_in: float) -> None:
-        """Begin the stream.
+        """Start a stream, and reset the clock for it.
 
         Args:
             player: the player, which was just opened.
             rate: samples per second.
-            clock: the word clock, which is reset.
-            begin: position in the sentence's audio from which this player plays it, in seconds.
-            lead_in: seconds of silence before the first sample.
+            clock: the word clock.
+            begin: position in the sentence's audio at which the stream begins, in seconds.
+            lead_in: seconds of silence to play first.
         """
         self.player = player
-        #: most bytes to offer at once
+        #: maximum number of bytes to offer at once
         self.piece_bytes = int(PIECE_S * rate) * SAMPLE_BYTES
-        #: bytes that the player had consumed by the last look, including silence
+        #: number of bytes that the player had consumed at the last update, including silence
         self.consumed = 0
-        #: bytes that were written to it, including silence
+        #: number of bytes written to the player, including silence
         self.written = 0
-        #: when it last took samples or consumed all that it had; from then on a stall is measured
+        #: time at which the player last accepted samples or had consumed everything; the start of a possible stall
         self.progress_at = time.monotonic()
         self._rate = rate
         self._zeros = bytes(self.piece_bytes)
         self._clock = clock
         self._first_write_at = 0.0
-        #: when all that was written will have been heard
+        #: time at which everything written will have been heard
         self._heard_at = 0.0
-        #: bytes of silence that are still to be written before the first sample
+        #: number of bytes of silence that remain to be written before the first sample
         self.lead_in = int(lead_in * rate) * SAMPLE_BYTES if player.real_time else 0
         clock.reset(begin)
 
     def offer(self, samples: memoryview) -> int:
-        """Offer at most `piece_bytes` of samples to the player, and return how many bytes it took."""
+        """Offer at most `piece_bytes` of samples to the player, and return the number of bytes accepted."""
         taken = self.player.offer(samples)
         if taken:
             now = time.monotonic()
@@ -174,9 +174,11 @@ class PlayerFeed:
         return taken
 
     def offer_silence(self, position: float, limit: int | None = None) -> int:
-        """Offer a piece of silence, at most `limit` bytes, and return how many bytes the player took.
+        """Offer silence to the player, and return the number of bytes accepted.
 
-        `position` is the position in the audio of the sample that follows.
+        Args:
+            position: position in the audio of the next sample.
+            limit: maximum number of bytes to offer, or None for a whole piece.
         """
         taken = self.offer(memoryview(self._zeros)[:limit])
         if taken:
@@ -184,13 +186,13 @@ class PlayerFeed:
         return taken
 
     def update(self, now: float, *, complete: bool) -> None:
-        """Bring the clock up to date. `complete` means that nothing more will be written."""
+        """Adjust the clock to the player's progress. `complete` says that nothing more will be written."""
         consumed = self.player.consumed()
         if consumed > self.consumed:
-            if self.consumed == 0:  # the player has opened its device; before that, samples waited in its pipe
+            if self.consumed == 0:  # the device is open now; until then, samples wait in the player's pipe
                 self._clock.start(now)
             self.consumed = consumed
-            if consumed >= self.written:  # a player that takes a few bytes at a time makes no progress
+            if consumed >= self.written:  # consuming a few bytes now and then doesn't count as progress
                 self.progress_at = now
         heard = self.player.heard()
         if heard is not None:
@@ -199,21 +201,21 @@ class PlayerFeed:
             self._clock.limit_elapsed(now, max(0.0, self._seconds(consumed) - MIN_PLAYER_BUFFER_S))
 
     def buffered(self, now: float) -> float:
-        """Return the seconds of sound that were written but not heard yet."""
+        """Return the length in seconds of the sound that was written but not heard yet."""
         return max(0.0, self.time_left(self.written, now))
 
     def time_left(self, written: int, now: float) -> float:
-        """Return the seconds until this byte of the stream is heard. Negative if it was heard already."""
+        """Return the seconds until this byte of the stream is heard, or a negative number if it was already heard."""
         return self._seconds(written) - self._clock.elapsed(now)
 
     def silent_for(self, now: float) -> float:
-        """Return the seconds since all that was written was heard; 0 before that."""
+        """Return the number of seconds for which the player has had nothing to play."""
         if self.written == 0 or self.time_left(self.written, now) > MIN_PLAYER_BUFFER_S:
             return 0.0
         return max(0.0, now - self._heard_at)
 
     def missing(self, now: float) -> float:
-        """Return how many seconds too early the player would end if it ended now."""
+        """Return the length in seconds of the audio that would be missing if the player ended now."""
         return self._first_write_at + self._seconds(self.written) - now
 
     def _seconds(self, length: int) -> float:
@@ -221,55 +223,66 @@ class PlayerFeed:
 
 
 class _PlayerReleased(Exception):
-    """The player was released because its sentence is held. The step is repeated with another player later."""
+    """The player was released because the sentence is held. The current step is later repeated with a new player."""
 
 
 class Playback:
-    """One sentence on its way to the player. The synthesizer writes to it.
+    """Plays one sentence. The synthesizer writes the samples to it.
 
-    Every method may raise Stopped or CannotSpeak, except `stop` and `silence`, which the synthesizer doesn't call.
+    All public methods except `stop` and `silence` may raise Stopped or CannotSpeak.
     """
 
     def __init__(self, runner: GoalRunner, on_word: Callable[[TimedWord], None]) -> None:
-        """Prepare the playback. `on_word` is called with each word when it begins to be heard."""
+        """Create a playback without opening a player.
+
+        Args:
+            runner: the runner of the current goal.
+            on_word: called with each word when the word starts to be heard.
+        """
         self._runner = runner
         self._players = runner.players
         self._wait = runner.wait
         self._on_word = on_word
         self._rate = 0
-        #: functions that open the players not tried yet, best first; None to try all
+        #: functions that open the players that have not been tried yet, best first; None to try all players
         self._untried: Iterator[Callable[[], Player]] | None = None
         self._feed: PlayerFeed | None = None
         self._first_error: CannotSpeak | None = None
         self._clock = WordClock()
-        #: all samples until a player is proven, then those not heard yet
+        #: all samples until the player is known to work, and from then on the samples not heard yet
         self._samples = SentenceSamples()
-        self._complete = False  # whether no more samples will come
-        self._begin = 0  # place of the first sample that this player got
-        self._sent = 0  # place after the last sample that a player took
-        self._began = False  # whether any sound is known to be heard
+        self._complete = False  # whether all samples were written
+        self._begin = 0  # place of the current player's first sample
+        self._sent = 0  # place after the last sample accepted by the player
+        self._began = False  # whether the beginning of the sentence was reported
         self._stopped = False
-        #: whether it is decided where the sound begins, and how many bytes of zeros before it are left out
+        #: whether `_left_out` is final
         self._start_known = False
+        #: number of bytes of zero samples skipped at the beginning
         self._left_out = 0
-        #: monotonic time until which a busy device is tried again; 0 before it was found busy
+        #: monotonic time until which opening a busy device is retried; 0 until a device is found to be busy
         self._busy_until = 0.0
-        #: whether the samples are made in another thread, and may be late
+        #: whether the samples are synthesized in another thread, and may be late
         self._made_elsewhere = False
-        #: seconds of each audible gap in the sentence, caused by late samples
+        #: length in seconds of each gap that late samples have caused
         self.gaps: list[float] = []
-        #: since when the player of a held sentence has got nothing but silence
+        #: time since which the player of a held sentence plays silence
         self._silent_at: float | None = None
 
     # -- methods for the synthesizer
 
     def begin(self, rate: int, voice: str, fallback_reason: str | None = None) -> None:
-        """Set the samples per second and the voice, and start a player.
+        """Begin the sentence and start a player.
 
-        The player takes 1 to 15 ms to start, while the first samples are made. Its errors are raised by `write`.
+        The player starts in 1 to 15 ms, while the synthesizer produces the first samples. `write` raises its errors.
+
+        Args:
+            rate: samples per second.
+            voice: ID of the voice that speaks.
+            fallback_reason: human-readable reason for a fallback voice, or None for the requested voice.
         """
         if self._feed is not None and rate != self._rate:
-            self._release_player(0)  # it was started for another rate
+            self._release_player(0)  # the player was started with another rate
         self._rate = rate
         self._runner.report_voice(voice, fallback_reason)
         if self._players.takes_time and not self._runner.hold_number:
@@ -279,22 +292,28 @@ class Playback:
                 self._untried = self._first_error = None
 
     def word(self, start: int, length: int, position: float) -> None:
-        """Report this word when it is heard."""
+        """Add a word, to be reported when it is heard.
+
+        Args:
+            start: offset of the word in the text.
+            length: number of characters.
+            position: start of the word in the audio, in seconds.
+        """
         self._samples.audible = True
         self._clock.add(TimedWord(start, length, position))
 
     def write(self, samples: bytes) -> None:
-        """Play samples. Return when the player has taken them, or at once as long as there is nothing audible."""
+        """Play samples. Return when the player has accepted them, or at once while everything so far is silent."""
         self._samples.add(samples)
-        self._wait((), 0.0)  # playing to a file never waits otherwise, and must be stoppable too
+        self._wait((), 0.0)  # checks for a stop, because writing to a file never waits
         self._check_stopped()
         if self._samples.audible and self._find_start():
             self._with_player(self._send_all)
 
     def wait(self, descriptor: int) -> None:
-        """Play on until the descriptor is readable or something else has happened, while more samples are made.
+        """Wait for the descriptor while another thread synthesizes more samples. Meanwhile, keep playing.
 
-        If the player runs out of sound in this time, that is no stall.
+        This method may return early. If the player runs out of samples in the meantime, it doesn't count as stalled.
         """
         self._made_elsewhere = True
         more = (descriptor, select.POLLIN)
@@ -308,7 +327,10 @@ class Playback:
     # -- methods for the driver
 
     def finish(self) -> float:
-        """Play to the end and return the length in seconds. It only returns if everything was heard."""
+        """Play the sentence to its end, and return its length in seconds.
+
+        If any part of the sentence wasn't heard, this method raises CannotSpeak.
+        """
         if not self._samples.audible:
             raise CannotSpeak(Reason.NOTHING_TO_SAY, "nothing in the text can be spoken")
         self._complete = self._start_known = True
@@ -321,16 +343,16 @@ class Playback:
         return self._seconds(self._sent - self._left_out)
 
     def stop(self) -> None:
-        """Be silent now. Whatever waits raises Stopped."""
+        """Stop the sound at once. The running method raises Stopped."""
         self._stopped = True
         if self._feed is not None:
             self._feed.player.kill()
 
     def silence(self) -> None:
-        """Release the player, and return when nothing can be heard any more.
+        """End the player, and return when it is certainly silent.
 
         Raises:
-            CannotEnd: the player could not be ended.
+            CannotEnd: the player has not exited in time.
         """
         if self._feed is None:
             return
@@ -350,13 +372,16 @@ class Playback:
     # -- choosing a player
 
     def _with_player(self, step: Callable[[PlayerFeed], None]) -> None:
-        """Take a step. If a player fails before it took any sound, or is released, repeat the step with the next."""
+        """Call `step` with the current player, and repeat it with the next player if necessary.
+
+        It is repeated if the player fails before any sound was heard, or if the player was released during a hold.
+        """
         while True:
             self._check_stopped()
             try:
                 if self._feed is None:
                     self._await_continue()
-                    if 0 < self._begin == self._samples.end:  # it was held at its very end
+                    if 0 < self._begin == self._samples.end:  # the sentence was held at its very end
                         return
                     self._feed = self._open()
                 step(self._feed)
@@ -375,13 +400,16 @@ class Playback:
         return PlayerFeed(player, self._rate, self._clock, self._seconds(self._begin), lead_in)
 
     def _next_player(self, error: CannotSpeak) -> None:
-        """Give up this player. If there is no other or sound was taken, raise the first player's error."""
+        """Release a player that has failed. If another one can't replace it, raise an error.
+
+        There is no replacement if some of the sound may have been heard, or if no other player is left.
+        """
         feed = self._feed
         if feed is not None and feed.player.real_time and self._runner.hold_number:
-            self._rewind(feed)  # the held sentence goes on with another player later, and fails then if there is none
+            self._rewind(feed)  # the sentence tries to continue with another player after the hold
             return
         first = self._first_error
-        if first is None or first.reason == Reason.NO_PLAYER:  # a player that fails says more than a missing one
+        if first is None or first.reason == Reason.NO_PLAYER:  # a failed player's error is more useful
             first = self._first_error = error
         proven = feed is not None and feed.player.proven
         lost = proven or error.final or (feed is not None and error.reason == Reason.AUDIO_STALLED)
@@ -396,59 +424,59 @@ class Playback:
             self._wait((), time.monotonic() + DEVICE_RETRY_INTERVAL_S)
 
     def _is_busy(self, error: CannotSpeak) -> bool:
-        """Return whether the device is busy and should be tried again."""
+        """Return whether the error is a busy device that should be tried again."""
         if error.reason != Reason.AUDIO_DEVICE or "busy" not in str(error).lower():
             return False
         self._busy_until = self._busy_until or time.monotonic() + DEVICE_BUSY_LIMIT_S
         return time.monotonic() < self._busy_until
 
     def _release_player(self, begin: int) -> None:
-        """End the player. Any player may go on from the place `begin`."""
+        """Release the player. The next player continues at the place `begin`."""
         feed, self._begin, self._sent = self._feed, begin, begin
         if feed is not None and feed.player.proven:
-            self._players.last_player = feed.player.name  # tried first again
+            self._players.last_player = feed.player.name  # will be tried first
         self._untried = self._first_error = None
         self.silence()
 
     def _rewind(self, feed: PlayerFeed) -> None:
-        """End a player that holds sound that wasn't heard. The next player begins there."""
+        """Release a player although it still has sound in its buffer. The next player repeats the unheard sound."""
         feed.update(time.monotonic(), complete=False)
         self._release_player(self._unheard_begin() if feed.player.proven else self._begin)
 
     # -- steps
 
     def _send_all(self, feed: PlayerFeed) -> None:
-        """Send all samples that there are to the player."""
+        """Send all samples in the buffer to the player."""
         if feed.written == 0:
-            feed.progress_at = time.monotonic()  # before that, it had nothing to take
+            feed.progress_at = time.monotonic()  # until now, the player had nothing to play
         while True:
             if self._runner.hold_number:
                 self._keep_silent(feed)
             if self._sent == self._audible_end(feed):
-                self._update(feed)  # the next samples may take long
+                self._update(feed)  # it may take long until the next samples arrive
                 return
             taken = self._offer(feed)
             self._update(feed)
             if taken:
                 continue
             limit = FIRST_SOUND_LIMIT_S if feed.consumed == 0 else STALL_LIMIT_S
-            due = feed.progress_at + limit if feed.player.real_time else None  # the reader of a file may take any time
+            due = feed.progress_at + limit if feed.player.real_time else None  # a stream's reader may be slow
             self._wait_for(feed, due)
             if due and time.monotonic() >= due and not self._runner.hold_number and not self._offer(feed):
                 raise CannotSpeak(Reason.AUDIO_STALLED, f"{feed.player.name} took no sound for {limit:g} s")
 
     def _await_samples(self, feed: PlayerFeed, more: Interest) -> None:
-        """Wait once for more samples, while the player plays what it has."""
+        """Wait once for more samples. Meanwhile, keep playing."""
         if self._runner.hold_number:
             self._keep_silent(feed)
         self._update(feed)
-        feed.player.ended()  # raises if the player is gone, which would wake nobody later
+        feed.player.ended()  # raises an error if the player has failed, because the wait below would not notice
         self._wait_for(feed, None, more)
         self._update(feed)
-        feed.progress_at = time.monotonic()  # before that, it had nothing to take
+        feed.progress_at = time.monotonic()  # until now, the player had nothing to play
 
     def _drain(self, feed: PlayerFeed) -> None:
-        """Send the rest of the samples, close the player's input and wait for the end of the player."""
+        """Send the remaining samples, and wait until the player has played them and ended."""
         self._send_all(feed)
         player = feed.player
         player.close()
@@ -457,7 +485,7 @@ class Playback:
         while not player.ended():
             self._update(feed)
             now = time.monotonic()
-            # A player with less sound left ends as soon as it could be held.
+            # If less sound is left, the player ends before a hold could silence it.
             if self._runner.hold_number and feed.buffered(now) > HOLD_SILENCE_LIMIT_S:
                 self._rewind(feed)
                 raise _PlayerReleased
@@ -473,10 +501,10 @@ class Playback:
     # -- samples
 
     def _find_start(self) -> bool:
-        """Find where the sound begins, and return whether that is known yet.
+        """Decide how many zero samples to skip at the beginning, and return whether that is possible yet.
 
-        Zeros before it are left out, because nobody hears them. Zeros after another sentence belong to the pause
-        between the two, and a file gets all samples.
+        Zeros before the first sound are skipped, so that it is heard earlier. They are kept in a file, and after
+        another sentence, because they are part of the pause between the two sentences.
         """
         if self._start_known:
             return True
@@ -493,7 +521,7 @@ class Playback:
         return True
 
     def _offer(self, feed: PlayerFeed) -> int:
-        """Offer a piece of the lead-in or of the samples to the player, and return how many bytes it took."""
+        """Offer part of the lead-in or of the samples to the player, and return the number of bytes accepted."""
         if feed.lead_in:
             taken = feed.offer_silence(self._seconds(self._begin), feed.lead_in)
             feed.lead_in -= taken
@@ -507,14 +535,17 @@ class Playback:
         return taken
 
     def _audible_end(self, feed: PlayerFeed) -> int:
-        """Return the end of the samples to play. Some silence is left out if a goal waits, or may still come."""
+        """Return the place up to which to play now.
+
+        Silence at the end is held back, because it is shortened if another goal is waiting.
+        """
         if not feed.player.real_time or (self._complete and not self._players.handovers.next_waits):
             return self._samples.end
         limit = int(self._players.handovers.silence_to_cut(feed.player.name) * self._rate) * SAMPLE_BYTES
         return max(self._sent, self._samples.end - self._samples.trailing_silence(limit))
 
     def _update(self, feed: PlayerFeed) -> None:
-        """Bring the clock up to date, report the words that have begun, and drop the samples that were heard."""
+        """Adjust the clock, report the words that have started, and drop the samples that were heard."""
         now = time.monotonic()
         sent_all = self._complete and self._sent == self._audible_end(feed)
         feed.update(now, complete=sent_all and not self._runner.hold_number)
@@ -531,12 +562,12 @@ class Playback:
         self._report_words(self._clock.take_begun(now) if player.real_time else self._clock.take_rest())
 
     def _report_words(self, words: list[TimedWord]) -> None:
-        """Report words, at their positions in the sound that is played."""
+        """Report words. Their positions are relative to the first sample played."""
         for word in words:
             self._on_word(replace(word, position=word.position - self._seconds(self._left_out)))
 
     def _unheard_begin(self) -> int:
-        """Return the place of the first of this player's samples that may not have been heard."""
+        """Return the place of the first sample that may not have been heard."""
         heard = self._clock.heard_position(time.monotonic()) - REPEATED_SOUND_S
         return min(self._sent, max(self._begin, self._samples.begin, int(max(0.0, heard) * self._rate) * SAMPLE_BYTES))
 
@@ -549,7 +580,7 @@ class Playback:
         """Play silence while the sentence is held.
 
         Raises:
-            _PlayerReleased: the player failed, or was held for too long.
+            _PlayerReleased: the player failed, or the hold is longer than `RELEASE_DELAY_S`.
         """
         if not feed.player.real_time:
             self._await_continue()
@@ -563,10 +594,10 @@ class Playback:
             try:
                 taken = self._offer_silence(feed)
             except CannotSpeak:
-                release_at = 0.0  # a failure during a hold is no reason to end the sentence
+                release_at = 0.0  # a player that fails during a hold is replaced
             due = min(release_at, feed.progress_at + STALL_LIMIT_S)
             if time.monotonic() >= due:
-                self._release_player(self._sent)  # all that it held was heard
+                self._release_player(self._sent)  # everything up to here was heard
                 raise _PlayerReleased
             if not taken:
                 self._wait_for(feed, due)
@@ -574,7 +605,7 @@ class Playback:
         feed.progress_at = time.monotonic()
 
     def _await_silence(self, feed: PlayerFeed) -> None:
-        """Wait until the player has played what it has of a held sentence, or the sentence goes on."""
+        """Wait until the player has played the rest of its buffer, or the sentence continues."""
         self._update(feed)
         written, now = feed.written, time.monotonic()
         deadline = now + HOLD_SILENCE_LIMIT_S
@@ -589,8 +620,8 @@ class Playback:
             now = time.monotonic()
 
     def _offer_silence(self, feed: PlayerFeed) -> int:
-        """Offer a piece of silence, unless the player has enough. Without this limit, some would take it endlessly."""
-        feed.player.ended()  # raises if the player is gone
+        """Offer silence, unless the player has enough. Without this limit, some players would accept it endlessly."""
+        feed.player.ended()  # raises an error if the player has failed
         taken = 0 if self._has_enough_silence(feed) else feed.offer_silence(self._seconds(self._sent))
         self._update(feed)
         return taken
@@ -601,21 +632,27 @@ class Playback:
     # -- waiting
 
     def _await_continue(self) -> None:
-        """Wait without a player while the sentence is held."""
+        """Wait for the end of a hold, without a player."""
         while self._runner.hold_number:
             self._runner.confirm_hold()
             self._wait((), None)
             self._check_stopped()
 
     def _wait_for(self, feed: PlayerFeed, until: float | None, more: Interest | None = None) -> None:
-        """Wait for the player or a monotonic time. With `more`, nothing is to be written, and wait for that too."""
+        """Wait for the player or a monotonic time.
+
+        Args:
+            feed: the stream of the player.
+            until: the monotonic time, or None for no limit.
+            more: the descriptor that announces more samples, if there are none to write.
+        """
         player, now = feed.player, time.monotonic()
         idle = more is not None or self._has_enough_silence(feed)
         moments = [until, now + PIECE_S if idle else player.wake_at()]
         moments.append(self._clock.next_word_at() if player.proven else None)
-        if feed.consumed < feed.written:  # poll doesn't report that a player has taken only a part
+        if feed.consumed < feed.written:  # poll doesn't report each time that a player consumes samples
             moments.append(now + PROGRESS_CHECK_INTERVAL_S)
-        # If there is nothing to write, don't wait for room to write.
+        # Without samples to write, a writable player would end the wait at once.
         interests = [each for each in player.interests() if not (idle and each[1] == select.POLLOUT)]
         interests += [] if more is None else [more]
         self._wait(interests, min((moment for moment in moments if moment is not None), default=None))

@@ -1,11 +1,11 @@
-"""The engine process's loop: it speaks one goal after the other through pyttsx3, and obeys commands in between.
+"""The main loop of the engine process, which speaks goals through pyttsx3 and executes commands.
 
-It runs in one thread. While `talk`'s own driver speaks, the driver waits in `GoalRunner.wait`, which obeys a `Stop` or
-`Hold` at once. Foreign drivers can't hold a sentence. There, a hold stops the sentence, and the rest of its text is
-spoken as another.
+The loop runs in one thread. While `talk`'s own driver speaks, it waits in `GoalRunner.wait`, which executes a `Stop` or
+`Hold` at once. Third-party drivers can't hold a sentence. For them, a hold stops the sentence, and the rest of the text
+is later spoken as a new sentence.
 
-Each goal must end with an `Ended`, although pyttsx3 drops the exceptions of its callbacks, ignores blank text and
-reports errors as notifications.
+Each goal must end with an `Ended`. pyttsx3 makes this harder because it drops exceptions raised by its callbacks,
+ignores blank text and reports errors as notifications.
 """
 
 from __future__ import annotations
@@ -35,32 +35,32 @@ if TYPE_CHECKING:
     from talkcli.engine.protocol import Command, Event
     from talkcli.goals.goal import Output
 
-#: Interval for letting a foreign driver go on while it speaks. It can't wake this process.
+#: Interval between two steps of a third-party driver while it speaks. The driver can't wake this process.
 DRIVER_STEP_S = 0.05
 
-# Limit for a foreign driver from one word, or the beginning, to the end of the text. It only shows that the driver
-# should have ended by then, because nobody can see whether it still speaks.
-#: The fixed part of the limit.
+#: Time allowed for a third-party driver to finish the text after its last word, in addition to the estimated time for
+#: the remaining words. The driver doesn't show whether it is still speaking.
 DRIVER_LIMIT_S = 10.0
-#: Words to allow for each character left, at the goal's rate. "€" is spoken as one word and an emoji as five, but
-#: other characters stand between emojis.
+#: Number of words to allow for each remaining character. "€" is spoken as one word. An emoji is spoken as up to five,
+#: but other characters are usually between emojis.
 MAX_WORDS_PER_CHARACTER = 3
 
 
 class Channel:
-    """The engine process's end of the socket to its server. If the server is gone, `closed` is set."""
+    """The engine process's end of the socket to its server."""
 
     #: standard input, which is the socket
     descriptor = 0
 
     def __init__(self) -> None:
+        #: whether the server has closed its end
         self.closed = False
-        #: monotonic time of the last event
+        #: monotonic time at which the last event was sent
         self.sent_at = time.monotonic()
         self._lines = LineSplitter()
 
     def send(self, event: Event) -> None:
-        """Send an event and wait until the server takes it."""
+        """Send an event. Block until all of it is written."""
         data = memoryview(protocol.encode(event))
         self.sent_at = time.monotonic()
         try:
@@ -70,7 +70,7 @@ class Channel:
             self.closed = True
 
     def receive(self) -> list[Command]:
-        """Read once, waiting for data, and return the commands that are complete."""
+        """Wait for data, read once, and return the complete commands."""
         try:
             data = os.read(self.descriptor, 65536)
         except ConnectionResetError:
@@ -88,52 +88,62 @@ class ActiveGoal:
         self.id = command.id
         self.command = command
         self.words = WordFinder(command.text)
-        #: when it began; moved later by the time for which it was held
+        #: time at which the goal started, plus the time for which it was held
         self.began_at = now
-        #: when the driver got the text or reported a word
+        #: time at which the driver last received text or reported a word
         self.progress_at = now
-        #: whether the driver has the text; a foreign driver doesn't have that of a held goal
+        #: whether the driver is speaking the text; False while the goal is held with a third-party driver
         self.with_driver = False
-        #: whether the driver was stopped in order to hold the goal
+        #: whether a third-party driver was stopped in order to hold the goal
         self.interrupted = False
-        #: when a foreign driver was silent after that
+        #: time at which a stopped third-party driver reported that it is silent
         self.silent_at: float | None = None
-        #: where the driver's part of the text begins
+        #: offset in the text of the part that the driver received
         self.offset = 0
-        #: where the last word that was heard begins
+        #: offset in the text of the last word heard
         self.last_word = 0
         self.stop_requested = False
+        #: the first error that the driver reported
         self.error: Exception | None = None
-        #: whether it was logged that the driver doesn't end
+        #: whether a driver that takes too long was logged
         self.overdue_logged = False
 
 
 class GoalRunner:
-    """The loop over the commands of the server. `attach_engine` gives it an engine, and `run` runs it."""
+    """Receives the server's commands and executes them. Call `attach_engine` once, and then `run`."""
 
     def __init__(self, channel: Channel, players: PlayerChooser) -> None:
-        """Prepare the loop. `players` is what `talk`'s own driver plays with."""
+        """Create a runner without an engine.
+
+        Args:
+            channel: the connection to the server.
+            players: chooses the players for `talk`'s own driver.
+        """
         self._channel = channel
         self.players = players
-        #: what the server was told about the goal: its output, its voice, and why that is another than it asked for
+        #: the last output sent to the server for the current goal
         self._reported_output: Output | None = None
+        #: the last voice sent to the server for the current goal
         self._reported_voice = ""
+        #: why the driver has set another voice than the goal's
         self._fallback_reason: str | None = None
+        #: commands to execute after the current goal
         self._backlog: deque[Command] = deque()
         self._goal: ActiveGoal | None = None
         self._engine: Any = None
         self._set_properties: Any = None
         self._pump: Callable[[], None] | None = None
         self._synthesizer: CombinedSynthesizer | None = None
-        #: number of the hold in force, or 0; the playback reads it here because pyttsx3 can't pass on a pause
+        #: number of the active hold, or 0; read by the playback, because pyttsx3 has no method for a hold
         self.hold_number = 0
+        #: number of the last hold confirmed to the server
         self._confirmed_hold = 0
-        # Set by `talk`'s own driver beside its notifications, which have no room for them. None with a foreign driver.
-        #: position in the audio of the word that begins, in seconds
+        # Only `talk`'s own driver sets these attributes. pyttsx3's notifications have no fields for them.
+        #: position in the audio of the word being reported, in seconds; None with a third-party driver
         self.position: float | None = None
-        #: length of the sentence that has ended, in seconds; None if not all of it was heard
+        #: length of the last sentence in seconds; None if it wasn't heard completely
         self.duration: float | None = None
-        #: seconds of each gap in that sentence
+        #: length in seconds of each gap in the last sentence
         self.gaps: list[float] = []
 
     def attach_engine(
@@ -143,14 +153,14 @@ class GoalRunner:
         pump: Callable[[], None] | None,
         synthesizer: CombinedSynthesizer | None = None,
     ) -> None:
-        """Take the engine to speak with.
+        """Set the engine that speaks the goals.
 
         Args:
             engine: pyttsx3's engine.
-            set_properties: sets the engine's properties for a goal. It returns why another voice speaks, or None, and
-                raises CannotSpeak if the goal can't be spoken.
-            pump: called about 20 times a second while a foreign driver speaks; None for `talk`'s own driver.
-            synthesizer: loads neural voices, or None if the driver has none.
+            set_properties: sets the engine's properties for a goal. It returns the reason for a fallback voice, or None
+                if the goal has the requested voice. It raises CannotSpeak if the goal can't be spoken.
+            pump: called about 20 times a second while a third-party driver speaks; None for `talk`'s own driver.
+            synthesizer: the synthesizer of `talk`'s own driver, which loads neural voices.
         """
         self._engine = engine
         self._set_properties = set_properties
@@ -161,12 +171,16 @@ class GoalRunner:
         engine.connect("error", _with_traceback(self._note_error))
 
     def run(self, *, send_voices: bool) -> None:
-        """Obey commands until the server is gone. First send the list of voices if that is wanted."""
+        """Execute commands until the server has closed the connection.
+
+        Args:
+            send_voices: whether to send the list of voices first.
+        """
         try:
             if send_voices:
                 try:
                     voices = list_voices(self._engine)
-                except Exception:  # noqa: BLE001 - a foreign driver may raise anything, and can speak without the list
+                except Exception:  # noqa: BLE001 - a third-party driver may raise anything, and may speak all the same
                     traceback.print_exc()
                     voices = ()
                 self._channel.send(protocol.VoiceList(voices))
@@ -175,15 +189,19 @@ class GoalRunner:
                     self.wait((), None)
                     continue
                 command = self._backlog.popleft()
-                if isinstance(command, protocol.GoalCommand):  # anything else came after its goal had ended
+                if isinstance(command, protocol.GoalCommand):  # other commands are for goals that have ended
                     self._speak(command)
         finally:
             self._engine.endLoop()
 
     def wait(self, interests: Sequence[Interest], until: float | None) -> None:
-        """Wait for one of the descriptors, a command or a monotonic time. It may return early.
+        """Wait for a descriptor, a command or a monotonic time, and execute the commands. It may return early.
 
-        Commands are obeyed inside, so the sentence may have been stopped when this returns.
+        A command may have stopped or held the sentence when this method returns.
+
+        Args:
+            interests: the descriptors, with the poll events to wait for.
+            until: the monotonic time, or None for no limit.
         """
         self._send_voice_events()
         poll = select.poll()
@@ -211,7 +229,7 @@ class GoalRunner:
             self._channel.send(protocol.Alive(self._goal.id if self._goal else ""))
 
     def _obey(self, command: Command) -> None:
-        """Obey a command for the goal being spoken or about voices. Keep any other for later."""
+        """Execute a command for the current goal or for a voice. Put others into the backlog."""
         goal = self._goal
         if isinstance(command, protocol.LoadVoice | protocol.DropVoice):
             if self._synthesizer is not None:
@@ -219,7 +237,7 @@ class GoalRunner:
         elif goal is None or isinstance(command, protocol.Configure | protocol.GoalCommand):
             self._backlog.append(command)
         elif goal.id != command.id:
-            return  # that goal ended before the command arrived
+            return  # the goal has already ended
         elif isinstance(command, protocol.Stop):
             self._stop_goal()
         elif isinstance(command, protocol.NextGoal):
@@ -238,7 +256,7 @@ class GoalRunner:
             self._goal.stop_requested = True
             if self._goal.with_driver:
                 self._engine.stop()
-            else:  # it is held or hasn't begun, so the driver would not report its end
+            else:  # the goal is held or hasn't started, so the driver would not report its end
                 self._end(protocol.OUTCOME_STOPPED)
 
     def _send_voice_events(self) -> None:
@@ -247,13 +265,13 @@ class GoalRunner:
             self._channel.send(event)
 
     def report_voice(self, voice: str, fallback_reason: str | None) -> None:
-        """Report the voice that speaks the goal, unless the server knows it. The playback calls this."""
+        """Report the voice that speaks the goal, unless it was already reported. The playback calls this method."""
         if self._goal is not None and voice != self._reported_voice:
             self._reported_voice = voice
             self._channel.send(protocol.VoiceChosen(self._goal.id, voice, fallback_reason or self._fallback_reason))
 
     def confirm_hold(self) -> None:
-        """Report, once, that the held goal is silent. The playback calls this as long as it is."""
+        """Confirm that the held goal is silent. If a hold was already confirmed, do nothing."""
         if self._goal is not None and not self._goal.stop_requested and self._confirmed_hold != self.hold_number:
             self._confirmed_hold = self.hold_number
             self._channel.send(protocol.Held(self._goal.id, self.hold_number))
@@ -267,14 +285,14 @@ class GoalRunner:
     # -- one goal
 
     def _speak(self, command: protocol.Speak) -> None:
-        """Speak a goal to its end."""
+        """Speak a goal. Return when the goal has ended."""
         self._goal = goal = ActiveGoal(command, time.monotonic())
         self.hold_number = self._confirmed_hold = 0
         self.gaps = []
         self.players.begin(command)
         self._reported_output, self._reported_voice, self._fallback_reason = None, "", None
         self._channel.send(protocol.Started(command.id))
-        # Commands for this goal may have arrived together with it.
+        # Commands for this goal may have arrived before it started.
         backlog, self._backlog = self._backlog, deque()
         for each in backlog:
             self._obey(each)
@@ -296,7 +314,7 @@ class GoalRunner:
                 self._give_to_driver(goal)
 
     def _give_to_driver(self, goal: ActiveGoal) -> None:
-        """Have the driver speak the text from the last word that was heard."""
+        """Have the driver speak the text, beginning with the last word heard."""
         goal.progress_at = time.monotonic()
         if goal.silent_at is not None:
             goal.began_at += goal.progress_at - goal.silent_at
@@ -306,22 +324,28 @@ class GoalRunner:
             self._fail(Reason.NOTHING_TO_SAY, "nothing in the text can be spoken")
 
     def _step_driver(self, goal: ActiveGoal) -> None:
-        """Let the driver go on. `talk`'s own speaks to the end in one step; a foreign one needs many steps."""
+        """Run the driver for one step.
+
+        `talk`'s own driver speaks the whole text in one step. A third-party driver needs many steps.
+        """
         self._engine.iterate()
         if self._goal is None:
             return
         if self._pump is None:
             self._fail(Reason.ENGINE_FAILED, "the driver lost the sentence")
-        elif goal.error is not None:  # a driver whose `say` raises never reports that it is finished
+        elif goal.error is not None:  # a driver never reports the end of a text if its `say` has failed
             self._engine.stop()
-            self._engine.proxy.setBusy(False)  # otherwise pyttsx3 would not pass on the next sentence
+            self._engine.proxy.setBusy(False)  # otherwise, pyttsx3 would not send the next text to the driver
             self._driver_finished(goal.id, completed=False)
         else:
             self.wait((), time.monotonic() + DRIVER_STEP_S)
             self._pump()
 
     def _report_word(self, location: int, length: int, **_: object) -> None:
-        """Report a word. The notification's name is ignored, because some drivers put the word there."""
+        """Report a word to the server.
+
+        The notification's `name` is not compared with the goal's ID, because some drivers set it to the word.
+        """
         goal = self._goal
         if goal is None or goal.stop_requested or goal.interrupted:
             return
@@ -338,7 +362,7 @@ class GoalRunner:
 
     def _driver_finished(self, name: str | None, completed: bool, **_: object) -> None:
         goal = self._goal
-        if goal is None or name != goal.id:  # it is about an earlier goal
+        if goal is None or name != goal.id:  # the notification is for an earlier goal
             return
         error = goal.error
         if goal.interrupted and not (completed or goal.stop_requested or error):
@@ -367,7 +391,7 @@ class GoalRunner:
         self._channel.send(protocol.Ended(goal.id, outcome, reason, message, duration, *gaps, self.players.chosen))
 
     def _alive_due(self) -> float | None:
-        """Return when the next sign of life is due; None if none is to be sent."""
+        """Return the time at which to send the next `Alive`, or None if none is needed."""
         loader = self._synthesizer.loader if self._synthesizer else None
         loading = loader is not None and loader.descriptor is not None
         if not loading and (self._goal is None or self._is_overdue(self._goal)):
@@ -375,10 +399,9 @@ class GoalRunner:
         return self._channel.sent_at + protocol.ALIVE_INTERVAL_S
 
     def _is_overdue(self, goal: ActiveGoal) -> bool:
-        """Return whether a foreign driver is taking longer than the text could need.
+        """Return whether a third-party driver takes longer than the text can possibly need.
 
-        This process then sends no signs of life, so the server kills it. There may be no other way to silence the
-        driver.
+        The process then sends no `Alive`, so that the server kills it. There may be no other way to stop the driver.
         """
         if self._pump is None or not goal.with_driver:
             return False
@@ -392,7 +415,7 @@ class GoalRunner:
 
 
 def _with_traceback(callback: Callable[..., None]) -> Callable[..., None]:
-    """Return a callback that prints the traceback of its exceptions, which pyttsx3 drops."""
+    """Wrap a callback to print the traceback of an exception, because pyttsx3 drops exceptions."""
 
     def call(**values: Any) -> None:
         try:

@@ -1,1 +1,1 @@
-"""The engine thread of the server, which starts the engine process, sends it goals, watches it and replaces it."""
+"""The engine thread of the server, which starts, feeds, monitors and replaces the engine process."""

@@ -1,10 +1,10 @@
-"""The engine process as its parent sees it: starting it, sending to it, reading from it and killing it.
+"""Control of an engine process by its parent: start it, exchange messages with it, and kill it.
 
-`EngineProcess` makes no decisions. The supervisor watches one of them beside other things, for months. `PrivateEngine`
-is for a caller that only wants to have a few texts spoken and waits for them.
+`EngineProcess` never blocks for long and makes no decisions, so that the supervisor can use it in an event loop.
+`PrivateEngine` is for callers that want to have a few texts spoken and wait for each of them.
 
-One pipe proves that the engine is silent. The engine process and its player inherit the writing end, and nobody writes
-to it. The reading end therefore reports end of file exactly when both are gone, however they ended.
+A liveness pipe proves that the engine is silent. The engine process and its player inherit the write end, and nobody
+writes to it. The read end therefore reports end of file exactly when both have exited, for whatever reason.
 """
 
 from __future__ import annotations
@@ -33,24 +33,24 @@ if TYPE_CHECKING:
 
     _E = TypeVar("_E", bound=protocol.Event)
 
-#: Environment variables that systemd sets for the server alone.
-_NOT_INHERITED = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID", "LISTEN_FDS", "LISTEN_PID", "LISTEN_FDNAMES")
-#: Size of the socket's send buffer. The longest text, escaped, fits several times.
+#: Environment variables that systemd sets only for the server itself.
+_SERVER_VARIABLES = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID", "LISTEN_FDS", "LISTEN_PID", "LISTEN_FDNAMES")
+#: Size of the socket's send buffer. Even with escapes, the longest text fits several times.
 _SEND_BUFFER_BYTES = 512 * 1024
-#: Time to let a process that closed its connection exit by itself, so that its own exit status is seen.
+#: Time allowed for a process to exit on its own after it closed its connection. Its exit status is then its own.
 _EXIT_WAIT_S = 0.2
-#: Longest line of standard error that is kept. The rest of a longer line is dropped.
+#: Maximum length of a line from standard error. The rest of a longer line is discarded.
 MAX_STDERR_LINE_BYTES = 1000
 
 
 def engine_command() -> list[str]:
-    """Return the command line of the engine process: this interpreter, with this process's own import path."""
+    """Return the command line of the engine process, which gets this process's interpreter and import path."""
     code = f"import sys; sys.path[:] = {sys.path!r}; from talkcli.engine.child.main import main; main()"
     return [sys.executable, "-c", code]
 
 
 class EngineProcess:
-    """A running engine process, and the descriptors to watch for it."""
+    """A running engine process, with the descriptors to watch."""
 
     def __init__(
         self,
@@ -61,27 +61,28 @@ class EngineProcess:
         """Start the process.
 
         Args:
-            configure: its settings.
-            on_stderr_line: called with each line that it writes to standard error.
-            env: its environment, or None for a copy of this process's.
+            configure: settings for the process.
+            on_stderr_line: called with each line that the process writes to standard error.
+            env: environment for the process, or None for a copy of the current environment.
 
         Raises:
-            OSError: it can't be started.
+            OSError: the process can't be started.
         """
+        #: whether the process has sent `Ready`; set by the caller
         self.ready = False
-        #: whether it has reported anything about a goal; set by the supervisor
+        #: whether the process has sent an event about a goal; set by the supervisor
         self.had_goal = False
-        #: its own reason for not starting; set by the supervisor
+        #: the `StartFailed` message from the process, if any; set by the supervisor
         self.start_failure: protocol.StartFailed | None = None
-        #: monotonic time by which it must be gone, once it was killed; set by the supervisor
+        #: monotonic time by which the process must have exited after a kill; set by the supervisor
         self.gone_by = float("inf")
-        # Held while sending, so that the descriptor isn't closed and reused by another thread in the meantime.
+        # Held while sending. Otherwise, another thread could close the descriptor and its number could be reused.
         self._sending = threading.Lock()
         self._lines = LineSplitter()
         self._stderr_lines = LineSplitter(MAX_STDERR_LINE_BYTES)
         self._last_stderr_line = ""
         self._on_stderr_line = on_stderr_line
-        environment = {name: value for name, value in (env or os.environ).items() if name not in _NOT_INHERITED}
+        environment = {name: value for name, value in (env or os.environ).items() if name not in _SERVER_VARIABLES}
         with contextlib.ExitStack() as kept, contextlib.ExitStack() as handed_over:
             self.socket, theirs = socket.socketpair()
             kept.enter_context(self.socket)
@@ -99,7 +100,8 @@ class EngineProcess:
                 stderr=stderr,
                 env={**environment, protocol.LIVENESS_VARIABLE: str(liveness)},
                 pass_fds=[each for each in (liveness, configure.output_fd) if each is not None],
-                # Ctrl-C in the server's terminal must not reach it, and one kill must reach its whole process group.
+                # In a session of its own, the process doesn't get Ctrl-C from the server's terminal, and the server can
+                # kill it together with its whole process group.
                 start_new_session=True,
             )
             kept.pop_all()
@@ -107,20 +109,20 @@ class EngineProcess:
         self.send(configure)
 
     def send(self, command: protocol.Command) -> bool:
-        """Send a command without waiting, from any thread. Return False if the process can't take it."""
+        """Send a command without blocking, and return whether it was sent. May be called from any thread."""
         line = protocol.encode(command)
         with self._sending:
             if self.socket.fileno() < 0:
                 return False  # closed
             try:
                 return self.socket.send(line) == len(line)
-            except OSError:  # the process is gone, the buffer is full, or the system is out of memory
+            except OSError:  # the process is dead, the buffer is full, or the system is out of memory
                 return False
 
     def receive(self) -> Iterator[protocol.Event | None]:
-        """Read once without waiting, and yield the events.
+        """Read once without blocking, and yield the received events.
 
-        A final None means that the process has closed the connection or sent a malformed message.
+        The last one is None if the process has closed the connection or sent a malformed message.
         """
         try:
             data = self.socket.recv(65536)
@@ -138,15 +140,15 @@ class EngineProcess:
                 return
 
     def read_stderr(self) -> bool:
-        """Read what the process wrote to standard error. Return False once that is closed."""
+        """Read standard error of the process once, and return whether it is still open."""
         try:
             data = os.read(self.stderr, 65536)
         except BlockingIOError:
             return True
-        self._pass_on_stderr(data or b"\n")
+        self._report_stderr(data or b"\n")
         return bool(data)
 
-    def _pass_on_stderr(self, data: bytes) -> None:
+    def _report_stderr(self, data: bytes) -> None:
         for line in self._stderr_lines.feed(data):
             text = line.decode(errors="replace").rstrip()
             if text:
@@ -156,40 +158,40 @@ class EngineProcess:
     def kill(self) -> None:
         """Kill the process, its player, and everything that the player has started.
 
-        As long as the process isn't reaped, no other process can have its group or session id. Processes that left both
-        are found by the liveness pipe.
+        Process group and session IDs can't be reused until the process is reaped. The liveness pipe finds processes
+        that have left both the process group and the session.
         """
         if self._process.returncode is None:
             kill([-self.pid])
-            # A player has a process group of its own. It dies with the engine process, but the programs of a pipeline
-            # started by the player would survive.
+            # A player dies with the engine process. If it is a pipeline, its programs are in a process group of their
+            # own and would survive.
             kill(pid for pid in processes() if peers.process_stat(pid)[3:4] == [b"%d" % self.pid])
             kill_holders(self.liveness)
 
     def describe_exit(self) -> str:
-        """Kill what is left of a process that closed its connection, and return how it ended, for people."""
+        """Return a human-readable description of how the process exited. Kill it if it is still running."""
         end = time.monotonic() + _EXIT_WAIT_S
-        # macOS has no waitid before Python 3.13. There, the status may be that of the kill below.
+        # Before Python 3.13, macOS has no waitid. There, the exit status may result from the kill below.
         while hasattr(os, "waitid") and time.monotonic() < end:
             if os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is not None:
                 break
             time.sleep(0.001)
-        self.kill()  # before it is reaped, because its group id may be reused afterwards
+        self.kill()  # before reaping the process, because its group ID may be reused afterwards
         try:
             status = self._process.wait(_EXIT_WAIT_S)
         except subprocess.TimeoutExpired:
             return "it closed its connection"
         self.read_stderr()
-        self._pass_on_stderr(b"\n")  # completes the last line
+        self._report_stderr(b"\n")  # ends an incomplete last line
         how = f"it was killed by {signal_name(-status)}" if status < 0 else f"it exited with status {status}"
         return f"{how} ({self._last_stderr_line})" if self._last_stderr_line else how
 
     def is_gone(self) -> bool:
-        """Return whether the process and its player are gone. Call this only if `liveness` is readable."""
+        """Return whether the process and its player have exited. Call this only if `liveness` is readable."""
         return os.read(self.liveness, 1) == b""
 
     def close(self) -> None:
-        """Reap the process and close the descriptors. A process that ignores a kill is left to the system."""
+        """Reap the process if it has exited, and close the descriptors."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(_EXIT_WAIT_S)
         with self._sending:
@@ -201,8 +203,8 @@ class EngineFailed(Exception):
     """The engine process failed.
 
     Attributes:
-        reason: the reason as a goal has it, for programs. For "engine_crashed" the text says how the process ended.
-        silent_s: how many seconds the process has been silent if that is the failure, else None.
+        reason: machine-readable reason, as in a goal. For ENGINE_CRASHED, the message describes how the process exited.
+        silent_s: number of seconds without a message, if that is the failure; otherwise None.
     """
 
     def __init__(self, reason: Reason, message: str, silent_s: float | None = None) -> None:
@@ -212,10 +214,11 @@ class EngineFailed(Exception):
 
 
 class PrivateEngine:
-    """An engine process for one caller, which has texts spoken one after the other and waits for each.
+    """An engine process for a single caller, as a context manager.
 
-    `say -o` and `talk doctor` use it, as a context manager. It waits in the caller's thread and enforces the time
-    limits of `protocol`. On exit the process and its player are gone, even after an error.
+    It speaks one text at a time and blocks the caller's thread while waiting. It enforces the time limits in
+    `protocol`. After the context is left, the process and its player are no longer running, even after an error.
+    `say -o` and `talk doctor` use this class.
     """
 
     def __init__(
@@ -229,13 +232,13 @@ class PrivateEngine:
         """Start the engine process.
 
         Args:
-            configure: its settings.
-            env: its environment, or None for a copy of this process's.
-            deadline: monotonic time at which any wait ends with a TimeoutError.
-            interrupt: descriptors that end any wait with Interrupted, as in `polling.wait_ready`.
+            configure: settings for the process.
+            env: environment for the process, or None for a copy of the current environment.
+            deadline: monotonic time at which every wait ends with a TimeoutError.
+            interrupt: descriptors that end a wait with Interrupted, as in `polling.wait_ready`.
 
         Raises:
-            EngineFailed: it can't be started.
+            EngineFailed: the process can't be started.
         """
         try:
             self._process = EngineProcess(configure, env=env)
@@ -244,28 +247,28 @@ class PrivateEngine:
         self._deadline = deadline
         self._interrupt = interrupt
         self._last_event_at = time.monotonic()
-        #: endless iterator over the events of the process, which raises the errors of `wait_for`
+        #: endless iterator over the events of the process, with the same errors as `wait_for`
         self.events = self._receive_events()
 
     def __enter__(self) -> PrivateEngine:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Kill the process and wait until it is gone, so that it can't write to its file any more."""
+        """Kill the process and wait until it has exited, so that it can't write to its output file any more."""
         self._process.kill()
         wait_ready({self._process.liveness: select.POLLIN}, KILL_LIMIT_S)
         self._process.close()
 
     def speak(self, command: protocol.GoalCommand) -> None:
-        """Have a text spoken. The process must be ready, and the text before must have ended."""
+        """Start to speak a text. The process must be ready, and the previous text must have ended."""
         self._last_event_at = time.monotonic()
         if not self._process.send(command):
             for _ in self._read_events():
-                pass  # raises a better error if the process is dead
+                pass  # raises a more specific error if the process is dead
             raise EngineFailed(Reason.ENGINE_HUNG, "the engine takes no commands")
 
     def wait_for(self, event_class: type[_E]) -> _E:
-        """Return the next event of this class.
+        """Wait for the next event of a class, and return the event.
 
         Raises:
             EngineFailed: the process failed, or exceeded a time limit.
@@ -283,7 +286,8 @@ class PrivateEngine:
             ready = wait_ready(watched, due - time.monotonic(), self._interrupt)
             if process.stderr in ready and not process.read_stderr():
                 del watched[process.stderr]
-            # Read before checking the limits. After a Ctrl-Z they are long past, but the events are all there.
+            # Read before checking the limits. If this process was suspended (Ctrl-Z), the limits may have passed even
+            # though the events arrived in time.
             if process.socket.fileno() in ready:
                 yield from self._read_events()
             now = time.monotonic()

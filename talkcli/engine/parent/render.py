@@ -1,9 +1,11 @@
-"""Rendering of a text into a WAV file, for `say -o`. It has an engine process of its own and needs no server.
+"""Rendering of a text into a WAV file, for `say -o`.
 
-A rendering is not a goal. It isn't queued, no other client sees it, and its text may have any length. A regular file
-appears complete or not at all: the engine writes to a hidden file beside it, which is renamed once the engine reports
-that it is complete. Neither the hidden file nor a process may be left behind, whatever interrupts the rendering. Only
-after a SIGKILL may the hidden file remain. Standard output, a named pipe or a device receives the sound as it is made.
+A rendering uses its own engine process and needs no server. It is not a goal: it isn't queued, other clients don't see
+it, and the text may have any length.
+
+A regular file appears only when it is complete. Until then, the engine writes to a hidden file in the same directory,
+which is finally renamed. Unless a SIGKILL ends the rendering, neither the hidden file nor a process is left behind.
+Standard output, a named pipe or a device receives the sound while it is being synthesized.
 """
 
 from __future__ import annotations
@@ -27,23 +29,24 @@ from talkcli.polling import wait_ready
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-#: Reasons with the exit code of a rejected goal. All others have that of an aborted one.
+#: Failures that have the exit code of a rejected goal. All other failures have the exit code of an aborted goal.
 _REJECTED_REASONS = frozenset({Reason.INVALID_TEXT, Reason.UNKNOWN_VOICE, Reason.BAD_OPTION})
-#: Reasons that come from the player. The only player here is the file.
+#: Failures of the player. Here, the player writes the file, so they mean that the file can't be written.
 _FILE_REASONS = frozenset({Reason.AUDIO_DEVICE, Reason.AUDIO_LOST})
-#: Paths that mean standard output. It is used as the shell has opened it.
+#: Paths that refer to standard output. They are not opened, because the shell has already opened standard output.
 STANDARD_OUTPUT = frozenset({"-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"})
-#: Interval for checking whether a named pipe has a reader, because no event reports that.
+#: Interval for checking whether a named pipe has a reader, because no event signals this.
 _READER_CHECK_INTERVAL_S = 0.05
-#: Longest piece of text sent at once: as long as a goal may be, because the engine is silent while it prepares one.
+#: Maximum length of the text in one `Speak`. It is the maximum length of a goal, because the engine sends no messages
+#: while it prepares a text.
 MAX_PIECE_CHARS = MAX_TEXT_CHARS
-#: Ends of sentences and lines. A text that is cut there sounds the same as the whole text.
+#: The end of a sentence or a line. Cutting a text there doesn't change how it sounds.
 _SENTENCE_END = re.compile(r"""[.!?…]["')\]»”’]*\s+|[。！？।]|\n\s*""")
 _BLANK = re.compile(r"\s+")
 
 
 class RenderFailed(TalkError):
-    """The text was not rendered, and there is no file. `code` is a goal's reason or "cannot_write"."""
+    """The text was not rendered, and no file was created. `code` is the reason, or "cannot_write"."""
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
@@ -52,7 +55,7 @@ class RenderFailed(TalkError):
 
 
 class CannotWrite(RenderFailed):
-    """The file can't be written. A file that was there before is unchanged."""
+    """The file can't be written. An existing file was not changed."""
 
     def __init__(self, path: str, problem: str) -> None:
         super().__init__("cannot_write", f"{path} {problem}")
@@ -71,31 +74,31 @@ def render(
     timeout: float | None = None,
     interrupt: Mapping[int, int] | None = None,
 ) -> float:
-    """Render a text into a WAV file and return the seconds of audio.
+    """Render a text into a WAV file, and return the length of the audio in seconds.
 
     Args:
         text: the text, of any length.
-        path: the file to write; "-" for standard output.
+        path: the file to write, or "-" for standard output.
         rate: words per minute, 80 to 450.
         volume: 0.0 to 1.0.
-        voice: id, name or language, or None for the default.
+        voice: ID, name or language of a voice, or None for the default.
         pitch: 0 to 100.
-        driver: name of a pyttsx3 driver, or None for the usual one.
-        timeout: limit in seconds, or None for no limit.
-        interrupt: descriptors that end the rendering, as in `polling.wait_ready`.
+        driver: name of a pyttsx3 driver, or None for the default.
+        timeout: time limit in seconds, or None for no limit.
+        interrupt: descriptors that interrupt the rendering, as in `polling.wait_ready`.
 
     Raises:
         RenderFailed: the text can't be spoken or the file can't be written.
         UsageError: the driver can't write files, or standard output is a terminal.
-        TimeoutError: the text was not rendered in time.
+        TimeoutError: the time limit was exceeded.
         Interrupted: one of the descriptors in `interrupt` became ready.
-        BrokenPipeError: the reader of standard output is gone.
+        BrokenPipeError: the reader of standard output has closed it.
     """
     deadline = time.monotonic() + (float("inf") if timeout is None else timeout)
     fault = bad_text(text, None)
     if fault is not None:
         raise RenderFailed(*fault)
-    # A rendering can wait for its voice to load, and a file in another voice would be useless.
+    # A rendering can wait until its voice is loaded. A file with another voice would be useless.
     commands = (
         protocol.Speak(f"{number}", piece, rate, volume, voice, pitch, voice_only=True)
         for number, piece in enumerate(pieces(text), 1)
@@ -139,7 +142,14 @@ def pieces(text: str) -> Iterator[str]:
 
 
 def _speak_all(engine: PrivateEngine, commands: Iterator[protocol.Speak], engine_path: str, path: str) -> float:
-    """Have all pieces spoken and return the seconds of audio. `engine_path` is how the engine calls the file `path`."""
+    """Render all pieces of the text, and return the length of the audio in seconds.
+
+    Args:
+        engine: the engine process.
+        commands: a `Speak` for each piece.
+        engine_path: name of the file in the engine's error messages.
+        path: name of the file in the errors raised here.
+    """
     ready = engine.wait_for(protocol.Ready)
     if ready.player is None:
         raise UsageError(f'the driver "{ready.driver}" cannot write a file: leave --driver out, on Linux')
@@ -152,7 +162,7 @@ def _speak_all(engine: PrivateEngine, commands: Iterator[protocol.Speak], engine
             raise _engine_failure(error, command.voice) from error
         if ended.outcome == protocol.OUTCOME_COMPLETED and ended.duration is not None:
             seconds += ended.duration
-        elif ended.reason == Reason.NOTHING_TO_SAY:  # one piece of a long text may consist of dots
+        elif ended.reason == Reason.NOTHING_TO_SAY:  # a piece of a long text may consist of dots only
             silent_end = ended
         else:
             raise _goal_failure(ended, engine_path, path)
@@ -185,7 +195,7 @@ def _display_name(path: str) -> str:
     return "standard output" if path in STANDARD_OUTPUT else path
 
 
-# -- output that is written as the sound is made
+# -- output to a stream
 
 
 def _is_stream(path: str) -> bool:
@@ -201,7 +211,7 @@ def _is_stream(path: str) -> bool:
 
 @contextlib.contextmanager
 def _stream(path: str, deadline: float, interrupt: Mapping[int, int] | None) -> Iterator[int]:
-    """Open standard output, a named pipe or a device for writing, and yield the descriptor."""
+    """Open standard output, a named pipe or a device for writing, and yield its descriptor."""
     output_fd = os.dup(1) if path in STANDARD_OUTPUT else _open_stream(path, deadline, interrupt)
     try:
         if os.isatty(output_fd):
@@ -215,7 +225,7 @@ def _stream(path: str, deadline: float, interrupt: Mapping[int, int] | None) -> 
 
 
 def _open_stream(path: str, deadline: float, interrupt: Mapping[int, int] | None) -> int:
-    """Open a device, or a named pipe as soon as it has a reader."""
+    """Open a device or a named pipe for writing. Wait until a named pipe has a reader."""
     while True:
         try:
             return os.open(path, os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
@@ -228,18 +238,18 @@ def _open_stream(path: str, deadline: float, interrupt: Mapping[int, int] | None
         wait_ready({}, left, interrupt)
 
 
-# -- a file that is replaced at the end
+# -- output to a regular file
 
 
 @contextlib.contextmanager
 def _replacing(path: str) -> Iterator[str]:
-    """Yield the path of a new hidden file, and rename it to `path` at the end. After an error, remove it."""
+    """Create a hidden file, yield its path, and finally rename it to `path`. Remove it after an error."""
     target = _target(path)
-    # A short name of its own, because the target's name may already be as long as a name can be.
+    # The hidden name isn't derived from the target's name, because a longer name may exceed the file system's limit.
     hidden = os.path.join(os.path.dirname(target), f".talk-{os.urandom(8).hex()}.wav")
     try:
         try:
-            open(hidden, "xb").close()  # with the mode given by the umask
+            open(hidden, "xb").close()  # gets its mode from the umask
         except OSError as error:
             directory = os.path.dirname(hidden)
             if not os.path.isdir(directory):
@@ -248,21 +258,21 @@ def _replacing(path: str) -> Iterator[str]:
         yield hidden
         try:
             with open(hidden, "rb") as file:
-                os.fsync(file)  # protects from a power cut, and some file systems report a full disk only here
+                os.fsync(file)  # for power cuts, and because some file systems report a full disk only now
             os.replace(hidden, target)
         except OSError as error:
             raise _write_failure(path, error) from error
     finally:
-        # It may have been renamed or never created. If it can't be removed, the error that led here says why.
+        # The file may have been renamed or never created. If removing it fails, the original error is more useful.
         with contextlib.suppress(OSError):
             os.unlink(hidden)
 
 
 def _target(path: str) -> str:
-    """Return the file to replace: the one that a link points to.
+    """Return the path of the file to replace, with symbolic links resolved.
 
     Raises:
-        CannotWrite: the path can't be replaced by a file.
+        CannotWrite: the path can't be replaced with a file.
     """
     if not path or path.endswith(os.sep) or "\0" in path:
         raise CannotWrite(repr(path), "is no name of a file: a rendering needs one, as in speech.wav")
@@ -275,7 +285,7 @@ def _target(path: str) -> str:
         raise _write_failure(path, error) from error
     if stat.S_ISDIR(found.st_mode):
         raise CannotWrite(path, "is a directory: name a file in it")
-    # A link in /proc/*/fd may point to a file that was deleted, so that nothing can be renamed to it.
+    # A link in /proc/*/fd may point to a deleted file, which can't be replaced.
     placed = os.path.exists(target) and os.path.samefile(path, target)
     if not stat.S_ISREG(found.st_mode) or not placed or _is_own_output(found):
         raise CannotWrite(path, "is no file that can be replaced: name another, as in speech.wav")
@@ -285,7 +295,7 @@ def _target(path: str) -> str:
 
 
 def _is_own_output(found: os.stat_result) -> bool:
-    """Return whether this process's standard output or error goes to the file, which then can't be replaced."""
+    """Return whether standard output or standard error of this process is the file. It can't be replaced then."""
     for descriptor in (1, 2):
         with contextlib.suppress(OSError):  # the descriptor is closed
             if os.path.samestat(found, os.fstat(descriptor)):

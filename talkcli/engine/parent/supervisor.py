@@ -1,8 +1,8 @@
-"""The engine thread, which owns the engine process, hands it one goal at a time, and enforces its time limits.
+"""The engine thread, which owns the engine process, gives it one goal at a time, and enforces time limits.
 
-Another thread hands goals in, and sends them directly to the process if it can. Whatever the process does, each goal
-ends with exactly one `Ended`, unless it was given up. The thread reports everything through `post` and holds no lock
-while it waits. It knows neither clients nor the queue.
+Another thread submits the goals. Whatever the engine process does, the engine thread posts exactly one `Ended` for each
+goal, unless the goal was given up. It reports everything through the callback `post` and holds no lock while it waits.
+It knows nothing about clients or the queue.
 """
 
 from __future__ import annotations
@@ -25,42 +25,43 @@ from talkcli.goals.reasons import Reason
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-#: Delay before the next start, by the number of processes in a row that didn't start or ended too soon.
+#: Delay before the next start, by the number of consecutive processes that failed to start or ended too soon.
 RESTART_DELAYS_S = (0.0, 0.1, 0.5, 2.0, 10.0)
-#: Lines of standard error passed on per period: enough for a traceback. A foreign driver may write one for each word.
+#: Maximum number of lines from standard error that are logged per period. It is enough for a traceback. A third-party
+#: driver may write a line for each word.
 MAX_STDERR_LINES = 20
 STDERR_PERIOD_S = 60.0
-#: A process that was ready for less than this, and had no goal, ended too soon.
+#: Age below which a process has ended too soon, unless it had a goal.
 MIN_LIFETIME_S = 1.0
-#: Time without a ready process after which each failed start ends a goal, so that no goal waits for ever.
+#: Time without a ready process after which each failed start also fails a goal. Otherwise, goals would wait forever.
 ENGINE_WAIT_LIMIT_S = 10.0
 NEVER = float("inf")
 
 
 @frozen
 class EngineDied:
-    """The engine process ended or was killed. For the log."""
+    """The engine process exited or was killed. The message is for the log."""
 
     message: str
 
 
 @frozen
 class EngineMissing:
-    """Another start failed after a long time without a ready process. The next goal ends for this reason."""
+    """Another start has failed after a long time without a ready process. The next goal fails with this message."""
 
     message: str
 
 
 @frozen
 class EngineSaid:
-    """A line that the engine process wrote to standard error, for the log. It may contain parts of a goal's text."""
+    """A line from the engine process's standard error, for the log. It may contain parts of a goal's text."""
 
     line: str
 
 
 @frozen
 class ThreadDied:
-    """A bug ended the engine thread. Nothing will be spoken any more."""
+    """The engine thread was ended by a bug. No more goals can be spoken."""
 
     message: str
 
@@ -69,26 +70,26 @@ Report = protocol.Event | EngineDied | EngineMissing | EngineSaid | ThreadDied
 
 
 class ActionQueue:
-    """Actions that other threads hand to a thread waiting for descriptors.
+    """A queue of functions that other threads want a waiting thread to call.
 
-    `call` may be used from any thread. The other methods belong to the thread that waits.
+    `call` may be used from any thread. Only the waiting thread may use the other methods.
     """
 
     def __init__(self, nap_s: float) -> None:
         """Create the queue.
 
         Args:
-            nap_s: after any work, the waiting thread wakes up once by itself within this time. Actions that can wait
-                as long don't have to wake it.
+            nap_s: maximum time until the waiting thread wakes up on its own after any work. Actions that can wait that
+                long don't need to wake the thread.
         """
         self.selector = selectors.DefaultSelector()
         self._actions: deque[Callable[[], None]] = deque()
         self._closed = False
-        #: held by `call`, so that the wake-up descriptor isn't closed and reused in the meantime
+        #: held by `call`, because otherwise the descriptor could be closed and its number reused before the write
         self._calling = threading.Lock()
-        #: whether a wake-up is on its way, which serves all actions until it arrives
+        #: whether the thread was woken and hasn't handled that yet; later actions then needn't wake it again
         self._woken = False
-        #: monotonic time until which the thread sleeps if nothing wakes it; 0 while it is awake
+        #: monotonic time at which the thread wakes up on its own; 0 while it is awake
         self._sleeps_until = 0.0
         self._nap_s = nap_s
         self._nap_ends_at = 0.0
@@ -98,27 +99,28 @@ class ActionQueue:
         self.selector.register(self._reader, selectors.EVENT_READ)
 
     def call(self, action: Callable[[], None], by: float = 0.0) -> None:
-        """Have the waiting thread run an action. After `close`, do nothing.
+        """Have the waiting thread run an action, or do nothing if the queue is closed.
 
         Args:
-            action: the action.
-            by: monotonic time until which the action can wait for the thread to wake up by itself. Waking it, and
-                handing over the interpreter, costs about 50 µs, as much as a hundred lines of Python.
+            action: the function to call.
+            by: monotonic time by which the action must run. The thread is only woken if it would sleep longer, because
+                waking it and switching to it takes about 50 µs.
         """
         with self._calling:
             if self._closed:
                 return
             self._actions.append(action)
-            # The order matters, and `wait` does the opposite: either this sees the thread asleep, or `wait` sees the
-            # action.
+            # `wait` sets `_sleeps_until` before it checks for actions. Because of this order, either this method finds
+            # the thread asleep, or `wait` finds the action.
             if self._sleeps_until > by and not self._woken:
                 self._woken = True
                 os.write(self._writer, b"\0")
 
     def wait(self, until: float) -> list[selectors.SelectorKey]:
-        """Wait for a registered descriptor, an action or a monotonic time.
+        """Wait for a registered descriptor, an action or a monotonic time, and run the actions.
 
-        Run the actions, and return the keys of the ready descriptors.
+        Returns:
+            The keys of the ready descriptors.
         """
         now = time.monotonic()
         if now < self._nap_ends_at < until:
@@ -131,7 +133,7 @@ class ActionQueue:
             self._nap_ends_at = time.monotonic() + self._nap_s
         if any(key.fd == self._reader for key in ready):
             os.read(self._reader, 4096)
-            self._woken = False  # before running the actions, so that a later `call` wakes the thread again
+            self._woken = False  # before running the actions, so that each later `call` wakes the thread again
         self.run()
         return [key for key in ready if key.fd != self._reader]
 
@@ -150,23 +152,23 @@ class ActionQueue:
 
 
 class RestartPolicy:
-    """The rule for when to start the next engine process, and whether goals wait for it.
+    """A policy for when to start the next engine process, and whether goals wait for it.
 
-    Temporary causes are waited out: no memory, no descriptors, a process killed while it started. A permanent cause,
-    such as a missing library or an unknown driver, ends each goal at once until a process becomes ready after all.
+    Goals wait while the cause may be temporary, such as a lack of memory or descriptors. A permanent cause, such as a
+    missing library or an unknown driver, fails each goal at once, until a process does become ready.
 
-    Pure: the time is an argument, in monotonic seconds.
+    The class never reads the clock. All times are arguments, in monotonic seconds.
     """
 
     def __init__(self, now: float) -> None:
         self.next_start_at = 0.0
-        #: why the last start failed, if the cause is permanent
+        #: error message of the last start, if the cause is permanent
         self.permanent_error: str | None = None
         self._failures = 0
         self._missing_since = now
 
     def process_died(self, now: float, *, age_s: float, had_goal: bool) -> None:
-        """Plan the next start after a process that was ready. There is no delay unless it ended too soon."""
+        """Schedule the next start after a ready process has ended. There is a delay only if it ended too soon."""
         self._missing_since = now
         if had_goal or age_s > MIN_LIFETIME_S:
             self._failures = 0
@@ -175,12 +177,12 @@ class RestartPolicy:
             self._back_off(now)
 
     def start_failed(self, now: float, started_at: float, permanent_error: str | None) -> bool:
-        """Plan the next start after a failed one, and return whether the failure ends a goal.
+        """Schedule the next start after a failed one, and return whether a goal must fail because of the long wait.
 
         Args:
-            now: the present time.
-            started_at: time of the failed start.
-            permanent_error: message about the cause if it is permanent, else None.
+            now: the current time.
+            started_at: the time at which the failed start began.
+            permanent_error: the error message if the cause is permanent, otherwise None.
         """
         self._back_off(now)
         self.permanent_error = permanent_error
@@ -193,59 +195,60 @@ class RestartPolicy:
 
 @dataclass(slots=True, eq=False)
 class SupervisedGoal:
-    """A goal from the time it is handed in until its `Ended` is posted."""
+    """The state of a goal from its submission until its `Ended` is posted. Times are monotonic."""
 
     command: protocol.GoalCommand
-    #: time of the last sign of life for this goal; None while it waits for a process
+    #: time at which the goal was sent or last reported by the process; None while it waits for a process
     last_sign_at: float | None = None
-    #: whether the process has reported that it has begun
+    #: whether the process has sent `Started`
     started: bool = False
-    #: whether the goal was already taken back from a process that died before it began
+    #: whether a process crashed before it started the goal, so that the goal is sent to another one
     retried: bool = False
-    #: when the process was told to stop
+    #: time at which a `Stop` was sent
     stop_sent_at: float | None = None
-    #: number of the hold in force; None if the goal is not to be held
+    #: number of the active hold; None if the goal is not held
     hold_number: int | None = None
-    #: when the process was told to hold, until it confirms
+    #: time at which a `Hold` was sent; None once it is confirmed
     hold_sent_at: float | None = None
-    #: how the goal ended, to be posted once `lost_process` is gone
+    #: the event to post once `lost_process` has exited
     end: protocol.Ended | None = None
-    #: the killed process that spoke the goal
+    #: the killed process that was speaking the goal
     lost_process: EngineProcess | None = None
 
     @property
     def sent(self) -> bool:
-        """Whether a process has the goal."""
+        """Whether the goal was sent to the current process."""
         return self.last_sign_at is not None
 
 
 class Supervisor:
-    """The owner of the engine process and its thread."""
+    """The owner of the engine thread and the engine process."""
 
     def __init__(self, configure: protocol.Configure, post: Callable[[Report], None]) -> None:
-        """Prepare the thread.
+        """Create the thread without starting it.
 
         Args:
-            configure: settings of each engine process.
-            post: called in the engine thread with what the process reports, including one `Ended` for each goal.
+            configure: settings for each engine process.
+            post: called in the engine thread with each report, including one `Ended` for each goal.
         """
-        # An attribute, not a base class, because Thread has private names that differ between versions of Python.
-        #: to be started by the owner, which also starts the first engine process, and joined after `close`
+        # Thread is not the base class, because its private names differ between versions of Python.
+        #: the engine thread. The owner starts it, and joins it after `close`. It starts the engine process.
         self.thread = threading.Thread(target=self._run, name="engine", daemon=True)
         self._configure = configure
         self._post = post
         self._actions = ActionQueue(nap_s=HANG_LIMIT_S)
         self._selector = self._actions.selector
         self._process: EngineProcess | None = None
-        #: the process to which `speak` sends goals directly; None if only the engine thread may decide
+        #: the process to which `speak` sends goals directly; None if the engine thread has to send them
         self._direct_process: EngineProcess | None = None
         self._started_at = 0.0
         self._restarts = RestartPolicy(time.monotonic())
         self._goal: SupervisedGoal | None = None
-        #: the neural voice that the process is loading, and the last sign of life
+        #: ID of the neural voice that the process is loading
         self._loading: str | None = None
+        #: time of the last event from the process
         self._last_sign_at = 0.0
-        #: killed processes that may still be there
+        #: killed processes that may not have exited yet
         self._dying: list[EngineProcess] = []
         self._stderr_quota = RateLimit(MAX_STDERR_LINES, STDERR_PERIOD_S)
         self._closing = False
@@ -253,10 +256,10 @@ class Supervisor:
     # -- methods for other threads
 
     def speak(self, command: protocol.GoalCommand) -> None:
-        """Hand in a goal. The previous goal must have ended or been given up. Always call this from the same thread.
+        """Submit a goal. The previous goal must have ended or been given up. Always call this from the same thread.
 
-        The caller's thread sends it to the process if possible, because waking the engine thread would take a tenth to
-        a fifth of the time that a goal costs.
+        If possible, the goal is sent from the caller's thread. Waking the engine thread first would increase the cost
+        of a goal by 10 to 20 percent.
         """
         process, now = self._direct_process, time.monotonic()
         if process is None:
@@ -271,54 +274,54 @@ class Supervisor:
         self._actions.call(lambda: self._stop_goal(goal_id))
 
     def pause(self, goal_id: str, number: int) -> None:
-        """Hold the goal. `Held` is posted once it is silent, unless it is being stopped."""
+        """Hold the goal. `Held` is posted once the goal is silent, unless the goal is being stopped."""
         self._actions.call(lambda: self._hold_goal(goal_id, number))
 
     def resume(self, goal_id: str) -> None:
-        """Let the goal go on."""
+        """Continue a held goal."""
         self._actions.call(lambda: self._hold_goal(goal_id, None))
 
     def announce_next(self, goal_id: str, next_waits: bool, next_is_neural: bool) -> None:
-        """Tell the process whether another goal waits behind this one, so that it can shorten the silence at its end.
+        """Tell the process whether another goal is waiting, so that it can shorten the silence at the end of this one.
 
-        The message is dropped if the process can't take it, which costs little.
+        If the message can't be sent, it is dropped, because the silence matters little.
         """
         process = self._direct_process
         if process:
             process.send(protocol.NextGoal(goal_id, next_waits, next_is_neural))
 
     def load(self, voice: str) -> None:
-        """Have the process load a neural voice. `VoiceLoaded` is posted when that is done."""
+        """Have the process load a neural voice. `VoiceLoaded` is posted when loading has finished."""
         self._actions.call(lambda: self._send_voice_command(protocol.LoadVoice(voice)))
 
     def drop(self, voice: str) -> None:
-        """Have the process remove a neural voice from memory."""
+        """Have the process unload a neural voice."""
         self._actions.call(lambda: self._send_voice_command(protocol.DropVoice(voice)))
 
     def give_up(self, goal_id: str) -> None:
-        """Forget a goal that didn't end in time, and replace its process. No `Ended` is posted for it."""
+        """Abandon a goal that didn't end in time, and replace its process. No `Ended` is posted for the goal."""
         self._direct_process = None
         self._actions.call(lambda: self._give_up_goal(goal_id))
 
     def close(self) -> None:
-        """End the process and the thread."""
+        """Make the thread kill the process and exit."""
         self._closing = True
         self._actions.call(lambda: None)
 
     # -- the loop
 
     def _run(self) -> None:
-        """Run until `close`. Report a bug, so that no goal waits for an engine that doesn't exist."""
+        """Run until `close` is called. Report an unexpected exception, because otherwise goals would wait forever."""
         try:
             while not self._closing:
-                # Taken before reading. If the machine or the process stood still, the messages are read before their
-                # absence counts.
+                # Taken before reading. If this machine was suspended, a deadline may have passed although the message
+                # has arrived. The message is read in this round, and the deadline is checked in the next.
                 now = time.monotonic()
                 for key in self._actions.wait(self._next_deadline()):
                     self._handle_ready(key)
                 if not self._closing:
                     self._check_deadlines(now)
-            self._actions.run()  # actions that came before `close`
+            self._actions.run()  # actions submitted before `close`
         except Exception as error:
             self._closing = True
             self._post(ThreadDied(f"a bug in the engine thread: {type(error).__name__}: {error}"))
@@ -331,7 +334,7 @@ class Supervisor:
         return min([*deadlines, NEVER if self._process else self._restarts.next_start_at])
 
     def _deadlines(self) -> Iterator[tuple[float, str]]:
-        """Yield each deadline of the process, with the message for missing it."""
+        """Yield each deadline of the process, with the error message for missing it."""
         goal, no_sign = self._goal, f"the engine gave no sign of life for {HANG_LIMIT_S:g} s"
         if self._process and not self._process.ready:
             yield self._started_at + START_LIMIT_S, f"the engine was not ready after {START_LIMIT_S:g} s"
@@ -354,8 +357,8 @@ class Supervisor:
         for process in self._dying:
             if now < process.gone_by:
                 continue
-            process.gone_by = NEVER  # checked once; it is reaped whenever it goes
-            process.kill()  # finds processes that the first kill may have missed for lack of a descriptor
+            process.gone_by = NEVER  # checked only once; the process is still reaped when it exits
+            process.kill()  # the first kill may have missed processes if descriptors were short
             if self._goal and self._goal.lost_process is process:
                 message = f"the player could not be ended within {KILL_LIMIT_S:g} s"
                 self._fail_goal(self._goal, Reason.NOT_SILENT, message)
@@ -366,7 +369,7 @@ class Supervisor:
         process: EngineProcess = key.data
         if key.fd == process.liveness:
             if process is self._process:
-                self._receive(process)  # its last messages, before its death is handled
+                self._receive(process)  # read its last messages before handling its death
             if process is self._process:
                 self._handle_crash(process)
             if process.is_gone():
@@ -380,11 +383,17 @@ class Supervisor:
     # -- goals
 
     def _current(self, goal_id: str) -> SupervisedGoal | None:
-        """Return the goal with this id; None if it has ended."""
+        """Return the goal with this ID, or None if the goal has ended."""
         return self._goal if self._goal and self._goal.command.id == goal_id else None
 
     def _take_goal(self, command: protocol.GoalCommand, sent_to: EngineProcess | None = None, at: float = 0.0) -> None:
-        """Take charge of a goal. Send it to the process unless that was already done."""
+        """Make this the current goal, and send it to the process unless the caller of `speak` has sent it.
+
+        Args:
+            command: the goal.
+            sent_to: the process to which the goal was sent, or None.
+            at: monotonic time at which the goal was sent.
+        """
         self._goal = SupervisedGoal(command)
         if sent_to is not None and sent_to is self._process:
             self._goal.last_sign_at = at
@@ -394,7 +403,7 @@ class Supervisor:
             self._send_goal()
 
     def _send_goal(self) -> None:
-        """Send the goal to the process if both are ready for it."""
+        """Send the current goal to the process, if the goal is waiting and the process is ready."""
         goal, process = self._goal, self._process
         waits = goal and not (goal.sent or goal.hold_number or goal.end)
         if goal and waits and process and process.ready:
@@ -403,7 +412,7 @@ class Supervisor:
                 self._goal_not_sent(goal.command.id, process)
 
     def _goal_not_sent(self, goal_id: str, process: EngineProcess) -> None:
-        """Keep a goal for the next process, because this one didn't take it."""
+        """Keep a goal that could not be sent for the next process."""
         if process is self._process:
             goal = self._current(goal_id)
             if goal:
@@ -411,7 +420,10 @@ class Supervisor:
             self._handle_refusal(process)
 
     def _send_voice_command(self, command: protocol.LoadVoice | protocol.DropVoice) -> None:
-        """Send a command about a voice, if a process is ready. The server asks each new process for voices anyway."""
+        """Send a command for a voice if a process is ready. Otherwise, drop it.
+
+        The server sends its commands for voices to each new process again.
+        """
         process = self._process
         if process and process.ready:
             if isinstance(command, protocol.LoadVoice):
@@ -420,13 +432,13 @@ class Supervisor:
                 self._handle_refusal(process)
 
     def _handle_refusal(self, process: EngineProcess) -> None:
-        """Replace a process that takes no commands."""
-        self._receive(process)  # notices how it died if it is dead
+        """Replace a process that accepts no commands."""
+        self._receive(process)  # if the process is dead, this reports a crash instead
         if process is self._process:
             self._lose_process("the engine takes no commands", Reason.ENGINE_HUNG)
 
     def _hold_goal(self, goal_id: str, number: int | None) -> None:
-        """Hold the goal, or let it go on if `number` is None."""
+        """Hold the goal, or continue it if `number` is None."""
         goal = self._current(goal_id)
         if goal is None or goal.stop_sent_at is not None or goal.end or goal.hold_number is number is None:
             return
@@ -437,7 +449,7 @@ class Supervisor:
             if self._process and not self._process.send(command):
                 self._handle_refusal(self._process)
         elif number is not None:
-            self._post(protocol.Held(goal_id, number))  # no process has it, so it is silent
+            self._post(protocol.Held(goal_id, number))  # the goal is silent, because no process has it
         else:
             self._send_goal()
 
@@ -492,9 +504,9 @@ class Supervisor:
             self._post(EngineSaid(line))
 
     def _receive(self, process: EngineProcess) -> None:
-        """Handle the messages of the process that have arrived."""
+        """Handle the messages that have arrived from the process."""
         for event in process.receive():
-            self._actions.run()  # the command that this answers may still be waiting to be noted
+            self._actions.run()  # this may be a reply to a goal that `speak` has sent, but `_take_goal` hasn't recorded
             if process is not self._process:
                 return
             if event is None:
@@ -509,7 +521,7 @@ class Supervisor:
     def _handle_event(self, process: EngineProcess, event: protocol.Event) -> None:
         self._last_sign_at = time.monotonic()
         if isinstance(event, protocol.GoalEvent):
-            if self._goal and self._goal.sent and event.id == self._goal.command.id:  # else it has ended already
+            if self._goal and self._goal.sent and event.id == self._goal.command.id:  # not an earlier goal
                 process.had_goal = True
                 self._handle_goal_event(self._goal, event)
             return
@@ -522,7 +534,7 @@ class Supervisor:
         elif isinstance(event, protocol.VoiceLoaded) and event.voice == self._loading:
             self._loading = None
         elif isinstance(event, protocol.VoiceList):
-            self._configure = replace(self._configure, list_voices=False)  # the next process doesn't have to send it
+            self._configure = replace(self._configure, list_voices=False)  # later processes needn't send it
         self._post(event)
         self._send_goal()
 
@@ -539,11 +551,11 @@ class Supervisor:
             self._post(event)
 
     def _lose_process(self, message: str, reason: Reason) -> None:
-        """Kill the process, let its goal end once it is silent, and plan the next start.
+        """Kill the process, decide what happens to its goal, and schedule the next start.
 
         Args:
-            message: what happened, for people.
-            reason: the reason for the goal to end.
+            message: a human-readable description of what happened.
+            reason: the reason for which the goal fails.
         """
         process, now = self._process, time.monotonic()
         if process is None:
@@ -567,10 +579,10 @@ class Supervisor:
             self._plan_after_failed_start(message)
 
     def _handle_lost_goal(self, goal: SupervisedGoal, process: EngineProcess, message: str, reason: Reason) -> None:
-        """Decide what happens to a goal whose process was lost.
+        """Retry or end a goal whose process was killed or has crashed.
 
-        If the process crashed before it began with the goal, nothing was heard, and the next process gets the goal.
-        This happens only once per goal.
+        If the process crashed before it started the goal, nothing was heard, so the goal is sent to the next process.
+        Each goal is retried only once.
         """
         if reason == Reason.ENGINE_CRASHED and goal.stop_sent_at is None and not (goal.started or goal.retried):
             goal.retried = True
@@ -584,7 +596,7 @@ class Supervisor:
         goal.last_sign_at = goal.stop_sent_at = goal.hold_sent_at = None
 
     def _plan_after_failed_start(self, message: str, *, permanent: bool = False) -> None:
-        """Plan another start, and end the waiting goal if it shouldn't wait for that."""
+        """Schedule another start, and fail the waiting goal if it should wait no longer."""
         ends_goal = self._restarts.start_failed(time.monotonic(), self._started_at, message if permanent else None)
         waiting = self._goal if self._goal and not self._goal.end else None
         if waiting and (ends_goal or permanent):
@@ -593,7 +605,7 @@ class Supervisor:
             self._post(EngineMissing(message))
 
     def _release_process(self, process: EngineProcess) -> None:
-        """Close the descriptors of a process that is gone with its player, and end its goal, which is silent now."""
+        """Close the descriptors of a process that has exited with its player, and end its goal, which is silent now."""
         self._selector.unregister(process.liveness)
         if process.stderr in self._selector.get_map():
             process.read_stderr()
@@ -605,7 +617,7 @@ class Supervisor:
             self._end_goal(goal.end)
 
     def _shut_down(self) -> None:
-        """End the process. If it can't be ended within the limit, leave it to the system."""
+        """Kill the process, and wait a limited time for it to exit."""
         self._lose_process("the server ends", Reason.SHUTDOWN)
         deadline = time.monotonic() + KILL_LIMIT_S / 4
         while self._dying and time.monotonic() < deadline:
