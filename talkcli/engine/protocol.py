@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from typing import TypeVar
 
-    _M = TypeVar("_M")
-
     from talkcli.goals.goal import JsonObject
+
+    _M = TypeVar("_M")
 
 #: Maximum interval between two messages of an engine process that is speaking or loading a voice. It is far below
 #: `HANG_LIMIT_S`, so that a late message isn't mistaken for a hang. An idle process sends nothing, so that the robot

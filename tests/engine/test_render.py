@@ -468,14 +468,15 @@ SAY = protocol.Speak("1", "length=0", 200, 1.0, None, 50)
 
 
 @pytest.mark.usefixtures("scripted_process")
-def test_saying_something_to_a_process_that_has_died_raises_how_it_died() -> None:
+def test_waiting_for_a_process_that_has_died_raises_how_it_died() -> None:
     with PrivateEngine(CONFIGURE) as engine:
         events = engine.events
         assert isinstance(next(events), protocol.Ready)
         os.kill(engine._process.pid, 9)
         os.waitid(os.P_PID, engine._process.pid, os.WEXITED | os.WNOWAIT)
+        engine.speak(SAY)
         with pytest.raises(EngineFailed, match=r"^it was killed by SIGKILL$") as failed:
-            engine.speak(SAY)
+            engine.wait_for(protocol.Ended)
         assert failed.value.reason == "engine_crashed"
 
 

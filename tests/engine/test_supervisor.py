@@ -403,7 +403,7 @@ class Undying:
     """Stands for a process that is ready, and that no kill ends for long."""
 
     def __init__(self) -> None:
-        self.ready, self.had_goal, self.start_failure, self.gone_by = True, False, None, 0.0
+        self.ready, self.had_goal, self.start_failure, self.exit_deadline = True, False, None, 0.0
         self.socket, self._other = socket.socketpair()
         self.stderr = self._other.fileno()
         self.liveness = os.dup(self.stderr)
@@ -453,7 +453,7 @@ def test_a_goal_ends_once_when_its_process_is_gone_or_should_be(monkeypatch: pyt
     monkeypatch.setattr(engine, "_start_process", lambda: None)
     engine._goal = SupervisedGoal(YES, last_sign_at=0.0, started=True)
     engine._lose_process("it hangs", Reason.ENGINE_HUNG)
-    due = process.gone_by
+    due = process.exit_deadline
     engine._check_deadlines(due - KILL_LIMIT_S / 2)
     assert [type(each).__name__ for each in posted] == ["EngineDied"]
     assert undying.kills == 1

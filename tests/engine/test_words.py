@@ -105,19 +105,19 @@ def test_the_clock_stands_until_it_is_started_and_is_held_back_by_the_player() -
     first, second = TimedWord(0, 1, 0.0), TimedWord(2, 1, 0.5)
     clock.add(first)
     clock.add(second)
-    assert clock.take_begun(100.0) == []
+    assert clock.pop_started(100.0) == []
     assert clock.next_word_at() is None
     clock.start(100.0)
-    assert clock.take_begun(100.0) == [first]
+    assert clock.pop_started(100.0) == [first]
     assert clock.next_word_at() == 100.5
     clock.limit_elapsed(100.4, 0.1)
     assert clock.elapsed(100.4) == pytest.approx(0.1)
-    assert clock.take_begun(100.6) == []
+    assert clock.pop_started(100.6) == []
     assert clock.next_word_at() == pytest.approx(100.8)
     clock.limit_elapsed(100.5, 10.0)
     assert clock.next_word_at() == pytest.approx(100.8)
-    assert clock.take_rest() == [second]
-    assert clock.take_begun(200.0) == []
+    assert clock.pop_all() == [second]
+    assert clock.pop_started(200.0) == []
 
 
 def test_silence_in_the_stream_moves_the_words_after_it_and_is_not_heard() -> None:
@@ -135,10 +135,10 @@ def test_silence_in_the_stream_moves_the_words_after_it_and_is_not_heard() -> No
     clock.add_silence(0.5, 1.0)
     clock.add(after)
     assert clock.next_word_at() == pytest.approx(100.65)
-    assert clock.take_begun(102.5) == [before]
+    assert clock.pop_started(102.5) == [before]
     assert clock.heard_position(102.5) == 0.5
     assert clock.next_word_at() == pytest.approx(102.75)
-    assert clock.take_begun(102.76) == [at]
+    assert clock.pop_started(102.76) == [at]
     assert clock.heard_position(103.0) == pytest.approx(0.75)
     assert clock.next_word_at() == pytest.approx(103.25)
 
@@ -155,7 +155,7 @@ def test_another_stream_begins_where_the_audio_goes_on() -> None:
     assert clock.heard_position(200.0) == 2.0
     clock.add_silence(2.0, 0.25)
     clock.start(200.0)
-    assert clock.take_begun(200.0) == [missed]
+    assert clock.pop_started(200.0) == [missed]
     assert clock.next_word_at() == pytest.approx(200.75)
     assert clock.heard_position(200.5) == pytest.approx(2.25)
 
@@ -176,4 +176,4 @@ def test_words_in_zeros_that_are_left_out_begin_with_the_sound() -> None:
     for position in (0.0, 0.2):
         clock.add(TimedWord(0, 1, position))
     clock.skip_until(0.1)
-    assert [each.position for each in clock.take_rest()] == [0.1, 0.2]
+    assert [each.position for each in clock.pop_all()] == [0.1, 0.2]

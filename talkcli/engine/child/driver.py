@@ -12,11 +12,10 @@ import types
 from importlib import import_module
 
 from talkcli import install
-from talkcli.engine import voices
+from talkcli.engine import protocol, voices
 from talkcli.engine.child.playback import Playback
 from talkcli.engine.child.players.base import CannotSpeak, Stopped
 from talkcli.engine.child.synthesizers.base import NotInstalled, SpeechSettings
-from talkcli.engine.protocol import Ready, StartFailed
 from talkcli.engine.voices import SYNTHESIZERS, UnknownVoice, is_own_driver
 from talkcli.frozen import TYPE_CHECKING, fields, replace
 from talkcli.goals.options import is_neural, without_speaker
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
     from talkcli.engine.child.synthesizers.base import Synthesizer
     from talkcli.engine.child.synthesizers.combined import CombinedSynthesizer
     from talkcli.engine.child.words import TimedWord
-    from talkcli.engine.protocol import Configure, Speak, Voice
 
 #: Drivers for macOS that speak in Apple's run loop, so this process has to run that loop.
 _RUN_LOOP_DRIVERS = ("nsss", "avspeech")
@@ -46,10 +44,10 @@ class CannotStart(Exception):
     def __init__(self, message: str, reason: Reason = Reason.ENGINE_FAILED, **more: bool) -> None:
         """Build the message for the server. `more` contains further fields of `StartFailed`."""
         super().__init__(message)
-        self.failure = StartFailed(reason, message, **more)
+        self.failure = protocol.StartFailed(reason, message, **more)
 
 
-def start(configure: Configure, runner: GoalRunner) -> Ready:
+def start(configure: protocol.Configure, runner: GoalRunner) -> protocol.Ready:
     """Start pyttsx3's engine and attach it to the runner.
 
     Raises:
@@ -71,20 +69,17 @@ def start(configure: Configure, runner: GoalRunner) -> Ready:
     except CannotSpeak as error:
         unknown = error.reason == Reason.UNKNOWN_VOICE
         raise CannotStart(str(error), error.reason, permanent=unknown, usage_error=unknown) from error
-    runner.attach_engine(engine, properties.apply, None if own else _pump(name), synthesizer)
-    neural_voice = voice if is_neural(voice) else None
-    if synthesizer is None:
-        return Ready(driver, None, None, neural_voice)
-    return Ready(driver, synthesizer.version, runner.players.first_player(), neural_voice)
+    runner.attach_engine(engine, properties.apply, None if own else _run_loop_step(name), synthesizer)
+    version, player = (synthesizer.version, runner.players.first_player()) if synthesizer else (None, None)
+    return protocol.Ready(driver, version, player, voice if is_neural(voice) else None)
 
 
 def _register_own(synthesizer_name: str, driver_name: str, runner: GoalRunner) -> CombinedSynthesizer:
     """Create a synthesizer and register a driver for it."""
     module, _, function = SYNTHESIZERS[synthesizer_name].partition(":")
     try:
-        synthesizer: CombinedSynthesizer = getattr(
-            import_module(f"talkcli.engine.child.synthesizers.{module}"), function
-        )()
+        imported = import_module(f"talkcli.engine.child.synthesizers.{module}")
+        synthesizer: CombinedSynthesizer = getattr(imported, function)()
     except NotInstalled as error:
         raise CannotStart(str(error)) from error
     except UnknownVoice as error:  # even the default voice is missing
@@ -138,7 +133,7 @@ def _driver_names(pyttsx3: Any) -> list[str]:
     return sorted(found | SYNTHESIZERS.keys())
 
 
-def _pump(driver_name: str) -> Callable[[], None]:
+def _run_loop_step(driver_name: str) -> Callable[[], None]:
     """Return a function that gives a third-party driver time to work between two steps."""
     if sys.platform != "darwin" or driver_name not in _RUN_LOOP_DRIVERS:
         return lambda: None
@@ -159,12 +154,12 @@ class DriverProperties:
         self._driver = driver
         self._values = fields(SpeechSettings())  # the initial values of pyttsx3's drivers
         self._default_voice: Any = None
-        self._voices: tuple[Voice, ...] = ()
+        self._voices: tuple[protocol.Voice, ...] = ()
         self._voice: str | None = None
         self._error: Exception | None = None
-        engine.connect("error", self._note_error)
+        engine.connect("error", self._record_error)
 
-    def apply(self, command: Speak) -> str | None:
+    def apply(self, command: protocol.Speak) -> str | None:
         """Set the properties for a goal.
 
         If a neural voice has disappeared since the goal was accepted, the driver falls back to one of its other voices,
@@ -249,7 +244,7 @@ class DriverProperties:
             why = str(error.args[0] if error.args else error) or type(error).__name__
             raise CannotSpeak(Reason.BAD_OPTION, f"the driver {self._driver} cannot set {shown}: {why}") from error
 
-    def _note_error(self, exception: Exception, **_: object) -> None:
+    def _record_error(self, exception: Exception, **_: object) -> None:
         self._error = exception
 
 

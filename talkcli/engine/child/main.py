@@ -99,6 +99,5 @@ def _inherited_descriptors() -> list[int]:
     if value is None:
         return []
     descriptor = int(value)
-    os.fstat(descriptor)  # if it isn't open, fail now instead of at every sentence
-    os.set_inheritable(descriptor, False)
+    os.set_inheritable(descriptor, False)  # if it isn't open, this fails now instead of at every sentence
     return [descriptor]

@@ -254,16 +254,16 @@ class Playback:
         self._complete = False  # whether all samples were written
         self._begin = 0  # place of the current player's first sample
         self._sent = 0  # place after the last sample accepted by the player
-        self._began = False  # whether the beginning of the sentence was reported
+        self._start_reported = False  # whether the beginning of the sentence was reported
         self._stopped = False
-        #: whether `_left_out` is final
+        #: whether `_skipped` is final
         self._start_known = False
         #: number of bytes of zero samples skipped at the beginning
-        self._left_out = 0
+        self._skipped = 0
         #: monotonic time until which opening a busy device is retried; 0 until a device is found to be busy
         self._busy_until = 0.0
         #: whether the samples are synthesized in another thread, and may be late
-        self._made_elsewhere = False
+        self._in_background = False
         #: length in seconds of each gap that late samples have caused
         self.gaps: list[float] = []
         #: time since which the player of a held sentence plays silence
@@ -315,7 +315,7 @@ class Playback:
 
         This method may return early. If the player runs out of samples in the meantime, it doesn't count as stalled.
         """
-        self._made_elsewhere = True
+        self._in_background = True
         more = (descriptor, select.POLLIN)
         if self._feed is not None:
             self._with_player(lambda feed: self._await_samples(feed, more))
@@ -335,12 +335,12 @@ class Playback:
             raise CannotSpeak(Reason.NOTHING_TO_SAY, "nothing in the text can be spoken")
         self._complete = self._start_known = True
         self._with_player(self._drain)
-        self._report_words(self._clock.take_rest())
+        self._report_words(self._clock.pop_all())
         if self._feed is not None:
             name, now = self._feed.player.name, time.monotonic()
             self._players.last_player = name
             self._players.handovers.sentence_ended(name, now + self._feed.time_left(self._feed.written, now))
-        return self._seconds(self._sent - self._left_out)
+        return self._seconds(self._sent - self._skipped)
 
     def stop(self) -> None:
         """Stop the sound at once. The running method raises Stopped."""
@@ -396,7 +396,7 @@ class Playback:
         player = next(self._untried)()
         self._sent = self._begin
         self._silent_at = None
-        lead_in = self._players.lead_in_seconds(begins=self._begin == self._left_out)
+        lead_in = self._players.lead_in_seconds(begins=self._begin == self._skipped)
         return PlayerFeed(player, self._rate, self._clock, self._seconds(self._begin), lead_in)
 
     def _next_player(self, error: CannotSpeak) -> None:
@@ -513,11 +513,10 @@ class Playback:
         if all_zeros and self._seconds(zeros) < LEADING_ZEROS_LIMIT_S:
             return False
         self._start_known = True
-        if not all_zeros and self._players.takes_time and not self._players.handovers.follows and self._sent == 0:
-            self._left_out = self._begin = self._sent = zeros
+        if not all_zeros and self._players.takes_time and not self._players.handovers.follows:
+            self._skipped = self._begin = self._sent = zeros
             self._clock.skip_until(self._seconds(zeros))
-            if self._feed is not None:
-                self._clock.reset(self._seconds(zeros))
+            self._clock.reset(self._seconds(zeros))
         return True
 
     def _offer(self, feed: PlayerFeed) -> int:
@@ -529,7 +528,7 @@ class Playback:
         with self._samples.part(self._sent, min(self._audible_end(feed), self._sent + feed.piece_bytes)) as part:
             silent = feed.silent_for(time.monotonic())
             taken = feed.offer(part)
-        if taken and silent > INAUDIBLE_GAP_S and self._made_elsewhere and feed.player.real_time:
+        if taken and silent > INAUDIBLE_GAP_S and self._in_background and feed.player.real_time:
             self.gaps.append(silent)
         self._sent += taken
         return taken
@@ -553,18 +552,18 @@ class Playback:
         if not player.proven:
             return
         self._players.update_output(player)
-        if feed.consumed and not self._began:
-            self._began = True
+        if feed.consumed and not self._start_reported:
+            self._start_reported = True
             self._players.handovers.sentence_started(
-                player.name, now - self._clock.elapsed(now), neural=self._made_elsewhere
+                player.name, now - self._clock.elapsed(now), neural=self._in_background
             )
         self._samples.drop_until(self._unheard_begin() if player.real_time else self._sent)
-        self._report_words(self._clock.take_begun(now) if player.real_time else self._clock.take_rest())
+        self._report_words(self._clock.pop_started(now) if player.real_time else self._clock.pop_all())
 
     def _report_words(self, words: list[TimedWord]) -> None:
         """Report words. Their positions are relative to the first sample played."""
         for word in words:
-            self._on_word(replace(word, position=word.position - self._seconds(self._left_out)))
+            self._on_word(replace(word, position=word.position - self._seconds(self._skipped)))
 
     def _unheard_begin(self) -> int:
         """Return the place of the first sample that may not have been heard."""

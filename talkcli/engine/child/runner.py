@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from talkcli.engine.child.players.base import Interest
     from talkcli.engine.child.players.chooser import PlayerChooser
     from talkcli.engine.child.synthesizers.combined import CombinedSynthesizer
-    from talkcli.engine.protocol import Command, Event
     from talkcli.goals.goal import Output
 
 #: Interval between two steps of a third-party driver while it speaks. The driver can't wake this process.
@@ -59,7 +58,7 @@ class Channel:
         self.sent_at = time.monotonic()
         self._lines = LineSplitter()
 
-    def send(self, event: Event) -> None:
+    def send(self, event: protocol.Event) -> None:
         """Send an event. Block until all of it is written."""
         data = memoryview(protocol.encode(event))
         self.sent_at = time.monotonic()
@@ -69,7 +68,7 @@ class Channel:
         except (BrokenPipeError, ConnectionResetError):
             self.closed = True
 
-    def receive(self) -> list[Command]:
+    def receive(self) -> list[protocol.Command]:
         """Wait for data, read once, and return the complete commands."""
         try:
             data = os.read(self.descriptor, 65536)
@@ -103,6 +102,13 @@ class ActiveGoal:
         #: offset in the text of the last word heard
         self.last_word = 0
         self.stop_requested = False
+        #: the last output and the last voice reported to the server
+        self.reported_output: Output | None = None
+        self.reported_voice = ""
+        #: human-readable reason for a fallback voice; None for the requested voice
+        self.fallback_reason: str | None = None
+        #: number of the last hold confirmed to the server
+        self.confirmed_hold = 0
         #: the first error that the driver reported
         self.error: Exception | None = None
         #: whether a driver that takes too long was logged
@@ -121,14 +127,8 @@ class GoalRunner:
         """
         self._channel = channel
         self.players = players
-        #: the last output sent to the server for the current goal
-        self._reported_output: Output | None = None
-        #: the last voice sent to the server for the current goal
-        self._reported_voice = ""
-        #: why the driver has set another voice than the goal's
-        self._fallback_reason: str | None = None
         #: commands to execute after the current goal
-        self._backlog: deque[Command] = deque()
+        self._backlog: deque[protocol.Command] = deque()
         self._goal: ActiveGoal | None = None
         self._engine: Any = None
         self._set_properties: Any = None
@@ -136,8 +136,6 @@ class GoalRunner:
         self._synthesizer: CombinedSynthesizer | None = None
         #: number of the active hold, or 0; read by the playback, because pyttsx3 has no method for a hold
         self.hold_number = 0
-        #: number of the last hold confirmed to the server
-        self._confirmed_hold = 0
         # Only `talk`'s own driver sets these attributes. pyttsx3's notifications have no fields for them.
         #: position in the audio of the word being reported, in seconds; None with a third-party driver
         self.position: float | None = None
@@ -168,7 +166,7 @@ class GoalRunner:
         self._synthesizer = synthesizer
         engine.connect("started-word", _with_traceback(self._report_word))
         engine.connect("finished-utterance", _with_traceback(self._driver_finished))
-        engine.connect("error", _with_traceback(self._note_error))
+        engine.connect("error", _with_traceback(self._record_error))
 
     def run(self, *, send_voices: bool) -> None:
         """Execute commands until the server has closed the connection.
@@ -219,7 +217,7 @@ class GoalRunner:
         ready = [descriptor for descriptor, _ in poll.poll(timeout)]
         if self._channel.descriptor in ready:
             for command in self._channel.receive():
-                self._obey(command)
+                self._execute(command)
             if self._channel.closed:
                 self._stop_goal()
         self._send_voice_events()
@@ -228,7 +226,7 @@ class GoalRunner:
         if alive_due is not None and time.monotonic() >= alive_due:
             self._channel.send(protocol.Alive(self._goal.id if self._goal else ""))
 
-    def _obey(self, command: Command) -> None:
+    def _execute(self, command: protocol.Command) -> None:
         """Execute a command for the current goal or for a voice. Put others into the backlog."""
         goal = self._goal
         if isinstance(command, protocol.LoadVoice | protocol.DropVoice):
@@ -266,38 +264,38 @@ class GoalRunner:
 
     def report_voice(self, voice: str, fallback_reason: str | None) -> None:
         """Report the voice that speaks the goal, unless it was already reported. The playback calls this method."""
-        if self._goal is not None and voice != self._reported_voice:
-            self._reported_voice = voice
-            self._channel.send(protocol.VoiceChosen(self._goal.id, voice, fallback_reason or self._fallback_reason))
+        goal = self._goal
+        if goal is not None and voice != goal.reported_voice:
+            goal.reported_voice = voice
+            self._channel.send(protocol.VoiceChosen(goal.id, voice, fallback_reason or goal.fallback_reason))
 
     def confirm_hold(self) -> None:
         """Confirm that the held goal is silent. If a hold was already confirmed, do nothing."""
-        if self._goal is not None and not self._goal.stop_requested and self._confirmed_hold != self.hold_number:
-            self._confirmed_hold = self.hold_number
-            self._channel.send(protocol.Held(self._goal.id, self.hold_number))
+        goal = self._goal
+        if goal is not None and not goal.stop_requested and goal.confirmed_hold != self.hold_number:
+            goal.confirmed_hold = self.hold_number
+            self._channel.send(protocol.Held(goal.id, self.hold_number))
 
     def _report_output(self) -> None:
-        output = self.players.output
-        if self._goal is not None and output != self._reported_output:
-            self._reported_output = output
-            self._channel.send(protocol.OutputChanged(self._goal.id, output.to_json() if output else None))
+        goal, output = self._goal, self.players.output
+        if goal is not None and output != goal.reported_output:
+            goal.reported_output = output
+            self._channel.send(protocol.OutputChanged(goal.id, output.to_json() if output else None))
 
     # -- one goal
 
     def _speak(self, command: protocol.Speak) -> None:
         """Speak a goal. Return when the goal has ended."""
         self._goal = goal = ActiveGoal(command, time.monotonic())
-        self.hold_number = self._confirmed_hold = 0
-        self.gaps = []
+        self.hold_number, self.duration, self.gaps = 0, None, []
         self.players.begin(command)
-        self._reported_output, self._reported_voice, self._fallback_reason = None, "", None
         self._channel.send(protocol.Started(command.id))
         # Commands for this goal may have arrived before it started.
         backlog, self._backlog = self._backlog, deque()
         for each in backlog:
-            self._obey(each)
+            self._execute(each)
         try:
-            self._fallback_reason = self._set_properties(command)
+            goal.fallback_reason = self._set_properties(command)
         except CannotSpeak as error:
             if self._goal is not None:
                 self._fail(error.reason, str(error))
@@ -311,9 +309,9 @@ class GoalRunner:
                 self.confirm_hold()
                 self.wait((), None)
             else:
-                self._give_to_driver(goal)
+                self._send_to_driver(goal)
 
-    def _give_to_driver(self, goal: ActiveGoal) -> None:
+    def _send_to_driver(self, goal: ActiveGoal) -> None:
         """Have the driver speak the text, beginning with the last word heard."""
         goal.progress_at = time.monotonic()
         if goal.silent_at is not None:
@@ -356,7 +354,7 @@ class GoalRunner:
             seconds = goal.progress_at - goal.began_at if self.position is None else self.position
             self._channel.send(protocol.Word(goal.id, start, end, number, round(seconds, 3)))
 
-    def _note_error(self, exception: Exception, **_: object) -> None:
+    def _record_error(self, exception: Exception, **_: object) -> None:
         if self._goal is not None and self._goal.error is None:
             self._goal.error = exception
 
@@ -386,9 +384,8 @@ class GoalRunner:
         assert self._goal is not None
         self._report_output()
         goal, self._goal = self._goal, None
-        duration = self.duration if outcome == protocol.OUTCOME_COMPLETED else None
         gaps = len(self.gaps), round(sum(self.gaps), 3)
-        self._channel.send(protocol.Ended(goal.id, outcome, reason, message, duration, *gaps, self.players.chosen))
+        self._channel.send(protocol.Ended(goal.id, outcome, reason, message, self.duration, *gaps, self.players.chosen))
 
     def _alive_due(self) -> float | None:
         """Return the time at which to send the next `Alive`, or None if none is needed."""

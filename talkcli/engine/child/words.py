@@ -98,7 +98,7 @@ class WordClock:
     def __init__(self) -> None:
         self._waiting: deque[TimedWord] = deque()
         #: time at which the stream started to be heard; None while the clock is stopped
-        self._zero: float | None = None
+        self._started_at: float | None = None
         #: position in the audio at which the stream begins, in seconds
         self._begin = 0.0
         #: pauses in the stream: the position in the audio after each pause, and its length in seconds
@@ -115,12 +115,12 @@ class WordClock:
     def reset(self, position: float) -> None:
         """Stop the clock, and prepare it for a new stream that begins at this position in the audio."""
         self._begin = position
-        self._zero = None
+        self._started_at = None
         self._silences.clear()
 
     def start(self, now: float) -> None:
         """Start or restart the clock at the beginning of the stream."""
-        self._zero = now
+        self._started_at = now
 
     def add_silence(self, position: float, seconds: float) -> None:
         """Record a pause in the stream before this position in the audio. Positions must not decrease."""
@@ -130,16 +130,16 @@ class WordClock:
 
     def set_elapsed(self, now: float, elapsed: float) -> None:
         """Set the number of seconds heard, as reported by the output. If it is 0, the clock is stopped."""
-        self._zero = now - elapsed if elapsed > 0 else None
+        self._started_at = now - elapsed if elapsed > 0 else None
 
     def limit_elapsed(self, now: float, elapsed: float) -> None:
         """Set the clock back if it shows more than this number of seconds heard."""
-        if self._zero is not None and now - self._zero > elapsed:
-            self._zero = now - elapsed
+        if self._started_at is not None and now - self._started_at > elapsed:
+            self._started_at = now - elapsed
 
     def elapsed(self, now: float) -> float:
         """Return the number of seconds heard, including pauses."""
-        return 0.0 if self._zero is None else now - self._zero
+        return 0.0 if self._started_at is None else now - self._started_at
 
     def heard_position(self, now: float) -> float:
         """Return the position in the audio up to which it was heard."""
@@ -152,20 +152,20 @@ class WordClock:
 
     def next_word_at(self) -> float | None:
         """Return the time at which the next word starts, or None if no word is left or the clock is stopped."""
-        if self._zero is None or not self._waiting:
+        if self._started_at is None or not self._waiting:
             return None
         position = self._waiting[0].position
         silence = sum(seconds for before, seconds in self._silences if before <= position)
-        return self._zero + position - self._begin + silence
+        return self._started_at + position - self._begin + silence
 
-    def take_begun(self, now: float) -> list[TimedWord]:
+    def pop_started(self, now: float) -> list[TimedWord]:
         """Remove and return the words that have started."""
         words = []
         while (begins_at := self.next_word_at()) is not None and begins_at <= now:
             words.append(self._waiting.popleft())
         return words
 
-    def take_rest(self) -> list[TimedWord]:
+    def pop_all(self) -> list[TimedWord]:
         """Remove and return all remaining words."""
         words = list(self._waiting)
         self._waiting.clear()

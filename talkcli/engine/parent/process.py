@@ -75,7 +75,7 @@ class EngineProcess:
         #: the `StartFailed` message from the process, if any; set by the supervisor
         self.start_failure: protocol.StartFailed | None = None
         #: monotonic time by which the process must have exited after a kill; set by the supervisor
-        self.gone_by = float("inf")
+        self.exit_deadline = float("inf")
         # Held while sending. Otherwise, another thread could close the descriptor and its number could be reused.
         self._sending = threading.Lock()
         self._lines = LineSplitter()
@@ -262,10 +262,7 @@ class PrivateEngine:
     def speak(self, command: protocol.GoalCommand) -> None:
         """Start to speak a text. The process must be ready, and the previous text must have ended."""
         self._last_event_at = time.monotonic()
-        if not self._process.send(command):
-            for _ in self._read_events():
-                pass  # raises a more specific error if the process is dead
-            raise EngineFailed(Reason.ENGINE_HUNG, "the engine takes no commands")
+        self._process.send(command)  # if this fails, `wait_for` raises an error
 
     def wait_for(self, event_class: type[_E]) -> _E:
         """Wait for the next event of a class, and return the event.
@@ -288,8 +285,15 @@ class PrivateEngine:
                 del watched[process.stderr]
             # Read before checking the limits. If this process was suspended (Ctrl-Z), the limits may have passed even
             # though the events arrived in time.
-            if process.socket.fileno() in ready:
-                yield from self._read_events()
+            for event in process.receive() if process.socket.fileno() in ready else ():
+                self._last_event_at = time.monotonic()
+                if event is None:
+                    raise EngineFailed(Reason.ENGINE_CRASHED, process.describe_exit())
+                if isinstance(event, protocol.StartFailed):
+                    raise EngineFailed(event.reason, event.message)
+                if isinstance(event, protocol.Ready):
+                    process.ready = True
+                yield event
             now = time.monotonic()
             if now >= self._deadline:
                 raise TimeoutError
@@ -298,14 +302,3 @@ class PrivateEngine:
             if process.ready:
                 raise EngineFailed(Reason.ENGINE_HUNG, f"the engine gave no sign of life for {limit:g} s", limit)
             raise EngineFailed(Reason.ENGINE_FAILED, f"the engine was not ready after {limit:g} s", limit)
-
-    def _read_events(self) -> Iterator[protocol.Event]:
-        for event in self._process.receive():
-            self._last_event_at = time.monotonic()
-            if event is None:
-                raise EngineFailed(Reason.ENGINE_CRASHED, self._process.describe_exit())
-            if isinstance(event, protocol.StartFailed):
-                raise EngineFailed(event.reason, event.message)
-            if isinstance(event, protocol.Ready):
-                self._process.ready = True
-            yield event

@@ -108,9 +108,9 @@ def render(
         output_fd: int | None = None
         engine_path = protocol.OUTPUT_STREAM_NAME
         if _is_stream(path):
-            output_fd = stack.enter_context(_stream(path, deadline, interrupt))
+            output_fd = stack.enter_context(_open_output(path, deadline, interrupt))
         else:
-            engine_path = stack.enter_context(_replacing(path))
+            engine_path = stack.enter_context(_hidden_file(path))
             player = f"file:{engine_path}"
         configure = protocol.Configure(os.getpid(), driver, player, None, None, list_voices=False, output_fd=output_fd)
         try:
@@ -130,12 +130,10 @@ def pieces(text: str) -> Iterator[str]:
     """Cut a text into pieces of at most `MAX_PIECE_CHARS`, at the end of a sentence or a word if possible."""
     start = 0
     while len(text) - start > MAX_PIECE_CHARS:
-        end = start + MAX_PIECE_CHARS
-        for boundary in (_SENTENCE_END, _BLANK):
-            ends = [match.end() for match in boundary.finditer(text, start, end)]
-            if ends:
-                end = ends[-1]
-                break
+        limit = start + MAX_PIECE_CHARS
+        sentences, words = (list(each.finditer(text, start, limit)) for each in (_SENTENCE_END, _BLANK))
+        ends = sentences or words
+        end = ends[-1].end() if ends else limit
         yield text[start:end]
         start = end
     yield text[start:]
@@ -210,9 +208,9 @@ def _is_stream(path: str) -> bool:
 
 
 @contextlib.contextmanager
-def _stream(path: str, deadline: float, interrupt: Mapping[int, int] | None) -> Iterator[int]:
+def _open_output(path: str, deadline: float, interrupt: Mapping[int, int] | None) -> Iterator[int]:
     """Open standard output, a named pipe or a device for writing, and yield its descriptor."""
-    output_fd = os.dup(1) if path in STANDARD_OUTPUT else _open_stream(path, deadline, interrupt)
+    output_fd = os.dup(1) if path in STANDARD_OUTPUT else _open_without_blocking(path, deadline, interrupt)
     try:
         if os.isatty(output_fd):
             raise UsageError(
@@ -224,7 +222,7 @@ def _stream(path: str, deadline: float, interrupt: Mapping[int, int] | None) -> 
         os.close(output_fd)
 
 
-def _open_stream(path: str, deadline: float, interrupt: Mapping[int, int] | None) -> int:
+def _open_without_blocking(path: str, deadline: float, interrupt: Mapping[int, int] | None) -> int:
     """Open a device or a named pipe for writing. Wait until a named pipe has a reader."""
     while True:
         try:
@@ -242,9 +240,9 @@ def _open_stream(path: str, deadline: float, interrupt: Mapping[int, int] | None
 
 
 @contextlib.contextmanager
-def _replacing(path: str) -> Iterator[str]:
+def _hidden_file(path: str) -> Iterator[str]:
     """Create a hidden file, yield its path, and finally rename it to `path`. Remove it after an error."""
-    target = _target(path)
+    target = _resolve_target(path)
     # The hidden name isn't derived from the target's name, because a longer name may exceed the file system's limit.
     hidden = os.path.join(os.path.dirname(target), f".talk-{os.urandom(8).hex()}.wav")
     try:
@@ -268,7 +266,7 @@ def _replacing(path: str) -> Iterator[str]:
             os.unlink(hidden)
 
 
-def _target(path: str) -> str:
+def _resolve_target(path: str) -> str:
     """Return the path of the file to replace, with symbolic links resolved.
 
     Raises:

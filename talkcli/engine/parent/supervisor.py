@@ -87,9 +87,7 @@ class ActionQueue:
         self._closed = False
         #: held by `call`, because otherwise the descriptor could be closed and its number reused before the write
         self._calling = threading.Lock()
-        #: whether the thread was woken and hasn't handled that yet; later actions then needn't wake it again
-        self._woken = False
-        #: monotonic time at which the thread wakes up on its own; 0 while it is awake
+        #: monotonic time at which the thread wakes up on its own; 0 while it is awake or being woken
         self._sleeps_until = 0.0
         self._nap_s = nap_s
         self._nap_ends_at = 0.0
@@ -112,8 +110,8 @@ class ActionQueue:
             self._actions.append(action)
             # `wait` sets `_sleeps_until` before it checks for actions. Because of this order, either this method finds
             # the thread asleep, or `wait` finds the action.
-            if self._sleeps_until > by and not self._woken:
-                self._woken = True
+            if self._sleeps_until > by:
+                self._sleeps_until = 0.0
                 os.write(self._writer, b"\0")
 
     def wait(self, until: float) -> list[selectors.SelectorKey]:
@@ -133,7 +131,6 @@ class ActionQueue:
             self._nap_ends_at = time.monotonic() + self._nap_s
         if any(key.fd == self._reader for key in ready):
             os.read(self._reader, 4096)
-            self._woken = False  # before running the actions, so that each later `call` wakes the thread again
         self.run()
         return [key for key in ready if key.fd != self._reader]
 
@@ -262,12 +259,9 @@ class Supervisor:
         of a goal by 10 to 20 percent.
         """
         process, now = self._direct_process, time.monotonic()
-        if process is None:
-            self._actions.call(lambda: self._take_goal(command))
-            return
-        self._actions.call(lambda: self._take_goal(command, process, now), by=now + HANG_LIMIT_S)
-        if not process.send(command):
-            self._actions.call(lambda: self._goal_not_sent(command.id, process))
+        self._actions.call(lambda: self._begin_goal(command, process, now), by=now + HANG_LIMIT_S if process else 0.0)
+        if process and not process.send(command):
+            self._actions.call(lambda: self._requeue_goal(command.id, process))
 
     def stop(self, goal_id: str) -> None:
         """Stop the goal."""
@@ -330,7 +324,7 @@ class Supervisor:
             self._shut_down()
 
     def _next_deadline(self) -> float:
-        deadlines = [deadline for deadline, _ in self._deadlines()] + [each.gone_by for each in self._dying]
+        deadlines = [deadline for deadline, _ in self._deadlines()] + [each.exit_deadline for each in self._dying]
         return min([*deadlines, NEVER if self._process else self._restarts.next_start_at])
 
     def _deadlines(self) -> Iterator[tuple[float, str]]:
@@ -355,9 +349,9 @@ class Supervisor:
         elif self._process is None and now >= self._restarts.next_start_at:
             self._start_process()
         for process in self._dying:
-            if now < process.gone_by:
+            if now < process.exit_deadline:
                 continue
-            process.gone_by = NEVER  # checked only once; the process is still reaped when it exits
+            process.exit_deadline = NEVER  # checked only once; the process is still reaped when it exits
             process.kill()  # the first kill may have missed processes if descriptors were short
             if self._goal and self._goal.lost_process is process:
                 message = f"the player could not be ended within {KILL_LIMIT_S:g} s"
@@ -386,7 +380,7 @@ class Supervisor:
         """Return the goal with this ID, or None if the goal has ended."""
         return self._goal if self._goal and self._goal.command.id == goal_id else None
 
-    def _take_goal(self, command: protocol.GoalCommand, sent_to: EngineProcess | None = None, at: float = 0.0) -> None:
+    def _begin_goal(self, command: protocol.GoalCommand, sent_to: EngineProcess | None, at: float) -> None:
         """Make this the current goal, and send it to the process unless the caller of `speak` has sent it.
 
         Args:
@@ -409,15 +403,15 @@ class Supervisor:
         if goal and waits and process and process.ready:
             goal.last_sign_at = time.monotonic()
             if not process.send(goal.command):
-                self._goal_not_sent(goal.command.id, process)
+                self._requeue_goal(goal.command.id, process)
 
-    def _goal_not_sent(self, goal_id: str, process: EngineProcess) -> None:
+    def _requeue_goal(self, goal_id: str, process: EngineProcess) -> None:
         """Keep a goal that could not be sent for the next process."""
         if process is self._process:
             goal = self._current(goal_id)
             if goal:
                 goal.last_sign_at = None
-            self._handle_refusal(process)
+            self._replace_unresponsive(process)
 
     def _send_voice_command(self, command: protocol.LoadVoice | protocol.DropVoice) -> None:
         """Send a command for a voice if a process is ready. Otherwise, drop it.
@@ -429,9 +423,9 @@ class Supervisor:
             if isinstance(command, protocol.LoadVoice):
                 self._loading, self._last_sign_at = command.voice, time.monotonic()
             if not process.send(command):
-                self._handle_refusal(process)
+                self._replace_unresponsive(process)
 
-    def _handle_refusal(self, process: EngineProcess) -> None:
+    def _replace_unresponsive(self, process: EngineProcess) -> None:
         """Replace a process that accepts no commands."""
         self._receive(process)  # if the process is dead, this reports a crash instead
         if process is self._process:
@@ -447,7 +441,7 @@ class Supervisor:
         if goal.sent:
             command = protocol.Continue(goal_id) if number is None else protocol.Hold(goal_id, number)
             if self._process and not self._process.send(command):
-                self._handle_refusal(self._process)
+                self._replace_unresponsive(self._process)
         elif number is not None:
             self._post(protocol.Held(goal_id, number))  # the goal is silent, because no process has it
         else:
@@ -490,7 +484,7 @@ class Supervisor:
         except OSError as error:
             message = f"the engine process cannot be started: {error.strerror or error}"
             self._post(EngineDied(message))
-            self._plan_after_failed_start(message)
+            self._handle_failed_start(message)
             return
         self._process = process
         for fd in (process.socket.fileno(), process.liveness, process.stderr):
@@ -506,7 +500,7 @@ class Supervisor:
     def _receive(self, process: EngineProcess) -> None:
         """Handle the messages that have arrived from the process."""
         for event in process.receive():
-            self._actions.run()  # this may be a reply to a goal that `speak` has sent, but `_take_goal` hasn't recorded
+            self._actions.run()  # `_begin_goal` may still be waiting there for the goal of this event
             if process is not self._process:
                 return
             if event is None:
@@ -563,7 +557,7 @@ class Supervisor:
         self._process = self._direct_process = self._loading = None
         process.kill()
         self._selector.unregister(process.socket.fileno())
-        process.gone_by = now + KILL_LIMIT_S
+        process.exit_deadline = now + KILL_LIMIT_S
         self._dying.append(process)
         goal = self._goal if self._goal and self._goal.sent else None
         if goal:
@@ -574,9 +568,9 @@ class Supervisor:
             had_goal = goal is not None or process.had_goal
             self._restarts.process_died(now, age_s=now - self._started_at, had_goal=had_goal)
         elif process.start_failure:
-            self._plan_after_failed_start(process.start_failure.message, permanent=process.start_failure.permanent)
+            self._handle_failed_start(process.start_failure.message, permanent=process.start_failure.permanent)
         else:
-            self._plan_after_failed_start(message)
+            self._handle_failed_start(message)
 
     def _handle_lost_goal(self, goal: SupervisedGoal, process: EngineProcess, message: str, reason: Reason) -> None:
         """Retry or end a goal whose process was killed or has crashed.
@@ -595,7 +589,7 @@ class Supervisor:
             goal.lost_process = process
         goal.last_sign_at = goal.stop_sent_at = goal.hold_sent_at = None
 
-    def _plan_after_failed_start(self, message: str, *, permanent: bool = False) -> None:
+    def _handle_failed_start(self, message: str, *, permanent: bool = False) -> None:
         """Schedule another start, and fail the waiting goal if it should wait no longer."""
         ends_goal = self._restarts.start_failed(time.monotonic(), self._started_at, message if permanent else None)
         waiting = self._goal if self._goal and not self._goal.end else None
