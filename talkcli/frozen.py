@@ -4,7 +4,7 @@
 would take a third of the 30 ms that a command runs. An engine would lose as much time at each restart after a crash. A
 class made by `frozen` costs almost nothing until its first instance.
 
-The server runs for months and may use `dataclasses` for features that are missing here: fields that can change,
+Code that only the server runs may use `dataclasses` for features that are missing here: fields that can change,
 inheritance, ordering and default factories. Type checkers treat `frozen` like a dataclass decorator.
 """
 

@@ -13,8 +13,8 @@ from talkcli.frozen import TYPE_CHECKING, frozen
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-#: Whether this process is a 64-bit one. Neither onnxruntime nor espeakng-loader has a 32-bit build. A 32-bit system can
-#: run on a 64-bit kernel, and there `platform.machine()` gives the kernel's architecture.
+#: Whether this process has 64 bits. Neither onnxruntime nor espeakng-loader has a 32-bit build. `platform.machine()`
+#: can't tell, because it gives the architecture of the kernel, and a 32-bit system can run on a 64-bit kernel.
 IS_64_BIT = sys.maxsize > 2**32
 
 #: The packages that neural voices need.

@@ -143,7 +143,7 @@ def voice_directories(environment: Mapping[str, str] | None = None) -> list[str]
 
 
 def cache_directory() -> str:
-    """Return the cache directory, which may not exist yet. It is platformdirs' one, or systemd's for a service."""
+    """Return the cache directory, which may not exist yet. A service uses the directory that systemd gives it."""
     given = os.environ.get("CACHE_DIRECTORY")
     if given:
         return os.path.realpath(given.split(":")[0])  # with DynamicUser= it is a link

@@ -1,4 +1,4 @@
-"""Wait for descriptors, for a limited time and so that something else can interrupt the wait."""
+"""Waiting for descriptors with a time limit. Other descriptors can interrupt the wait."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
 
 class Interrupted(Exception):
-    """One of the caller's own descriptors became ready during a wait."""
+    """A descriptor that interrupts the wait became ready."""
 
 
 def wait_ready(

@@ -13,7 +13,7 @@ from talkcli.frozen import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-#: How long to wait for a killed process to close its pipe before looking for other holders. It takes 1 to 2 ms.
+#: How long to wait for a killed process to close its pipe before looking for other holders. It usually takes 1 to 2 ms.
 _RELEASE_S = 0.01
 
 

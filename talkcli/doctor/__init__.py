@@ -1,4 +1,4 @@
-"""The checks of `talk doctor`: everything between a sentence and the loudspeaker, in order.
+"""The checks of `talk doctor`: everything between a sentence and the loudspeaker.
 
 - `voice`, `sound`, `server` and `sentence` have the checks of one subject each. Every check consists of facts, a
   function that finds them, and a `judge_…` function that turns them into findings. Judging is pure.

@@ -1,7 +1,7 @@
-"""All checks of this machine, in the order in which a sentence passes through them.
+"""The checks of this machine, in the order of a sentence's way from the voice to the loudspeaker.
 
-Each check is judged as soon as its facts are known. The examination never hangs, because every question has a time
-limit. It changes nothing: the only thing that it sends is one goal.
+Each check is judged as soon as its facts are known. The examination never hangs, because everything that it waits for
+has a time limit. It changes nothing: the only thing that it sends is one goal.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ class LocalExamination:
         reported = self._server.get("neural_voices")
         server_voices = reported if isinstance(reported, dict) else {}
         if used and not is_neural(used):
-            # The engine knows the voice that a short name stands for, unless it failed because of this name.
+            # The engine reports which voice a short name stands for, unless it failed because of this name.
             used = used if engine.reason and find_voice(used, models.installed_names(env)) else engine.neural_voice
         needed = used or server_voices or engine.neural_count or env.get("TALK_VOICES")
         if not needed or not is_own_driver(self._setting("driver")):
@@ -167,7 +167,7 @@ class LocalExamination:
         custom = sound.is_custom(player)
         step = sentence.find_playback_step(self._findings, custom=custom)
         if self._silent and self._server_pid is not None and self._session.server_pid is None:
-            # Another user's server: nothing can be played in its environment. With hidepid, /proc hides its owner.
+            # This is another user's server, whose environment can't be read. With hidepid, /proc also hides the owner.
             owner = sound.file_owner(f"/proc/{self._server_pid}")
             step = step if owner is None else sentence.RUN_AS_OWNER.format(owner)
         if result.reason == Reason.AUDIO_STALLED and not (self._hangs or custom):
@@ -181,6 +181,6 @@ class LocalExamination:
         if is_silent(player):
             player = "null"  # the server's output file must not get another sentence
         elif player in PLAYERS and not sound.names_a_player(server_pid, self._env):
-            player, first = None, player  # the server's automatic choice: it would try the other players, too
+            player, first = None, player  # the server chose this player, and would also try the others
         device, used, driver = map(self._setting, ("device", "voice", "driver"))
         return voice.EngineOptions(player, device, used, driver, first, self._env, self._interrupt)

@@ -1,4 +1,4 @@
-"""The findings of the doctor: one per check, the conclusion from all of them, and how to show both.
+"""The findings of the doctor, the conclusion from all of them, and how to show both.
 
 This module is pure. The caller passes the screen.
 """
@@ -70,17 +70,17 @@ BRIDGE_QUESTION = Question(
 
 
 def ok(check: str, message: str) -> Finding:
-    """Return a finding that nothing is wrong."""
+    """Return a finding for a check that found no fault."""
     return Finding(check, OK, printable(message))
 
 
 def warning(check: str, message: str, step: str) -> Finding:
-    """Return a finding about a possible reason why nothing is heard, with the next step."""
+    """Return a finding about a fault that may prevent sound, with the next step."""
     return Finding(check, WARNING, printable(message), printable(step))
 
 
 def failure(check: str, message: str, step: str) -> Finding:
-    """Return a finding about a certain reason why nothing is heard, with the next step."""
+    """Return a finding about a fault that certainly prevents sound, with the next step."""
     return Finding(check, FAILURE, printable(message), printable(step))
 
 
@@ -129,5 +129,5 @@ def _wrap(text: str, room: int | None) -> list[str]:
     """Return the text in lines of this width. If `room` is None, it is one line."""
     if room is None:
         return [text]
-    # People copy paths and commands, so these are only cut if a line has no blank at all.
+    # People copy paths and commands, so a word is only cut if it is longer than a line.
     return textwrap.wrap(text, room, break_on_hyphens=False)

@@ -206,7 +206,7 @@ def judge_sentence(
         result: how the sentence ended.
         silent: whether it was played without sound.
         device: the device that was configured for the player, or None.
-        playback_step: the next step from `find_playback_step`.
+        playback_step: the result of `find_playback_step`.
         hangs: whether the sound server hangs. Engines wait for it when they start.
     """
     if result.state is State.SUCCEEDED:
@@ -224,7 +224,7 @@ def judge_sentence(
     if result.reason == Reason.AUDIO_STALLED and result.suspended:
         message = f"{message}; suspended: {', '.join(result.suspended)}"
         step = f"pactl suspend-sink {result.suspended[0]} 0"
-    # The other checks know more about player and device, unless the player itself gives the cause.
+    # The other checks know more about the player and the device, unless the player itself gave the cause.
     elif playback_step is not None and step != _BUSY_STEP:
         causes = {*_PLAYER_REASONS, Reason.NO_PLAYER, *(_START_REASONS if hangs else ())}
         step = playback_step if result.reason in causes else step

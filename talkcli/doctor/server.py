@@ -51,7 +51,7 @@ _REFUSAL_ADVICE = {
     "busy": "end some of its clients, or raise the limit that is named: talk serve --max-clients 512, or LimitNOFILE=",
     "permission_denied": "have its owner let you in: talk serve --socket-mode 0660, and join the socket's group",
 }
-#: The next step for each kind of place, in the order in which they count if there are several.
+#: The next step for each kind of place. If the search found several kinds, the first one here counts.
 _PLACE_ADVICE = {
     PLACE_FORBIDDEN: "have {whose} let you in: talk serve --socket-mode 0660, and join the socket's group; "
     "or start your own",
@@ -62,7 +62,7 @@ _PLACE_ADVICE = {
     PLACE_DIRECTORY: "remove {path}, and: talk serve",
     PLACE_STALE: "talk serve (it takes the place of what was left over)",
 }
-#: For the option and the variable that name a socket, the words that name one and the step that stops it.
+#: How to name a socket by the option or the variable, and how to undo that.
 _NAMING = {"TALK_SOCKET": "TALK_SOCKET=", "--socket": "--socket "}
 _UNNAMING: dict[str | None, str] = {"TALK_SOCKET": "unset TALK_SOCKET", "--socket": "leave --socket out"}
 #: Below this volume setting, speech may be inaudible. The loudest setting is 1.
@@ -90,7 +90,7 @@ class SocketSearch:
     places: tuple[SocketPlace, ...]
     #: what named the only place, "--socket" or "TALK_SOCKET", or None if the usual places were tried
     named_by: str | None = None
-    #: what a client's error says besides the places, or None
+    #: why a client was not accepted, or None if no process listens
     message: str | None = None
     #: code of the client's error, or None
     code: str | None = None
@@ -128,7 +128,7 @@ def connect(option: str | None, interrupt: Mapping[int, int] | None) -> tuple[Cl
 
 
 def _client_message(lines: list[str], found: tuple[SocketPlace, ...]) -> str | None:
-    """Return what a client's error message says besides the places, or why a process that listens did not accept it."""
+    """Return why a listening process did not accept the client. An error that lists no places is returned as it is."""
     if not lines[0].startswith(_NO_SERVER_PREFIX):
         return lines[0]
     listening = [f"{each.path}: " for each in found if each.what in {PLACE_LISTENING, PLACE_STOPPED}]
@@ -162,7 +162,7 @@ def describe_server(client: Client) -> tuple[JsonObject, list[Goal]]:
     end = time.monotonic() + _ENGINE_START_LIMIT_S
     server, log = client.status().server, client.log(_LOG_GOALS_COUNT)
     while server.get("engine") == "starting" and time.monotonic() < end:
-        time.sleep(_ENGINE_POLL_S)  # a client gets no event when the engine is ready
+        time.sleep(_ENGINE_POLL_S)  # the server sends no event when the engine is ready
         server = client.status().server
     return server, log
 
@@ -178,7 +178,7 @@ def local_pid(client: Client) -> int | None:
 
 
 def judge_search(search: SocketSearch) -> Finding:
-    """Judge whether the server was found, and whether clients may be stopped by what is at the places before it."""
+    """Judge whether the server was found, and whether clients may find something else at a place before it."""
     *before, last = search.places
     if last.what == PLACE_SERVER:
         obstacles = [each for each in before if each.what != PLACE_ABSENT]
@@ -284,7 +284,7 @@ def _judge_recent(log: Sequence[Goal], now: float, server: JsonObject) -> Findin
 
 
 def format_span(seconds: object) -> str:
-    """Return a duration in its largest unit for people, or "?" if it is no number."""
+    """Return a duration in its largest unit for people, or "?" if it isn't a number."""
     if not isinstance(seconds, int | float):
         return "?"
     for unit, length in (("d", 86400), ("h", 3600), ("min", 60)):

@@ -1,8 +1,8 @@
 """The sound: user session, sound cards, players, devices, sound servers and volume.
 
-Facts come from files of the kernel and from programs such as pactl, each with a time limit. No device is opened,
-because that would wake it. Only a sentence proves that there is sound, so most findings here are warnings. A missing or
-silent player is a failure.
+Facts come from files of the kernel and from programs such as pactl. Programs have a time limit. No device is opened,
+because that would wake it. Only a sentence proves that there is sound, so most faults are warnings. A missing or silent
+player is a failure, and so is a muted output.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ SESSION_ELSEWHERE = ok(
 #: Tags and permission bits of an access control list in <linux/posix_acl.h>.
 _ACL_USER, _ACL_GROUP, _ACL_READ_WRITE = 2, 8, 6
 
-#: Names in ALSA's list that are no devices: plugins and converters.
+#: Plugins and converters in ALSA's list of devices.
 _NOT_DEVICES = frozenset(
     {"null", "lavrate", "samplerate", "speexrate", "jack", "oss", "speex", "upmix", "vdownmix", "usbstream"}
 )
@@ -63,7 +63,7 @@ _SOUND_SERVER_CHECK, _LOUDNESS_CHECK = "sound server", "loudness"
 _FAINT_PERCENT = 20
 #: ALSA's mixer controls for loudspeakers, as `amixer scontrols` shows them.
 _ALSA_CONTROLS = ("Master", "PCM", "Speaker", "Headphone", "Digital")
-#: The name for people of the output that a sound server's mixer controls.
+#: Name of a sound server's output, for people.
 _DEFAULT_SINK = "the default sink"
 #: For each mixer program, the commands that unmute the default sink and make it louder.
 _PACTL_COMMANDS = ("pactl set-sink-mute @DEFAULT_SINK@ 0", "pactl set-sink-volume @DEFAULT_SINK@ 70%")
@@ -142,7 +142,7 @@ class Players:
 
 @frozen
 class Devices:
-    """The devices of a player, by the player's own names."""
+    """The devices that a player can use, by the player's own names."""
 
     #: the command that lists them
     list_command: str
@@ -191,7 +191,7 @@ class MixerLevel:
 def find_session(server_pid: int | None) -> tuple[UserSession, Mapping[str, str]]:
     """Return the session and environment of the server, because its player makes the sound.
 
-    If there is no server, or its environment can't be read, both describe this process.
+    If there is no server, or its environment can't be read, return those of this process.
     """
     environment = None if server_pid is None else _environment(server_pid)
     if environment is None:
@@ -216,7 +216,7 @@ def find_session(server_pid: int | None) -> tuple[UserSession, Mapping[str, str]
 
 
 def names_a_player(server_pid: int, env: Mapping[str, str]) -> bool:
-    """Return whether a server's command line or environment names a player. It then tries no other player."""
+    """Return whether a server's command line or environment names a player. Such a server tries no other player."""
     return bool(env.get("TALK_PLAYER") or re.search(r"\0--player[=\0]", _read_text(f"/proc/{server_pid}/cmdline")))
 
 
@@ -305,7 +305,13 @@ def find_cards(session: UserSession, kernel: str = "/proc/asound", nodes: str = 
 
 
 def _may_open(found: os.stat_result, entries: list[tuple[int, int, int]], session: UserSession) -> bool:
-    """Return whether the user may read and write a file, by its mode or by its access control list."""
+    """Return whether the user may read and write a file.
+
+    Args:
+        found: mode and owner of the file.
+        entries: its access control list, as from `_access_list`.
+        session: the user.
+    """
     if session.uid == 0:
         return True
     if session.uid == found.st_uid:
@@ -365,7 +371,7 @@ def run_program(program: str, *arguments: str, env: Mapping[str, str], limit: fl
 
 
 def is_custom(player: str | None) -> bool:
-    """Return whether a player is the user's own command, so that nothing is known about its requirements."""
+    """Return whether a player is the user's own command, whose requirements are unknown."""
     program = _program_of(player) if player and not is_silent(player) else None
     return program is not None and program.rpartition("/")[2] not in PLAYERS
 

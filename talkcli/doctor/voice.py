@@ -54,7 +54,7 @@ _MIN_REAL_TIME_FACTOR = 1.3
 #: A program that imports a package, but not from the current directory, and prints an error in one line. It runs as
 #: a process of its own, because onnxruntime can crash on an old processor.
 _IMPORT_PROGRAM = "import sys; sys.tracebacklimit = 0; sys.path[:] = filter(None, sys.path); import "
-#: Time limit for an import, which may be from an SD card.
+#: Time limit for an import. Reading a package from an SD card is slow.
 _IMPORT_LIMIT_S = 10.0
 _IMPORT_TIMED_OUT = f"it takes more than {_IMPORT_LIMIT_S:g} s"
 #: The next step for a package that can't be imported. The key is a text in the message; "" is the default.
@@ -142,11 +142,11 @@ def installed_version(package: str) -> str | None:
 
 
 def start_engine(options: EngineOptions, limit: float = math.inf, output: int | None = None) -> PrivateEngine:
-    """Start an engine process, and return the conversation with it.
+    """Start an engine process, and return it.
 
     Args:
         options: its options.
-        limit: time in seconds for the whole conversation.
+        limit: seconds after which any wait for the process ends with a TimeoutError.
         output: descriptor that gets the sound as a WAV file, instead of a player. Such an engine lists no voices.
     """
     given = options.driver, options.player, options.device, options.voice
@@ -174,7 +174,7 @@ def find_engine(options: EngineOptions) -> EngineReport:
 
 
 def explain_failure(error: EngineFailed) -> tuple[str, str]:
-    """Return the reason and the message of an engine's failure. Silence counts as `engine_hung`, whenever it occurs."""
+    """Return the reason and the message of an engine's failure. A silent engine counts as `engine_hung`."""
     if error.silent_s is not None:
         return Reason.ENGINE_HUNG, f"the engine process said nothing for {error.silent_s:g} s"
     return error.reason, str(error)
@@ -200,7 +200,7 @@ def judge_engine(pyttsx3: str | None, engine: EngineReport, *, server: str | Non
     if engine.reason is None:
         words = f"{pyttsx3 or 'of an unknown version'}, driver {engine.driver}"
         return [ok("pyttsx3", words), *_judge_library(engine)]
-    # The finding shows the next step on its own.
+    # The finding shows the next step separately.
     message = engine.message.removesuffix(f": {_INSTALL_PYTTSX3}").removesuffix(f": {INSTALL_LIBRARY}")
     if "pyttsx3 is missing" in message or pyttsx3 is None:
         return [broken("pyttsx3", message or "pyttsx3 is missing", _INSTALL_PYTTSX3)]
@@ -277,9 +277,8 @@ def _split_step(message: str) -> tuple[str, str]:
 
 def _try_voice(used: str, options: EngineOptions, limit: float) -> VoiceTrial:
     """Load the voice and time a sentence. Nothing is played."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
     try:
-        with start_engine(options, limit, nowhere) as engine:
+        with open(os.devnull, "wb") as output, start_engine(options, limit, output.fileno()) as engine:
             engine.wait_for(protocol.Ready)
             ended, load_s = _speak(engine, used, "a")  # speaking a first text also loads the voice
             began = time.monotonic()
@@ -293,8 +292,6 @@ def _try_voice(used: str, options: EngineOptions, limit: float) -> VoiceTrial:
         return VoiceTrial(fault=(explain_failure(error)[1], _CHOOSE_ESPEAK))
     except TimeoutError:
         return VoiceTrial(fault=(f"it was not loaded, and had not spoken, after {limit:g} s", _CHOOSE_ESPEAK))
-    finally:
-        os.close(nowhere)
 
 
 def _speak(engine: PrivateEngine, voice: str, text: str) -> tuple[protocol.Ended, float | None]:

@@ -1,6 +1,7 @@
 """The messages between client and server: lines of bytes, requests, events and replies.
 
-Form only: nothing is decided, opened or waited for. It may import goals and the ground. A new request is a class with a
-row for each of its fields, a new event or reply a frozen value with its JSON form beside it. The fields of a goal and
-the settings are in `goals.options`. README.md beside this file documents the wire.
+This package only defines the form of messages. It decides nothing, opens nothing and waits for nothing. It may import
+`goals` and the flat modules of `talkcli`. A new request is a class with a row for each of its fields. A new event or
+reply is a frozen value with a method for its JSON form. The fields of a goal and the settings are in `goals.options`.
+README.md beside this file documents the wire.
 """
