@@ -1,6 +1,7 @@
-"""Robots and desks on an MQTT 5 broker, by means of paho-mqtt (the extra `fleet`).
+"""A fleet: robots and their operators, connected through an MQTT 5 broker.
 
-The bridge runs beside a robot's server, as a client of the server. The desk is a connection below the library's
-`Client`. Payloads are lines of the socket's protocol, and the server alone decides about goals. Nothing here prints or
-imports the server. The README in this folder describes topics and payloads.
+A bridge runs beside each robot's server and connects to it as a client. On the operator's side, a desk connects the
+library's `Client` to robots. Requests and replies have the same form as on the server's socket, and only the server
+decides about goals. These modules don't print anything and don't import the server. The README in this folder describes
+topics and payloads. paho-mqtt is required (the extra `fleet`).
 """

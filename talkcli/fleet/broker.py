@@ -1,6 +1,6 @@
-"""The settings of the connection to the broker, read from environment variables.
+"""The broker's address and login, read from environment variables.
 
-Settings that would expose a secret are refused. Nothing here connects to the broker.
+Settings that would expose a secret are refused. This module doesn't connect to the broker.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ PASSWORD_FILE = "TALK_MQTT_PASSWORD_FILE"
 CA = "TALK_MQTT_CA"
 CERT = "TALK_MQTT_CERT"
 KEY = "TALK_MQTT_KEY"
-#: For each scheme of the URL: whether it means TLS, and its default port.
+#: Whether the connection uses TLS, and the default port, by URL scheme.
 _SCHEMES = {"mqtt": (False, 1883), "mqtts": (True, 8883)}
-#: Longest password that MQTT allows.
+#: Maximum length of a password in MQTT.
 _MAX_PASSWORD_BYTES = 65_535
 
 
@@ -41,23 +41,28 @@ class Broker:
     host: str
     port: int
     tls: bool
-    #: None for no user, or for the one that the certificate names
+    #: the user name; None for an anonymous login, or if the certificate contains the user name
     user: str | None = None
     password: str | None = None
-    #: file of the CA that signed the broker's certificate; None for the system's CAs
+    #: path of the CA certificate that verifies the broker; None for the system's CAs
     ca: str | None = None
-    #: files of the client's certificate and its key
+    #: path of the client's certificate
     cert: str | None = None
+    #: path of the certificate's private key; None if the certificate file contains it
     key: str | None = None
 
     @property
     def url(self) -> str:
-        """The broker's address for people, without secrets."""
+        """The broker's address, without the login."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{'mqtts' if self.tls else 'mqtt'}://{host}:{self.port}"
 
     def ssl_context(self) -> ssl.SSLContext | None:
-        """Return the settings for TLS, None without TLS. Raise UsageError if a file is unusable."""
+        """Return the TLS settings, or None if the connection doesn't use TLS.
+
+        Raises:
+            UsageError: the file of a certificate or key is unusable.
+        """
         if not self.tls:
             return None
         try:
@@ -73,14 +78,14 @@ class Broker:
 
 
 def from_environment(environment: Mapping[str, str], *, insecure: bool = False) -> Broker:
-    """Return the broker that the environment variables describe.
+    """Return the broker described by environment variables.
 
     Args:
         environment: the variables.
-        insecure: whether a password may go to another machine in clear text.
+        insecure: whether a password may be sent to another machine in clear text.
 
     Raises:
-        UsageError: a variable is missing or wrong.
+        UsageError: a variable is missing or invalid.
     """
     url = environment.get(URL, "")
     if not url:
@@ -110,9 +115,10 @@ def require_paho() -> None:
 
 
 def client_user(broker: Broker) -> str:
-    """Return the user name for topics: the user of the login, or else the user of this machine.
+    """Return the user name for topics: the user name of the login, or else the name of the local user.
 
-    Raise UsageError if it can't be a level of a topic.
+    Raises:
+        UsageError: the name can't be a level of a topic.
     """
     name = broker.user
     if name is None:
@@ -129,11 +135,14 @@ def client_user(broker: Broker) -> str:
 def _parse_url(url: str) -> tuple[str, int, bool]:
     """Return the host, the port, and whether to use TLS.
 
-    Raise UsageError if the URL is wrong. No message shows the whole URL, because it may contain a password.
+    Error messages don't show the whole URL, because it may contain a password.
+
+    Raises:
+        UsageError: the URL is invalid.
     """
     try:
         parts = urlsplit(url)
-    except ValueError:  # its message shows the URL
+    except ValueError:  # its message contains the URL, so it is dropped
         raise UsageError(f"{URL} is no URL: write mqtts://HOST or mqtt://HOST") from None
     if parts.scheme not in _SCHEMES:
         raise UsageError(
@@ -170,7 +179,7 @@ def _read_password(path: str) -> str:
 
 
 def is_local(host: str) -> bool:
-    """Return whether the host is this machine, so that nobody can listen in between."""
+    """Return whether a host is this machine, so that nobody else can read the traffic."""
     if host == "localhost":
         return True
     try:
@@ -184,7 +193,7 @@ def _no_passphrase() -> str:
 
 
 def _file_error(path: str | None, error: Exception) -> str:
-    """Return a message for people about a file that can't be used."""
+    """Return an error message about a file that can't be used."""
     if isinstance(error, ssl.SSLError):
         return f"{printable(str(path))} is not what it should be: {error.reason or error}"
     words = error.strerror if isinstance(error, OSError) else str(error)

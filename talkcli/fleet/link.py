@@ -1,8 +1,8 @@
-"""A connection to the broker, made with paho-mqtt. It has no loop and no thread of its own.
+"""A connection to the broker through paho-mqtt, without an event loop or thread.
 
-The owner polls its descriptor, and calls `read`, `write` and `tick`. Each connection needs a new `Link`, because paho
-would send the old connection's unacknowledged messages again, and one of them may be a sentence. Nothing here knows
-what messages mean.
+The owner polls the connection's descriptor, and calls `read`, `write` and `tick`. A link is never reconnected, because
+paho would resend unacknowledged messages, and one of them may be an outdated sentence. Create a new link instead. This
+module doesn't interpret payloads.
 """
 
 from __future__ import annotations
@@ -40,32 +40,32 @@ if TYPE_CHECKING:
     #: Called with the reason code of a PUBACK.
     OnAcknowledged = Callable[[int], None]
 
-#: After one and a half times this time without data, the broker counts a client as gone.
+#: MQTT's keepalive interval. The broker closes a connection after one and a half intervals without data.
 KEEPALIVE_S = 10
-#: Time for the broker to answer the login.
+#: Time allowed for the broker to answer the login.
 LOGIN_LIMIT_S = 5.0
-#: Time between two calls of `tick`.
+#: Interval between calls of `tick`.
 TICK_EVERY_S = 5.0
-#: Largest packet that this side sends: the lines of a reply, and the header.
+#: Largest packet to send, including the header.
 MAX_PACKET_BYTES = 256 * 1024
-#: Room for all of a packet but its payload: topics, properties and numbers.
+#: Space in a packet for everything except the payload, such as topics and properties.
 MAX_HEADER_BYTES = 1024
-#: Messages of QoS 1 that may be unacknowledged; further ones wait here. HiveMQ's cloud accepts 10, other brokers accept
-#: more, and paho can't follow the limit that a broker announces.
+#: Maximum number of unacknowledged QoS 1 messages. paho queues further messages, but ignores the limit that a broker
+#: announces. HiveMQ's cloud accepts 10, and other brokers accept more.
 _MAX_UNACKNOWLEDGED_MESSAGES = 10
-#: The highest receive maximum in MQTT, for a client that hears from all robots. By default, mosquitto sends 20 messages
-#: ahead and queues 1,000. It silently drops all others, even retained ones.
+#: Highest receive maximum in MQTT, for a client that receives messages from all robots. By default, mosquitto sends 20
+#: unacknowledged messages and queues 1,000. It silently drops further messages, even retained ones.
 MAX_RECEIVE_COUNT = 65_535
-# MQTT 5 reason codes: login denied, protocol not supported, the first of those that mean failure, not authorized.
+# MQTT 5 reason codes. REASON_FAILURE is the lowest code of a failure.
 _REASONS_DENIED = (0x86, 0x87, 0x8A, 0x8C)
 _REASON_UNSUPPORTED_PROTOCOL = 0x84
 REASON_FAILURE, REASON_NOT_AUTHORIZED = 0x80, 0x87
-#: SO_LINGER values for closing. A stalled sentence must not arrive minutes later, so unsent data is usually discarded.
+#: Values of SO_LINGER. Closing usually discards unsent data, so that a delayed sentence can't arrive minutes later.
 _LINGER_DISCARD, _LINGER_DELIVER = struct.pack("ii", 1, 0), struct.pack("ii", 0, 0)
 
 
 def boottime() -> float:
-    """Return the seconds since the machine started, including the time it was suspended if the system counts that."""
+    """Return the seconds since the machine started, on Linux including the time in suspend."""
     return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
 
@@ -78,7 +78,7 @@ class Will:
 
 
 class Link:
-    """A connection to the broker. Any thread may use it; `on_message` is called by the thread that reads."""
+    """A connection to the broker. Any thread may use it. The thread that calls `read` runs the callbacks."""
 
     def __init__(
         self,
@@ -89,38 +89,39 @@ class Link:
         max_packet_bytes: int = MAX_PACKET_BYTES,
         receive_maximum: int | None = None,
     ) -> None:
-        """Prepare a connection, which `open` makes.
+        """Prepare a connection without opening it.
 
         Args:
-            broker: where to connect.
+            broker: the broker's address and login.
             client_id: unique name of this connection.
-            on_message: called with each message that comes.
-            will: published if the connection breaks.
+            on_message: called with each received message.
+            will: published by the broker if the connection breaks.
             max_packet_bytes: largest packet that the broker may send.
-            receive_maximum: how many messages of QoS 1 the broker may send before the first is acknowledged. None
-                leaves it to the broker.
+            receive_maximum: how many unacknowledged QoS 1 messages the broker may send; None for the broker's default.
 
         Raises:
-            UsageError: a file for TLS is unusable.
+            UsageError: the file of a certificate or key is unusable.
         """
         self._broker = broker
         self._deliver = on_message
         self._max_packet_bytes = max_packet_bytes
         self._receive_maximum = receive_maximum
-        #: why the connection has ended; None while it lasts
+        #: why the connection has ended; None until then
         self.ended: str | None = None
-        #: size of the messages that are unsent or unacknowledged
+        #: total size of the unsent and unacknowledged messages
         self.outstanding_bytes = 0
         #: largest payload that the broker accepts
         self.max_payload_bytes = MAX_PACKET_BYTES - MAX_HEADER_BYTES
-        #: unacknowledged messages: size and callback, by message id
+        #: size and callback of each unacknowledged message, by message id
         self._unacknowledged: dict[int, tuple[int, OnAcknowledged | None]] = {}
         #: the broker's answer to the login
         self._answer: ReasonCode | None = None
+        #: the TLS alert that the broker sent during the login
         self._alert = ""
-        #: held while paho is used, because TLS can't be read and written at the same time
+        #: held during calls of paho, because TLS can't be read and written at the same time
         self._lock = threading.RLock()
-        #: set while paho calls `_on_message`. A write from there that found the broker gone would wait for itself.
+        #: whether paho is reading and may call `_on_message`. If a callback wrote to a broken connection, paho would
+        #: wait for itself.
         self._delivering = False
         self._socket: socket.socket | None = None
         self._paho = paho.Client(
@@ -141,11 +142,11 @@ class Link:
         self._paho.on_log = self._on_log
 
     def open(self) -> None:
-        """Connect, log in, and wait for the broker's answer. It blocks, so call it in a thread of its own.
+        """Connect, log in, and wait for the broker's answer.
 
         Raises:
             ServerUnavailable: no broker answers.
-            AccessDenied: the broker or its certificate can't be trusted, or it rejects the login.
+            AccessDenied: the broker's certificate isn't trusted, or the broker rejects the login.
             ProtocolMismatch: the broker doesn't speak MQTT 5.
         """
         url = self._broker.url
@@ -168,13 +169,14 @@ class Link:
             why = error.strerror if isinstance(error, OSError) else None
             raise ServerUnavailable(f"no broker at {url}: {why or error}") from error
         found = self._paho.socket()
-        if isinstance(found, socket.socket):  # else the broker closed the connection before the login was sent
+        if isinstance(found, socket.socket):  # otherwise the broker has already closed the connection
             self._socket = found
             try:
-                found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # Nagle would cost 40 ms per message
+                # Without this, Nagle's algorithm delays messages by 40 ms.
+                found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 found.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER_DISCARD)
             except OSError:
-                pass  # on macOS, if the broker has reset the connection; the first read finds that
+                pass  # macOS: the broker has reset the connection, and the first read will report that
         end = time.monotonic() + LOGIN_LIMIT_S
         while self._answer is None and self.ended is None and (left := end - time.monotonic()) > 0:
             events = select.POLLIN | (select.POLLOUT if self.wants_write else 0)
@@ -186,16 +188,16 @@ class Link:
             raise fault
 
     def fileno(self) -> int:
-        """Return the descriptor to poll, -1 once the connection has ended."""
+        """Return the descriptor to poll, or -1 after the end of the connection."""
         return -1 if self._socket is None else self._socket.fileno()
 
     @property
     def wants_write(self) -> bool:
-        """Whether unsent data waits for the descriptor to become writable."""
+        """Whether unsent data is waiting for the descriptor to become writable."""
         return self.ended is None and bool(self._paho.want_write())
 
     def read(self) -> None:
-        """Read what has arrived, without waiting, and pass each message to `on_message`."""
+        """Read available data without waiting, and pass each message to `on_message`."""
         with self._lock:
             while self.ended is None:
                 self._delivering = True
@@ -204,20 +206,20 @@ class Link:
                 finally:
                     self._delivering = False
                 if self.ended is None and self._socket is not None and hasattr(socket, "TCP_QUICKACK"):
-                    # Else this kernel delays the acknowledgement by 40 ms, and the broker's Nagle waits for it.
+                    # Linux delays TCP acknowledgements by 40 ms, and Nagle's algorithm in the broker waits for them.
                     self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
                 if not self._tls_pending():
                     break
             self.write()
 
     def write(self) -> None:
-        """Send as much unsent data as possible without waiting. During `on_message`, leave that to `read`."""
+        """Send as much unsent data as possible without waiting. During `on_message`, `read` does it later."""
         with self._lock:
             if self.wants_write and not self._delivering:
                 self._paho.loop_write()
 
     def tick(self) -> None:
-        """Send and check keepalive messages. Call it every `TICK_EVERY_S`."""
+        """Send and check keepalive messages. Call this every `TICK_EVERY_S`."""
         with self._lock:
             if self.ended is None:
                 self._paho.loop_misc()
@@ -234,17 +236,17 @@ class Link:
         correlation: bytes | None = None,
         acknowledged: OnAcknowledged | None = None,
     ) -> bool:
-        """Publish a message. Return False if the connection has ended.
+        """Publish a message, or return False if the connection has ended.
 
         Args:
-            topic: where to publish.
-            payload: the content.
+            topic: the topic.
+            payload: the payload.
             qos: 0 or 1.
             retain: whether the broker keeps the message for later subscribers.
-            expiry: seconds after which the broker need not deliver the message.
+            expiry: seconds after which the broker discards an undelivered message.
             response: topic for answers.
-            correlation: data for the receiver to repeat in its answers.
-            acknowledged: called by the reading thread with the reason code of the acknowledgement, for QoS 1.
+            correlation: data that the receiver repeats in answers.
+            acknowledged: called with the reason code of the broker's acknowledgement of a QoS 1 message.
         """
         properties = _properties(expiry, response, correlation)
         with self._lock:
@@ -261,7 +263,7 @@ class Link:
         return True
 
     def size_error(self, line: bytes, kind: str) -> RequestRefused | None:
-        """Return the error if a request of this kind is longer than the broker accepts, else None."""
+        """Return an error if a request of this kind is longer than the broker accepts, or None if it isn't."""
         if len(line) <= self.max_payload_bytes:
             return None
         words = f"{kind} has {len(line):,} bytes, and the broker takes {self.max_payload_bytes:,}: nothing was sent"
@@ -271,9 +273,8 @@ class Link:
         """Subscribe to topics.
 
         Args:
-            topics: the topics, with wildcards if needed.
-            retained: whether the broker also sends the messages that it keeps. In both cases, `Message.retained` shows
-                whether the publisher asked to retain a message.
+            topics: the topics, which may contain wildcards.
+            retained: whether to receive the messages that the broker has retained before.
         """
         handling = SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE if retained else SubscribeOptions.RETAIN_DO_NOT_SEND
         options = SubscribeOptions(qos=1, retainAsPublished=True, retainHandling=handling)
@@ -283,7 +284,7 @@ class Link:
                 self.write()
 
     def close(self) -> None:
-        """Close the connection: with a DISCONNECT if all messages are acknowledged, else unsent data is discarded."""
+        """Close the connection. If any message is unacknowledged, discard unsent data and don't send a DISCONNECT."""
         with self._lock:
             logged_in = self._answer is not None and not self._answer.is_failure
             if self.ended is None and self._socket is not None and logged_in and not self._unacknowledged:
@@ -296,22 +297,22 @@ class Link:
                 self._socket = None
 
     def drop(self) -> None:
-        """Close only this process's copy of the descriptor, in a forked child. The parent keeps the connection."""
+        """Close the descriptor in a forked child. The parent's connection stays open."""
         if self._socket is not None:
             os.close(self._socket.detach())
 
     # -- inside
 
     def _tls_pending(self) -> bool:
-        """Return whether TLS holds decrypted data. Polling the descriptor doesn't show that."""
+        """Return whether TLS holds decrypted data, which polling the descriptor doesn't show."""
         return isinstance(self._socket, ssl.SSLSocket) and self._socket.pending() > 0
 
     def _login_fault(self) -> TalkError | None:
-        """Return why the broker rejected the login, None if it accepted."""
+        """Return an error if the login has failed, or None if the broker has accepted it."""
         url, answer = self._broker.url, self._answer
         if answer is None and self._broker.tls and (self._alert or self.ended):
-            # With TLS 1.3, the client's side of the handshake is over before the broker checks the client's
-            # certificate. The broker's alert may be lost together with the connection.
+            # With TLS 1.3, the client finishes its handshake before the broker checks the client's certificate. If the
+            # broker then closes the connection, its alert may get lost.
             why = self._alert or "it ends the connection before it answers"
             which = "the certificate of this client" if self._broker.cert else "a client without a certificate"
             words = f"the broker at {url} does not let {which} in: {why}"
@@ -333,7 +334,7 @@ class Link:
         self, _client: paho.Client, _data: object, _flags: object, code: ReasonCode, properties: Properties | None
     ) -> None:
         self._answer = code
-        # The log is only useful if the login fails. It takes a tenth of the processor time of each packet.
+        # paho's log is needed only if the login fails. It would take a tenth of the processor time for each packet.
         self._paho.on_log = None
         limit = getattr(properties, "MaximumPacketSize", MAX_PACKET_BYTES)
         self.max_payload_bytes = max(0, min(MAX_PACKET_BYTES, limit) - MAX_HEADER_BYTES)
@@ -355,14 +356,14 @@ class Link:
             acknowledged(code.value)
 
     def _on_log(self, _client: paho.Client, _data: object, _level: int, words: str) -> None:
-        # If TLS 1.3 requires a client's certificate, the alert comes with the first read, and paho only logs it.
+        # With TLS 1.3, the alert for a missing client certificate arrives in the first read. paho only logs it.
         if "ALERT" in words and self._answer is None:
             self._alert = words.rpartition("] ")[2].partition(" (")[0]
 
 
 @lru_cache(maxsize=32)
 def _properties(expiry: float | None, response: str | None, correlation: bytes | None) -> Properties | None:
-    """Return the MQTT properties of a message, None if it has none. Cached, because paho is slow at making them."""
+    """Return the MQTT properties of a message, or None if it has none. Cached, because paho creates them slowly."""
     if (expiry, response, correlation) == (None, None, None):
         return None
     properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
@@ -376,10 +377,10 @@ def _properties(expiry: float | None, response: str | None, correlation: bytes |
 
 
 class LinkOpener:
-    """Opens a link in a thread of its own, because that blocks and can't be interrupted."""
+    """Opens a link in a thread, because `Link.open` blocks and can't be interrupted."""
 
     def __init__(self, link: Link, on_done: Callable[[], object]) -> None:
-        """Start to open the link. The thread calls `on_done` at the end, unless `cancel` was called before."""
+        """Start opening the link. The thread calls `on_done` when it has finished, unless `cancel` was called."""
         self.link = link
         self.error: TalkError | None = None
         self.done = False
@@ -389,7 +390,7 @@ class LinkOpener:
         threading.Thread(target=self._open, name="talk: connecting", daemon=True).start()
 
     def cancel(self) -> None:
-        """Close the link as soon as it is open."""
+        """Close the link now if it is open, or else as soon as it opens."""
         with self._lock:
             self._canceled = True
             if self.done:
@@ -400,7 +401,7 @@ class LinkOpener:
             self.link.open()
         except TalkError as error:
             self.error = error
-        except Exception as error:  # noqa: BLE001 - reported to the thread that waits
+        except Exception as error:  # noqa: BLE001 - reported to the waiting thread
             self.error = ServerUnavailable(f"a bug in the connection to the broker: {type(error).__name__}: {error}")
         with self._lock:
             self.done = True

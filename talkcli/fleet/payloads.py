@@ -1,9 +1,11 @@
 """The messages of a fleet: presence, status, and the description of a robot for Home Assistant.
 
-Pure. Anybody may have written a payload that is read here, so a field of the wrong form counts as missing.
+Rules for this file: no I/O. Any client of the broker may have written a received payload, so invalid fields are treated
+as missing.
 
 Rules for `homeassistant_device`: use only keys that Home Assistant documents, and values from presence or status. Write
-templates that Jinja and Python read alike. Never rename a component: Home Assistant would take it for another one.
+templates that mean the same in Jinja and in Python, because tests evaluate them in Python. Never rename a component,
+because Home Assistant would treat it as a new one.
 """
 
 from __future__ import annotations
@@ -28,10 +30,11 @@ class Message:
 
     topic: str
     payload: bytes
-    #: whether the broker keeps it for later subscribers
+    #: whether the publisher asked the broker to retain the message
     retained: bool = False
-    #: the topic that the sender named for answers
+    #: the topic for answers, if the sender named one
     response: str | None = None
+    #: data that the sender wants to be repeated in answers
     correlation: bytes | None = None
     #: seconds until the message expires; None if it never does
     expiry: int | None = None
@@ -39,29 +42,27 @@ class Message:
 
 @frozen
 class Presence:
-    """Whether a robot is online, and what its bridge last said about it."""
+    """Whether a robot is online, and its latest description by its bridge."""
 
     name: str
     online: bool
-    #: random name of this run of the bridge; "" if unknown
+    #: random id of the bridge process; "" if unknown
     session: str = ""
-    #: when the bridge started, in seconds since 1970 UTC by the robot's clock; None if it is offline
+    #: start time of the bridge, in seconds since 1970 UTC by the robot's clock; None if the robot is offline
     since: float | None = None
     groups: tuple[str, ...] = ()
-    #: the requests that the robot accepts over the broker
+    #: kinds of requests that the robot accepts over the broker
     allow: tuple[str, ...] = ()
     #: boot id, pid and version of the robot's server; None if no server runs
     server: JsonObject | None = None
-    #: version of the bridge; "" if it is offline
+    #: version of the bridge; "" if the robot is offline
     version: str = ""
 
     @classmethod
     def read(cls, name: str, payload: bytes) -> Presence | None:
-        """Return the presence in a retained message, None if it was cleared or can't be read.
+        """Return the presence in a message, or None if the robot's name or the payload is invalid.
 
-        Args:
-            name: the robot's level in the topic. If no robot can have this name, the result is None.
-            payload: the message's payload.
+        An empty payload, which clears a retained presence, is invalid, too.
         """
         said = _object(payload)
         if said is None or topics.name_fault(name):
@@ -79,14 +80,17 @@ class Presence:
         )
 
     def to_json(self) -> JsonObject:
-        """Return the presence as an object for programs, without the robot's name."""
+        """Return the presence as a JSON object, without the robot's name."""
         said = fields(self)
         del said["name"]
         return {**said, "groups": list(self.groups), "allow": list(self.allow)}
 
 
 def bridge_rank(presence: Presence | None) -> tuple[float, str] | None:
-    """Return the rank among bridges of the same name: the lowest one stays. None if no bridge is online."""
+    """Return the rank of a bridge among bridges of the same robot, or None if the bridge is offline.
+
+    The bridge with the lowest rank keeps the robot's name. The others exit.
+    """
     if presence is None or presence.since is None or not (presence.online and presence.session):
         return None
     return presence.since, presence.session
@@ -94,33 +98,33 @@ def bridge_rank(presence: Presence | None) -> tuple[float, str] | None:
 
 @frozen
 class LastGoal:
-    """The goal that ended last on a robot."""
+    """The goal that ended most recently on a robot."""
 
     id: str
     state: State
     reason: str | None = None
-    #: None if the robot keeps texts private
+    #: the goal's text; None if the robot keeps texts private
     text: str | None = None
-    #: when the goal ended, in seconds since 1970 UTC by the robot's clock
+    #: end of the goal, in seconds since 1970 UTC by the robot's clock
     at: float | None = None
 
 
 @frozen
 class RobotStatus:
-    """The goals of a robot: the one that is being spoken, how many wait, and which one ended last."""
+    """A robot's active goal, its number of pending goals, and the goal that ended last."""
 
-    #: id of the goal that is being spoken
+    #: id of the active goal; None if there is none
     active: str | None = None
-    #: its text; None if the robot keeps texts private
+    #: the active goal's text; None if the robot keeps texts private
     text: str | None = None
-    #: how many goals wait
+    #: number of pending goals
     pending: int = 0
     paused: bool = False
     last: LastGoal | None = None
 
     @classmethod
     def read(cls, payload: bytes) -> RobotStatus | None:
-        """Return the status in a retained message, None if it was cleared or can't be read."""
+        """Return the status in a message, or None if the payload is empty or malformed."""
         said = _object(payload)
         if said is None:
             return None
@@ -135,7 +139,7 @@ class RobotStatus:
         )
 
     def events(self) -> list[StateChanged]:
-        """Return the events that led to this status: the end of the last goal, and the start of the active one."""
+        """Return the events that led to this status: the end of the last goal and the start of the active goal."""
         last, found = self.last, []
         if last:
             ended = Goal(last.id, last.state, last.text, last.reason, ended_at=last.at)
@@ -146,27 +150,27 @@ class RobotStatus:
         return found
 
     def to_json(self) -> JsonObject:
-        """Return the status as an object for programs."""
+        """Return the status as a JSON object."""
         last = self.last
         return {**fields(self), "last": None if last is None else {**fields(last), "state": last.state.name}}
 
 
 @frozen
 class RobotInfo:
-    """A robot's presence together with its last status."""
+    """A robot's presence and its latest status."""
 
     presence: Presence
-    #: the last known status, also if the robot is offline; None if there is none
+    #: the latest known status, which is kept while the robot is offline; None if unknown
     status: RobotStatus | None
 
     def to_json(self) -> JsonObject:
-        """Return both as an object for programs."""
+        """Return the robot's name, presence and status as a JSON object."""
         status = None if self.status is None else self.status.to_json()
         return {"robot": self.presence.name, "presence": self.presence.to_json(), "status": status}
 
 
 def _object(payload: bytes) -> JsonObject | None:
-    """Return the JSON object in a payload, None if there is none."""
+    """Return the JSON object in a payload, or None if the payload is anything else."""
     try:
         return decode(payload.strip())
     except BadRequest:
@@ -183,12 +187,12 @@ def _texts(value: object) -> tuple[str, ...]:
 
 # -- Home Assistant
 
-#: What Home Assistant publishes on its status topic when it starts.
+#: Payload that Home Assistant publishes on its status topic when it starts.
 HOMEASSISTANT_ONLINE = b"online"
 
-#: Template for presence: whether a sentence would be spoken now.
+#: Template for the presence payload: whether the robot can speak now.
 _AVAILABLE = "{{ 'online' if value_json.online and value_json.server else 'offline' }}"
-# Templates for the status. In Home Assistant, the state `None` means unknown.
+# Templates for the status payload. Home Assistant shows the state `None` as unknown.
 _STATE_TEMPLATE = "{{ 'paused' if value_json.paused else 'speaking' if value_json.active else 'idle' }}"
 _SPEAKING_TEMPLATE = "{{ 'ON' if value_json.active and not value_json.paused else 'OFF' }}"
 _PENDING_TEMPLATE = "{{ value_json.pending }}"
@@ -197,12 +201,12 @@ _LAST_ATTRIBUTES_TEMPLATE = "{{ (value_json.last or {}) | tojson }}"
 
 
 def homeassistant_device(name: str, allow: Collection[str], version: str) -> tuple[str, bytes]:
-    """Return the topic and the payload that make a robot a device in Home Assistant.
+    """Return the topic and the payload of the message that adds a robot to Home Assistant as a device.
 
     Args:
         name: the robot's name.
-        allow: the requests that the robot accepts. Components for other requests are described as empty, so that
-            Home Assistant removes them if it had them before.
+        allow: kinds of requests that the robot accepts. Components for other requests are sent without content, so that
+            Home Assistant removes them if they exist.
         version: the bridge's version.
     """
     identifier = f"{topics.PREFIX}-{name}"
@@ -235,7 +239,7 @@ def homeassistant_device(name: str, allow: Collection[str], version: str) -> tup
 
 
 def _command(name: str, kind: str, platform: str, shown: str | None, *, allowed: bool) -> JsonObject:
-    """Return a component that sends a request to the robot, or an empty one if the request is not allowed."""
+    """Return a component that sends a request to the robot, without content if the request isn't allowed."""
     if not allowed:
         return {"platform": platform}
     topic = topics.robot(name, kind, topics.HOMEASSISTANT)
@@ -243,6 +247,6 @@ def _command(name: str, kind: str, platform: str, shown: str | None, *, allowed:
 
 
 def _sensor(name: str, shown: str, template: str, platform: str = "sensor", **more: object) -> JsonObject:
-    """Return a component that shows a part of the robot's status."""
+    """Return a component that shows part of the robot's status."""
     topic = topics.robot(name, topics.STATUS)
     return {"platform": platform, "name": shown, "state_topic": topic, "value_template": template, "qos": 1, **more}

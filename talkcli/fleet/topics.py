@@ -1,8 +1,8 @@
-"""The topics of a fleet on the broker, and the access rules for them.
+"""The MQTT topics of a fleet, and the broker's access rules for them.
 
-Pure. Rules for this file: topics may be added, but never renamed or given another meaning. The last level of a topic
-names the client that asks, because a broker's access rules can tie only that level to a login. The levels before it
-name the robot or group that is asked.
+Rules for this file: no I/O. Topics may be added, but an existing topic is never renamed or reused. The last level of a
+request topic is the sender's user name, because MQTT doesn't tell the receiver who sent a message. The access rules tie
+that level to the sender's login. The levels before it name the receiving robot or group.
 """
 
 from __future__ import annotations
@@ -14,30 +14,30 @@ from talkcli.goals.options import MAX_SENDER_NAME_CHARS
 
 PREFIX = "talk"
 ROBOT_LEVEL, _GROUP, _REPLY = "robot", "group", "reply"
-#: The group of all robots.
+#: The group that every robot belongs to.
 ALL_ROBOTS = "all"
-#: Matches any level in a subscription.
+#: Wildcard for one level of a topic in a subscription.
 ANY = "+"
-#: Takes the place of the robot in the topic that a desk publishes to itself. No robot can have this name.
+#: Level in place of a robot's name, in the topic that a desk publishes to itself. It is not a valid robot name.
 MARKER = "_"
-#: Beginning of the name by which the server knows a remote client; the client's user name follows.
+#: Prefix of a remote client's name at the server, followed by the client's user name.
 REMOTE_PREFIX = "mqtt:"
-#: Longest name of a robot, a group or a user.
+#: Maximum length of the name of a robot, a group or a user.
 MAX_NAME_CHARS = MAX_SENDER_NAME_CHARS - len(REMOTE_PREFIX)
 _NAME_PATTERN = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{MAX_NAME_CHARS - 1}}}")
 
-# The levels below a robot's name. A client sends to the first three.
+# The levels below a robot's name. Clients publish requests on the first three.
 REQUEST, PLAIN_SAY, PLAIN_CANCEL = "request", "say", "cancel"
 PRESENCE, STATUS, EVENT, ECHO = "presence", "status", "event", "echo"
 
 #: Home Assistant's user name at the broker, and the prefix of its own topics.
 HOMEASSISTANT = "homeassistant"
-#: Where Home Assistant says whether it is running.
+#: Topic on which Home Assistant publishes whether it is running.
 HOMEASSISTANT_STATUS = f"{HOMEASSISTANT}/status"
 
 
 def name_fault(name: str) -> str | None:
-    """Return why a robot, a group or a user can't have this name, in words for people. None if it can."""
+    """Return why a name is invalid for a robot, a group or a user, or None if it is valid."""
     if _NAME_PATTERN.fullmatch(name):
         return None
     return f"must be 1 to {MAX_NAME_CHARS} of A-Z a-z 0-9 . _ -, the first of them a letter or a digit"
@@ -54,18 +54,18 @@ def group(name: str, *levels: str) -> str:
 
 
 def reply(user: str, session: str, *robot_name: str) -> str:
-    """Return the topic on which a robot answers a session of this user.
+    """Return the topic on which a robot answers a user's session.
 
-    Without a robot's name, return the response topic for a request to several robots.
+    Without a robot's name, return the response topic for a request to a group.
     """
     return "/".join((PREFIX, _REPLY, user, session, *robot_name))
 
 
 def homeassistant_device(name: str) -> str:
-    """Return the topic where Home Assistant reads the description of a robot.
+    """Return the topic on which Home Assistant expects the description of a robot.
 
-    The name is a level of its own, because a pattern in access rules can tie only a whole level to a login. Home
-    Assistant allows no dots in these levels, so a name with a dot is escaped and put below another level.
+    The robot's name is a whole level, because a pattern in access rules can match a login only against a whole level.
+    Home Assistant allows no dots in this level, so a name with a dot is escaped and put below a different level.
     """
     if "." not in name:
         return "/".join((HOMEASSISTANT, "device", PREFIX, name, "config"))
@@ -79,12 +79,12 @@ class RequestTopic:
 
     #: REQUEST, PLAIN_SAY or PLAIN_CANCEL
     kind: str
-    #: the client's user name, which the broker's access rules check
+    #: the client's user name, verified by the broker's access rules
     user: str
 
 
 def parse_request(topic: str) -> RequestTopic | None:
-    """Return the parts of a topic for requests, None if it is another topic."""
+    """Return the parts of a request topic, or None if it is another kind of topic."""
     prefix, _, rest = topic.partition("/")
     levels = rest.split("/")
     if prefix != PREFIX or len(levels) != 4 or name_fault(levels[3]):
@@ -95,9 +95,9 @@ def parse_request(topic: str) -> RequestTopic | None:
 
 
 def checked_reply(response: str, user: str, robot_name: str) -> str | None:
-    """Return the topic on which a robot answers this user, None if the response topic is not the user's own.
+    """Return the topic on which a robot answers a user, or None if the response topic isn't the user's own.
 
-    So nobody can make a robot publish to another user or to another robot.
+    This prevents users from making a robot publish to other users or on another robot's topic.
     """
     levels = response.split("/")
     if levels[:3] != [PREFIX, _REPLY, user] or len(levels) not in (4, 5) or name_fault(levels[3]):
@@ -110,15 +110,16 @@ def access_rules(
 ) -> str:
     """Return the content of mosquitto's `acl_file` for a fleet.
 
-    Robots are covered by patterns, because each logs in by its own name. Operators are listed by name: mosquitto
-    applies patterns to everybody, so a pattern for operators would let each robot command the others. The patterns for
-    robots do no harm to that: they let operators read requests to groups, and use the topics of a robot that has the
-    operator's name, which doesn't exist.
+    Robots are covered by patterns, because each robot logs in under its own name. Operators are listed by name, because
+    mosquitto applies patterns to all users. With a pattern for operators, each robot could command the others. The
+    patterns for robots also apply to operators, which is harmless. They let operators read requests to groups, and use
+    the topics of a robot with the operator's name, if there were such a robot.
 
     Args:
         operators: the users who may command every robot.
         homeassistant: whether to add the rules for Home Assistant.
-        name: a robot that Home Assistant knows. If its name has a dot, no pattern matches, so it gets its own rule.
+        name: a robot that is shown in Home Assistant. A name with a dot gets its own rule, because the pattern for the
+            other robots doesn't match its topic.
     """
     lines = [
         "# Robots: each logs in by its own name, %u, and is heard under that alone.",

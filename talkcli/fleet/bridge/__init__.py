@@ -1,1 +1,1 @@
-"""The robot's side of a fleet: a process that connects the robot's server to the broker."""
+"""The bridge, a process that connects a robot's server to the broker."""

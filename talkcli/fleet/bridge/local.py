@@ -1,11 +1,11 @@
-"""The bridge's connections to the robot's own server: shells around the client core, in the event loop.
+"""The bridge's connections to the robot's server.
 
-They don't decode lines, except the greeting, because most lines are only passed on.
+They are shells around the client core, and run in the event loop. They pass lines on without decoding them.
 """
 
 from __future__ import annotations
 
-import _socket  # see `peers`
+import _socket  # the type of the sockets that `connect.reach` returns
 import asyncio
 import contextlib
 import random
@@ -25,25 +25,25 @@ _CHUNK_BYTES = 64 * 1024
 
 
 class LocalConnection(ClientCore):
-    """A connection to the server of this machine, used by one reader.
+    """A connection to the robot's server. Only one task at a time may read from it.
 
-    It uses the loop directly. With asyncio's transports, each new client takes 1.6 times the processor time, which
-    matters when somebody cancels everything on a thousand robots.
+    It uses the event loop's callbacks for descriptors. With asyncio's transports, each new connection takes 1.6 times
+    the processor time, which matters when an operator cancels everything on a thousand robots.
     """
 
     def __init__(self, socket: _socket.socket, path: str) -> None:
-        """`socket` is connected to the server at `path` and doesn't block."""
+        """Use a non-blocking socket that is connected to the server at `path`."""
         self._loop = asyncio.get_running_loop()
         super().__init__(connect.ANSWER_LIMIT_S, self._loop.time())
         self.path = path
         self._socket = socket
         self._lines: list[bytes] = []
-        #: done as soon as there may be something to read
+        #: completed when there may be data to read
         self._readable: asyncio.Future[None] | None = None
         self._closed = False
 
     async def greet(self, hello: JsonObject) -> None:
-        """Say hello, and wait for the server's greeting. The connection is closed if there is none that can be used.
+        """Send a hello line, and wait for the server's greeting. If that fails, close the connection.
 
         Raises:
             ServerUnavailable, AccessDenied, ProtocolMismatch, Busy: the server can't be used.
@@ -68,7 +68,7 @@ class LocalConnection(ClientCore):
         self.connected(*identity(greeting), self._loop.time())
 
     async def read(self) -> list[bytes]:
-        """Wait for lines, and return them without their newlines. Return none if the connection has ended."""
+        """Wait for lines and return them without newlines, or return an empty list if the connection has ended."""
         while not self._lines:
             data = await self._receive()
             if not data:
@@ -78,20 +78,20 @@ class LocalConnection(ClientCore):
         return lines
 
     def send(self, exchange: Exchange) -> bool:
-        """Send a request as soon as the server accepts it. Return False if it is too long."""
+        """Send a request as soon as the server can receive it, or return False if it is too long."""
         self.register(exchange, self._loop.time())
         line = self.line(exchange)
         if len(line) > MAX_LINE_BYTES:
             self.forget(exchange)
             return False
-        with contextlib.suppress(ServerUnavailable):  # the reader finds that the connection has ended
+        with contextlib.suppress(ServerUnavailable):  # `read` will report the end of the connection
             self.queue(line, exchange)
-        if len(line) == self.unsent_bytes:  # else the loop is waiting for the server
+        if len(line) == self.unsent_bytes:  # otherwise the loop is already waiting to send
             self._flush()
         return True
 
     def close(self) -> None:
-        """Close the connection now. The server cancels unanswered requests if that is still possible."""
+        """Close the connection. The server then cancels the unanswered requests, unless it is too late."""
         if not self._closed:
             self._closed = True
             self._loop.remove_reader(self._socket)
@@ -100,8 +100,8 @@ class LocalConnection(ClientCore):
             self._wake()
 
     async def _receive(self) -> bytes:
-        """Return the next data, nothing if the connection has ended."""
-        await asyncio.sleep(0)  # lets other tasks run if the server sends a lot
+        """Wait for data and return it, or return b"" if the connection has ended."""
+        await asyncio.sleep(0)  # let other tasks run even if data is always available
         while not self._closed:
             try:
                 return self._socket.recv(_CHUNK_BYTES)
@@ -123,6 +123,7 @@ class LocalConnection(ClientCore):
             self._readable.set_result(None)
 
     def _flush(self) -> None:
+        """Send as much as possible without waiting. Send the rest when the socket becomes writable."""
         if self._closed:
             return
         try:
@@ -130,7 +131,7 @@ class LocalConnection(ClientCore):
         except BlockingIOError:
             pass
         except OSError as error:
-            # A part of a line may have been sent, so nothing may follow. The reader finds that the connection ended.
+            # Nothing may follow, because part of a line may have been sent. `read` will report the end.
             self.stop_sending("the server went away", str(error))
             with contextlib.suppress(OSError):
                 self._socket.shutdown(_socket.SHUT_RDWR)
@@ -146,14 +147,14 @@ async def dial(
     """Connect to the server, and wait for its greeting.
 
     Args:
-        socket: path of the server's socket, None for the usual places.
-        name: what the client calls itself.
-        urgent: whether the client only sends `status` and `cancel`, for which a full server keeps some places.
-        slots: limits how many connections wait for a greeting at the same time. A hung server keeps a connection in
-            its backlog although the client has closed it, so a cancelled call keeps its slot until the server answers.
+        socket: path of the server's socket, or None for the default locations.
+        name: the client's name.
+        urgent: whether the client sends only `status` and `cancel`. The server reserves connections for such clients.
+        slots: limits how many connections wait for a greeting at the same time. A cancelled call keeps its slot until
+            the server answers, because a hung server's backlog also holds connections that the client has closed.
 
     Raises:
-        ServerUnavailable, AccessDenied, ProtocolMismatch, Busy: no server can be used.
+        ServerUnavailable, AccessDenied, ProtocolMismatch, Busy: no usable server was found.
     """
     if slots:
         await slots.acquire()
@@ -168,6 +169,7 @@ async def dial(
 
 
 def _discard(dialing: asyncio.Task[LocalConnection]) -> None:
+    """Close the connection that was made after its `dial` had been cancelled."""
     if not dialing.cancelled() and not dialing.exception():
         dialing.result().close()
 
@@ -184,7 +186,7 @@ async def _dial(place: str | None, hello: JsonObject) -> LocalConnection:
             try:
                 await connection.greet(hello)
                 return connection
-            except AccessDenied as denied:  # try the next place
+            except AccessDenied as denied:  # try the next location
                 failures = (*attempt.failures, (attempt.path, denied))
                 continue
             except Busy as busy:

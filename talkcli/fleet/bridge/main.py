@@ -1,7 +1,7 @@
-"""The bridge: it puts one robot on the broker, as a client of the robot's server.
+"""The bridge connects one robot's server to the broker.
 
-It keeps a connection to the broker, publishes the robot's presence, and measures how old messages may be. `policy`
-decides about requests, `session` carries them out, and `publisher` watches the server.
+This module maintains the connection to the broker, publishes the robot's presence, and detects outdated messages.
+`policy` decides which requests are accepted, `session` carries them out, and `publisher` watches the server.
 """
 
 from __future__ import annotations
@@ -34,29 +34,29 @@ if TYPE_CHECKING:
     from talkcli.fleet.payloads import Message
     from talkcli.goals.goal import JsonObject
 
-#: How long the broker keeps the presence of a robot, and the time between two renewals.
+#: How long the broker keeps a robot's presence, and the interval at which the bridge renews it.
 PRESENCE_EXPIRY_S, PRESENCE_EVERY_S = 150, 60.0
-#: Time for another bridge of the same name to answer.
+#: Time allowed for another bridge of the same robot to answer.
 _RIVAL_LIMIT_S = 1.0
-#: Longest pause before the first try to reach the broker again, and before later tries. The pause is random, so that a
-#: thousand robots don't come back together.
+#: Upper limit of the random pause before the first attempt to reconnect to the broker, and before later attempts.
+#: Without randomness, a thousand robots would reconnect at the same time.
 _FIRST_BROKER_RETRY_S, _LAST_BROKER_RETRY_S = 0.5, 10.0
-#: Time without a returning echo after which the connection counts as dead.
+#: Time without a returned echo after which the connection is closed.
 _ECHO_TIMEOUT_S = 15.0
-#: Shortest time between two echoes. A message that is refused as stale causes one.
+#: Minimum time between the last echo and the extra echo that follows the refusal of a stale message.
 _ECHO_PAUSE_S = 1.0
-#: Unsent data above which events are left out and nothing is read from the server.
+#: Amount of unsent data above which events are dropped and nothing is read from the server.
 SLOW_BROKER_BYTES = 256 * 1024
-#: Unsent data above which the connection is closed.
+#: Amount of unsent data above which the connection is closed.
 STUCK_BROKER_BYTES = 4 * 1024 * 1024
-#: Largest packet that the broker may send: the longest request, and some more, so that longer ones get an error. paho
-#: needs several seconds for 250 kB of MQTT properties, and a tenth of a second for a quarter of that.
+#: Largest packet that the broker may send. Requests that are slightly too long fit, so that they can be answered with
+#: an error. A larger limit would be risky, because paho needs several seconds to parse 250 kB of MQTT properties.
 _MAX_INCOMING_BYTES = MAX_LINE_BYTES + 8 * 1024
-#: A robot answers a Home Assistant that has started after a random delay of at most this time.
+#: Upper limit of the random delay before a robot describes itself to a Home Assistant that has just started.
 _DEVICE_DELAY_S = 3.0
-#: Time for the broker to take the goodbye.
+#: Time allowed for the broker to acknowledge the bridge's last message.
 _OFFLINE_LIMIT_S = 1.0
-#: Beginning of a message on the echo topic that asks whether another bridge has this name.
+#: Prefix of the message on the echo topic that asks whether another bridge uses this robot's name.
 _RIVAL_QUESTION = b"? "
 _RIGHTS = "may its user do there what 'talk bridge --print-acl' has for these options?"
 
@@ -68,15 +68,15 @@ class BridgeSettings:
     #: the robot's name
     name: str
     broker: Broker
-    #: the kinds of requests that remote clients may send
+    #: kinds of requests that remote clients may send
     allow: tuple[str, ...]
-    #: the robot's groups, besides the group of all robots
+    #: the robot's groups, not including the group of all robots
     groups: tuple[str, ...] = ()
-    #: path of the server's socket; None for the usual places
+    #: path of the server's socket; None for the default locations
     socket: str | None = None
-    #: whether everybody may read the texts of goals
+    #: whether events and statuses contain the texts of goals
     with_text: bool = True
-    #: whether the robot is a device in Home Assistant
+    #: whether to add the robot to Home Assistant as a device
     homeassistant: bool = False
 
 
@@ -85,11 +85,11 @@ def run_bridge(settings: BridgeSettings, read_broker: Callable[[], Broker]) -> i
 
     Args:
         settings: the settings.
-        read_broker: reads the broker's settings again before each new connection, because a password may have changed.
+        read_broker: called before each reconnection to read the broker's settings, because a password may have changed.
 
     Raises:
-        UsageError: a file for TLS is unusable.
-        AddressInUse: an older bridge has the same name.
+        UsageError: the file of a certificate or key is unusable.
+        AddressInUse: an older bridge has the same robot name.
     """
     asyncio.run(_run(settings, read_broker))
     return EXIT_OK
@@ -103,19 +103,19 @@ async def _run(settings: BridgeSettings, read_broker: Callable[[], Broker]) -> N
         bridge.end()
 
     loop.set_exception_handler(log.handle_loop_error)
-    # A shell without job control starts background programs with SIGINT ignored.
+    # If SIGINT is ignored, leave it so: a shell without job control starts background programs like this.
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
         loop.add_signal_handler(signal.SIGINT, on_signal, signal.SIGINT)
     loop.add_signal_handler(signal.SIGTERM, on_signal, signal.SIGTERM)
-    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the robot stays when the terminal closes
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # keep running when the terminal closes
     await bridge.run()
 
 
 class Bridge:
-    """One robot on the broker. All methods run in the event loop's thread."""
+    """Connects one robot to the broker. All methods run in the event loop's thread."""
 
     def __init__(self, settings: BridgeSettings, read_broker: Callable[[], Broker]) -> None:
-        """Start offline; the arguments are those of `run_bridge`."""
+        """Start offline. The arguments are those of `run_bridge`."""
         self._settings = settings
         self._echo_topic = topics.robot(settings.name, topics.ECHO)
         self._presence_topic = topics.robot(settings.name, topics.PRESENCE)
@@ -133,28 +133,30 @@ class Bridge:
             self._sessions, self._publish_to_all, self._server_changed, with_text=settings.with_text
         )
         self._link: Link | None = None
-        #: the link's descriptor as the loop knows it, and whether the loop waits until it can be written
+        #: the link's descriptor in the event loop, or -1, and whether the loop waits for it to become writable
         self._descriptor, self._writing = -1, False
         self._disconnected = asyncio.Event()
-        #: whether this bridge owns the robot's name, so that it may be online
+        #: whether this bridge has claimed the robot's name on the current connection
         self._owns_name = False
-        #: whether the broker keeps the presence of another bridge
+        #: whether the broker has retained the presence of another bridge
         self._rival_seen = False
-        #: waits for the answer of another bridge
+        #: claims the name unless another bridge answers before
         self._rival_timer: asyncio.TimerHandle | None = None
         self._echoes = EchoTracker(boottime())
-        # By the loop's clock: the last echo, the first one since the last that returned, and the last presence.
+        #: when the last echo was sent (loop clock)
         self._echo_at = 0.0
+        #: when the first echo after the last returned one was sent (loop clock); None if no echo is outstanding
         self._unanswered_since: float | None = None
+        #: when the presence was last published (loop clock)
         self._presence_at = 0.0
-        #: publishes the device for a Home Assistant that has started
+        #: describes the robot to a Home Assistant that has just started
         self._device_timer: asyncio.TimerHandle | None = None
         self._ending = asyncio.Event()
         self._error: BaseException | None = None
 
     async def run(self) -> None:
-        """Run until `end` is called."""
-        self._broker.ssl_context()  # raises UsageError before anything is started
+        """Keep the robot connected until `end` is called."""
+        self._broker.ssl_context()  # raise UsageError before starting anything
         log.write(f"robot {self._settings.name}, by the broker at {self._settings.broker.url}")
         self._systemd.notify_ready()
         tasks = [asyncio.create_task(each) for each in (self._stay_connected(), self._publisher.run())]
@@ -175,18 +177,18 @@ class Bridge:
             raise self._error
 
     def end(self, error: BaseException | None = None) -> None:
-        """Make `run` go offline, and return or raise this error."""
+        """Stop `run`, which takes the robot offline and then raises the error, if any."""
         self._error = self._error or error
         self._ending.set()
 
     def _on_task_done(self, task: asyncio.Task[None]) -> None:
-        """End the bridge if a task has failed, so that the service manager starts it again."""
+        """End the bridge if a task has failed, so that the service manager restarts it."""
         if not task.cancelled() and (error := task.exception()):
             self.end(error)
 
     @property
     def ready(self) -> bool:
-        """Whether the robot is online and has a server."""
+        """Whether the robot is online and its server is running."""
         return self._owns_name and self._link is not None and self._publisher.server is not None
 
     def _status_text(self) -> str:
@@ -205,7 +207,7 @@ class Bridge:
         return Link(self._broker, client_id, self._on_message, will, _MAX_INCOMING_BYTES)
 
     async def _stay_connected(self) -> None:
-        """Connect to the broker, and connect again whenever the connection ends."""
+        """Connect to the broker, and reconnect whenever the connection ends."""
         retry_s = _FIRST_BROKER_RETRY_S
         while True:
             try:
@@ -228,6 +230,7 @@ class Bridge:
                 log.write_limited("settings", f"{log.sanitize(str(error))}; what was there before is used")
 
     async def _open(self, link: Link) -> None:
+        """Open a link without blocking the event loop."""
         done = asyncio.Event()
         opener = LinkOpener(link, lambda: self._loop.call_soon_threadsafe(done.set))
         try:
@@ -239,7 +242,7 @@ class Bridge:
             raise opener.error
 
     def _on_connect(self, link: Link) -> None:
-        """Start to use a new connection. First find out whether another bridge has this name."""
+        """Start to use a new connection, first to find out whether another bridge has the robot's name."""
         self._disconnected.clear()
         self._link, self._descriptor = link, link.fileno()
         self._owns_name, self._rival_seen, self._rival_timer = False, False, None
@@ -248,13 +251,13 @@ class Bridge:
         self._unanswered_since = None
         link.subscribe(self._presence_topic, retained=True)
         link.subscribe(self._echo_topic, retained=False)
-        # The broker sends the retained presence of another bridge before this question returns. If that bridge is
-        # still alive, its answer comes after that.
+        # The retained presence of another bridge arrives before this question returns. If the other bridge is still
+        # running, its answer arrives after the question.
         self._publish(self._echo_topic, _RIVAL_QUESTION + self._session.encode())
         self._send_echo()
 
     def _take_name(self) -> None:
-        """Go online: accept requests, and publish the robot's presence."""
+        """Claim the robot's name, accept requests, and publish the robot's presence."""
         if self._owns_name or self._link is None:
             return
         self._owns_name = True
@@ -272,7 +275,7 @@ class Bridge:
         log.write(f"online, at {self._settings.broker.url}")
 
     def _disconnect(self, link: Link) -> None:
-        """Close a connection and end all sessions. It may be called again."""
+        """Close a connection and end all sessions. Do nothing if that has been done."""
         if self._link is link:
             self._link = None
             self._forget_descriptor()
@@ -286,20 +289,20 @@ class Bridge:
     def _forget_descriptor(self) -> None:
         if self._descriptor >= 0:
             for forget in (self._loop.remove_reader, self._loop.remove_writer):
-                # If paho has closed it already, the loop forgets it with an error.
+                # If paho has closed the socket, the loop removes the descriptor but raises an error.
                 with contextlib.suppress(OSError):
                     forget(self._descriptor)
             self._descriptor, self._writing = -1, False
 
     def _use(self, action: Callable[[Link], None]) -> None:
-        """Read or write, when the loop says that it is possible."""
+        """Read from the link or write to it, after the loop has found it ready."""
         link = self._link
         if link:
             action(link)
             self._check_link(link)
 
     def _check_link(self, link: Link) -> None:
-        """React to the state of the connection after it was used."""
+        """Handle a broken link, and adapt to the amount of unsent data. Call this after each use of the link."""
         if link is not self._link or self._descriptor < 0:
             return
         if link.ended is None and link.outstanding_bytes > STUCK_BROKER_BYTES:
@@ -309,8 +312,8 @@ class Bridge:
             )
             link.close()
         if link.ended is not None:
-            # Forget the descriptor now, because another file may get the number. Do the rest later, because the caller
-            # may be in the middle of something.
+            # Forget the descriptor now, because another file may get its number. Disconnect later, because the caller
+            # may still be working with the sessions.
             self._forget_descriptor()
             self._loop.call_soon(self._disconnect, link)
             return
@@ -338,12 +341,12 @@ class Bridge:
         return done
 
     def _publish_reply(self, topic: str, payload: bytes, qos: int, correlation: bytes | None) -> None:
-        """Publish lines to a remote client."""
+        """Publish lines for a remote client."""
         acknowledged = self._check_rights if qos else None
         self._publish(topic, payload, qos, correlation=correlation, acknowledged=acknowledged)
 
     def _publish_to_all(self, topic: str, payload: bytes, expiry: float | None) -> None:
-        """Publish an event, or retain a message that doesn't expire. If the broker is slow, events are left out."""
+        """Publish an event that expires, or a retained message. Drop events if the broker is slow."""
         retain = expiry is None
         if self._owns_name and self._link and (retain or self._link.outstanding_bytes <= SLOW_BROKER_BYTES):
             self._publish(topic, payload, retain=retain, expiry=expiry)
@@ -408,7 +411,7 @@ class Bridge:
             self._unanswered_since = None
 
     def _handle_presence(self, payload: bytes) -> None:
-        """Handle a presence message about this robot. It comes from this bridge, an ended one, or a rival."""
+        """Process a presence message of this robot, from this bridge, an ended one, or a rival."""
         presence = Presence.read(self._settings.name, payload)
         rank = bridge_rank(presence)
         if payload and (presence is None or (presence.online and rank is None)):
@@ -417,16 +420,16 @@ class Bridge:
         if rank and rank[1] == self._session:
             return
         if not self._rival_timer and not self._owns_name:
-            self._rival_seen = rank is not None  # a retained message, so its bridge may be gone
+            self._rival_seen = rank is not None  # the bridge of a retained message may have ended
         elif rank is None:
             if self._owns_name:
-                self._publish_presence()  # replaces a late will, or an ignored message
+                self._publish_presence()  # replace a late will or an ignored message
         elif rank < (self._since, self._session):
             words = f"another bridge is '{self._settings.name}' already: session {log.sanitize(rank[1])}"
             self.end(AddressInUse(f"{words}; each robot has a name of its own, give another --name"))
         else:
             self._take_name()
-            self._publish_presence()  # for the younger bridge
+            self._publish_presence()  # tell the younger bridge that the name is in use
 
     # -- what this bridge publishes about itself
 
@@ -451,7 +454,7 @@ class Bridge:
         return encode({"talk": 1, "online": False, "session": self._session, "groups": list(self._groups)})
 
     def _publish_device(self) -> None:
-        """Publish the robot's description for Home Assistant if that is wanted. The broker keeps it."""
+        """Publish the robot's description for Home Assistant as a retained message, if enabled."""
         self._device_timer = None
         if self._settings.homeassistant and self._owns_name:
             topic, device = homeassistant_device(self._settings.name, self._settings.allow, __version__)
@@ -470,7 +473,7 @@ class Bridge:
         self._publish(self._echo_topic, f"{self._session} {number}".encode())
 
     def _tick(self, due: float) -> None:
-        """Do the regular work, which was due at this time."""
+        """Do the periodic work. `due` is the time for which this call was scheduled."""
         now = self._loop.time()
         self._tick_timer = self._loop.call_at(now + ECHO_EVERY_S, self._tick, now + ECHO_EVERY_S)
         self._sessions.tick()
@@ -481,7 +484,7 @@ class Bridge:
         link.tick()
         self._check_link(link)
         if self._unanswered_since is not None:
-            # If this process itself was stopped, messages that came meanwhile have yet to be read.
+            # Don't count the time while this process was stopped, because returned echoes are still unread.
             self._unanswered_since += now - due
             if now - self._unanswered_since > _ECHO_TIMEOUT_S:
                 log.write_limited("echo", f"nothing that this robot sends itself comes back: {_RIGHTS}")
@@ -492,18 +495,19 @@ class Bridge:
             self._publish_presence()
 
     async def _go_offline(self) -> None:
-        """Publish that the robot is offline, if it was online and no other bridge has its name."""
+        """Disconnect. If the robot was online and no other bridge has its name, publish that it is offline."""
         link = self._link
         if link is None:
             return
         taken = asyncio.Event()
         was_online = self._owns_name and not isinstance(self._error, AddressInUse)
-        self._owns_name = False  # before its own message comes back, which it would contradict
+        self._owns_name = False  # otherwise the returning message would be contradicted
         if was_online:
             topic, payload = self._presence_topic, self._offline_presence()
         else:
-            # Once the broker has acknowledged this, the connection can end with a DISCONNECT. Otherwise, the broker
-            # would publish the will, and the robot would be offline for a moment although another bridge is online.
+            # Wait for the acknowledgement of any message, because the link is closed with a DISCONNECT only if all
+            # messages are acknowledged. Otherwise, the broker would publish the will, and the robot would seem to be
+            # offline although another bridge is online.
             topic, payload = self._echo_topic, f"{self._session} 0".encode()
         self._publish(topic, payload, retain=was_online, acknowledged=lambda _: taken.set())
         with contextlib.suppress(asyncio.TimeoutError):
