@@ -41,7 +41,7 @@ class SessionsWithoutBroker:
         asked = topics.parse_request(topic)
         assert asked
         message = Message(topic, payload, response=response, correlation=correlation)
-        found = self._policy.judge(message, asked, self._boottime(), stale=False)
+        found = self._policy.decide(message, asked, self._boottime(), stale=False)
         if isinstance(found, policy.Goodbye):
             self.sessions.say_goodbye(found.user, found.reply_topic)
         else:

@@ -40,7 +40,7 @@ Judged = RemoteRequest | Refusal | Goodbye | Ignored
 def judge(message: Message, *, stale: bool = False, allow: tuple[str, ...] = policy.ASKABLE) -> Judged:
     asked = topics.parse_request(message.topic)
     assert asked
-    return Policy("anna", allow).judge(message, asked, NOW, stale=stale)
+    return Policy("anna", allow).decide(message, asked, NOW, stale=stale)
 
 
 def request(fields: object = SAY, topic: str = OWN, response: str | None = REPLY, **more: object) -> Message:

@@ -380,7 +380,7 @@ class Bridge:
         if topic is None or not self._owns_name:
             return
         now = boottime()
-        decision = self._policy.judge(message, topic, now, stale=self._echoes.is_stale(now))
+        decision = self._policy.decide(message, topic, now, stale=self._echoes.is_stale(now))
         if isinstance(decision, Ignored):
             log.write_limited(decision.kind, log.sanitize(decision.words))
         elif isinstance(decision, Goodbye):

@@ -1,7 +1,7 @@
-"""What a robot accepts over the broker, and what the bridge remembers to decide that.
+"""The rules by which a bridge accepts or refuses messages from the broker.
 
-Pure. It decides about messages, never about speech, which is the server's job. A message is refused before anything is
-sent to the server. Everything that is remembered has a limit.
+Rules for this file: no I/O and no clock. A message is refused before anything is sent to the server. An accepted goal
+may still be rejected by the server, which makes all decisions about speech. All stored data is limited in size.
 """
 
 from __future__ import annotations
@@ -25,50 +25,50 @@ if TYPE_CHECKING:
     from talkcli.goals.states import State
     from talkcli.protocol.requests import Request
 
-#: The error code for a message that may be old.
+#: Error code for a message that may be outdated.
 STALE_CODE = "stale"
-#: Requests that are always allowed. They tell nothing that the broker doesn't publish anyway.
+#: Requests that are always allowed. They reveal nothing that the bridge doesn't publish anyway.
 ALWAYS_ALLOWED = ("hello", "watch")
-#: Requests that the option `--allow` can name.
+#: Requests that the option `--allow` can contain.
 ASKABLE = tuple(each for each in REQUEST_TYPES if each not in ALWAYS_ALLOWED)
 
-#: Time between two echoes that the bridge sends to itself.
+#: Interval at which the bridge sends an echo to itself.
 ECHO_EVERY_S = 5.0
-#: If the newest echo that returned was sent longer ago, messages are stale: one interval, and a second for the way.
+#: Messages are stale if the newest returned echo is older than one interval and a second for its transmission.
 STALE_AFTER_S = ECHO_EVERY_S + 1.0
-#: How many echoes may be on their way: those of half a minute, and some more.
+#: Maximum number of outstanding echoes, enough for one per second during half a minute.
 _MAX_ECHOES = 32
-#: How many goals of remote clients may be pending. The rest of the queue (usually 100) is for the robot's own goals.
+#: Maximum number of pending goals from remote clients. The rest of the queue, usually 100, is for local clients.
 MAX_REMOTE_GOALS = 20
-#: How many ids of goals are remembered, so that no goal is spoken twice although the server forgot it.
+#: Maximum number of remembered goal ids, by which a goal that the server has forgotten isn't spoken twice.
 MAX_REMEMBERED_IDS = 1_000
-#: Longest correlation data. They are repeated in the header of each answer.
+#: Maximum size of correlation data, which the header of each answer repeats.
 MAX_CORRELATION_BYTES = 256
-#: The ttl of a goal whose message expired while the goal waited for room. Zero would mean no limit.
+#: TTL of a goal whose message expired while the goal was waiting for room. Zero would mean no limit.
 _EXPIRED_TTL_S = 0.001
 
 
 @frozen
 class RemoteRequest:
-    """A request from the broker that may be carried out."""
+    """An accepted request from a remote client."""
 
     user: str
-    #: where to publish the answers; None if nobody wants any
+    #: topic for the answers; None if the client wants none
     reply_topic: str | None
     seq: int | None
     request: Request
     correlation: bytes | None = None
-    #: size of the payload, which counts while the request waits
+    #: size of the payload, which is counted while the request is waiting
     size_bytes: int = 0
-    #: when its goal must have started, by the clock of `judge`; None for no limit
+    #: latest time at which the goal may start, by the clock of `Policy.decide`; None for no limit
     start_by: float | None = None
 
     def say(self, goal_id: str, now: float) -> Say:
-        """Return the `say` for the server, with an id, and with a ttl that respects the expiry of the message.
+        """Return the `say` for the server, with an id, and with a TTL that ends before the message expires.
 
         Args:
             goal_id: the goal's id.
-            now: the current time by the clock of `judge`.
+            now: the current time by the clock of `Policy.decide`.
         """
         assert isinstance(self.request, Say)
         ttl = self.request.ttl
@@ -80,7 +80,7 @@ class RemoteRequest:
 
 @frozen
 class Refusal:
-    """A request that is answered with an error."""
+    """A refused request, with the error for its client."""
 
     reply_topic: str | None
     seq: int | None
@@ -90,7 +90,7 @@ class Refusal:
 
 @frozen
 class Goodbye:
-    """A message that ends a client's session."""
+    """A message by which a client ends its session."""
 
     user: str
     reply_topic: str
@@ -98,9 +98,9 @@ class Goodbye:
 
 @frozen
 class Ignored:
-    """A message that gets no answer, only a line in the log."""
+    """A message that is logged but not answered."""
 
-    #: for the log, which limits how often it shows the same kind
+    #: the log limits how often messages of the same kind are shown
     kind: str
     words: str
 
@@ -109,20 +109,20 @@ class Policy:
     """The rules for messages to one robot."""
 
     def __init__(self, name: str, allow: Collection[str]) -> None:
-        """`name` is the robot's name, `allow` the kinds of requests that it accepts."""
+        """Set up the rules for a robot with this name, which accepts these kinds of requests."""
         self._name = name
         self._allow = {*allow, *ALWAYS_ALLOWED}
 
-    def judge(
+    def decide(
         self, message: Message, topic: topics.RequestTopic, now: float, *, stale: bool
     ) -> RemoteRequest | Refusal | Goodbye | Ignored:
         """Decide what to do with a message.
 
         Args:
             message: the message.
-            topic: the parts of its topic.
-            now: seconds by a clock that goes on while the robot is suspended.
-            stale: whether the message may be old.
+            topic: the parts of the message's topic.
+            now: the time by a clock that includes the time in suspend.
+            stale: whether the message may be outdated.
         """
         if message.retained:
             return Ignored("retained", f"a retained message on {message.topic} is dropped: it is no request of now")
@@ -157,7 +157,11 @@ class Policy:
 
 
 def _request_fields(kind: str, payload: bytes) -> JsonObject:
-    """Return the fields of the request in a payload. Raise BadRequest if there is none."""
+    """Return the fields of the request in a payload.
+
+    Raises:
+        BadRequest: the payload is malformed.
+    """
     if kind == topics.PLAIN_CANCEL:
         return {"request": "cancel"}
     line = payload.removesuffix(b"\n") if kind == topics.REQUEST else payload
@@ -173,25 +177,26 @@ def _request_fields(kind: str, payload: bytes) -> JsonObject:
 
 
 def _repeatable(correlation: bytes | None) -> bytes | None:
-    """Return correlation data, or None if they are too long to be repeated in answers."""
+    """Return correlation data, or None if it is too long to be repeated in answers."""
     return correlation if len(correlation or b"") <= MAX_CORRELATION_BYTES else None
 
 
 class EchoTracker:
-    """Limits the age of messages, by means of echoes that the bridge sends to itself through the broker.
+    """Detects outdated messages by means of echoes, which are messages that the bridge sends to itself.
 
-    The broker forwards messages in order. So a message that comes after an echo was forwarded after the echo was sent,
-    and can't be older than that. No clocks are compared.
+    The broker forwards messages in order. A message that arrives after an echo was forwarded after that echo had been
+    sent. Therefore the age of the newest returned echo limits the delay of the next message. This needs no comparison
+    of the clocks of different machines.
     """
 
     def __init__(self, now: float) -> None:
-        """`now` is when the connection was made. No message on it is older."""
+        """Start on a connection that was made at the time `now`."""
         self._newest_at = now
         self._sent: dict[int, float] = {}
         self._number = 0
 
     def add(self, now: float) -> int:
-        """Return the number for an echo that is sent now."""
+        """Record an echo that is sent now, and return its number."""
         self._number += 1
         self._sent[self._number] = now
         while len(self._sent) > _MAX_ECHOES:
@@ -199,7 +204,7 @@ class EchoTracker:
         return self._number
 
     def returned(self, number_text: bytes) -> bool:
-        """Record that an echo has returned, and return whether it was awaited."""
+        """Record a returned echo, and return whether it was outstanding."""
         number = int(number_text) if number_text.isdigit() and len(number_text) <= MAX_DIGITS else 0
         sent = self._sent.get(number)
         if sent is None:
@@ -209,46 +214,46 @@ class EchoTracker:
         return True
 
     def is_stale(self, now: float) -> bool:
-        """Return whether a message that comes now may be too old."""
+        """Return whether a message that arrives now may be outdated."""
         return now - self._newest_at > STALE_AFTER_S
 
 
 class SentIds:
-    """The ids of recent goals, each with the boot id of the server that it was sent to."""
+    """The ids of recent goals, each with the boot id of the server that received the goal."""
 
     def __init__(self) -> None:
-        #: boot id of the server, and whether the goal counts for the limit of remote goals, by id
+        #: the server's boot id, and whether the goal counts towards the limit of remote goals, by goal id
         self._sent: dict[str, tuple[str, bool]] = {}
 
     def boot_of(self, goal_id: str) -> str | None:
-        """Return the boot id of the server that got this goal, None if the goal is unknown."""
+        """Return the boot id of the server that received a goal, or None if the goal is unknown."""
         return self._sent.get(goal_id, (None, False))[0]
 
     def is_counted(self, goal_id: str, boot: str) -> bool:
-        """Return whether this goal of this start of the server counts for the limit of remote goals."""
+        """Return whether a goal was sent to the server with this boot id and counts towards the limit."""
         return self._sent.get(goal_id) == (boot, True)
 
     def add(self, goal_id: str, boot: str, *, counted: bool = True) -> None:
-        """Record that a goal is sent to the server with this boot id."""
+        """Record a goal that is sent to the server with this boot id."""
         self._sent.pop(goal_id, None)
         self._sent[goal_id] = boot, counted
         if len(self._sent) > MAX_REMEMBERED_IDS:
             del self._sent[next(iter(self._sent))]
 
     def discard(self, goal_id: str) -> None:
-        """Forget a goal that the server didn't accept, because it can't have been spoken."""
+        """Forget a goal that can't have been spoken, because the server didn't accept it."""
         self._sent.pop(goal_id, None)
 
 
 class RemoteGoals:
-    """The goals of remote clients that are pending at the server, or on their way there.
+    """The goals of remote clients that are pending at the server or on their way to it.
 
-    Goals with `preempt` or `flush` don't count. A goal's reply and its events come on different connections, so either
-    may be first.
+    Goals with `preempt` or `flush` don't count. A goal's reply and its events arrive on different connections, in any
+    order.
     """
 
     def __init__(self) -> None:
-        #: each goal's key, and whether the server has said that the goal is pending, by id
+        #: the goal's key, and whether the server has confirmed that the goal is pending, by goal id
         self._goals: dict[str, tuple[str | None, bool]] = {}
 
     def __len__(self) -> int:
@@ -256,29 +261,29 @@ class RemoteGoals:
 
     @property
     def pending_count(self) -> int:
-        """How many goals are known to be pending."""
+        """Number of goals that the server has confirmed as pending."""
         return sum(pending for _, pending in self._goals.values())
 
     @staticmethod
     def counts(say: Say) -> bool:
-        """Return whether a goal counts for the limit."""
+        """Return whether a goal counts towards the limit."""
         return not (say.preempt or say.flush)
 
     def has_room(self, say: Say) -> bool:
-        """Return whether this goal may be sent. A goal that will replace another one by its key always has room."""
+        """Return whether a goal may be sent now. There is always room for a goal that replaces another by its key."""
         replaces = say.key is not None and any(key == say.key for key, _ in self._goals.values())
         return len(self) < MAX_REMOTE_GOALS or not self.counts(say) or replaces
 
     def add(self, goal_id: str, key: str | None) -> None:
-        """Count a goal that is sent to the server."""
+        """Count a goal that is on its way to the server."""
         self._goals.setdefault(goal_id, (key, False))
 
     def answered(self, goal_id: str, *, pending: bool) -> None:
-        """Record the server's reply to a goal, unless an event has already told more.
+        """Record the server's reply to a goal, unless an event has already confirmed the goal as pending.
 
         Args:
-            goal_id: the goal.
-            pending: whether the goal is pending. False also if nobody waits for the reply any more.
+            goal_id: the goal's id.
+            pending: whether the goal is pending. False if the reply isn't awaited any more.
         """
         key, is_known = self._goals.get(goal_id, (None, True))
         if not is_known and pending:
@@ -287,20 +292,20 @@ class RemoteGoals:
             del self._goals[goal_id]
 
     def queued(self, goal_id: str, key: str | None) -> None:
-        """Record an event that says that a goal is pending."""
+        """Record an event that reports a goal as pending."""
         self._goals[goal_id] = key, True
 
     def dequeued(self, goal_id: str) -> bool:
-        """Record an event that says that a goal is no longer pending, and return whether the goal was counted."""
+        """Record an event that reports a goal as no longer pending, and return whether the goal was counted."""
         return self._goals.pop(goal_id, None) is not None
 
     def reset(self, pending: Iterable[tuple[str, str | None]]) -> None:
-        """Replace the pending goals, given as ids and keys. Goals on their way still count."""
+        """Replace the pending goals by these ids and keys. Goals on their way to the server still count."""
         self._goals = {each: found for each, found in self._goals.items() if not found[1]}
         self._goals |= {goal_id: (key, True) for goal_id, key in pending}
 
     def clear(self) -> None:
-        """Forget all goals, because the server is gone."""
+        """Forget all goals, because the connection to the server has ended."""
         self._goals.clear()
 
 
@@ -309,16 +314,16 @@ def end_unsent(
 ) -> tuple[Goal, list[JsonObject]]:
     """End a goal that was not sent to the server, and return it with the lines for its client.
 
-    The lines are those that the server would send.
+    The lines are the same as the server's would be.
 
     Args:
         request: the `say`.
         goal_id: the goal's id.
-        state: how the goal ends.
-        reason: why, for programs.
-        words: why, for people.
-        at: seconds since 1970 UTC.
-        by: who ended it, if anybody did.
+        state: the goal's end state.
+        reason: the machine-readable reason for the end.
+        words: the human-readable reason for the end.
+        at: the current time, in seconds since 1970 UTC.
+        by: the client that canceled the goal, if it was canceled.
     """
     say = request.request
     assert isinstance(say, Say)
@@ -341,7 +346,7 @@ def end_unsent(
 
 
 def without_texts(message: JsonObject) -> JsonObject:
-    """Return a message without the texts of its goals, for a line that is longer than the broker accepts."""
+    """Return a message without the texts of its goals, to shorten a line that is too long for the broker."""
     nothing = {"text": None, "spoken": None}
     return {
         name: {**each, **nothing} if isinstance(each, dict) and "text" in each else each
@@ -350,10 +355,10 @@ def without_texts(message: JsonObject) -> JsonObject:
 
 
 def sender_name(user: str, name: str | None = None) -> str:
-    """Return what a remote client is called at the server: its user, and the name that it gave itself if any."""
+    """Return a remote client's name at the server: its user name, and the name that it gave itself, if any."""
     return f"{topics.REMOTE_PREFIX}{user} {name}"[:MAX_SENDER_NAME_CHARS] if name else f"{topics.REMOTE_PREFIX}{user}"
 
 
 def is_remote(goal: Goal) -> bool:
-    """Return whether a goal came over the broker."""
+    """Return whether a goal was sent by a remote client."""
     return goal.client is not None and (goal.client.name or "").startswith(topics.REMOTE_PREFIX)

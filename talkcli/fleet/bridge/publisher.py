@@ -1,7 +1,7 @@
-"""What a robot publishes for everybody: its status, retained, and the events of its goals.
+"""Publishes a robot's status and the events of its goals for all subscribers.
 
-It watches the robot's server as long as the bridge runs. If the broker can't keep up, it leaves events out. If a
-payload is too long for the broker, it leaves texts out.
+A connection watches the robot's server as long as the bridge runs. If the broker is too slow, events are dropped. If a
+payload is too long for the broker, it is published without texts.
 """
 
 from __future__ import annotations
@@ -31,26 +31,26 @@ if TYPE_CHECKING:
     from talkcli.fleet.bridge.session import RemoteSessions
     from talkcli.goals.goal import Goal, JsonObject
 
-    #: Publishes a message for everybody: topic, payload, expiry in seconds. Without an expiry, the message is retained.
+    #: Publishes a message for all subscribers: topic, payload, expiry in seconds. Without an expiry, it is retained.
     PublishToAll = Callable[[str, bytes, float | None], None]
 
-#: How long an event is of use.
+#: How long the broker keeps an undelivered event.
 EVENT_EXPIRY_S = 60
-#: Shortest time between two statuses.
+#: Minimum time between two status messages.
 _STATUS_EVERY_S = 1.0
-#: Time from a change to the status that shows it. A canceled goal is PREEMPTING for some milliseconds. If that was
-#: published at once, the end of the goal would follow a second later.
+#: Delay between a change and the status that shows it. A canceled goal is PREEMPTING for some milliseconds before it
+#: ends. Without the delay, the status would show that state for a second.
 _STATUS_AFTER_CHANGE_S = 0.1
-#: Longest text in the status. The texts of all pending goals are kept for it.
+#: Maximum length of a text in the status. This part of the text of each pending goal is kept in memory.
 _MAX_STATUS_TEXT_CHARS = 1_000
-#: The server sends a sign of life every 5 s. After this silence it counts as hung.
+#: Time without data after which the server counts as hung. A server sends a sign of life every 5 s.
 _SERVER_SILENCE_LIMIT_S = 15.0
-#: Longest pause before the first try to find the server again, and before later tries. The pause is random.
+#: Upper limit of the random pause before the first attempt to reconnect to the server, and before later attempts.
 _FIRST_SERVER_RETRY_S, _LAST_SERVER_RETRY_S = 0.2, 5.0
 
 
 class Publisher:
-    """Watches the server, and publishes what everybody may know."""
+    """Watches the server, and publishes its status and events."""
 
     def __init__(
         self, sessions: RemoteSessions, publish: PublishToAll, on_server_change: Callable[[], None], *, with_text: bool
@@ -58,33 +58,35 @@ class Publisher:
         """Start without a server.
 
         Args:
-            sessions: the sessions, which are told about all changes of goals.
-            publish: publishes a message for everybody.
-            on_server_change: called when a server has come or gone.
-            with_text: whether everybody may read the texts of goals.
+            sessions: the remote sessions, which receive all changes of goals.
+            publish: publishes a message for all subscribers.
+            on_server_change: called after the connection to the server has been made or has ended.
+            with_text: whether to publish the texts of goals.
         """
         self._sessions = sessions
         self._publish = publish
         self._on_server_change = on_server_change
         self._with_text = with_text
-        #: boot id, pid and version of the server; None if there is none
+        #: boot id, pid and version of the server; None while there is no connection to it
         self.server: JsonObject | None = None
         self._connection: LocalConnection | None = None
-        #: when the server was last heard, by the loop's clock
+        #: when data was last received from the server (loop clock)
         self._heard_at = 0.0
-        #: texts of the goals that have not ended, and the goal that is being spoken
+        #: texts of the goals that have not ended, by goal id
         self._texts: dict[str, str | None] = {}
+        #: id of the active goal
         self._active: str | None = None
+        #: the goal that ended last
         self._last: Goal | None = None
         self._paused = False
-        #: publishes the next status
+        #: timer for the next status
         self._timer: asyncio.TimerHandle | None = None
-        #: when the last status was published, by the loop's clock
+        #: when the last status was published (loop clock)
         self._published_at = 0.0
         self._loop = asyncio.get_running_loop()
 
     async def run(self) -> None:
-        """Follow the server, and try again whenever the connection ends."""
+        """Watch the server, and reconnect whenever the connection ends."""
         self._retry_s = _FIRST_SERVER_RETRY_S
         while True:
             try:
@@ -94,30 +96,30 @@ class Publisher:
                 finally:
                     self._connection = None
                     server.close()
-                    self._server_left()
+                    self._on_disconnect()
             except TalkError as error:
                 log.write_limited("server", f"no news of the server: {log.sanitize(str(error))}")
             await asyncio.sleep(random.uniform(0, self._retry_s))
             self._retry_s = min(_LAST_SERVER_RETRY_S, self._retry_s * 2)
 
     async def _follow(self, server: LocalConnection) -> None:
-        """Watch the server until the connection ends."""
+        """Receive the server's events until the connection ends."""
         self._heard_at = self._loop.time()
         watch = partial(self._watch, server)
-        # The log comes first, so that the goals of an earlier bridge are known.
+        # Request the log before watching, to learn about the goals of an earlier bridge.
         server.send(Exchange(Log(MAX_LOG_GOALS), watch, lambda _: watch({}, [])))
         while lines := await server.read():
             self._receive(server, lines)
         log.write("the server's connection has ended")
 
     def schedule_status(self) -> None:
-        """Publish the status soon."""
+        """Publish the status after a short delay."""
         if self._timer is None:
             due = max(self._loop.time() + _STATUS_AFTER_CHANGE_S, self._published_at + _STATUS_EVERY_S)
             self._timer = self._loop.call_at(due, self._publish_status)
 
     def tick(self) -> None:
-        """Close the connection if the server is silent. Call it every few seconds."""
+        """Close the connection if the server counts as hung. Call this every few seconds."""
         server = self._connection
         if server and self._loop.time() - self._heard_at > _SERVER_SILENCE_LIMIT_S:
             log.write_limited(
@@ -126,7 +128,7 @@ class Publisher:
             server.close()
 
     def close(self) -> None:
-        """Publish nothing more."""
+        """Cancel the timer for the next status."""
         if self._timer:
             self._timer.cancel()
 
@@ -145,17 +147,17 @@ class Publisher:
                 log.write_limited("line", f"what the server says can't be read: {log.sanitize(str(error))}")
 
     def _watch(self, server: LocalConnection, _reply: JsonObject, ended: list[JsonObject]) -> None:
-        """Watch the server, and remember the goals in the reply to `log`."""
+        """Remember the goals in the reply to `log`, and send a `watch`."""
 
         def refuse(error: TalkError) -> None:
             raise ServerUnavailable(f"the server at {server.path} can't be watched: {error}")
 
         for goal in goals(ended, "goal"):
             self._sessions.remember(goal, server.boot)
-        server.send(Exchange(Watch(), partial(self._server_came, server), refuse))
+        server.send(Exchange(Watch(), partial(self._on_watching, server), refuse))
 
-    def _server_came(self, server: LocalConnection, reply: JsonObject, items: list[JsonObject]) -> None:
-        """Take over the server's state at the start of the watch."""
+    def _on_watching(self, server: LocalConnection, reply: JsonObject, items: list[JsonObject]) -> None:
+        """Store the server's state, from the reply to `watch`."""
         status = ServerStatus.from_reply(reply, items)
         self._retry_s = _FIRST_SERVER_RETRY_S
         for each in unfinished(status):
@@ -165,16 +167,17 @@ class Publisher:
         self._texts = {each.id: _shown_text(each) for each in unfinished(status)}
         self._last = status.recent[-1] if status.recent else self._last
         self._paused = status.server.get("paused") is True
-        self._sessions.server_came(list(status.pending), server.boot)
+        self._sessions.on_server_connected(list(status.pending), server.boot)
         log.write(f"the server at {log.sanitize(server.path)} is there (pid {server.pid})")
         self._on_server_change()
         self.schedule_status()
 
-    def _server_left(self) -> None:
+    def _on_disconnect(self) -> None:
+        """Forget the server's state after the end of the connection."""
         self._active = None
         self._texts.clear()
         self._paused = False
-        self._sessions.server_left()
+        self._sessions.on_server_disconnected()
         if self.server:
             self.server = None
             self._on_server_change()
@@ -183,7 +186,7 @@ class Publisher:
     def _receive_event(self, server: LocalConnection, message: JsonObject, line: bytes) -> None:
         event = from_json(message)
         if isinstance(event, StateChanged):
-            self._note(event)
+            self._update(event)
             self._sessions.goal_changed(event, server.boot)
             if event.goal and (not self._with_text or len(line) >= self._sessions.max_payload()):
                 line = encode(replace(event, goal=_without_text(event.goal)).to_json()).removesuffix(b"\n")
@@ -195,8 +198,8 @@ class Publisher:
         self._publish(topic, line + b"\n", EVENT_EXPIRY_S)
         self.schedule_status()
 
-    def _note(self, event: StateChanged) -> None:
-        """Note what the status will show of this event."""
+    def _update(self, event: StateChanged) -> None:
+        """Update the status from an event, without publishing it."""
         if event.state is State.PENDING:
             self._texts[event.id] = _shown_text(event.goal)
         elif event.state is State.ACTIVE:
@@ -227,10 +230,10 @@ class Publisher:
 
 
 def _shown_text(goal: Goal | None) -> str | None:
-    """Return the beginning of a goal's text, for the status."""
+    """Return the part of a goal's text that the status shows."""
     return goal.text[:_MAX_STATUS_TEXT_CHARS] if goal and goal.text else None
 
 
 def _without_text(goal: Goal) -> Goal:
-    """Return a goal without its text. Its message may quote the text, so it is left out, too."""
+    """Return a goal without its text, and without its message, which may quote the text."""
     return replace(goal, text=None, spoken=None, message=None)

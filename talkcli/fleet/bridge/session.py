@@ -1,7 +1,7 @@
-"""The sessions of remote clients: each is one client's connection to the robot's server.
+"""Sessions of remote clients. Each session is one client's connection to the robot's server.
 
-Requests go in, and the server's lines come back, in their order. `policy` has decided before whether a request is
-accepted at all. If too many goals are pending, further ones wait here or are rejected.
+A session sends its client's requests to the server and publishes the server's lines in their order. `policy` has
+already accepted the requests. If too many goals are pending, further goals wait here for room or are rejected.
 """
 
 from __future__ import annotations
@@ -35,31 +35,31 @@ if TYPE_CHECKING:
     from talkcli.protocol.events import StateChanged
     from talkcli.protocol.requests import Request
 
-    #: Publishes lines: topic, payload, QoS, correlation data.
+    #: Publishes lines for a client: topic, payload, QoS, correlation data.
     Publish = Callable[[str, bytes, int, bytes | None], None]
 
-#: How many clients may have a session. Each has a connection to the server, which accepts 256 by default.
+#: Maximum number of sessions. Each has a connection to the server, which accepts 256 connections by default.
 MAX_SESSIONS = 32
-#: How many requests of one client may wait for the connection, for room, or for their answers.
+#: Maximum number of a client's requests that wait for the connection, for room, or for their answers.
 MAX_WAITING_REQUESTS = 64
-#: Total size of the waiting requests of all clients. Cancel and status requests may go to twice as much.
+#: Maximum total size of the waiting requests of all clients. For a cancel or status request, it is twice as much.
 MAX_WAITING_BYTES = 4 * 1024 * 1024
-#: A client that sends nothing for this time counts as gone, because MQTT doesn't tell. A client that waits says hello
-#: every 30 s, and two of these messages may be lost.
+#: Time without a message after which a client's session ends, because MQTT doesn't report that a client has left.
+#: Waiting clients say hello every 30 s, and two of these messages may get lost.
 CLIENT_SILENCE_LIMIT_S = 90.0
-#: Time for the server to take the requests of a client that said goodbye.
+#: Time allowed for the server to answer the requests of a client that has said goodbye.
 _GOODBYE_LIMIT_S = 5.0
-#: Longest part of a robot's name in the ids that it gives. With the rest, an id has at most 64 characters.
+#: Maximum length of the robot's name in a generated goal id, which has at most 64 characters in total.
 _MAX_ID_PREFIX_CHARS = 48
-#: The last message to a client if the server ended the connection.
+#: The last message to a client after its connection to the server has ended.
 _SERVER_GONE = "the robot's talk server ended the connection"
 _ALIVE = b'{"event": "alive"}\n'
-#: Beginnings of lines that may get lost on their way to the client.
+#: Beginnings of lines that may get lost, because they are published with QoS 0.
 _UNRELIABLE = (b'{"event": "word"', b'{"event": "alive"')
 
 
 class RemoteSessions:
-    """The sessions of all remote clients, with the limits that they share."""
+    """The sessions of all remote clients, and the limits that they share."""
 
     def __init__(
         self,
@@ -73,26 +73,26 @@ class RemoteSessions:
 
         Args:
             name: the robot's name.
-            socket: path of the server's socket, None for the usual places.
-            publish: publishes lines to a client.
-            max_payload: returns the largest payload that the broker accepts, in bytes.
+            socket: path of the server's socket, or None for the default locations.
+            publish: publishes lines for a client.
+            max_payload: returns the size of the largest payload that the broker accepts, in bytes.
             on_change: called when the number of pending goals may have changed.
         """
         self.name, self.socket = name, socket
         self.publish, self.max_payload = publish, max_payload
         self.ids, self.goals = policy.SentIds(), policy.RemoteGoals()
-        #: limits how many sessions wait for the server's greeting
+        #: limits how many connections wait for the server's greeting at the same time
         self.dialing = asyncio.Semaphore(MAX_SESSIONS)
-        #: cleared while the broker is slow, so that nothing more is read from the server
+        #: cleared while the broker is slow, so that sessions stop reading from the server
         self.may_read = asyncio.Event()
         self.may_read.set()
-        #: goals that wait until fewer are pending, in their order
+        #: goals that wait for room, oldest first
         self.waiting: list[tuple[RemoteRequest, Say, RemoteSession]] = []
         self._on_change = on_change
         self._loop = asyncio.get_running_loop()
         self._sessions: dict[tuple[str, str | None], RemoteSession] = {}
         self._release_handle: asyncio.Handle | None = None
-        #: who canceled the goals that last left the queue
+        #: the client that canceled the goals that left the server's queue most recently
         self._canceled_by: By | None = None
 
     # -- from the broker
@@ -107,25 +107,25 @@ class RemoteSessions:
             self.refuse(policy.Refusal(request.reply_topic, request.seq, request.correlation, error))
 
     def refuse(self, refusal: policy.Refusal) -> None:
-        """Answer a request with an error, if its client wants an answer."""
+        """Publish the error for a refused request, if its client wants answers."""
         if refusal.reply_topic is not None:
             line = encode(failure(refusal.seq, refusal.error.code, refusal.error.message))
             self.publish(refusal.reply_topic, line, 1, refusal.correlation)
 
     def say_goodbye(self, user: str, reply_topic: str) -> None:
-        """End a client's session, once the server has taken the client's requests."""
+        """End a client's session after the server has answered the client's requests."""
         session = self._sessions.get((user, reply_topic))
         if session:
             session.say_goodbye()
 
     def end_all(self) -> None:
-        """End all sessions without a word, because the broker is gone."""
+        """End all sessions without informing the clients, because the connection to the broker has ended."""
         for session in list(self._sessions.values()):
             session.end()
         self.may_read.set()
 
     def tick(self) -> None:
-        """End the sessions of silent clients, and send signs of life. Call it every few seconds."""
+        """End the sessions of silent clients, and send signs of life to others. Call this every few seconds."""
         now = self._loop.time()
         for session in list(self._sessions.values()):
             if now - session.used_at > CLIENT_SILENCE_LIMIT_S:
@@ -135,9 +135,9 @@ class RemoteSessions:
                 session.send_alive()
 
     def _new_session(self, request: RemoteRequest) -> RemoteSession | None:
-        """Return a new session, None if there are too many and none can be ended.
+        """Return a new session, or None if there are too many sessions.
 
-        For a cancel or a status, any session can be ended.
+        If there are too many, end an idle one first. For a cancel or status request, end any session.
         """
         if len(self._sessions) >= MAX_SESSIONS:
             sessions = list(self._sessions.values())
@@ -158,12 +158,12 @@ class RemoteSessions:
         self._sessions = {key: each for key, each in self._sessions.items() if each is not session}
 
     def waiting_bytes(self) -> int:
-        """Return the size of all requests that wait for anything."""
+        """Return the total size of the waiting requests of all clients."""
         in_sessions = sum(each.waiting_bytes for each in self._sessions.values())
         return in_sessions + sum(request.size_bytes for request, _, _ in self.waiting)
 
     def cancel_waiting(self, selection: Cancel, by: By | None) -> list[Goal]:
-        """End the selected goals of those that wait for room, and return them."""
+        """End the goals that a `cancel` selects among those that wait for room, and return them."""
         selected = [self.waiting[each] for each in selection.select_waiting([say for _, say, _ in self.waiting])]
         self.waiting = [each for each in self.waiting if not any(each is other for other in selected)]
         words = "canceled before it was spoken"
@@ -173,19 +173,21 @@ class RemoteSessions:
         ]
 
     def schedule_release(self) -> None:
-        """Send goals that wait for room soon, if there is room then.
+        """Schedule the release of waiting goals for which there is room.
 
-        Call it whenever the number of pending goals has changed. All events that came together are counted first.
+        Call this whenever the number of pending goals may have changed. Events that were received together are all
+        processed before goals are released.
         """
         self._on_change()
         if self.waiting and self._release_handle is None:
             self._release_handle = self._loop.call_soon(self._release)
 
     def _release(self) -> None:
+        """Send waiting goals to the server as long as there is room."""
         self._release_handle = None
         canceled_by, self._canceled_by = self._canceled_by, None
         if canceled_by and not self.goals.pending_count:
-            # Somebody canceled all pending goals, so the goals that wait for their places are canceled, too.
+            # The client canceled all pending goals, so cancel the goals that were waiting for their places, too.
             self.cancel_waiting(Cancel(), canceled_by)
         while self.waiting and self.goals.has_room(self.waiting[0][1]):
             request, say, session = self.waiting.pop(0)
@@ -194,7 +196,7 @@ class RemoteSessions:
     # -- from the watch of the server
 
     def goal_changed(self, event: StateChanged, boot: str) -> None:
-        """Count a goal that became pending or left the queue of the server with this boot id."""
+        """Process a goal's change of state, reported by the server with this boot id."""
         goal = event.goal
         if event.state is not State.PENDING:
             counted = self.goals.dequeued(event.id)
@@ -205,40 +207,40 @@ class RemoteSessions:
         self.schedule_release()
 
     def remember(self, goal: Goal, boot: str) -> None:
-        """Remember the id of a goal that the server knows, if it is remote. An earlier bridge may have sent it.
+        """Remember the id of a remote goal that an earlier bridge may have sent.
 
-        It counts for the limit even if it preempted, because a goal doesn't show that.
+        The goal counts towards the limit even if it was sent with `preempt`, because the server doesn't report that.
         """
         if policy.is_remote(goal) and self.ids.boot_of(goal.id) != boot:
             self.ids.add(goal.id, boot)
 
-    def server_came(self, pending: list[Goal], boot: str) -> None:
-        """Take over the pending goals of a server that has just been found."""
+    def on_server_connected(self, pending: list[Goal], boot: str) -> None:
+        """Replace the pending goals by those of the server with this boot id."""
         self.goals.reset((each.id, each.key) for each in pending if self.ids.is_counted(each.id, boot))
         self.schedule_release()
 
-    def server_left(self) -> None:
-        """Forget all pending goals, because the server is gone."""
+    def on_server_disconnected(self) -> None:
+        """Forget all pending goals."""
         self.goals.clear()
         self.schedule_release()
 
 
 class _RemoteExchange(Exchange):
-    """An exchange with the server for a remote client."""
+    """A remote client's request to the server, and the answer."""
 
     __slots__ = ("canceled", "is_new", "remote")
 
     def __init__(self, remote: RemoteRequest, request: Request, *, is_new: bool = False) -> None:
         super().__init__(request)
         self.remote = remote
-        #: for a goal: whether it was never sent before
+        #: whether the goal is sent for the first time, if the request is a `say`
         self.is_new = is_new
-        #: for a cancel: the goals that it ended before they reached the server
+        #: the waiting goals that were canceled here, if the request is a `cancel`
         self.canceled: list[Goal] = []
 
     @property
     def goal_id(self) -> str | None:
-        """The id of the goal that is sent, None for other requests."""
+        """The goal's id if the request is a `say`, otherwise None."""
         return self.request.id if isinstance(self.request, Say) else None
 
 
@@ -249,11 +251,11 @@ class RemoteSession:
         """Start without a connection.
 
         Args:
-            sessions: the owner.
+            sessions: all sessions, to which this one belongs.
             user: the client's user name at the broker.
-            reply_topic: where to publish answers, None for nowhere.
+            reply_topic: the topic for answers, or None if the client wants none.
         """
-        #: when the client was last heard, by the loop's clock
+        #: when the client sent its last request (loop clock)
         self.used_at = 0.0
         self._sessions = sessions
         self._user, self._reply_topic = user, reply_topic
@@ -261,28 +263,28 @@ class RemoteSession:
         self._loop = asyncio.get_running_loop()
         self._server: LocalConnection | None = None
         self._task: asyncio.Task[None] | None = None
-        #: requests that wait for the connection
+        #: requests that wait for the connection to the server
         self._queue: deque[RemoteRequest] = deque()
-        #: ids of the goals whose results the client is still to get
+        #: ids of the goals whose results the client is waiting for
         self._awaited: set[str] = set()
         self._watching = False
-        #: ends the session after a goodbye
+        #: timer that ends the session after a goodbye
         self._goodbye_timer: asyncio.TimerHandle | None = None
 
     # -- from the client
 
     @property
     def idle(self) -> bool:
-        """Whether the client is waiting for nothing."""
+        """Whether the client isn't waiting for anything."""
         return not (self._unanswered or self._awaited or self._watching or self._waiting_for_room())
 
     @property
     def waiting_bytes(self) -> int:
-        """Size of the requests that wait for the connection or for their answers."""
+        """Total size of the requests that wait for the connection or for their answers."""
         return sum(each.size_bytes for each in self._unanswered)
 
     def submit(self, request: RemoteRequest) -> None:
-        """Carry out a request after those that came before it."""
+        """Carry out a request after the earlier ones, or refuse it if too many are waiting."""
         self.used_at = self._loop.time()
         if self._goodbye_timer:  # the client has come back
             self._goodbye_timer.cancel()
@@ -301,18 +303,18 @@ class RemoteSession:
                 self._task = asyncio.create_task(self._run(urgent=urgent))
 
     def say_goodbye(self) -> None:
-        """Answer nothing more, and end once the server has taken the requests. Cancel goals that wait for room."""
+        """Stop answering, drop goals that wait for room, and end after the server has answered other requests."""
         self._reply_topic = None
-        self._leave_waiting()
+        self._drop_waiting()
         self._queue = deque(each for each in self._queue if _outlives_client(each))
         self._goodbye_timer = self._goodbye_timer or self._loop.call_later(_GOODBYE_LIMIT_S, self.end)
         self._end_if_done()
 
     def end(self, why: str | None = None) -> None:
-        """Close the connection, which cancels whatever can still be canceled.
+        """End the session. The server cancels everything that can still be canceled.
 
         Args:
-            why: what to tell the client if it waits for anything.
+            why: a message for the client, which is sent only if the client is waiting for something.
         """
         if why and not self.idle:
             self._send_gone(why)
@@ -324,7 +326,7 @@ class RemoteSession:
         self._clean_up()
 
     def send_alive(self) -> None:
-        """Send a sign of life if a goal waits for room, because the server doesn't know about it."""
+        """Publish a sign of life if a goal waits for room. The server sends one only for goals that it knows."""
         if self._waiting_for_room():
             self._publish([(_ALIVE, None)])
 
@@ -341,11 +343,12 @@ class RemoteSession:
     def _waiting_for_room(self) -> list[RemoteRequest]:
         return [request for request, _, session in self._sessions.waiting if session is self]
 
-    def _leave_waiting(self) -> None:
+    def _drop_waiting(self) -> None:
+        """Remove the session's goals from those that wait for room."""
         self._sessions.waiting = [each for each in self._sessions.waiting if each[2] is not self]
 
     def _end_if_done(self) -> None:
-        """End the session if the client said goodbye and the server has taken all requests."""
+        """End the session if the client has said goodbye and only requests without a lasting effect are unanswered."""
         if self._goodbye_timer and not any(map(_outlives_client, self._unanswered)):
             self.end()
 
@@ -365,12 +368,12 @@ class RemoteSession:
             self._send(_RemoteExchange(remote, request))
 
     def send_say(self, remote: RemoteRequest, say: Say, *, has_room: bool = False) -> None:
-        """Send a goal to the server, unless it must wait for room or is refused.
+        """Send a goal to the server, let it wait for room, or refuse it.
 
         Args:
             remote: the client's request.
             say: the goal in it.
-            has_room: whether the goal has waited, and has room now.
+            has_room: whether the goal has waited and there is room now.
         """
         shared, server = self._sessions, self._server
         assert server
@@ -391,7 +394,7 @@ class RemoteSession:
             self.end_goal(remote, None, State.REJECTED, "queue_full", words, None)
 
     def _send_cancel(self, remote: RemoteRequest, cancel: Cancel) -> None:
-        """Cancel goals that wait for room, then goals at the server, which doesn't know the ids of the former."""
+        """Cancel goals that wait for room, then goals at the server, which doesn't know the waiting goals."""
         goals = self._sessions.cancel_waiting(cancel, By(client=Sender(name=self._name)))
         canceled = {each.id for each in goals}
         if cancel.ids is not None:
@@ -403,7 +406,7 @@ class RemoteSession:
         self._send(exchange)
 
     def _send(self, exchange: _RemoteExchange) -> bool:
-        """Send a request to the server. If it is too long, refuse it and return False."""
+        """Send a request to the server, or refuse it and return False if it is too long."""
         assert self._server
         if not self._server.send(exchange):
             self._refuse(exchange.remote, "line_too_long", f"a request has at most {MAX_LINE_BYTES} bytes")
@@ -411,13 +414,13 @@ class RemoteSession:
         return True
 
     def _new_id(self) -> str:
-        """Return a unique id for a goal that has none. Every goal needs an id, so that it can be counted."""
+        """Return a new id for a goal that has none. Goals are counted by their ids."""
         return f"{self._sessions.name[:_MAX_ID_PREFIX_CHARS]}-x{random.getrandbits(48):012x}"
 
     # -- from the server
 
     async def _run(self, *, urgent: bool) -> None:
-        """Connect to the server, send the requests that came meanwhile, and pass on lines until the connection ends."""
+        """Connect to the server, send the queued requests, and publish lines until the connection ends."""
         shared = self._sessions
         try:
             self._server = await dial(shared.socket, self._name, urgent=urgent, slots=shared.dialing)
@@ -430,7 +433,7 @@ class RemoteSession:
             for request in self._waiting_for_room():
                 self._refuse(request, "no_server", _SERVER_GONE)
             self._send_gone(_SERVER_GONE)
-        except TalkError as error:  # there is no connection
+        except TalkError as error:  # the connection failed
             code = Busy.code if isinstance(error, Busy) else "no_server"
             while self._queue:
                 self._refuse(self._queue.popleft(), code, " ".join(str(error).split()))
@@ -439,7 +442,7 @@ class RemoteSession:
         self._clean_up()
 
     def _receive(self, lines: list[bytes]) -> None:
-        """Pass the server's lines on to the client."""
+        """Publish the server's lines for the client."""
         answers: list[tuple[bytes, bytes | None]] = []
         for line in lines:
             if line.startswith(_UNRELIABLE):
@@ -460,7 +463,7 @@ class RemoteSession:
         self._end_if_done()
 
     def _translate(self, message: JsonObject) -> list[tuple[bytes, bytes | None]]:
-        """Return the lines that answer a client's request, from a reply of the server or an item of its list."""
+        """Return the lines for the client that correspond to a line of the server's answer to a request."""
         assert self._server
         exchange = self._server.match(message)
         if not isinstance(exchange, _RemoteExchange):
@@ -470,7 +473,7 @@ class RemoteSession:
         found: list[JsonObject] = []
         goal = message.get("goal")
         if isinstance(goal, dict):
-            self._note_awaited(remote, goal)
+            self._await_result(remote, goal)
         if "ok" in message:
             self._server.forget(exchange)
             self._count_goal(exchange, message)
@@ -481,15 +484,15 @@ class RemoteSession:
         numbered = (each if remote.seq is None else {"seq": remote.seq, **each} for each in (*found, message))
         return [(encode(each), remote.correlation) for each in numbered]
 
-    def _note_awaited(self, remote: RemoteRequest, goal: JsonObject) -> None:
-        """Remember a goal if the client waits for its result."""
+    def _await_result(self, remote: RemoteRequest, goal: JsonObject) -> None:
+        """Record that the client is waiting for a goal's result, if the request asks for it."""
         request, state = remote.request, State.__members__.get(str(goal.get("state")))
         waits = isinstance(request, Wait) or (isinstance(request, Say) and (request.wait or request.feedback))
         if waits and state is not None and not state.terminal:
             self._awaited.add(str(goal.get("id")))
 
     def _count_goal(self, exchange: _RemoteExchange, reply: JsonObject) -> None:
-        """Update the number of pending goals after the server's reply to a `say`."""
+        """Update the count of pending goals after the server's reply to a `say`."""
         if exchange.goal_id is None:
             return
         goal = reply.get("goal")
@@ -507,7 +510,7 @@ class RemoteSession:
     def end_goal(
         self, request: RemoteRequest, goal_id: str | None, state: State, reason: str, words: str, by: By | None
     ) -> Goal:
-        """End a goal that was not sent to the server, and tell the client; the arguments are those of `end_unsent`."""
+        """End a goal that was not sent to the server. The arguments are those of `policy.end_unsent`."""
         goal, lines = policy.end_unsent(request, goal_id or self._new_id(), state, reason, words, time.time(), by)
         answer, *events = (encode(each) for each in lines)
         self._publish([(answer, request.correlation), *((each, None) for each in events)])
@@ -517,7 +520,7 @@ class RemoteSession:
         self._publish([(encode({"event": "gone", "message": why}), None)])
 
     def _publish(self, lines: list[tuple[bytes, bytes | None]]) -> None:
-        """Publish lines, each with its correlation data. Lines with the same data share a payload if they fit."""
+        """Publish lines, each given with its correlation data. Lines with the same data share a payload if they fit."""
         if self._reply_topic is None:
             return
         limit = self._sessions.max_payload()
@@ -533,7 +536,7 @@ class RemoteSession:
             self._sessions.publish(self._reply_topic, payload, int(reliable), current)
 
     def _shortened(self, line: bytes, limit: int) -> bytes:
-        """Return a line to publish in place of one that is too long for the broker."""
+        """Return a line without texts, an error, or nothing, to replace a line that is too long for the broker."""
         message = decode(line)
         shorter = encode(policy.without_texts(message))
         if len(shorter) <= limit:
@@ -548,7 +551,7 @@ class RemoteSession:
     def _clean_up(self) -> None:
         """Close the connection and forget unanswered requests."""
         shared = self._sessions
-        self._leave_waiting()
+        self._drop_waiting()
         for exchange in self._exchanges:
             if exchange.goal_id is not None:
                 shared.goals.answered(exchange.goal_id, pending=False)
@@ -560,6 +563,6 @@ class RemoteSession:
 
 
 def _outlives_client(remote: RemoteRequest) -> bool:
-    """Return whether a request has an effect without its client. A goal that waits for room has none."""
+    """Return whether a request takes effect even if its client has left. A `patient` goal doesn't."""
     request = remote.request
     return not request.patient if isinstance(request, Say) else isinstance(request, Cancel | Set | Pause | Resume)
