@@ -75,7 +75,7 @@ def by_click(arguments: list[str]) -> tuple[str, dict[str, Any], CommonOptions]:
         assert name
         assert command
         with command.make_context(name, rest, parent=group) as context:
-            options.typed = {each for each in context.params if context.get_parameter_source(each) is TYPED}
+            options.typed = frozenset(each for each in context.params if context.get_parameter_source(each) is TYPED)
             return name, context.params, options
 
 

@@ -179,7 +179,8 @@ class ClickCommand(_HelpfulCommand):
     def _run(self, **given: Any) -> int | None:
         context = click.get_current_context()
         options: CommonOptions = context.obj
-        options.typed = {each for each in given if context.get_parameter_source(each) is ParameterSource.COMMANDLINE}
+        source = context.get_parameter_source
+        options.typed = frozenset(each for each in given if source(each) is ParameterSource.COMMANDLINE)
         fault = self.row.usage_fault(given, options.typed, vars(options))
         if fault:
             raise click.UsageError(fault, context)

@@ -13,7 +13,6 @@ from talkcli.paths import named_robot
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
-    from collections.abc import Set as AbstractSet
     from typing import Any
 
     from talkcli.cli.show import CommonOptions
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
     ExitCodes = Mapping[int | str, str]
     #: Returns what is wrong with a combination of options. It is called with the values of all options, by name, and
     #: with the names of the options on the command line.
-    Rule = Callable[[Mapping[str, Any], AbstractSet[str]], str | None]
+    Rule = Callable[[Mapping[str, Any], frozenset[str]], str | None]
 
 #: A file to be written.
 OUTPUT_FILE = Kind("string", (str,), "must be a string")
@@ -96,7 +95,7 @@ class Command:
     fleet_function: str = ""
     rule: Rule | None = None
 
-    def usage_fault(self, given: Mapping[str, Any], typed: AbstractSet[str], common: Mapping[str, Any]) -> str | None:
+    def usage_fault(self, given: Mapping[str, Any], typed: frozenset[str], common: Mapping[str, Any]) -> str | None:
         """Return what is wrong with a command line whose values are each valid, or None.
 
         Args:

@@ -30,7 +30,6 @@ from talkcli.goals.options import (
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
-    from collections.abc import Set as AbstractSet
     from typing import Any
 
 #: The largest value of --max-queue, and so of --ahead.
@@ -76,7 +75,7 @@ _SERVERLESS_OPTIONS = {"timeout", "output", *(each.name for each in SOUND_OPTION
 _OTHER_EXTENSIONS = (".aac", ".aiff", ".au", ".flac", ".m4a", ".mp3", ".mp4", ".oga", ".ogg", ".opus", ".webm", ".wma")
 
 
-def _say_rule(given: Mapping[str, Any], typed: AbstractSet[str]) -> str | None:
+def _say_rule(given: Mapping[str, Any], typed: frozenset[str]) -> str | None:
     output, text, waits = given["output"], given["text"], given["wait"] or given["feedback"]
     if output is not None:
         named = [spelling(each, given[each.name]) for each in _SAY_OPTIONS if each.name in typed - _SERVERLESS_OPTIONS]
@@ -151,7 +150,7 @@ _SERVE_OPTIONS = (
 )
 
 
-def _serve_rule(given: Mapping[str, Any], _: AbstractSet[str]) -> str | None:
+def _serve_rule(given: Mapping[str, Any], _: frozenset[str]) -> str | None:
     player = given["player"] or ""
     if given["device"] and player.startswith(("null", "file:")):
         return f"--device means nothing to the player {player}"
@@ -177,7 +176,7 @@ _BRIDGE_OPTIONS = (
 )
 
 
-def _bridge_rule(given: Mapping[str, Any], _: AbstractSet[str]) -> str | None:
+def _bridge_rule(given: Mapping[str, Any], _: frozenset[str]) -> str | None:
     if given["name"] is None and not given["print_acl"]:
         return "--name is missing: what the robot is called on the broker"
     return None

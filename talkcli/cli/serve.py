@@ -39,22 +39,13 @@ def serve(options: CommonOptions, print_unit: str | None, **given: Any) -> int:
 
 
 def _warn_about_sound(player: str, driver: str | None) -> None:
-    """Warn if no sentence could be heard, because there is no sound device or no such player.
-
-    Without --player this only looks for certain files, so that the start isn't delayed.
-    """
+    """Warn if no sentence could be heard, because there is no sound device or no such player."""
     from talkcli.engine.players import PACKAGES, has_no_output, is_silent
-
-    if is_silent(player):
-        return
-    silent = has_no_output(os.environ)
-    if not player and not silent:
-        return
     from talkcli.engine.voices import is_own_driver
 
-    if not is_own_driver(driver):
-        return  # this driver plays by itself, and the server says so
-    if silent and (not player or player in PACKAGES):
+    if is_silent(player) or not is_own_driver(driver):
+        return  # other drivers play by themselves, and the server says so
+    if (not player or player in PACKAGES) and has_no_output(os.environ):
         note(_NO_DEVICE)
     if player:
         _warn_about_player(player)

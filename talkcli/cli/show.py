@@ -17,7 +17,6 @@ from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
-    from collections.abc import Set as AbstractSet
     from typing import Any, TextIO, TypeVar
 
     from talkcli.client.client import Client
@@ -56,7 +55,7 @@ class CommonOptions:
     #: signals that stay blocked until the command can handle them
     blocked_signals: Iterable[int] = ()
     #: the names of the options on the command line
-    typed: AbstractSet[str] = frozenset()
+    typed: frozenset[str] = frozenset()
     #: whether the command may connect to a server that has reached its client limit
     urgent = False
 
