@@ -9,13 +9,18 @@ from __future__ import annotations
 import _socket
 import sys
 
+from talkcli.frozen import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
 #: Length limit for a command line. It leaves room for an interpreter, a script and its first arguments.
 _MAX_COMMAND_LINE_CHARS = 200
 
 #: Programs that run another program and wait for it. Their parents say more about where a request comes from.
 _WRAPPER_PROGRAMS = frozenset({b"timeout", b"time", b"flock", b"xargs", b"sudo"})
-#: How many wrapper programs to skip at most.
-_MAX_WRAPPERS_COUNT = 8
+#: How many parents of a process to look at. A shell that a script runs is three levels below cron.
+_MAX_PARENTS_COUNT = 8
 
 _LOCAL_PEERCRED = 0x001  # <sys/un.h> on macOS
 _LOCAL_PEERPID = 0x002
@@ -42,17 +47,25 @@ def command_name(pid: int) -> str | None:
     return line.decode(errors="replace").rstrip("\n") if line else None
 
 
+def parents(pid: int) -> Iterator[int]:
+    """Yield the id of a process's parent, then of the parent's parent, and so on."""
+    for _ in range(_MAX_PARENTS_COUNT):
+        stat = process_stat(pid)
+        pid = int(stat[1]) if stat else 0
+        if pid == 0:
+            return
+        yield pid
+
+
 def parent_command_line(pid: int) -> str | None:
     """Return the command line of a process's parent, or None if it is unknown.
 
     Wrapper programs are skipped: of `timeout 5 talk say …`, the result is the script that called `timeout`.
     """
     line = None
-    for _ in range(_MAX_WRAPPERS_COUNT):
-        parent = process_stat(pid)[1:2]
-        pid = int(parent[0]) if parent else 0
-        above = read_proc_file(f"/proc/{pid}/cmdline")
-        if not above or (line and pid == 1):
+    for parent in parents(pid):
+        above = read_proc_file(f"/proc/{parent}/cmdline")
+        if not above or (line and parent == 1):
             break
         line = above
         program, *arguments = (each.rpartition(b"/")[2] for each in line.split(b"\0"))

@@ -45,7 +45,7 @@ class ServiceManager:
         self._watchdog_interval = _watchdog_interval()
         #: fields that could not be sent yet, with the newest value of each
         self._unsent: dict[str, str] = {}
-        #: the status that was reported last
+        #: the newest status
         self._status = ""
         #: timers of notifications that are due later, by name
         self._timers: dict[str, asyncio.TimerHandle] = {}
@@ -56,8 +56,7 @@ class ServiceManager:
 
     def notify_ready(self) -> None:
         """Report that the process is ready, and start the watchdog notifications."""
-        self._status = self._describe_status()
-        self._send(READY="1", STATUS=self._status)
+        self._send(READY="1", STATUS=self._describe_status())
         self._notify_watchdog()
 
     def schedule_status(self) -> None:
@@ -67,8 +66,7 @@ class ServiceManager:
     def notify_stopping(self) -> None:
         """Report that the process is about to end. Watchdog notifications continue until `close`."""
         if self._status != "ending":
-            self._status = "ending"
-            self._send(STOPPING="1", STATUS=self._status)
+            self._send(STOPPING="1", STATUS="ending")
 
     def close(self) -> None:
         """Stop all notifications."""
@@ -82,7 +80,6 @@ class ServiceManager:
     def _notify_status(self) -> None:
         status = self._describe_status()
         if self._status not in {status, "ending"}:
-            self._status = status
             self._send(STATUS=status)
 
     def _notify_watchdog(self) -> None:
@@ -103,6 +100,7 @@ class ServiceManager:
     def _send(self, **fields: str) -> None:
         if self._socket is None:
             return
+        self._status = fields.get("STATUS", self._status)
         self._unsent |= fields
         data = "".join(f"{name}={value}\n" for name, value in self._unsent.items()).encode(errors="replace")
         try:

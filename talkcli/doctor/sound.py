@@ -31,7 +31,7 @@ from talkcli.engine.players import (
     sound_server_sockets,
 )
 from talkcli.frozen import frozen, replace
-from talkcli.peers import command_name, process_stat, read_proc_file
+from talkcli.peers import command_name, parents, read_proc_file
 from talkcli.processes import kill, signal_name
 
 if TYPE_CHECKING:
@@ -42,8 +42,6 @@ if TYPE_CHECKING:
 _AUDIO_GROUP = "audio"
 #: Files that container runtimes create in every container.
 _CONTAINER_FILES = ("/.dockerenv", "/run/.containerenv", "/run/systemd/container")
-#: How many parents of a process to look at. A shell that a script runs is three levels below cron.
-_MAX_PARENTS_COUNT = 8
 _CRON_PROGRAMS = frozenset({"cron", "crond", "cronie", "anacron"})
 _SSH_PROGRAMS = frozenset({"ssh", "sshd"})
 _CONTAINER, _CRON_JOB, _SYSTEM_SERVICE = "a container", "a cron job", "a system service"
@@ -261,22 +259,13 @@ def _origins(environment: Mapping[str, str], pid: int) -> Iterable[str]:
         yield _CONTAINER
     unit = re.search(r"system\.slice/(?:[^\n]*/)?([^/\n]+)\.service", _read_text(f"/proc/{pid}/cgroup"))
     service = unit[1] if unit else ""
-    if service in _CRON_PROGRAMS or any(each.lower() in _CRON_PROGRAMS for each in _parent_names(pid)):
+    programs = {service, *(str(command_name(each)).lower() for each in parents(pid))}  # Debian's cron also runs as CRON
+    if not _CRON_PROGRAMS.isdisjoint(programs):
         yield _CRON_JOB
     elif service and service not in _SSH_PROGRAMS and environment.get("INVOCATION_ID"):
         yield _SYSTEM_SERVICE
     if environment.get("SSH_CONNECTION"):
         yield "an ssh session"
-
-
-def _parent_names(pid: int) -> Iterable[str]:
-    """Yield the names of the programs that a process's parents run, the nearest first."""
-    for _ in range(_MAX_PARENTS_COUNT):
-        parent = process_stat(pid)[1:2]
-        pid = int(parent[0]) if parent else 0
-        if pid == 0:
-            return
-        yield command_name(pid) or ""
 
 
 def find_cards(session: UserSession, kernel: str = "/proc/asound", nodes: str = "/dev/snd") -> Cards:
