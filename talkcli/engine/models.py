@@ -1,8 +1,8 @@
-"""The files of neural voices: where they are, whether they can be trusted, and the description beside each model.
+"""The files of neural voices: finding them, checking who can change them, and reading their descriptions.
 
-A voice consists of NAME.onnx and NAME.onnx.json in a directory of `paths.voice_directories`, or in an installed package
-`*_piper_voice`. Users name a voice by its file name and never by a path, so a client can't make the server read any
-other file. Nothing is cached: a new voice is found at the next call. No model is run here.
+A voice consists of NAME.onnx and NAME.onnx.json, either in one of `paths.voice_directories` or in an installed package
+`*_piper_voice`. Users give the name of the file and never a path, so a client can't make the server read any other
+file. Nothing is cached, so a new voice is found by the next call. This module doesn't run models.
 """
 
 from __future__ import annotations
@@ -23,33 +23,35 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from typing import Any
 
-#: The packages that run a model.
+#: The packages that are needed to run a model.
 MODEL_PACKAGES = install.NEURAL_PACKAGES
 #: Since version 1.30, onnxruntime writes a device id into ~/.cache/Microsoft when it is imported, and contacts a
-#: telemetry host some seconds later. A robot's voice reports to nobody, so even a user's own value is overwritten.
+#: telemetry host some seconds later. A robot must not report to anyone, so even a value that the user has set is
+#: overwritten.
 NO_TELEMETRY = {"ORT_DISABLE_TELEMETRY": "1"}
 
 _MODEL_SUFFIX, JSON_SUFFIX = ".onnx", ".json"
-#: How the names of packages with voices end, and where in such a package the models may be.
+#: The suffix of packages that contain voices, and the directories in such a package that may contain models.
 _PACKAGE_SUFFIX, _PACKAGE_DIRS = "_piper_voice", ("", "data")
-#: The largest JSON file; a model with a thousand speakers has 30,000 bytes.
+#: The maximum size of a JSON file. The file of a model with a thousand speakers has 30,000 bytes.
 _MAX_JSON_BYTES = 1 << 20
-#: The most speakers of a model; the largest of Piper's has 904.
+#: The maximum number of speakers. Piper's largest model has 904.
 _MAX_SPEAKERS = 4096
-#: The longest part of a JSON's text that is shown, and the longest name of a speaker.
+#: The maximum length of a displayed text from a JSON file, and of a speaker's name.
 _MAX_SHOWN_CHARS, _MAX_SPEAKER_CHARS = 40, 64
-#: The sample rates that a player can be asked for.
+#: The sample rates that players support.
 _RATES_HZ = range(4000, 192001)
-#: The most symbolic links on the way to a file; Linux has the same limit.
+#: The maximum number of symbolic links in a path, as in Linux.
 _MAX_LINKS = 40
-#: The most ids of a phoneme; Piper's voices use one. A model's memory grows with the square of all ids in a sentence.
+#: The maximum number of ids per phoneme. Piper's voices use one, and a model's memory grows with the square of all ids
+#: in a sentence.
 _MAX_IDS_PER_PHONEME = 4
-#: The symbols in `phoneme_id_map` for the padding between phonemes, and for the begin and end of a sentence.
+#: The keys in `phoneme_id_map` for the padding between phonemes and for the beginning and end of a sentence.
 PAD_SYMBOL, BEGIN_SYMBOL, END_SYMBOL = "_", "^", "$"
 
 
 class VoiceFileError(Exception):
-    """A file of a voice is missing, unsafe or invalid; the text names the file and the next step."""
+    """A voice's file is missing, unsafe or invalid. The text is an error message with the file and the next step."""
 
 
 @frozen
@@ -57,23 +59,23 @@ class VoiceDescription:
     """The content of the JSON file beside a model."""
 
     rate: int  # samples per second
-    #: the libespeak-ng voice that provides the phonemes
+    #: the voice of libespeak-ng that provides the phonemes
     espeak_voice: str
-    #: the language that the voice's author states, in libespeak-ng's form: "en-us". `espeak_voice` may have another
-    #: code for the same language, such as "cmn" for "zh-cn".
+    #: the language that the voice's author states, as libespeak-ng writes it: "en-us". `espeak_voice` may have another
+    #: code for the same language: "cmn" instead of "zh-cn".
     language: str
-    name: str  # for people: "joe, medium", "thorsten, medium, 8 speakers"
+    name: str  # for display: "joe, medium" or "thorsten, medium, 8 speakers"
     quality: str | None  # "medium"
     speakers: int
     speaker_names: Mapping[str, int]
-    phoneme_ids: Mapping[str, tuple[int, ...]]  # the model's ids of each IPA character
-    noise: float  # random variation of the sound; 0 makes a text sound the same each time
+    phoneme_ids: Mapping[str, tuple[int, ...]]  # the ids of each IPA character in the model
+    noise: float  # random variation of the sound; with 0, a text always sounds the same
     duration_noise: float  # random variation of the durations
-    duration_scale: float  # factor of all durations, for the voice's natural pace
+    duration_scale: float  # factor by which durations are multiplied for the voice's natural pace
 
 
 def missing_package() -> str | None:
-    """Return the error for a missing package, or None if all packages for neural voices are installed."""
+    """Return the error message for a missing package, or None if all packages for neural voices are installed."""
     from importlib.util import find_spec
 
     missing = next((each for each in MODEL_PACKAGES if find_spec(each) is None), None)
@@ -81,18 +83,19 @@ def missing_package() -> str | None:
 
 
 def find_models(environment: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Return the paths of the models by name; if two directories have the same name, the first one counts.
+    """Return the paths of the models by their names.
 
-    Models whose names can't be typed, or that a terminal would take for commands, are left out.
+    If several directories contain the same name, the first directory has precedence. Names that a user can't type, or
+    that contain control characters, are left out.
 
     Args:
-        environment: The environment variables that name the directories, or None for this process's.
+        environment: The environment variables that name the directories, or None for this process's environment.
     """
     result: dict[str, str] = {}
     for directory in _model_directories(environment):
         try:
             names = sorted(os.listdir(directory))
-        except OSError:  # most of the directories don't exist
+        except OSError:  # most of these directories don't exist
             continue
         for each in names:
             name = each.removesuffix(_MODEL_SUFFIX)
@@ -102,20 +105,20 @@ def find_models(environment: Mapping[str, str] | None = None) -> dict[str, str]:
 
 
 def installed_voices() -> tuple[Voice, ...]:
-    """Return the voices whose files exist, including those that can't be loaded."""
+    """Return all voices that have a model file, including voices that can't be loaded."""
     return tuple(_described_voice(name, path) for name, path in find_models().items())
 
 
 def installed_names(environment: Mapping[str, str] | None = None) -> tuple[Voice, ...]:
-    """Return the voices whose files exist, with nothing but their names, because no file is read."""
+    """Return all voices that have a model file, but only with their names; no file is read."""
     return tuple(Voice(NEURAL_PREFIX + name, None, name) for name in find_models(environment))
 
 
 def read_description(path: str) -> VoiceDescription:
-    """Read the JSON file beside the model at a path.
+    """Read the JSON file that belongs to a model.
 
     Raises:
-        VoiceFileError: It is missing, unsafe or invalid.
+        VoiceFileError: The file is missing, unsafe or invalid.
     """
     json_path = path + JSON_SUFFIX
     missing = "it belongs to the model: get it from where that came from"
@@ -134,15 +137,15 @@ def read_description(path: str) -> VoiceDescription:
 
 
 def open_checked(path: str, missing: str = "put it there again", model: str | None = None) -> Any:
-    """Open a file for reading bytes, unless someone other than root and this user could have written it.
+    """Open a file to read bytes, after checking that only this user and root can have written it.
 
     Args:
-        path: The file.
-        missing: The next step if the file is missing.
-        model: The model that the file belongs to, so that one error names the faults of both.
+        path: The path of the file.
+        missing: The next step for the error message if the file is missing.
+        model: The path of the model that the file belongs to. It is checked too, so that one error message covers both.
 
     Raises:
-        VoiceFileError: The file is missing, unreadable or unsafe.
+        VoiceFileError: A file is missing, unreadable or unsafe.
     """
     try:
         _check_paths(path, *([] if model is None else [model]))
@@ -164,13 +167,13 @@ def open_checked(path: str, missing: str = "put it there again", model: str | No
 
 
 def _check_paths(*paths: str) -> None:
-    """Check files, and every directory and link on the way to them.
+    """Check that no other user can replace files, nor any directory or link in their paths.
 
     A sticky directory such as /tmp may be writable for everyone, because only the owner of an entry can replace it. But
-    a voice file or a link to one must not be directly in such a directory.
+    it must not contain a voice file, or a link to one, directly.
 
     Raises:
-        VoiceFileError: Someone else could replace a file.
+        VoiceFileError: Another user could replace a file.
     """
     may_be_sticky: dict[str, bool] = {}
     for path in paths:
@@ -186,10 +189,10 @@ def _check_paths(*paths: str) -> None:
 
 
 def _walk_path(path: str) -> Iterator[tuple[str, bool]]:
-    """Yield the directories that lead to a file, and the file itself.
+    """Yield the directories in a file's path and the file itself, each with whether another directory follows.
 
-    Links are resolved. Each path comes with a flag that is True if another directory follows it. The walk ends before
-    the first path that doesn't exist; opening the file reports that.
+    Links are resolved. If a path doesn't exist, the walk ends before it, because opening the file then reports the
+    error.
 
     Raises:
         VoiceFileError: A link belongs to another user.
@@ -223,12 +226,12 @@ def _walk_path(path: str) -> Iterator[tuple[str, bool]]:
 
 
 def _others_can_write(path: str, status: os.stat_result, file: str | int) -> bool:
-    """Return whether someone other than root and this user may write a file.
+    """Return whether anyone except root and this user may write a file.
 
     Args:
-        path: The file's name for the error.
+        path: The file's name for the error message.
         status: The file's status.
-        file: The path or descriptor to examine.
+        file: The file's path or descriptor, for reading its access control list.
 
     Raises:
         VoiceFileError: The file belongs to another user.
@@ -248,7 +251,7 @@ def _check_owner(path: str, status: os.stat_result) -> None:
 
 
 def _has_acl(file: str | int) -> bool:
-    """Return whether a file has an access control list, which may grant other users the group's permissions."""
+    """Return whether a file has an access control list, which may give other users the group's permissions."""
     try:
         return hasattr(os, "listxattr") and "system.posix_acl_access" in os.listxattr(file)
     except OSError as error:
@@ -256,7 +259,7 @@ def _has_acl(file: str | int) -> bool:
 
 
 def _is_private_group(user: int, group: int) -> bool:
-    """Return whether a group has this user as its only member, like the groups that Debian and Fedora create."""
+    """Return whether a user is the only member of a group, as in the private groups of Debian and Fedora."""
     import grp
     import pwd
 
@@ -270,8 +273,8 @@ def _is_private_group(user: int, group: int) -> bool:
 
 
 def _writable_error(*paths: str) -> VoiceFileError:
-    """Return the error for paths that others can write, with the one command that repairs all of them."""
-    import shlex  # imported only here, because every engine process lists the voices when it starts
+    """Return the error for paths that others can write, with a single command that repairs all of them."""
+    import shlex  # every engine process imports this module, but rarely needs shlex
 
     names = f"{', '.join(paths[:-1])} and {paths[-1]}" if len(paths) > 1 else paths[0]
     needs_root = os.geteuid() != 0 and any(os.stat(each).st_uid == 0 for each in paths)
@@ -304,10 +307,10 @@ def _described_voice(name: str, path: str) -> Voice:
 
 
 def _parse_description(found: Any) -> VoiceDescription:
-    """Return the description in a parsed JSON file.
+    """Return the description from the content of a JSON file.
 
     Raises:
-        KeyError, TypeError, ValueError, AttributeError: It is invalid.
+        KeyError, TypeError, ValueError, AttributeError: The content is invalid.
     """
     if found.get("phoneme_type", "espeak") != "espeak":
         raise ValueError(f"its sounds are not libespeak-ng's, but {found['phoneme_type']!r}")

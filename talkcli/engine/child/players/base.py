@@ -1,7 +1,7 @@
 """The interface of a player, and the exceptions that end a sentence.
 
 Samples are signed 16 bit, little-endian, one channel. Lengths are in bytes. `tests/engine/test_player_contract.py`
-tests every player against the promises of `Player`.
+tests that every player keeps the promises of `Player`.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ if TYPE_CHECKING:
 else:
     Protocol = object
 
-#: A file descriptor, and the poll events to wait for.
+#: A file descriptor and the poll events to wait for.
 Interest = tuple[int, int]
 
 
 class CannotSpeak(Exception):
-    """The sentence, or the rest of it, can't be spoken.
+    """The sentence or the rest of it can't be spoken.
 
     Args:
-        reason: The reason for programs, such as "audio_lost".
-        message: The reason for people.
-        final: Whether no other player would be heard either, so none is tried.
+        reason: The machine-readable reason, such as "audio_lost".
+        message: The error message.
+        final: Whether to try no other player, because it wouldn't be heard either.
     """
 
     def __init__(self, reason: Reason, message: str, *, final: bool = False) -> None:
@@ -40,98 +40,99 @@ class Stopped(Exception):
 
 
 class CannotEnd(Exception):
-    """A player survived `kill`, so this process can't promise silence any more and has to end."""
+    """A player couldn't be killed, so the engine process can't guarantee silence any more and has to exit."""
 
 
 class Player(Protocol):
-    """A player for the samples of one sentence; every sentence has a player of its own.
+    """A player for one sentence.
 
-    A constructor that can't open the output raises CannotSpeak (`no_player` or `audio_device`) and leaves nothing
-    open. After that, the playback calls the player from a single thread:
+    The constructor raises CannotSpeak (`no_player` or `audio_device`) if the output can't be opened, and leaves nothing
+    open then. After that, the playback calls the player from a single thread:
 
-    1. `offer` until there are no more samples, then `close` once, then `ended` until it returns True. `consumed` and
-       `proven` may be read at any time. `interests` and `wake_at` are called right before each wait.
-    2. `kill`, however the sentence ended (a stop and an error may come at any point), then `gone` until it returns
-       True.
+    1. It calls `offer` until there are no more samples, then `close` once, then `ended` until it returns True. It may
+       read `consumed` and `proven` at any time, and it calls `interests` and `wake_at` right before each wait.
+    2. However the sentence ended, it calls `kill`, and then `gone` until that returns True. A stop or an error can lead
+       to this step at any point.
 
-    No method blocks, except that `kill` may take some milliseconds if silence is certain afterwards. Work that would
-    block is done in a thread or process of the player's own, which wakes the playback through a descriptor.
+    No method blocks, except that `kill` may take some milliseconds to ensure silence. A player does blocking work in a
+    thread or process of its own, which wakes the playback through a descriptor.
 
-    A player plays everything that it took, in order and once, and adds no silence. If the outside world fails (the
-    device is unplugged, the disk is full), it raises CannotSpeak. Any other exception is a bug in the player.
+    A player plays all accepted samples once and in order, and adds no silence. It raises CannotSpeak for faults outside
+    of the program, such as an unplugged device or a full disk. Any other exception is a bug in the player.
     """
 
-    #: the player's name for people, by which a player that worked is also found again; it never changes
+    #: the player's name, which is displayed and identifies the player that last worked; it never changes
     name: str
-    #: whether playing takes as long as the sound lasts, so that a player that takes no samples is stuck. A player that
-    #: writes a file is not real-time, and is never heard. It never changes.
+    #: whether playing takes as long as the sound lasts, so that a player that accepts no samples has stalled. A player
+    #: that writes to a file isn't real-time, and nobody hears it. The value never changes.
     real_time: bool
-    #: whether sound has certainly reached the output, so that it may have been heard and is not played again. While it
-    #: is False, the next player gets the sentence if this one fails. It is up to date after `consumed`, and stays True
-    #: once it is True. A player that keeps all it is offered may start with True.
+    #: whether sound has certainly reached the output. The sentence may have been heard then, so no other player repeats
+    #: it if this one fails. The value is up to date after each call of `consumed`, and never becomes False again. A
+    #: player that stores everything it is offered may start with True.
     proven: bool
 
     @property
     def output(self) -> Output | None:
-        """The output's device, volume and mute state; None if it isn't known."""
+        """The device, volume and mute state of the output, or None if they are unknown."""
         return None
 
     def offer(self, data: memoryview) -> int:
-        """Take as many samples as fit now, and return their length.
+        """Accept as many samples as there is room for.
 
         Args:
-            data: Between one byte and one piece of samples. The caller overwrites the buffer afterwards.
+            data: Between one byte and one piece of samples. The caller reuses this buffer after the call.
 
         Returns:
-            The number of bytes taken, which may end within a sample; 0 if the player is full.
+            The number of accepted bytes, which may include a part of a sample. It is 0 if the player is full.
 
         Raises:
-            CannotSpeak: The player won't take samples any more. Every later call raises it again.
+            CannotSpeak: The player doesn't accept samples any more. Every later call raises this again.
         """
 
     def consumed(self) -> int:
-        """Return how many of the bytes taken have left for the device; the rest waits and could still be lost.
+        """Return how many of the accepted bytes the device has received.
 
-        The number never shrinks. It reaches all bytes taken by the time `ended` returns True. After `close`, it may
-        include bytes that still wait. The word clock starts when it begins to grow, and never runs ahead of it.
+        The other bytes could still be lost. The number never decreases. It includes all accepted bytes once `ended` has
+        returned True. After `close`, it may include bytes that the device hasn't received yet. The word clock starts
+        when the number starts to grow, and never runs ahead of it.
         """
 
     def heard(self) -> float | None:
-        """Return how many seconds of the player's stream have been heard; None if the output has no clock.
+        """Return how many seconds of the stream have been heard, or None if the output has no clock.
 
-        It is 0 until the first sample is heard. If there is such a clock, words and pauses follow it instead of
+        The result is 0 until the first sample is heard. If there is a clock, words and pauses follow it instead of
         `consumed`.
         """
         return None
 
     def close(self) -> None:
-        """Take no more samples, and play those already taken to their end.
+        """Accept no more samples, and play the accepted ones to the end.
 
         Raises:
-            CannotSpeak: They can't be played to their end.
+            CannotSpeak: The accepted samples can't be played to the end.
         """
 
     def ended(self) -> bool:
-        """Return whether the player was closed and has successfully played everything.
+        """Return whether the player was closed and has played everything successfully.
 
         Raises:
-            CannotSpeak: The player failed. This is raised before `close` too, even if no sample is offered.
+            CannotSpeak: The player failed. This is also raised before `close`, even if no samples are offered.
         """
 
     def interests(self) -> Sequence[Interest]:
-        """Return the open descriptors to poll for room, failure or the end.
+        """Return the open descriptors to poll for room, failure or the end of the player.
 
-        The playback leaves out descriptors that only wait for POLLOUT if it has no samples to offer.
+        The playback ignores descriptors that only wait for POLLOUT while it has no samples to offer.
         """
 
     def wake_at(self) -> float | None:
-        """Return the monotonic time at which the player has to be checked again, or None if poll is enough."""
+        """Return the monotonic time at which to check the player again, or None to rely on poll alone."""
 
     def kill(self) -> None:
-        """Fall silent at once and release what can be released; never raises, and may be called again."""
+        """Stop playing at once, and start to release all resources; never raises, and may be called again."""
 
     def gone(self) -> bool:
-        """Return whether the player is certainly silent, and its descriptors, processes and threads are released.
+        """Return whether the player is certainly silent and has released its descriptors, processes and threads.
 
-        It is called only after `kill`, every 20 ms. After one second, the whole engine process is given up.
+        It is called every 20 ms after `kill`. After one second, the engine process exits.
         """

@@ -1,4 +1,4 @@
-"""The players that need neither a program nor a sound server: "null", "file:PATH", and `talk say --output`."""
+"""Players that need neither a program nor a sound server: "null", "file:PATH", and `talk say --output`."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ if TYPE_CHECKING:
 
     from talkcli.engine.child.players.base import Interest
 
-#: Seconds of sound that the null player takes ahead of its clock: as much as a real player buffers.
+#: Seconds of sound that the null player accepts ahead of its clock, which is as much as a real player buffers.
 NULL_AHEAD_S = 0.06
 
 _WAV_HEADER = struct.Struct("<4sI4s4sIHHIIHH4sI")
-#: Bytes of the header that the length after "RIFF" includes.
+#: The number of header bytes that the length after "RIFF" counts.
 _RIFF_HEADER_BYTES = _WAV_HEADER.size - 8
-#: The length in the header of a stream; the two lengths are 32 bits wide.
+#: The length in the header of a stream. Both lengths in a header have 32 bits.
 _UNKNOWN_BYTES = 0xFFFFFFFF
 _MAX_WAV_BYTES = _UNKNOWN_BYTES - _WAV_HEADER.size
 
 
 class BuiltInPlayer(Player):
-    """Base class of players that handle samples at once and have nothing to release."""
+    """Base class of players that process samples at once and have nothing to release."""
 
     proven = True
 
@@ -63,9 +63,9 @@ class BuiltInPlayer(Player):
 
 
 class NullPlayer(BuiltInPlayer):
-    """A player that makes no sound, but takes as long as the sound would.
+    """Accepts samples as slowly as a loudspeaker would play them, but makes no sound.
 
-    It is for robots in simulation and for CI, where scripts have to keep their timing.
+    This player is for simulated robots and for CI, where scripts have to keep their timing.
     """
 
     name = "null"
@@ -82,7 +82,7 @@ class NullPlayer(BuiltInPlayer):
         now = self._clock()
         if self._started is None:
             self._started = now
-        self._started += max(0.0, now - self._end_time())  # a silence in which no samples came
+        self._started += max(0.0, now - self._end_time())  # the time without samples counts as silence
         if self._taken + len(data) > (now - self._started + NULL_AHEAD_S) * self._bytes_per_second:
             return 0
         self._taken += len(data)
@@ -94,19 +94,20 @@ class NullPlayer(BuiltInPlayer):
     def wake_at(self) -> float | None:
         if self._started is None:
             return self._clock()
-        # A third of the buffer is free by then, so it wakes up no more often than a real player.
+        # A third of the buffer is free then, so this player wakes up no more often than a real one.
         return self._end_time() if self._closed else self._end_time() - NULL_AHEAD_S * 2 / 3
 
     def _end_time(self) -> float:
-        """Return the time at which the last sample would have been heard."""
+        """Return the time at which the last accepted sample would have been heard."""
         return (self._started or 0.0) + self._taken / self._bytes_per_second
 
 
 class WavPlayer(BuiltInPlayer):
-    """A player that appends each sentence to a WAV file.
+    """Appends each sentence to a WAV file.
 
-    The file is valid after every sentence and after a stop. The player only writes to files with the plain 44-byte
-    header that it writes itself. If a crash left samples beyond the length in that header, they are cut off.
+    The file is valid after every sentence, even if the sentence was stopped. The player only appends to files with the
+    plain 44-byte header that it writes itself. It removes samples beyond the length in the header, which a crash may
+    have left.
     """
 
     real_time = False
@@ -115,7 +116,7 @@ class WavPlayer(BuiltInPlayer):
         """Open or create the file.
 
         Raises:
-            CannotSpeak: The file can't take this sentence (`audio_device`).
+            CannotSpeak: This sentence can't be written to the file (`audio_device`).
         """
         super().__init__()
         self.name = f"{FILE_PREFIX}{path}"
@@ -148,10 +149,10 @@ class WavPlayer(BuiltInPlayer):
             try:
                 self._write_header()
             finally:
-                os.close(self._file)  # a quota or a network file system may report only here that it is full
+                os.close(self._file)  # some network file systems and quotas report a full disk only here
 
     def kill(self) -> None:
-        with contextlib.suppress(CannotSpeak):  # the sentence already ended with a stop or an error of its own
+        with contextlib.suppress(CannotSpeak):  # the sentence has already ended with a stop or another error
             self.close()
 
     def _write_header(self) -> None:
@@ -160,18 +161,18 @@ class WavPlayer(BuiltInPlayer):
 
 
 class WavStreamPlayer(BuiltInPlayer):
-    """A player that writes a WAV stream to a pipe, a device, or a file that the shell has opened.
+    """Writes a WAV stream to a pipe, a device, or a file that the shell has opened.
 
-    The sentences follow each other in the stream. The header states unknown lengths, because it can't be rewritten
-    later. The reader sets the pace. Other programs share the descriptor, so its mode isn't changed, and it is only
-    written to if poll reports room.
+    The stream contains all sentences. Its header has no valid lengths, because it can't be rewritten later. The program
+    that reads the stream sets the pace. Other programs share the descriptor, so this player doesn't make it
+    non-blocking. It polls the descriptor before each write instead.
     """
 
     real_time = False
     name = OUTPUT_STREAM_NAME
 
     def __init__(self, output: int, rate: int, *, first: bool) -> None:
-        """Open the player on a descriptor; the `first` sentence of a stream starts with the header."""
+        """Open the player on a descriptor, and write the header before the `first` sentence."""
         super().__init__()
         self._output = output
         self._header = _WAV_HEADER.pack(*_header_fields(rate, _UNKNOWN_BYTES, _UNKNOWN_BYTES)) if first else b""
@@ -179,7 +180,7 @@ class WavStreamPlayer(BuiltInPlayer):
         self._poll.register(output, select.POLLOUT)
 
     def offer(self, data: memoryview) -> int:
-        if not self._poll.poll(0):  # a writable pipe has room for a header and a piece at least
+        if not self._poll.poll(0):  # a writable pipe has room for at least a header and a piece
             return 0
         try:
             written = os.write(self._output, self._header + data if self._header else data)
@@ -201,7 +202,7 @@ class WavStreamPlayer(BuiltInPlayer):
 
 @contextlib.contextmanager
 def _os_errors(reason: Reason, subject: str) -> Iterator[None]:
-    """Turn an OSError into CannotSpeak."""
+    """Raise CannotSpeak instead of an OSError."""
     try:
         yield
     except OSError as error:
@@ -219,13 +220,14 @@ def _open_regular(path: str) -> int:
 
 
 def _header_fields(rate: int, riff_bytes: int, sample_bytes: int) -> tuple[bytes | int, ...]:
-    """Return the fields of a WAV header: `riff_bytes` follow the first length, `sample_bytes` the second."""
+    """Return the fields of a WAV header; `riff_bytes` is the length after "RIFF", `sample_bytes` the one after "data".
+    """
     audio_format = (1, 1, rate, rate * SAMPLE_BYTES, SAMPLE_BYTES, 8 * SAMPLE_BYTES)  # PCM, one channel
     return b"RIFF", riff_bytes, b"WAVE", b"fmt ", 16, *audio_format, b"data", sample_bytes
 
 
 def _sample_bytes(file: int, path: str, rate: int) -> int:
-    """Return the length of the samples in a file, or 0 if it is empty.
+    """Return the number of sample bytes in a file, or 0 if the file is empty.
 
     Raises:
         CannotSpeak: The file wasn't written by a `WavPlayer` with this sample rate.

@@ -1,6 +1,6 @@
-"""The choice of a player for each sentence, as `--player` and `--device` command.
+"""The choice of a player for each sentence, according to `--player` and `--device`.
 
-No player stays open between two sentences. If a player fails, the playback decides whether the next one is tried.
+Every sentence opens a player of its own. If a player fails, the playback decides whether to try the next one.
 """
 
 from __future__ import annotations
@@ -25,78 +25,83 @@ if TYPE_CHECKING:
     from talkcli.engine.protocol import Configure, Speak
     from talkcli.goals.goal import Output
 
-#: The automatic players that run in this process instead of a program; they are tried first.
+#: The players of the automatic choice that run in this process. They are tried before any program.
 _AUTOMATIC = [name for name, each in PLAYERS.items() if each.automatic and each.opens]
 
-#: Seconds without sound after which a device counts as idle, so the next sentence starts with the lead-in. Sound cards
-#: with power saving (snd_hda_intel) sleep after 1 s, and sound servers suspend a device after 5 s. Played silence
-#: counts as idle, because loudspeakers switch themselves off by what they hear.
+#: Seconds without sound after which a device counts as idle. The next sentence then starts with the lead-in. Sound
+#: cards with power saving (snd_hda_intel) sleep after 1 s, and sound servers suspend a device after 5 s. Silence that
+#: is played counts as no sound, because some loudspeakers switch off when they receive only silence.
 IDLE_AFTER_S = 1.0
 
-#: The number of handovers whose median predicts the next one. The median ignores a late one on a busy machine.
+#: The number of handovers to remember for each player. Their median predicts the next handover, because it ignores a
+#: late one on a busy machine.
 MAX_HANDOVERS = 5
 
-#: The most seconds of silence to cut. Half of the pause after a sentence stays, because it separates sentences.
+#: Maximum seconds of silence to cut. This is half of the pause after a sentence. The other half stays to separate
+#: sentences.
 MAX_CUT_S = 0.12
 
-#: The longest handover. If it takes longer, the waiting goal was canceled or held, and another one came later.
+#: Maximum seconds of a handover. A longer one isn't counted, because the waiting goal was canceled or held, and another
+#: goal came later.
 MAX_HANDOVER_S = 0.5
 
 
 class HandoverTimes:
-    """The times that changes from one sentence to the next have taken, and the silence to cut because of them.
+    """Measures the gaps between sentences, and tells how much silence to cut in return.
 
-    A sentence ends with a pause. After it, the player drains and ends, the server is told, and the next sentence
-    starts. This makes a queue 25 to 40 ms slower than it should sound. If another goal waits, the playback therefore
-    cuts as much inaudible silence from the end of the sentence as recent handovers took. A sentence that nothing
-    follows is played to its last sample.
+    A handover is the time between the last sample of one sentence and the first sample of the next. In it, the player
+    drains and exits, the server gets the result, and the next sentence starts. This would lengthen the pause between
+    queued sentences by 25 to 40 ms. If another goal is waiting, the playback therefore cuts as much inaudible silence
+    from the end of the sentence as recent handovers took. The last sentence in the queue is played completely.
 
-    Handovers are measured per player and separately for neural voices, which need about 0.1 s more for their first
-    sound. Nothing is cut until a handover has been measured. The class is pure: times are monotonic and passed in.
+    Handovers are measured for each player. Those to neural voices are measured separately, because such a voice needs
+    about 0.1 s more for its first sound. Nothing is cut before the first measurement. The class is pure: it gets all
+    times (monotonic) as arguments.
     """
 
     def __init__(self) -> None:
-        #: whether another goal waits behind the current one, and whether that one needs a neural voice
+        #: whether another goal is waiting, and whether that goal needs a neural voice
         self.next_waits = self.next_is_neural = False
         self._measured: dict[tuple[str, bool], deque[float]] = {}
-        #: the previous sentence's player and the time of its last sample; None if no goal waited behind it
+        #: the player of the previous sentence and the time of its last sample, or None if no goal was waiting at its
+        #: end
         self._previous: tuple[str, float] | None = None
 
     @property
     def follows(self) -> bool:
-        """Whether the sentence that starts follows another one directly."""
+        """Whether the starting sentence directly follows another one."""
         return self._previous is not None
 
     def silence_to_cut(self, player: str) -> float:
-        """Return the seconds of silence to cut from the end of a sentence of this player."""
+        """Return the seconds of silence to cut from the end of a sentence that this player plays."""
         measured = sorted(self._measured.get((player, self.next_is_neural), ()))
         return min(MAX_CUT_S, measured[len(measured) // 2]) if measured else 0.0
 
     def sentence_ended(self, player: str, last_sample_at: float) -> None:
-        """Record the end of a sentence that was played completely."""
+        """Record the time of the last sample after a sentence was played completely."""
         self._previous = (player, last_sample_at) if self.next_waits else None
 
     def sentence_started(self, player: str, at: float, *, neural: bool = False) -> None:
-        """Record the time at which the player of a new sentence took its first sample."""
+        """Record the time at which the player of a new sentence accepted the first sample."""
         previous, self._previous = self._previous, None
         if previous is not None and previous[0] == player and 0 < at - previous[1] < MAX_HANDOVER_S:
             self._measured.setdefault((player, neural), deque(maxlen=MAX_HANDOVERS)).append(at - previous[1])
 
 
 class PlayerChooser:
-    """The players of one engine process, and the output of the current sentence.
+    """Opens the players of an engine process, and records the output of the current sentence.
 
     Args:
-        configure: The engine's settings: the player, the device and so on.
+        configure: The settings of the engine process, such as the player and the device.
         inherited: Descriptors that every player program inherits.
     """
 
     def __init__(self, configure: Configure, inherited: Sequence[int] = ()) -> None:
         self._configure = configure
         self._inherited = inherited
-        #: whether playing takes as long as the sound lasts; only files are faster
+        #: whether playing takes as long as the sound lasts, which is only False for files
         self.takes_time = configure.output_fd is None and not (configure.player or "").startswith(FILE_PREFIX)
-        #: the names of the players to try that run in this process
+        #: the names of the players in this process that are tried first
         self._in_process: Sequence[str] = ()
         if configure.player is configure.device is None:
             self._in_process = _AUTOMATIC
@@ -104,22 +109,22 @@ class PlayerChooser:
             self._in_process = [configure.player]
         self._streaming = False
         self.handovers = HandoverTimes()
-        #: the current sentence's output; None if it isn't known
+        #: the output of the current sentence, or None if it is unknown
         self.output: Output | None = None
-        #: milliseconds of lead-in that the current sentence asks for; None for the engine's setting
+        #: the lead-in of the current sentence in milliseconds, or None to use the engine's setting
         self._own_lead_in: int | None = None
         #: whether the current sentence fails if the output is muted
         self._audible = configure.audible
-        #: the name of the player that last played a sentence to its end
+        #: the player that last played a sentence completely
         self.last_player = configure.last_player
-        #: the name of the player that plays the current sentence, if the choice is automatic
+        #: the player of the current sentence, if the choice is automatic
         self.chosen: str | None = None
         self._last_used_at: float | None = None
 
     def candidates(self, rate: int) -> Iterator[Callable[[], Player]]:
-        """Yield functions that open the players to try for a sentence, best first.
+        """Yield functions that open the players to try, best first.
 
-        Programs are searched for only when the caller asks for them.
+        Programs are searched for only after the players in this process have been tried.
         """
         player, device = self._configure.player, self._configure.device
         if not self.takes_time:
@@ -143,7 +148,7 @@ class PlayerChooser:
         self.handovers.next_waits, self.handovers.next_is_neural = command.next_waits, command.next_is_neural
 
     def update_output(self, player: Player) -> None:
-        """Record where the current sentence is played; once it was muted, it counts as muted to its end."""
+        """Record the output of the current sentence; once the output was muted, the sentence counts as muted."""
         if player.proven and self._configure.player is None:
             self.chosen = player.name
         output, before = player.output, self.output
@@ -152,18 +157,18 @@ class PlayerChooser:
         elif output is not None:
             self.output = replace(output, muted=output.muted or before.muted)
         elif player.proven and before.player != player.name and not before.muted:
-            self.output = None  # this player can't tell where it plays
+            self.output = None  # this player doesn't know its output
 
     def device_released(self, silent_since: float | None = None) -> None:
-        """Record that the device was closed now, or has played only silence since `silent_since`."""
+        """Record that the device was released now, or that it has played only silence since `silent_since`."""
         self._last_used_at = time.monotonic() if silent_since is None else silent_since
 
     def lead_in_seconds(self, begins: bool = True) -> float:
-        """Return the seconds of silence to play first on a player that opens now.
+        """Return the seconds of silence that a newly opened player has to play first.
 
         Args:
-            begins: Whether the player starts the sentence. If it continues a sentence after a long pause, the
-                sentence's own lead-in only wakes up an idle device.
+            begins: Whether the player plays the beginning of the sentence. Otherwise it continues the sentence after a
+                long pause, and a lead-in of the sentence's own is only needed if the device is idle.
         """
         idle = self._last_used_at is None or time.monotonic() - self._last_used_at >= IDLE_AFTER_S
         own = self._own_lead_in
@@ -171,7 +176,7 @@ class PlayerChooser:
         return milliseconds / 1000 if due else 0.0
 
     def first_player(self) -> str | None:
-        """Return the name of the player that is tried first, for people; None if there is no player."""
+        """Return the name of the player that would be tried first, or None if there is no player."""
         if self._configure.output_fd is not None:
             return WavStreamPlayer.name
         if self._configure.player is not None:
@@ -193,7 +198,7 @@ class PlayerChooser:
 
 
 def _open(name: str, rate: int, device: str | None = None, audible: bool = False) -> Player:
-    """Open the player that a row of PLAYERS names by its class."""
+    """Open a player in this process by its name in PLAYERS."""
     module, _, member = PLAYERS[name].opens.partition(":")
     opens = getattr(import_module(f"talkcli.engine.child.players.{module}"), member)
     player: Player = opens(rate, device, audible)

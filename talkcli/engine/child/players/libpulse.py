@@ -1,12 +1,12 @@
-"""Bindings of libpulse: the functions and structures that a player needs, and a main loop that never blocks.
+"""Bindings of libpulse's functions and structures that a player needs, and a main loop that never blocks.
 
-libpulse splits an iteration of its main loop into prepare, poll and dispatch, and lets the program replace the poll
-function. Ours notes what libpulse wants to wait for and polls without waiting. The loop is iterated until there is no
-work left. After that, the engine waits for the noted descriptors together with its own. This needs neither a thread nor
-a blocking call.
+An iteration of libpulse's main loop consists of prepare, poll and dispatch. A program can replace the poll function.
+Ours stores the descriptors and the timeout that libpulse wants to wait for, and polls without waiting. The loop is
+iterated until it has no more work. Then the engine waits for the stored descriptors together with its own ones. This
+needs neither a thread nor a blocking call.
 
-libpulse itself finds the server (PULSE_SERVER, client.conf, the runtime directories of the user and the system) and
-sends the cookie.
+libpulse finds the server on its own (PULSE_SERVER, client.conf, the runtime directories of the user and the system),
+and sends the cookie.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ if TYPE_CHECKING:
 
 _LIBPULSE = "libpulse.so.0"
 
-#: An invalid index, or the server's choice of a size: (uint32_t) -1.
+#: The value for an invalid index, and for a size that the server chooses: (uint32_t) -1.
 NO_INDEX = 0xFFFFFFFF
-#: The volume of 100 %.
+#: The value for a volume of 100 %.
 NORMAL_VOLUME = 0x10000
 
-# From pulse/def.h and pulse/sample.h; these numbers are part of libpulse's ABI.
+# Constants from pulse/def.h and pulse/sample.h, which are part of libpulse's ABI.
 NO_AUTOSPAWN = 1
 S16LE = 3
 CONTEXT_READY, CONTEXT_FAILED, CONTEXT_TERMINATED = 4, 5, 6
@@ -45,7 +45,7 @@ FLAT_VOLUME = 0x40
 MASK_SINK, MASK_SINK_INPUT = 0x1, 0x4
 FACILITY_MASK, EVENT_SINK, EVENT_SINK_INPUT = 0xF, 0, 2
 NO_ENTITY, CONNECTION_REFUSED, INVALID_SERVER = 5, 6, 13
-#: The size that reports an error: (size_t) -1.
+#: The value of a size that reports an error: (size_t) -1.
 SIZE_ERROR = ctypes.c_size_t(-1).value
 
 
@@ -80,7 +80,7 @@ class BufferSizes(Structure):
 
 
 class SinkInfo(Structure):
-    """The first fields of the C structure `pa_sink_info`; later versions only add fields at the end."""
+    """The first fields of the C structure `pa_sink_info`; later versions of libpulse only append fields."""
 
     _fields_ = [
         ("name", c_char_p),
@@ -119,7 +119,7 @@ class SinkInputInfo(Structure):
     ]
 
 
-# Types of the callbacks. A callback must not raise: ctypes would print the exception and return garbage.
+# Types of callbacks. A callback must not raise an exception: ctypes would print it and return garbage.
 PollCallback = CFUNCTYPE(c_int, POINTER(PollDescriptor), ctypes.c_ulong, c_int, c_void_p)
 StreamCallback = CFUNCTYPE(None, c_void_p, c_void_p)
 #: (stream or context, success, data)
@@ -129,7 +129,7 @@ ChangeCallback = CFUNCTYPE(None, c_void_p, c_int, u32, c_void_p)
 SinkCallback = CFUNCTYPE(None, c_void_p, POINTER(SinkInfo), c_int, c_void_p)
 SinkInputCallback = CFUNCTYPE(None, c_void_p, POINTER(SinkInputInfo), c_int, c_void_p)
 
-#: The functions that are used, with their result and argument types.
+#: The functions that the player uses, with the types of their results and arguments.
 _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     "pa_mainloop_new": (c_void_p, []),
     "pa_mainloop_free": (None, [c_void_p]),
@@ -171,7 +171,7 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
 
 @cache
 def load() -> Any:
-    """Return the functions of libpulse as attributes without the prefix "pa_", and the C library's `poll`.
+    """Return an object with libpulse's functions (without the prefix "pa_") and the C library's `poll`.
 
     Raises:
         OSError: libpulse isn't installed, or lacks a function.
@@ -190,7 +190,7 @@ def load() -> Any:
 
 
 class MainLoop:
-    """A main loop of libpulse that never waits by itself."""
+    """A main loop of libpulse that never waits."""
 
     def __init__(self, library: Any) -> None:
         self._library = library
@@ -198,17 +198,17 @@ class MainLoop:
         self._callback = PollCallback(self._poll)
         library.mainloop_set_poll_func(self._pointer, self._callback, None)
         self._error: BaseException | None = None
-        #: the descriptors that libpulse wants to wait for, and the monotonic time of its next timer
+        #: the descriptors that libpulse wants to wait for, and the monotonic time of its next timer (or None)
         self.interests: list[Interest] = []
         self.wake_at: float | None = None
 
     @property
     def api(self) -> int:
-        """The pointer that a new context takes."""
+        """The pointer to pass to `pa_context_new`."""
         return self._library.mainloop_get_api(self._pointer)  # type: ignore[no-any-return]
 
     def iterate(self) -> bool:
-        """Run one iteration without waiting, and return whether it did any work; there may be more then."""
+        """Run one iteration without waiting, and return whether to run another because it did some work."""
         if self._library.mainloop_prepare(self._pointer, -1) < 0:
             return False
         self._library.mainloop_poll(self._pointer)  # without it, dispatch would abort the process
@@ -218,7 +218,7 @@ class MainLoop:
         return bool(done > 0)
 
     def free(self) -> None:
-        """Free the loop; its contexts have to be released first."""
+        """Free the loop, after its contexts have been released."""
         self._library.mainloop_free(self._pointer)
         self.interests, self.wake_at = [], None
 
@@ -233,5 +233,5 @@ class MainLoop:
 
 
 def loudest(volume: Volume) -> float:
-    """Return the volume of the loudest channel; 1.0 is 100 %."""
+    """Return the volume of the loudest channel, where 1.0 is 100 %."""
     return float(max(volume.values[: volume.channels], default=0) / NORMAL_VOLUME)

@@ -1,21 +1,21 @@
-"""A player program: its process, its error messages, and the player that writes samples to its standard input.
+"""Player programs, which read samples from standard input.
 
-The program is started for one sentence and ends with it. It ends with this process too, and so does everything that it
-has started.
+A program is started for one sentence and exits after it. It never outlives this process, and neither does any process
+that it has started.
 
-`subprocess` can only tie a child to its parent with a function that runs between fork and exec. This needs a real
-fork, which copies the page tables of the engine process: 3 ms before every sentence, where `posix_spawn` takes 0.4 ms
-(on a PC; a Raspberry Pi takes five to ten times as long). Therefore the child runs no code of ours. Instead, it has a
-leash: a pipe that nobody writes to, and whose write end exists only in this process. When this process ends, however it
-ends, the kernel closes that end and sends SIGKILL to the program's process group.
+With `subprocess`, a child can be tied to its parent only by a function between fork and exec. This needs a real fork,
+which copies the page tables of the engine process. On a PC, the fork takes 3 ms before every sentence, while
+`posix_spawn` takes 0.4 ms. A Raspberry Pi takes five to ten times as long. Therefore no code of ours runs in the child.
+Instead, every program has a leash. This is a pipe that nobody writes to, and only this process has its write end. When
+this process ends for any reason, the kernel closes the write end and sends SIGKILL to the program's process group.
 
-These processes escape the leash (which only Linux has):
+The leash, which only Linux has, doesn't reach these processes:
 
-- A program whose parent is killed in the 0.1 ms between its start and its leash. It has no samples yet, and ends
-  because its input does.
-- A program that closes the descriptors it inherited (ssh, sudo). The server kills what a dead engine leaves behind.
+- A program whose parent is killed in the 0.1 ms between its start and its leash. It has no samples yet, and exits
+  because its input is closed.
+- A program that closes inherited descriptors (ssh, sudo). The server kills the remaining processes of a dead engine.
 - A process that has left the process group and the session. It is found in /proc by a pipe that it inherited. If it has
-  closed that pipe too (a sound server, `ssh -f`), it has nothing to do with the player any more and is left alone.
+  closed that pipe too (a sound server, `ssh -f`), it is no longer part of the player and is left alone.
 """
 
 from __future__ import annotations
@@ -42,26 +42,27 @@ if TYPE_CHECKING:
     from talkcli.engine.child.players.base import Interest
     from talkcli.engine.players import PlayerCommand
 
-#: Bytes that the program's input pipe can hold, if the system allows a choice. With a single page, poll reports room
-#: only when the program has read everything.
+#: The capacity of the program's input pipe in bytes, if the system allows a choice. If the pipe has only one page, poll
+#: reports room only after the program has read everything.
 PIPE_BYTES = 4096
 
-#: Seconds that a program which closed its input has to end and to report an error, before it is killed.
+#: Seconds for which a program may report an error and exit after it has closed its input. After that, it is killed.
 ERROR_GRACE_S = 0.5
 
-#: Seconds to wait for a killed program; it takes 1 ms. One that hangs in the kernel is left to `gone`.
+#: Seconds for which `kill` waits until the program has exited, which takes 1 ms. If the program hangs in the kernel,
+#: `gone` continues to check.
 REAP_WAIT_S = 0.02
 
-#: Seconds between two checks of a program if the system has no descriptor for its end (macOS, Linux before 5.3).
+#: Seconds between checks of a program if the system has no descriptor that reports its exit (macOS, Linux before 5.3).
 EXIT_CHECK_S = 0.01
 
-#: Bytes of a line on standard error that are kept: errors are shorter, and the message has to stay readable.
+#: The maximum length of a stored line from standard error. Errors are shorter, and the message has to stay readable.
 MAX_ERROR_LINE_BYTES = 300
 
-#: Bytes of standard error that are read at a time, so that a flood of messages doesn't delay the samples.
+#: Bytes to read from standard error at a time. Many messages then don't delay the samples.
 STDERR_READ_BYTES = 65536
 
-#: Lines that are no errors, or that say nothing to a user: library messages, underruns and friendly hints.
+#: Lines that aren't errors or don't help users, such as messages of libraries, underruns and hints.
 _NOISE = (
     r"ALSA lib |underrun|overrun|Playing |Warning:|please, try |Stream (suspended|successfully|started)|^Got signal"
 )
@@ -69,25 +70,25 @@ _ERROR = (
     r"error|fail|cannot|can't|could ?n[o']t|unable|no such|not found|not available|refused|denied|invalid|unknown"
     r"|disconnected|busy|broken|terminated|killed|lost"
 )
-#: The source location in "aplay: main:831: text", which says nothing to a user.
+#: The source location in "aplay: main:831: text", which doesn't help users.
 _SOURCE_LOCATION = r"^(?P<program>[^\s:]+): \w+:\d+: "
 
-#: Signals that Python ignores, and that a program must not inherit as ignored.
+#: Signals that Python ignores. Programs must not inherit this.
 _RESET_SIGNALS = [getattr(signal, name) for name in ("SIGPIPE", "SIGXFSZ") if hasattr(signal, name)]
 
 
 class PlayerProcess:
-    """A running program that leads a process group of its own."""
+    """A running program, in a process group of its own."""
 
     def __init__(self, argv: tuple[str, ...], inherited: Sequence[int] = ()) -> None:
         """Start the program.
 
         Args:
             argv: The command line.
-            inherited: More descriptors that the program inherits.
+            inherited: Other descriptors that the program inherits.
 
         Raises:
-            OSError: It can't be started.
+            OSError: The program can't be started.
         """
         (stdin, our_stdin), (our_stderr, stderr), (tied, leash) = open_pipes(3)
         try:
@@ -102,18 +103,19 @@ class PlayerProcess:
             raise
         finally:
             close(stdin, stderr, tied)
-        #: the non-blocking ends of the program's standard input and standard error; None once they are closed
+        #: our non-blocking ends of the program's standard input and standard error, or None once they are closed
         self.stdin: int | None = our_stdin
         self.stderr: int | None = our_stderr
-        #: readable once the program has ended; None if the system has no such descriptor (macOS, Linux before 5.3)
+        #: readable after the program has exited; None if the system has no such descriptor (macOS, Linux before 5.3)
         self.exit = _exit_descriptor(self.pid)
         self._leash: int | None = leash
         self._status: int | None = None
 
     def status(self) -> int | None:
-        """Return the exit status, negative for the signal that killed the program; None while it runs.
+        """Return the exit status, or None while the program runs.
 
-        The program counts as running until the processes that it started are gone too.
+        If a signal killed the program, the status is the negative number of the signal. The program counts as running
+        until all processes that it has started have exited.
         """
         if self._status is None:
             if hasattr(os, "waitid"):  # not on macOS before Python 3.13
@@ -125,18 +127,18 @@ class PlayerProcess:
                 self._status = os.waitstatus_to_exitcode(status)
         if self._status is None or self._leash is None:
             return self._status
-        # A process of another user can't be killed, and doesn't count; the server reports that it is still there.
+        # Processes of other users can't be killed. They don't count, because the server reports them.
         return None if kill_holders(self._leash) and is_held(self._leash) else self._status
 
     def kill(self) -> None:
         """Kill the program and its process group."""
-        if self._status is None:  # once the program is reaped, its process id may be used again
+        if self._status is None:  # after the program is reaped, its process id may be used again
             kill([-self.pid])
 
     def await_end(self, seconds: float) -> None:
-        """Block until the program ends, for a limited time; return at once if the system can't report the end."""
+        """Block until the program exits or the time is over; return at once if the system can't report the exit."""
         if self.exit is not None and self._status is None:
-            # Not `wait_ready`: this may run while the interpreter ends, when nothing can be imported any more.
+            # `wait_ready` can't be used, because this may run while the interpreter exits and nothing can be imported.
             wait = select.poll()
             wait.register(self.exit, select.POLLIN)
             wait.poll(seconds * 1000)
@@ -154,7 +156,7 @@ class PlayerProcess:
             self.stderr = None
 
     def release(self) -> None:
-        """Close every descriptor; call it once the program is reaped. It may be called again."""
+        """Close all descriptors after the program was reaped; may be called again."""
         self.close_stdin()
         self.close_stderr()
         close(*(each for each in (self.exit, self._leash) if each is not None))
@@ -162,7 +164,7 @@ class PlayerProcess:
 
 
 def _spawn(argv: tuple[str, ...], stdin: int, stderr: int, inherited: Sequence[int]) -> int:
-    """Start the program and return its process id; the inherited descriptors are inheritable only during the call."""
+    """Start the program and return its process id; `inherited` descriptors are inheritable only during the call."""
     actions = [
         (os.POSIX_SPAWN_DUP2, stdin, 0),
         (os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0),
@@ -178,31 +180,32 @@ def _spawn(argv: tuple[str, ...], stdin: int, stderr: int, inherited: Sequence[i
 
 
 def _tie(leash: int, group: int) -> None:
-    """Make the kernel kill a process group when the other end of this pipe is closed."""
+    """Make the kernel kill a process group when the other end of its leash is closed."""
     if not hasattr(fcntl, "F_SETSIG"):
         return
-    with contextlib.suppress(OSError):  # if a sandbox forbids it, the program ends with its input
+    with contextlib.suppress(OSError):  # if a sandbox forbids this, the program exits when its input is closed
         fcntl.fcntl(leash, fcntl.F_SETOWN, -group)
         fcntl.fcntl(leash, fcntl.F_SETSIG, signal.SIGKILL)
         fcntl.fcntl(leash, fcntl.F_SETFL, fcntl.fcntl(leash, fcntl.F_GETFL) | os.O_ASYNC)
 
 
 def _exit_descriptor(pid: int) -> int | None:
-    """Return a descriptor that becomes readable when the process ends; None if the system has none."""
+    """Return a descriptor that becomes readable when the process exits, or None if the system has none."""
     if not hasattr(os, "pidfd_open"):
         return None
     try:
         return os.pidfd_open(pid)
-    except OSError:  # an old kernel, or a sandbox that forbids it
+    except OSError:  # the kernel is old, or a sandbox forbids it
         return None
 
 
 class ErrorOutput:
-    """The line on a program's standard error that names the error.
+    """Finds the error message in a program's standard error.
 
-    A player may write underrun messages for hours, so no other line is kept. It is rarely the last line, because some
-    programs print their parameters after the error. The patterns are compiled at the first message;
-    at the start of each engine process they would cost 1 ms.
+    Only the first line that looks like an error and the first line of all are stored, because a player may write
+    underrun messages for hours. The last line is rarely the error, because some programs print their parameters after
+    it. The patterns are compiled when the first message comes, because compiling them at the start of each engine
+    process would take 1 ms.
     """
 
     def __init__(self) -> None:
@@ -211,12 +214,12 @@ class ErrorOutput:
         self._first: str | None = None
 
     def feed(self, data: bytes) -> None:
-        """Take bytes that the program wrote."""
+        """Process bytes that the program wrote to standard error."""
         for line in self._lines.feed(data):
             self._examine(line)
 
     def line(self) -> str | None:
-        """Return the line that names the error, or else the first line; None if there is neither."""
+        """Return the first line that looks like an error, or else the first line, or None if there are no lines."""
         self._examine(self._lines.take_rest())
         return self._error or self._first
 
@@ -231,7 +234,7 @@ class ErrorOutput:
 
 
 class ProgramPlayer(Player):
-    """A player that writes its sentence to the standard input of a program."""
+    """Plays a sentence through an external program, by writing the samples to its standard input."""
 
     real_time = True
 
@@ -239,8 +242,8 @@ class ProgramPlayer(Player):
         """Start the program.
 
         Args:
-            command: The program's command line.
-            inherited: More descriptors that the program inherits.
+            command: The command line of the program.
+            inherited: Other descriptors that the program inherits.
 
         Raises:
             CannotSpeak: The program can't be started (`no_player`).
@@ -262,20 +265,20 @@ class ProgramPlayer(Player):
         self._write(memoryview(command.preamble))
 
     def offer(self, data: memoryview) -> int:
-        self.ended()  # raises if the program is gone
+        self.ended()  # raises CannotSpeak if the program has exited
         if self._process.stdin is None:
             return 0
-        # The pipe holds at most one piece, because sound in the pipe is still played after a pause.
+        # Only one piece is kept in the pipe, because sound in the pipe is still played after a pause begins.
         waiting = _unread_bytes(self._process.stdin)
-        # If bytes wait although nobody holds the read end, the program has closed its input: the write reports that.
+        # If nobody holds the read end, the program has closed its input. The write reports that.
         if waiting == 0 or not is_held(self._process.stdin):
             return self._write(data)
-        # A program that has read nothing yet gets as much as it needs to start.
+        # If the program has read nothing yet, it gets as much as it needs to start.
         room = self._command.at_start - waiting if waiting == self._written else 0
         return self._write(data[:room]) if room > 0 else 0
 
     def consumed(self) -> int:
-        """Return the bytes of sound that the program has read from the pipe."""
+        """Return the number of sample bytes that the program has read from the pipe."""
         if self._process.stdin is not None and self._broken_at is None:
             read = self._written - _unread_bytes(self._process.stdin) - self._overhead
             self._consumed = max(self._consumed, read)
@@ -339,7 +342,7 @@ class ProgramPlayer(Player):
         return written
 
     def _failure(self, status: int) -> CannotSpeak:
-        """Return the error for a program that ended too early or with an error."""
+        """Return the error for a program that exited too early or with an error."""
         self.consumed()
         line = self._errors.line()
         if status < 0:
@@ -363,7 +366,7 @@ class ProgramPlayer(Player):
 
 
 def _unread_bytes(pipe: int) -> int:
-    """Return how many bytes wait in a pipe; 0 if the system doesn't tell."""
+    """Return the number of unread bytes in a pipe, or 0 if the system doesn't report it."""
     try:
         return int(struct.unpack("i", fcntl.ioctl(pipe, termios.FIONREAD, b"\0\0\0\0"))[0])
     except OSError:

@@ -1,8 +1,8 @@
-"""The player "pulse": a stream to the sound server (PulseAudio or PipeWire), opened by this process itself.
+"""The player "pulse", which sends its samples directly to the sound server (PulseAudio or PipeWire).
 
-Each sentence has a connection and a stream of its own. Opening both takes 1 ms, where starting a program takes 9 ms.
-The server reports what no exit status could: when the stream began, whether it was moved, suspended or killed, how much
-of it has been heard, and how loud the sink and the stream are. The player never starts a server.
+Each sentence has a connection and a stream of its own. Opening both takes 1 ms, while starting a program takes 9 ms.
+The server reports more than a program could: when the stream started, whether it was moved, suspended or killed, how
+much of it has been heard, and how loud the sink and the stream are. The player never starts a sound server.
 """
 
 from __future__ import annotations
@@ -22,22 +22,23 @@ if TYPE_CHECKING:
 
     from talkcli.engine.child.players.base import Interest
 
-#: Milliseconds of room at which the server wakes the player.
+#: Milliseconds of room in the buffer at which the server wakes the player.
 REQUEST_MS = 15
 
-#: Seconds for which a stream volume of 0 means nothing: PipeWire creates every stream with it, and sets the real one a
-#: millisecond later.
+#: Seconds for which a stream volume of 0 is ignored. PipeWire creates every stream with this volume, and sets the real
+#: one a millisecond later.
 VOLUME_SETTLES_S = 0.1
 
-#: Seconds within which the server must create the stream, which takes 1 to 20 ms. A server that hangs is given up: it
-#: has no samples yet, and another player may be heard.
+#: Seconds within which the server has to create the stream, which usually takes 1 to 20 ms. If the server hangs, the
+#: sentence can move to another player, because this one has no samples yet.
 READY_LIMIT_S = 2.0
 
-#: Seconds for which the sink may be suspended under a stream. A sink that slept is awake before the stream begins.
+#: Seconds for which the sink may stay suspended while a stream plays. A sink that was asleep wakes up before the stream
+#: starts.
 SUSPENDED_LIMIT_S = 0.5
 
-#: Seconds between an answer and the next request for the time, until sound is heard: a word begins at that moment. It
-#: takes 1 to 10 ms at a near sink, and 200 ms over Bluetooth.
+#: Seconds between an answer and the next request for the time, until sound is heard. The requests are frequent because
+#: the first word begins at that moment. It takes 1 to 10 ms with local devices and 200 ms over Bluetooth.
 TIME_REQUEST_S = 0.002
 
 
@@ -45,14 +46,15 @@ TIME_REQUEST_S = 0.002
 class Level:
     """The volume and mute state of a sink or a stream."""
 
-    volume: float  # of the loudest channel; 1.0 is 100 %, and more is possible
+    volume: float  # of the loudest channel; 1.0 is 100 %, and higher values are possible
     muted: bool
-    #: of a sink: whether stream volumes are absolute, and the sink's own volume is just the loudest of them
+    #: whether the volumes of streams are absolute, so that the sink's volume is just the loudest of them; only for
+    #: sinks
     flat: bool = False
 
 
 class PulsePlayer(Player):
-    """A player that streams its sentence to the sound server."""
+    """Plays a sentence through a stream of the sound server."""
 
     name = "pulse"
     real_time = True
@@ -69,31 +71,32 @@ class PulsePlayer(Player):
             CannotSpeak: No server answers (`no_player`).
         """
         self.proven = False
-        #: the name of the sink; None until the stream exists
+        #: the name of the sink, or None until the stream exists
         self.device: str | None = None
         self._rate = rate
         self._wanted_device = device
         self._audible = audible
         self._written = self._heard = 0
-        #: the seconds heard by the server's last report, and its time; None until some sound has been heard
+        #: the number of seconds heard according to the server's last report, and the time of that report; None until
+        #: sound is heard
         self._clock_report: tuple[float, float] | None = None
-        #: the bytes written when the server ran out of samples; None while it plays
+        #: the number of bytes written when the server last ran out of samples, or None while it plays
         self._dry_at: int | None = None
-        #: when to ask for the time, until the server has reported one; None while a request is pending
+        #: when to request the time until the server has reported one; None while a request is pending
         self._time_request_at: float | None = 0.0
         self._closed = self._draining = self._drained = False
         self._error: CannotSpeak | None = None
         self._stream: int | None = None
         self._sink_index = libpulse.NO_INDEX
-        #: until when a stream volume of 0 means nothing
+        #: the time until which a stream volume of 0 is ignored
         self._volume_settled_at = 0.0
         self._ready_by = time.monotonic() + READY_LIMIT_S
         self._suspended_at: float | None = None
-        #: the number of unanswered requests for the stream's level
+        #: the number of pending requests for the stream's level
         self._pending_levels = 0
         self._sink_level: Level | None = None
         self._stream_level: Level | None = None
-        #: whether the output was muted at any time, and whether the server refuses to report a level
+        #: whether the output was ever muted during the sentence, and whether the server refused to report a level
         self._muted = self._level_refused = False
         try:
             self._lib = libpulse.load()
@@ -111,13 +114,14 @@ class PulsePlayer(Player):
         if self._context is None:
             self._loop.free()
             raise CannotSpeak(Reason.NO_PLAYER, "libpulse makes no connection: is there enough memory?")
-        self._lib.context_connect(self._context, None, libpulse.NO_AUTOSPAWN, None)  # the state reports a failure
+        # a failure appears in the state of the context
+        self._lib.context_connect(self._context, None, libpulse.NO_AUTOSPAWN, None)
         self._run()
         if self._error is not None:
             self.kill()
             raise self._error
 
-    # -- the interface of every player
+    # -- the interface `Player`
 
     def offer(self, data: memoryview) -> int:
         self._check()
@@ -132,7 +136,7 @@ class PulsePlayer(Player):
         return length
 
     def consumed(self) -> int:
-        """Return the bytes that have been heard by the server's clock."""
+        """Return the number of bytes that have been heard according to the server's clock."""
         self.heard()
         return self._heard
 
@@ -157,9 +161,9 @@ class PulsePlayer(Player):
         return self._loop.interests if self._loop is not None else []
 
     def wake_at(self) -> float | None:
-        """Return when libpulse has work to do, or the next time limit ends.
+        """Return the time at which libpulse has work to do or the next time limit ends.
 
-        That is now if there is room, or if the server has just reported the time, because words may be due.
+        This is now if there is room. It is also now after each report of the server's time, because words may be due.
         """
         report = self._clock_report
         self._run()
@@ -177,7 +181,7 @@ class PulsePlayer(Player):
         return min((each for each in times if each is not None), default=None)
 
     def kill(self) -> None:
-        """Close the connection; the server drops the stream, and the samples that it holds."""
+        """Close the connection, so that the server drops the stream and its remaining samples."""
         if self._loop is None:
             return
         self._lib.context_disconnect(self._context)
@@ -199,10 +203,14 @@ class PulsePlayer(Player):
         volume = stream.volume if sink.flat else sink.volume * stream.volume
         return Output(self.name, self.device, round(min(1.0, volume), 2), self._muted)
 
-    # -- the stream's life
+    # -- the states of the stream
 
     def _check(self) -> None:
-        """Process what the server has sent; raise CannotSpeak if the stream has failed."""
+        """Process the server's messages.
+
+        Raises:
+            CannotSpeak: The stream has failed.
+        """
         self._run()
         if self._error is not None and not self._drained:
             raise self._error
@@ -213,7 +221,7 @@ class PulsePlayer(Player):
             pass
 
     def _advance(self) -> bool:
-        """Take the next step in the stream's life, and return whether libpulse may have work because of it."""
+        """Check the state and take the next step, and return whether libpulse may have work because of it."""
         if self._error is not None or self._drained:
             return False
         state = self._lib.context_get_state(self._context)
@@ -237,8 +245,8 @@ class PulsePlayer(Player):
 
     def _open_stream(self) -> bool:
         buffered, request = (each * self._rate // 1000 * SAMPLE_BYTES for each in (BUFFER_MS, REQUEST_MS))
-        # It starts to play with a full buffer. With the first piece alone it would run dry before the second one, and
-        # rewind for that, which some sinks can't.
+        # The server starts playing once the buffer is full. If it started with the first piece, it would run out of
+        # samples before the second, and would have to rewind. Some sinks can't rewind.
         sizes = libpulse.BufferSizes(2 * buffered, buffered, buffered, request, libpulse.NO_INDEX)
         spec = libpulse.SampleSpec(libpulse.S16LE, self._rate, 1)
         self._stream = self._lib.stream_new(self._context, b"talk", byref(spec), None)
@@ -255,7 +263,7 @@ class PulsePlayer(Player):
         return True
 
     def _check_sink(self) -> bool:
-        """Check to which sink the stream plays, and whether it is suspended; return whether the server was asked."""
+        """Check which sink the stream plays to and whether it is suspended; return whether requests were sent."""
         index = int(self._lib.stream_get_device_index(self._stream))
         changed = index != self._sink_index
         if changed:
@@ -284,7 +292,7 @@ class PulsePlayer(Player):
         return changed
 
     def _request_time(self) -> bool:
-        """Ask for the time until sound is heard, and return whether a request was due."""
+        """Request the time if that is due, and return whether a request was sent."""
         due = self._time_request_at
         if not self.proven or self._clock_report or due is None or time.monotonic() < due:
             return False
@@ -302,7 +310,7 @@ class PulsePlayer(Player):
         self._release(self._lib.context_get_sink_input_info(self._context, index, self._stream_callback, None))
 
     def _release(self, operation: int | None) -> None:
-        """Release an operation, which goes on; if it is None, the context has failed, and its state says so."""
+        """Release an operation, which continues; None means that the context has failed, as its state shows."""
         if operation is not None:
             self._lib.operation_unref(operation)
 
@@ -316,23 +324,23 @@ class PulsePlayer(Player):
         return True
 
     def _room(self) -> int:
-        """Return the bytes of whole samples for which the server has room."""
+        """Return the number of bytes that the server has room for, in whole samples."""
         if self._sink_index == libpulse.NO_INDEX or self._closed or self._error is not None:
             return 0
         if self._audible and not (self._level_refused or self.output):
-            return 0  # the level is known within 1 ms
+            return 0  # the server reports the levels within 1 ms
         room = self._lib.stream_writable_size(self._stream)
         return 0 if room == libpulse.SIZE_ERROR else room // SAMPLE_BYTES * SAMPLE_BYTES
 
     def _is_volume_pending(self) -> bool:
-        """Return whether the server has yet to set the stream's volume."""
+        """Return whether the server still has to set the real volume of the stream."""
         level = self._stream_level
         if level is None or level.volume > 0 or level.muted or self._drained:
             return False
         return self._pending_levels > 0 or time.monotonic() < self._volume_settled_at
 
     def _check_mute(self) -> None:
-        """Record whether the output is muted now; once muted, the sentence counts as muted."""
+        """Check the levels, and mark the whole sentence as muted if the output is muted now."""
         levels = [each for each in (self._sink_level, self._stream_level) if each is not None]
         if self._drained or self._is_volume_pending() or not any(each.muted or each.volume == 0 for each in levels):
             return
@@ -341,11 +349,11 @@ class PulsePlayer(Player):
             self._error = CannotSpeak(Reason.MUTED, f"the output is muted: {self.device}", final=True)
 
     def _restart_clock(self) -> None:
-        """Ask for the time again, after it stood still because the stream had not begun, ran dry or was suspended."""
+        """Request the time again after the stream has started, run out of samples or been suspended."""
         self._clock_report, self._time_request_at = None, 0.0
 
     def _fail(self, reason: Reason) -> None:
-        """Record that the stream has failed, with a message for libpulse's error number."""
+        """Record the failure of the stream, with a message for libpulse's error number."""
         if self._error is not None:
             return
         number = self._lib.context_errno(self._context)
@@ -355,7 +363,8 @@ class PulsePlayer(Player):
             reason, message = Reason.NO_PLAYER, f"no sound server answers: {words}"
         elif self._stream is None:
             message = f"the sound server lets nobody in: {words}"
-        elif self._sink_index != libpulse.NO_INDEX:  # the number may belong to a request about a sink that is gone
+        # the error number may belong to a request for a sink that was removed
+        elif self._sink_index != libpulse.NO_INDEX:
             message = "the sound server ended the stream"
         elif number == libpulse.NO_ENTITY and self._wanted_device is not None:
             message = f'the sound server has no sink "{self._wanted_device}": see pactl list short sinks'
@@ -375,7 +384,7 @@ class PulsePlayer(Player):
     def _on_time(self, *_: Any) -> None:
         heard, now = c_uint64(), time.monotonic()
         self._time_request_at = now + TIME_REQUEST_S
-        # Before the stream has begun, the time only shows how long the answer took.
+        # Before the stream has started, the time only contains the delay of the answer.
         if self.proven and self._lib.stream_get_time(self._stream, byref(heard)) == 0 and heard.value:
             self._clock_report = heard.value / 1_000_000, now
 
@@ -383,13 +392,13 @@ class PulsePlayer(Player):
         if not success:
             self._fail(Reason.AUDIO_LOST)
             return
-        self._check_sink()  # it may have been moved at the same moment
+        self._check_sink()  # the stream may have been moved in the meantime
         self._volume_settled_at = 0.0
         self._check_mute()
         self._drained = self.proven = self._error is None
 
     def _on_change(self, _context: int, event: int, index: int, _data: object) -> None:
-        """Ask for a level that may have changed."""
+        """Request a level that may have changed."""
         facility = event & libpulse.FACILITY_MASK
         if facility == libpulse.EVENT_SINK and index == self._sink_index:
             self._request_sink_level()
@@ -397,7 +406,7 @@ class PulsePlayer(Player):
             self._request_stream_level()
 
     def _on_sink(self, _context: int, found: Any, end: int, _data: object) -> None:
-        if end == 0 and found[0].index == self._sink_index:  # otherwise the stream has left that sink
+        if end == 0 and found[0].index == self._sink_index:  # otherwise the stream was moved to another sink
             flat = bool(found[0].flags & libpulse.FLAT_VOLUME)
             self._sink_level = Level(libpulse.loudest(found[0].volume), bool(found[0].mute), flat)
             self._check_mute()
