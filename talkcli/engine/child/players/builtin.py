@@ -220,8 +220,7 @@ def _open_regular(path: str) -> int:
 
 
 def _header_fields(rate: int, riff_bytes: int, sample_bytes: int) -> tuple[bytes | int, ...]:
-    """Return the fields of a WAV header; `riff_bytes` is the length after "RIFF", `sample_bytes` the one after "data".
-    """
+    """Return the fields of a WAV header with the lengths of the RIFF chunk and of the samples."""
     audio_format = (1, 1, rate, rate * SAMPLE_BYTES, SAMPLE_BYTES, 8 * SAMPLE_BYTES)  # PCM, one channel
     return b"RIFF", riff_bytes, b"WAVE", b"fmt ", 16, *audio_format, b"data", sample_bytes
 

@@ -1,5 +1,5 @@
-"""The synthesizers: libespeak-ng, and neural voices of Piper.
+"""Synthesizers, which turn texts into samples: libespeak-ng and Piper's neural voices.
 
-`base` defines what a synthesizer does. A crash of a synthesizer's library costs the engine process and no more. The
-names of the synthesizers are in `talkcli.engine.voices`.
+`base` defines the interface of a synthesizer. If the library of a synthesizer crashes, only the engine process is lost.
+The names of the synthesizers are in `talkcli.engine.voices`.
 """

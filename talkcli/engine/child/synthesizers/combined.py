@@ -1,7 +1,8 @@
-"""The synthesizer that `talk` speaks with: libespeak-ng, and the neural voices beside it.
+"""The default synthesizer, which combines libespeak-ng and Piper's neural voices.
 
-The code for neural voices is imported when one is asked for. If a neural voice isn't loaded, or fails before any of the
-sentence was heard, libespeak-ng speaks in the same language instead, unless the sentence must have that voice.
+The code for neural voices is imported only after a neural voice was requested. If a neural voice isn't loaded, or fails
+before any sound was heard, libespeak-ng speaks in the same language instead. A sentence with `voice_only` fails in this
+case.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class CombinedSynthesizer:
-    """A synthesizer that speaks every voice, with libespeak-ng or with Piper."""
+    """A synthesizer that speaks every voice, either with libespeak-ng or with Piper."""
 
     def __init__(self, espeak: Espeak | None = None) -> None:
         self._espeak = espeak or Espeak()
@@ -42,7 +43,7 @@ class CombinedSynthesizer:
         self._current, self.voice = current, current.voice
 
     def speak(self, text: str, settings: SpeechSettings, sink: SampleSink) -> None:
-        """Speak with the current voice, or with libespeak-ng if a neural voice can't."""
+        """Speak with the current voice, or with libespeak-ng if a neural voice can't speak."""
         neural = self._neural
         if neural is None or self._current is not neural or settings.voice_only:
             self._current.speak(text, settings, sink)
@@ -62,18 +63,18 @@ class CombinedSynthesizer:
             except Exception as error:
                 if watched.used:
                     raise
-                traceback.print_exc()  # a bug is no reason for silence either
+                traceback.print_exc()  # a bug must not cause silence
                 why = f"{neural.voice} failed: {type(error).__name__}: {error}"
         self._espeak.load_language(neural.language)
         self._espeak.speak(text, settings, _WatchedSink(sink, why))
 
     @property
     def loader(self) -> ModelLoader | None:
-        """The loader of neural voices; None until a neural voice has been asked for."""
+        """The loader of neural voices, or None until a neural voice has been requested."""
         return self._neural.loader if self._neural else None
 
     def carry_out(self, command: LoadVoice | DropVoice) -> None:
-        """Start to load a neural voice in the background, or drop one."""
+        """Start to load a neural voice in the background, or drop a loaded one."""
         loader = self._piper().loader
         if isinstance(command, protocol.DropVoice):
             loader.drop(command.voice)
@@ -89,11 +90,11 @@ class CombinedSynthesizer:
 
 
 class _WatchedSink:
-    """A sink that passes a sentence on, and records whether it has any words or samples yet.
+    """Passes a sentence to another sink, and records whether it has had any words or samples.
 
     Args:
-        sink: The sink that gets the sentence.
-        fallback_reason: Why another voice speaks than was asked for, for people.
+        sink: The sink that receives the sentence.
+        fallback_reason: Why the requested voice doesn't speak, as a message, or None if it does.
     """
 
     def __init__(self, sink: SampleSink, fallback_reason: str | None = None) -> None:

@@ -1,8 +1,8 @@
 """libespeak-ng as a synthesizer, and as the source of phonemes for neural voices.
 
-The library speaks a text in a single call, and calls back in the same thread with about 50 ms of samples at a time. An
-exception can't pass through it, so it is stored until the library has returned. A process has one instance of the
-library. This module is for Linux; pyttsx3's own drivers find their libraries on other systems.
+The library speaks a text in a single call. In this call, it passes about 50 ms of samples at a time to a callback in
+the same thread. An exception can't pass through the library, so it is stored until the call returns. A process has only
+one instance of the library. This module is for Linux. On other systems, pyttsx3's own drivers find their libraries.
 """
 
 from __future__ import annotations
@@ -32,36 +32,37 @@ if TYPE_CHECKING:
 
 _LIBESPEAK = "libespeak-ng.so.1"
 
-#: Milliseconds of sound per callback. The library rounds up to 49 ms at 22,050 Hz; more would only delay the first
-#: sound.
+#: Milliseconds of sound per callback. The library rounds this up to 49 ms at 22,050 Hz. Longer parts would delay the
+#: first sound.
 _CALLBACK_MS = 20
 
-#: Without this option, the library calls exit() if its data is missing.
+#: The option that keeps the library from calling exit() if its data is missing.
 _DONT_EXIT = 0x8000
 
-#: English. The file name saves the 4 to 40 ms in which the library reads all voices to find the language.
+#: The names of the English voice. The first is a file name, which saves 4 to 40 ms, because the library doesn't have to
+#: read all voices to find the language.
 _ENGLISH = ("gmw/en", "en")
 
-#: An event that pyttsx3's binding doesn't define: the sample rate, before the first samples.
+#: The type of the event that reports the sample rate before the first samples, which pyttsx3's binding doesn't define.
 _EVENT_SAMPLERATE = 8
 
-#: The library's own default in words per minute.
+#: The library's default rate in words per minute.
 _ESPEAK_DEFAULT_WPM = 175
-#: A shorter pause after a clause means an abbreviation: after "Mr." there are up to a hundred samples, and after a
-#: sentence 6,000.
+#: The shortest pause that isn't due to an abbreviation. There are up to a hundred samples of pause after "Mr.", and
+#: 6,000 after a sentence.
 _PAUSE_SAMPLES = 2000
 
-#: The library's mode for phonemes in IPA.
+#: The library's output mode for phonemes in IPA.
 _IPA = 2
 
-#: Names for two lists of voices, which the library takes in place of a language.
+#: The names of the lists of variants and of MBROLA voices, which the library accepts in place of a language.
 _VARIANTS, _MBROLA = b"variant", b"mbrola"
-#: Where the library looks for the data of MBROLA voices. It can only speak them if the data and the program are there.
+#: The paths of an MBROLA voice's data. Without its data and the program mbrola, the library can't speak the voice.
 _MBROLA_PATHS = ("/usr/share/mbrola/{0}", "/usr/share/mbrola/{0}/{0}", "/usr/share/mbrola/voices/{0}")
 
 
 class _EspeakEventId(ctypes.Union):
-    """The id of an event, which takes 8 bytes even if a pointer has 4."""
+    """The C union `id` of an event, which has 8 bytes even if pointers have 4."""
 
     _fields_ = (("number", ctypes.c_int), ("name", ctypes.c_char_p), ("string", ctypes.c_char * 8))
 
@@ -69,8 +70,8 @@ class _EspeakEventId(ctypes.Union):
 class _EspeakEvent(ctypes.Structure):
     """The C structure `espeak_EVENT` of speak_lib.h.
 
-    The structure in pyttsx3's binding has no `id.string`. On 32-bit systems it is therefore 4 bytes too short, and the
-    second of two events can't be read.
+    The structure in pyttsx3's binding lacks `id.string`, so it is 4 bytes too short on 32-bit systems. The second event
+    of a callback can't be read there.
     """
 
     _fields_ = (
@@ -86,22 +87,22 @@ class _EspeakEvent(ctypes.Structure):
 
 
 def _events_of(pointer: Any) -> Iterator[_EspeakEvent]:
-    """Yield the events of a callback; an event of type 0 follows the last one."""
+    """Yield the events of a callback, up to the final event of type 0."""
     return itertools.takewhile(lambda each: each.type, iter(ctypes.cast(pointer, ctypes.POINTER(_EspeakEvent))))
 
 
 def load_library() -> tuple[Any, str, int]:
-    """Load and initialize libespeak-ng: the system's if there is one, or else the one in the package espeakng-loader.
+    """Load and initialize libespeak-ng, from the system or else from the package espeakng-loader.
 
-    It must be called once per process, before anything imports `pyttsx3.drivers._espeak`, which loads the library.
+    This must be called once per process, before anything imports `pyttsx3.drivers._espeak`, which loads the library.
 
     Returns:
-        pyttsx3's binding, the library's name for people ("eSpeak NG 1.51 (system)"), and the samples per second, which
-        a voice may change.
+        pyttsx3's binding, the library's name and version for display ("eSpeak NG 1.51 (system)"), and the number of
+        samples per second, which a voice may change.
 
     Raises:
         NotInstalled: The library or its data is missing.
-        OSError: There is not enough memory or there are not enough descriptors; it may work later.
+        OSError: There is not enough memory, or there are not enough descriptors. A later attempt may succeed.
     """
     origin, data = _preload()
     from pyttsx3.drivers import _espeak
@@ -118,8 +119,8 @@ def load_library() -> tuple[Any, str, int]:
 def _hidden_sound_server() -> Iterator[None]:
     """Hide PulseAudio from the library.
 
-    It always connects to PulseAudio when it is initialized, although it won't play anything. This takes 7 ms, and 30 s
-    if PulseAudio hangs. By then the server would have given up the engine process.
+    Although the library doesn't play anything, its initialization connects to PulseAudio. This takes 7 ms, or 30 s if
+    PulseAudio hangs. The server gives up the engine process earlier than that.
     """
     before = os.environ.get("PULSE_SERVER")
     os.environ["PULSE_SERVER"] = "unix:/dev/null"
@@ -132,7 +133,7 @@ def _hidden_sound_server() -> Iterator[None]:
 
 
 def _preload() -> tuple[str, bytes | None]:
-    """Load the library so that the binding finds it; return its origin and the directory of its data."""
+    """Load the library so that the binding finds it, and return its origin and the directory of its data."""
     try:
         ctypes.CDLL(_LIBESPEAK)
         return "system", None
@@ -143,7 +144,8 @@ def _preload() -> tuple[str, bytes | None]:
     try:
         import espeakng_loader
 
-        # The binding asks for the system library's name. Loaded globally, this one answers to it.
+        # The binding loads the library by the name of the system's. As this library is loaded globally, it is found by
+        # that name.
         ctypes.CDLL(espeakng_loader.get_library_path(), mode=ctypes.RTLD_GLOBAL)
     except (ImportError, OSError) as error:
         if _is_temporary(error):
@@ -153,12 +155,12 @@ def _preload() -> tuple[str, bytes | None]:
 
 
 def _is_temporary(error: Exception) -> bool:
-    """Return whether loading failed for lack of memory or descriptors, judging by the end of the message."""
+    """Return whether an error message reports a lack of memory or descriptors."""
     return str(error).endswith(tuple(map(os.strerror, (errno.EMFILE, errno.ENFILE, errno.ENOMEM))))
 
 
 class Espeak:
-    """libespeak-ng as a synthesizer."""
+    """A synthesizer that uses libespeak-ng."""
 
     version: str | None
 
@@ -166,19 +168,19 @@ class Espeak:
         """Load the library.
 
         Raises:
-            NotInstalled, OSError: As in `load_library`.
+            NotInstalled, OSError: See `load_library`.
             UnknownVoice: The library has no English voice.
         """
         self._espeak, self.version, self._rate = load_library()
         espeak = self._espeak
         self._listed: tuple[Voice, ...] = ()
-        #: the current parameters. They are only set if they change, so that a new process makes the same samples as the
-        #: library on its own.
+        #: the current parameters. Only changed parameters are set, so that the samples in a new process are those that
+        #: the library makes on its own.
         self._parameters = {espeak.RATE: _ESPEAK_DEFAULT_WPM, espeak.VOLUME: 100, espeak.PITCH: 50}
         self._text = ""
         self._sink: SampleSink | None = None
         self._raised: BaseException | None = None
-        #: the last borrower of the library, which may still be using it; None once it was taken back
+        #: the phonemizer that was created last. It may still be using the library, unless it is None.
         self._borrower: EspeakPhonemizer | None = None
         found = (each for each in _ENGLISH if espeak.SetVoiceByName(each.encode()) == espeak.EE_OK)
         self.voice = next(found, "")
@@ -187,24 +189,25 @@ class Espeak:
         espeak.SetSynthCallback(self._on_audio)
 
     def voices(self) -> tuple[Voice, ...]:
-        """Return the library's voices, the usable MBROLA voices, and the variants."""
+        """Return the normal voices, the usable MBROLA voices, and the variants."""
         self._take_back()
         espeak = self._espeak
         return (*_list_voices(espeak, None), *_mbrola_voices(espeak), *_variants(espeak))
 
     def load(self, voice: str) -> None:
-        """Load a voice by its id with or without a variant, or by another name that the library knows."""
+        """Load a voice by its id, with or without a variant, or by another name that the library knows."""
         self._take_back()
-        # Some voices leave their speed to the next voice, up to a third slower, unless the rate is set again.
+        # After some voices, the next voice is up to a third slower unless the rate is set again.
         self._parameters.clear()
         if not voice or self._espeak.SetVoiceByName(voice.encode("utf-8", "replace")) != self._espeak.EE_OK:
-            # If only a part of a voice is missing, the library has switched to it, and is silent.
+            # If a part of the voice is missing, the library has switched to the voice nevertheless, and would be
+            # silent.
             self._espeak.SetVoiceByName(self.voice.encode())
             raise UnknownVoice("part of it is missing")
         self.voice = voice
 
     def speak(self, text: str, settings: SpeechSettings, sink: SampleSink) -> None:
-        """Speak as `Synthesizer` describes; the samples of this library vary slightly from time to time."""
+        """Speak as `Synthesizer` describes; the samples vary slightly between calls."""
         self._take_back()
         sink.begin(self._rate, self.voice)
         espeak = self._espeak
@@ -219,18 +222,18 @@ class Espeak:
             raise CannotSpeak(Reason.ENGINE_FAILED, f"espeak_Synth failed with {status}")
 
     def load_language(self, language: str) -> None:
-        """Load a voice of a language such as "de-at", or else of its first part, or else English."""
+        """Load a voice of a language, such as "de-at", or of its first part, or else an English voice."""
         self._take_back()
         found = (self._find(each) for each in (language, language.partition("-")[0], *_ENGLISH))
         self.load(next((each.id for each in found if each), self.voice))
 
     @contextlib.contextmanager
     def lend(self, language: str) -> Iterator[EspeakPhonemizer]:
-        """Lend the library as a phonemizer, which another thread may use until the end of the `with` block.
+        """Return a context manager with a phonemizer, which another thread may use until the end of the `with` block.
 
-        The synthesizer must not be used meanwhile. After the block, calls of the phonemizer raise Stopped. A call that
-        is in progress at the end of the block goes on for some milliseconds, or up to 130 ms if it asks for phonemes.
-        The block doesn't wait for it, but the next use of the library does.
+        The synthesizer must not be used in the block. After it, calls of the phonemizer raise Stopped. A call that is
+        still running at the end of the block continues for some milliseconds, or up to 130 ms if it gets phonemes. The
+        block doesn't wait for this call, but the next use of the synthesizer does.
 
         Raises:
             UnknownVoice: The library has no voice of this language.
@@ -252,7 +255,7 @@ class Espeak:
         return find_voice(word, self._listed)
 
     def _take_back(self) -> None:
-        """Restore the library's state from before it was lent."""
+        """Wait until the last phonemizer has finished, and restore the synthesizer's voice."""
         borrower, self._borrower = self._borrower, None
         if borrower is not None:
             borrower.wait()
@@ -270,7 +273,7 @@ class Espeak:
                 self._parameters[parameter] = value
 
     def _on_audio(self, samples: Any, count: int, events: Any) -> int:
-        """Pass on what the library has made, and return 1 to end the synthesis."""
+        """Process samples and events from the library, and return 1 to end the synthesis."""
         if self._sink is None or self._raised is not None:
             return 1
         try:
@@ -295,7 +298,7 @@ class Espeak:
 
 
 class EspeakPhonemizer:
-    """libespeak-ng as a `phonemes.Phonemizer`, which makes no sound.
+    """A `phonemes.Phonemizer` that uses libespeak-ng without any sound.
 
     Args:
         espeak: The binding of the library.
@@ -307,7 +310,7 @@ class EspeakPhonemizer:
 
         self._espeak = espeak
         self._voice = voice
-        #: held while the library works
+        #: held during each call of the library
         self._busy = threading.Lock()
         self._ended = False
         self._text = ""
@@ -318,7 +321,7 @@ class EspeakPhonemizer:
         espeak.SetSynthCallback(self._on_audio)
 
     def clauses(self, text: str) -> list[tuple[str, str]]:
-        # All clauses are read at once: any other call would make the library forget what it has read ahead.
+        # All clauses are read at once, because any other call would discard the text that the library has read ahead.
         raw = ctypes.create_string_buffer(guard.guarded(text, self._voice).encode("utf-8", "replace"))
         base = ctypes.addressof(raw)
         at = ctypes.c_void_p(base)
@@ -328,7 +331,7 @@ class EspeakPhonemizer:
             ipa = self._call(self._to_phonemes, ctypes.byref(at), self._espeak.CHARS_UTF8, _IPA) or b""
             end = len(raw) - 1 if at.value is None else at.value - base
             clause = raw.raw[begin:end].decode("utf-8", "replace")
-            if at.value and clause and not clause[-1].isspace():  # the first character of the next clause
+            if at.value and clause and not clause[-1].isspace():  # this is the first character of the next clause
                 end -= len(clause[-1].encode())
                 clause = clause[:-1]
             end_character = begin_character + len(clause)
@@ -337,22 +340,22 @@ class EspeakPhonemizer:
         return found
 
     def word_positions(self, clause: str) -> list[tuple[int, int]]:
-        """Return the positions by speaking the clause without output, which takes 1 ms per second of sound."""
+        """Return the positions after speaking the clause without output, which takes 1 ms per second of sound."""
         self._speak(clause)
         return self._positions
 
     def ends_with_abbreviation(self, clause: str) -> bool:
-        """Return whether the library makes no pause after the clause's last word if another word follows."""
+        """Return whether the library makes no pause between the clause's last word and another word after it."""
         word = clause.rsplit(maxsplit=1)[-1]
         alone = self._speak(word)
         return self._speak(f"{word} A") - alone < _PAUSE_SAMPLES
 
     def end(self) -> None:
-        """Make the current call and all later ones raise Stopped; any thread may call this."""
+        """Make the current call and all later calls raise Stopped; may be called from any thread."""
         self._ended = True
 
     def wait(self) -> None:
-        """Wait until the library has finished its current work; call `end` first."""
+        """Wait until the current call of the library returns; `end` has to be called first."""
         with self._busy:
             pass
 
@@ -366,7 +369,7 @@ class EspeakPhonemizer:
         return result
 
     def _speak(self, text: str) -> int:
-        """Speak a text without output, keep its words, and return the end of its first clause in samples."""
+        """Speak a text without output, store its words, and return the end of its first clause in samples."""
         self._text, self._positions, self._clause_ends = guard.guarded(text, self._voice), [], []
         self._call(self._espeak.Synth, self._text.encode("utf-8", "replace"), flags=self._espeak.CHARS_UTF8)
         return self._clause_ends[0] if self._clause_ends else 0
@@ -383,33 +386,33 @@ class EspeakPhonemizer:
 
 
 def _word_position(event: _EspeakEvent, text: str) -> tuple[int, int] | None:
-    """Return the start and length in the text of an event's word; None if there is no word."""
+    """Return the start and length of an event's word in the text, or None if there is no word."""
     start = event.text_position - 1
     length = event.length if event.length > 0 else count_letters(text, start)
     return (start, length) if length else None
 
 
 def _variants(espeak: Any) -> list[Voice]:
-    """Return the variants; the ids in the library's list are files, such as "!v/f3"."""
+    """Return the variants, whose ids in the library's list are files such as "!v/f3"."""
     found = [(each.id.rpartition("/")[2], each.name) for each in _list_voices(espeak, _VARIANTS)]
     return [Voice(VARIANT_PREFIX + file, None, f"variant {name}") for file, name in found]
 
 
 def _mbrola_voices(espeak: Any) -> list[Voice]:
-    """Return the MBROLA voices that are installed; the library lists all that it knows."""
+    """Return the installed MBROLA voices, which are only a part of the library's list."""
     if not on_path("mbrola"):
         return []
     return [each for each in _list_voices(espeak, _MBROLA) if _has_mbrola_data(each.id)]
 
 
 def _has_mbrola_data(identifier: str) -> bool:
-    """Return whether the data of a voice is installed; for "mb/mb-de4-en" it is called "de4"."""
+    """Return whether the data of an MBROLA voice is installed, which is "de4" for the id "mb/mb-de4-en"."""
     name = identifier.rpartition("/")[2].split("-")[1]
     return any(os.path.isfile(path.format(name)) for path in _MBROLA_PATHS)
 
 
 def _list_voices(espeak: Any, kind: bytes | None) -> tuple[Voice, ...]:
-    """Return one of the library's lists of voices; None for the normal voices."""
+    """Return one of the library's lists of voices, or the normal voices if `kind` is None."""
     found = []
     for each in espeak.ListVoices(None if kind is None else espeak.VOICE(languages=kind)):
         # The first byte of the languages is a priority.

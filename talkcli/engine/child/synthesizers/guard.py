@@ -1,14 +1,14 @@
-"""The guard before libespeak-ng, which replaces the few characters of a text that would crash the library.
+"""The guard for libespeak-ng, which replaces the few characters of a text that would crash the library.
 
-The module is pure. It replaces a character by a single one, so every position in the text stays the same. Ordinary text
-must pass unchanged: a rule looks for a known cause of a crash, states where its numbers come from, and does nothing
-unless that cause is there. The guard only makes crashes rare; what contains them is the engine process.
+The module is pure. It replaces single characters by single characters, so every position in the text stays the same.
+Ordinary text must pass unchanged. Each rule is for a known cause of a crash, documents its numbers, and changes nothing
+without that cause. The guard only makes crashes rare. If a crash happens nevertheless, only the engine process is lost.
 
-The first sound waits for the guard. A rule that examines every character takes 20 ms for a long text, so it only runs
-after a quick check has found that it may be needed.
+The guard delays the first sound. A rule that examines every character takes 20 ms for a long text, so it only runs if a
+quick check has found that it may be needed.
 
-The numbers are sizes of buffers that libespeak-ng 1.51 overruns: N_WORD_BYTES, N_CLAUSE_WORDS and N_TR_SOURCE in its
-`translate.h`. Version 1.52 has fixed some of them.
+The numbers are the sizes of buffers that libespeak-ng 1.51 overruns (N_WORD_BYTES, N_CLAUSE_WORDS and N_TR_SOURCE in
+`translate.h`). Version 1.52 has fixed some of these faults.
 """
 
 from __future__ import annotations
@@ -17,27 +17,30 @@ import functools
 import re
 import unicodedata
 
-#: Control characters that become blanks: 0x01 starts a command to the library (a new pitch or voice), 0x02 after a "["
-#: starts phonemes, and NUL ends the text. The library itself treats tabs and line ends as blanks. U+FFFD, which stands
-#: for unreadable bytes, is silent, but the library would report it as a word instead of the next word.
+#: The characters that become blanks. 0x01 starts a command to the library (a new pitch or voice), 0x02 after a "["
+#: starts phonemes, and NUL ends the text. Tabs and line ends are harmless. U+FFFD, the replacement for unreadable
+#: bytes, is silent, but the library would report it as a word instead of the next word.
 _BLANKED = {code: " " for code in (*range(0x20), *range(0x7F, 0xA0), 0xFFFD) if chr(code) not in "\t\n\r"}
 
-#: The buffer for looking up initials such as "U.S.A.": it holds each letter with its dot, and the whole word after the
-#: last dot (N_WORD_BYTES is 160, including the end). 'a.' * 85 and 'a.' + 'b' * 170 overrun it.
+#: The usable size of the buffer for looking up initials such as "U.S.A.". It contains each letter with its dot, and the
+#: whole word after the last dot (N_WORD_BYTES is 160, including the end). 'a.' * 85 and 'a.' + 'b' * 170 overrun it.
 _LOOKUP_BYTES = 156
-#: The buffer for spelling out initials has 80 bytes. At most 50 letters are heard anyway.
+#: The usable size of the buffer for spelling out initials, which has 80 bytes. At most 50 letters are spoken anyway.
 _SPELLING_BYTES = 78
-#: Each initial marks up to two words after it as spoken, in an unchecked table of 300 words per clause
-#: (N_CLAUSE_WORDS). Therefore no initials may follow this many words.
+#: The maximum number of words before initials in a clause. Each initial marks up to two words after it as spoken, in a
+#: table of 300 words per clause (N_CLAUSE_WORDS), without a check of the limit.
 _MAX_CLAUSE_WORDS = 220
-#: The library ends a clause after this many bytes, at the next blank (N_TR_SOURCE is 800; 75 are reserved).
+#: The number of bytes after which the library ends a clause at the next blank (N_TR_SOURCE is 800, of which 75 are
+#: reserved).
 _MAX_CLAUSE_BYTES = 725
-#: The longest word from which the library may remove an ending: N_WORD_BYTES less the replacement.
+#: The maximum length of a word from which the library may remove an ending: N_WORD_BYTES without room for the
+#: replacement.
 _MAX_WORD_BYTES = 150
-#: The most apostrophes in a word. Each "'s" is an ending, whose phonemes share a buffer of 200 bytes; 70 overrun it.
+#: The maximum number of apostrophes in a word. Each "'s" is an ending, and the phonemes of all endings share a buffer
+#: of 200 bytes, which 70 endings overrun.
 _MAX_WORD_APOSTROPHES = 30
 
-#: The characters that the library treats as parts of a word: letters, digits, apostrophes, and nearly all characters
+#: A character that the library treats as a part of a word: a letter, a digit, an apostrophe, and nearly every character
 #: outside ASCII, including separate accents.
 _WORD_CHARACTER = (
     r"(?:[A-Za-z0-9'’]|(?![\s\u0080-\u00a9\u00ab-\u00b4\u00b6-\u00b9\u00bb-\u00bf\u2000-\u200a\u2010-\u205f\u3000-\u303f"
@@ -45,24 +48,25 @@ _WORD_CHARACTER = (
 )
 _IN_WORD = re.compile(_WORD_CHARACTER)
 _WORD_OR_GAP = re.compile(f"({_WORD_CHARACTER}+)|((?:(?!{_WORD_CHARACTER}).)+)", re.DOTALL)
-#: A run of characters that may contain a word with too many apostrophes or bytes.
+#: A run of characters without blanks, long enough to contain a word with too many apostrophes or bytes.
 _LONG_RUN = re.compile(rf"\S{{{_MAX_WORD_APOSTROPHES + 1},}}")
-#: Symbols that the library treats as letters: enclosed characters and Braille.
+#: Symbols that the library treats as letters (enclosed characters and Braille).
 _SYMBOL_LETTERS = frozenset(map(chr, (*range(0x2460, 0x2500), *range(0x2800, 0x2900))))
-#: The ends of a clause: Western punctuation if a blank, a bracket or nothing follows, and other punctuation anywhere.
+#: The end of a clause: Western punctuation before a blank, a bracket or the end of the text, and other punctuation
+#: anywhere.
 _CLAUSE_END = re.compile(r"[.,;:!?…](?:[\s()\[\]{}<>\"«»“”‘’„]|\Z)|[。、，！？：；︒؟،؛।॥։՝]|\n\s*\n")
-#: The ends of a clause that are certain.
+#: An end of a clause that is certain.
 _CERTAIN_CLAUSE_END = re.compile(r"[,;:!?]\s|\.\s+[A-Z]")
 #: A hyphen between a symbol and a letter.
 _HYPHEN = re.compile(r"(?<=[^\w\s]|_)-(?=[^\W\d_])")
-#: The first character of the scripts in which each character is a word, and the range of Hangul syllables, which the
-#: library splits into letters of three bytes.
+#: The first character of the scripts in which each character is a word, and the first and last Hangul syllables. The
+#: library splits these syllables into letters of three bytes.
 _IDEOGRAPHS, _HANGUL, _HANGUL_END = "\u2e80", "\uac00", "\ud7a3"
-#: Characters that the default language of their script has no name for, by the languages that handle them safely. For
+#: Characters that have no name in the default language of their script, with the languages that can process them. For
 #: any other voice, the library loads that default language, finds no name, loads English instead, and continues with
-#: memory that it has just freed (`LookupLetter` in its `numbers.c`). They were found in 1.51 by speaking every
-#: character in each of the 131 voices with that memory overwritten. Those voices speak none of them except the four
-#: Greek symbols.
+#: memory that it has just freed (`LookupLetter` in `numbers.c`). The characters were found in 1.51 by speaking every
+#: character in each of the 131 voices while freed memory was overwritten. These voices are silent for all of them
+#: except the four Greek symbols.
 _CRASHING_CHARACTERS = {
     ("el", "grc"): "\u0384\u0385\u0387\u03f6",
     ("hy",): "\u055a\u058d-\u058f",
@@ -77,13 +81,14 @@ _CRASHING_CHARACTERS = {
     ("ka",): "\u10fb",
     ("ko",): "\u1180-\u11a7\u11c3-\u11ff",
 }
-#: A number, with or without separators of thousands.
+#: A number, with or without thousands separators.
 _SPOKEN_NUMBER = re.compile(r"[0-9]+(?:,[0-9]{3})*")
-#: The lengths of numbers, in digits, that crash the Cantonese and Shan voices, because their words have more than 200
-#: bytes of phonemes (N_WORD_PHONEMES). Longer numbers are spoken digit by digit. This was measured by speaking 382
-#: numbers of 6 to 39 digits in each of the 131 voices.
+#: The minimum and maximum number of digits with which a number crashes the Cantonese and Shan voices, because its words
+#: have more than 200 bytes of phonemes (N_WORD_PHONEMES). Longer numbers are spoken digit by digit. This was measured
+#: by speaking 382 numbers of 6 to 39 digits in each of the 131 voices.
 _UNSAFE_DIGIT_COUNTS = {"yue": (13, 14), "shn": (13, 14)}
-#: Digits that those voices speak separately, so that they split a number. Two of them in a row would be silent.
+#: Replacements for digits that these voices speak separately, so that they split a number. Two of them in a row would
+#: be silent.
 _SEPARATE_DIGITS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -91,8 +96,8 @@ def guarded(text: str, voice: str = "") -> str:
     """Return a text of the same length that doesn't crash libespeak-ng.
 
     Args:
-        text: The text.
-        voice: The library's id of the voice, such as "gmw/en-US" or "ko+f3"; empty for no language.
+        text: The text to make safe.
+        voice: The library's id of the voice, such as "gmw/en-US" or "ko+f3", or "" if the language is unknown.
     """
     text = text.translate(_BLANKED)
     language = re.split(r"[-+]", voice.rpartition("/")[2], maxsplit=1)[0]
@@ -109,13 +114,13 @@ def guarded(text: str, voice: str = "") -> str:
 
 @functools.lru_cache(maxsize=8)
 def _unsafe_characters(language: str) -> re.Pattern[str]:
-    """Return a pattern for the characters that voices of this language must not get."""
+    """Return a pattern for the characters that crash the voices of a language."""
     found = (signs for languages, signs in _CRASHING_CHARACTERS.items() if language not in languages)
     return re.compile(f"[{''.join(found)}]")
 
 
 def _split_number(number: str, least: int, most: int) -> str:
-    """Return a number; if it has `least` to `most` digits, one of them is replaced so that it splits the number."""
+    """Return a number, with one digit replaced to split it if it has `least` to `most` digits."""
     if not least <= sum(map(str.isdigit, number)) <= most:
         return number
     middle = next(place for place in range(len(number) // 2, len(number)) if number[place].isdigit())
@@ -123,7 +128,9 @@ def _split_number(number: str, least: int, most: int) -> str:
 
 
 def _may_have_long_initials(text: str) -> bool:
-    """Return whether there may be too many initials in a row, or too many words before them; checks only the dots."""
+    """Return whether there may be too many initials in a row or too many words before them; only checks words with
+    dots.
+    """
     dot = text.find(".")
     while dot >= 0 and (behind := _IN_WORD.search(text, dot)):
         start = _initial_before(text, dot)
@@ -134,7 +141,7 @@ def _may_have_long_initials(text: str) -> bool:
 
 
 def _initial_before(text: str, dot: int) -> int | None:
-    """Return the start of the last word before a dot if it has at most one letter."""
+    """Return the start of the word before a dot, or None if it has more than one letter."""
     end = dot
     while end and not _IN_WORD.match(text[end - 1]):
         end -= 1
@@ -146,7 +153,7 @@ def _initial_before(text: str, dot: int) -> int | None:
 
 
 def _may_be_too_long(text: str, start: int) -> bool:
-    """Return whether the initials that begin at `start` may be too many, together with the word after them."""
+    """Return whether the initials from `start` on, with the word after them, may overrun a buffer."""
     room = 0
     for piece in _WORD_OR_GAP.finditer(text, start):
         word, between = piece.groups()
@@ -164,7 +171,7 @@ def _may_be_too_long(text: str, start: int) -> bool:
 
 
 def _without_long_initials(text: str) -> str:
-    """Blank the dots after initials that would overrun the library's buffers."""
+    """Replace the dots after initials that would overrun the library's buffers by blanks."""
     result = list(text)
     looked_up = spelled = words = size = 0
     dots: list[int] = []
@@ -192,29 +199,29 @@ def _without_long_initials(text: str) -> str:
 
 
 def _ends_clause(text: str, start: int, end: int) -> bool:
-    """Return whether a clause ends in a part of a text; a dot before a lower-case letter belongs to an abbreviation."""
+    """Return whether a clause ends between two positions; a dot before a lower-case letter means an abbreviation."""
     behind = text[end : end + 1]
     stops = _CLAUSE_END.finditer(text, start, end + len(behind))
     return any(text[each.start()] != "." or not behind.islower() for each in stops)
 
 
 def _is_letter(character: str) -> bool:
-    """Return whether a character is a letter, not one of the quotes, joiners and symbols around letters."""
+    """Return whether a character counts as a letter, unlike the quotes, joiners and symbols in words."""
     return character.isalnum() or character in _SYMBOL_LETTERS or unicodedata.category(character).startswith("M")
 
 
 def _max_bytes(character: str) -> int:
-    """Return the bytes that a character may need; some voices replace it by other letters."""
+    """Return the number of bytes that a character may need, because some voices replace it by other letters."""
     if _HANGUL <= character <= _HANGUL_END:
         return 9
     return max(2, len(character.encode()), len(character.lower().encode()))
 
 
 def _without_leading_hyphens(text: str) -> str:
-    """Blank a hyphen between a clause's first symbol and a word, as in "'-o".
+    """Replace a hyphen between the first symbol of a clause and a word by a blank, as in "'-o".
 
-    The library doesn't mark the beginning of that word, and searches for the mark before the start of its list of
-    phonemes. This crashes Vietnamese, Danish, Hindi and other voices. The word isn't reported either.
+    The library doesn't mark the beginning of this word, and searches for the mark before the start of its list of
+    phonemes. This crashes Vietnamese, Danish, Hindi and other voices. The library doesn't report the word either.
     """
 
     def blanked(found: re.Match[str]) -> str:
@@ -227,13 +234,13 @@ def _without_leading_hyphens(text: str) -> str:
 
 
 def _without_long_words(text: str) -> str:
-    """Split words that would overrun the library's buffers, at an apostrophe or before a capital letter."""
+    """Split words that would overrun the library's buffers, by blanking an apostrophe or capitalizing a letter."""
     return _LONG_RUN.sub(lambda run: _WORD_OR_GAP.sub(_split_word, run.group()), text)
 
 
 def _split_word(piece: re.Match[str]) -> str:
     word = piece.group(1) or ""
-    # Scripts without capital letters can only be split at an apostrophe.
+    # Words in scripts without capital letters can only be split at an apostrophe.
     short = len(word.encode()) <= _MAX_WORD_BYTES or word.lower() == word.upper()
     if short and word.count("'") + word.count("’") <= _MAX_WORD_APOSTROPHES:
         return piece.group()

@@ -1,9 +1,9 @@
-"""The models of Piper voices in onnxruntime, as two halves each, and the cache of these halves.
+"""Piper's models in onnxruntime, each split into two halves, and the cache of these halves.
 
-The encoder turns phoneme ids into frames, and the decoder turns any part of the frames into samples. A model runs only
-in the thread that calls it: onnxruntime must not start any, so a voice uses one processor, and none while nobody
-speaks. Another thread can end a run within milliseconds. This is the only module that imports onnxruntime. A faulty
-model raises VoiceFileError, whose text names the file.
+The encoder turns phoneme ids into frames, and the decoder turns any part of the frames into samples. onnxruntime starts
+no threads. A model runs in the thread that calls it, so a voice uses one processor, and none between sentences. Another
+thread can end a run within milliseconds. This is the only module that imports onnxruntime. For a faulty model it raises
+VoiceFileError, with the name of the file.
 """
 
 from __future__ import annotations
@@ -31,49 +31,55 @@ if TYPE_CHECKING:
 
     _T = TypeVar("_T")
 
-os.environ.update(NO_TELEMETRY)  # before onnxruntime is imported
+os.environ.update(NO_TELEMETRY)  # onnxruntime reads this when it is imported
 
-#: The frames on either side of a part that its samples depend on. The calculation for the largest of Piper's decoders
-#: ("high") gives 13.4. With 10 frames, the samples of a "medium" decoder differ from the whole by 1 in 400,000.
+#: The number of frames on either side of a part that affect its samples. For Piper's largest decoder ("high"), 13.4 was
+#: calculated. With 10 frames, the samples of a "medium" decoder differ by 1 in 400,000.
 CONTEXT_FRAMES = 14
-#: The largest model; Piper's have 15 to 120 million bytes.
+#: The maximum size of a model. Piper's have 15 to 120 million bytes.
 _MAX_MODEL_BYTES = 1 << 28
-#: The most frames of a phoneme on average (padding counts as phonemes), and the most samples of a frame. Phonemes of
-#: en_US-joe-medium have 4 frames on average at its own pace and at most 35, and Piper's frames have 256 samples. More
-#: would mean minutes for a sentence, and gigabytes.
+#: The maximum average number of frames per phoneme (including padding), and the maximum number of samples per frame. At
+#: its natural pace, en_US-joe-medium has 4 frames per phoneme on average and 35 at most. Piper's frames have 256
+#: samples. Higher values would mean minutes of sound for a sentence, and gigabytes of memory.
 _MAX_MEAN_FRAMES, _MAX_FRAME_SAMPLES = 40, 4096
-#: What onnxruntime and the dynamic linker say among other things if they get no memory.
+#: Parts of the messages of onnxruntime and the dynamic linker if they can't get memory.
 _NO_MEMORY = (
     *("bad_alloc", "bad allocation", "Failed to allocate memory", os.strerror(errno.ENOMEM)),
     "failed to map segment from shared object",
 )
-#: The longest message of onnxruntime that is passed on.
+#: The maximum length of onnxruntime's message in an error message.
 _MAX_ERROR_CHARS = 200
-#: The version of `vits.split_model` in the keys of the cache. Raise it if that function's result changes.
+#: The version of `vits.split_model`, which is a part of the cache's keys. Raise it whenever the result of this function
+#: changes.
 _SPLIT_VERSION = 1
-#: The inputs of a model; the second name is there only if it has several speakers.
+#: The inputs of every model, and the additional input of a model with several speakers.
 _INPUTS, _SPEAKER_INPUT = ("input", "input_lengths", "scales"), "sid"
 
-#: The largest cache, which holds about eight voices; the oldest files are removed.
+#: The maximum size of the cache, which is enough for about eight voices. If it is exceeded, the oldest files are
+#: removed.
 MAX_CACHE_BYTES = 500_000_000
-#: Bytes of a half that are written at a time. All other threads wait while they are copied.
+#: Bytes of a half to write at a time. All other threads wait while these bytes are copied.
 _WRITE_BYTES = 1 << 20
 _ENCODER_SUFFIX, _DECODER_SUFFIX = ".encoder.onnx", ".decoder.onnx"
-#: The suffix of a directory that is being written, which takes seconds, and the age at which its writer is dead.
+#: The suffix of a directory that is being written, which takes seconds, and the age at which its writer must be dead.
 _UNFINISHED_SUFFIX, _UNFINISHED_LIMIT_S = ".new", 3600.0
-#: The names of cached files; no other file is ever removed.
+#: The names of cached files. The cache never removes any other file.
 _CACHED_NAME = re.compile(r"[0-9a-f]{64}-.*(\.encoder\.onnx|\.decoder\.onnx|\.new)")
 
 
 class ModelCache:
-    """The halves of models as files, which only this user can read and write.
+    """A directory with the halves of models, which only this user can read and write.
 
-    The encoder is cached as onnxruntime has optimized it. The cache is never required: if files can't be written or are
-    damaged, the halves are made again. A key starts with 64 hexadecimal digits and a hyphen.
+    The encoder is stored as optimized by onnxruntime. Speech never depends on the cache: if files are damaged or can't
+    be written, the halves are made again. A key consists of 64 hexadecimal digits, a hyphen and anything else.
     """
 
     def __init__(self, directory: str) -> None:
-        """Open or create the cache; OSError if the directory can't be used."""
+        """Open or create the cache.
+
+        Raises:
+            OSError: The directory can't be used.
+        """
         os.makedirs(os.path.dirname(directory), exist_ok=True)
         with contextlib.suppress(FileExistsError):
             os.mkdir(directory, 0o700)
@@ -83,7 +89,7 @@ class ModelCache:
         self._directory = directory
 
     def find(self, key: str) -> tuple[str, str] | None:
-        """Return the paths of the encoder and the decoder, and mark them as used; None if they aren't cached."""
+        """Return the paths of both halves and mark them as used, or return None if they aren't cached."""
         paths = self._path(key, _ENCODER_SUFFIX), self._path(key, _DECODER_SUFFIX)
         try:
             for each in paths:
@@ -93,18 +99,19 @@ class ModelCache:
         return paths
 
     def store(self, key: str, make_encoder: Callable[[str | None], _T], decoder: Iterable[Buffer]) -> _T:
-        """Make the encoder and cache both halves.
+        """Make the encoder, and store both halves.
 
         Args:
             key: The key of the model.
-            make_encoder: Makes the encoder, and writes it to a path. If caching fails, it is called with None instead.
+            make_encoder: A function that makes the encoder and writes it to a path. It is called with None if the
+                halves can't be stored.
             decoder: The parts of the decoder's file.
 
         Returns:
             The result of `make_encoder`.
         """
         try:
-            # Each writer has a directory of its own, because another process may be caching the same model.
+            # Each writer has a directory of its own, because another process may be storing the same model.
             with tempfile.TemporaryDirectory(_UNFINISHED_SUFFIX, key, self._directory) as folder:
                 unfinished = os.path.join(folder, "half")
                 with open(unfinished, "wb", _WRITE_BYTES) as file:
@@ -112,7 +119,7 @@ class ModelCache:
                 os.replace(unfinished, self._path(key, _DECODER_SUFFIX))
                 made = make_encoder(unfinished)
                 os.replace(unfinished, self._path(key, _ENCODER_SUFFIX))
-        except Exception:  # noqa: BLE001 - an error that has nothing to do with writing is raised again below
+        except Exception:  # noqa: BLE001 - an error with another cause is raised again below
             made = make_encoder(None)
         self._shrink()
         return made
@@ -127,20 +134,20 @@ class ModelCache:
         return os.path.join(self._directory, key + suffix)
 
     def _shrink(self) -> None:
-        """Remove the oldest files beyond the limit, and what killed writers have left."""
+        """Remove the oldest files beyond the maximum size, and the directories of dead writers."""
         size = 0
         for changed, path in sorted(self._entries(), reverse=True):
             if path.endswith(_UNFINISHED_SUFFIX):
                 if time.time() - changed > _UNFINISHED_LIMIT_S:
                     shutil.rmtree(path, ignore_errors=True)
                 continue
-            with contextlib.suppress(OSError):  # another process may have removed it
+            with contextlib.suppress(OSError):  # another process may have removed the file
                 size += os.lstat(path).st_size
                 if size > MAX_CACHE_BYTES:
                     os.unlink(path)
 
     def _entries(self) -> Iterator[tuple[float, str]]:
-        """Yield the cached files with the times of their last use."""
+        """Yield the cached files, each after the time of its last use."""
         with contextlib.suppress(OSError), os.scandir(self._directory) as entries:
             for each in entries:
                 if _CACHED_NAME.fullmatch(each.name):
@@ -153,7 +160,7 @@ class Frames:
     """The encoder's output for some phoneme ids."""
 
     values: tuple[Any, ...]
-    #: the frame at which each phoneme ends
+    #: the number of the frame at which each phoneme id ends
     ends: tuple[int, ...]
 
     @property
@@ -162,16 +169,16 @@ class Frames:
 
 
 class ModelRun:
-    """The handle of all runs of a model for one sentence, which can end them."""
+    """Handle to end all runs of a model for one sentence."""
 
     def __init__(self) -> None:
         import onnxruntime
 
         self.options = onnxruntime.RunOptions()
-        self.options.log_severity_level = 4  # only fatal errors, because the others are raised as well
+        self.options.log_severity_level = 4  # only fatal errors, because the others are also raised
 
     def end(self) -> None:
-        """Make the current run and all later ones raise an exception; any thread may call this."""
+        """Make the current run and all later runs raise an exception; may be called from any thread."""
         self.options.terminate = True
 
 
@@ -179,7 +186,7 @@ class Model:
     """A loaded model of a Piper voice."""
 
     def __init__(self, path: str, description: VoiceDescription, cache: ModelCache | None = None) -> None:
-        """Load a model, which takes 0.3 to 3 s; most of that is saved if the cache has its halves.
+        """Load a model, which takes 0.3 to 3 s, or much less if its halves are cached.
 
         Raises:
             VoiceFileError: The model can't be loaded.
@@ -197,23 +204,24 @@ class Model:
         cached = cache.find(key) if cache is not None else None
         if cache is not None and cached is not None:
             try:
-                unchanged = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL  # the encoder is optimized already
+                # the cached encoder is already optimized
+                unchanged = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
                 self._set_halves(_session(cached[0], unchanged), _session(cached[1]))
                 return
             except Exception as error:
                 if _is_out_of_memory(error):
                     raise no_memory_error(path) from error
-                cache.remove(key)  # for example truncated by a full disk; a real fault shows below
+                cache.remove(key)  # a full disk may have truncated it; a fault of the model itself is found below
         self._set_halves(*_split(path, content, cache, key))
 
     def encode(self, ids: Sequence[int], speaker: int, scale: float, run: ModelRun) -> Frames:
         """Return the frames of some phoneme ids.
 
         Args:
-            ids: The model's ids of the phonemes.
-            speaker: The speaker's number, which only matters if there are several.
-            scale: A factor of all durations, on top of the voice's own.
-            run: The run, through which the call can be ended.
+            ids: The ids of the phonemes in the model.
+            speaker: The number of the speaker, which is ignored if there is only one.
+            scale: The factor by which all durations are multiplied, in addition to the voice's own factor.
+            run: The handle to end the run.
 
         Raises:
             VoiceFileError: The model is faulty, or the run was ended.
@@ -239,7 +247,7 @@ class Model:
         return Frames(tuple(values), tuple(int(each) for each in np.cumsum(durations)))
 
     def decode(self, frames: Frames, begin: int, end: int, run: ModelRun) -> Any:
-        """Return the samples of the frames from `begin` up to `end` as floats, 1.0 for full scale.
+        """Return the samples of the frames from `begin` up to `end`, as floats from -1.0 to 1.0.
 
         Raises:
             VoiceFileError: The model is faulty, or the run was ended.
@@ -247,7 +255,7 @@ class Model:
         import numpy as np
 
         low, high = max(0, begin - CONTEXT_FRAMES), min(frames.count, end + CONTEXT_FRAMES)
-        # Values without a dimension for frames belong to the whole sentence, such as the speaker's.
+        # Values without a dimension for frames, such as the speaker's, belong to the whole sentence.
         parts = {
             name: each[..., low:high] if each.shape[-1:] == (frames.count,) else each
             for name, each in zip(self._frame_inputs, frames.values, strict=True)
@@ -266,10 +274,10 @@ class Model:
         return frames * self._samples_per_frame / self.description.rate
 
     def _set_halves(self, encoder: Any, decoder: Any) -> None:
-        """Check both halves, and let them speak a phoneme.
+        """Set both halves after checking them and letting them speak a phoneme.
 
         Raises:
-            VoiceFileError: They are faulty, or don't belong to the description.
+            VoiceFileError: The halves are faulty, or don't match the description.
         """
         self._encoder, self._decoder = encoder, decoder
         names = {each.name for each in encoder.get_inputs()}
@@ -291,7 +299,7 @@ class Model:
         return found
 
     def _try_out(self) -> int:
-        """Return the number of samples per frame, after speaking the phoneme with the highest id."""
+        """Speak the phoneme with the highest id, and return the number of samples per frame."""
         ids = self.description.phoneme_ids
         highest = max(each for every in ids.values() for each in every)
         phonemes = [*ids[BEGIN_SYMBOL], *ids[PAD_SYMBOL], highest, *ids[PAD_SYMBOL], *ids[END_SYMBOL]]
@@ -315,17 +323,17 @@ class Model:
 
 
 def load_libraries(path: str) -> None:
-    """Import numpy and onnxruntime. It takes 0.25 s, and all other threads wait for a tenth of that.
+    """Import numpy and onnxruntime, which takes 0.25 s and blocks all other threads for a tenth of that time.
 
     Args:
-        path: The model that needs them, for the error.
+        path: The path of the model for the error message.
 
     Raises:
         VoiceFileError: There is not enough memory.
-        ImportError: They can't be imported.
+        ImportError: The packages can't be imported.
     """
     try:
-        import numpy as np  # noqa: F401 - before onnxruntime, which doesn't say why it fails
+        import numpy as np  # noqa: F401 - first, because onnxruntime doesn't report why numpy fails
         import onnxruntime  # noqa: F401
     except Exception as error:
         if _is_out_of_memory(error):
@@ -334,7 +342,7 @@ def load_libraries(path: str) -> None:
 
 
 def _split(path: str, content: bytes, cache: ModelCache | None, key: str) -> tuple[Any, Any]:
-    """Split a model, cache the halves, and return their sessions.
+    """Split a model, cache its halves, and return the sessions of the halves.
 
     Raises:
         VoiceFileError: The model can't be split or loaded.
@@ -353,17 +361,18 @@ def _split(path: str, content: bytes, cache: ModelCache | None, key: str) -> tup
 
 
 def _session_of(half: Sequence[Buffer], optimized_path: str | None = None) -> Any:
-    """Return the session of a half that is in memory.
+    """Return the session of a half in memory.
 
-    onnxruntime reads it from a temporary file in memory. If it got bytes, they would have to be joined first, and
-    onnxruntime would copy and keep them. For joe this takes 30 to 110 ms each, while all other threads wait.
+    onnxruntime reads the half from a temporary file in memory. If it got bytes instead, they would have to be joined,
+    and onnxruntime would copy and keep them. For joe, each of these steps takes 30 to 110 ms in which all other threads
+    wait.
     """
     try:
         with open(os.memfd_create("half"), "wb", _WRITE_BYTES) as file:
             file.writelines(half)
             file.flush()
             return _session(f"/proc/self/fd/{file.fileno()}", optimized_path=optimized_path)
-    except (OSError, AttributeError):  # files are limited in size, or the system has none in memory
+    except (OSError, AttributeError):  # the system limits the size of files, or has no files in memory
         return _session(b"".join(half), optimized_path=optimized_path)
 
 
@@ -372,8 +381,8 @@ def _session(model: str | bytes, level: Any = None, optimized_path: str | None =
 
     Args:
         model: The path or the content of a model.
-        level: The level of optimization, or None for the basic one.
-        optimized_path: Where to write the optimized model, or None.
+        level: The level of optimization, or None for the basic level.
+        optimized_path: The path to write the optimized model to, or None.
     """
     import onnxruntime
 
@@ -381,9 +390,9 @@ def _session(model: str | bytes, level: Any = None, optimized_path: str | None =
     options.log_severity_level = 4
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    # The arena keeps as much memory as was ever needed, and makes nothing faster.
+    # The arena keeps as much memory as was ever needed, and isn't faster.
     options.enable_cpu_mem_arena = options.enable_mem_pattern = False
-    # Higher levels take 0.15 s longer, make nothing faster, and their result only fits one type of processor.
+    # Higher levels take 0.15 s longer and aren't faster, and their result fits only one type of processor.
     options.graph_optimization_level = level or onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
     if optimized_path is not None:
         options.optimized_model_filepath = optimized_path
@@ -391,14 +400,14 @@ def _session(model: str | bytes, level: Any = None, optimized_path: str | None =
 
 
 def _load_error(path: str, what: str, error: Exception) -> VoiceFileError:
-    """Return the error for a model that onnxruntime rejects."""
+    """Return the error for an exception of onnxruntime."""
     if _is_out_of_memory(error):
         return no_memory_error(path)
     return VoiceFileError(f"{path} {what} ({_first_line(error)}): get the voice anew")
 
 
 def no_memory_error(path: str) -> VoiceFileError:
-    """Return the error for a model that needs more memory than there is."""
+    """Return the error for a model that needs more memory than is available."""
     return VoiceFileError(f"{path} cannot be spoken with: there is no memory for it; end another program")
 
 

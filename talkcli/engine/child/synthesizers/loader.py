@@ -1,8 +1,8 @@
-"""The models of neural voices: loaded one at a time in the background, and kept until they are dropped.
+"""The loading of neural voices in the background, one at a time.
 
-The server decides which voices are loaded and dropped. A load takes seconds and runs in a thread; a single other thread
-calls everything else. The result of each load is reported once, as an event for the server. Voices are named by their
-ids without a speaker.
+The server decides which voices are loaded and dropped. Loading takes seconds and runs in a thread. All other calls come
+from a single other thread. The result of each load is reported to the server once, as an event. Voices are identified
+by their ids without a speaker.
 """
 
 from __future__ import annotations
@@ -27,34 +27,34 @@ from talkcli.paths import cache_directory
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-#: Bytes of growth after which freed memory is returned to the system and the process is measured. Less is left alone,
-#: because the next sentence needs it again.
+#: The growth of the process in bytes that triggers a new measurement and the return of freed memory to the system.
+#: Smaller amounts aren't returned, because the next sentence would need them again.
 GROWTH_BYTES = 16_000_000
 
 _T = TypeVar("_T")
 
 
 class BackgroundIterator(threading.Thread, Generic[_T]):
-    """A thread that runs an iterator, some items ahead of the thread that takes them."""
+    """A thread that runs an iterator some items ahead of its consumer."""
 
     def __init__(self, items: Iterator[_T], max_ahead: int) -> None:
-        """Start the thread; it pauses while `max_ahead` items wait to be taken."""
-        # A daemon thread would be left inside a C library when the process ends, which aborts then.
+        """Start the thread; it pauses while `max_ahead` items have not been taken."""
+        # A daemon thread could still be inside a C library when the process exits, which would abort the process.
         super().__init__(daemon=False)
         self._items = items
         self._room = threading.Semaphore(max_ahead)
         self._made: deque[_T] = deque()
         self._error: BaseException | None = None
         self._finished = False
-        #: held while the thread writes to its descriptor, so that `close` doesn't free the number meanwhile
+        #: held while the thread writes to its descriptor, so that `close` can't free the descriptor's number meanwhile
         self._lock = threading.Lock()
         self._closed = False
-        #: readable if an item can be taken, and at the end
+        #: readable if an item can be taken or the iterator has ended
         self.descriptor, self._write_end = os.pipe()
         self.start()
 
     def run(self) -> None:
-        """Run the iterator to its end or an error."""
+        """Run the iterator until it ends or raises an exception."""
         try:
             for item in self._items:
                 self._room.acquire()
@@ -76,15 +76,15 @@ class BackgroundIterator(threading.Thread, Generic[_T]):
         """Return the next item, or None at the end.
 
         Args:
-            wait: Called to wait for the descriptor. It may return early. Whatever it raises passes through, and no
-                item is lost. It may be omitted if `ready` is True.
+            wait: A function that waits for the descriptor. It may return early. If it raises an exception, the
+                exception passes through and no item is lost. It isn't needed if `ready` is True.
 
         Raises:
-            BaseException: The error of the iterator.
+            BaseException: The iterator raised this exception.
         """
         while not self._made:
             if self._finished:
-                if self._made:  # the last item may have come between the two checks
+                if self._made:  # the last item may have been added between the two checks
                     break
                 if self._error is not None:
                     raise self._error
@@ -96,7 +96,7 @@ class BackgroundIterator(threading.Thread, Generic[_T]):
         return self._made.popleft()
 
     def close(self) -> None:
-        """Tell the thread to end after its current item, which is discarded; return at once."""
+        """Make the thread end after its current item, which is discarded, and return at once."""
         with self._lock:
             if not self._closed:
                 self._closed = True
@@ -112,51 +112,51 @@ class BackgroundIterator(threading.Thread, Generic[_T]):
 
 @frozen
 class LoadedModel:
-    """A model in memory, with the stamps of its files at the time of loading."""
+    """A model in memory, with the stamps of its files from before it was loaded."""
 
     model: Model
     stamps: tuple[tuple[int, int, int], ...]
 
 
 class ModelLoader:
-    """The models in memory, and the queue of voices to load."""
+    """Keeps the loaded models, and loads queued voices one after the other."""
 
     def __init__(self) -> None:
         self._models: dict[str, LoadedModel] = {}
         self._waiting: deque[str] = deque()
         self._load: BackgroundIterator[LoadedModel] | None = None
-        #: the voice that is being loaded, and when its load started
+        #: the voice that is being loaded, and the monotonic time when its load started
         self._voice = ""
         self._started_at = 0.0
-        #: loaded voices that failed to speak
+        #: the loaded voices that failed to speak
         self._suspect: set[str] = set()
-        #: the error of each voice's last load
+        #: the error message of each voice's last load, if the load failed
         self._errors: dict[str, str] = {}
         self._events: list[VoiceLoaded | VoiceUnloaded | VoiceMemory] = []
-        #: the process's own memory before the first load, and the growth that was reported last
+        #: the private memory of the process before the first load, and the growth in the last report
         self._initial_bytes: int | None = None
         self._reported_growth = 0
-        #: the voice that spoke since the last measurement, "" if one was dropped, None for neither
+        #: the voice that spoke since the last measurement, "" if a voice was dropped, or None if neither happened
         self._unmeasured: str | None = None
 
     @property
     def descriptor(self) -> int | None:
-        """A descriptor that is readable once the load has finished; None if nothing is being loaded."""
+        """A descriptor that is readable after the load has finished, or None if no voice is being loaded."""
         return self._load.descriptor if self._load else None
 
     @property
     def deadline(self) -> float:
-        """The monotonic time at which the load in progress is given up."""
+        """The monotonic time at which the current load fails."""
         return self._started_at + LOAD_LIMIT_S
 
     def drop(self, voice: str) -> None:
-        """Release the model of a voice; a sentence that is being spoken keeps it to its end."""
+        """Release the model of a voice; a sentence that is being spoken keeps using it."""
         if self._models.pop(voice, None):
             self._unmeasured = ""
         self._suspect.discard(voice)
 
     def start(self, voice: str) -> None:
-        """Load a voice in the background, unless it is loaded or queued; an earlier error is forgotten."""
+        """Load a voice in the background unless it is loaded or queued, and discard its earlier error."""
         if voice in self._models:
             self._events.append(VoiceLoaded(voice, 0.0))
         elif voice not in self._waiting and not (self._load and voice == self._voice):
@@ -165,7 +165,7 @@ class ModelLoader:
             self._start_next()
 
     def model(self, voice: str) -> Model | None:
-        """Return the model of a voice; None if it isn't loaded."""
+        """Return the model of a voice, or None if it isn't loaded."""
         self._check_load()
         found = self._models.get(voice)
         if found and voice in self._suspect and found.stamps != _stamps(found.model.path):
@@ -175,17 +175,17 @@ class ModelLoader:
         return found.model if found else None
 
     def error(self, voice: str) -> str | None:
-        """Return the error of a voice's last load, for people."""
+        """Return the error message of a voice's last load, or None if the load didn't fail."""
         return self._errors.get(voice)
 
     def suspect(self, voice: str) -> None:
-        """Record that a loaded voice failed to speak, so that it is dropped once its files change."""
+        """Record that a loaded voice failed to speak. It is dropped after its files have changed."""
         self._suspect.add(voice)
 
     def spoken(self, voice: str) -> None:
-        """Record that a voice has spoken: the first sentences need memory that stays allocated."""
+        """Record that a voice has spoken, because its first sentences allocate memory that is kept."""
         if voice not in self._models:
-            self._unmeasured = ""  # it was dropped meanwhile, and is released only now
+            self._unmeasured = ""  # the voice was dropped during the sentence, so its memory is only released now
         elif self._unmeasured is None:
             self._unmeasured = voice
 
@@ -198,7 +198,7 @@ class ModelLoader:
         return events
 
     def _check_load(self) -> None:
-        """Take the model if the load has finished, or give up a load that takes too long."""
+        """Store the model if the load has finished, or record a failure if it takes too long."""
         load, voice = self._load, self._voice
         if load is None:
             return
@@ -206,7 +206,7 @@ class ModelLoader:
             if not load.ready:
                 if time.monotonic() < self.deadline:
                     return
-                # The thread may hang for ever, for example in a file on a server that is gone.
+                # The thread may hang forever, for example reading a file from a dead server.
                 raise VoiceFileError(f"{voice} was not loaded within {LOAD_LIMIT_S:g} s: are its files on a slow disk?")
             loaded = load.take()
             assert loaded is not None
@@ -224,7 +224,7 @@ class ModelLoader:
         self._start_next()
 
     def _measure(self, voice: str, min_growth: float = -math.inf) -> None:
-        """Report by how much the process has grown, unless a voice that spoke grew it by less than `min_growth`."""
+        """Report the growth of the process's memory, unless a voice that spoke added less than `min_growth` bytes."""
         self._unmeasured = None
         before, now = self._initial_bytes, _own_bytes()
         if before is None or now is None or (voice and now - before - self._reported_growth < min_growth):
@@ -241,7 +241,7 @@ class ModelLoader:
         self._events.append(VoiceLoaded(self._voice, seconds, why))
 
     def _start_next(self) -> None:
-        """Start the next load. Only one runs at a time, because it needs a processor and twice the model's memory."""
+        """Start the next load. Only one runs at a time because it needs a processor and twice the model's memory."""
         while self._load is None and self._waiting:
             self._voice, self._started_at = self._waiting.popleft(), time.monotonic()
             try:
@@ -258,7 +258,7 @@ def _model_path(voice: str) -> str:
     """Return the path of a voice's model.
 
     Raises:
-        VoiceFileError: A package is missing, or the file is.
+        VoiceFileError: A package or the model file is missing.
     """
     missing = models.missing_package()
     if missing is not None:
@@ -270,7 +270,7 @@ def _model_path(voice: str) -> str:
 
 
 def _stamps(path: str) -> tuple[tuple[int, int, int], ...]:
-    """Return the identities of a voice's files, which change with the files; () if a file can't be examined."""
+    """Return values that change whenever a voice's files change, or () if a file can't be examined."""
     try:
         found = [os.stat(each) for each in (path, path + models.JSON_SUFFIX)]
     except OSError:
@@ -279,9 +279,13 @@ def _stamps(path: str) -> tuple[tuple[int, int, int], ...]:
 
 
 def _load(path: str) -> Iterator[LoadedModel]:
-    """Yield the model at a path; VoiceFileError if it can't be loaded."""
+    """Yield the model at a path.
+
+    Raises:
+        VoiceFileError: The model can't be loaded.
+    """
     try:
-        load_libraries(path)  # first, so that a load that has taken time has certainly imported them
+        load_libraries(path)  # this comes first, so that any load that takes long has already imported them
         stamps = _stamps(path)
         yield LoadedModel(Model(path, models.read_description(path), _open_cache()), stamps)
     except OSError as error:
@@ -293,7 +297,7 @@ def _load(path: str) -> Iterator[LoadedModel]:
 
 
 def _open_cache() -> ModelCache | None:
-    """Return the cache; None if it can't be used, which is logged."""
+    """Return the cache, or None if it can't be used. The reason is logged."""
     try:
         return ModelCache(cache_directory())
     except OSError:
@@ -302,7 +306,7 @@ def _open_cache() -> ModelCache | None:
 
 
 def _own_bytes() -> int | None:
-    """Return this process's private memory, swapped pages included; None in sandboxes without /proc/self/status."""
+    """Return this process's private memory, including swapped pages, or None if it is unknown (in a sandbox)."""
     try:
         with open("/proc/self/status", "rb") as file:
             fields = dict(line.split(b":", 1) for line in file)
@@ -312,7 +316,7 @@ def _own_bytes() -> int | None:
 
 
 def _trim_heap() -> None:
-    """Return freed memory to the system; glibc would keep most of a dropped model. It takes 1 to 13 ms."""
+    """Return freed memory to the system, because glibc would keep most of a dropped model; takes 1 to 13 ms."""
     import ctypes
 
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)

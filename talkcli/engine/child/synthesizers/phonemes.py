@@ -1,8 +1,8 @@
-"""The parts of a text that a neural voice speaks: phonemes from libespeak-ng, with the positions of the words.
+"""The split of a text into parts for a neural voice, with phonemes from libespeak-ng and the positions of words.
 
-libespeak-ng returns the phonemes of each clause with blanks between words, and separately, for its own speech, the
-positions of the words in the text. It joins some words ("in the") and splits others ("1,000"), so the two lists have to
-be aligned. This module doesn't use the library itself: it gets a `Phonemizer`.
+libespeak-ng returns the phonemes of each clause with blanks between words. When it speaks the clause, it reports the
+positions of the words in the text. These two lists have to be aligned, because some words are joined in the phonemes
+("in the") and others are split ("1,000"). This module doesn't use the library itself, but a `Phonemizer`.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ if TYPE_CHECKING:
 else:
     Protocol = object
 
-#: The most phonemes of a part. The time and memory of a model grow with their square: on a PC, 250 phonemes take 0.25 s
-#: and 60 MB, and 800 take 2 s and 450 MB.
+#: The maximum number of phonemes in a part. The time and memory that a model needs grow with their square. On a PC, 250
+#: phonemes take 0.25 s and 60 MB, and 800 phonemes take 2 s and 450 MB.
 MAX_PART_PHONEMES = 250
-#: The number of phonemes from which a part may also end at a comma.
+#: The number of phonemes after which a part may also end at a comma.
 _LONG_PART_PHONEMES = 150
-#: The most comparisons for aligning two strings, which take up to 50 ms. It allows a clause of 1,000 phonemes;
-#: libespeak-ng ends every clause after 800 bytes. Only a number of 800 digits has ten times as many phonemes, and
-#: nobody can tell where a word begins in it.
+#: The maximum number of comparisons for aligning two strings, which take up to 50 ms. This is enough for a clause of
+#: 1,000 phonemes, and libespeak-ng ends every clause after 800 bytes. Only a number of 800 digits has ten times as many
+#: phonemes, and nobody can tell where a word begins in it.
 _MAX_COMPARISONS = 1 << 20
-#: The marks between clauses that Piper's voices know; the last three end a sentence.
+#: The marks between clauses that Piper's voices know. The last three end a sentence.
 PAUSE_MARKS = ",;:.!?"
-#: The punctuation in texts, and the pause mark for each.
+#: The pause mark for each punctuation character in a text.
 _PUNCTUATION = {
     **{each: each for each in PAUSE_MARKS},
     **dict.fromkeys("，、،", ","),
@@ -43,18 +43,18 @@ _PUNCTUATION = {
 }
 _SENTENCE_ENDS = ".!?"
 _LAST_PUNCTUATION = re.compile(rf"[{re.escape(''.join(_PUNCTUATION))}](?=[^\w]*\Z)")
-#: The mark of a change of language: "(en)hello(de)".
+#: A change of language in phonemes: "(en)hello(de)".
 _LANGUAGE_MARK = re.compile(r"\([^()]*\)")
 
 
 class Phonemizer(Protocol):
-    """A source of the phonemes of a language: libespeak-ng with one of its voices.
+    """Returns the phonemes of a language, as libespeak-ng does with one of its voices.
 
     Positions are characters from 0.
     """
 
     def clauses(self, text: str) -> list[tuple[str, str]]:
-        """Return the clauses of a text, which add up to the text, each with its phonemes in IPA."""
+        """Return the clauses of a text, each with its phonemes in IPA; joined, the clauses are the text."""
 
     def word_positions(self, clause: str) -> list[tuple[int, int]]:
         """Return the start and the length (at least 1) of each word in a clause."""
@@ -65,20 +65,20 @@ class Phonemizer(Protocol):
 
 @frozen
 class SpeechPart:
-    """A sentence, or the part of a long sentence that a model speaks at a time."""
+    """A sentence, or a part of a long sentence, that a model speaks in one run."""
 
     #: characters of IPA, blanks and pause marks; never empty
     phonemes: tuple[str, ...]
-    #: for each word: the index of its first phoneme, and its start and length in the text; the indexes never decrease
+    #: the index of each word's first phoneme (never decreasing), with the word's start and length in the text
     words: tuple[tuple[int, int, int], ...]
-    #: whether it ends a sentence, so that a pause follows
+    #: whether the part ends a sentence, so that a pause follows
     ends_sentence: bool
 
 
 def split_text(phonemizer: Phonemizer, text: str) -> Iterator[SpeechPart]:
-    """Yield the parts of a text, or none if nothing in it can be spoken.
+    """Yield the parts of a text. A text without any speech has no parts.
 
-    The phonemizer is used only as parts are taken.
+    The phonemizer is only used when the next part is requested.
     """
     offset = 0
     pending = _PendingPart()
@@ -92,7 +92,7 @@ def split_text(phonemizer: Phonemizer, text: str) -> Iterator[SpeechPart]:
             inside = [each for each in clause_words if at <= each[0] < at + len(group)]
             words = [(place - at, offset + start, length) for place, start, length in inside]
             at += len(group)
-            # There must be room for a blank before the group and a pause mark after it.
+            # There must be room for a blank before the group and for a pause mark after it.
             if pending.phonemes and len(pending.phonemes) + 1 + len(group) >= MAX_PART_PHONEMES:
                 yield pending.finish(ends_sentence=False)
             yield from pending.add(group, words)
@@ -115,7 +115,7 @@ class _PendingPart:
         self._words: list[tuple[int, int, int]] = []
 
     def add(self, group: str, words: Sequence[tuple[int, int, int]]) -> Iterator[SpeechPart]:
-        """Add a group of phonemes with the words that begin in it, and yield parts that are full."""
+        """Add a group of phonemes and the words that begin in it, and yield full parts."""
         if self.phonemes:
             self.phonemes.append(" ")
         for at in range(0, len(group), MAX_PART_PHONEMES - 1):
@@ -127,7 +127,7 @@ class _PendingPart:
             self.phonemes += section
 
     def finish(self, *, ends_sentence: bool) -> SpeechPart:
-        """Return the part, and start another one."""
+        """Return the part, and start a new one."""
         part = SpeechPart(tuple(self.phonemes), tuple(self._words), ends_sentence)
         self.phonemes, self._words = [], []
         return part
@@ -139,17 +139,17 @@ def _phoneme_groups(ipa: str) -> list[str]:
 
 
 def _locate_words(phonemizer: Phonemizer, clause: str, groups: Sequence[str]) -> list[tuple[int, int, int]]:
-    """Return, for each word of a clause, the index of its first phoneme, its start and its length."""
+    """Return the index of the first phoneme, the start and the length of each word in a clause."""
     positions = phonemizer.word_positions(clause)
     group_starts = [0, *itertools.accumulate(map(len, groups))]
     if len(positions) == len(groups):
         return [(start, *position) for start, position in zip(group_starts, positions, strict=False)]
     if not positions:  # there are phonemes, but their words are unknown
         return []
-    # A word that is spelled out is reported once for each letter, always with the word's position.
+    # A spelled word is reported once per letter, always with the position of the word.
     positions = _increasing(positions)
     next_starts = [*(start for start, _ in positions[1:]), len(clause)]
-    # Each word is spoken alone, and the result is aligned with the phonemes of the whole clause.
+    # Each word is converted alone. The result is aligned with the phonemes of the whole clause.
     limits = zip(positions, next_starts, strict=True)
     words = [clause[start : min(start + length, next_start)] for (start, length), next_start in limits]
     alone = ["".join(itertools.chain(*(_phoneme_groups(ipa) for _, ipa in phonemizer.clauses(word)))) for word in words]
@@ -160,7 +160,7 @@ def _locate_words(phonemizer: Phonemizer, clause: str, groups: Sequence[str]) ->
 
 
 def _increasing(positions: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return the positions that come after all previous ones."""
+    """Return the positions without those that are before an earlier one or repeat it."""
     found: list[tuple[int, int]] = []
     for position in positions:
         if not found or position[0] > found[-1][0]:
@@ -169,7 +169,7 @@ def _increasing(positions: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def _align(first: str, second: str, places: Sequence[int]) -> list[int]:
-    """Return the places in the second string that correspond to places in the similar first string."""
+    """Return the places in the second string that correspond to `places` in the similar first string."""
     if len(first) * len(second) > _MAX_COMPARISONS:
         return [place * len(second) // len(first) for place in places]
     import difflib

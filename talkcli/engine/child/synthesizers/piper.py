@@ -1,8 +1,8 @@
-"""Piper's neural voices as a synthesizer: libespeak-ng provides the phonemes of a text, and a model speaks them.
+"""Piper's neural voices as a synthesizer, with phonemes from libespeak-ng.
 
-A model is loaded and run in a background thread. The calling thread waits in its sink meanwhile, so playback, signs of
-life, stops and pauses go on. That background thread also asks libespeak-ng for the phonemes, which nobody else uses
-during that time.
+Models are loaded and run in background threads. Meanwhile, the calling thread waits in its sink, so playback, stops,
+pauses and signs of life continue. The thread that runs a model also gets the phonemes from libespeak-ng, which no other
+thread uses during that time.
 """
 
 from __future__ import annotations
@@ -32,47 +32,50 @@ if TYPE_CHECKING:
     from talkcli.engine.child.synthesizers.phonemes import SpeechPart
     from talkcli.engine.protocol import Voice
 
-    #: for each word: its start and length in the text, and its time from the first sample of a part in seconds
+    #: the start and length of each word in the text, and its time in seconds from the first sample of a part
     WordTimes = tuple[tuple[int, int, float], ...]
 
-#: The numbers of frames that are decoded at a time, at first and at most. The first 0.23 s of sound are ready soon.
-#: Later parts have up to 0.93 s, because each also decodes some frames on both sides (`inference.CONTEXT_FRAMES`).
+#: The initial and the maximum number of frames to decode at a time. The first 0.23 s of sound are ready soon. Later
+#: parts have up to 0.93 s, because extra frames have to be decoded on both sides of each part
+#: (`inference.CONTEXT_FRAMES`).
 _MIN_DECODED_FRAMES, _MAX_DECODED_FRAMES = 20, 80
-#: The most decoded parts that may wait, up to seven seconds, so that a slow moment of the machine is not heard.
+#: The maximum number of decoded parts to keep ready. With up to seven seconds of sound, a slow moment of the machine
+#: isn't heard.
 _MAX_PARTS_AHEAD = 8
-#: Seconds between the last audible sound of a sentence and its end. libespeak-ng makes 0.24 to 0.28, and a player may
-#: end 0.25 s early. A model makes 0.07 to 0.2 s of sound below the second value, which is relative to full scale.
+#: Seconds between the last audible sound of a sentence and its end, and the level (of full scale) below which sound is
+#: inaudible here. libespeak-ng makes pauses of 0.24 to 0.28 s, and a player may end 0.25 s early. Models make 0.07 to
+#: 0.2 s of sound below this level.
 _PAUSE_S, _PAUSE_LEVEL = 0.26, 0.01
-#: Sound below this level (of full scale) before a sentence is cut, except for the second value in seconds. It lasts 26
-#: to 60 ms, by which every sentence would start late.
+#: The level (of full scale) below which sound before a sentence is cut, and the seconds of it that are kept. This sound
+#: lasts 26 to 60 ms, and would delay every sentence.
 _LEADING_LEVEL, _LEADING_S = 0.0015, 0.005
-#: If the silence between two words is shorter, the second word begins where the first one ends, because the blank and
-#: its padding already sound like the second word. Otherwise it is a pause.
+#: Seconds of silence between two words that count as a pause. If the silence is shorter, the second word begins where
+#: the first one ends, because the blank and its padding already sound like the second word.
 _WORD_GAP_S = 0.15
-#: A part whose samples all stay below this level (of full scale) is no speech.
+#: The level (of full scale) below which a part counts as silent.
 _SPEECH_LEVEL = 0.001
-#: Seconds of sound that are written at a time.
+#: Seconds of sound to write at a time.
 _WRITE_S = 0.1
 _FULL_SCALE = 32767
 _DEFAULT_PITCH = 50
-#: libespeak-ng's words per minute at a voice's own pace, and the share of its time that the pace doesn't change,
-#: because durations are rounded up to whole frames. Both were fitted to five sentences of libespeak-ng 1.51 (gmw/en-US)
-#: at 80 to 450 words per minute, and of en_US-joe-medium at scales of 0.2 to 2.2. The two agree within 5 % from 120 to
-#: 400 words per minute. At 80 and 450, the model is 11 and 13 % slower.
+#: The rate of libespeak-ng that matches a voice's natural pace, and the share of the time that the pace doesn't change
+#: because durations are rounded up to whole frames. Both values were fitted to five sentences of libespeak-ng 1.51
+#: (gmw/en-US) at 80 to 450 words per minute, and of en_US-joe-medium at scales of 0.2 to 2.2. The durations agree
+#: within 5 % from 120 to 400 words per minute. At 80 and 450, the model is 11 and 13 % slower.
 _NATURAL_WPM, _CONSTANT_SHARE = 195, 0.30
 _MIN_SCALE = 0.1
 
 
 @frozen
 class SpokenPart:
-    """Some sound, and the words that begin in it or later."""
+    """Some samples, and the words that begin in them or later."""
 
     samples: bytes
     words: WordTimes = ()
 
 
 class Piper:
-    """The synthesizer for all neural voices; it uses libespeak-ng only while it speaks."""
+    """A synthesizer for all neural voices, which uses libespeak-ng only while it speaks."""
 
     version: str | None = None
 
@@ -80,7 +83,7 @@ class Piper:
         self._espeak = espeak
         self.loader = ModelLoader()
         self.voice = ""
-        #: the current voice's id without its speaker, its speaker, and the path of its model
+        #: the id of the current voice without its speaker, the speaker, and the path of the model
         self._model_id, self._speaker, self._path = "", "", ""
 
     @property
@@ -90,12 +93,12 @@ class Piper:
 
     @property
     def error(self) -> str | None:
-        """The error of the last load of the current voice."""
+        """The error message of the current voice's last load, or None if the load didn't fail."""
         return self.loader.error(self._model_id)
 
     @property
     def language(self) -> str:
-        """The libespeak-ng voice that matches the current voice's language, by its files or else its name."""
+        """The language of the current voice for libespeak-ng, from the voice's description or else from its name."""
         try:
             return models.read_description(self._path).espeak_voice
         except VoiceFileError:
@@ -105,7 +108,7 @@ class Piper:
         return models.installed_voices()
 
     def load(self, voice: str) -> None:
-        """Choose a voice, with or without a speaker; faults of its files are reported by `speak`."""
+        """Choose a voice, with or without a speaker. Faults of its files are reported by `speak`."""
         missing = models.missing_package()
         if missing is not None:
             raise UnknownVoice(missing)
@@ -119,9 +122,9 @@ class Piper:
         self.voice, self._model_id, self._speaker, self._path = voice, model, speaker, path
 
     def speak(self, text: str, settings: SpeechSettings, sink: SampleSink) -> None:
-        """Speak as `Synthesizer` describes, after waiting for the voice to be loaded.
+        """Speak as `Synthesizer` describes, after waiting until the voice is loaded.
 
-        The samples vary from time to time unless the voice's noise is 0.
+        The samples vary between calls unless the voice's noise is 0.
         """
         if settings.pitch != _DEFAULT_PITCH:
             words = f"the voice {self.voice} has no pitch but its own: leave --pitch out, or choose one of espeak's"
@@ -148,7 +151,7 @@ class Piper:
     def _wait_for_model(self, voice: str, sink: SampleSink) -> Model:
         loader = self.loader
         if loader.model(voice) is None:
-            loader.start(voice)  # an earlier fault may have been repaired
+            loader.start(voice)  # the files may have been repaired after an earlier error
         while (model := loader.model(voice)) is None:
             why = loader.error(voice)
             if why is not None:
@@ -185,7 +188,7 @@ def _speak_parts(
     """Yield the sound of a text's parts.
 
     Raises:
-        VoiceFileError: The model is faulty, or knows none of the phonemes.
+        VoiceFileError: The model is faulty, or doesn't know any of the phonemes.
     """
     pause = int(_PAUSE_S * model.description.rate)
     any_known, unknown = False, ""
@@ -198,13 +201,14 @@ def _speak_parts(
         any_known = True
         frames = model.encode(ids, speaker, _duration_scale(settings.rate), run)
         begins = [0, *frames.ends]
-        # A word without any known phoneme gets the time of the next one, which may be early; times must not decrease.
+        # A word without known phonemes gets the time of the next phoneme, which may be early. Times must not decrease.
         times = itertools.accumulate((_word_time(model, part, places, begins, at) for at, _, _ in part.words), max)
         words = tuple((start, length, time) for (_, start, length), time in zip(part.words, times, strict=True))
         loudest = 0.0
-        quiet = 0  # samples of silence at the end so far
+        quiet = 0  # the number of silent samples at the end so far
         begin, count = 0, _MIN_DECODED_FRAMES
-        silent: list[SpokenPart] = []  # held back until there is sound, as another voice can speak a silent part
+        # these parts are held back until there is sound, because another voice can speak a silent part
+        silent: list[SpokenPart] = []
         while begin < frames.count:
             end = min(frames.count, begin + count)
             samples = model.decode(frames, begin, end, run)
@@ -229,16 +233,16 @@ def _speak_parts(
 
 
 def _word_time(model: Model, part: SpeechPart, places: Sequence[int], begins: Sequence[int], at: int) -> float:
-    """Return when a word is heard, in seconds from the start of its part.
+    """Return the time at which a word is heard, in seconds from the start of its part.
 
-    In the median, the result is at most 9 ms early, where the start of the word's first phoneme would be 41 to 93 ms
-    late. This was measured with a recognizer's alignment of 300 words at 120, 200 and 300 words per minute.
+    In the median, the result is at most 9 ms early. The start of the word's first phoneme would be 41 to 93 ms late.
+    This was measured with a speech recognizer's alignment of 300 words at 120, 200 and 300 words per minute.
 
     Args:
-        model: The model.
+        model: The model that speaks the part.
         part: The part of the text.
-        places: For each phoneme, the index of its first id.
-        begins: For each id, the frame at which it begins.
+        places: The index of the first id of each phoneme.
+        begins: The frame at which each id begins.
         at: The index of the word's first phoneme.
     """
     own = begins[places[at]]
@@ -250,7 +254,7 @@ def _word_time(model: Model, part: SpeechPart, places: Sequence[int], begins: Se
 
 
 def _cut_leading_silence(samples: Any, levels: Any, words: WordTimes, rate: int) -> tuple[Any, WordTimes]:
-    """Return the start of a sentence without its inaudible beginning, and the words with their new times."""
+    """Return the samples without the inaudible beginning of the sentence, and the words with their new times."""
     audible = (levels > _LEADING_LEVEL).nonzero()[0]
     cut = max(0, int(audible[0]) - int(_LEADING_S * rate)) if len(audible) else 0
     return samples[cut:], tuple((start, length, max(0.0, time - cut / rate)) for start, length, time in words)
@@ -264,8 +268,8 @@ def _to_bytes(samples: Any, volume: float) -> bytes:
 def _phoneme_ids(phonemes: Sequence[str], ids: Mapping[str, tuple[int, ...]]) -> tuple[list[int], list[int]]:
     """Return the model's ids for some phonemes, and the index of each phoneme's first id.
 
-    The place of a phoneme that the model doesn't know is that of the next known one, or the end. If it knows none, the
-    list of places is empty.
+    A phoneme that the model doesn't know gets the index of the next known phoneme, or of the end. If the model knows
+    none of them, the list of indexes is empty.
     """
     result = [*ids[BEGIN_SYMBOL], *ids[PAD_SYMBOL]]
     places = []
@@ -278,9 +282,9 @@ def _phoneme_ids(phonemes: Sequence[str], ids: Mapping[str, tuple[int, ...]]) ->
 
 
 def _duration_scale(rate: int) -> float:
-    """Return the factor of all durations for a rate in words per minute.
+    """Return the factor by which all durations are multiplied for a rate in words per minute.
 
-    With it, a sentence takes as long as with libespeak-ng. Above 400 words per minute, the model is slower, because no
-    phoneme is shorter than a frame.
+    With this factor, a sentence takes as long as with libespeak-ng. Above 400 words per minute, the model is slower,
+    because no phoneme is shorter than a frame.
     """
     return max(_MIN_SCALE, (_NATURAL_WPM / rate - _CONSTANT_SHARE) / (1 - _CONSTANT_SHARE))

@@ -1,12 +1,12 @@
 """The split of a Piper voice's model (VITS, in ONNX) into an encoder and a decoder.
 
-The encoder turns phoneme ids into frames, and the decoder frames into samples. The decoder looks at no more than some
-frames around each sample, so it can run on a part at a time. The encoder also outputs for how many frames each phoneme
-lasts, which the whole model keeps to itself. This tells when each word is heard.
+The encoder turns phoneme ids into frames, and the decoder turns frames into samples. Each sample depends only on some
+frames around it, so the decoder can run on a part at a time. The encoder also outputs the number of frames of each
+phoneme id, from which the time of each word is known. The whole model doesn't output this.
 
-The module is pure. It reads just as much of ONNX's encoding (protobuf) as it needs, by the field numbers of
-`onnx.proto`. A model comes from a stranger, and a C library will read it. Therefore a model that isn't understood, or
-that refers to anything outside of its file, is refused, and only the fields that were examined are passed on.
+The module is pure. It reads only as much of ONNX's encoding (protobuf) as it needs, with the field numbers of
+`onnx.proto`. Models come from strangers, and a C library reads them. Therefore a model is rejected if it isn't
+understood or refers to anything outside of its file, and the halves contain only fields that were examined.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     Buffer = bytes | memoryview
-    #: a field of a message: its number, its wire type (one of the four below), and its value (an integer encoded)
+    #: a field of a message: its number, its wire type (one of the four below), and its value (encoded if an integer)
     Field = tuple[int, int, Buffer]
 
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
@@ -29,39 +29,41 @@ _NODE_INPUT, _NODE_OUTPUT, _OPERATOR, _ATTRIBUTE, _NODE_DOMAIN = 1, 2, 4, 5, 7
 _TENSOR, _SUBGRAPH, _TENSORS, _SUBGRAPHS, _SPARSE_TENSOR, _SPARSE_TENSORS = 5, 6, 10, 11, 22, 23
 _TENSOR_NAME, _EXTERNAL_DATA, _DATA_LOCATION = 8, 13, 14
 
-#: The domains of ONNX's own operators. An operator of any other domain is foreign code.
+#: The domains of ONNX's own operators. Operators of other domains are foreign code.
 _STANDARD_DOMAINS = ("", "ai.onnx")
-#: The weights of the decoder's first layer, which have this name in all of Piper's models.
+#: The name of the weights of the decoder's first layer in all of Piper's models.
 _DECODER_WEIGHTS = "dec.conv_pre.weight"
-#: The operator that rounds durations up to whole frames; the encoder has one of it.
+#: The operator that rounds durations up to whole frames. The encoder contains it once.
 _ROUNDING_OPERATOR = "Ceil"
-#: The prefix of operators whose results aren't constant, although they may have no inputs.
+#: The prefix of operators whose results vary even if they have no inputs.
 _RANDOM_PREFIX = "Random"
 #: The encoded type of a value: floats, in any shape.
 _FLOAT_TYPE = b"\x12\x04\x0a\x02\x08\x01"
-#: The most levels of nested graphs: Piper's models have none, and PyTorch writes one for a condition.
+#: The maximum depth of nested graphs. Piper's models have none, and PyTorch writes one for a condition.
 _MAX_NESTED_GRAPHS = 4
-#: The most fields of a model; reading one takes 300 bytes and 1 to 3 microseconds. Piper's models have 30,000 fields.
+#: The maximum number of fields in a model. Reading a field takes 300 bytes and 1 to 3 microseconds. Piper's models have
+#: 30,000 fields.
 _MAX_FIELDS = 300_000
-#: The longest name; the longest in Piper's models has 52 characters.
+#: The maximum length of a name. The longest in Piper's models has 52 characters.
 _MAX_NAME_BYTES = 1000
 _MAX_INTEGER_BITS = 64
 
 
 class NotSplit(Exception):
-    """The model is unsafe, or not one of Piper's; the text says why, to be shown after the file's name."""
+    """The model is unsafe or not one of Piper's. The text is the reason, worded to follow the file's name."""
 
 
 @frozen
 class ModelHalves:
-    """The encoder and the decoder, each a complete model whose bytes are the parts joined.
+    """The encoder and the decoder, each a complete model in parts that have to be joined.
 
-    The parts with the weights, which are nearly all of the bytes, are not copied.
+    The parts with the weights, which make up nearly all bytes, are not copied.
     """
 
-    #: has the whole model's inputs. Its outputs are the decoder's inputs, and at the end the frames of each phoneme.
+    #: the half with the whole model's inputs. Its outputs are the inputs of the decoder, followed by the number of
+    #: frames of each phoneme id.
     encoder: tuple[Buffer, ...]
-    #: has the encoder's outputs except the last one as its inputs, and the whole model's output
+    #: the half with the whole model's output. Its inputs are the outputs of the encoder except the last one.
     decoder: tuple[Buffer, ...]
 
 
@@ -102,7 +104,7 @@ def split_model(model: Buffer) -> ModelHalves:
 
 
 class _Reader:
-    """A reader of the messages of one model, which limits the number of their fields."""
+    """Reads the messages of one model, and limits the number of their fields."""
 
     def __init__(self) -> None:
         self._fields_left = _MAX_FIELDS
@@ -133,7 +135,7 @@ class _Reader:
 
 
 class _Node:
-    """An operation; its inputs include those of the graphs inside of it."""
+    """An operation, whose inputs include those of the graphs inside it."""
 
     def __init__(self, reader: _Reader, raw: Buffer, depth: int) -> None:
         fields = reader.fields(raw)
@@ -189,7 +191,7 @@ class _Graph:
         return found[::-1]
 
     def constants(self) -> set[str]:
-        """Return the names of the values that are always the same, so that both halves may compute them."""
+        """Return the names of constant values, which both halves may compute."""
         names = {*self._weights, ""}
         for node in self.nodes:
             if names.issuperset(node.inputs) and not node.operator.startswith(_RANDOM_PREFIX):
@@ -197,14 +199,14 @@ class _Graph:
         return names
 
     def fields_of(self, nodes: list[_Node]) -> list[Field]:
-        """Return the fields of a graph with some nodes and their weights, but without inputs and outputs."""
+        """Return the fields of a graph with some nodes and their weights, without inputs and outputs."""
         names = {name for each in nodes for name in each.inputs}
         weights = [(_INITIALIZER, _BYTES, each) for name, each in self._weights.items() if name in names]
         return [*((_NODE, _BYTES, each.raw) for each in nodes), (_GRAPH_NAME, _BYTES, b"half"), *weights]
 
 
 def _is_shared(reader: _Reader, field: Field) -> bool:
-    """Return whether a field of the model belongs to both halves: its version or a set of standard operators."""
+    """Return whether both halves get a field of the model: its version, or a set of standard operators."""
     number, kind, value = field
     if (number, kind) == (_OPERATOR_SETS, _BYTES):
         return "".join(_names(reader.fields(value), _DOMAIN)) in _STANDARD_DOMAINS
@@ -215,7 +217,7 @@ def _tensor_name(reader: _Reader, raw: Buffer) -> str:
     """Return the name of a tensor.
 
     Raises:
-        NotSplit: Its numbers are in another file.
+        NotSplit: The tensor's data is in another file.
     """
     fields = reader.fields(raw)
     locations = (value for number, _, value in fields if number in {_EXTERNAL_DATA, _DATA_LOCATION})
@@ -241,7 +243,7 @@ def _names(fields: Iterable[Field], wanted: int) -> list[str]:
 
 
 def _parse_integer(raw: Buffer, at: int) -> tuple[int, int]:
-    """Return the integer that begins at a byte, and the byte after it."""
+    """Return the integer that begins at an index, and the index after it."""
     result = shift = 0
     while at < len(raw) and shift < _MAX_INTEGER_BITS:
         byte = raw[at]
@@ -262,7 +264,7 @@ def _encode_integer(value: int) -> bytes:
 
 
 def _encode_model(head: list[Field], graph: list[Field]) -> tuple[Buffer, ...]:
-    """Return the parts of a model."""
+    """Return the parts of a model with these fields and this graph."""
     parts = list(_encode_fields(graph))
     key = _encode_integer(_GRAPH << 3 | _BYTES) + _encode_integer(sum(map(len, parts)))
     return (*_encode_fields(head), key, *parts)
