@@ -4,9 +4,6 @@ The module is pure. It replaces single characters by single characters, so every
 Ordinary text must pass unchanged. Each rule is for a known cause of a crash, documents its numbers, and changes nothing
 without that cause. The guard only makes crashes rare. If a crash happens nevertheless, only the engine process is lost.
 
-The guard delays the first sound. A rule that examines every character takes 20 ms for a long text, so it only runs if a
-quick check has found that it may be needed.
-
 The numbers are the sizes of buffers that libespeak-ng 1.51 overruns (N_WORD_BYTES, N_CLAUSE_WORDS and N_TR_SOURCE in
 `translate.h`). Version 1.52 has fixed some of these faults.
 """
@@ -46,7 +43,6 @@ _WORD_CHARACTER = (
     r"(?:[A-Za-z0-9'’]|(?![\s\u0080-\u00a9\u00ab-\u00b4\u00b6-\u00b9\u00bb-\u00bf\u2000-\u200a\u2010-\u205f\u3000-\u303f"
     r"\uff00-\uff0f])[^\x00-\x7f])"
 )
-_IN_WORD = re.compile(_WORD_CHARACTER)
 _WORD_OR_GAP = re.compile(f"({_WORD_CHARACTER}+)|((?:(?!{_WORD_CHARACTER}).)+)", re.DOTALL)
 #: A run of characters without blanks, long enough to contain a word with too many apostrophes or bytes.
 _LONG_RUN = re.compile(rf"\S{{{_MAX_WORD_APOSTROPHES + 1},}}")
@@ -55,8 +51,6 @@ _SYMBOL_LETTERS = frozenset(map(chr, (*range(0x2460, 0x2500), *range(0x2800, 0x2
 #: The end of a clause: Western punctuation before a blank, a bracket or the end of the text, and other punctuation
 #: anywhere.
 _CLAUSE_END = re.compile(r"[.,;:!?…](?:[\s()\[\]{}<>\"«»“”‘’„]|\Z)|[。、，！？：；︒؟،؛।॥։՝]|\n\s*\n")
-#: An end of a clause that is certain.
-_CERTAIN_CLAUSE_END = re.compile(r"[,;:!?]\s|\.\s+[A-Z]")
 #: A hyphen between a symbol and a letter.
 _HYPHEN = re.compile(r"(?<=[^\w\s]|_)-(?=[^\W\d_])")
 #: The first character of the scripts in which each character is a word, and the first and last Hangul syllables. The
@@ -105,11 +99,7 @@ def guarded(text: str, voice: str = "") -> str:
         text = _unsafe_characters(language).sub(" ", text)
     if language in _UNSAFE_DIGIT_COUNTS:
         text = _SPOKEN_NUMBER.sub(lambda found: _split_number(found[0], *_UNSAFE_DIGIT_COUNTS[language]), text)
-    if _may_have_long_initials(text):
-        text = _without_long_initials(text)
-    if "-" in text:
-        text = _without_leading_hyphens(text)
-    return _without_long_words(text)
+    return _without_long_words(_without_leading_hyphens(_without_long_initials(text)))
 
 
 @functools.lru_cache(maxsize=8)
@@ -125,49 +115,6 @@ def _split_number(number: str, least: int, most: int) -> str:
         return number
     middle = next(place for place in range(len(number) // 2, len(number)) if number[place].isdigit())
     return number[:middle] + number[middle].translate(_SEPARATE_DIGITS) + number[middle + 1 :]
-
-
-def _may_have_long_initials(text: str) -> bool:
-    """Return whether there may be too many initials in a row or too many words before them; only checks words with
-    dots.
-    """
-    dot = text.find(".")
-    while dot >= 0 and (behind := _IN_WORD.search(text, dot)):
-        start = _initial_before(text, dot)
-        if start is not None and _may_be_too_long(text, start):
-            return True
-        dot = text.find(".", behind.start())
-    return False
-
-
-def _initial_before(text: str, dot: int) -> int | None:
-    """Return the start of the word before a dot, or None if it has more than one letter."""
-    end = dot
-    while end and not _IN_WORD.match(text[end - 1]):
-        end -= 1
-    start, letters = end, 0
-    while start and letters < 2 and _IN_WORD.match(text[start - 1]):
-        start -= 1
-        letters += _is_letter(text[start])
-    return start if start < end and letters < 2 else None
-
-
-def _may_be_too_long(text: str, start: int) -> bool:
-    """Return whether the initials from `start` on, with the word after them, may overrun a buffer."""
-    room = 0
-    for piece in _WORD_OR_GAP.finditer(text, start):
-        word, between = piece.groups()
-        if between is not None:
-            if "." not in between:
-                return False
-            continue
-        room += (2 * len(word) if word.isascii() else sum(map(_max_bytes, word))) + 1
-        before = piece.end() - _MAX_CLAUSE_WORDS  # there are at least as many characters as words
-        if room > _SPELLING_BYTES or (before > 0 and not _CERTAIN_CLAUSE_END.search(text, before, start + 1)):
-            return True
-        if sum(map(_is_letter, word)) > 1:
-            return False
-    return False
 
 
 def _without_long_initials(text: str) -> str:
