@@ -13,12 +13,7 @@ from __future__ import annotations
 
 import ctypes
 import time
-from ctypes import CFUNCTYPE, POINTER, Structure, c_char_p, c_int, c_short, c_void_p
-from ctypes import c_int64 as i64
-from ctypes import c_size_t as size
-from ctypes import c_uint8 as u8
-from ctypes import c_uint32 as u32
-from ctypes import c_uint64 as u64
+from ctypes import CFUNCTYPE, POINTER, Structure, c_char_p, c_int, c_size_t, c_uint32, c_uint64, c_void_p
 from functools import cache
 from types import SimpleNamespace
 
@@ -46,37 +41,37 @@ MASK_SINK, MASK_SINK_INPUT = 0x1, 0x4
 FACILITY_MASK, EVENT_SINK, EVENT_SINK_INPUT = 0xF, 0, 2
 NO_ENTITY, CONNECTION_REFUSED, INVALID_SERVER = 5, 6, 13
 #: The value of a size that reports an error: (size_t) -1.
-SIZE_ERROR = ctypes.c_size_t(-1).value
+SIZE_ERROR = c_size_t(-1).value
 
 
 class PollDescriptor(Structure):
     """The C structure `pollfd`."""
 
-    _fields_ = [("fd", c_int), ("events", c_short), ("revents", c_short)]
+    _fields_ = [("fd", c_int), ("events", ctypes.c_short), ("revents", ctypes.c_short)]
 
 
 class SampleSpec(Structure):
     """The C structure `pa_sample_spec`: the format, rate and channels of samples."""
 
-    _fields_ = [("format", c_int), ("rate", u32), ("channels", u8)]
+    _fields_ = [("format", c_int), ("rate", c_uint32), ("channels", ctypes.c_uint8)]
 
 
 class ChannelMap(Structure):
     """The C structure `pa_channel_map`: the speaker position of each channel."""
 
-    _fields_ = [("channels", u8), ("map", c_int * 32)]
+    _fields_ = [("channels", ctypes.c_uint8), ("map", c_int * 32)]
 
 
 class Volume(Structure):
     """The C structure `pa_cvolume`: the volume of each channel."""
 
-    _fields_ = [("channels", u8), ("values", u32 * 32)]
+    _fields_ = [("channels", ctypes.c_uint8), ("values", c_uint32 * 32)]
 
 
 class BufferSizes(Structure):
     """The C structure `pa_buffer_attr`: the sizes of a stream's buffers in bytes."""
 
-    _fields_ = [(name, u32) for name in ("maxlength", "tlength", "prebuf", "minreq", "fragsize")]
+    _fields_ = [(name, c_uint32) for name in ("maxlength", "tlength", "prebuf", "minreq", "fragsize")]
 
 
 class SinkInfo(Structure):
@@ -84,16 +79,16 @@ class SinkInfo(Structure):
 
     _fields_ = [
         ("name", c_char_p),
-        ("index", u32),
+        ("index", c_uint32),
         ("description", c_char_p),
         ("sample_spec", SampleSpec),
         ("channel_map", ChannelMap),
-        ("owner_module", u32),
+        ("owner_module", c_uint32),
         ("volume", Volume),
         ("mute", c_int),
-        ("monitor_source", u32),
+        ("monitor_source", c_uint32),
         ("monitor_source_name", c_char_p),
-        ("latency", u64),
+        ("latency", c_uint64),
         ("driver", c_char_p),
         ("flags", c_int),
     ]
@@ -103,16 +98,16 @@ class SinkInputInfo(Structure):
     """The first fields of the C structure `pa_sink_input_info`, which describes a stream."""
 
     _fields_ = [
-        ("index", u32),
+        ("index", c_uint32),
         ("name", c_char_p),
-        ("owner_module", u32),
-        ("client", u32),
-        ("sink", u32),
+        ("owner_module", c_uint32),
+        ("client", c_uint32),
+        ("sink", c_uint32),
         ("sample_spec", SampleSpec),
         ("channel_map", ChannelMap),
         ("volume", Volume),
-        ("buffer_usec", u64),
-        ("sink_usec", u64),
+        ("buffer_usec", c_uint64),
+        ("sink_usec", c_uint64),
         ("resample_method", c_char_p),
         ("driver", c_char_p),
         ("mute", c_int),
@@ -125,48 +120,38 @@ StreamCallback = CFUNCTYPE(None, c_void_p, c_void_p)
 #: (stream or context, success, data)
 SuccessCallback = CFUNCTYPE(None, c_void_p, c_int, c_void_p)
 #: (context, facility and type of the change, index of the changed object, data)
-ChangeCallback = CFUNCTYPE(None, c_void_p, c_int, u32, c_void_p)
+ChangeCallback = CFUNCTYPE(None, c_void_p, c_int, c_uint32, c_void_p)
 SinkCallback = CFUNCTYPE(None, c_void_p, POINTER(SinkInfo), c_int, c_void_p)
 SinkInputCallback = CFUNCTYPE(None, c_void_p, POINTER(SinkInputInfo), c_int, c_void_p)
 
-#: The functions that the player uses, with the types of their results and arguments.
-_SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
-    "pa_mainloop_new": (c_void_p, []),
-    "pa_mainloop_free": (None, [c_void_p]),
-    "pa_mainloop_get_api": (c_void_p, [c_void_p]),
-    "pa_mainloop_set_poll_func": (None, [c_void_p, PollCallback, c_void_p]),
-    "pa_mainloop_prepare": (c_int, [c_void_p, c_int]),
-    "pa_mainloop_poll": (c_int, [c_void_p]),
-    "pa_mainloop_dispatch": (c_int, [c_void_p]),
-    "pa_context_new": (c_void_p, [c_void_p, c_char_p]),
-    "pa_context_connect": (c_int, [c_void_p, c_char_p, c_int, c_void_p]),
-    "pa_context_disconnect": (None, [c_void_p]),
-    "pa_context_unref": (None, [c_void_p]),
-    "pa_context_get_state": (c_int, [c_void_p]),
-    "pa_context_errno": (c_int, [c_void_p]),
-    "pa_context_set_subscribe_callback": (None, [c_void_p, ChangeCallback, c_void_p]),
-    "pa_context_subscribe": (c_void_p, [c_void_p, c_int, c_void_p, c_void_p]),
-    "pa_context_get_sink_info_by_index": (c_void_p, [c_void_p, u32, SinkCallback, c_void_p]),
-    "pa_context_get_sink_input_info": (c_void_p, [c_void_p, u32, SinkInputCallback, c_void_p]),
-    "pa_strerror": (c_char_p, [c_int]),
-    "pa_operation_unref": (None, [c_void_p]),
-    "pa_stream_new": (c_void_p, [c_void_p, c_char_p, POINTER(SampleSpec), c_void_p]),
-    "pa_stream_connect_playback": (c_int, [c_void_p, c_char_p, POINTER(BufferSizes), c_int, c_void_p, c_void_p]),
-    "pa_stream_unref": (None, [c_void_p]),
-    "pa_stream_get_state": (c_int, [c_void_p]),
-    "pa_stream_get_index": (u32, [c_void_p]),
-    "pa_stream_get_device_index": (u32, [c_void_p]),
-    "pa_stream_get_device_name": (c_char_p, [c_void_p]),
-    "pa_stream_is_suspended": (c_int, [c_void_p]),
-    "pa_stream_writable_size": (size, [c_void_p]),
-    "pa_stream_write": (c_int, [c_void_p, c_char_p, size, c_void_p, i64, c_int]),
-    "pa_stream_drain": (c_void_p, [c_void_p, SuccessCallback, c_void_p]),
-    "pa_stream_get_time": (c_int, [c_void_p, POINTER(u64)]),
-    "pa_stream_set_started_callback": (None, [c_void_p, StreamCallback, c_void_p]),
-    "pa_stream_set_underflow_callback": (None, [c_void_p, StreamCallback, c_void_p]),
-    "pa_stream_set_latency_update_callback": (None, [c_void_p, StreamCallback, c_void_p]),
-    "pa_stream_update_timing_info": (c_void_p, [c_void_p, c_void_p, c_void_p]),
-}
+#: The functions that the player uses without the prefix "pa_", with the types of their results and arguments.
+_SIGNATURES: tuple[tuple[str, Any, list[Any]], ...] = (
+    ("mainloop_new", c_void_p, []),
+    ("mainloop_free context_disconnect context_unref operation_unref stream_unref", None, [c_void_p]),
+    ("mainloop_get_api", c_void_p, [c_void_p]),
+    ("mainloop_set_poll_func", None, [c_void_p, PollCallback, c_void_p]),
+    ("mainloop_prepare", c_int, [c_void_p, c_int]),
+    ("mainloop_poll mainloop_dispatch context_get_state context_errno", c_int, [c_void_p]),
+    ("context_new", c_void_p, [c_void_p, c_char_p]),
+    ("context_connect", c_int, [c_void_p, c_char_p, c_int, c_void_p]),
+    ("context_set_subscribe_callback", None, [c_void_p, ChangeCallback, c_void_p]),
+    ("context_subscribe", c_void_p, [c_void_p, c_int, c_void_p, c_void_p]),
+    ("context_get_sink_info_by_index", c_void_p, [c_void_p, c_uint32, SinkCallback, c_void_p]),
+    ("context_get_sink_input_info", c_void_p, [c_void_p, c_uint32, SinkInputCallback, c_void_p]),
+    ("strerror", c_char_p, [c_int]),
+    ("stream_new", c_void_p, [c_void_p, c_char_p, POINTER(SampleSpec), c_void_p]),
+    ("stream_connect_playback", c_int, [c_void_p, c_char_p, POINTER(BufferSizes), c_int, c_void_p, c_void_p]),
+    ("stream_get_state stream_is_suspended", c_int, [c_void_p]),
+    ("stream_get_index stream_get_device_index", c_uint32, [c_void_p]),
+    ("stream_get_device_name", c_char_p, [c_void_p]),
+    ("stream_writable_size", c_size_t, [c_void_p]),
+    ("stream_write", c_int, [c_void_p, c_char_p, c_size_t, c_void_p, ctypes.c_int64, c_int]),
+    ("stream_drain", c_void_p, [c_void_p, SuccessCallback, c_void_p]),
+    ("stream_get_time", c_int, [c_void_p, POINTER(c_uint64)]),
+    ("stream_set_started_callback stream_set_underflow_callback", None, [c_void_p, StreamCallback, c_void_p]),
+    ("stream_set_latency_update_callback", None, [c_void_p, StreamCallback, c_void_p]),
+    ("stream_update_timing_info", c_void_p, [c_void_p, c_void_p, c_void_p]),
+)
 
 
 @cache
@@ -179,13 +164,14 @@ def load() -> Any:
     library, poll = ctypes.CDLL(_LIBPULSE), ctypes.CDLL(None).poll
     poll.argtypes = [POINTER(PollDescriptor), ctypes.c_ulong, c_int]
     functions = {"poll": poll}
-    for name, (result, arguments) in _SIGNATURES.items():
-        try:
-            function = getattr(library, name)
-        except AttributeError as error:
-            raise OSError(str(error)) from error
-        function.restype, function.argtypes = result, arguments
-        functions[name.removeprefix("pa_")] = function
+    for names, result, arguments in _SIGNATURES:
+        for name in names.split():
+            try:
+                function = getattr(library, f"pa_{name}")
+            except AttributeError as error:
+                raise OSError(str(error)) from error
+            function.restype, function.argtypes = result, arguments
+            functions[name] = function
     return SimpleNamespace(**functions)
 
 
