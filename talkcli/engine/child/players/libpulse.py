@@ -183,10 +183,10 @@ class MainLoop:
         self._pointer = library.mainloop_new()
         self._callback = PollCallback(self._poll)
         library.mainloop_set_poll_func(self._pointer, self._callback, None)
-        self._error: BaseException | None = None
         #: the descriptors that libpulse wants to wait for, and the monotonic time of its next timer (or None)
         self.interests: list[Interest] = []
         self.wake_at: float | None = None
+        self.freed = False
 
     @property
     def api(self) -> int:
@@ -195,27 +195,20 @@ class MainLoop:
 
     def iterate(self) -> bool:
         """Run one iteration without waiting, and return whether to run another because it did some work."""
-        if self._library.mainloop_prepare(self._pointer, -1) < 0:
+        if self.freed or self._library.mainloop_prepare(self._pointer, -1) < 0:
             return False
         self._library.mainloop_poll(self._pointer)  # without it, dispatch would abort the process
-        done = self._library.mainloop_dispatch(self._pointer)
-        if self._error is not None:
-            raise self._error
-        return bool(done > 0)
+        return bool(self._library.mainloop_dispatch(self._pointer) > 0)
 
     def free(self) -> None:
         """Free the loop, after its contexts have been released."""
         self._library.mainloop_free(self._pointer)
-        self.interests, self.wake_at = [], None
+        self.freed, self.interests, self.wake_at = True, [], None
 
     def _poll(self, wanted: Any, count: int, timeout: int, _: object) -> int:
-        try:
-            self.interests = [(wanted[number].fd, wanted[number].events) for number in range(count)]
-            self.wake_at = None if timeout < 0 else time.monotonic() + timeout / 1000
-            return int(self._library.poll(wanted, count, 0))
-        except BaseException as error:  # noqa: BLE001 - raised again by `iterate`, because it can't pass through C
-            self._error = error
-            return 0
+        self.interests = [(wanted[number].fd, wanted[number].events) for number in range(count)]
+        self.wake_at = None if timeout < 0 else time.monotonic() + timeout / 1000
+        return int(self._library.poll(wanted, count, 0))
 
 
 def loudest(volume: Volume) -> float:

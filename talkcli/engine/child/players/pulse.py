@@ -109,7 +109,7 @@ class PulsePlayer(Player):
         self._change_callback = libpulse.ChangeCallback(self._on_change)
         self._sink_callback = libpulse.SinkCallback(self._on_sink)
         self._stream_callback = libpulse.SinkInputCallback(self._on_stream)
-        self._loop: libpulse.MainLoop | None = libpulse.MainLoop(self._lib)
+        self._loop = libpulse.MainLoop(self._lib)
         self._context = self._lib.context_new(self._loop.api, b"talk")
         if self._context is None:
             self._loop.free()
@@ -158,7 +158,7 @@ class PulsePlayer(Player):
         return self._drained
 
     def interests(self) -> list[Interest]:
-        return self._loop.interests if self._loop is not None else []
+        return self._loop.interests
 
     def wake_at(self) -> float | None:
         """Return the time at which libpulse has work to do or the next time limit ends.
@@ -169,7 +169,7 @@ class PulsePlayer(Player):
         self._run()
         if self._error is not None or self._drained or self._clock_report is not report or self._room():
             return 0.0
-        times = [self._loop.wake_at if self._loop is not None else None]
+        times = [self._loop.wake_at]
         if self._sink_index == libpulse.NO_INDEX:
             times.append(self._ready_by)
         if self._suspended_at is not None:
@@ -182,18 +182,18 @@ class PulsePlayer(Player):
 
     def kill(self) -> None:
         """Close the connection, so that the server drops the stream and its remaining samples."""
-        if self._loop is None:
+        if self._loop.freed:
             return
         self._lib.context_disconnect(self._context)
         if self._stream is not None:
             self._lib.stream_unref(self._stream)
         self._lib.context_unref(self._context)
         self._loop.free()
-        self._loop = self._stream = None
+        self._stream = None
         self._error = self._error or CannotSpeak(Reason.AUDIO_LOST, "the stream was ended")
 
     def gone(self) -> bool:
-        return self._loop is None
+        return self._loop.freed
 
     @property
     def output(self) -> Output | None:
@@ -217,7 +217,7 @@ class PulsePlayer(Player):
 
     def _run(self) -> None:
         """Run libpulse until it has no more work."""
-        while self._loop is not None and (self._loop.iterate() or self._advance()):
+        while self._loop.iterate() or self._advance():
             pass
 
     def _advance(self) -> bool:
@@ -240,7 +240,10 @@ class PulsePlayer(Player):
             self._fail(Reason.AUDIO_DEVICE if self._written == 0 else Reason.AUDIO_LOST)
         elif state == libpulse.STREAM_READY:
             asked = self._check_sink() or self._request_time()
-            return asked or (self._closed and not self._draining and self._error is None and self._drain())
+            if self._closed and not self._draining and self._error is None:
+                self._release(self._lib.stream_drain(self._stream, self._drained_callback, None))
+                self._draining = asked = True
+            return asked
         return False
 
     def _open_stream(self) -> bool:
@@ -268,13 +271,13 @@ class PulsePlayer(Player):
         changed = index != self._sink_index
         if changed:
             begins, self._sink_index = self._sink_index == libpulse.NO_INDEX, index
-            self._volume_settled_at = time.monotonic() + VOLUME_SETTLES_S if begins else self._volume_settled_at
             self.device = (self._lib.stream_get_device_name(self._stream) or b"").decode("utf-8", "replace")
             if self.device == DUMMY_SINK != self._wanted_device:  # no other player would be heard either
                 reason, left = (Reason.AUDIO_DEVICE, "") if begins else (Reason.AUDIO_LOST, " left")
                 self._error = CannotSpeak(reason, f"the sound server has only a dummy output{left}", final=True)
             self._request_sink_level()
             if begins:
+                self._volume_settled_at = time.monotonic() + VOLUME_SETTLES_S
                 self._lib.context_set_subscribe_callback(self._context, self._change_callback, None)
                 mask = libpulse.MASK_SINK | libpulse.MASK_SINK_INPUT
                 self._release(self._lib.context_subscribe(self._context, mask, None, None))
@@ -313,15 +316,6 @@ class PulsePlayer(Player):
         """Release an operation, which continues; None means that the context has failed, as its state shows."""
         if operation is not None:
             self._lib.operation_unref(operation)
-
-    def _drain(self) -> bool:
-        operation = self._lib.stream_drain(self._stream, self._drained_callback, None)
-        if operation is None:
-            self._fail(Reason.AUDIO_LOST)
-            return False
-        self._draining = True
-        self._lib.operation_unref(operation)
-        return True
 
     def _room(self) -> int:
         """Return the number of bytes that the server has room for, in whole samples."""
