@@ -84,12 +84,11 @@ def test_an_endless_word_ends_earlier_and_loses_no_letter() -> None:
     assert guarded("x" + "'s" * 70) == "x" + "'s" * 30 + " s" + "'s" * 30 + " s" + "'s" * 8
 
 
-@given(st.text(st.characters(exclude_categories=["Cs"]) | st.sampled_from("a.- 'é\n"), max_size=300))
+@given(st.text(st.characters() | st.sampled_from("a.- 'é\n\ud800"), max_size=300))
 def test_any_text_keeps_its_length_and_what_is_changed_once_is_not_changed_again(text: str) -> None:
     changed = guarded(text)
     assert len(changed) == len(text)
     assert guarded(changed) == changed
-    changed.encode()
 
 
 @pytest.mark.parametrize("motif", ["a.", "a. ", "-'", "'-o", "... ", "a", "é", ".-", "한.", "\u0301", "\n"])

@@ -61,12 +61,6 @@ _VARIANTS, _MBROLA = b"variant", b"mbrola"
 _MBROLA_PATHS = ("/usr/share/mbrola/{0}", "/usr/share/mbrola/{0}/{0}", "/usr/share/mbrola/voices/{0}")
 
 
-class _EspeakEventId(ctypes.Union):
-    """The C union `id` of an event, which has 8 bytes even if pointers have 4."""
-
-    _fields_ = (("number", ctypes.c_int), ("name", ctypes.c_char_p), ("string", ctypes.c_char * 8))
-
-
 class _EspeakEvent(ctypes.Structure):
     """The C structure `espeak_EVENT` of speak_lib.h.
 
@@ -82,7 +76,9 @@ class _EspeakEvent(ctypes.Structure):
         ("audio_position", ctypes.c_int),
         ("sample", ctypes.c_int),
         ("user_data", ctypes.c_void_p),
-        ("id", _EspeakEventId),
+        # The union `id`, which has 8 bytes even if pointers have 4.
+        ("id_number", ctypes.c_int),
+        ("id_padding", ctypes.c_int),
     )
 
 
@@ -286,8 +282,8 @@ class Espeak:
     def _pass_on(self, sink: SampleSink, samples: Any, count: int, events: Any) -> None:
         for event in _events_of(events):
             if event.type == _EVENT_SAMPLERATE:
-                if event.id.number != self._rate:
-                    self._rate = event.id.number
+                if event.id_number != self._rate:
+                    self._rate = event.id_number
                     sink.begin(self._rate, self.voice)
             elif event.type == self._espeak.EVENT_WORD:
                 position = _word_position(event, self._text)

@@ -10,7 +10,6 @@ The numbers are the sizes of buffers that libespeak-ng 1.51 overruns (N_WORD_BYT
 
 from __future__ import annotations
 
-import functools
 import re
 import unicodedata
 
@@ -44,8 +43,6 @@ _WORD_CHARACTER = (
     r"\uff00-\uff0f])[^\x00-\x7f])"
 )
 _WORD_OR_GAP = re.compile(f"({_WORD_CHARACTER}+)|((?:(?!{_WORD_CHARACTER}).)+)", re.DOTALL)
-#: A run of characters without blanks, long enough to contain a word with too many apostrophes or bytes.
-_LONG_RUN = re.compile(rf"\S{{{_MAX_WORD_APOSTROPHES + 1},}}")
 #: Symbols that the library treats as letters (enclosed characters and Braille).
 _SYMBOL_LETTERS = frozenset(map(chr, (*range(0x2460, 0x2500), *range(0x2800, 0x2900))))
 #: The end of a clause: Western punctuation before a blank, a bracket or the end of the text, and other punctuation
@@ -99,10 +96,9 @@ def guarded(text: str, voice: str = "") -> str:
         text = _unsafe_characters(language).sub(" ", text)
     if language in _UNSAFE_DIGIT_COUNTS:
         text = _SPOKEN_NUMBER.sub(lambda found: _split_number(found[0], *_UNSAFE_DIGIT_COUNTS[language]), text)
-    return _without_long_words(_without_leading_hyphens(_without_long_initials(text)))
+    return _WORD_OR_GAP.sub(_split_word, _without_leading_hyphens(_without_long_initials(text)))
 
 
-@functools.lru_cache(maxsize=8)
 def _unsafe_characters(language: str) -> re.Pattern[str]:
     """Return a pattern for the characters that crash the voices of a language."""
     found = (signs for languages, signs in _CRASHING_CHARACTERS.items() if language not in languages)
@@ -124,7 +120,7 @@ def _without_long_initials(text: str) -> str:
     dots: list[int] = []
     for piece in _WORD_OR_GAP.finditer(text):
         word, between = piece.groups()
-        size += len(piece.group().encode())
+        size += _utf8_bytes(piece.group())
         if between is not None:
             words += len("".join(between.split()))
             if size > _MAX_CLAUSE_BYTES or _ends_clause(text, piece.start(), piece.end()):
@@ -157,11 +153,16 @@ def _is_letter(character: str) -> bool:
     return character.isalnum() or character in _SYMBOL_LETTERS or unicodedata.category(character).startswith("M")
 
 
+def _utf8_bytes(text: str) -> int:
+    """Return the length of a text in UTF-8, where the library gets a single byte for a lone surrogate."""
+    return len(text.encode("utf-8", "replace"))
+
+
 def _max_bytes(character: str) -> int:
     """Return the number of bytes that a character may need, because some voices replace it by other letters."""
     if _HANGUL <= character <= _HANGUL_END:
         return 9
-    return max(2, len(character.encode()), len(character.lower().encode()))
+    return max(2, _utf8_bytes(character), _utf8_bytes(character.lower()))
 
 
 def _without_leading_hyphens(text: str) -> str:
@@ -180,21 +181,17 @@ def _without_leading_hyphens(text: str) -> str:
     return _HYPHEN.sub(blanked, text)
 
 
-def _without_long_words(text: str) -> str:
-    """Split words that would overrun the library's buffers, by blanking an apostrophe or capitalizing a letter."""
-    return _LONG_RUN.sub(lambda run: _WORD_OR_GAP.sub(_split_word, run.group()), text)
-
-
 def _split_word(piece: re.Match[str]) -> str:
+    """Split a word that would overrun the library's buffers, by blanking apostrophes or capitalizing letters."""
     word = piece.group(1) or ""
     # Words in scripts without capital letters can only be split at an apostrophe.
-    short = len(word.encode()) <= _MAX_WORD_BYTES or word.lower() == word.upper()
+    short = _utf8_bytes(word) <= _MAX_WORD_BYTES or word.lower() == word.upper()
     if short and word.count("'") + word.count("’") <= _MAX_WORD_APOSTROPHES:
         return piece.group()
     result = list(word)
     size = endings = 0
     for at, character in enumerate(word):
-        size += len(character.encode())
+        size += _utf8_bytes(character)
         endings += character in "'’"
         before, here = result[at - 1].lower(), character.upper()
         if endings > _MAX_WORD_APOSTROPHES:
@@ -202,5 +199,5 @@ def _split_word(piece: re.Match[str]) -> str:
             size = endings = 0
         elif size > _MAX_WORD_BYTES and before.islower() and here.isupper() and len(before) == len(here) == 1:
             result[at - 1], result[at] = before, here
-            size = len(here.encode())
+            size = _utf8_bytes(here)
     return "".join(result)

@@ -23,7 +23,7 @@ from talkcli.engine.models import BEGIN_SYMBOL, END_SYMBOL, NO_TELEMETRY, PAD_SY
 from talkcli.frozen import TYPE_CHECKING, frozen
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Sequence
     from typing import Any, TypeVar
 
     from talkcli.engine.child.synthesizers.vits import Buffer
@@ -124,35 +124,21 @@ class ModelCache:
         self._shrink()
         return made
 
-    def remove(self, key: str) -> None:
-        """Remove both halves of a model."""
-        for each in (_ENCODER_SUFFIX, _DECODER_SUFFIX):
-            with contextlib.suppress(OSError):
-                os.unlink(self._path(key, each))
-
     def _path(self, key: str, suffix: str) -> str:
         return os.path.join(self._directory, key + suffix)
 
     def _shrink(self) -> None:
         """Remove the oldest files beyond the maximum size, and the directories of dead writers."""
         size = 0
-        for changed, path in sorted(self._entries(), reverse=True):
-            if path.endswith(_UNFINISHED_SUFFIX):
-                if time.time() - changed > _UNFINISHED_LIMIT_S:
-                    shutil.rmtree(path, ignore_errors=True)
-                continue
-            with contextlib.suppress(OSError):  # another process may have removed the file
-                size += os.lstat(path).st_size
-                if size > MAX_CACHE_BYTES:
-                    os.unlink(path)
-
-    def _entries(self) -> Iterator[tuple[float, str]]:
-        """Yield the cached files, each after the time of its last use."""
-        with contextlib.suppress(OSError), os.scandir(self._directory) as entries:
-            for each in entries:
-                if _CACHED_NAME.fullmatch(each.name):
-                    with contextlib.suppress(OSError):
-                        yield each.stat(follow_symlinks=False).st_mtime, each.path
+        with contextlib.suppress(OSError):  # another process may be removing files too
+            cached = [each for each in os.scandir(self._directory) if _CACHED_NAME.fullmatch(each.name)]
+            for each in sorted(cached, key=lambda each: each.stat().st_mtime, reverse=True):
+                if not each.name.endswith(_UNFINISHED_SUFFIX):
+                    size += each.stat().st_size
+                    if size > MAX_CACHE_BYTES:
+                        os.unlink(each)
+                elif time.time() - each.stat().st_mtime > _UNFINISHED_LIMIT_S:
+                    shutil.rmtree(each, ignore_errors=True)
 
 
 @frozen
@@ -211,7 +197,7 @@ class Model:
             except Exception as error:
                 if _is_out_of_memory(error):
                     raise no_memory_error(path) from error
-                cache.remove(key)  # a full disk may have truncated it; a fault of the model itself is found below
+                # A full disk may have truncated the halves, so they are made again. This also finds a faulty model.
         self._set_halves(*_split(path, content, cache, key))
 
     def encode(self, ids: Sequence[int], speaker: int, scale: float, run: ModelRun) -> Frames:

@@ -43,9 +43,8 @@ class BackgroundIterator(threading.Thread, Generic[_T]):
         super().__init__(daemon=False)
         self._items = items
         self._room = threading.Semaphore(max_ahead)
-        self._made: deque[_T] = deque()
-        self._error: BaseException | None = None
-        self._finished = False
+        #: the items that were not taken yet, each without an error, and at the end None with the error (if any)
+        self._made: deque[tuple[_T | None, BaseException | None]] = deque()
         #: held while the thread writes to its descriptor, so that `close` can't free the descriptor's number meanwhile
         self._lock = threading.Lock()
         self._closed = False
@@ -60,17 +59,15 @@ class BackgroundIterator(threading.Thread, Generic[_T]):
                 self._room.acquire()
                 if self._closed:
                     return
-                self._made.append(item)
-                self._notify()
+                self._put(item)
+            self._put(None)
         except BaseException as error:  # noqa: BLE001 - raised again by `take`
-            self._error = error
-        self._finished = True
-        self._notify()
+            self._put(None, error)
 
     @property
     def ready(self) -> bool:
         """Whether `take` returns at once."""
-        return bool(self._made) or self._finished
+        return bool(self._made)
 
     def take(self, wait: Callable[[int], None] | None = None) -> _T | None:
         """Return the next item, or None at the end.
@@ -83,17 +80,16 @@ class BackgroundIterator(threading.Thread, Generic[_T]):
             BaseException: The iterator raised this exception.
         """
         while not self._made:
-            if self._finished:
-                if self._made:  # the last item may have been added between the two checks
-                    break
-                if self._error is not None:
-                    raise self._error
-                return None
             assert wait is not None
             wait(self.descriptor)
-        os.read(self.descriptor, 1)
-        self._room.release()
-        return self._made.popleft()
+        item, error = self._made[0]
+        if error is not None:
+            raise error
+        if item is not None:
+            self._made.popleft()
+            os.read(self.descriptor, 1)
+            self._room.release()
+        return item
 
     def close(self) -> None:
         """Make the thread end after its current item, which is discarded, and return at once."""
@@ -104,7 +100,8 @@ class BackgroundIterator(threading.Thread, Generic[_T]):
                 os.close(self._write_end)
         self._room.release()
 
-    def _notify(self) -> None:
+    def _put(self, item: _T | None, error: BaseException | None = None) -> None:
+        self._made.append((item, error))
         with self._lock:
             if not self._closed:
                 os.write(self._write_end, b"\0")
