@@ -14,8 +14,8 @@ from talkcli.errors import EXIT_SIGPIPE, ServerUnavailable, UsageError
 from talkcli.fleet import topics
 from talkcli.fleet.bridge.policy import ASKABLE
 from talkcli.fleet.desk.request import Selection
-from talkcli.frozen import replace
-from talkcli.terminal.fleet import FleetTranscript, RobotRow, robot_lines
+from talkcli.fleet.desk.table import FleetTranscript, robot_lines
+from talkcli.fleet.payloads import Presence
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from talkcli.cli.show import CommonOptions
     from talkcli.fleet.broker import Broker
     from talkcli.fleet.desk.watch import FleetEvent
-    from talkcli.fleet.payloads import Presence, RobotInfo
+    from talkcli.fleet.payloads import RobotInfo
     from talkcli.goals.goal import JsonObject
 
 
@@ -94,7 +94,7 @@ def _show_robots(options: CommonOptions, broker: Broker, selection: Selection | 
     show_result(
         options,
         (each.to_json() for each in selected),
-        lambda: robot_lines([_table_row(each) for each in selected], screen(), time.time()),
+        lambda: robot_lines(selected, screen(), time.time()),
     )
 
 
@@ -129,16 +129,14 @@ def _show_event(options: CommonOptions, broker: Broker, transcript: FleetTranscr
 
     now = time.time()
     if isinstance(event, FleetSnapshot):
-        rows = [_table_row(each) for each in event.robots]
+        robots = [each.presence for each in event.robots]
         objects = (_snapshot_object(each) for each in event.robots)
-        show_result(options, objects, lambda: transcript.begin(rows, broker.url, screen(), now))
+        show_result(options, objects, lambda: transcript.begin(robots, broker.url, screen(), now))
     elif isinstance(event, RobotChanged):
         presence = None if event.now is None else event.now.to_json()
         message: JsonObject = {"robot": event.name, "event": "presence", "presence": presence}
-        robot = RobotRow(event.name, online=False) if event.now is None else _row_without_goals(event.now)
-        same = event.before is not None and event.now is not None and event.before.session == event.now.session
-        before = _row_without_goals(event.before) if event.before and same else None
-        show_result(options, [message], lambda: transcript.change(before, robot, screen(), now))
+        robot = event.now or Presence(event.name, online=False)
+        show_result(options, [message], lambda: transcript.change(event.before, robot, screen(), now))
     elif isinstance(event, RobotEvent):
         message = {"robot": event.name, **event.message}
         show_result(options, [message], lambda: transcript.lines(event.name, event.event, screen(), now))
@@ -156,26 +154,3 @@ def _show_event(options: CommonOptions, broker: Broker, transcript: FleetTranscr
 
 def _snapshot_object(robot: RobotInfo) -> JsonObject:
     return {"robot": robot.presence.name, "event": "snapshot", **robot.to_json()}
-
-
-def _row_without_goals(presence: Presence) -> RobotRow:
-    """Return a table row for a robot whose goals are unknown."""
-    server = None if presence.server is None else str(presence.server.get("version") or "?")
-    return RobotRow(presence.name, presence.online, server, since=presence.since)
-
-
-def _table_row(robot: RobotInfo) -> RobotRow:
-    """Return the table row of a robot."""
-    row, status = _row_without_goals(robot.presence), robot.status
-    if status is None:
-        return row
-    last = status.last
-    return replace(
-        row,
-        active=status.active,
-        text=status.text,
-        pending=status.pending,
-        paused=status.paused,
-        last=None if last is None else last.state,
-        last_at=None if last is None else last.at,
-    )

@@ -4,37 +4,50 @@ from __future__ import annotations
 
 import json
 from itertools import pairwise
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.fleet.payloads import Presence, RobotStatus
+from talkcli.fleet.desk.table import COLUMN_NAMES, FleetTranscript, robot_lines
+from talkcli.fleet.payloads import LastGoal, Presence, RobotInfo, RobotStatus
 from talkcli.frozen import replace
 from talkcli.goals.states import State
 from talkcli.protocol.events import StateChanged, from_json
-from talkcli.terminal.fleet import COLUMN_NAMES, FleetTranscript, RobotRow, robot_lines
 from talkcli.terminal.text import MIN_COLUMNS, Screen, printable, width
 
 NOW = 1_000_000.0
-ANNA = RobotRow(
-    "anna", online=True, server="0.1.0", active="a-1", text="please step back, the doors are closing now", pending=2,
-    last=State.SUCCEEDED, last_at=NOW - 10, since=NOW - 900,
-)  # fmt: skip
-GONE = RobotRow(
-    "bert", online=False, active="b-1", text="said long ago", pending=3, last=State.ABORTED, last_at=NOW - 7200
+ANNA = RobotInfo(
+    Presence("anna", online=True, since=NOW - 900, server={"version": "0.1.0"}),
+    RobotStatus(
+        "a-1", "please step back, the doors are closing now", 2, last=LastGoal("a-0", State.SUCCEEDED, at=NOW - 10)
+    ),
+)
+GONE = RobotInfo(
+    Presence("bert", online=False),
+    RobotStatus("b-1", "said long ago", 3, last=LastGoal("b-0", State.ABORTED, at=NOW - 7200)),
 )
 
 TEXTS = st.text(st.characters(exclude_categories=["Cs"]), max_size=60)
 TIMES = st.none() | st.floats(-1e9, 2 * NOW)
-ROBOTS = st.builds(
-    RobotRow, st.text("abcXYZ019._-", min_size=1, max_size=59), online=st.booleans(), server=st.none() | TEXTS,
-    active=st.none() | TEXTS, text=st.none() | TEXTS, pending=st.integers(0, 10_000), paused=st.booleans(),
-    last=st.none() | st.sampled_from(State), last_at=TIMES, since=TIMES,
+PRESENCES = st.builds(
+    Presence, st.text("abcXYZ019._-", min_size=1, max_size=59), online=st.booleans(), since=TIMES,
+    server=st.none() | st.fixed_dictionaries({"version": TEXTS}),
 )  # fmt: skip
+STATUSES = st.builds(
+    RobotStatus, active=st.none() | TEXTS, text=st.none() | TEXTS, pending=st.integers(0, 10_000), paused=st.booleans(),
+    last=st.none() | st.builds(LastGoal, st.just("a-0"), st.sampled_from(State), at=TIMES),
+)  # fmt: skip
+ROBOTS = st.builds(RobotInfo, PRESENCES, st.none() | STATUSES)
 
 
-def cells(robot: RobotRow) -> list[str]:
+def anna(**changes: Any) -> RobotInfo:
+    """Return ANNA with other values in the status."""
+    return RobotInfo(ANNA.presence, replace(ANNA.status, **changes))
+
+
+def cells(robot: RobotInfo) -> list[str]:
     """Return a robot's line, cut at the heads; it has all the room that it needs."""
     head, line = robot_lines([robot], Screen(), NOW)
     places = [*(head.index(each) for each in COLUMN_NAMES), None]
@@ -42,41 +55,46 @@ def cells(robot: RobotRow) -> list[str]:
 
 
 @given(st.lists(ROBOTS, max_size=3), st.integers(1, 200), st.booleans())
-def test_no_line_is_wider_than_its_terminal(robots: list[RobotRow], columns: int, colour: bool) -> None:
+def test_no_line_is_wider_than_its_terminal(robots: list[RobotInfo], columns: int, colour: bool) -> None:
     lines = robot_lines(robots, Screen(columns, colour), NOW)
     assert len(lines) == len(robots) + 1
     assert max(map(width, lines)) <= max(columns, MIN_COLUMNS)
     head, *lines = robot_lines(robots, Screen(), NOW)  # in a pipe nothing is cut
     assert head.split() == list(COLUMN_NAMES)
     for robot, line in zip(robots, lines, strict=True):
-        assert line.startswith(f"{robot.name} ")
-        if robot.online and robot.server is not None and robot.active is not None and robot.text is not None:
-            assert f'"{printable(robot.text)}"' in line
+        presence, status = robot.presence, robot.status or RobotStatus()
+        assert line.startswith(f"{presence.name} ")
+        if presence.online and presence.server and status.active is not None and status.text is not None:
+            assert f'"{printable(status.text)}"' in line
 
 
 @pytest.mark.parametrize(
     ("robot", "shown"),
     [
-        (replace(ANNA, active=None, text=None), ["anna", "yes", "0.1.0", "-", "2", "SUCCEEDED 10 s", "15 min"]),
+        (anna(active=None, text=None), ["anna", "yes", "0.1.0", "-", "2", "SUCCEEDED 10 s", "15 min"]),
         (GONE, ["bert", "OFFLINE", "-", "-", "-", "ABORTED 2 h", "-"]),
-        (replace(ANNA, server=None, last=None), ["anna", "yes", "none", "-", "-", "-", "15 min"]),
+        (
+            RobotInfo(replace(ANNA.presence, server=None), replace(ANNA.status, last=None)),
+            ["anna", "yes", "none", "-", "-", "-", "15 min"],
+        ),
+        (RobotInfo(ANNA.presence, None), ["anna", "yes", "0.1.0", "-", "0", "-", "15 min"]),
     ],
 )
-def test_a_robot_is_shown_with_all_that_is_known_of_it(robot: RobotRow, shown: list[str]) -> None:
+def test_a_robot_is_shown_with_all_that_is_known_of_it(robot: RobotInfo, shown: list[str]) -> None:
     assert cells(robot) == shown
 
 
 @pytest.mark.parametrize(
     ("robot", "shown"),
     [
-        (replace(ANNA, text="hello"), '"hello"'),
-        (replace(ANNA, text=None), "a-1"),
-        (replace(ANNA, text="hello", paused=True), 'PAUSED "hello"'),
-        (replace(ANNA, active=None, text=None, paused=True), "PAUSED"),
-        (replace(ANNA, text="\x1b[2J\n\u202e"), r'"\x1b[2J\n\u202e"'),
+        (anna(text="hello"), '"hello"'),
+        (anna(text=None), "a-1"),
+        (anna(text="hello", paused=True), 'PAUSED "hello"'),
+        (anna(active=None, text=None, paused=True), "PAUSED"),
+        (anna(text="\x1b[2J\n\u202e"), r'"\x1b[2J\n\u202e"'),
     ],
 )
-def test_the_speaking_column_has_the_text_or_the_id_and_pauses(robot: RobotRow, shown: str) -> None:
+def test_the_speaking_column_has_the_text_or_the_id_and_pauses(robot: RobotInfo, shown: str) -> None:
     assert cells(robot)[3] == shown
 
 
@@ -86,7 +104,8 @@ def test_the_speaking_column_has_the_text_or_the_id_and_pauses(robot: RobotRow, 
 )
 def test_a_time_is_shown_by_its_age(seconds: float, shown: str) -> None:
     """A robot's clock may be ahead of the desk's."""
-    assert cells(replace(ANNA, text="", since=NOW - seconds))[-1] == shown
+    robot = RobotInfo(replace(ANNA.presence, since=NOW - seconds), replace(ANNA.status, text=""))
+    assert cells(robot)[-1] == shown
 
 
 @pytest.mark.parametrize(
@@ -100,23 +119,23 @@ def test_a_time_is_shown_by_its_age(seconds: float, shown: str) -> None:
     ],
 )
 def test_the_text_gives_way_first_and_then_whole_columns(columns: int, heads: tuple[str, ...]) -> None:
-    head, anna, bert = robot_lines([ANNA, GONE], Screen(columns), NOW)
+    head, first, bert = robot_lines([ANNA, GONE], Screen(columns), NOW)
     assert tuple(head.split()) == heads
-    assert '"please ste' in anna
-    assert ("closing" in anna) == (columns > 100)
+    assert '"please ste' in first
+    assert ("closing" in first) == (columns > 100)
     assert "OFFLINE" in bert
 
 
 def test_wide_characters_line_up() -> None:
-    lines = robot_lines([ANNA, replace(ANNA, text="请往后退，门即将关闭，请注意安全")], Screen(80), NOW)
+    lines = robot_lines([ANNA, anna(text="请往后退，门即将关闭，请注意安全")], Screen(80), NOW)
     ends = {width(each[: each.index("2  ")]) for each in lines[1:]}
     assert len(ends) == 1
 
 
 def test_colours_are_those_of_the_states() -> None:
-    head, anna, bert = robot_lines([ANNA, GONE], Screen(120, colour=True), NOW)
+    head, first, bert = robot_lines([ANNA, GONE], Screen(120, colour=True), NOW)
     assert head.startswith("\x1b[1mROBOT")
-    assert '\x1b[1;32m"please' in anna
+    assert '\x1b[1;32m"please' in first
     assert "\x1b[31mOFFLINE\x1b[0m" in bert
 
 
@@ -124,14 +143,13 @@ def test_colours_are_those_of_the_states() -> None:
 def test_a_robot_with_an_impossible_time_is_shown_all_the_same(moment: float) -> None:
     goal = {"id": "odd", "state": "SUCCEEDED", "text": "hello", "created_at": moment, "ended_at": moment, "at": moment}
     event = from_json({"event": "state", "id": "odd", "state": "SUCCEEDED", "at": moment, "n": 1, "goal": goal})
-    presence = Presence.read("anna", json.dumps({"since": moment}).encode())
+    presence = Presence.read("anna", json.dumps({"online": True, "since": moment}).encode())
     status = RobotStatus.read(json.dumps({"last": goal}).encode())
     assert presence
     assert status
     assert status.last
     assert isinstance(event, StateChanged)
-    robot = replace(ANNA, since=presence.since, last_at=status.last.at)
-    assert robot_lines([robot], Screen(), NOW)[1].split()[:2] == ["anna", "yes"]
+    assert robot_lines([RobotInfo(presence, status)], Screen(), NOW)[1].split()[:2] == ["anna", "yes"]
     transcript = FleetTranscript(full=True)
     assert "SUCCEEDED" in transcript.lines("anna", event, Screen(), NOW)[0]
-    assert transcript.change(None, robot, Screen(), NOW)
+    assert transcript.change(None, presence, Screen(), NOW)

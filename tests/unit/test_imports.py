@@ -35,7 +35,7 @@ PURE = [
     *("errors", "frozen", "client.core", "engine.child.words", "engine.child.synthesizers.guard"),
     *("engine.child.synthesizers.phonemes", "engine.child.synthesizers.vits"),
     *("fleet.payloads", "fleet.topics", "fleet.bridge.policy"),
-    "fleet.desk.request",
+    *("fleet.desk.request", "fleet.desk.table"),
 ]
 IMPURE = {
     *("asyncio", "threading", "_thread", "socket", "_socket", "select", "selectors", "signal", "time", "datetime"),

@@ -5,7 +5,8 @@ The caller passes the time and the properties of the terminal.
 
 from __future__ import annotations
 
-from talkcli.frozen import TYPE_CHECKING, frozen
+from talkcli.fleet.payloads import RobotStatus
+from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
 from talkcli.terminal.goals import clock_time
 from talkcli.terminal.text import COLUMN_GAP, Screen, cut, max_id_columns, pad, printable, shorten, width
@@ -14,6 +15,7 @@ from talkcli.terminal.transcript import ColumnWidths, Transcript
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from talkcli.fleet.payloads import LastGoal, Presence, RobotInfo
     from talkcli.protocol.events import Event
 
     #: The text of a cell, and the state whose colour is used; None for no colour.
@@ -30,42 +32,13 @@ _MAX_VERSION_CHARS = 12
 _EMPTY_CELL: Cell = ("-", None)
 
 
-@frozen
-class RobotRow:
-    """The values that the table shows about a robot.
-
-    Attributes:
-        name: the robot's name.
-        online: whether the robot is online.
-        server: the version of the robot's server; None if the robot has no server.
-        active: the id of the active goal; None if there is none.
-        text: the active goal's text; None if the robot doesn't publish texts.
-        pending: the number of waiting goals.
-        paused: whether speech is paused.
-        last: the state in which the last goal ended; None if unknown.
-        last_at: when the last goal ended, in seconds since 1970.
-        since: when the robot came online, in seconds since 1970.
-    """
-
-    name: str
-    online: bool
-    server: str | None = None
-    active: str | None = None
-    text: str | None = None
-    pending: int = 0
-    paused: bool = False
-    last: State | None = None
-    last_at: float | None = None
-    since: float | None = None
-
-
-def robot_lines(robots: Sequence[RobotRow], screen: Screen, now: float) -> list[str]:
+def robot_lines(robots: Sequence[RobotInfo], screen: Screen, now: float) -> list[str]:
     """Return the lines of the table, with a heading.
 
     If a terminal is too narrow, the texts of sentences are shortened first. Then columns are omitted.
 
     Args:
-        robots: the rows.
+        robots: the robots, one for each row.
         screen: the properties of the terminal.
         now: the current time in seconds since 1970, to show ages.
     """
@@ -76,40 +49,45 @@ def robot_lines(robots: Sequence[RobotRow], screen: Screen, now: float) -> list[
     return [screen.coloured(heading, None), *(_line(cells, widths, screen) for cells in rows)]
 
 
-def _cells(robot: RobotRow, screen: Screen, now: float) -> dict[str, Cell]:
+def _cells(robot: RobotInfo, screen: Screen, now: float) -> dict[str, Cell]:
     """Return the cells of a row, by column name."""
-    has_server = robot.online and robot.server is not None
-    return {
-        "ROBOT": (cut(printable(robot.name), max_id_columns(screen)), None),
-        "ONLINE": ("yes", None) if robot.online else ("OFFLINE", State.LOST),
-        "SERVER": _server_cell(robot),
-        "SPEAKING": _speaking_cell(robot) if has_server else _EMPTY_CELL,
-        "QUEUE": (str(robot.pending), None) if has_server else _EMPTY_CELL,
-        "LAST": _last_cell(robot, now),
-        "SINCE": _EMPTY_CELL if robot.since is None or not robot.online else (_age(now - robot.since), None),
-    }
+    presence, status = robot.presence, robot.status or RobotStatus()
+    cells = dict.fromkeys(COLUMN_NAMES, _EMPTY_CELL)
+    cells["ROBOT"] = cut(printable(presence.name), max_id_columns(screen)), None
+    cells["ONLINE"] = ("yes", None) if presence.online else ("OFFLINE", State.LOST)
+    if presence.online:
+        version = _server_version(presence)
+        if version is None:
+            cells["SERVER"] = "none", State.LOST
+        else:
+            cells |= {
+                "SERVER": (version, None),
+                "SPEAKING": _speaking_cell(status),
+                "QUEUE": (str(status.pending), None),
+            }
+        if presence.since is not None:
+            cells["SINCE"] = _age(now - presence.since), None
+    if status.last is not None:
+        cells["LAST"] = _last_cell(status.last, now)
+    return cells
 
 
-def _server_cell(robot: RobotRow) -> Cell:
-    if not robot.online:
-        return _EMPTY_CELL
-    return ("none", State.LOST) if robot.server is None else (printable(robot.server, _MAX_VERSION_CHARS), None)
+def _server_version(presence: Presence) -> str | None:
+    """Return the version of the robot's server, or None if the robot has no server."""
+    server = presence.server
+    return None if server is None else printable(str(server.get("version") or "?"), _MAX_VERSION_CHARS)
 
 
-def _speaking_cell(robot: RobotRow) -> Cell:
-    words = _EMPTY_CELL[0]
-    if robot.active is not None:
-        words = printable(robot.active) if robot.text is None else f'"{printable(robot.text)}"'
-    if robot.paused:
-        return ("PAUSED" if robot.active is None else f"PAUSED {words}"), State.PREEMPTING
-    return words, None if robot.active is None else State.ACTIVE
+def _speaking_cell(status: RobotStatus) -> Cell:
+    if status.active is None:
+        return ("PAUSED", State.PREEMPTING) if status.paused else _EMPTY_CELL
+    words = printable(status.active) if status.text is None else f'"{printable(status.text)}"'
+    return (f"PAUSED {words}", State.PREEMPTING) if status.paused else (words, State.ACTIVE)
 
 
-def _last_cell(robot: RobotRow, now: float) -> Cell:
-    if robot.last is None:
-        return _EMPTY_CELL
-    age = "" if robot.last_at is None else f" {_age(now - robot.last_at)}"
-    return f"{robot.last.name}{age}", robot.last
+def _last_cell(goal: LastGoal, now: float) -> Cell:
+    age = "" if goal.at is None else f" {_age(now - goal.at)}"
+    return f"{goal.state.name}{age}", goal.state
 
 
 def _age(seconds: float) -> str:
@@ -156,7 +134,7 @@ class FleetTranscript:
         self._columns = ColumnWidths()
         self._transcripts: dict[str, Transcript] = {}
 
-    def begin(self, robots: Sequence[RobotRow], broker: str, screen: Screen, now: float) -> list[str]:
+    def begin(self, robots: Sequence[Presence], broker: str, screen: Screen, now: float) -> list[str]:
         """Return the first line, which has the number of robots and the broker's URL."""
         for each in robots:
             self._columns.robot(each.name, screen)  # before the first line, so that all lines are aligned
@@ -173,20 +151,20 @@ class FleetTranscript:
             self._transcripts[name] = Transcript(full=self._full, words=False, robot=name, widths=self._columns)
         return self._transcripts[name].lines(event, screen, now)
 
-    def change(self, before: RobotRow | None, robot: RobotRow, screen: Screen, now: float) -> list[str]:
+    def change(self, before: Presence | None, robot: Presence, screen: Screen, now: float) -> list[str]:
         """Return the line for a robot that has come or gone, or whose server has. Goals seen before are forgotten.
 
         Args:
-            before: the robot before the change; None if it was unknown or had another bridge.
-            robot: the robot after the change.
+            before: the presence before the change; None if the robot was unknown.
+            robot: the presence after the change.
             screen: the properties of the terminal.
             now: the current time in seconds since 1970.
         """
         self._transcripts.pop(robot.name, None)
-        server = "no server" if robot.server is None else f"talk {printable(robot.server, _MAX_VERSION_CHARS)}"
+        server = "no server" if robot.server is None else f"talk {_server_version(robot)}"
         if not robot.online:
             word, state, more = "OFFLINE", State.LOST, ""
-        elif before is None or not before.online:
+        elif before is None or not before.online or before.session != robot.session:
             word, state, more = "online", State.SUCCEEDED, server
         elif robot.server is None:
             word, state, more = server, State.LOST, ""
