@@ -15,7 +15,7 @@ from talkcli.fleet import topics
 from talkcli.fleet.bridge.policy import ASKABLE
 from talkcli.fleet.desk.request import Selection
 from talkcli.fleet.desk.table import FleetTranscript, robot_lines
-from talkcli.fleet.payloads import Presence
+from talkcli.fleet.payloads import Presence, RobotInfo
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from talkcli.cli.show import CommonOptions
     from talkcli.fleet.broker import Broker
     from talkcli.fleet.desk.watch import FleetEvent
-    from talkcli.fleet.payloads import RobotInfo
     from talkcli.goals.goal import JsonObject
 
 

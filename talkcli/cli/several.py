@@ -18,7 +18,7 @@ from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.errors import EXIT_DIFFER, EXIT_OK, EXIT_TIMEOUT, TalkError, UsageError
 from talkcli.goals.options import Cancel, Say, Set
 from talkcli.polling import Interrupted
-from talkcli.protocol.requests import Pause, Resume, Status, Wait
+from talkcli.protocol.requests import Pause, Request, Resume, Status, Wait
 from talkcli.terminal.goals import describe_end, setting_lines
 from talkcli.terminal.text import printable
 
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from talkcli.cli.show import CommonOptions
     from talkcli.fleet.desk.request import Outcome
     from talkcli.fleet.desk.several import FleetRequest
-    from talkcli.protocol.requests import Request
 
 #: Limits for the notes about failures: names per note, and notes. Standard output has all failures.
 _MAX_NAMES, _MAX_NOTES = 5, 10

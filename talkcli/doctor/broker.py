@@ -19,15 +19,16 @@ from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
 from talkcli.client.client import Client
-from talkcli.doctor.report import BRIDGE_QUESTION, FAILURE, ROBOT_QUESTION, Finding, failure, join_names, ok, warning
+from talkcli.doctor import report
+from talkcli.doctor.report import FAILURE, Finding, Question, failure, join_names, ok, warning
 from talkcli.doctor.server import format_span, summarize_server
 from talkcli.errors import ServerUnavailable, TalkError, UsageError
 from talkcli.fleet import topics
-from talkcli.fleet.broker import CA, URL, USER, client_user, from_environment, is_local
+from talkcli.fleet.broker import CA, URL, USER, Broker, client_user, from_environment, is_local
 from talkcli.fleet.desk.robot import connect_robot
 from talkcli.fleet.desk.watch import read_robots
 from talkcli.fleet.link import LOGIN_LIMIT_S, REASON_NOT_AUTHORIZED, Link
-from talkcli.fleet.payloads import Presence
+from talkcli.fleet.payloads import Message, Presence
 from talkcli.frozen import frozen, replace
 from talkcli.polling import wait_ready
 from talkcli.terminal.text import printable
@@ -35,9 +36,6 @@ from talkcli.terminal.text import printable
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from talkcli.doctor.report import Question
-    from talkcli.fleet.broker import Broker
-    from talkcli.fleet.payloads import Message
     from talkcli.goals.goal import JsonObject
 
 _Result = TypeVar("_Result")
@@ -135,7 +133,7 @@ class BrokerExamination:
     @property
     def question(self) -> Question:
         """The question that the report answers. With a robot's own login, no requests can be sent to robots."""
-        return BRIDGE_QUESTION if self._is_robot else ROBOT_QUESTION
+        return report.BRIDGE_QUESTION if self._is_robot else report.ROBOT_QUESTION
 
     def findings(self) -> Iterator[Finding]:
         """Yield each finding as soon as it is known, up to the first failure that prevents other checks."""

@@ -17,7 +17,7 @@ from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.fleet.broker import URL, from_environment, require_paho
 from talkcli.fleet.desk.request import Selection
 from talkcli.goals.options import Cancel, Say, Set
-from talkcli.protocol.requests import Pause, Resume, Status, Wait
+from talkcli.protocol.requests import Pause, Request, Resume, Status, Wait
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
     from talkcli.fleet.desk.several import FleetRequest
     from talkcli.fleet.payloads import Presence
-    from talkcli.protocol.requests import Request
 
 
 class Fleet:

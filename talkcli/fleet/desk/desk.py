@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from talkcli.errors import AccessDenied, ServerUnavailable, TalkError
 from talkcli.fleet import topics
-from talkcli.fleet.broker import client_user
+from talkcli.fleet.broker import Broker, client_user
 from talkcli.fleet.link import (
     KEEPALIVE_S,
     MAX_RECEIVE_COUNT,
@@ -32,7 +32,6 @@ from talkcli.protocol.lines import request_line, write_request
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from talkcli.fleet.broker import Broker
     from talkcli.fleet.payloads import Message
     from talkcli.protocol.requests import Request
 

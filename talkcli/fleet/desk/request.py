@@ -8,16 +8,14 @@ from fnmatch import translate
 from talkcli.errors import EXIT_OK, Lost, ServerUnavailable, TalkError, UnknownGoal
 from talkcli.fleet import topics
 from talkcli.frozen import TYPE_CHECKING, frozen
-from talkcli.goals.goal import Goal
+from talkcli.goals.goal import Goal, JsonObject
 from talkcli.goals.options import Cancel, Say, Set
 from talkcli.goals.states import State
 from talkcli.protocol.events import Canceled, ServerStatus, goal_in
-from talkcli.protocol.requests import Pause, Resume, Status
+from talkcli.protocol.requests import Pause, Request, Resume, Status
 
 if TYPE_CHECKING:
     from talkcli.fleet.payloads import Presence
-    from talkcli.goals.goal import JsonObject
-    from talkcli.protocol.requests import Request
 
 _GROUP_PREFIX, _WILDCARDS = "@", "*?["
 #: Globs that consist of valid characters. Other globs can't match a robot's name.

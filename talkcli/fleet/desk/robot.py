@@ -20,23 +20,21 @@ from talkcli.errors import AccessDenied, BadRequest, Lost, ServerUnavailable, Ta
 from talkcli.fleet import topics
 from talkcli.fleet.desk.desk import ABSENCE_LIMIT_S, DeskLink
 from talkcli.fleet.desk.request import NoServer
-from talkcli.fleet.link import boottime
+from talkcli.fleet.link import Link, boottime
 from talkcli.frozen import replace
 from talkcli.goals.options import MAX_SENDER_NAME_CHARS, Cancel, Say, Set
 from talkcli.polling import wait_ready
 from talkcli.protocol.events import check_greeting
 from talkcli.protocol.lines import decode
-from talkcli.protocol.requests import Hello, Pause, Resume, Wait
+from talkcli.protocol.requests import Hello, Pause, Request, Resume, Wait
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from talkcli.fleet.broker import Broker
-    from talkcli.fleet.link import Link
     from talkcli.fleet.payloads import Message
     from talkcli.goals.goal import JsonObject
-    from talkcli.protocol.requests import Request
 
 #: Interval of the messages that keep the bridge's session alive, which ends after 90 s of silence.
 _KEEP_ALIVE_INTERVAL_S = 30.0

@@ -18,27 +18,22 @@ from talkcli.client.goal import GoalHandle
 from talkcli.errors import EXIT_OK, Lost, ServerUnavailable, TalkError, UnknownGoal, Unreadable, UsageError
 from talkcli.fleet import topics
 from talkcli.fleet.desk.desk import DeskLink
-from talkcli.fleet.desk.request import NoServer, Outcome, cancel_outcomes, failure_outcome, reply_outcomes
+from talkcli.fleet.desk.request import NoServer, Outcome, Selection, cancel_outcomes, failure_outcome, reply_outcomes
 from talkcli.fleet.desk.robot import RobotConnection, RobotExchange, new_goal_id
-from talkcli.fleet.link import boottime
-from talkcli.fleet.payloads import Presence
+from talkcli.fleet.link import Link, boottime
+from talkcli.fleet.payloads import Message, Presence
 from talkcli.frozen import replace
-from talkcli.goals.goal import Goal
+from talkcli.goals.goal import Goal, JsonObject
 from talkcli.goals.options import Cancel, Say, Set, key_error
 from talkcli.goals.states import State
 from talkcli.protocol.events import goals
 from talkcli.protocol.lines import FIRST_NUMBER
-from talkcli.protocol.requests import Pause, Status, Wait
+from talkcli.protocol.requests import Pause, Request, Status, Wait
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from talkcli.fleet.broker import Broker
-    from talkcli.fleet.desk.request import Selection
-    from talkcli.fleet.link import Link
-    from talkcli.fleet.payloads import Message
-    from talkcli.goals.goal import JsonObject
-    from talkcli.protocol.requests import Request
 
 #: Default ttl of a sentence, so that no robot says something that was true a minute ago.
 DEFAULT_TTL_S = 10.0

@@ -5,7 +5,7 @@ The caller passes the time and the properties of the terminal.
 
 from __future__ import annotations
 
-from talkcli.fleet.payloads import RobotStatus
+from talkcli.fleet.payloads import LastGoal, Presence, RobotInfo, RobotStatus
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
 from talkcli.terminal.goals import clock_time
@@ -15,7 +15,6 @@ from talkcli.terminal.transcript import ColumnWidths, Transcript
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from talkcli.fleet.payloads import LastGoal, Presence, RobotInfo
     from talkcli.protocol.events import Event
 
     #: The text of a cell, and the state whose colour is used; None for no colour.

@@ -15,7 +15,7 @@ from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.errors import BadRequest, Lost
 from talkcli.fleet import topics
 from talkcli.fleet.desk.desk import ABSENCE_LIMIT_S, DeskLink
-from talkcli.fleet.payloads import Presence, RobotInfo, RobotStatus
+from talkcli.fleet.payloads import Message, Presence, RobotInfo, RobotStatus
 from talkcli.frozen import frozen
 from talkcli.goals.states import State
 from talkcli.protocol.events import PausedChanged, StateChanged, from_json
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from talkcli.fleet.broker import Broker
     from talkcli.fleet.desk.request import Selection
     from talkcli.fleet.link import Link
-    from talkcli.fleet.payloads import Message
     from talkcli.goals.goal import JsonObject
 
 #: Time for bridges to reconnect after the broker is back. Robots without a presence then count as gone.
