@@ -72,29 +72,21 @@ def _check_names(option: str, names: Sequence[str]) -> None:
 
 
 def fleet(options: CommonOptions, what: str) -> int | None:
-    """Show the state of the robots, or watch them. Return the exit code, or None for 0."""
+    """Show the state of each robot, or watch all robots. Return the exit code, or None for 0."""
     broker = options.broker()
     text = paths.named_robot(options.robot, options.socket)
     selection = None if text is None else Selection(text)
     if what == "watch":
         return _watch(options, broker, selection)
-    _show_robots(options, broker, selection)
-    return None
-
-
-def _show_robots(options: CommonOptions, broker: Broker, selection: Selection | None) -> None:
-    """Show the state of each robot."""
     from talkcli.fleet.desk.watch import read_robots
 
     found = read_robots(broker, ANSWER_LIMIT_S, selection.name if selection else None)
     selected = [each for each in found if selection is None or selection.includes(each.presence)]
     if not selected:
         raise _no_robot_error(broker, selection)
-    show_result(
-        options,
-        (each.to_json() for each in selected),
-        lambda: robot_lines(selected, screen(), time.time()),
-    )
+    objects = (each.to_json() for each in selected)
+    show_result(options, objects, lambda: robot_lines(selected, screen(), time.time()))
+    return None
 
 
 def _no_robot_error(broker: Broker, selection: Selection | None) -> ServerUnavailable:

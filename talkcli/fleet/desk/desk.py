@@ -220,19 +220,14 @@ class DeskLink:
         while self.link is not None and self.link.outstanding_bytes and (left := end - time.monotonic()) > 0:
             self.poll(left)
 
-    def close(self) -> None:
-        """Close the connection permanently."""
-        if self._opening is not None:
+    def close(self, *, forked: bool = False) -> None:
+        """Close the connection permanently. In a forked child, close only the child's copies of the descriptors."""
+        if self._opening is not None and not forked:
             self._opening.cancel()
         if self.link is not None:
-            self.link.close()
-        self._close_wake_sockets()
-
-    def drop(self) -> None:
-        """Close a forked child's copies of the descriptors. The parent's connection stays open."""
-        if self.link is not None:
-            self.link.drop()
-        self._close_wake_sockets()
+            (self.link.drop if forked else self.link.close)()
+        self._wake_reader.close()
+        self._wake_writer.close()
 
     def publish_error(self, code: int, action: str) -> TalkError:
         """Return the error for a message that the broker has refused.
@@ -299,7 +294,3 @@ class DeskLink:
         self.link, self.marker_at = None, None
         self._next_attempt_at = time.monotonic() + random.uniform(0, _FIRST_BROKER_PAUSE_S)
         self.handler.on_disconnected(f"the broker at {self.broker.url} went away")
-
-    def _close_wake_sockets(self) -> None:
-        self._wake_reader.close()
-        self._wake_writer.close()

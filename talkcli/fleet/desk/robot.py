@@ -360,10 +360,7 @@ class RobotConnection(Connection):
         self._desk.wake()
 
     def _drop(self) -> None:
-        if os.getpid() != self._process:
-            self._desk.drop()
-        else:
-            self._desk.close()
+        self._desk.close(forked=os.getpid() != self._process)
 
 
 def connect_robot(robot: str, broker: Broker, *, keep_trying: float = 0.0, **options: Any) -> RobotConnection:

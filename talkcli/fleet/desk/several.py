@@ -109,7 +109,8 @@ class FleetRequest:
             self._desk.wait_for_retained(patience, interrupt=interrupt)
             #: the time by `boottime` after which the sentence is not sent again; None for no limit
             self._latest = boottime() + request.ttl if isinstance(request, Say) and request.ttl else None
-            self._begin()
+            self._began = True
+            self._send_to_known_robots()
         except BaseException:
             self.close()
             raise
@@ -209,9 +210,8 @@ class FleetRequest:
                         each.connection.end_session()
         self._desk.close()
 
-    def _begin(self) -> None:
-        """Send the request to the robots that are known to be online."""
-        self._began = True
+    def _send_to_known_robots(self) -> None:
+        """Send the request to the group, or to each robot whose presence has arrived."""
         group = self._selection.group
         if group is not None and self._rejected is None:
             self._desk.send(self.request, self._number, group, self._on_refused, is_group=True)

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 #: Time for bridges to reconnect after the broker is back. Robots without a presence then count as gone.
 BRIDGES_BACK_LIMIT_S = 15.0
+#: Interval of the checks for time limits that have passed.
+_LIMIT_CHECK_INTERVAL_S = 0.5
 
 
 @frozen
@@ -183,7 +185,7 @@ class FleetWatch:
                 self._check_limits(now)
                 while self._events:
                     yield self._events.popleft()
-                self._desk.poll(self._until_next_limit(now), interrupt)
+                self._desk.poll(_LIMIT_CHECK_INTERVAL_S, interrupt)
         finally:
             self._desk.close()
 
@@ -240,13 +242,6 @@ class FleetWatch:
         for name in [name for name, until in self._missing.items() if now >= until]:
             del self._missing[name]
             self._set_presence(name, None)
-
-    def _until_next_limit(self, now: float) -> float:
-        """Return the seconds until the next time limit that `_check_limits` handles."""
-        limits = list(self._missing.values())
-        if self._away_since is not None:
-            limits.append(self._away_since + (ABSENCE_LIMIT_S if self._began else ANSWER_LIMIT_S))
-        return max(0.0, min(limits, default=now + ABSENCE_LIMIT_S) - now)
 
     # -- changes
 
