@@ -111,31 +111,31 @@ def _ask(options: CommonOptions, request: Request, timeout: float | None = None,
         patience = min(ANSWER_LIMIT_S, timeout or ANSWER_LIMIT_S)
         with FleetRequest(
             broker, selection, request, name=name, interrupt=interrupts.watched, patience=patience
-        ) as asked:
+        ) as fleet_request:
             is_late = False
             try:
-                printer.show_outcomes(asked, seconds_left(options.deadline(timeout)))
+                printer.show_outcomes(fleet_request, seconds_left(options.deadline(timeout)))
             except (Interrupted, OSError) as error:
                 interrupts.record(error)
                 is_late = isinstance(error, TimeoutError)
             if not (is_late or interrupts.reader_gone or interrupts.signal_number is not None):
-                return printer.summarize(asked)
+                return printer.summarize(fleet_request)
             if owns_goals:
-                _cancel(asked, interrupts, printer)
+                _cancel(fleet_request, interrupts, printer)
             if is_late:
                 show_error(timeout_error(timeout), json=options.json)
-            printer.summarize(asked, "not known to be silent" if owns_goals else "not done")
+            printer.summarize(fleet_request, "not known to be silent" if owns_goals else "not done")
             return EXIT_TIMEOUT if is_late else interrupts.exit_code
     return interrupts.exit_code
 
 
-def _cancel(asked: FleetRequest, interrupts: Interrupts, printer: _OutcomePrinter) -> None:
+def _cancel(fleet_request: FleetRequest, interrupts: Interrupts, printer: _OutcomePrinter) -> None:
     """Cancel the goals that haven't ended, and wait briefly for silence."""
     interrupts.reset()
     try:
-        if asked.unfinished_robots:
-            asked.cancel()
-        retry_without_output(printer.show_outcomes, asked, CANCEL_TIMEOUT_S)
+        if fleet_request.unfinished_robots:
+            fleet_request.cancel()
+        retry_without_output(printer.show_outcomes, fleet_request, CANCEL_TIMEOUT_S)
     except (Interrupted, TimeoutError):
         pass  # the summary names the robots that haven't answered
     except TalkError as error:
@@ -154,15 +154,15 @@ class _OutcomePrinter:
         shows_count = not options.quiet and sys.stderr is not None and sys.stderr.isatty()
         self._terminal = sys.stderr if shows_count else None
 
-    def show_outcomes(self, asked: FleetRequest, timeout: float | None) -> None:
+    def show_outcomes(self, fleet_request: FleetRequest, timeout: float | None) -> None:
         """Show all outcomes as they arrive. Raises the same errors as `FleetRequest.results`."""
         try:
-            self._show_count(asked)
-            for each in asked.results(timeout):
+            self._show_count(fleet_request)
+            for each in fleet_request.results(timeout):
                 self._add(each)
                 self._clear_count()
                 self._show(each)
-                self._show_count(asked)
+                self._show_count(fleet_request)
         finally:
             self._clear_count()
 
@@ -176,11 +176,11 @@ class _OutcomePrinter:
         else:
             self._unfinished.add(robot)
 
-    def summarize(self, asked: FleetRequest, unknown: str = "not done") -> int:
+    def summarize(self, fleet_request: FleetRequest, unknown: str = "not done") -> int:
         """Show how many robots carried out the request, and why others failed. Return the exit code.
 
         Args:
-            asked: the request.
+            fleet_request: the request.
             unknown: how to describe the robots whose last outcome hasn't arrived.
         """
         failures = [each for each in self._outcomes.values() if each.exit_code]
@@ -188,10 +188,10 @@ class _OutcomePrinter:
         if not self._options.quiet:
             for words in _failure_notes(failures)[:_MAX_NOTES]:
                 note(words)
-            if asked.unfinished_robots:
-                why = f": {asked.why_disconnected}" if asked.why_disconnected else ""
-                note(f"{unknown}: {_listed(asked.unfinished_robots)}{why}")
-            note(f"{len(done)} of {len(asked)} as asked")
+            if fleet_request.unfinished_robots:
+                why = f": {fleet_request.why_disconnected}" if fleet_request.why_disconnected else ""
+                note(f"{unknown}: {_join_names(fleet_request.unfinished_robots)}{why}")
+            note(f"{len(done)} of {len(fleet_request)} as asked")
         codes = {each.exit_code for each in failures}
         return EXIT_DIFFER if len(codes) > 1 else next(iter(codes), EXIT_OK)
 
@@ -206,10 +206,10 @@ class _OutcomePrinter:
             goal = printable(outcome.goal.id) if outcome.goal and outcome.goal.id else "-"
             show_if_possible(show, f"{outcome.robot} {goal} {outcome.state} {outcome.exit_code}")
 
-    def _show_count(self, asked: FleetRequest) -> None:
+    def _show_count(self, fleet_request: FleetRequest) -> None:
         """Show how many robots have finished, if standard error is a terminal."""
         if self._terminal:
-            self._terminal.write(f"\r{len(self._outcomes) - len(self._unfinished)} of {len(asked)}")
+            self._terminal.write(f"\r{len(self._outcomes) - len(self._unfinished)} of {len(fleet_request)}")
             self._terminal.flush()
 
     def _clear_count(self) -> None:
@@ -224,17 +224,18 @@ def _failure_notes(failures: list[Outcome]) -> list[str]:
     for each in failures:
         alike.setdefault((each.state, each.exit_code), []).append(each)
     return [
-        f"{state}: {_listed([each.robot for each in some])}: {_reason(some[0])}" for (state, _), some in alike.items()
+        f"{state}: {_join_names([each.robot for each in some])}: {_describe_failure(some[0])}"
+        for (state, _), some in alike.items()
     ]
 
 
-def _listed(names: list[str]) -> str:
+def _join_names(names: list[str]) -> str:
     """Return the first few names, and the number of the remaining ones, as text."""
     more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
     return ", ".join(names[:_MAX_NAMES]) + more
 
 
-def _reason(outcome: Outcome) -> str:
+def _describe_failure(outcome: Outcome) -> str:
     """Return a human-readable reason for a failure."""
     if outcome.error is not None:
         return outcome.error.message.removeprefix(f"{outcome.robot}: ")  # the note already names the robot

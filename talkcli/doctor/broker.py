@@ -68,16 +68,16 @@ class BrokerConnection:
     Attributes:
         took: seconds that it took to connect, including TLS.
         trouble: why the broker can't be reached, or None if it can.
-        untrusted: why TLS failed; None if it succeeded or is not used.
-        fault: OpenSSL's error code if the certificate was rejected, otherwise 0.
-        until: when the certificate expires, in seconds since 1970; None without TLS.
+        tls_error: why TLS failed; None if it succeeded or is not used.
+        certificate_code: OpenSSL's error code if the certificate was rejected, otherwise 0.
+        expires_at: when the certificate expires, in seconds since 1970; None without TLS.
     """
 
     took: float = 0.0
     trouble: str | None = None
-    untrusted: str | None = None
-    fault: int = 0
-    until: float | None = None
+    tls_error: str | None = None
+    certificate_code: int = 0
+    expires_at: float | None = None
 
 
 @frozen
@@ -86,14 +86,14 @@ class AccessRights:
 
     Attributes:
         presence: the robot's presence; None if it is unknown to the broker, or if the user may not read it.
-        unwritten: topics to which the user must not publish.
-        unread: topics from which no message came back, so that the user can't read them.
+        unwritable: topics to which the user must not publish.
+        unreadable: topics from which no message came back, so that the user can't read them.
         trouble: why the rights could not be tested, or None if they could.
     """
 
     presence: Presence | None
-    unwritten: tuple[str, ...] = ()
-    unread: tuple[str, ...] = ()
+    unwritable: tuple[str, ...] = ()
+    unreadable: tuple[str, ...] = ()
     trouble: str | None = None
 
 
@@ -151,7 +151,7 @@ class BrokerExamination:
         if connection.trouble is not None:
             return
         yield from judge_certificate(broker, connection, time.time(), near=is_local(broker.host))
-        if connection.untrusted is not None:
+        if connection.tls_error is not None:
             return
         try:
             link = self._log_in(broker, self._inbox.append)
@@ -168,8 +168,9 @@ class BrokerExamination:
         elif self._is_robot:
             presence_finding = ok("name", f"'{self._robot}' is free: no bridge has it, and none had it")
         else:
-            may = rights_finding.state != FAILURE
-            presence_finding = judge_unknown(self._robot, self._known_robots(broker) if may else (), name, may=may)
+            privileged = rights_finding.state != FAILURE
+            known = self._known_robots(broker) if privileged else ()
+            presence_finding = judge_unknown(self._robot, known, name, privileged=privileged)
         yield presence_finding
         yield rights_finding
         if not self._is_robot and FAILURE not in (presence_finding.state, rights_finding.state):
@@ -222,10 +223,10 @@ class BrokerExamination:
             now = time.monotonic()
             if not is_acknowledged and len(codes) == len(tested):
                 is_acknowledged, end = True, min(end, now + _ECHO_RETURN_LIMIT_S)
-        unwritten = tuple(each for each in tested if codes.get(each) == REASON_NOT_AUTHORIZED)
+        unwritable = tuple(each for each in tested if codes.get(each) == REASON_NOT_AUTHORIZED)
         missing = [each for each in tested if each not in codes]
         trouble = link.ended or (f"it has acknowledged nothing of {missing[0]}" if missing else None)
-        return AccessRights(presence, unwritten, () if is_back or echo in unwritten else (echo,), trouble)
+        return AccessRights(presence, unwritable, () if is_back or echo in unwritable else (echo,), trouble)
 
     def _known_robots(self, broker: Broker) -> tuple[str, ...]:
         """Return the names of all robots that the broker knows, or an empty tuple if they can't be read."""
@@ -284,22 +285,23 @@ def _connect(broker: Broker, context: ssl.SSLContext | None) -> BrokerConnection
     try:
         connection = socket.create_connection((broker.host, broker.port), LOGIN_LIMIT_S)
     except OSError as error:
-        return BrokerConnection(trouble=_trouble(error))
+        return BrokerConnection(trouble=_describe_error(error))
     with connection:
         if context is None:
             return BrokerConnection(time.monotonic() - began)
         try:
             with context.wrap_socket(connection, server_hostname=broker.host) as secured:
-                until = ssl.cert_time_to_seconds(str((secured.getpeercert() or {})["notAfter"]))
-                return BrokerConnection(time.monotonic() - began, until=until)
+                expires_at = ssl.cert_time_to_seconds(str((secured.getpeercert() or {})["notAfter"]))
+                return BrokerConnection(time.monotonic() - began, expires_at=expires_at)
         except ssl.SSLCertVerificationError as error:
-            untrusted, fault = error.verify_message, error.verify_code
+            tls_error, code = error.verify_message, error.verify_code
         except OSError as error:
-            untrusted, fault = (error.reason if isinstance(error, ssl.SSLError) else _trouble(error)) or str(error), 0
-        return BrokerConnection(time.monotonic() - began, untrusted=untrusted, fault=fault)
+            reason = error.reason if isinstance(error, ssl.SSLError) else _describe_error(error)
+            tls_error, code = reason or str(error), 0
+        return BrokerConnection(time.monotonic() - began, tls_error=tls_error, certificate_code=code)
 
 
-def _trouble(error: OSError) -> str:
+def _describe_error(error: OSError) -> str:
     if isinstance(error, ConnectionRefusedError):
         return "connection refused"
     if isinstance(error, socket.gaierror):
@@ -344,27 +346,27 @@ def judge_certificate(broker: Broker, connection: BrokerConnection, now: float, 
         step = f"give the broker a certificate (listener, certfile, keyfile in mosquitto.conf), and: {URL}=mqtts://…"
         return [warning(check, words, step)]
     by = f"the CA in {broker.ca}" if broker.ca else "the system's CAs"
-    if connection.untrusted is not None:
-        return [failure(check, f"{connection.untrusted} (by {by})", _trust_step(broker, connection, now))]
-    if connection.until is None:
+    if connection.tls_error is not None:
+        return [failure(check, f"{connection.tls_error} (by {by})", _trust_step(broker, connection, now))]
+    if connection.expires_at is None:
         return []
-    date = time.strftime("%Y-%m-%d", time.gmtime(connection.until))
-    if connection.until - now < _RENEWAL_LIMIT_S:
-        words = f"good until {date}, {format_span(connection.until - now)} from now; trusted by {by}"
+    date = time.strftime("%Y-%m-%d", time.gmtime(connection.expires_at))
+    if connection.expires_at - now < _RENEWAL_LIMIT_S:
+        words = f"good until {date}, {format_span(connection.expires_at - now)} from now; trusted by {by}"
         return [warning(check, words, f"renew the certificate of {broker.host}, and have mosquitto read it: SIGHUP")]
     return [ok(check, f"trusted by {by}; good until {date}")]
 
 
 def _trust_step(broker: Broker, connection: BrokerConnection, now: float) -> str:
     """Return the next step if TLS failed."""
-    if connection.fault in _DATE_CODES:
+    if connection.certificate_code in _DATE_CODES:
         clock = time.strftime("%Y-%m-%d %H:%M", time.gmtime(now))
         return f"renew the certificate of {broker.host}; or set this machine's clock: it says {clock} UTC"
-    if connection.fault in _HOST_CODES:
+    if connection.certificate_code in _HOST_CODES:
         return f"name the host in {URL} as its certificate does, or have it certified as {broker.host}"
-    if "ALERT" in str(connection.untrusted):
+    if "ALERT" in str(connection.tls_error):
         return "log in with a certificate that the broker takes: TALK_MQTT_CERT and TALK_MQTT_KEY name it"
-    if not connection.fault:
+    if not connection.certificate_code:
         return f"name the port that has TLS in {URL}, if {broker.port} of {broker.host} has none; or {_LOG_STEP}"
     other = "another file" if broker.ca else "the file"
     return f"name {other} of the CA that the certificate of {broker.host} is of: {CA}=FILE"
@@ -413,14 +415,14 @@ def judge_presence(presence: Presence, now: float) -> Finding:
     return ok("name", f"{words}; its server is talk {server.get('version')}, process {server.get('pid')}")
 
 
-def judge_unknown(robot: str, known: tuple[str, ...], name: str, *, may: bool) -> Finding:
+def judge_unknown(robot: str, known: tuple[str, ...], name: str, *, privileged: bool) -> Finding:
     """Return the finding for a robot whose presence the broker doesn't have or doesn't send.
 
     Args:
         robot: the robot's name.
         known: the names of the robots that the broker knows.
         name: the user's name.
-        may: whether the user has all other rights.
+        privileged: whether the user has all other rights.
     """
     words = f"the broker knows no robot '{robot}'"
     by_lower = {each.lower(): each for each in known}
@@ -431,16 +433,16 @@ def judge_unknown(robot: str, known: tuple[str, ...], name: str, *, may: bool) -
     if known:
         return failure("name", f"{words}; it knows {join_names(known)}", step)
     words += f", or does not tell '{name}'"
-    if not may:
+    if not privileged:
         return warning("name", words, f"let '{name}' do what an operator does, and ask again")
     return failure("name", words, f"{step}; or let '{name}' read presence: talk bridge --print-acl")
 
 
 def judge_rights(name: str, rights: AccessRights) -> Finding:
     """Return the finding about the user's access rights."""
-    parts = [f"write {' and '.join(rights.unwritten)}"] if rights.unwritten else []
+    parts = [f"write {' and '.join(rights.unwritable)}"] if rights.unwritable else []
     # If the connection has broken, a missing message doesn't show that reading is forbidden.
-    parts += [f"read {' and '.join(rights.unread)}"] if rights.unread and rights.trouble is None else []
+    parts += [f"read {' and '.join(rights.unreadable)}"] if rights.unreadable and rights.trouble is None else []
     if parts:
         words = f"the broker does not let '{name}' {', nor '.join(parts)}"
         return failure("rights", words, "give the broker's acl_file the lines for that: talk bridge --print-acl")

@@ -280,11 +280,18 @@ PLAIN = Named("broker.example", 1883, tls=False)
 @pytest.mark.parametrize(
     ("broker", "connection", "near", "state", "words", "step"),
     [
-        (TLS, BrokerConnection(until=1e9 + 13 * 86400), False, "warning", "the system's CAs", "renew the certificate"),
-        (TLS, BrokerConnection(until=1e9 + 15 * 86400), False, "ok", "the system's CAs", "None"),
         (
             TLS,
-            BrokerConnection(untrusted="Hostname mismatch", fault=62),
+            BrokerConnection(expires_at=1e9 + 13 * 86400),
+            False,
+            "warning",
+            "the system's CAs",
+            "renew the certificate",
+        ),
+        (TLS, BrokerConnection(expires_at=1e9 + 15 * 86400), False, "ok", "the system's CAs", "None"),
+        (
+            TLS,
+            BrokerConnection(tls_error="Hostname mismatch", certificate_code=62),
             False,
             "failed",
             "mismatch",

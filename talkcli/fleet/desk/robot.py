@@ -280,7 +280,7 @@ class RobotConnection(Connection):
                 self._look_up(exchange, exchange.request, now)
             elif exchange.sent and isinstance(exchange.request, self.lasting):
                 # If the request were sent again, it could affect newer goals.
-                self.fail(exchange, self._lost(exchange, self.absence))
+                self.fail(exchange, self._lost_error(exchange, self.absence))
             else:
                 self._resend(exchange)
         if self.listeners.watched:
@@ -297,7 +297,7 @@ class RobotConnection(Connection):
         if isinstance(request, Say) and request.id in self._canceled:
             left, why = -1.0, "it was cancelled before the robot had heard of it"
         if left < 0 or exchange.resends > _MAX_RESENDS:
-            self.fail(exchange, self._lost(exchange, why))
+            self.fail(exchange, self._lost_error(exchange, why))
             return
         if isinstance(request, Say) and left:
             exchange.request = replace(request, ttl=left)
@@ -305,7 +305,7 @@ class RobotConnection(Connection):
         exchange.heard_at = time.monotonic()
         self._publish(exchange)
 
-    def _lost(self, exchange: Exchange, why: str) -> Lost:
+    def _lost_error(self, exchange: Exchange, why: str) -> Lost:
         words = f"{exchange.request.kind} was sent to the server at {self.path}, but {why}"
         return Lost(f"{words}; it may have been carried out")
 

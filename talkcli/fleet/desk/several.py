@@ -287,14 +287,14 @@ class FleetRequest:
             return
         self._include(robot, name)
         if (goal := self._rejected) is not None:
-            self._take([Outcome(name, goal.state.name, goal.exit_code or EXIT_OK, goal)])
+            self._record([Outcome(name, goal.state.name, goal.exit_code or EXIT_OK, goal)])
         elif not presence.online:
-            self._take([failure_outcome(name, ServerUnavailable(f"{name} is offline: nothing was sent"), "OFFLINE")])
+            self._record([failure_outcome(name, ServerUnavailable(f"{name} is offline: nothing was sent"), "OFFLINE")])
         elif self._selection.group is not None:
             robot.expect_reply(self._number, self._latest)
         elif presence.server is None:
             words = f"{name} has no talk server at this moment: nothing was sent"
-            self._take([failure_outcome(name, NoServer(words))])
+            self._record([failure_outcome(name, NoServer(words))])
         else:
             robot.send()
             self._update(name)
@@ -329,9 +329,9 @@ class FleetRequest:
     def _update(self, name: str, *, check_time: bool = False) -> None:
         """Collect the new outcomes of a robot."""
         if name in self._unfinished:
-            self._take(self._robots[name].new_outcomes(check_time=check_time))
+            self._record(self._robots[name].new_outcomes(check_time=check_time))
 
-    def _take(self, outcomes: list[Outcome]) -> None:
+    def _record(self, outcomes: list[Outcome]) -> None:
         self._outcomes += outcomes
         self._unfinished -= {each.robot for each in outcomes if each.last}
 

@@ -43,9 +43,9 @@ def robot_lines(robots: Sequence[RobotInfo], screen: Screen, now: float) -> list
     """
     rows = [_cells(each, screen, now) for each in robots]
     widths = {name: max(map(width, (name, *(cells[name][0] for cells in rows)))) for name in COLUMN_NAMES}
-    _fit(widths, screen.columns_left(0))
-    heading = _line({name: (name, None) for name in COLUMN_NAMES}, widths, Screen())
-    return [screen.coloured(heading, None), *(_line(cells, widths, screen) for cells in rows)]
+    _fit_columns(widths, screen.columns_left(0))
+    heading = _format_row({name: (name, None) for name in COLUMN_NAMES}, widths, Screen())
+    return [screen.coloured(heading, None), *(_format_row(cells, widths, screen) for cells in rows)]
 
 
 def _cells(robot: RobotInfo, screen: Screen, now: float) -> dict[str, Cell]:
@@ -65,7 +65,7 @@ def _cells(robot: RobotInfo, screen: Screen, now: float) -> dict[str, Cell]:
                 "QUEUE": (str(status.pending), None),
             }
         if presence.since is not None:
-            cells["SINCE"] = _age(now - presence.since), None
+            cells["SINCE"] = _format_age(now - presence.since), None
     if status.last is not None:
         cells["LAST"] = _last_cell(status.last, now)
     return cells
@@ -85,11 +85,11 @@ def _speaking_cell(status: RobotStatus) -> Cell:
 
 
 def _last_cell(goal: LastGoal, now: float) -> Cell:
-    age = "" if goal.at is None else f" {_age(now - goal.at)}"
+    age = "" if goal.at is None else f" {_format_age(now - goal.at)}"
     return f"{goal.state.name}{age}", goal.state
 
 
-def _age(seconds: float) -> str:
+def _format_age(seconds: float) -> str:
     """Return a duration in its largest unit. It may be negative if the robot's clock is ahead; then return `0 s`."""
     whole = max(0, int(seconds))
     for size, name in ((86400, "d"), (3600, "h"), (60, "min")):
@@ -98,7 +98,7 @@ def _age(seconds: float) -> str:
     return f"{whole} s"
 
 
-def _fit(widths: dict[str, int], room: int | None) -> None:
+def _fit_columns(widths: dict[str, int], room: int | None) -> None:
     """Narrow the column SPEAKING, and remove other columns, until a line fits into `room` characters."""
     longest = widths["SPEAKING"]
     if room is None:
@@ -113,7 +113,7 @@ def _fit(widths: dict[str, int], room: int | None) -> None:
             return
 
 
-def _line(cells: dict[str, Cell], widths: dict[str, int], screen: Screen) -> str:
+def _format_row(cells: dict[str, Cell], widths: dict[str, int], screen: Screen) -> str:
     shown = []
     for name, columns in widths.items():
         text, state = cells[name]

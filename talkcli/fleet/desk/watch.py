@@ -160,10 +160,10 @@ class FleetWatch:
         #: for each robot, the ids of the goals that were last reported as ended (key True) and as started (key False)
         self._reported: dict[str, dict[bool, str]] = {}
         #: robots that may have spoken while their events were missed, which their next status shows
-        self._unheard: set[str] = set()
+        self._maybe_missed: set[str] = set()
         #: the first messages on a new connection, until all retained ones have arrived; None after that
         self._retained: list[Message] | None = None
-        self._began = False
+        self._has_started = False
         #: since when the broker has been disconnected (monotonic), and why; None while it is connected
         self._away_since: float | None = time.monotonic()
         self._away_why = ""
@@ -217,7 +217,7 @@ class FleetWatch:
                 self._missing.pop(name, None)
                 self._set_presence(name, presence if presence and self._selects(presence) else None)
         elif kind == topics.STATUS:
-            if name in self._unheard:  # otherwise its events have more details
+            if name in self._maybe_missed:  # otherwise its events have more details
                 self._report_missed(name, RobotStatus.read(message.payload))
         elif (event := _read_event(message)) is not None:
             self._report(event)
@@ -231,11 +231,11 @@ class FleetWatch:
         """Handle every time limit that has passed."""
         if self._retained is not None and self._desk.retained_received:
             self._process_retained(self._retained, now)
-        if not self._began and self._desk.failure:
+        if not self._has_started and self._desk.failure:
             raise self._desk.failure
         if self._away_since is not None:
             away = now - self._away_since
-            if not self._began and away >= ANSWER_LIMIT_S:
+            if not self._has_started and away >= ANSWER_LIMIT_S:
                 raise self._desk.no_answer_error(ANSWER_LIMIT_S)
             if away >= ABSENCE_LIMIT_S:
                 raise Lost(f"the broker at {self._broker.url} was away for {ABSENCE_LIMIT_S:g} s: {self._away_why}")
@@ -250,21 +250,21 @@ class FleetWatch:
         self._retained = None
         robots = {each.presence.name: each for each in _robots_in(messages) if self._selects(each.presence)}
         events = [event for each in messages if (event := _read_event(each))]
-        if self._began:
+        if self._has_started:
             self._events.append(BrokerBack(now - (self._away_since or now)))
             gone = [name for name, each in self._presences.items() if each.online and name not in robots]
             self._missing = dict.fromkeys(gone, now + BRIDGES_BACK_LIMIT_S)
             for name, robot in robots.items():
                 self._set_presence(name, robot.presence)
         else:
-            self._began = True
+            self._has_started = True
             self._presences = {name: each.presence for name, each in robots.items()}
             self._events.append(FleetSnapshot(tuple(robots.values())))
         self._away_since = None
-        self._unheard = set(self._presences)
-        coming = {each.event.id for each in events}
+        self._maybe_missed = set(self._presences)
+        arrived = {each.event.id for each in events}
         for name, robot in robots.items():
-            self._report_missed(name, robot.status, coming)
+            self._report_missed(name, robot.status, arrived)
         for event in events:
             self._report(event)
 
@@ -274,26 +274,26 @@ class FleetWatch:
         if now:
             self._presences[name] = now
             if before is None or not before.online:
-                self._unheard.add(name)
+                self._maybe_missed.add(name)
         if _identity(before) != _identity(now):
             self._events.append(RobotChanged(name, before, now))
 
-    def _report_missed(self, name: str, status: RobotStatus | None, coming: Container[str | None] = ()) -> None:
+    def _report_missed(self, name: str, status: RobotStatus | None, arrived: Container[str | None] = ()) -> None:
         """Report the missed events that can be derived from a robot's status.
 
         Args:
             name: the robot's name.
             status: the robot's status; None if unknown.
-            coming: ids of goals whose events have arrived and will be reported next.
+            arrived: ids of goals whose events have arrived and will be reported next.
         """
         if status is None:
             return
         events, is_known, presence = status.events(), name in self._reported, self._presences.get(name)
         reported = self._reported.setdefault(name, {})
-        missed = [each for each in events if reported.get(each.state.terminal) != each.id and each.id not in coming]
+        missed = [each for each in events if reported.get(each.state.terminal) != each.id and each.id not in arrived]
         reported.update({each.state.terminal: each.id for each in events})
         if events:  # a bridge that has just started may not know any goals yet
-            self._unheard.discard(name)
+            self._maybe_missed.discard(name)
         if is_known and missed and presence and presence.online:
             self._events.append(EventsMissed(RobotInfo(presence, status), tuple(missed)))
 
