@@ -24,7 +24,7 @@ from talkcli.doctor.report import FAILURE, Finding, Question, failure, join_name
 from talkcli.doctor.server import format_span, summarize_server
 from talkcli.errors import ServerUnavailable, TalkError, UsageError
 from talkcli.fleet import topics
-from talkcli.fleet.broker import CA, URL, USER, Broker, client_user, from_environment, is_local
+from talkcli.fleet.broker import CA, URL, USER, client_user, from_environment, is_local
 from talkcli.fleet.desk.robot import connect_robot
 from talkcli.fleet.desk.watch import read_robots
 from talkcli.fleet.link import LOGIN_LIMIT_S, REASON_NOT_AUTHORIZED, Link
@@ -36,6 +36,7 @@ from talkcli.terminal.text import printable
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
+    from talkcli.fleet.broker import Broker
     from talkcli.goals.goal import JsonObject
 
 _Result = TypeVar("_Result")
