@@ -147,7 +147,7 @@ class LoadVoice:
 
 @frozen
 class DropVoice:
-    """Unload a neural voice, or do so after the current sentence if it uses the voice. Answered by `VoiceMemory`."""
+    """Unload a neural voice, but not before a sentence that uses it has ended. Answered by `VoiceMemory`."""
 
     voice: str  # voice ID without a speaker
 
@@ -197,7 +197,7 @@ class VoiceLoaded:
     """A neural voice was loaded, or loading failed."""
 
     voice: str  # voice ID without a speaker
-    seconds: float  # duration of the loading
+    seconds: float  # time that the loading took
     error: str | None = None  # human-readable error; None if the voice was loaded
 
 
@@ -275,8 +275,8 @@ class Ended:
     reason: Reason | None = None  # reason for the failure, if any
     message: str | None = None  # error message of the player or the engine, if the goal failed
     duration: float | None = None  # length of the audio in seconds; None unless the goal was completed
-    gaps: int = 0  # number of pauses caused by audio that was synthesized too late
-    gap_seconds: float = 0.0  # total length of these pauses
+    gaps: int = 0  # number of silent gaps caused by audio that was synthesized too late
+    gap_seconds: float = 0.0  # total length of these gaps
     player: str | None = None  # name of the player, if it was chosen automatically
 
 

@@ -1,4 +1,4 @@
-"""The use of pyttsx3: starting an engine, setting its properties for each goal, and `talk`'s own driver.
+"""Interface to pyttsx3: starting an engine, setting its properties for each goal, and `talk`'s own driver.
 
 `talk`'s own driver makes a synthesizer and the players available through pyttsx3's interface.
 """
@@ -99,7 +99,7 @@ def _start_engine(pyttsx3: Any, name: str, *, named: bool) -> Any:
     """Return pyttsx3's engine for a driver, with its loop started.
 
     Args:
-        pyttsx3: the module.
+        pyttsx3: the imported module.
         name: name of the driver.
         named: whether an option named the driver, which makes an unknown name a usage error.
     """
@@ -251,12 +251,12 @@ class DriverProperties:
 class Driver:
     """`talk`'s own driver for pyttsx3, which connects a synthesizer with a playback.
 
-    pyttsx3's DriverProxy calls its methods. It speaks a whole sentence in one step of `iterate`: the synthesizer writes
-    to the playback, which waits for the player. It must not raise exceptions while speaking, because pyttsx3 would drop
-    the sentence without an error.
+    pyttsx3's DriverProxy calls the methods. One step of `iterate` speaks a whole sentence: the synthesizer writes to
+    the playback, which waits for the player. An exception must not leave this step, because pyttsx3 would drop the
+    sentence without an error.
 
-    It sends pyttsx3's notifications. Results for which pyttsx3 has no field are set as attributes of the runner. It has
-    one property beyond pyttsx3's own: "pitch" (0 to 100).
+    The driver sends pyttsx3's notifications. Results for which they have no field are set as attributes of the runner.
+    In addition to pyttsx3's own properties, the driver has the property "pitch" (0 to 100).
     """
 
     def __init__(self, proxy: Any, synthesizer: Synthesizer, runner: GoalRunner) -> None:
@@ -268,10 +268,10 @@ class Driver:
         self._playback: Playback | None = None
 
     def iterate(self) -> Iterator[None]:
-        """Yield repeatedly. Each step speaks the waiting text, if there is one."""
+        """Yield endlessly. Before each yield, speak the stored text, if there is one."""
         while True:
             if self._text is None:
-                self._proxy.setBusy(False)  # pyttsx3 starts busy, and calls `say` with a waiting text only if not busy
+                self._proxy.setBusy(False)  # a busy driver gets no text from pyttsx3, and each driver starts as busy
             if self._text is None:
                 yield
                 continue
@@ -289,7 +289,7 @@ class Driver:
         if self._playback is not None:
             self._playback.stop()
 
-    #: Called when the proxy is deleted.
+    #: Called by pyttsx3 when the proxy is deleted.
     destroy = stop
 
     def getProperty(self, name: str) -> Any:  # noqa: N802 - pyttsx3's name

@@ -21,7 +21,7 @@ _PR_SET_PDEATHSIG = 1
 
 
 def main() -> None:
-    """Run the engine process until the server is gone or an error ends it."""
+    """Run the engine process until the server disconnects or the engine can't continue."""
     _die_with_parent()
     _limit_core_dump()
     _limit_memory()
@@ -50,7 +50,7 @@ def main() -> None:
         runner.run(send_voices=configure.list_voices)
     except CannotStart as error:
         channel.send(error.failure)
-    except CannotEnd as error:  # the server detects that a player is left, and starts another process
+    except CannotEnd as error:  # the server detects that a player is still running, and starts another process
         sys.stderr.write(f"{error}\n")
     threading = sys.modules.get("threading")
     if threading and threading.active_count() > 1:  # a thread may still be loading a voice or running a model

@@ -36,8 +36,8 @@ PROGRESS_CHECK_INTERVAL_S = 0.1
 #: Time allowed for a player to exit after the end of the audio. It covers the same delays as `STALL_LIMIT_S`.
 DRAIN_LIMIT_S = 3.0
 
-#: Maximum time by which a player may end before its audio should. Sound cards have inexact clocks, and players cut off
-#: silence at the end. A sentence ends with a longer pause, so nothing audible is missing.
+#: Maximum time by which a player may end before the calculated end of its audio. Sound cards have inexact clocks, and
+#: players cut off silence at the end. A sentence ends with a longer silence, so nothing audible is missing.
 EARLY_END_LIMIT_S = 0.25
 
 #: Time for which opening a busy device is retried, because another program, such as `talk doctor --silent`, may use the
@@ -59,8 +59,8 @@ HOLD_SILENCE_LIMIT_S = 0.15
 #: Maximum time by which the word clock may be ahead of the sound. Measurements show 4 to 8 ms.
 CLOCK_ERROR_S = 0.01
 
-#: Maximum length of a pause caused by late samples that doesn't count as a gap. It is inaudible, and the clock isn't
-#: more precise.
+#: Maximum length of a silence caused by late samples that doesn't count as a gap. Such a silence is inaudible, and the
+#: clock can't measure it precisely.
 INAUDIBLE_GAP_S = 0.05
 
 #: Length of the sound that is repeated after a player was killed with sound in its buffer. It compensates for the
@@ -71,7 +71,7 @@ REPEATED_SOUND_S = 0.03
 #: During a longer one, other programs can use the device, and the device can sleep.
 RELEASE_DELAY_S = 10.0
 
-#: Minimum amount of sound that a player has buffered. With a configured buffer of 60 ms, measurements show 42 to 78 ms
+#: Minimum amount of sound in a player's buffer. With a configured buffer of 60 ms, measurements show 42 to 78 ms
 #: for aplay and 25 to 60 ms for pacat.
 MIN_PLAYER_BUFFER_S = 0.02
 
@@ -84,7 +84,7 @@ MAX_QUIET_LEVEL = 16
 class SentenceSamples:
     """A buffer for the samples of one sentence.
 
-    Places are in bytes from the beginning of the sentence. Samples are added at the end, and dropped from the beginning
+    Offsets are in bytes from the beginning of the sentence. Samples are added at the end, and dropped from the front
     after they were heard. A long text therefore takes no more memory than a short one.
     """
 
@@ -92,14 +92,14 @@ class SentenceSamples:
         self._kept = bytearray()
         #: whether the sentence has had any sound or any word
         self.audible = False
-        #: place of the first sample in the buffer
+        #: offset of the first sample in the buffer
         self.begin = 0
         #: number of bytes of silence at the end, including samples already dropped
         self._quiet = 0
 
     @property
     def end(self) -> int:
-        """Place after the last sample added so far."""
+        """Offset after the last sample added so far."""
         return self.begin + len(self._kept)
 
     def add(self, samples: bytes) -> None:
@@ -115,13 +115,13 @@ class SentenceSamples:
         return (len(self._kept) - len(self._kept.lstrip(b"\0"))) // SAMPLE_BYTES * SAMPLE_BYTES
 
     def part(self, begin: int, end: int) -> memoryview:
-        """Return the samples between two places. Release the view before adding or dropping samples."""
+        """Return the samples between two offsets. Release the view before adding or dropping samples."""
         return memoryview(self._kept)[begin - self.begin : end - self.begin]
 
-    def drop_until(self, place: int) -> None:
-        """Drop the samples before this place."""
-        del self._kept[: place - self.begin]
-        self.begin = place
+    def drop_until(self, offset: int) -> None:
+        """Drop the samples before this offset."""
+        del self._kept[: offset - self.begin]
+        self.begin = offset
 
     def trailing_silence(self, limit: int) -> int:
         """Return the length in bytes of the silence at the end of the buffer, at most `limit`."""
@@ -252,8 +252,8 @@ class Playback:
         #: all samples until the player is known to work, and from then on the samples not heard yet
         self._samples = SentenceSamples()
         self._complete = False  # whether all samples were written
-        self._begin = 0  # place of the current player's first sample
-        self._sent = 0  # place after the last sample accepted by the player
+        self._begin = 0  # offset of the current player's first sample
+        self._sent = 0  # offset after the last sample accepted by the player
         self._start_reported = False  # whether the beginning of the sentence was reported
         self._stopped = False
         #: whether `_skipped` is final
@@ -266,7 +266,7 @@ class Playback:
         self._in_background = False
         #: length in seconds of each gap that late samples have caused
         self.gaps: list[float] = []
-        #: time since which the player of a held sentence plays silence
+        #: time at which the player of a held sentence started to play silence
         self._silent_at: float | None = None
 
     # -- methods for the synthesizer
@@ -292,7 +292,7 @@ class Playback:
                 self._untried = self._first_error = None
 
     def word(self, start: int, length: int, position: float) -> None:
-        """Add a word, to be reported when it is heard.
+        """Schedule a word to be reported when it is heard.
 
         Args:
             start: offset of the word in the text.
@@ -406,7 +406,7 @@ class Playback:
         """
         feed = self._feed
         if feed is not None and feed.player.real_time and self._runner.hold_number:
-            self._rewind(feed)  # the sentence tries to continue with another player after the hold
+            self._rewind(feed)  # after the hold, the sentence continues with another player
             return
         first = self._first_error
         if first is None or first.reason == Reason.NO_PLAYER:  # a failed player's error is more useful
@@ -431,7 +431,7 @@ class Playback:
         return time.monotonic() < self._busy_until
 
     def _release_player(self, begin: int) -> None:
-        """Release the player. The next player continues at the place `begin`."""
+        """Release the player. The next player continues at the offset `begin`."""
         feed, self._begin, self._sent = self._feed, begin, begin
         if feed is not None and feed.player.proven:
             self._players.last_player = feed.player.name  # will be tried first
@@ -453,14 +453,14 @@ class Playback:
             if self._runner.hold_number:
                 self._keep_silent(feed)
             if self._sent == self._audible_end(feed):
-                self._update(feed)  # it may take long until the next samples arrive
+                self._update(feed)  # the next samples may take long to arrive
                 return
             taken = self._offer(feed)
             self._update(feed)
             if taken:
                 continue
             limit = FIRST_SOUND_LIMIT_S if feed.consumed == 0 else STALL_LIMIT_S
-            due = feed.progress_at + limit if feed.player.real_time else None  # a stream's reader may be slow
+            due = feed.progress_at + limit if feed.player.real_time else None  # a pipe's reader may be slow
             self._wait_for(feed, due)
             if due and time.monotonic() >= due and not self._runner.hold_number and not self._offer(feed):
                 raise CannotSpeak(Reason.AUDIO_STALLED, f"{feed.player.name} took no sound for {limit:g} s")
@@ -501,10 +501,10 @@ class Playback:
     # -- samples
 
     def _find_start(self) -> bool:
-        """Decide how many zero samples to skip at the beginning, and return whether that is possible yet.
+        """Decide how many zero samples to skip at the beginning, and return whether a decision was possible.
 
-        Zeros before the first sound are skipped, so that it is heard earlier. They are kept in a file, and after
-        another sentence, because they are part of the pause between the two sentences.
+        Zeros before the first sound are skipped, so that it is heard earlier. They are kept in a file. They are also
+        kept after another sentence, because they are part of the silence between the two sentences.
         """
         if self._start_known:
             return True
@@ -534,7 +534,7 @@ class Playback:
         return taken
 
     def _audible_end(self, feed: PlayerFeed) -> int:
-        """Return the place up to which to play now.
+        """Return the offset up to which to play now.
 
         Silence at the end is held back, because it is shortened if another goal is waiting.
         """
@@ -561,12 +561,12 @@ class Playback:
         self._report_words(self._clock.pop_started(now) if player.real_time else self._clock.pop_all())
 
     def _report_words(self, words: list[TimedWord]) -> None:
-        """Report words. Their positions are relative to the first sample played."""
+        """Report words, with their positions relative to the first sample played."""
         for word in words:
             self._on_word(replace(word, position=word.position - self._seconds(self._skipped)))
 
     def _unheard_begin(self) -> int:
-        """Return the place of the first sample that may not have been heard."""
+        """Return the offset of the first sample that may not have been heard."""
         heard = self._clock.heard_position(time.monotonic()) - REPEATED_SOUND_S
         return min(self._sent, max(self._begin, self._samples.begin, int(max(0.0, heard) * self._rate) * SAMPLE_BYTES))
 
@@ -596,7 +596,7 @@ class Playback:
                 release_at = 0.0  # a player that fails during a hold is replaced
             due = min(release_at, feed.progress_at + STALL_LIMIT_S)
             if time.monotonic() >= due:
-                self._release_player(self._sent)  # everything up to here was heard
+                self._release_player(self._sent)  # everything sent so far was heard
                 raise _PlayerReleased
             if not taken:
                 self._wait_for(feed, due)

@@ -87,7 +87,7 @@ class ActiveGoal:
         self.id = command.id
         self.command = command
         self.words = WordFinder(command.text)
-        #: time at which the goal started, plus the time for which it was held
+        #: time at which the goal started, plus the duration of its holds
         self.began_at = now
         #: time at which the driver last received text or reported a word
         self.progress_at = now
@@ -111,7 +111,7 @@ class ActiveGoal:
         self.confirmed_hold = 0
         #: the first error that the driver reported
         self.error: Exception | None = None
-        #: whether a driver that takes too long was logged
+        #: whether it was logged that the driver takes too long
         self.overdue_logged = False
 
 
@@ -178,7 +178,7 @@ class GoalRunner:
             if send_voices:
                 try:
                     voices = list_voices(self._engine)
-                except Exception:  # noqa: BLE001 - a third-party driver may raise anything, and may speak all the same
+                except Exception:  # noqa: BLE001 - a third-party driver may raise anything, and can speak without the list
                     traceback.print_exc()
                     voices = ()
                 self._channel.send(protocol.VoiceList(voices))
@@ -290,7 +290,7 @@ class GoalRunner:
         self.hold_number, self.duration, self.gaps = 0, None, []
         self.players.begin(command)
         self._channel.send(protocol.Started(command.id))
-        # Commands for this goal may have arrived before it started.
+        # Commands for this goal may have been received together with it.
         backlog, self._backlog = self._backlog, deque()
         for each in backlog:
             self._execute(each)

@@ -23,8 +23,8 @@ _END_MARKS = ".,;:!?…"
 def count_letters(text: str, start: int) -> int:
     """Return the number of consecutive letters and digits that begin at `start`, including combining accents.
 
-    It is the length of a word if libespeak-ng reports a length of 0. libespeak-ng does so if a non-ASCII character
-    follows the word (as in "«hello»"), and also if there is no word at all.
+    It is used as the length of a word if libespeak-ng reports a length of 0. libespeak-ng does so if the next character
+    isn't ASCII (as in "«hello»"), and also if there is no word at all.
     """
     end = start
     while 0 <= end < len(text) and (text[end].isalnum() or unicodedata.category(text[end]).startswith("M")):
@@ -101,7 +101,7 @@ class WordClock:
         self._started_at: float | None = None
         #: position in the audio at which the stream begins, in seconds
         self._begin = 0.0
-        #: pauses in the stream: the position in the audio after each pause, and its length in seconds
+        #: silence in the stream, as pairs of the position in the audio that follows and the length in seconds
         self._silences: list[tuple[float, float]] = []
 
     def add(self, word: TimedWord) -> None:
@@ -123,7 +123,7 @@ class WordClock:
         self._started_at = now
 
     def add_silence(self, position: float, seconds: float) -> None:
-        """Record a pause in the stream before this position in the audio. Positions must not decrease."""
+        """Record silence in the stream before this position in the audio. Positions must not decrease."""
         if self._silences and self._silences[-1][0] == position:
             seconds += self._silences.pop()[1]
         self._silences.append((position, seconds))
@@ -138,11 +138,11 @@ class WordClock:
             self._started_at = now - elapsed
 
     def elapsed(self, now: float) -> float:
-        """Return the number of seconds heard, including pauses."""
+        """Return the number of seconds heard, including silence."""
         return 0.0 if self._started_at is None else now - self._started_at
 
     def heard_position(self, now: float) -> float:
-        """Return the position in the audio up to which it was heard."""
+        """Return the position up to which the audio was heard."""
         position = self._begin + self.elapsed(now)
         for before, seconds in self._silences:
             if position <= before:

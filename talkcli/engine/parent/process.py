@@ -1,7 +1,7 @@
-"""Control of an engine process by its parent: start it, exchange messages with it, and kill it.
+"""The parent's side of an engine process: starting it, exchanging messages with it and killing it.
 
 `EngineProcess` never blocks for long and makes no decisions, so that the supervisor can use it in an event loop.
-`PrivateEngine` is for callers that want to have a few texts spoken and wait for each of them.
+`PrivateEngine` is for callers that have only a few texts and can block until each of them is spoken.
 
 A liveness pipe proves that the engine is silent. The engine process and its player inherit the write end, and nobody
 writes to it. The read end therefore reports end of file exactly when both have exited, for whatever reason.
@@ -37,14 +37,15 @@ if TYPE_CHECKING:
 _SERVER_VARIABLES = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID", "LISTEN_FDS", "LISTEN_PID", "LISTEN_FDNAMES")
 #: Size of the socket's send buffer. Even with escapes, the longest text fits several times.
 _SEND_BUFFER_BYTES = 512 * 1024
-#: Time allowed for a process to exit on its own after it closed its connection. Its exit status is then its own.
+#: Time allowed for a process to exit on its own after it closed its connection. Killing it earlier would hide its exit
+#: status.
 _EXIT_WAIT_S = 0.2
 #: Maximum length of a line from standard error. The rest of a longer line is discarded.
 MAX_STDERR_LINE_BYTES = 1000
 
 
 def engine_command() -> list[str]:
-    """Return the command line of the engine process, which gets this process's interpreter and import path."""
+    """Return the command that starts an engine process with this process's interpreter and import path."""
     code = f"import sys; sys.path[:] = {sys.path!r}; from talkcli.engine.child.main import main; main()"
     return [sys.executable, "-c", code]
 
@@ -158,8 +159,8 @@ class EngineProcess:
     def kill(self) -> None:
         """Kill the process, its player, and everything that the player has started.
 
-        Process group and session IDs can't be reused until the process is reaped. The liveness pipe finds processes
-        that have left both the process group and the session.
+        Process group and session IDs can't be reused until the process is reaped. Processes that have left both the
+        group and the session are found through the liveness pipe.
         """
         if self._process.returncode is None:
             kill([-self.pid])
@@ -204,7 +205,7 @@ class EngineFailed(Exception):
 
     Attributes:
         reason: machine-readable reason, as in a goal. For ENGINE_CRASHED, the message describes how the process exited.
-        silent_s: number of seconds without a message, if that is the failure; otherwise None.
+        silent_s: the exceeded time limit for a message, in seconds; None for any other failure.
     """
 
     def __init__(self, reason: Reason, message: str, silent_s: float | None = None) -> None:
@@ -216,9 +217,8 @@ class EngineFailed(Exception):
 class PrivateEngine:
     """An engine process for a single caller, as a context manager.
 
-    It speaks one text at a time and blocks the caller's thread while waiting. It enforces the time limits in
-    `protocol`. After the context is left, the process and its player are no longer running, even after an error.
-    `say -o` and `talk doctor` use this class.
+    It speaks one text at a time, blocks the caller's thread while waiting, and enforces the time limits in `protocol`.
+    Leaving the context kills the process and its player. `say -o` and `talk doctor` use this class.
     """
 
     def __init__(

@@ -37,8 +37,8 @@ _FILE_REASONS = frozenset({Reason.AUDIO_DEVICE, Reason.AUDIO_LOST})
 STANDARD_OUTPUT = frozenset({"-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"})
 #: Interval for checking whether a named pipe has a reader, because no event signals this.
 _READER_CHECK_INTERVAL_S = 0.05
-#: Maximum length of the text in one `Speak`. It is the maximum length of a goal, because the engine sends no messages
-#: while it prepares a text.
+#: Maximum length of the text in one `Speak`, which is the same as for a goal. The engine sends no messages while it
+#: prepares a text, so a longer text could be mistaken for a hang.
 MAX_PIECE_CHARS = MAX_TEXT_CHARS
 #: The end of a sentence or a line. Cutting a text there doesn't change how it sounds.
 _SENTENCE_END = re.compile(r"""[.!?…]["')\]»”’]*\s+|[。！？।]|\n\s*""")
@@ -46,7 +46,7 @@ _BLANK = re.compile(r"\s+")
 
 
 class RenderFailed(TalkError):
-    """The text was not rendered, and no file was created. `code` is the reason, or "cannot_write"."""
+    """The text was not rendered, and no file was created. `code` is a goal's reason or "cannot_write"."""
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
@@ -256,7 +256,7 @@ def _hidden_file(path: str) -> Iterator[str]:
         yield hidden
         try:
             with open(hidden, "rb") as file:
-                os.fsync(file)  # for power cuts, and because some file systems report a full disk only now
+                os.fsync(file)  # protects against power cuts, and makes some file systems report a full disk
             os.replace(hidden, target)
         except OSError as error:
             raise _write_failure(path, error) from error
@@ -293,7 +293,7 @@ def _resolve_target(path: str) -> str:
 
 
 def _is_own_output(found: os.stat_result) -> bool:
-    """Return whether standard output or standard error of this process is the file. It can't be replaced then."""
+    """Return whether the file is this process's standard output or standard error, so that it can't be replaced."""
     for descriptor in (1, 2):
         with contextlib.suppress(OSError):  # the descriptor is closed
             if os.path.samestat(found, os.fstat(descriptor)):

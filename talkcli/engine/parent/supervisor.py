@@ -31,7 +31,7 @@ RESTART_DELAYS_S = (0.0, 0.1, 0.5, 2.0, 10.0)
 #: driver may write a line for each word.
 MAX_STDERR_LINES = 20
 STDERR_PERIOD_S = 60.0
-#: Age below which a process has ended too soon, unless it had a goal.
+#: Minimum lifetime of a process. If it ends earlier and had no goal, the next start may be delayed.
 MIN_LIFETIME_S = 1.0
 #: Time without a ready process after which each failed start also fails a goal. Otherwise, goals would wait forever.
 ENGINE_WAIT_LIMIT_S = 10.0
@@ -70,7 +70,7 @@ Report = protocol.Event | EngineDied | EngineMissing | EngineSaid | ThreadDied
 
 
 class ActionQueue:
-    """A queue of functions that other threads want a waiting thread to call.
+    """A queue of actions that other threads submit to a thread that waits for descriptors.
 
     `call` may be used from any thread. Only the waiting thread may use the other methods.
     """
@@ -199,7 +199,7 @@ class SupervisedGoal:
     last_sign_at: float | None = None
     #: whether the process has sent `Started`
     started: bool = False
-    #: whether a process crashed before it started the goal, so that the goal is sent to another one
+    #: whether the goal was retried because a process crashed before it started the goal
     retried: bool = False
     #: time at which a `Stop` was sent
     stop_sent_at: float | None = None
@@ -276,9 +276,10 @@ class Supervisor:
         self._actions.call(lambda: self._hold_goal(goal_id, None))
 
     def announce_next(self, goal_id: str, next_waits: bool, next_is_neural: bool) -> None:
-        """Tell the process whether another goal is waiting, so that it can shorten the silence at the end of this one.
+        """Tell the process whether another goal is waiting behind this one.
 
-        If the message can't be sent, it is dropped, because the silence matters little.
+        If so, the process shortens the silence between the two. A message that can't be sent is dropped, because it
+        isn't important.
         """
         process = self._direct_process
         if process:
@@ -298,7 +299,7 @@ class Supervisor:
         self._actions.call(lambda: self._give_up_goal(goal_id))
 
     def close(self) -> None:
-        """Make the thread kill the process and exit."""
+        """Have the thread kill the process and exit."""
         self._closing = True
         self._actions.call(lambda: None)
 
@@ -308,8 +309,8 @@ class Supervisor:
         """Run until `close` is called. Report an unexpected exception, because otherwise goals would wait forever."""
         try:
             while not self._closing:
-                # Taken before reading. If this machine was suspended, a deadline may have passed although the message
-                # has arrived. The message is read in this round, and the deadline is checked in the next.
+                # The time is taken before reading. After the machine was suspended, a deadline may have passed although
+                # a message has arrived. In this way, the message is read before the deadline is checked.
                 now = time.monotonic()
                 for key in self._actions.wait(self._next_deadline()):
                     self._handle_ready(key)
@@ -352,14 +353,14 @@ class Supervisor:
             if now < process.exit_deadline:
                 continue
             process.exit_deadline = NEVER  # checked only once; the process is still reaped when it exits
-            process.kill()  # the first kill may have missed processes if descriptors were short
+            process.kill()  # the first kill may have missed processes for lack of a free descriptor
             if self._goal and self._goal.lost_process is process:
                 message = f"the player could not be ended within {KILL_LIMIT_S:g} s"
                 self._fail_goal(self._goal, Reason.NOT_SILENT, message)
 
     def _handle_ready(self, key: selectors.SelectorKey) -> None:
         if key.fd not in self._selector.get_map():
-            return  # closed while an earlier key was handled
+            return  # the descriptor was closed while an earlier one was handled
         process: EngineProcess = key.data
         if key.fd == process.liveness:
             if process is self._process:
@@ -381,7 +382,7 @@ class Supervisor:
         return self._goal if self._goal and self._goal.command.id == goal_id else None
 
     def _begin_goal(self, command: protocol.GoalCommand, sent_to: EngineProcess | None, at: float) -> None:
-        """Make this the current goal, and send it to the process unless the caller of `speak` has sent it.
+        """Make this the current goal, and send it to the process unless `speak` has sent it.
 
         Args:
             command: the goal.
@@ -406,7 +407,7 @@ class Supervisor:
                 self._requeue_goal(goal.command.id, process)
 
     def _requeue_goal(self, goal_id: str, process: EngineProcess) -> None:
-        """Keep a goal that could not be sent for the next process."""
+        """Keep a goal that could not be sent, so that the next process gets it."""
         if process is self._process:
             goal = self._current(goal_id)
             if goal:
@@ -416,7 +417,7 @@ class Supervisor:
     def _send_voice_command(self, command: protocol.LoadVoice | protocol.DropVoice) -> None:
         """Send a command for a voice if a process is ready. Otherwise, drop it.
 
-        The server sends its commands for voices to each new process again.
+        The server sends such commands again whenever a new process becomes ready.
         """
         process = self._process
         if process and process.ready:
@@ -500,7 +501,7 @@ class Supervisor:
     def _receive(self, process: EngineProcess) -> None:
         """Handle the messages that have arrived from the process."""
         for event in process.receive():
-            self._actions.run()  # `_begin_goal` may still be waiting there for the goal of this event
+            self._actions.run()  # the goal of this event may still be in the queue of actions
             if process is not self._process:
                 return
             if event is None:
@@ -515,7 +516,7 @@ class Supervisor:
     def _handle_event(self, process: EngineProcess, event: protocol.Event) -> None:
         self._last_sign_at = time.monotonic()
         if isinstance(event, protocol.GoalEvent):
-            if self._goal and self._goal.sent and event.id == self._goal.command.id:  # not an earlier goal
+            if self._goal and self._goal.sent and event.id == self._goal.command.id:  # otherwise, ignore it
                 process.had_goal = True
                 self._handle_goal_event(self._goal, event)
             return
@@ -528,7 +529,7 @@ class Supervisor:
         elif isinstance(event, protocol.VoiceLoaded) and event.voice == self._loading:
             self._loading = None
         elif isinstance(event, protocol.VoiceList):
-            self._configure = replace(self._configure, list_voices=False)  # later processes needn't send it
+            self._configure = replace(self._configure, list_voices=False)  # later processes needn't list them
         self._post(event)
         self._send_goal()
 
