@@ -17,7 +17,7 @@ from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.reasons import Reason
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
     from talkcli.engine.child.players.base import Interest, Player
     from talkcli.engine.child.runner import GoalRunner
@@ -241,7 +241,6 @@ class Playback:
         """
         self._runner = runner
         self._players = runner.players
-        self._wait = runner.wait
         self._on_word = on_word
         self._rate = 0
         #: functions that open the players that have not been tried yet, best first; None to try all players
@@ -306,7 +305,6 @@ class Playback:
         """Play samples. Return when the player has accepted them, or at once while everything so far is silent."""
         self._samples.add(samples)
         self._wait((), 0.0)  # checks for a stop, because writing to a file never waits
-        self._check_stopped()
         if self._samples.audible and self._find_start():
             self._with_player(self._send_all)
 
@@ -322,7 +320,6 @@ class Playback:
             return
         self._await_continue()
         self._wait((more,), None)
-        self._check_stopped()
 
     # -- methods for the driver
 
@@ -364,7 +361,7 @@ class Playback:
         while not player.gone():
             if time.monotonic() >= deadline:
                 raise CannotEnd(f"{player.name} could not be ended within {PLAYER_KILL_LIMIT_S:g} s")
-            self._wait((), time.monotonic() + PIECE_S)
+            self._runner.wait((), time.monotonic() + PIECE_S)
         if player.real_time and player.proven:
             self._players.device_released(self._silent_at)
         self._feed = None
@@ -635,7 +632,6 @@ class Playback:
         while self._runner.hold_number:
             self._runner.confirm_hold()
             self._wait((), None)
-            self._check_stopped()
 
     def _wait_for(self, feed: PlayerFeed, until: float | None, more: Interest | None = None) -> None:
         """Wait for the player or a monotonic time.
@@ -655,6 +651,10 @@ class Playback:
         interests = [each for each in player.interests() if not (idle and each[1] == select.POLLOUT)]
         interests += [] if more is None else [more]
         self._wait(interests, min((moment for moment in moments if moment is not None), default=None))
+
+    def _wait(self, interests: Sequence[Interest], until: float | None) -> None:
+        """Wait in the runner. If the sentence was stopped in the meantime, raise Stopped."""
+        self._runner.wait(interests, until)
         self._check_stopped()
 
     def _check_stopped(self) -> None:

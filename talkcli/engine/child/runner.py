@@ -178,7 +178,7 @@ class GoalRunner:
             if send_voices:
                 try:
                     voices = list_voices(self._engine)
-                except Exception:  # noqa: BLE001 - a third-party driver may raise anything, and can speak without the list
+                except Exception:  # noqa: BLE001 - a third-party driver may raise any error, yet be able to speak
                     traceback.print_exc()
                     voices = ()
                 self._channel.send(protocol.VoiceList(voices))
