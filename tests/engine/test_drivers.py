@@ -1,4 +1,4 @@
-"""Starting the engine with pyttsx3's drivers: others', and our own as pyttsx3 sees it."""
+"""Tests for pyttsx3's drivers: third-party drivers in an engine process, and talk's own driver in pyttsx3."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from talkcli.engine.child.runner import GoalRunner
     from talkcli.engine.child.synthesizers.base import SampleSink, SpeechSettings, Synthesizer
 
-#: The parts of a driver that all have here: it has no properties, and puts itself among pyttsx3's.
+#: The common part of all drivers here. It has no properties, and registers the driver with pyttsx3.
 _DRIVER = """
 import re, time, types
 class Base:
@@ -67,7 +67,7 @@ module.buildDriver = Driver
 sys.modules[module.__name__] = module
 """
 
-#: A driver like macOS's: it speaks by itself, gives words as names, and confirms a stop some time later.
+#: A driver like that of macOS. It speaks on its own, reports words as names, and confirms a stop after some time.
 SLOW_DRIVER = _DRIVER.format(
     name="slow",
     driver="""
@@ -83,7 +83,7 @@ class Driver(Base):
 """,
 )
 
-#: A driver that reports each word as it says it, 0.1 s a word, and writes each text to standard error.
+#: A driver that takes 0.1 s for a word, reports each word, and writes each text to standard error.
 TIMED_DRIVER = _DRIVER.format(
     name="timed",
     driver="""
@@ -97,7 +97,7 @@ class Driver(Base):
 """,
 )
 
-#: A system whose library is not there.
+#: A system without libespeak-ng.
 NO_LIBRARY = """
 import ctypes
 class Missing(ctypes.CDLL):
@@ -168,7 +168,7 @@ def _timed(text: str = "battery low, please come home") -> Spawned:
 
 
 def _texts(engine: Spawned) -> list[str]:
-    """Return the texts that the driver was told to say; ends the process."""
+    """End the process, and return the texts that the driver got."""
     engine.leave()
     return engine.errors().splitlines()
 
@@ -244,7 +244,7 @@ def test_a_driver_that_never_ends_shows_no_sign_of_life_after_a_while() -> None:
 
 
 def _processor(pid: int) -> float:
-    """Return the seconds of processor time that a process has used."""
+    """Return the processor time that a process has used, in seconds."""
     with open(f"/proc/{pid}/stat", encoding="ascii", errors="replace") as file:
         fields = file.read().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
@@ -258,7 +258,7 @@ def test_the_wheels_library_serves_if_the_system_has_none() -> None:
         assert engine.spoken("yes").outcome == protocol.OUTCOME_COMPLETED
 
 
-#: A library that has not even talk's own voice.
+#: A library that lacks even the default voice.
 WITHOUT_ENGLISH = """
 from talkcli.engine.child.synthesizers import espeak
 load_library = espeak.load_library
@@ -325,16 +325,16 @@ def test_espeak_means_talks_own_driver() -> None:
         assert engine.spoken("yes").outcome == protocol.OUTCOME_COMPLETED
 
 
-# -- our own driver
+# -- talk's own driver
 
 
 _NAME = "talk_scripted"
 
 
 class Told:
-    """An engine of pyttsx3's with our driver, and all that it has notified, with the times that went beside it.
+    """An engine of pyttsx3 with talk's own driver, which records all notifications.
 
-    For the driver it is the session.
+    It stands in for the runner.
     """
 
     def __init__(self, player: str = "null", synthesizer: Synthesizer | None = None) -> None:
@@ -342,7 +342,7 @@ class Told:
         self.position: float | None = None
         self.duration: float | None = None
         self.beside: list[tuple[float | None, float | None]] = []
-        #: called when a word is told, and in each wait
+        #: called for each word, and in each wait
         self.at_word: Callable[[], None] = lambda: None
         self.at_wait: Callable[[], None] = lambda: None
         self.players = PlayerChooser(protocol.Configure(0, None, player, None, None))
@@ -373,7 +373,7 @@ class Told:
         pass
 
     def spoken(self, text: str, name: str) -> list[tuple[str, dict[str, Any]]]:
-        """Speak as talk does, and return the notifications."""
+        """Speak a text as the runner does, and return the notifications."""
         self.told.clear()
         self.beside.clear()
         self.engine.say(text, name)
@@ -446,7 +446,7 @@ def test_its_properties_are_pyttsx3s_and_pitch(told: Told) -> None:
     ("name", "value", "kind"), [("speed", 3, KeyError), ("voice", "three", UnknownVoice), ("rate", "fast", ValueError)]
 )
 def test_a_wrong_property_is_an_error(told: Told, name: str, value: object, kind: type[Exception]) -> None:
-    """And changes nothing."""
+    """It doesn't change any property."""
     told.engine.iterate()
     told.engine.setProperty(name, value)
     ((topic, values),) = told.told
@@ -456,17 +456,17 @@ def test_a_wrong_property_is_an_error(told: Told, name: str, value: object, kind
 
 
 class Thinking(Scripted):
-    """Has a little, and then nothing for long, like a synthesizer that computes."""
+    """A synthesizer that writes a few samples and then computes for a long time."""
 
     def speak(self, text: str, sound: SpeechSettings, output: SampleSink) -> None:  # noqa: ARG002 - no text is spoken
         output.begin(self._RATE, "scripted")
         tone = array("h", [9000 if each % 100 < 50 else -9000 for each in range(self._RATE // 5)]).tobytes()
         output.word(0, 1, 0.0)
-        output.word(2, 1, 0.16)  # when all of it has been taken, but not been heard
+        output.word(2, 1, 0.16)  # all samples were accepted, but not heard
         output.write(tone)
         for _ in range(200):
             output.write(b"")
-            time.sleep(0.005)  # it computes
+            time.sleep(0.005)  # the computation
 
 
 @limits()

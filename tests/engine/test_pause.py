@@ -1,4 +1,4 @@
-"""A sentence that is paused and goes on: nothing is lost, nothing is said twice, words stay in time.
+"""Tests for held sentences: nothing is lost or repeated, and words are reported on time.
 
 What is heard at a sound server is compared in `conformance/test_heard_pausing.py`.
 """
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 TEXT = "one two three four five six seven"
 
-#: A player that takes all it gets at once, plays it in real time, and writes it to a file of its own.
+#: A player that accepts everything at once, plays it in real time, and writes it to a file.
 DEEP = """
 import os, sys, time
 heard = open(f"{sys.argv[1]}.{os.getpid()}", "ab", buffering=0)
@@ -66,7 +66,7 @@ def test_words_stand_still_in_a_pause_and_signs_of_life_go_on(player: Player, pr
             late.append(time.monotonic() - event.time)
             if event.number == 3:
                 engine.pause()
-                before, last = len(late), time.monotonic()  # one more, if it came in the meantime, is not looked at
+                before, last = len(late), time.monotonic()  # a word that arrived in the meantime is ignored
                 for _ in range(3):
                     assert isinstance(engine.event(), protocol.Alive), "a word was heard while it was paused"
                     assert_within(time.monotonic() - last, alive_every + 0.2, "a sign of life")
@@ -208,7 +208,7 @@ def test_a_pause_when_only_the_end_is_left_lets_it_end(player: Player) -> None:
     with Spawned(player.plays(after=f"open({str(mark)!r}, 'w'); time.sleep(0.3)")) as engine:
         engine.say("yes")
         while not mark.exists():
-            time.sleep(0.002)  # what another process does is no event
+            time.sleep(0.002)  # no event reports what another process does
         engine.send(protocol.Hold("g1", 1))
         assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
         assert not any(isinstance(event, protocol.Held) for event in engine.events)
@@ -216,7 +216,7 @@ def test_a_pause_when_only_the_end_is_left_lets_it_end(player: Player) -> None:
 
 @pytest.mark.parametrize("held", ["before", "within"])
 def test_no_silence_is_written_to_a_file(tmp_path: Path, held: str) -> None:
-    text, rate = TEXT if held == "before" else " ".join([TEXT] * 60), 200  # at which it is made the quickest
+    text, rate = TEXT if held == "before" else " ".join([TEXT] * 60), 200  # the rate at which synthesis is fastest
     target = tmp_path / "paused.wav"
     with Spawned(f"file:{target}", alive_every=SOON) as engine:
         engine.until(protocol.VoiceList)
@@ -234,14 +234,14 @@ def test_no_silence_is_written_to_a_file(tmp_path: Path, held: str) -> None:
     assert target.read_bytes()[44:] == render([text], rate=rate)[0].tobytes()
 
 
-# -- another player that goes on with it
+# -- continuing with another player
 
-#: A player is let go of at once if the sentence is held.
+#: Limits that make a held sentence release its player at once.
 AT_ONCE = {"RELEASE_DELAY_S": 0.0}
 
 
 def _held(engine: Spawned) -> list[protocol.OutputChanged]:
-    """Begin a sentence, hold it behind its second word and return the events about the output."""
+    """Begin a sentence, hold it after its second word, and return the events about the output."""
     engine.say(TEXT)
     engine.until_word(2)
     engine.pause()
@@ -271,7 +271,7 @@ def test_an_output_that_was_muted_for_a_part_of_the_sentence_stays_so(sink: Sink
 def test_nothing_is_told_of_a_program_that_goes_on_with_it(
     sink: Sink, tmp_path: Path, alsa: bool, goes_on: bool
 ) -> None:
-    """The sound server's socket is gone when the sentence goes on; aplay has a way of its own, by `.asoundrc`."""
+    """The sound server's socket is removed before the sentence continues. aplay can still play, through `.asoundrc`."""
     path = tmp_path / "s"
     path.symlink_to(sink.socket)
     environment = {**sink.env, "PULSE_SERVER": f"unix:{path}", **({} if alsa else {"ALSA_CONFIG_PATH": os.devnull})}

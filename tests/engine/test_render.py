@@ -1,4 +1,4 @@
-"""Rendering into a file: espeak-ng's own samples, whole or not at all, with nothing left behind."""
+"""Tests for rendering: a file has exactly espeak-ng's samples or isn't created, and nothing is left behind."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 TEXT = "battery low, please recharge"
-#: Some seconds of work.
+#: A text that takes some seconds to render.
 LONG_TEXT = "one two three. " * 666
 BEFORE = b"what was there before"
 
@@ -57,7 +57,7 @@ def samples(path: Path) -> bytes:
 
 @pytest.fixture(autouse=True)
 def _nothing_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Assert after each test that no engine process and no hidden file is left, nor one that is empty."""
+    """Assert after each test that no engine process, no hidden file and no empty file is left."""
     mark = uuid.uuid4().hex
     monkeypatch.setenv(MARK, mark)
     yield
@@ -90,7 +90,7 @@ def test_a_text_longer_than_a_goal_is_rendered_in_pieces(tmp_path: Path, monkeyp
     path = tmp_path / "x.wav"
     monkeypatch.setattr("talkcli.engine.parent.render.MAX_PIECE_CHARS", 500)
     sentences = [f"This is number {number}, and so on." for number in range(20)]
-    text = f"{' '.join(sentences)}\n\n{'... ' * 200}"  # and what is silent is no failure
+    text = f"{' '.join(sentences)}\n\n{'... ' * 200}"  # a silent piece is not an error
     first, second, *rest = pieces(text)
     assert first + second + "".join(rest) == text
     assert first.endswith("so on. ")
@@ -163,7 +163,7 @@ def test_the_target_of_a_link_is_replaced_and_the_link_stays(tmp_path: Path) -> 
 def test_a_path_that_cannot_be_written_is_told_before_anything_is_started(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, words: str
 ) -> None:
-    monkeypatch.setattr(process, "EngineProcess", None)  # calling it would be a TypeError
+    monkeypatch.setattr(process, "EngineProcess", None)  # starting a process would raise TypeError
     (tmp_path / "file").touch()
     with socket.socket(socket.AF_UNIX) as listening, monkeypatch.context() as there:
         there.chdir(tmp_path)
@@ -175,7 +175,7 @@ def test_a_path_that_cannot_be_written_is_told_before_anything_is_started(
     assert (error.code, error.exit_code) == ("cannot_write", 1)
 
 
-#: A program that renders a text to a path, its arguments.
+#: A program that renders the text in its first argument to the path in its second.
 RENDERS = """
 import sys
 sys.path[:] = {path!r}
@@ -191,7 +191,7 @@ def renders(path: str, stdout: IO[bytes] | int, text: str = "yes", env: dict[str
 
 
 def streamed(data: bytes) -> bytes:
-    """Return the samples of a WAV file whose lengths are not known."""
+    """Return the samples of a WAV stream, whose header has no valid lengths."""
     assert (data[:8], data[8:16]) == (b"RIFF\xff\xff\xff\xff", b"WAVEfmt ")
     assert struct.unpack("<HHIIHH", data[20:36]) == (1, 1, RATE, 2 * RATE, 2, 16)
     assert data[36:44] == b"data\xff\xff\xff\xff"
@@ -217,7 +217,7 @@ def test_standard_output_gets_it_as_it_is_made(tmp_path: Path, path: str) -> Non
 
 
 def have_engines_run(monkeypatch: pytest.MonkeyPatch, before: str) -> None:
-    """Have each engine process run this code first."""
+    """Make each engine process run this code first."""
     interpreter, option, code = engine_command()
     path, rest = code.split("; from ", 1)
     command = [interpreter, option, f"{path}\n{before}\nfrom {rest}"]
@@ -225,7 +225,7 @@ def have_engines_run(monkeypatch: pytest.MonkeyPatch, before: str) -> None:
 
 
 def test_a_reader_that_takes_its_time_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """More than a pipe holds, and it is read later than a player that is stuck would be given up."""
+    """The sound doesn't fit into the pipe, and the reader waits for longer than a stalled player may take."""
     limits = "from talkcli.engine.child import playback; playback.FIRST_SOUND_LIMIT_S = playback.STALL_LIMIT_S = 0.1"
     have_engines_run(monkeypatch, limits)
     text = TEXT * 4
@@ -245,7 +245,7 @@ def test_a_reader_that_takes_its_time_is_waited_for(tmp_path: Path, monkeypatch:
 
 @pytest.fixture
 def interrupt() -> Iterator[dict[int, int]]:
-    """Interrupts at once."""
+    """Return descriptors that interrupt a wait at once."""
     reader, writer = os.pipe()
     os.write(writer, b"x")
     yield {reader: select.POLLIN}
@@ -305,10 +305,10 @@ def test_a_file_that_the_shell_has_open_for_our_output_is_not_replaced(tmp_path:
     assert path.read_bytes() == b""
 
 
-#: Code that turns root, who may write everywhere, into nobody.
+#: Code that changes the user from root, who may write everywhere, to nobody.
 AS_NOBODY = """
 import os
-import unicodedata  # needed later, and nobody may not read an interpreter in root's home
+import unicodedata  # needed later; the user nobody can't read an interpreter in root's home
 if os.geteuid() == 0:
     os.setgroups([])
     os.setgid(65534)
@@ -318,7 +318,7 @@ if os.geteuid() == 0:
 
 @pytest.mark.parametrize("protected", ["directory", "file"])
 def test_a_protected_path_is_told_and_left_as_it_was(monkeypatch: pytest.MonkeyPatch, protected: str) -> None:
-    with tempfile.TemporaryDirectory() as directory:  # pytest's own can't be entered by nobody
+    with tempfile.TemporaryDirectory() as directory:  # the user nobody can't enter pytest's directory
         path = os.path.join(directory, "x.wav")
         with open(path, "wb") as file:
             file.write(BEFORE)
@@ -335,7 +335,7 @@ def test_a_protected_path_is_told_and_left_as_it_was(monkeypatch: pytest.MonkeyP
 
 
 def test_a_file_that_may_not_be_as_long_is_told_and_left_as_it_was(tmp_path: Path) -> None:
-    """As on a full disk: the write fails in the midst."""
+    """A limit on the file size makes a write fail in the middle, as on a full disk."""
     path = tmp_path / "x.wav"
     path.write_bytes(BEFORE)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -442,7 +442,7 @@ def test_a_kill_at_any_moment_leaves_no_half_file(tmp_path: Path, how: signal.Si
         with renders(str(path), subprocess.DEVNULL, text, {MARK: mark}) as program:
             assert program.stderr is not None
             program.stderr.readline()
-            time.sleep(moments.uniform(0, whole))  # any moment is the point, there is nothing to wait for
+            time.sleep(moments.uniform(0, whole))  # a random moment is intended
             program.send_signal(how)
         assert_none_left(mark, 2)
         hidden = [each for each in os.listdir(tmp_path) if each != "x.wav"]
@@ -460,7 +460,7 @@ def test_a_kill_at_any_moment_leaves_no_half_file(tmp_path: Path, how: signal.Si
     assert False in outcomes
 
 
-# -- a private engine process, and as doctor tells it
+# -- a private engine process
 
 
 CONFIGURE = protocol.Configure(os.getpid(), None, None, None, None, list_voices=False)
@@ -491,7 +491,7 @@ def test_a_deadline_ends_a_conversation_in_which_there_is_much_to_hear() -> None
         assert any(isinstance(event, protocol.Word) for event in heard)
 
 
-# -- as doctor tells it
+# -- errors in `talk doctor`
 
 
 @pytest.mark.usefixtures("scripted_process")

@@ -1,4 +1,4 @@
-"""Silence before a sentence and behind it: lead-ins for devices that wake up slowly, and what a queue leaves out."""
+"""Tests for silence around sentences: lead-ins for slow devices, and shorter silence between queued sentences."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from tests.engine.programs import Player
 
 TEXT, SECOND = "battery low", "thank you"
-#: Milliseconds.
+#: Lengths of two lead-ins in milliseconds.
 LEAD_IN, OWN = 300, 200
 
 
@@ -83,7 +83,7 @@ def test_a_player_gets_the_lead_in_uncounted_and_words_wait_for_it(
 def test_a_lead_in_comes_again_after_a_pause_if_the_device_was_idle(
     player: Player, own: int | None, idle_after: float, again: int
 ) -> None:
-    """The device is idle as soon as it was let go of, for as long as it has played silence."""
+    """When a held sentence releases the device, its silence counts as idle time."""
     before, constants = _idle_after(idle_after), {"RELEASE_DELAY_S": 0.3}
     with Spawned(player.plays(), lead_in=LEAD_IN, limits=constants, before=before, alive_every=SOON) as engine:
         engine.until(protocol.VoiceList)
@@ -102,7 +102,7 @@ def test_a_lead_in_comes_again_after_a_pause_if_the_device_was_idle(
     assert heard[first : first + len(sentence) - len(rest)] == sentence[: -len(rest)]
 
 
-#: Holds 0.4 s of what it has read, as a Bluetooth output does, and keeps it.
+#: A player that buffers 0.4 s of sound, as a Bluetooth output does, and records it.
 SLOW_OUTPUT = """
 import os, sys, time
 tape = open(sys.argv[1], "ab", buffering=0)
@@ -120,7 +120,7 @@ def test_a_sentence_held_in_its_lead_in_begins_with_all_of_it_again(player: Play
     with Spawned(player.command(SLOW_OUTPUT)) as engine:
         engine.say(TEXT, lead_in=800)
         engine.until(protocol.Started)
-        _await_size(player, 0.35)  # of which little was heard
+        _await_size(player, 0.35)  # little of it was heard
         engine.pause()
         held = player.heard.stat().st_size
         engine.resume()
@@ -144,9 +144,9 @@ def test_a_pause_within_the_lead_in_loses_nothing(player: Player) -> None:
 
 
 def _await_size(player: Player, seconds: float) -> None:
-    """Wait until the player has more than so many seconds of sound."""
+    """Wait until the player has received more than this number of seconds of sound."""
     while not (player.heard.exists() and player.heard.stat().st_size > seconds * RATE * 2):
-        time.sleep(0.002)  # what another process writes is no event
+        time.sleep(0.002)  # no event reports what another process writes
 
 
 @limits()
@@ -175,7 +175,7 @@ def test_a_device_is_idle_some_time_after_it_was_let_go_of(monkeypatch: pytest.M
 
 
 TEXTS = ["battery low", "coming home", "please help"]
-#: Seconds that are left out in some tests, and their bytes: even a fast sentence ends in as much silence.
+#: Length of the silence that some tests cut, in seconds and in bytes. Even a fast sentence ends with this much silence.
 LEFT_OUT = 0.02
 _BYTES = int(LEFT_OUT * RATE) * 2
 _CUTS = "from talkcli.engine.child.players import chooser\nchooser.HandoverTimes.silence_to_cut = lambda *_: {}"
@@ -183,19 +183,19 @@ _SAYS_SO = _CUTS.format(LEFT_OUT)
 
 
 def _all_played(rate: int = FAST) -> list[bytes]:
-    """Return the samples that are played of each: all of those that follow another."""
+    """Return the samples played of each sentence if nothing is cut."""
     first, *others = render(TEXTS, rate=rate)
     return [each.tobytes() for each in (played(first), *others)]
 
 
 def _changed(gap: HandoverTimes, took: float, player: str = "aplay", *, neural: bool = False) -> None:
-    """Have one sentence follow another after so many seconds."""
+    """Record that one sentence followed another after this number of seconds."""
     gap.next_waits = True
     gap.sentence_ended(player, 100.0)
     gap.sentence_started(player, 100.0 + took, neural=neural)
 
 
-# -- how much
+# -- how much silence is cut
 
 
 def test_as_much_is_left_out_as_the_last_changes_took_in_their_median() -> None:
@@ -234,7 +234,7 @@ def test_the_longer_change_to_a_neural_voice_counts_for_neural_voices_alone() ->
 
 
 def test_a_start_without_a_goal_that_waited_is_no_change() -> None:
-    """Nobody waited; or the goal that waited was recalled, and another came much later."""
+    """Either no goal was waiting, or the waiting goal was canceled and another one came much later."""
     gap = HandoverTimes()
     gap.sentence_ended("aplay", 100.0)
     gap.sentence_started("aplay", 100.03)
@@ -243,7 +243,7 @@ def test_a_start_without_a_goal_that_waited_is_no_change() -> None:
     assert gap.silence_to_cut("aplay") == 0.0
 
 
-# -- which samples
+# -- which samples are cut
 
 
 def test_silence_is_counted_from_the_end_to_the_last_sample_that_is_louder() -> None:
@@ -261,7 +261,7 @@ def test_silence_is_counted_from_the_end_to_the_last_sample_that_is_louder() -> 
 
 
 def test_a_sentence_behind_which_a_goal_waits_ends_sooner_by_silence_alone(player: Player) -> None:
-    """The next one follows, whole, and the results tell the length that was played."""
+    """The next sentence is played completely. Each `Ended` has the length that was played."""
     first, second, third = _all_played()
     with Spawned(player.plays(), before=_SAYS_SO) as engine:
         ended = []
@@ -276,7 +276,7 @@ def test_a_sentence_behind_which_a_goal_waits_ends_sooner_by_silence_alone(playe
 
 @pytest.mark.parametrize("followed", [True, False])
 def test_a_goal_that_waits_counts_if_it_does_at_the_end_of_a_sentence(player: Player, followed: bool) -> None:
-    """A goal that comes while the sentence is spoken counts; a goal that is recalled does not."""
+    """A goal counts if it arrives during the sentence, but not if it is canceled."""
     first = _all_played()[0]
     with Spawned(player.plays(), before=_SAYS_SO) as engine:
         engine.say(TEXTS[0], "g0", next_waits=not followed)
@@ -304,8 +304,8 @@ def test_a_file_gets_every_sample_and_no_lead_in(tmp_path: Path) -> None:
 
 
 def test_a_player_that_ends_too_early_is_seen_if_silence_is_left_out(player: Player) -> None:
-    """A sentence may not end much sooner than its whole length, the omitted silence included."""
-    rate = 200  # at which the silence at the end is that long
+    """A sentence may end only a little earlier than its length including the cut silence."""
+    rate = 200  # the rate at which the silence at the end is long enough
     length = len(_all_played(rate)[0]) / 2 / RATE
     before = (
         "from talkcli.engine.child.players.chooser import HandoverTimes\nHandoverTimes.silence_to_cut = lambda *_: 0.2"
@@ -330,7 +330,7 @@ def test_a_sentence_that_is_held_and_goes_on_leaves_out_no_more(player: Player) 
 
 
 def test_the_engine_measures_what_a_change_takes(player: Player) -> None:
-    """The first two sentences are played whole; how long the change took is known from then on."""
+    """The first two sentences are played completely, and the time between them is measured."""
     sentences = _all_played()
     with Spawned(player.plays()) as engine:
         for number, text in enumerate(TEXTS):

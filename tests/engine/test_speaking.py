@@ -1,4 +1,4 @@
-"""The engine process speaks through talk's own driver, as the server sees it, from its start to its end."""
+"""Tests for an engine process with talk's own driver, from its start to its exit, through the protocol."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from tests.engine.programs import Player
 
 ALIVE_EVERY = 0.2
-#: Each takes milliseconds of the start, on a Raspberry Pi ten times as many, and nothing in the process needs it.
+#: Modules that the process doesn't need. Each import takes milliseconds, and ten times as long on a Raspberry Pi.
 _NOT_NEEDED = (
     "typing",
     "dataclasses",
@@ -50,7 +50,7 @@ def shared() -> Iterator[Shared]:
 
 @pytest.fixture
 def writing(tmp_path: Path) -> Iterator[Spawned]:
-    """A process that writes to a file, which takes no time."""
+    """Return a process that writes to a file, which takes no time."""
     with Spawned(f"file:{tmp_path}/x.wav") as engine:
         yield engine
 
@@ -86,7 +86,7 @@ def test_voices_that_are_known_are_not_listed() -> None:
 
 @pytest.mark.parametrize("text", ["battery low. Please come home", "..."])
 def test_a_process_imports_nothing_that_it_does_not_need(player: Player, text: str) -> None:
-    """After a crash somebody waits for its start."""
+    """Imports delay the next sentence after a crash."""
     with Spawned(player.plays(), before=_TELL) as engine:
         engine.spoken(text)
         engine.leave()
@@ -97,7 +97,7 @@ def test_a_process_imports_nothing_that_it_does_not_need(player: Player, text: s
 
 @pytest.mark.parametrize("less", [0, 1 << 20])
 def test_a_process_gets_no_more_than_half_of_the_machines_memory(less: int) -> None:
-    """Or a billion bytes, if that is more; and less if somebody has set less."""
+    """The limit is at least a billion bytes. A lower limit that is already set remains."""
     most = max(1 << 30, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2)
     before = f"import resource\nresource.setrlimit(resource.RLIMIT_DATA, ({most - less}, -1))" if less else ""
     with Spawned(before=before) as engine:
@@ -127,7 +127,7 @@ def test_words_come_as_they_are_heard_and_only_forward(engine: Spawned) -> None:
 
 def test_a_goal_in_hand_is_told_to_be_alive(engine: Spawned) -> None:
     last = time.monotonic()
-    engine.say("a.\n\n\n\na", rate=120)  # a word, and the next one some signs of life later
+    engine.say("a.\n\n\n\na", rate=120)  # the second word comes after some `Alive` messages
     alive = 0
     while not isinstance(event := engine.event(), protocol.Ended):
         now = time.monotonic()
@@ -148,7 +148,7 @@ def test_control_characters_are_no_commands_and_keep_the_offsets(writing: Spawne
     plain = _length(writing.spoken("a    b one two", "g1"))
     assert writing.spoken("a \x01\x00\x1bb one two", "g2").outcome == protocol.OUTCOME_COMPLETED
     assert writing.words("g1")[-1].start == writing.words("g2")[-1].start == len("a    b one ")
-    # 0x01 would have made it speak at 80 words per minute
+    # libespeak-ng would take 0x01 for a command and speak at 80 words per minute
     assert _length(writing.spoken("a \x0180Sb one two", "g3")) < plain * 2.5
 
 
@@ -185,19 +185,19 @@ def test_a_stop_that_comes_with_the_sentence_is_obeyed(engine: Spawned) -> None:
     assert engine.words() == []
 
 
-# -- idle, and the end
+# -- idle, and exit
 
 
 def test_a_crash_leaves_no_core(engine: Spawned) -> None:
     soft, _ = resource.prlimit(engine.process.pid, resource.RLIMIT_CORE)
-    assert soft in (0, 1)  # bytes; 0 if it may not have more
+    assert soft in (0, 1)  # bytes; 0 if the hard limit is 0
 
 
 def test_an_idle_process_does_not_wake_up(engine: Spawned) -> None:
     assert engine.spoken("a").outcome == protocol.OUTCOME_COMPLETED
-    time.sleep(0.05)  # it goes to rest, and says nowhere when it has
+    time.sleep(0.05)  # the process becomes idle, which no event reports
     before = _switches(engine.process.pid)
-    time.sleep(4 * ALIVE_EVERY)  # the time that is looked at
+    time.sleep(4 * ALIVE_EVERY)  # the measured time
     assert _switches(engine.process.pid) == before
 
 

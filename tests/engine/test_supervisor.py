@@ -1,6 +1,6 @@
-"""The engine thread holds goals, watches its process and passes on what it says, with the scripted engine as that.
+"""Tests for the engine thread, with the scripted engine as its process.
 
-A goal goes to the process without a detour. Whatever happens to the process, the goal is spoken or ends.
+Goals are sent directly to the process. Whatever happens to the process, each goal is spoken or ends.
 """
 
 from __future__ import annotations
@@ -51,17 +51,17 @@ if TYPE_CHECKING:
     from tests.engine.threads import Start
 
 YES = protocol.Speak("g1", "yes", 200, 1.0, None, 50)
-#: How "yes" ends.
+#: The expected end of `YES`.
 SPOKEN = protocol.Ended("g1", OUTCOME_COMPLETED, duration=0.1)
 
 
 def _pauses(thread: Thread) -> int:
-    """Return how many pauses were confirmed."""
+    """Return the number of confirmed holds."""
     return sum(isinstance(each, protocol.Held) for each in thread.seen)
 
 
 def _hold(thread: Thread, text: str) -> None:
-    """Begin a goal and ask for a pause in its first word."""
+    """Begin a goal, and request a pause during its first word."""
     thread.say(text)
     thread.until(protocol.Word)
     thread.engine.pause("g1", 1)
@@ -181,12 +181,12 @@ def test_a_pause_or_resume_of_another_goal_changes_nothing(start: Start) -> None
     assert not _pauses(thread)
 
 
-# -- the way of a goal to its process
+# -- sending a goal to the process
 
 
 @pytest.fixture
 def answers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Callable[..., Thread]]:
-    """Starts an engine thread with a process that answers by lines of Python, as in `answering`."""
+    """Return a function that starts an engine thread. The process replies with lines of Python, as in `answering`."""
     with contextlib.ExitStack() as stack:
 
         def make(*lines: str) -> Thread:
@@ -202,7 +202,7 @@ def test_the_process_is_told_whether_a_goal_follows(answers: Callable[..., Threa
         'protocol.Ended(command.id, protocol.OUTCOME_COMPLETED, None, f"{command.next_waits} {command.next_is_neural}")'
     )
     thread = answers("tell(protocol.Started(command.id))", f"tell({told})")
-    thread.engine.announce_next("g1", followed, next_is_neural=True)  # there is none yet that could be told
+    thread.engine.announce_next("g1", followed, next_is_neural=True)  # no process is ready yet
     thread.until(protocol.Ready)
     thread.say("battery low")
     thread.engine.announce_next("g1", followed, next_is_neural=True)
@@ -212,8 +212,8 @@ def test_the_process_is_told_whether_a_goal_follows(answers: Callable[..., Threa
 def test_a_goal_behind_another_wakes_the_thread_once(
     monkeypatch: pytest.MonkeyPatch, answers: Callable[..., Thread]
 ) -> None:
-    """By its answer, which comes in one piece: it was begun and played."""
-    monkeypatch.setattr(supervisor, "HANG_LIMIT_S", 600.0)  # so that no goal is slow enough on any machine
+    """The wake-up is the reply of the process, which arrives in one piece."""
+    monkeypatch.setattr(supervisor, "HANG_LIMIT_S", 600.0)  # longer than any goal takes on a slow machine
     thread = answers("tell(protocol.Started(command.id), protocol.Ended(command.id, protocol.OUTCOME_COMPLETED))")
     process = _process(thread)
     thread.spoken("the first may find it asleep for longer", "g0")
@@ -228,19 +228,19 @@ def test_a_goal_behind_another_wakes_the_thread_once(
     monkeypatch.setattr(thread.engine._selector, "select", counted)
     for number in range(1, 51):
         assert thread.spoken("yes", f"g{number}") == protocol.Ended(f"g{number}", OUTCOME_COMPLETED)
-    # By the messages of the process, and by nothing else; its answer to the first may have come to a `select` before.
+    # Only the messages of the process wake the thread. The reply to the first goal may have arrived earlier.
     assert {each for fds in woken for each in fds} == {process.socket.fileno()}
-    # A thread that was not asleep yet looks once more; if it is, that is one for a goal.
+    # If the thread wasn't asleep yet, one wake-up may serve two goals.
     assert sum(bool(fds) for fds in woken) <= 50
 
 
 def test_a_process_that_hangs_is_noticed_although_nobody_woke_the_thread(start: Start) -> None:
     thread = start(HANG_LIMIT_S=0.5)
     assert thread.spoken("length=0").outcome == OUTCOME_COMPLETED
-    # handed over while the thread dozes
+    # submitted while the thread naps
     assert thread.spoken("length=0.05 hang", "g2").reason == "engine_hung"
     assert thread.spoken("yes", "g3").outcome == OUTCOME_COMPLETED
-    assert thread.next(0.7) is None  # it does not doze any more
+    assert thread.next(0.7) is None  # the nap is over
     assert thread.spoken("length=0.05 hang", "g4").reason == "engine_hung"
 
 
@@ -253,7 +253,7 @@ def test_the_answer_to_a_goal_is_understood_before_the_goal_is_noted(monkeypatch
         said.append(command)
         return True
 
-    # It answers before anybody looks.
+    # The reply arrives before the thread has recorded the goal.
     swift = SimpleNamespace(send=send, receive=lambda: [protocol.Ended("g1", OUTCOME_COMPLETED)] * said.count(YES))
     for name in ("_process", "_direct_process"):
         monkeypatch.setattr(engine, name, swift)
@@ -267,7 +267,7 @@ def test_the_answer_to_a_goal_is_understood_before_the_goal_is_noted(monkeypatch
 def test_a_goal_sent_to_a_lost_process_is_spoken_by_the_next(
     start: Start, monkeypatch: pytest.MonkeyPatch, takes: bool
 ) -> None:
-    thread = start(HANG_LIMIT_S=1.0)  # so long a thread may doze that nothing wakes
+    thread = start(HANG_LIMIT_S=1.0)  # the longest nap of the thread
     thread.until(protocol.Ready)
     monkeypatch.setattr(thread.engine, "_direct_process", SimpleNamespace(send=lambda _: takes))
     assert thread.spoken("yes") == SPOKEN
@@ -275,7 +275,7 @@ def test_a_goal_sent_to_a_lost_process_is_spoken_by_the_next(
 
 
 def test_a_process_that_takes_no_goal_is_ended(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The goal is the next one's."""
+    """The next process gets the goal."""
     thread = start()
     monkeypatch.setattr(_process(thread), "send", lambda _: False)
     thread.say("yes")
@@ -337,7 +337,7 @@ def test_a_goal_that_is_handed_in_just_before_the_end_ends(start: Start, monkeyp
     def slow(report: Report) -> None:
         post(report)
         if isinstance(report, protocol.Ended) and report.id == "g0":
-            held.wait(PATIENCE)  # both come while it is at work, and finds next that it is to end
+            held.wait(PATIENCE)  # the goal and `close` arrive while the thread is busy
 
     monkeypatch.setattr(thread.engine, "_post", slow)
     assert thread.spoken("length=0", "g0").id == "g0"
@@ -352,7 +352,7 @@ def test_a_goal_that_is_handed_in_just_before_the_end_ends(start: Start, monkeyp
 
 
 def test_a_thread_that_stood_still_hears_the_engine_first(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Before it judges it; as in a machine that was suspended, or a server that was stopped, between two lines."""
+    """After the machine or the server was suspended, messages are read before time limits are checked."""
     standing = [0.7]
 
     class Clock:
@@ -360,7 +360,7 @@ def test_a_thread_that_stood_still_hears_the_engine_first(start: Start, monkeypa
             return getattr(time, name)
 
         def monotonic(self) -> float:
-            if words and standing and sys._getframe(1).f_code.co_name == "_run":  # the loop, between two rounds
+            if words and standing and sys._getframe(1).f_code.co_name == "_run":  # between two rounds of the loop
                 time.sleep(standing.pop())
             return time.monotonic()
 
@@ -400,7 +400,7 @@ def test_a_start_that_hangs_is_tried_again_and_fails_a_goal_each_time_after_a_wh
 
 
 class Undying:
-    """Stands for a process that is ready, and that no kill ends for long."""
+    """A stand-in for a ready process that survives being killed."""
 
     def __init__(self) -> None:
         self.ready, self.had_goal, self.start_failure, self.exit_deadline = True, False, None, 0.0
@@ -419,7 +419,7 @@ class Undying:
 
 
 def _watching(process: EngineProcess, posted: list[Report]) -> Supervisor:
-    """Return an engine thread that doesn't run, with this process."""
+    """Return a supervisor with this process, without running its thread."""
     engine = Supervisor(CONFIGURE, posted.append)
     for descriptor in (process.socket.fileno(), process.liveness):
         engine._selector.register(descriptor, selectors.EVENT_READ, process)
@@ -436,7 +436,7 @@ def test_a_process_that_dies_while_idle_was_of_use_if_it_has_spoken(spoken: bool
     if spoken:
         engine._goal = SupervisedGoal(YES, last_sign_at=0.0)
         engine._handle_event(process, SPOKEN)
-    engine._handle_event(process, protocol.Alive(""))  # as one does that loads a voice
+    engine._handle_event(process, protocol.Alive(""))  # as from a process that loads a voice
     before = time.monotonic()
     engine._lose_process("it is killed", Reason.ENGINE_CRASHED)
     assert (engine._restarts.next_start_at - before < RESTART_DELAYS_S[1]) == spoken
@@ -470,7 +470,7 @@ def test_a_goal_ends_once_when_its_process_is_gone_or_should_be(monkeypatch: pyt
     engine._actions.close()
 
 
-# -- when it is started again
+# -- restarts
 
 LACKING = "no library"
 
@@ -520,7 +520,7 @@ def test_a_start_costs_a_goal_only_if_it_began_long_after_there_was_a_process() 
 
 
 def _complaining(script: str) -> tuple[list[str], str]:
-    """Return the lines that a process passes on which writes to standard error, and its last words."""
+    """Run a script as the engine process. Return its reported lines of standard error and how it exited."""
     lines: list[str] = []
     command = [sys.executable, "-c", f"import os\n{script}"]
     with pytest.MonkeyPatch.context() as patch:
@@ -583,14 +583,14 @@ tell(protocol.Ended(command.id, protocol.OUTCOME_COMPLETED))
     assert said[-1] == "ValueError: no tongue"
 
 
-# -- its queue: actions are done in order, and wake the thread only if they must
+# -- the queue of actions
 
 
 Sleepers = Callable[[float], "Sleeper"]
 
 
 class Sleeper:
-    """A thread that does nothing but wait for actions; `wakes` counts the bytes that were written to wake it."""
+    """A thread that only waits for actions. `wakes` is the number of bytes written to wake the thread."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, doze: float) -> None:
         self.queue = ActionQueue(doze)
@@ -618,7 +618,7 @@ class Sleeper:
             self.queue.wait(NEVER)
 
     def do(self, action: Callable[[], None]) -> None:
-        """Have an action done, and wait for that and for the thread to sleep again."""
+        """Run an action in the thread, and wait until the thread sleeps again."""
         done = threading.Event()
 
         def act() -> None:
@@ -639,7 +639,7 @@ class Sleeper:
 
 @pytest.fixture
 def sleepers(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[float], Sleeper]]:
-    """Starts threads that sleep; each is closed at the end."""
+    """Return a function that starts sleeping threads, which are closed at the end of the test."""
     with contextlib.ExitStack() as stack:
         yield lambda doze: stack.enter_context(contextlib.closing(Sleeper(monkeypatch, doze)))
 
@@ -662,7 +662,7 @@ def test_an_action_that_is_due_before_the_thread_would_wake_wakes_it(sleepers: S
     sleeper, done = sleepers(0.0), threading.Event()
     sleeper.do(lambda: None)
     wakes = sleeper.wakes
-    sleeper.queue.call(done.set, by=time.monotonic() + 1000)  # it does not doze, so it would sleep for ever
+    sleeper.queue.call(done.set, by=time.monotonic() + 1000)  # without a nap, the thread would sleep forever
     assert done.wait(PATIENCE)
     assert sleeper.wakes == wakes + 1
 
@@ -675,7 +675,7 @@ def test_a_thread_that_dozes_does_its_actions_before_it_sleeps_on(
     wakes = sleeper.wakes
     sleeper.queue.call(done.set, by=time.monotonic() + 1000)
     assert done.wait(PATIENCE)
-    assert sleeper.wakes <= wakes + 1  # one, where this test itself came later than the doze was long
+    assert sleeper.wakes <= wakes + 1  # one wake-up if this test was slower than the nap
 
 
 def test_nothing_is_lost_and_nothing_overtakes_if_several_threads_hand_in(
@@ -708,7 +708,7 @@ def test_nothing_is_done_once_no_more_is_taken() -> None:
 
 
 def test_a_queue_is_not_closed_under_a_thread_that_wakes_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The descriptor could be another file's by then, and get the byte."""
+    """Otherwise, the byte could be written to another file that has reused the descriptor."""
     queue, closed, write = ActionQueue(0.0), threading.Event(), os.write
 
     def close() -> None:
@@ -724,4 +724,4 @@ def test_a_queue_is_not_closed_under_a_thread_that_wakes_it(monkeypatch: pytest.
     monkeypatch.setattr(queue, "_sleeps_until", NEVER)
     queue.call(lambda: None)
     assert closed.wait(PATIENCE)
-    queue.call(lambda: None)  # nothing happens
+    queue.call(lambda: None)  # does nothing

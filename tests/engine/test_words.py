@@ -1,4 +1,4 @@
-"""The words of a text as libespeak-ng tells them: each once, forward, with its own place; and when each is heard."""
+"""Tests for the words that are found in libespeak-ng's events, and for the clock that computes when they are heard."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def on_32_bits(kind: type) -> type:
-    """Return a C type as a 32-bit system lays it out, with pointers of 4 bytes."""
+    """Return a C type with the layout of a 32-bit system, which has pointers of 4 bytes."""
     if not issubclass(kind, (ctypes.Structure, ctypes.Union)):
         return ctypes.c_uint32 if kind in (ctypes.c_char_p, ctypes.c_void_p) else kind
     fields = [(each[0], on_32_bits(each[1])) for each in kind._fields_]
@@ -27,7 +27,7 @@ def on_32_bits(kind: type) -> type:
 
 
 def test_an_event_has_the_size_of_the_librarys_with_pointers_of_4_and_8_bytes() -> None:
-    """The sizes of espeak_EVENT in speak_lib.h. If ours is shorter, all words but the first of a callback are lost."""
+    """Compare with espeak_EVENT in speak_lib.h. If ours is shorter, all but the first word of a callback are lost."""
     sizes = [ctypes.sizeof(each) for each in (on_32_bits(espeak._EspeakEvent), espeak._EspeakEvent)]
     assert sizes == [36, 40 if ctypes.sizeof(ctypes.c_void_p) == 8 else 36]
 
@@ -40,7 +40,7 @@ def reported(text: str, places: Iterable[tuple[int, int]]) -> list[str]:
     return [text[start:end] for start, end, _ in found]
 
 
-#: Sentences by language, and their words as they are told.
+#: Languages, sentences, and the words that are reported for them.
 SENTENCES = [
     ("gmw/en", "battery low, please!", "battery low please"),
     ("gmw/en", "is in the kitchen", "is in kitchen"),
@@ -97,7 +97,7 @@ def test_words_go_forward_within_the_text_whatever_is_reported(text: str, places
             assert text[start:end].split() == [text[start:end]]
 
 
-# -- when they are heard
+# -- the word clock
 
 
 def test_the_clock_stands_until_it_is_started_and_is_held_back_by_the_player() -> None:

@@ -1,4 +1,4 @@
-"""An engine thread that runs, and the reports that it has posted."""
+"""A running engine thread for tests, with the reports that it has posted."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 _R = TypeVar("_R")
 
-#: Seconds after which a report is late on the busiest machine.
+#: Time in seconds after which a report is late even on a busy machine.
 PATIENCE = 20.0
 CONFIGURE = protocol.Configure(os.getpid(), None, None, None, None)
-#: An engine process that is ready at once; `say` and `other` are its answers to a goal and to any other command.
+#: An engine process that is ready at once. `say` and `other` are its code for a goal and for any other command.
 _ANSWERS = """
 import os, sys
 sys.path.insert(0, {root!r})
@@ -42,7 +42,7 @@ for line in os.fdopen(0, "rb"):
 
 
 def answering(folder: Path, say: str, other: str = "pass") -> list[str]:
-    """Return the command line of an engine process that answers by these lines of Python."""
+    """Return the command line of an engine process that replies with these lines of Python."""
     program = folder / "engine.py"
     root = os.path.dirname(os.path.dirname(talkcli.__file__))
     program.write_text(_ANSWERS.format(root=root, say=say.replace("\n", "\n        "), other=other))
@@ -62,7 +62,7 @@ class Thread:
         self.engine.speak(protocol.Speak(goal, text, 200, 1.0, None, 50))
 
     def next(self, seconds: float = PATIENCE) -> Report | None:
-        """Return the next report, None if there is none for so long."""
+        """Return the next report, or None if none arrives in time."""
         with contextlib.suppress(queue.Empty):
             self.seen.append(self._posted.get(timeout=seconds))
             return self.seen[-1]
@@ -75,7 +75,7 @@ class Thread:
         raise AssertionError(f"no {kind.__name__} in {self.seen}")
 
     def spoken(self, text: str, goal: str = "g1") -> protocol.Ended:
-        """Say a text and return how it ended."""
+        """Speak a text, and return its end."""
         self.say(text, goal)
         return self.until(protocol.Ended)
 
@@ -85,8 +85,13 @@ class Thread:
 
 
 class Start(Protocol):
-    """Starts an engine thread; it is closed when the test is over."""
+    """A function that starts an engine thread, which is closed at the end of the test."""
 
     def __call__(self, begins: str = "", **limits: Any) -> Thread:
-        """`begins`: how the scripted process starts; `limits`: constants of the supervisor."""
+        """Start an engine thread.
+
+        Args:
+            begins: script for the start of the process.
+            limits: new values for constants of the supervisor.
+        """
         ...
