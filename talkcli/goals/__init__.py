@@ -1,6 +1,6 @@
-"""Goals: what a goal is, which one is spoken when, and how it ends.
+"""Goals: what a goal is, when it is spoken, and how it ends.
 
-Pure: no clock, no thread, no socket. The time is an argument. This package imports nothing of `talkcli` but the modules
-at its top. A rule about goals goes into the module that has its noun. How a goal is written on the wire is in
-`protocol`.
+These modules are pure. They use no clock, thread or socket, and get the time as an argument. From `talkcli` they import
+only each other and the modules directly in `talkcli/`. A rule about goals belongs in the module named after its
+subject. The messages in which goals travel are in `protocol`.
 """

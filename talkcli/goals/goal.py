@@ -1,8 +1,8 @@
-"""A goal and its sender as values, and their form in JSON.
+"""Immutable snapshots of goals and their senders, and their JSON form.
 
-Only the form is here. The scheduler decides whether a goal is accepted. A field may be added, but never renamed or
-given another meaning. Unknown fields are ignored. That would be wrong in requests, which are in `options` and
-`protocol.requests`.
+This module only defines the format. The scheduler decides whether a goal is accepted. Fields may be added, but a field
+never changes its name or meaning. Unknown fields are ignored. Requests, in contrast, are refused if they have unknown
+fields. They are in `options` and `protocol.requests`.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ if TYPE_CHECKING:
 
 JsonObject = dict[str, object]
 
-#: some thirty million years, more than any calendar can show
+#: The largest time that is accepted: about thirty million years, more than any calendar can show.
 _MAX_TIME_S = 1e15
 
 
 @frozen
 class Sender:
-    """The program at the other end of a connection. A field is None if the system doesn't tell."""
+    """The program at the other end of a connection. A field is None if it is unknown."""
 
     pid: int | None = None
     uid: int | None = None
     command: str | None = None
-    #: the command line of the program that started it, which is usually a script
+    #: the command line of the parent process, which is usually a script
     parent: str | None = None
-    #: the name that the sender gives itself, which may be wrong
+    #: the name that the sender gave itself in `hello`, which nobody verifies
     name: str | None = None
 
     def to_json(self) -> JsonObject:
@@ -43,7 +43,7 @@ class Sender:
 
 @frozen
 class By:
-    """The cause of a goal's end: another goal, or the request of a client. Neither is set if it was the server."""
+    """The cause of a goal's end: another goal, or a client's request. Both are None if the server ended the goal."""
 
     goal: str | None = None
     client: Sender | None = None
@@ -60,14 +60,14 @@ class By:
 
 @frozen
 class Output:
-    """The audio output of a goal, as the sound server reports it."""
+    """The audio output of a goal, as reported by the sound server."""
 
     player: str
     #: the sound server's name for the device
     device: str
-    #: 0 to 1, where 1 is 100 % of the device
+    #: volume of the device, where 1 is 100 %
     volume: float
-    #: whether it was muted, or its volume 0, at any time while the goal was spoken
+    #: whether the output was muted or at volume 0 at any time while the goal was spoken
     muted: bool
 
     def to_json(self) -> JsonObject:
@@ -81,21 +81,21 @@ class Output:
 
 @frozen
 class Goal:
-    """A goal at one moment. In JSON it always has all keys, with null for unknown values.
+    """A snapshot of a goal. Its JSON form always has all keys, with null for unknown values.
 
-    Times are seconds since 1970 UTC. `duration` is in seconds of audio.
+    Times are seconds since 1970 UTC. `duration` is the length of the audio in seconds.
     """
 
     id: str
     state: State
     text: str | None = None
-    #: why it ended, for programs: a `Reason`, or another string from a newer server
+    #: machine-readable reason for the end: a `Reason`, or an unknown string from a newer server
     reason: str | None = None
     by: By | None = None
-    #: how it ended, for people
+    #: human-readable description of the end
     message: str | None = None
     format: str = "text"
-    #: the text up to the last word that was heard
+    #: the text up to the end of the last word that was heard
     spoken: str | None = None
     priority: int = 0
     key: str | None = None
@@ -107,19 +107,18 @@ class Goal:
     started_at: float | None = None
     ended_at: float | None = None
     duration: float | None = None
-    #: id of the voice that speaks it, which may differ from the requested voice; None until it is ACTIVE
+    #: id of the voice that is used, which may differ from the requested voice; None until the goal is ACTIVE
     voice: str | None = None
-    #: None if unknown
     output: Output | None = None
 
     @property
     def exit_code(self) -> int | None:
-        """The exit code of a command with this goal; None until the goal has ended."""
-        # The sender has asked for throttling, so this is no failure.
+        """The exit code of a command that waits for this goal, or None until the goal has ended."""
+        # A throttled goal is not a failure, because its sender asked for throttling.
         return 0 if self.reason == "throttled" else EXIT_CODES.get(self.state)
 
     def to_json(self) -> JsonObject:
-        # Written out for speed, because a busy server does little else.
+        # The keys are written out for speed, because a busy server spends most of its time here.
         return {
             "id": self.id,
             "state": self.state.name,
@@ -146,40 +145,41 @@ class Goal:
 
     @classmethod
     def from_json(cls, value: object) -> Goal:
-        """Return the goal in a message of a server; raise Unreadable if the message has none."""
+        """Return the goal in a server's message. Raises Unreadable if its id or state is missing or invalid."""
         found = read_fields(cls, value if isinstance(value, dict) else {})
-        if not str(found.get("id", "\n")).isprintable() or "state" not in found:  # ids are shown unescaped
+        if not str(found.get("id", "\n")).isprintable() or "state" not in found:  # ids are printed without escaping
             raise Unreadable("what the server sent for a goal has no id that can be one, or an unknown state")
         return cls(**found)
 
 
 def read_fields(cls: type, message: JsonObject) -> dict[str, Any]:
-    """Return the values in a JSON object for the fields of a class; leave out those of the wrong type."""
+    """Return the values that a JSON object has for the fields of a class. Values of the wrong type are left out."""
     found = {}
     for name, annotation in cls.__annotations__.items():
         value = message.get(name)
-        if value is not None and (read := _READ[annotation.partition(" ")[0]](value)) is not None:
+        if value is not None and (read := _READERS[annotation.partition(" ")[0]](value)) is not None:
             found[name] = read
     return found
 
 
-def _of_type(kind: type) -> Callable[[object], object]:
-    return lambda value: value if isinstance(value, kind) and (kind is bool or not isinstance(value, bool)) else None
+def _reader(kind: type) -> Callable[[object], object]:
+    """Return a function that returns a value of exactly this type unchanged, and None for every other value."""
+    return lambda value: value if type(value) is kind else None
 
 
 def read_seconds(value: object) -> float | None:
-    """Return a time or a length of time from a message; None if it is no number or too large to be shown."""
+    """Return a number of seconds from a message, or None if it is not a number or too large to be shown."""
     number = isinstance(value, int | float) and not isinstance(value, bool)
     return float(value) if number and abs(value) <= _MAX_TIME_S else None  # type: ignore[arg-type]
 
 
-#: the functions that read a field, by its annotation; they return None for a value of the wrong type
-_READ: dict[str, Callable[[object], object]] = {
-    "str": _of_type(str),
-    "int": _of_type(int),
+#: Functions that read a field, by the field's annotation. They return None for a value of the wrong type.
+_READERS: dict[str, Callable[[object], object]] = {
+    "str": _reader(str),
+    "int": _reader(int),
     "float": read_seconds,
-    "bool": _of_type(bool),
-    "JsonObject": _of_type(dict),
+    "bool": _reader(bool),
+    "JsonObject": _reader(dict),
     "State": lambda value: State.__members__.get(value) if isinstance(value, str) else None,
     "By": By.from_json,
     "Sender": Sender.from_json,

@@ -1,13 +1,13 @@
-"""The scheduler's memory: goals that have ended, what was spoken when, and cancels that arrived before their goal.
+"""What the scheduler remembers: ended goals, times of speech, and cancels that arrived before their goal.
 
-Pure: it drops the oldest entries at fixed limits, and takes the time as an argument (monotonic seconds). Ended goals
-are kept so that another process can still ask for the result, as `talk wait ID` does.
+Pure: each store drops its oldest entries at a fixed limit. Times are arguments, in monotonic seconds. Ended goals are
+kept so that another process can ask for the result later, as `talk wait ID` does.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections import OrderedDict
+from collections import OrderedDict, defaultdict, deque
 from itertools import islice
 from typing import TYPE_CHECKING, TypeVar
 
@@ -22,21 +22,22 @@ if TYPE_CHECKING:
 _Key = TypeVar("_Key")
 _Value = TypeVar("_Value")
 
-#: Goals that are kept after they were spoken. A robot that speaks ten times a minute has 100 minutes to ask for them.
+#: Spoken goals that are kept. They cover the last 100 minutes of a robot that speaks ten times a minute.
 MAX_SPOKEN_GOALS = 1_000
-#: REJECTED goals have a limit of their own, so that a client that is always refused displaces no results.
+#: REJECTED goals that are kept. They have their own limit, so that one client's rejected goals can't displace the
+#: results of other clients.
 MAX_REJECTED_GOALS = 200
-#: RECALLED goals have a limit of their own, too. One cancel may recall the 1,000 goals of a connection that wait for
-#: room, and each can still be asked for.
+#: RECALLED goals that are kept. One cancel can recall the 1,000 goals of a connection that wait for room, and the
+#: result of each one must stay available.
 MAX_RECALLED_GOALS = 1_000
-#: All texts of ended goals together. Without this limit they could take 40 MB.
+#: Total size of the texts of ended goals. Without this limit, they could take 40 MB.
 MAX_KEPT_TEXT_BYTES = 8 * 1024 * 1024
-#: Keys whose last start is remembered, and as many texts.
+#: Keys whose last start is remembered. The limit for texts is the same.
 MAX_SPEECH_TIMES = 10_000
-#: How long a cancel is remembered if no goal has the id yet. Two programs that start one after the other may send the
-#: goal and its cancel.
+#: How long the cancel of an unknown id is remembered. If two programs started one after the other send a goal and its
+#: cancel, the cancel may arrive first.
 EARLY_CANCEL_S = 60.0
-#: Cancels that are remembered.
+#: Cancels of unknown ids that are remembered.
 MAX_EARLY_CANCELS = 1_000
 
 
@@ -44,26 +45,20 @@ class History:
     """The goals that have ended, oldest first."""
 
     def __init__(self) -> None:
-        self._all: OrderedDict[str, Record] = OrderedDict()
-        #: the same goals by how they ended: REJECTED, RECALLED, or after they had begun
-        self._rejected: OrderedDict[str, Record] = OrderedDict()
-        self._recalled: OrderedDict[str, Record] = OrderedDict()
-        self._spoken: OrderedDict[str, Record] = OrderedDict()
+        self._all: dict[str, Record] = {}
+        #: the ids of the goals that share a limit, oldest first; all spoken goals are under SUCCEEDED
+        self._ids: defaultdict[State, deque[str]] = defaultdict(deque)
         self._text_bytes = 0
 
     def add(self, record: Record) -> None:
-        """Keep a goal that has ended, and drop the oldest ones past the limits."""
-        kept, limit = self._spoken, MAX_SPOKEN_GOALS
-        if record.state is State.REJECTED:
-            kept, limit = self._rejected, MAX_REJECTED_GOALS
-        elif record.state is State.RECALLED:
-            kept, limit = self._recalled, MAX_RECALLED_GOALS
-        self._all[record.id] = kept[record.id] = record
+        """Keep a goal that has ended, and drop the oldest goals and texts above the limits."""
+        limits = {State.REJECTED: MAX_REJECTED_GOALS, State.RECALLED: MAX_RECALLED_GOALS}
+        ids = self._ids[record.state if record.state in limits else State.SUCCEEDED]
+        ids.append(record.id)
+        self._all[record.id] = record
         self._text_bytes += record.text_bytes
-        if len(kept) > limit:
-            oldest = kept.popitem(last=False)[1]
-            del self._all[oldest.id]
-            self._text_bytes -= oldest.text_bytes
+        if len(ids) > limits.get(record.state, MAX_SPOKEN_GOALS):
+            self._text_bytes -= self._all.pop(ids.popleft()).text_bytes
         while self._text_bytes > MAX_KEPT_TEXT_BYTES:
             oldest = next(each for each in self._all.values() if each.text is not None)
             self._text_bytes -= oldest.text_bytes
@@ -74,30 +69,31 @@ class History:
         return self._all.get(goal_id)
 
     def latest(self, count: int) -> Iterator[Record]:
-        """Return the last goals that ended, newest first, without REJECTED ones."""
+        """Return the goals that ended last, newest first, without REJECTED ones."""
         return islice((each for each in reversed(self._all.values()) if each.state is not State.REJECTED), count)
 
     def log(self, count: int) -> Iterator[Record]:
-        """Return the last goals that ended, newest first, with REJECTED ones."""
+        """Return the goals that ended last, newest first, including REJECTED ones."""
         return islice(reversed(self._all.values()), count)
 
 
 class SpeechTimes:
-    """When a goal with a key, or with a text, was last spoken."""
+    """The last time that a goal with each key and each text was spoken."""
 
     def __init__(self) -> None:
+        #: start time and goal id
         self._by_key: OrderedDict[str, tuple[float, str]] = OrderedDict()
         self._by_text: OrderedDict[bytes, tuple[float, str]] = OrderedDict()
 
-    def note(self, record: Record) -> None:
-        """Note a goal of which something was heard."""
-        began = (record.began_at, record.id)
+    def add(self, record: Record) -> None:
+        """Remember the start of a goal that was at least partly heard."""
+        start = (record.began_at, record.id)
         if record.key is not None:
-            _keep(self._by_key, record.key, began, MAX_SPEECH_TIMES)
-        _keep(self._by_text, _digest(record.text or ""), began, MAX_SPEECH_TIMES)
+            _set_newest(self._by_key, record.key, start, MAX_SPEECH_TIMES)
+        _set_newest(self._by_text, _digest(record.text or ""), start, MAX_SPEECH_TIMES)
 
     def find(self, since: float, key: str | None, text: str) -> str | None:
-        """Return the id of the last goal that began after `since` with this key, or, without a key, with this text."""
+        """Return the id of the last goal with this key that started after `since`. Without a key, compare the text."""
         last = self._by_text.get(_digest(text)) if key is None else self._by_key.get(key)
         return last[1] if last is not None and last[0] > since else None
 
@@ -106,21 +102,21 @@ class EarlyCancels:
     """Cancels of ids that no goal had yet."""
 
     def __init__(self) -> None:
-        #: by id: until when the cancel holds, and who sent it
-        self._until: OrderedDict[str | None, tuple[float, By]] = OrderedDict()
+        #: by goal id: the time at which the cancel lapses, and the client that sent it
+        self._cancels: OrderedDict[str | None, tuple[float, By]] = OrderedDict()
 
-    def note(self, goal_id: str, by: By, now: float) -> None:
-        """Note that an id was cancelled."""
-        _keep(self._until, goal_id, (now + EARLY_CANCEL_S, by), MAX_EARLY_CANCELS)
+    def add(self, goal_id: str, by: By, now: float) -> None:
+        """Remember that this id was cancelled."""
+        _set_newest(self._cancels, goal_id, (now + EARLY_CANCEL_S, by), MAX_EARLY_CANCELS)
 
     def find(self, goal_id: str | None, now: float) -> By | None:
-        """Return who has cancelled this id; None if nobody has."""
-        until, by = self._until.get(goal_id, (now, None))
-        return by if now < until else None
+        """Return the client that cancelled this id, or None if the id was not cancelled."""
+        lapses_at, by = self._cancels.get(goal_id, (now, None))
+        return by if now < lapses_at else None
 
 
-def _keep(entries: OrderedDict[_Key, _Value], key: _Key, value: _Value, limit: int) -> None:
-    """Set the newest entry, and drop the oldest one past the limit."""
+def _set_newest(entries: OrderedDict[_Key, _Value], key: _Key, value: _Value, limit: int) -> None:
+    """Set an entry as the newest one, and drop the oldest one above the limit."""
     entries[key] = value
     entries.move_to_end(key)
     if len(entries) > limit:
@@ -128,5 +124,5 @@ def _keep(entries: OrderedDict[_Key, _Value], key: _Key, value: _Value, limit: i
 
 
 def _digest(text: str) -> bytes:
-    """Return a hash of a text, because ten thousand texts could take 400 MB."""
+    """Return a hash of a text. Ten thousand texts themselves could take 400 MB."""
     return hashlib.blake2b(text.encode(errors="surrogatepass"), digest_size=16).digest()

@@ -1,15 +1,14 @@
-"""The options of goals and the settings of servers: one row for each, from which everything else is made.
+"""The options of goals and the settings of servers. Each one is described by a row in a table.
 
-Made from the rows: the fields of `say` and `set` on the wire and their checks, the checks of the library, the options
-of the commands and how they are read, the names of a server's settings, and the tables of the documents. `Say` and
-`Client.say` repeat them for type checkers and readers, and tests compare both with the rows. A row may be added, but
-never renamed or given another meaning.
+The rows define the fields of `say` and `set` on the wire, the options of the commands, the checks of all of them, and
+the tables in the documents. `Say` and `Client.say` repeat the rows for type checkers and readers, and tests compare
+them with the rows. Rows may be added, but a row never changes its name or meaning.
 
-A value may be wrong in two ways. A request with a value of the wrong type is an error and does nothing
+There are two kinds of invalid values. A request with a value of the wrong type is an error and has no effect
 (`Option.type_error`). A goal with a value that is not allowed is REJECTED (`Option.value_error`).
 
-A client imports this module before it sends anything, so it imports nothing heavy. The first sentence of a request's
-docstring is its meaning in the wire's document.
+Clients import this module before they send anything, so it imports nothing that is slow to load. The first sentence of
+a request's docstring also describes the request in the protocol's document.
 """
 
 from __future__ import annotations
@@ -24,73 +23,74 @@ if TYPE_CHECKING:
     from talkcli.goals.reasons import Refusal
 
 MAX_ID_CHARS = 64
-#: ids in one request; more would not fit into a line
+#: Ids in one request. More would not fit into a line.
 MAX_IDS = 4096
-#: the name that a client gives itself, which is shown on one line of a terminal
+#: Length of the name that a client gives itself. It is shown on one line of a terminal.
 MAX_SENDER_NAME_CHARS = 64
-#: `data` of a goal as JSON: a label for programs, not a store
+#: Size of a goal's `data` as JSON. It is meant for labels, not for storage.
 MAX_DATA_BYTES = 1024
-#: goals in one reply to `log`: as many as the server keeps
+#: Goals in one reply to `log`. The server keeps this number of ended goals.
 MAX_LOG_GOALS = 2_200
-#: A text is some minutes of speech at most. Nobody who waits for the end of a longer one could stop it in between.
+#: Length of a text. It allows for some minutes of speech. A longer text should be sent in parts, so that other goals
+#: can be spoken in between.
 MAX_TEXT_CHARS = 10_000
-#: A text of 10,000 characters with four bytes each fits into a request.
+#: Size of a text. A text of 10,000 characters with four bytes each still fits into a request.
 MAX_TEXT_BYTES = 40_000
-#: far more than anybody needs, and exact in the JSON reader of every language
+#: Largest priority. JSON readers in all languages represent it exactly.
 MAX_PRIORITY = 1_000_000
-#: a label, which is shown on one line
+#: Length of a key, which is shown on one line.
 MAX_KEY_CHARS = 64
-#: the silence before a sentence: no output needs longer to wake
+#: Longest silence before a sentence. No output needs more time to wake up.
 MAX_LEAD_IN_MS = 5000
-#: the word for the driver's own voice
+#: Name of the driver's own voice.
 DEFAULT_VOICE = "default"
-#: how the ids of neural voices begin: "piper/NAME"
+#: Prefix of the ids of neural voices, as in "piper/NAME".
 NEURAL_PREFIX = "piper/"
-#: what separates the id of a neural voice from its speaker: "piper/NAME#3"
+#: Separator between the id of a neural voice and the speaker, as in "piper/NAME#3".
 SPEAKER_MARK = "#"
-#: Unicode categories of characters that make no sound: separators, controls, format characters such as the zero-width
-#: space, and code points that are unassigned or private
+#: Unicode categories of silent characters: separators, control characters, format characters such as the zero-width
+#: space, and unassigned and private code points.
 _SILENT_CATEGORIES = frozenset({"Zs", "Zl", "Zp", "Cc", "Cf", "Cn", "Co"})
 _DIGITS = frozenset("0123456789")
 _LETTERS = frozenset("abcdefghijklmnopqrstuvwxyz")
 _ID_CHARACTERS = _DIGITS | _LETTERS | frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZ._:/-")
-#: sys.float_info.max, which neither NaN nor a huge integer is below
+#: The value of sys.float_info.max. A larger integer can't be converted to a float.
 _MAX_FLOAT = 1.7976931348623157e308
 
 
 def without_speaker(voice: str | None) -> str:
-    """Return the id of a neural voice without its speaker, as the voice is loaded; "" if there is no voice."""
+    """Return the id of a neural voice without its speaker, or "" if there is no voice."""
     return (voice or "").partition(SPEAKER_MARK)[0]
 
 
 def is_neural(voice: str) -> bool:
-    """Return whether a word names a neural voice, even if no such voice exists."""
+    """Return whether a name has the form of a neural voice's id. The voice need not exist."""
     return voice.casefold().startswith(NEURAL_PREFIX)
 
 
 @frozen
 class Kind:
-    """The kind of values that an option has."""
+    """The type of an option's values."""
 
-    #: its name in the wire's document
+    #: name in the protocol's document
     name: str
     types: tuple[type, ...]
-    #: the message about a value of another type
+    #: error message for a value of another type
     wrong_type: str
-    #: the placeholder for the value in help
+    #: placeholder for the value in help texts
     metavar: str = ""
-    #: checks a value of the right type; returns an error message or None
+    #: function that checks a value of the right type and returns an error message or None
     check: Callable[[Any], str | None] | None = None
 
 
 def is_clients_id(goal_id: str) -> bool:
-    """Return whether a client may choose this id. A server never gives an id of this form."""
+    """Return whether a client may choose this id. Ids that look like a server's own are reserved."""
     if not (0 < len(goal_id) <= MAX_ID_CHARS and _ID_CHARACTERS.issuperset(goal_id)) or goal_id[0] == "-":
         return False
     boot, dash, number = goal_id.partition("-")
     if not dash:
         return not _DIGITS.issuperset(goal_id)
-    # A server's ids are like 4k7f-12. Nobody names a goal like that, as people do `goal-1` or `2024-12`.
+    # A server's ids look like 4k7f-12. People prefer names such as `goal-1` or `2024-12`, which stay available.
     servers = len(boot) == 4 and _DIGITS.issuperset(boot[::2]) and _LETTERS.issuperset(boot[1::2])
     return not (servers and number and _DIGITS.issuperset(number))
 
@@ -116,19 +116,19 @@ def _data_error(value: JsonObject) -> str | None:
 
 
 def format_number(value: object) -> str:
-    """Return a value for people: a number has at most four decimals."""
+    """Return a value in human-readable form. Numbers have at most four decimals."""
     return f"{round(value, 4):.12g}" if isinstance(value, float) else str(value)
 
 
 FLAG = Kind("boolean", (bool,), "must be true or false")
 TEXT = Kind("string", (str,), "must be a string", "TEXT")
-#: a name; on a command line it is never empty, and it is UTF-8
+#: A name. On a command line, it must be valid UTF-8 and not empty.
 WORD = Kind("string", (str,), "must be a string")
-#: a path of a file or a socket; it may have any bytes but is never empty
+#: The path of a file or a socket. On a command line, it may contain any bytes but must not be empty.
 PATH = Kind("string", (str,), "must be a string", "PATH")
 INTEGER = Kind("integer", (int,), "must be an integer", "N")
 NUMBER = Kind("number", (int, float), "must be a number", "X")
-#: a length of time, 0 or more
+#: A length of time, 0 or more.
 SECONDS = Kind("number", (int, float), "must be a number", "SEC")
 DATA = Kind("object", (dict,), f"must be an object of at most {MAX_DATA_BYTES} bytes", check=_data_error)
 ID = Kind("id", (str,), "must be a string", "ID", _id_error)
@@ -137,64 +137,66 @@ IDS = Kind("list", (list, tuple), f"must be a list of at most {MAX_IDS} ids", "[
 
 @frozen
 class Setting:
-    """The server's value of an option, for goals that don't give the option."""
+    """A server's default for an option of goals."""
 
     initial: Any
-    #: the value that means "none", and is shown as null
+    #: value that stands for "none", which is shown as null
     none_value: Any = None
-    #: its meaning in `set` on the wire, if it differs from the option's
+    #: meaning in a `set` request, if it differs from the meaning in `say`
     meaning: str = ""
-    #: its help in `talk set` and `talk serve`, if it differs from that of `talk say`
+    #: help in `talk set`, if it differs from the help in `talk say`
     set_help: str = ""
+    #: help in `talk serve`, if it differs from the help in `talk say`
     serve_help: str = ""
-    #: its spellings for `talk set`, if they differ
+    #: spellings in `talk set` and `talk serve`, if they differ from those in `talk say`
     flags: str = ""
-    #: how its value is shown to people, and how it is shown that there is none
+    #: format string for showing the value in a sentence
     words: str = ""
+    #: words for showing that there is no value
     none_words: str = ""
 
 
 @frozen
 class Option:
-    """An option of a goal or of a command: its name, its values, and everything that is said about it."""
+    """An option of a goal or of a command: its name, its allowed values and its descriptions."""
 
     name: str
     kind: Kind
-    #: its meaning on the wire, for documents
+    #: meaning on the wire, for the documents
     meaning: str = ""
-    #: its value if it isn't given; if this is None, a request may also have null
+    #: value if the option isn't given; if this is None, a request may also contain null
     default: Any = None
-    #: the least and the greatest number; None for no limit
+    #: minimum and maximum of a number, with None for no limit
     limits: tuple[float | None, float | None] = (None, None)
-    #: whether the least number itself is out of range
+    #: whether the minimum itself is out of range
     excludes_minimum: bool = False
-    #: the unit of a number, with a space before it
+    #: unit of a number, preceded by a space
     unit: str = ""
-    #: the only possible values
+    #: the only allowed values, if the option has a fixed choice
     choices: tuple[str, ...] = ()
-    #: a further check of a value of the right type; returns an error message or None
+    #: additional check of a value of the right type, which returns an error message or None
     check: Callable[[Any], str | None] | None = None
-    #: a note on its values, for documents
+    #: note on the allowed values, for the documents
     form: str = ""
-    #: a note on its default, for documents
+    #: note on the default, for the documents
     default_words: str = ""
-    #: its spellings on a command line, "-w, --wait"; with one for yes and one for no, "--preempt/--queue"
+    #: spellings on a command line: "-w, --wait", or "--preempt/--queue" with one for yes and one for no
     flags: str = ""
     metavar: str = ""
     help: str = ""
-    #: the environment variable that replaces it
+    #: environment variable that is read if the option isn't given
     env: str = ""
-    #: the function of `cli.completion` that completes its values
+    #: name of the function in `cli.completion` that completes values
     completion: str = ""
-    #: the server's own value, if servers have one
+    #: the server's default, if it can be changed with `talk set`
     setting: Setting | None = None
-    #: whether the engine is told its value
+    #: whether the value is sent to the engine
     for_engine: bool = False
-    #: whether goals show its value
+    #: whether goals show the value
     in_goal: bool = False
 
     def type_error(self, value: Any) -> str | None:
-        """Return an error message such as "must be an integer" if a value has the wrong type or form."""
+        """Return an error message such as "must be an integer" if the type or form of a value is wrong."""
         if value is None and self.default is None:
             return None
         kind = self.kind
@@ -217,13 +219,13 @@ class Option:
         low, high = self.limits
         if self.kind is SECONDS and high is None:
             high = _MAX_FLOAT
-        # NaN is outside, because every comparison with it is false.
+        # NaN is out of range, because every comparison with NaN is false.
         above = low is None or (value > low if self.excludes_minimum else value >= low)
         return not (above and (high is None or value <= high))
 
     @property
     def range(self) -> str:
-        """The limits in words; "" if there are none."""
+        """The limits in words, or "" if there are none."""
         low, high = self.limits
         if low is None:
             return ""
@@ -232,7 +234,7 @@ class Option:
         return f"above {low:g}" if self.excludes_minimum else f"from {low:g} on"
 
     def for_set(self) -> Option:
-        """Return the option of `talk set` for this setting. It has no default, because other settings stay."""
+        """Return the option of `talk set` for this setting. It has no default: omitted settings don't change."""
         setting = self.setting
         assert setting
         return replace(self, env="", flags=setting.flags or self.flags, help=setting.set_help or self.help)
@@ -252,7 +254,7 @@ def _priority_error(value: int) -> str | None:
 
 
 def key_error(value: str) -> str | None:
-    """Return an error message if this is no valid key."""
+    """Return an error message if a string is not a valid key."""
     if 0 < len(value) <= MAX_KEY_CHARS:
         return None
     return f"a key has 1 to {MAX_KEY_CHARS} characters, this one has {len(value)}"
@@ -339,7 +341,7 @@ OPTIONS = (
         INTEGER,
         "higher goes first; first in first out among equals",
         default=0,
-        # These are no `limits`, because help would show them.
+        # The range is not in `limits`, because help would show it.
         check=_priority_error,
         form=f"{-MAX_PRIORITY:,} to {MAX_PRIORITY:,}",
         flags="--priority",
@@ -401,7 +403,7 @@ OPTIONS = (
         "rate",
         INTEGER,
         "words per minute",
-        # libespeak-ng takes no others.
+        # libespeak-ng accepts no other rates.
         limits=(80, 450),
         unit=" words per minute",
         default_words="the server's",
@@ -496,20 +498,20 @@ OPTIONS = (
     Option("format", TEXT, "anything else is REJECTED", "text", check=_format_error, in_goal=True),
 )
 
-#: the names of the options that the engine is told
+#: Names of the options that are sent to the engine.
 ENGINE_OPTIONS = tuple(each.name for each in OPTIONS if each.for_engine)
-#: the options that decide how a goal sounds, also in a file; servers have values of their own for them
+#: Options that determine how a goal sounds, even if it is written to a file. Servers have a default for each of them.
 SOUND_OPTIONS = tuple(each for each in OPTIONS if each.for_engine and each.setting)
-#: the names of the options that goals show
+#: Names of the options that goals show.
 SHOWN_OPTIONS = tuple(each.name for each in OPTIONS if each.in_goal)
-#: the options for which servers have values of their own: first those that the engine is told
+#: Options for which servers have a default, starting with those that are sent to the engine.
 SETTINGS = tuple(sorted((each for each in OPTIONS if each.setting), key=lambda each: not each.for_engine))
 _NONE_VALUES = {each.name: each.setting.none_value for each in SETTINGS if each.setting}
 
 
 @frozen
 class Say:
-    """A goal: speak this. Values out of their range make it REJECTED, bad_option."""
+    """A goal: speak this. Values that are out of range make the goal REJECTED, bad_option."""
 
     kind: ClassVar[str] = "say"
     options: ClassVar[tuple[Option, ...]] = OPTIONS
@@ -543,7 +545,7 @@ class Set:
     options: ClassVar[tuple[Option, ...]] = SETTINGS
     rate: int | None = None  # words per minute
     volume: float | None = None  # 0 to 1
-    voice: str | None = None  # id, name or language; "default" for the driver's own
+    voice: str | None = None  # id, name or language, or "default" for the driver's own voice
     pitch: int | None = None  # 0 to 100
     preempt: bool | None = None
     ttl: float | None = None  # seconds, 0 for no limit
@@ -589,13 +591,13 @@ class Cancel:
 
     @property
     def selects_all(self) -> bool:
-        """Whether it selects all goals."""
+        """Whether all goals are selected."""
         return self.ids is None and not self.current and self.before is None and self.key is None
 
     def select_waiting(self, goals: Sequence[Say]) -> list[int]:
-        """Return the indexes of the selected goals in a list of goals that wait for room.
+        """Return the indexes of the selected goals in a list of goals that wait for room in the queue.
 
-        `before` selects such goals only if it is the id that a sender has given to one of them.
+        Such goals have an id only if their sender chose one, so `before` has to name an id of this kind to select them.
         """
         ids = set(self.ids or ())
         last = max((index for index, say in enumerate(goals) if say.id == self.before is not None), default=-1)
@@ -607,7 +609,7 @@ class Cancel:
 
 
 def require_fields(cls: type, options: Iterable[str]) -> None:
-    """Raise TypeError if a class lacks the field of one of these options. Called at import to find mistakes in rows."""
+    """Raise TypeError if a class lacks a field for one of these options. This check runs at import."""
     for name in options:
         if name not in cls.__annotations__:
             raise TypeError(f"the option {name!r} has a row but {cls.__name__} has no such field")
@@ -616,32 +618,27 @@ def require_fields(cls: type, options: Iterable[str]) -> None:
 for _request in (Say, Set, Cancel):
     require_fields(_request, (each.name for each in _request.options))
 
-#: the settings of a server that is given none
+#: Settings of a server that was started without any.
 INITIAL = Set(**{each.name: each.setting.initial for each in SETTINGS if each.setting})
-#: the options whose values must be checked for each goal
-_CHECKED = {
-    each: tuple(option for option in each.options if option.check or option.limits != (None, None))
-    for each in (Say, Set)
-}
 
 
 def bad_option(asked: Say | Set) -> str | None:
-    """Return an error message if an option of a goal, or a setting, has a value that is not allowed."""
+    """Return an error message if a goal or a change of settings has a value that is not allowed."""
     if isinstance(asked, Say) and asked.flush and asked.preempt is False:
         return "flush preempts: it can't be had together with preempt false"
-    for option in _CHECKED[type(asked)]:
+    for option in asked.options:
         value = getattr(asked, option.name)
-        if value is not None and value != option.default and (words := option.value_error(value)):
+        if value != option.default and (words := option.value_error(value)):
             return words
     return None
 
 
 def bad_text(text: str, max_chars: int | None = MAX_TEXT_CHARS) -> Refusal | None:
-    """Return why a text can't be spoken; None if it can, as far as is known without the engine.
+    """Return the reason why a text can't be spoken, or None if no problem is found without the engine.
 
     Args:
         text: the text.
-        max_chars: its greatest length; None for any length.
+        max_chars: the maximum length, or None for no limit.
     """
     import unicodedata
 
@@ -664,35 +661,35 @@ def bad_text(text: str, max_chars: int | None = MAX_TEXT_CHARS) -> Refusal | Non
 
 
 def given_values(asked: Say | Set) -> dict[str, Any]:
-    """Return the options or settings that are given, by name."""
+    """Return the options or settings that have a value, by name."""
     return {name: value for name, value in fields(asked).items() if value is not None}
 
 
 def engine_options(say: Say, settings: Set) -> dict[str, Any]:
-    """Return the options of a goal that the engine is told, by name, with the server's values for missing ones."""
+    """Return a goal's options for the engine by name. The server's settings are used for omitted options."""
     found = {}
     for name in ENGINE_OPTIONS:
         own = getattr(say, name)
         found[name] = getattr(settings, name, None) if own is None else own
-    return _without_none(found)
+    return _replace_none_values(found)
 
 
 def shown_settings(settings: Set) -> JsonObject:
-    """Return settings as the server shows them: None if there is no voice or no ttl."""
-    return _without_none(fields(settings))
+    """Return settings as the server shows them, with None for the default voice and for a ttl of 0."""
+    return _replace_none_values(fields(settings))
 
 
-def _without_none(values: dict[str, Any]) -> dict[str, Any]:
-    """Replace the values that mean "none", the default voice and a ttl of 0, by None."""
+def _replace_none_values(values: dict[str, Any]) -> dict[str, Any]:
+    """Replace the values that stand for "none" by None."""
     return {name: None if value == _NONE_VALUES.get(name) else value for name, value in values.items()}
 
 
 def describe_settings(settings: JsonObject) -> list[str]:
-    """Return a few words for people about each setting that a server shows."""
+    """Return a short description of each setting that a server shows."""
     found = []
     for each in SETTINGS:
-        setting, value = each.setting, settings.get(each.name)
-        if setting:
-            none = setting.none_words and not value
-            found.append(setting.none_words if none else setting.words.format(format_number(value)))
+        value = settings.get(each.name)
+        if each.setting:
+            words = each.setting.words.format(format_number(value))
+            found.append(words if value else each.setting.none_words or words)
     return found

@@ -1,6 +1,6 @@
-"""The reasons why a goal was refused or has ended without success.
+"""The reasons for which goals are refused or end without success.
 
-A new reason needs a member here and nothing else. The table in the wire's document is made from the members.
+To add a reason, add a member here. The table of reasons in the protocol's document is generated from the members.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ _REJECTED, _ABORTED, _LOST = State.REJECTED, State.ABORTED, State.LOST
 
 
 class Reason(str, Enum):
-    """A reason as programs read it: a string that never changes its meaning.
+    """A machine-readable reason: a string whose meaning never changes.
 
-    A client may get a reason that it doesn't know from a newer server, so `Goal.reason` is a plain string.
+    `Goal.reason` is a plain string because a newer server may send a reason that this client doesn't know.
     """
 
     #: the states in which a goal may have this reason
     states: tuple[State, ...]
-    #: what the reason means, for people, in Markdown
+    #: human-readable meaning, in Markdown
     meaning: str
 
     def __new__(cls, code: str, states: tuple[State, ...] = (), meaning: str = "") -> Reason:
@@ -74,14 +74,14 @@ class Reason(str, Enum):
     ENGINE_HUNG = "engine_hung", (_ABORTED,), "the engine process said nothing any more"
     NOTHING_TO_SAY = "nothing_to_say", (_ABORTED,), "nothing in the text can be spoken"
     NOT_SILENT = "not_silent", (_ABORTED,), "it was stopped, and silence was not confirmed within 2 s"
-    # Only a client gives these two.
+    # Only clients set these two reasons.
     NOT_SENT = "not_sent", (_REJECTED,), "the client could not send it: it never reached a server"
     LOST = "lost", (_LOST,), "the connection ended first"
 
-    # A member is shown and formatted as a plain string, in every version of Python.
+    # Make a member look like a plain string in every Python version.
     __str__ = str.__str__
     __repr__ = str.__repr__
 
 
-#: Why a goal is refused: the reason, and a message for people that gives the particulars.
+#: A refusal: the machine-readable reason, and a human-readable message with the details.
 Refusal = tuple[Reason, str]

@@ -1,6 +1,6 @@
-"""The scheduler's record of a goal.
+"""The scheduler's mutable record of a goal.
 
-Only this package writes to it; other packages may read it. It has slots, because ten thousand goals may wait.
+Only the `goals` package changes records. Other packages may read them.
 """
 
 from __future__ import annotations
@@ -19,54 +19,54 @@ if TYPE_CHECKING:
     from talkcli.goals.options import Say
     from talkcli.goals.reasons import Reason
 
-#: the fields of a goal that are unknown when it is accepted
+#: Fields that a goal gets after it was accepted.
 _LATER = ("reason", "by", "message", "started_at", "ended_at", "duration", "voice", "output")
 require_fields(Goal, (*SHOWN_OPTIONS, *_LATER))
 
 
 @dataclass(slots=True, eq=False)
 class Record:
-    """One goal, from its acceptance to its end."""
+    """One goal from its submission to its end. It has slots because ten thousand goals may wait."""
 
     id: str
-    #: its place in the order of acceptance
+    #: position in the order of submission
     number: int
-    #: the request; it has the server's time to live if the sender gave none
+    #: the request; if the sender gave no time to live, the request contains that of the server
     say: Say
     sender: Sender
     queued_at: float
     preempt: bool = False
-    #: when it expires if it has not begun (monotonic seconds)
+    #: time at which it expires unless it has started (monotonic)
     expires_at: float | None = None
-    #: None once the text is dropped
+    #: the text, or None after it was dropped to free memory
     text: str | None = field(init=False)
-    #: replaces a text that is dropped
+    #: a hash of the text, set when the text is dropped
     text_hash: int = 0
-    #: memory for the text; 0 once it is dropped
+    #: size of the text, or 0 after it was dropped
     text_bytes: int = field(init=False)
     state: State = State.PENDING
-    #: its place among the pending goals of its priority; only the queue uses it
+    #: position among the pending goals of its priority, used only by the queue
     position: int = 0
     reason: Reason | None = None
     by: By | None = None
     message: str | None = None
-    #: the offset after the last word that was heard
+    #: offset of the end of the last word that was heard
     spoken_end: int = 0
-    #: whether it is held while it is spoken
+    #: whether it was paused in mid-sentence
     paused: bool = False
-    #: how often it was paused
+    #: number of times it was paused
     pause_count: int = 0
-    #: since when it is the next goal (monotonic seconds); inf before that
+    #: time at which it became the next goal (monotonic), or inf before that
     next_since: float = inf
-    #: when it was handed to the engine (monotonic seconds)
+    #: time at which it was given to the engine (monotonic)
     began_at: float = 0.0
     started_at: float | None = None
     ended_at: float | None = None
     duration: float | None = None
-    #: id of the voice that speaks it
+    #: id of the voice that is used
     voice: str | None = None
     output: Output | None = None
-    #: when it was first told to stop (monotonic seconds)
+    #: time of the first order to stop it (monotonic)
     stop_requested_at: float | None = None
 
     def __post_init__(self) -> None:
@@ -75,29 +75,29 @@ class Record:
 
     @property
     def priority(self) -> int:
-        """The goal's priority: higher goes first."""
+        """The goal's priority. Higher priorities are spoken first."""
         return self.say.priority
 
     @property
     def key(self) -> str | None:
-        """The label by which a later goal replaces this one, if it has one."""
+        """The goal's key, or None. A later goal with the same key replaces this one."""
         return self.say.key
 
     def change_state(self, state: State) -> None:
-        """Change the state, or raise IllegalTransition and change nothing."""
+        """Change the state. Raises IllegalTransition if the transition is not allowed."""
         self.state = check_transition(self.state, state)
 
     def drop_text(self) -> None:
-        """Forget the text to free memory, but not the result."""
+        """Drop the text to free memory, and keep everything else."""
         self.text_hash = hash(self.text)
         self.text, self.text_bytes, self.say = None, 0, replace(self.say, text="")
 
     def has_text(self, text: str) -> bool:
-        """Return whether this is the goal's text, even if the text was dropped."""
+        """Return whether the goal has this text. After the text was dropped, compare hashes."""
         return hash(text) == self.text_hash if self.text is None else text == self.text
 
     def snapshot(self, state: State | None = None) -> Goal:
-        """Return the goal as it is now, or with PENDING, as it was when it was accepted."""
+        """Return the goal as it is now. With PENDING, return the goal as it was when it was accepted."""
         state = self.state if state is None else state
         shown = {name: getattr(self.say, name) for name in SHOWN_OPTIONS}
         if state is not State.PENDING:

@@ -1,11 +1,11 @@
 """The scheduler: decides which goal is spoken, which goals wait, how each one ends, and which voices are loaded.
 
-Pure: a request, a report of the engine or the time goes in, and effects come out. A method either does its whole step
-or raises an error and changes nothing. Effects must be carried out in their order: the orders for the engine among
-themselves, and the changes to be published among themselves. Only this package writes to the scheduler and its records.
+Pure: methods take a request, a report from the engine or the time, and return effects. A method either does everything
+or raises an error and changes nothing. The caller must carry out the orders for the engine in the order in which they
+were returned, and publish the state changes in their order. Only this package changes the scheduler and its records.
 
-After every step: at most one goal is ACTIVE or PREEMPTING. No goal starts before that one has ended, while speech is
-paused, or without an engine. A goal ends once.
+At most one goal is ACTIVE or PREEMPTING at any time. The next goal starts only after that goal has ended, and only with
+an engine and while speech is not paused. Every goal ends exactly once.
 """
 
 from __future__ import annotations
@@ -40,46 +40,46 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import Output, Sender
     from talkcli.goals.options import Cancel, Say, Set
 
-#: How long the engine may take to confirm silence after a stop. A cancel must be answered within 2 s in any case.
+#: How long the engine may take to confirm silence after a stop. Every cancel must be answered within 2 s.
 CONFIRM_SILENCE_S = 1.9
 
 
 @frozen
 class Now:
-    """One moment on both clocks, in seconds.
+    """The current time on two clocks, in seconds.
 
-    The monotonic clock must go on while the machine is suspended, so that goals expire meanwhile.
+    The monotonic clock must keep running while the machine is suspended, so that goals expire meanwhile.
     """
 
     monotonic: float
-    #: seconds since 1970 UTC, only to be shown
+    #: seconds since 1970 UTC, used only for display
     wall: float
 
 
 @frozen
 class StateChange:
-    """Effect: publish that a goal is in a new state."""
+    """Effect: publish a goal's new state."""
 
     record: Record
     state: State
 
 
 class Order(Enum):
-    """What the engine is to do with a goal; the value is the name in the log."""
+    """An order for the engine about a goal. The value is the name in the log."""
 
     START = "Start"
-    #: be silent, and report the end
+    #: become silent and report the end
     STOP = "Stop"
-    #: replace the engine process, because it did not become silent in time
+    #: replace the engine process because it did not become silent in time
     GIVE_UP = "GiveUp"
-    #: be silent until RESUME
+    #: stay silent until RESUME
     HOLD = "Hold"
     RESUME = "Resume"
 
 
 @frozen
 class EngineOrder:
-    """Effect: give the engine an order about a goal."""
+    """Effect: give the engine an order for a goal."""
 
     record: Record
     order: Order
@@ -92,10 +92,10 @@ Effect = StateChange | EngineOrder | VoiceLoadOrder | VoiceDropOrder | VoiceWarn
 class Submission:
     """The result of `Scheduler.submit`."""
 
-    #: the new goal, or the earlier goal with the same id and text
+    #: the new goal, or an earlier goal with the same id and text
     record: Record
     effects: list[Effect]
-    #: whether it is the earlier goal
+    #: whether the record is that of an earlier goal
     attached: bool = False
 
 
@@ -103,19 +103,19 @@ class Submission:
 class Cancellation:
     """The result of `Scheduler.cancel`."""
 
-    #: goals that have ended at once
+    #: pending goals that were recalled by this cancel
     recalled: list[Record] = field(default_factory=list)
     #: the active goal, if it is being stopped
     stopping: Record | None = None
-    #: goals that had ended before
+    #: selected goals that had already ended
     ended: list[Record] = field(default_factory=list)
-    #: ids that no goal has
+    #: selected ids that no goal has
     unknown: list[str] = field(default_factory=list)
     effects: list[Effect] = field(default_factory=list)
 
 
 class Scheduler:
-    """The goals of one server."""
+    """Schedules the goals of one server."""
 
     def __init__(
         self,
@@ -129,11 +129,11 @@ class Scheduler:
         """Start without goals and without an engine.
 
         Args:
-            boot: four characters that begin the ids of this server's goals.
-            max_queue: the number of goals that may be pending.
-            max_text: the number of characters that a text may have.
-            settings: the values of options that goals don't give. None of them is None.
-            voices: the neural voices, if they have a memory limit.
+            boot: the first four characters of all goal ids made by this server.
+            max_queue: the maximum number of pending goals.
+            max_text: the maximum number of characters in a text.
+            settings: the values for options that a goal omits. Every setting must have a value.
+            voices: the scheduler of neural voices, or None for one without a memory limit or file sizes.
         """
         self.boot = boot
         self.settings = settings
@@ -143,13 +143,13 @@ class Scheduler:
         self.voices = voices or VoiceScheduler()
         #: the goal that is ACTIVE or PREEMPTING
         self.active: Record | None = None
-        #: whether no goal starts until `resume`
+        #: whether speech is paused
         self.paused = False
-        #: whether goals can start
+        #: whether goals can be given to the engine, even if only to fail
         self.has_engine = False
-        #: whether `shutdown` was called, so that every new goal is rejected
+        #: whether `shutdown` was called, after which every new goal is rejected
         self.closing = False
-        #: whether there is an engine process that loads voices
+        #: whether a running engine process can load voices
         self._loads_voices = False
         self._queue = Queue()
         self._by_id: dict[str, Record] = {}
@@ -157,7 +157,7 @@ class Scheduler:
         self._early_cancels = EarlyCancels()
         self._count = 0
 
-    # -- what there is
+    # -- the goals
 
     @property
     def pending_count(self) -> int:
@@ -165,7 +165,7 @@ class Scheduler:
         return len(self._queue)
 
     def pending(self) -> Iterator[Record]:
-        """Return the pending goals in the order in which they will be spoken."""
+        """Return the pending goals in the order of speech."""
         return iter(self._queue)
 
     def unfinished(self) -> list[Record]:
@@ -173,24 +173,24 @@ class Scheduler:
         return ([self.active] if self.active else []) + list(self._queue)
 
     def find(self, goal_id: str) -> Record | None:
-        """Return the goal with this id, if it is active, pending or still in the history."""
+        """Return the active, pending or ended goal with this id. Old goals have been dropped from the history."""
         return self._by_id.get(goal_id) or self.history.find(goal_id)
 
     def has_room(self, say: Say) -> bool:
-        """Return whether a goal that waits for room in the queue can be submitted now."""
+        """Return whether the queue has room for a goal, or an earlier goal already has its id."""
         attaches = say.id is not None and self.find(say.id) is not None
         return attaches or self._find_room(say) is not None
 
     def lacks_room(self, say: Say, now: Now, refusal: Refusal | None = None) -> bool:
-        """Return whether a goal would be rejected only because the queue is full; `refusal` as in `submit`."""
+        """Return whether a full queue is the only reason to reject a goal. `refusal` is the same as in `submit`."""
         canceled = self._early_cancels.find(say.id, now.monotonic)
         return not (canceled or self.has_room(say)) and self._refuse(say, refusal, None) is None
 
     def wanted_voice(self, record: Record) -> str:
-        """Return the voice of a goal: its own, or that of the settings; "" for the engine's default."""
+        """Return the voice that a goal asks for, or else the voice in the settings, or "" for the driver's own."""
         return record.say.voice or self.settings.voice or ""
 
-    # -- what clients ask for
+    # -- requests from clients
 
     def submit(
         self,
@@ -201,15 +201,15 @@ class Scheduler:
         canceled: By | None = None,
         waited_s: float = 0.0,
     ) -> Submission:
-        """Accept or reject a goal. A rejected goal has no effect on the others.
+        """Accept or reject a goal. A rejected goal doesn't affect other goals.
 
         Args:
             say: the goal.
-            sender: the sender of the goal.
-            now: the time.
-            refusal: why the server refuses the goal, if it does.
-            canceled: the client that cancelled the goal while it waited for room. The goal is recalled at once.
-            waited_s: how long the goal waited for room. The goal is recalled at once if its time to live is over.
+            sender: the program that sent the goal.
+            now: the current time.
+            refusal: the server's own reason to reject the goal, or None.
+            canceled: the client that cancelled the goal while it waited for room. The goal is accepted and recalled.
+            waited_s: how long the goal waited for room, which counts towards its time to live.
         """
         first = self.find(say.id) if say.id is not None and is_clients_id(say.id) else None
         if first is not None and first.has_text(say.text):
@@ -246,19 +246,19 @@ class Scheduler:
     def cancel(
         self, selection: Cancel, sender: Sender | None, now: Now, waiting: Collection[str | None] = ()
     ) -> Cancellation:
-        """End the selected goals: the pending ones at once, the active one when the engine is silent.
+        """End the selected goals. Pending goals end at once, and the active goal ends when the engine is silent.
 
         Args:
-            selection: the goals to end.
-            sender: the client that cancels them.
-            now: the time.
-            waiting: the ids of selected goals that wait for room and have not been submitted yet.
+            selection: the goals to cancel.
+            sender: the client that cancels the goals.
+            now: the current time.
+            waiting: ids of selected goals that still wait for room in the queue.
         """
         result = Cancellation()
         by = By(client=sender)
         chosen = self._select(selection, result, waiting)
         for goal_id in filter(is_clients_id, result.unknown):
-            self._early_cancels.note(goal_id, by, now.monotonic)
+            self._early_cancels.add(goal_id, by, now.monotonic)
         for record in chosen:
             if record.state is State.PENDING:
                 result.effects += self._recall(record, Reason.CANCELED, "canceled before it was spoken", by, now)
@@ -270,19 +270,16 @@ class Scheduler:
         return result
 
     def change_settings(self, changes: dict[str, object], now: Now) -> list[Effect]:
-        """Change the values of options that goals don't give, for the goals that have not begun.
-
-        A voice that has failed before is loaded again if it is named here.
-        """
+        """Change settings for all goals that have not started. If they name a voice that had failed, load it again."""
         self.settings = replace(self.settings, **changes)
         voice = changes.get("voice")
         if isinstance(voice, str):
             self.voices.forget_failure(without_speaker(voice))
             self._request_voice(voice, now)
-        return self.tick(now)  # the next goal may not have to wait for its voice any more
+        return self.tick(now)  # the next goal may no longer have to wait for its voice
 
     def pause(self) -> list[Effect]:
-        """Hold the active goal, and start no other."""
+        """Pause the active goal, and start no other goal until `resume`."""
         if self.paused:
             return []
         self.paused = True
@@ -293,7 +290,7 @@ class Scheduler:
         return [EngineOrder(self.active, Order.HOLD)]
 
     def resume(self, now: Now) -> list[Effect]:
-        """Continue the goal that is held, or start the next one."""
+        """Continue the paused goal, or start the next one."""
         if not self.paused:
             return []
         self.paused = False
@@ -303,7 +300,7 @@ class Scheduler:
         return [EngineOrder(self.active, Order.RESUME)]
 
     def shutdown(self, now: Now) -> list[Effect]:
-        """End all goals, and reject every new one."""
+        """End all goals, and reject every new goal."""
         self.closing = True
         effects: list[Effect] = []
         for record in list(self._queue):
@@ -312,58 +309,57 @@ class Scheduler:
             effects += self._stop(self.active, Reason.SHUTDOWN, None, now)
         return effects
 
-    # -- what the engine reports
+    # -- reports from the engine
 
     def engine_lost(self, now: Now) -> list[Effect]:
-        """Start no goal until there is an engine again."""
+        """Record that the engine process has ended. No goal starts until there is another one."""
         self.has_engine = self._loads_voices = False
         return [*self.voices.engine_lost(now.monotonic)]
 
     def engine_ready(self, now: Now) -> list[Effect]:
-        """Start the next goal, and load the voices that goals need: there is an engine."""
+        """Record that an engine is ready. Start the next goal, and load the voices that goals need."""
         self.has_engine = self._loads_voices = True
         for voice in (*self._needed_voices(), self.settings.voice or ""):
             self._request_voice(voice, now)
         return self._start_next(now) + self._load_next(now)
 
     def engine_unavailable(self, now: Now) -> list[Effect]:
-        """Start goals although no engine can be started, so that each one fails at once."""
+        """Record that the engine can't be started at all. Goals still start, so that each one fails at once."""
         self.has_engine, self._loads_voices = True, False
         return self._start_next(now)
 
     def fail_next(self, message: str, now: Now) -> list[Effect]:
-        """Fail the next goal: no engine could be started for a long time."""
+        """Fail the next goal, because no engine could be started for a long time."""
         if self.has_engine:
             return []
         record, effects = self._activate_next(now)
         return effects + self.failed(record.id, Reason.ENGINE_FAILED, message, None, now) if record else effects
 
-    def word_heard(self, goal_id: str, end: int) -> Record:
-        """Note that a word is being heard, which ends at this offset of the text. Return the goal."""
+    def word_heard(self, goal_id: str, end: int) -> None:
+        """Record that a word of the active goal is being heard. `end` is the offset of its end in the text."""
         record = self._require_active(goal_id)
         record.spoken_end = max(record.spoken_end, end)
-        return record
 
     def voice_chosen(self, goal_id: str, voice: str, now: Now) -> list[Effect]:
-        """Note which voice speaks the active goal. Its own voice may be dropped for that of another goal now."""
+        """Record the voice that is used for the active goal. If it needs no other voice now, load the next one."""
         self._require_active(goal_id).voice = voice
         return self._load_next(now)
 
     def output_changed(self, goal_id: str, output: Output | None) -> None:
-        """Note where the sound of the active goal goes; None if unknown."""
+        """Record the output of the active goal, or None if the output is unknown."""
         self._require_active(goal_id).output = output
 
     def completed(
         self, goal_id: str, duration: float | None, now: Now, gaps: int = 0, gap_seconds: float = 0
     ) -> list[Effect]:
-        """End the active goal: all of it was played.
+        """End the active goal, because all of it was played.
 
         Args:
             goal_id: the id of the goal.
-            duration: the seconds of audio, if known.
-            now: the time.
-            gaps: how often the sound was interrupted because it was not made in time.
-            gap_seconds: how long all gaps were together.
+            duration: the length of the audio in seconds, or None if unknown.
+            now: the current time.
+            gaps: the number of interruptions because speech was not synthesized in time.
+            gap_seconds: the total length of the interruptions.
         """
         record = self._require_active(goal_id)
         record.duration = duration
@@ -374,52 +370,62 @@ class Scheduler:
         if gaps:
             many = f"{gaps} gap{'s' if gaps > 1 else ''} of {gap_seconds:.1f} s in all"
             words += f", but with {many}: this machine is too slow for the voice"
-        # A stop that came too late had no effect, so its reason goes.
-        return self._end(record, State.SUCCEEDED, None, words, None, now) + self._load_next(now)
+        # If a stop came too late, its reason and cause don't apply.
+        return self._end(record, State.SUCCEEDED, None, words, None, now)
 
     def failed(self, goal_id: str, reason: Reason, message: str, duration: float | None, now: Now) -> list[Effect]:
-        """End the active goal because engine or audio failed.
+        """End the active goal, because the engine or the audio failed.
 
-        If the goal was being stopped, it is silent now and ends PREEMPTED. Only `not_silent` makes it ABORTED.
+        A failure while the goal is being stopped makes it silent, so the goal ends PREEMPTED. `not_silent` is an
+        exception.
         """
         record = self._require_active(goal_id)
         record.duration = duration
         if record.state is State.PREEMPTING and reason is not Reason.NOT_SILENT:
             return self.stopped(goal_id, now)
-        message = f"Talk aborted: {message}"
-        return self._end(record, State.ABORTED, reason, message, record.by, now) + self._load_next(now)
+        return self._end(record, State.ABORTED, reason, f"Talk aborted: {message}", record.by, now)
 
     def stopped(self, goal_id: str, now: Now) -> list[Effect]:
-        """End the active goal, which was being stopped and is silent now."""
+        """End the active goal, because it was stopped and is now silent."""
         record = self._require_active(goal_id)
-        effects = self._end(record, State.PREEMPTED, record.reason, "Talk preempted", record.by, now)
-        return effects + self._load_next(now)
+        return self._end(record, State.PREEMPTED, record.reason, "Talk preempted", record.by, now)
 
     def voice_load_ended(self, voice: str, error: str | None, now: Now, *, has_libraries: bool) -> list[Effect]:
-        """Note that a voice was loaded, or why it could not be. `has_libraries`: whether the engine imported them."""
+        """Record that a voice was loaded, or with `error`, that it could not be loaded.
+
+        Args:
+            voice: the id of the voice.
+            error: the human-readable error, or None if the voice was loaded.
+            now: the current time.
+            has_libraries: whether the engine process has imported the libraries for neural voices.
+        """
         self.voices.has_libraries = self.voices.has_libraries or has_libraries
         self.voices.load_ended(voice, error, now.monotonic)
         return self._drop_excess() + self.tick(now)
 
     def voices_measured(self, voice: str, memory_bytes: int, now: Now) -> list[Effect]:
-        """Note the memory that all voices take. `voice`: the voice that was just loaded or has just spoken, if any."""
+        """Record the memory use of all voices. `voice` is the voice that was just loaded or has just spoken, or ""."""
         self.voices.measured(voice, memory_bytes)
         return self._drop_excess() + self._load_next(now)
 
     def voice_unloaded(self, voice: str, now: Now) -> list[Effect]:
-        """Note that the engine has dropped a voice by itself."""
+        """Record that the engine has dropped a voice on its own."""
         self.voices.unloaded(voice, self._needed_voices())
         return self._load_next(now)
 
     # -- time
 
     def deadline(self) -> float | None:
-        """Return the time at which `tick` has something to do (monotonic); None if it has nothing to do."""
+        """Return the time at which `tick` has something to do (monotonic), or None if nothing is due in future."""
         due = (self._active_deadline(), self._queue.next_expiry(), self._next_deadline())
         return min((each for each in due if each is not None), default=None)
 
     def tick(self, now: Now) -> list[Effect]:
-        """Recall expired goals, abort the active goal if it isn't silent in time, and start the next goal."""
+        """Do everything that is due now.
+
+        Expired goals are recalled. If the active goal was stopped and did not become silent in time, it is aborted. The
+        next goal starts if it no longer has to wait for its voice.
+        """
         effects: list[Effect] = []
         record, deadline = self.active, self._active_deadline()
         if record is not None and deadline is not None and now.monotonic >= deadline:
@@ -434,7 +440,7 @@ class Scheduler:
     # -- admission
 
     def _select(self, selection: Cancel, result: Cancellation, waiting: Collection[str | None]) -> list[Record]:
-        """Return the selected goals that have not ended; note the others in `result`."""
+        """Return the selected goals that have not ended. Add ended goals and unknown ids to `result`."""
         chosen = self.unfinished() if selection.selects_all else []
         for goal_id in dict.fromkeys(selection.ids or ()):
             record = self.find(goal_id)
@@ -455,11 +461,17 @@ class Scheduler:
             else:
                 result.unknown.append(selection.before)
         unique = {each.number: each for each in chosen}.values()
-        # The active goal comes last. Otherwise a selected goal would start, only to be stopped again.
+        # The active goal comes last. Otherwise, the next selected goal could start before it is recalled.
         return sorted(unique, key=lambda each: (each is self.active, each.number))
 
     def _refuse(self, say: Say, refusal: Refusal | None, first: Record | None) -> Refusal | None:
-        """Return why a goal is refused regardless of other goals. `first`: an earlier goal with the same id."""
+        """Return the reason to reject a goal whatever the queue contains, or None.
+
+        Args:
+            say: the goal.
+            refusal: the server's own reason to reject the goal, or None.
+            first: an earlier goal with the same id and another text, or None.
+        """
         if self.closing:
             return Reason.SHUTDOWN, "the server is being stopped"
         if words := bad_option(say):
@@ -469,7 +481,7 @@ class Scheduler:
         return bad_text(say.text, self.max_text) or refusal
 
     def _throttle(self, say: Say, record: Record, now: Now) -> Refusal | None:
-        """Return why a goal is throttled, and note the goal that it repeats; None if it is not throttled."""
+        """Return the refusal if a goal is throttled, and set `record.by` to the goal that it repeats."""
         if say.throttle is None:
             return None
         active = self.active
@@ -490,7 +502,7 @@ class Scheduler:
         return say.flush or bool(self.settings.preempt if say.preempt is None else say.preempt)
 
     def _find_room(self, say: Say) -> list[tuple[Record, Reason]] | None:
-        """Return the pending goals that this goal recalls, each with the reason; None if there is no room for it."""
+        """Return the pending goals to recall for a new goal, each with the reason, or None if the queue has no room."""
         replaced = self._queue.with_key(say.key)
         preempted: list[Record] = []
         if say.flush:
@@ -499,16 +511,16 @@ class Scheduler:
             preempted = self._queue.preempting_goals_up_to(say.priority)
         recalled = [(replaced, Reason.REPLACED)] if replaced else []
         recalled += [(each, Reason.PREEMPTED) for each in preempted if each is not replaced]
-        # The queue never holds too many goals, so one recalled goal makes enough room.
+        # The queue never exceeds its limit, so recalling one goal makes enough room.
         if recalled or len(self._queue) < self.max_queue:
             return recalled
         last = self._queue.displaceable_goal()
-        # A goal that brings `preempt` also displaces its own priority. Goals that preempt are in `recalled` already.
+        # A goal that was sent with `preempt` also displaces goals of its own priority, except other preempting goals.
         limit = say.priority if say.preempt else say.priority - 1
         return [(last, Reason.DISPLACED)] if last and last.priority <= limit else None
 
     def _enqueue(self, record: Record, recalled: list[tuple[Record, Reason]], now: Now) -> list[Effect]:
-        """Queue an accepted goal, end the pending goals that it recalls, and stop the active goal if it preempts it."""
+        """Add an accepted goal to the queue. Recall the given goals, and stop the active goal if it is preempted."""
         by = By(goal=record.id)
         effects: list[Effect] = []
         replaced = None
@@ -524,14 +536,14 @@ class Scheduler:
     # -- voices
 
     def _request_voice(self, voice: str, now: Now) -> None:
-        """Have a voice loaded for a goal, if it is a neural one and there is an engine."""
+        """Plan to load the voice for a goal if it is a neural voice and an engine process is running."""
         if self._loads_voices and is_neural(model := without_speaker(voice)):
             self.voices.request(model, now.monotonic)
 
     def _needed_voices(self) -> list[str]:
         """Return the neural voices that goals need, in the order of the goals.
 
-        The active goal needs none once it is heard: its voice is kept until it has spoken.
+        If the active goal already has a voice, it needs no other. The engine keeps that voice until the goal ends.
         """
         voices = (without_speaker(self.wanted_voice(each)) for each in self.unfinished() if each.voice is None)
         return list(filter(is_neural, dict.fromkeys(voices)))
@@ -539,7 +551,7 @@ class Scheduler:
     def _load_next(self, now: Now) -> list[Effect]:
         """Return the order to load the next voice, if there is one.
 
-        The first voice is not loaded while a goal is heard. The libraries that are imported then stop the whole engine
+        The first voice is not loaded while a goal is active. Loading it imports libraries, which blocks the engine
         process for a tenth of a second.
         """
         if not (self._loads_voices and self.voices.can_load) or self.closing:
@@ -550,25 +562,26 @@ class Scheduler:
         return [order] if order else []
 
     def _drop_excess(self) -> list[Effect]:
-        """Return orders to drop voices if they take more memory than allowed."""
+        """Return orders to drop voices if the voices use more memory than allowed."""
         needed = self._needed_voices()
         speaking = without_speaker(self.active.voice) if self.active else ""
         if is_neural(speaking) and not self.voices.is_loaded(speaking):
-            return []  # it was dropped but keeps its memory until it has spoken, and the engine measures again then
+            return []  # a dropped voice that still speaks uses its memory until then, and is measured again after that
         return [*self.voices.drop_excess(next(iter(needed), speaking), needed)]
 
-    # -- how goals begin and end
+    # -- starting and ending goals
 
     def _expire(self, now: Now) -> list[Effect]:
+        """Recall the pending goals that have expired."""
         effects: list[Effect] = []
         for record in self._queue.expired(now.monotonic):
             effects += self._recall(record, Reason.EXPIRED, _expiry_message(record), None, now)
         return effects
 
     def _active_deadline(self) -> float | None:
-        """Return when the active goal must be silent, if it is being stopped, or when it expires.
+        """Return the time at which the active goal must be silent if it is being stopped, or at which it expires.
 
-        It expires only if its engine was lost before any of it was heard, because it has to begin again.
+        An active goal can expire only if the engine was lost before anything was heard. Then it has to start again.
         """
         goal = self.active
         if goal is None:
@@ -578,7 +591,7 @@ class Scheduler:
         return None if self.has_engine or goal.spoken_end else goal.expires_at
 
     def _next_deadline(self) -> float | None:
-        """Return when the next goal no longer waits for its voice; None if it doesn't wait."""
+        """Return the time at which the next goal stops waiting for its voice (monotonic), or None without a limit."""
         record = None if self.active or self.paused or not self.has_engine else self._queue.first()
         if record is None:
             return None
@@ -590,14 +603,14 @@ class Scheduler:
         return self.voices.start_time(record, self.settings.voice) if self._loads_voices else 0.0
 
     def _start_next(self, now: Now) -> list[Effect]:
-        """Start the next goal, if one can start."""
+        """Start the next goal, if it can start now."""
         if not self.has_engine:
             return []
         record, effects = self._activate_next(now)
         return [*effects, EngineOrder(record, Order.START)] if record else effects
 
     def _activate_next(self, now: Now) -> tuple[Record | None, list[Effect]]:
-        """Make the next goal the active one, and return it; None if no goal can start."""
+        """Make the next goal ACTIVE. Return it with the effects, or None if no goal can start now."""
         if self.active or self.paused:
             return None, []
         effects = self._expire(now)
@@ -614,26 +627,26 @@ class Scheduler:
         return record, [*effects, StateChange(record, State.ACTIVE)]
 
     def _recall(self, record: Record, reason: Reason, words: str, by: By | None, now: Now) -> list[Effect]:
-        """End a pending goal."""
+        """Remove a goal from the queue, and end it RECALLED."""
         self._queue.remove(record)
         return self._end_unqueued(record, reason, words, by, now)
 
     def _end_unqueued(self, record: Record, reason: Reason, words: str, by: By | None, now: Now) -> list[Effect]:
-        """End a PENDING goal that is not in the queue."""
+        """End a PENDING goal as RECALLED. The goal must not be in the queue."""
         record.change_state(State.RECALLING)
         return self._end(record, State.RECALLED, reason, f"Talk recalled: {words}", by, now)
 
     def _stop(self, record: Record, reason: Reason, by: By | None, now: Now) -> list[Effect]:
-        """Have the engine stop the active goal."""
+        """Order the engine to stop the active goal."""
         if record.state is State.PREEMPTING:
-            return []  # the first stop gives the reason
+            return []  # keep the reason of the first stop
         record.change_state(State.PREEMPTING)
         record.reason, record.by, record.stop_requested_at = reason, by, now.monotonic
         record.paused = False
         return [StateChange(record, State.PREEMPTING), EngineOrder(record, Order.STOP)]
 
     def _require_active(self, goal_id: str) -> Record:
-        """Return the active goal; IllegalTransition if this is not its id."""
+        """Return the active goal. Raises IllegalTransition if its id is another one."""
         if self.active is None or self.active.id != goal_id:
             raise IllegalTransition(f"{goal_id} is not being spoken")
         return self.active
@@ -641,18 +654,18 @@ class Scheduler:
     def _end(
         self, record: Record, state: State, reason: Reason | None, message: str, by: By | None, now: Now
     ) -> list[Effect]:
-        """End a goal. If it was the active one, start the next."""
+        """End a goal. If it was the active goal, start the next one."""
         record.change_state(state)
         record.reason, record.message, record.by = reason, message, by
         record.ended_at, record.paused = now.wall, False
         if record.spoken_end and state is not State.ABORTED:
-            self._speech_times.note(record)
+            self._speech_times.add(record)
         self._by_id.pop(record.id)
         self.history.add(record)
         if record is not self.active:
             return [StateChange(record, state)]
         self.active = None
-        return [StateChange(record, state), *self._start_next(now)]
+        return [StateChange(record, state), *self._start_next(now), *self._load_next(now)]
 
 
 def _expiry_message(record: Record) -> str:

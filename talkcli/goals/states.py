@@ -1,7 +1,7 @@
-"""The states of a goal, with the names and numbers of actionlib, and the table of allowed transitions.
+"""The states of a goal, with actionlib's names and numbers, and the table of allowed transitions.
 
-A transition that is not in the table is an error and changes nothing. To allow another one, change the table and the
-tests that list it.
+A transition that is not in the table raises an error and changes nothing. To allow another transition, change the table
+and the tests that repeat it.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from talkcli.errors import TalkError
 
 
 class State(IntEnum):
-    """State of a goal. Its value is actionlib's number; `str` and f-strings give its name."""
+    """The state of a goal. The value is actionlib's number. `str` and f-strings give the name."""
 
     PENDING = 0  # in the queue
-    ACTIVE = 1  # handed to the engine
-    PREEMPTED = 2  # stopped while it was spoken, by a cancel or by another goal
-    SUCCEEDED = 3  # all of it was played
-    ABORTED = 4  # engine or audio failed, or nothing in the text can be spoken
-    REJECTED = 5  # never queued
-    PREEMPTING = 6  # told to stop, not yet silent
-    RECALLING = 7  # being taken out of the queue; a goal never stays in this state
-    RECALLED = 8  # taken out of the queue before it was spoken
-    LOST = 9  # set by a client: the connection to the server ended after the goal was accepted
+    ACTIVE = 1  # given to the engine
+    PREEMPTED = 2  # stopped after it had become ACTIVE
+    SUCCEEDED = 3  # completely played
+    ABORTED = 4  # the engine or the audio failed, or the text contains nothing that can be spoken
+    REJECTED = 5  # refused, so never in the queue
+    PREEMPTING = 6  # being stopped, but not silent yet
+    RECALLING = 7  # being removed from the queue; becomes RECALLED in the same step
+    RECALLED = 8  # removed from the queue before it was spoken
+    LOST = 9  # set by a client if its connection to the server ends after the goal was accepted
 
     @property
     def terminal(self) -> bool:
@@ -34,11 +34,11 @@ class State(IntEnum):
         return self.name
 
     def __format__(self, spec: str) -> str:
-        # Without this, IntEnum formats the number from Python 3.11 on.
+        # In Python 3.11 and later, IntEnum would format the number.
         return format(int(self) if spec.endswith("d") else self.name, spec)
 
 
-#: the terminal states, each with the exit code of a command whose goal ended in it
+#: The terminal states, each with the exit code of a command that waits for the goal.
 EXIT_CODES: dict[State, int] = {
     State.SUCCEEDED: 0,
     State.ABORTED: 4,
@@ -48,8 +48,8 @@ EXIT_CODES: dict[State, int] = {
     State.LOST: 12,
 }
 
-#: The states that may follow each state. A goal begins PENDING or REJECTED. PREEMPTING may end ABORTED only with the
-#: reason `not_silent`, which the scheduler ensures. A client may conclude LOST from any state that is not terminal.
+#: The states that may follow each state. A new goal is PENDING or REJECTED. The scheduler changes PREEMPTING to ABORTED
+#: only with the reason `not_silent`. A client may change any non-terminal state to LOST.
 TRANSITIONS: dict[State, frozenset[State]] = {
     State.PENDING: frozenset({State.ACTIVE, State.RECALLING, State.LOST}),
     State.RECALLING: frozenset({State.RECALLED, State.LOST}),
@@ -60,13 +60,13 @@ TRANSITIONS: dict[State, frozenset[State]] = {
 
 
 class IllegalTransition(TalkError):
-    """A change of state that the table does not allow. It is a bug of the caller and has changed nothing."""
+    """A transition that the table does not allow. It indicates a bug in the caller. No state was changed."""
 
     code = "illegal_transition"
 
 
 def check_transition(state: State, target: State) -> State:
-    """Return `target` if it may follow `state`. Otherwise raise IllegalTransition."""
+    """Return `target`. Raises IllegalTransition if `target` may not follow `state`."""
     if target not in TRANSITIONS[state]:
         raise IllegalTransition(f"a goal that is {state.name} can't become {target.name}")
     return target

@@ -1,7 +1,7 @@
-"""The neural voices that goals ask for: which one is loaded next, which ones are dropped, and how long a goal waits.
+"""Neural voices: which one is loaded next, which ones are dropped, and how long a goal waits for its voice.
 
-Pure: it decides from what the engine reports, and the scheduler passes its orders on. Whether a voice exists is for the
-server to know. A neural voice is named by its id without a speaker. Every other voice is always ready and never kept
+Pure: decisions depend on the engine's reports, and the scheduler passes the orders on. The server knows which voices
+exist. A neural voice is identified by its id without a speaker. All other voices are always ready and don't appear
 here.
 """
 
@@ -21,46 +21,46 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
     from talkcli.goals.record import Record
 
-#: How long a goal waits for a voice that is being loaded. On a small machine, loading takes three seconds.
+#: How long a goal waits for a voice that is being loaded. Loading takes three seconds on a small machine.
 VOICE_PATIENCE_S = 10.0
-#: A goal stops waiting for its voice this long before it expires, so that it can still begin.
+#: A goal stops waiting for its voice this long before it expires, so that it can still start.
 EXPIRY_MARGIN_S = 0.5
-#: When a goal may have a failed voice loaded again. The delay doubles with each failure, because an attempt that fails
-#: costs a second of processor time, and one that kills the engine costs a sentence.
+#: Shortest and longest delay before a goal may load a failed voice again. The delay doubles with each failure. A failed
+#: attempt costs a second of processor time, or even a sentence if it kills the engine.
 FIRST_VOICE_RETRY_S, LAST_VOICE_RETRY_S = 5.0, 3600.0
-#: A voice is blamed if the engine dies this many times in a row while it loads the voice.
+#: A voice is considered faulty if the engine dies this many times in a row while loading it.
 MAX_ENGINE_DEATHS = 2
 
 
 class VoiceState(Enum):
     """The state of a neural voice that a goal has asked for."""
 
-    WAITING = "waiting"  # to be loaded
+    WAITING = "waiting"  # not loaded yet
     LOADING = "loading"
     LOADED = "loaded"
-    FAILED = "failed"  # another voice speaks instead
+    FAILED = "failed"  # could not be loaded, so another voice speaks instead
 
 
 @dataclass(slots=True)
 class NeuralVoice:
     """A neural voice that a goal has asked for."""
 
-    #: memory that it takes, as the engine measured it; the size of its file before that
+    #: memory use as measured by the engine, or the size of the voice's file before the first measurement
     size_bytes: int
     state: VoiceState = VoiceState.WAITING
-    #: why it can't be loaded, or a warning about it, for people
+    #: human-readable reason for a failure, or a warning
     why: str | None = None
-    #: how often in a row loading has failed
+    #: number of failed attempts to load it since it was last loaded
     failures: int = 0
-    #: whether it is to be loaded, or loaded again after a failure
+    #: whether it should be loaded, or loaded again after a failure
     wanted: bool = True
-    #: when it may be loaded again after a failure (monotonic seconds)
+    #: earliest time for another attempt after a failure (monotonic)
     retry_at: float = 0.0
-    #: when loading began (monotonic seconds); inf before that
+    #: time at which loading started (monotonic), or inf before that
     loading_since: float = inf
 
     def fail(self, why: str, now: float) -> None:
-        """Note that it could not be loaded."""
+        """Record that the voice could not be loaded."""
         self.failures += 1
         self.retry_at = now + min(LAST_VOICE_RETRY_S, FIRST_VOICE_RETRY_S * 2 ** (self.failures - 1))
         self.state, self.why = VoiceState.FAILED, why
@@ -68,7 +68,7 @@ class NeuralVoice:
 
 @frozen
 class VoiceLoadOrder:
-    """Order for the engine: drop some voices to make room, then load a voice."""
+    """Effect: the engine drops some voices to make room, and then loads a voice."""
 
     voice: str
     dropped: tuple[str, ...] = ()
@@ -76,66 +76,67 @@ class VoiceLoadOrder:
 
 @frozen
 class VoiceDropOrder:
-    """Order for the engine: drop a voice, because the voices take more memory than allowed."""
+    """Effect: the engine drops a voice because the loaded voices use more memory than allowed."""
 
     voice: str
 
 
 @frozen
 class VoiceWarning:
-    """A problem with a voice, for the log."""
+    """Effect: log a problem with a voice."""
 
     message: str
 
 
 class VoiceScheduler:
-    """Decides which neural voices the engine loads and drops, and remembers how that went."""
+    """Decides which neural voices the engine loads and drops."""
 
     def __init__(self, limit_bytes: int = 0, file_size: Callable[[str], int] = lambda _: 0) -> None:
         """Start without any voice.
 
         Args:
-            limit_bytes: memory that the loaded voices may take. One voice alone may take more.
-            file_size: returns the size of a voice's file in bytes, an estimate of its memory.
+            limit_bytes: memory limit for all loaded voices. A single voice may use more.
+            file_size: function that returns the size of a voice's file in bytes, an estimate of its memory use.
         """
         self._limit_bytes = limit_bytes
         self._file_size = file_size
-        #: by id; the voice that was asked for last comes last
+        #: by id, in the order of the latest requests
         self._voices: dict[str, NeuralVoice] = {}
-        #: memory that each voice took when it was last loaded
+        #: memory that each voice used when it was last loaded
         self._measured_bytes: dict[str, int] = {}
-        #: memory that all voices together have added to the engine process: as it reported last, and without the voices
-        #: that were dropped since
-        self._reported_bytes = self._used_bytes = 0
-        #: whether the engine process has imported the libraries, which the first load does
+        #: memory that all voices have added to the engine process, according to its latest report
+        self._reported_bytes = 0
+        #: the reported memory without the voices that were dropped after the report
+        self._used_bytes = 0
+        #: whether the engine process has imported the libraries, which it does when it loads its first voice
         self.has_libraries = False
         #: the voice that the engine is loading
         self._loading: str | None = None
 
-    # -- what goals ask for
+    # -- requests from goals
 
     def request(self, voice: str, now: float) -> None:
-        """Have a voice loaded as soon as possible, because a goal asks for it."""
+        """Plan to load a voice, because a goal asks for it. A failed voice is tried again only after its delay."""
         found = self._voices.pop(voice, None) or self._new(voice)
         self._voices[voice] = found
         if found.state is VoiceState.FAILED and voice != self._loading and now >= found.retry_at:
             found.wanted = True
 
     def forget_failure(self, voice: str) -> None:
-        """Let the next request load a voice that has failed before."""
+        """Allow the next request to load a failed voice without delay."""
         found = self._voices.get(voice)
         if found and found.state is VoiceState.FAILED and voice != self._loading:
             del self._voices[voice]
 
     def start_time(self, record: Record, default_voice: str | None) -> float:
-        """Return the earliest time at which the next goal may start (monotonic); 0 if it needn't wait for its voice.
+        """Return the earliest time at which the next goal may start (monotonic), or 0 if it needn't wait for its voice.
 
-        An urgent goal doesn't wait, nor does a goal that would expire meanwhile. A `voice_only` goal waits until its
-        voice is loaded or has failed.
+        Urgent goals don't wait. Other goals stop waiting before they expire. A `voice_only` goal waits until its voice
+        is loaded or has failed.
 
         Args:
             record: the next goal.
-            default_voice: the voice of goals that name none.
+            default_voice: the voice of goals that don't name one.
         """
         found = self._voices.get(without_speaker(record.say.voice or default_voice)) if self._voices else None
         if found is None or found.state not in {VoiceState.WAITING, VoiceState.LOADING}:
@@ -148,7 +149,7 @@ class VoiceScheduler:
         return start if record.expires_at is None else min(start, record.expires_at - EXPIRY_MARGIN_S)
 
     def failure(self, voice: str) -> str | None:
-        """Return why a voice can't be loaded, for people; None if it can or if that is not known."""
+        """Return the human-readable reason why a voice could not be loaded, or None if it has not failed."""
         found = self._voices.get(voice)
         return found.why if found and found.state is VoiceState.FAILED else None
 
@@ -156,22 +157,22 @@ class VoiceScheduler:
         """Return the state of each voice, as `status` shows it."""
         return {voice: {"state": each.state.value, "why": each.why} for voice, each in self._voices.items()}
 
-    # -- what the engine is to do
+    # -- orders for the engine
 
     @property
     def can_load(self) -> bool:
-        """Whether a voice is wanted and none is being loaded."""
+        """Whether a voice should be loaded and no other voice is being loaded."""
         return self._loading is None and any(each.wanted for each in self._voices.values())
 
     def load_next(self, needed: Sequence[str], default_voice: str, now: float) -> VoiceLoadOrder | None:
-        """Return the order to load the next voice, and note that it has begun; None if nothing is to be loaded.
+        """Start loading the next voice. Return the order for the engine, or None if no voice can be loaded now.
 
-        Only one voice is loaded at a time. No voice is dropped that a goal needs sooner, because it would have to be
-        loaded again.
+        Only one voice is loaded at a time. If a goal needs a loaded voice sooner than the next one, the loaded voice is
+        not dropped, because it would have to be loaded again.
 
         Args:
             needed: the voices that waiting goals need, in the order of the goals.
-            default_voice: the voice of goals that name none. Nothing is dropped for it while no goal needs it.
+            default_voice: the voice of goals that don't name one. Unless a goal needs it, no voice is dropped for it.
             now: the time (monotonic).
         """
         if not self.can_load:
@@ -195,10 +196,12 @@ class VoiceScheduler:
         return None
 
     def drop_excess(self, first: str, needed: Sequence[str]) -> list[VoiceDropOrder | VoiceWarning]:
-        """Return orders to drop voices until the others fit into memory, because they took more than was expected.
+        """Drop voices until the others fit into the memory limit. Return the orders for the engine.
+
+        This is necessary if the voices use more memory than was estimated.
 
         Args:
-            first: the voice that speaks next, or speaks now. It is kept.
+            first: the voice that speaks now or next. It is never dropped.
             needed: the voices that waiting goals need, in the order of the goals. They are dropped last.
         """
         loaded = self._loaded()
@@ -214,11 +217,11 @@ class VoiceScheduler:
             self.unloaded(each, needed)
         return [*map(VoiceDropOrder, dropped), *self._warn_too_large()]
 
-    # -- what the engine reports
+    # -- reports from the engine
 
     def load_ended(self, voice: str, error: str | None, now: float) -> None:
-        """Note that a voice was loaded, or why it could not be."""
-        if voice == self._loading:  # the engine itself loads a voice that a `voice_only` goal needs
+        """Record that a voice was loaded, or with `error`, that it could not be loaded."""
+        if voice == self._loading:  # not true if the engine loaded the voice on its own for a `voice_only` goal
             self._loading = None
         found = self._voices.setdefault(voice, self._new(voice))
         found.wanted = False
@@ -228,11 +231,11 @@ class VoiceScheduler:
             found.fail(error, now)
 
     def measured(self, voice: str, memory_bytes: int) -> None:
-        """Note the memory that all voices have added to the engine process.
+        """Record the memory that all voices have added to the engine process.
 
         Args:
-            voice: the voice that was just loaded or has just spoken; "" if one was dropped.
-            memory_bytes: the memory of all voices.
+            voice: the voice that was just loaded or has just spoken, or "" if a voice was dropped.
+            memory_bytes: the memory of all voices together.
         """
         found, growth = self._voices.get(voice), memory_bytes - self._reported_bytes
         self._reported_bytes = self._used_bytes = memory_bytes
@@ -241,26 +244,26 @@ class VoiceScheduler:
             self._measured_bytes[voice] = found.size_bytes
 
     def unloaded(self, voice: str, needed: Collection[str]) -> None:
-        """Note that a voice is no longer loaded, and have it loaded again if a goal needs it."""
+        """Record that a voice is no longer loaded. If a goal needs the voice, plan to load it again."""
         found = self._voices.pop(voice, None)
         if found and found.state is VoiceState.LOADED:
-            self._used_bytes = max(0, self._used_bytes - found.size_bytes)  # until the engine measures again
+            self._used_bytes = max(0, self._used_bytes - found.size_bytes)  # an estimate until the next measurement
         if found and voice in needed:
             self._voices[voice] = NeuralVoice(found.size_bytes)
 
     def engine_lost(self, now: float) -> list[VoiceWarning]:
-        """Note that no voice is loaded any more. Return a warning if a voice is blamed for it."""
-        blamed, self._loading, self.has_libraries = self._loading, None, False
+        """Record that the engine process and all loaded voices are gone. Return a warning if a voice seems faulty."""
+        suspect, self._loading, self.has_libraries = self._loading, None, False
         self._reported_bytes = self._used_bytes = 0
         for voice, found in list(self._voices.items()):
-            if voice == blamed and found.failures + 1 >= MAX_ENGINE_DEATHS:
+            if voice == suspect and found.failures + 1 >= MAX_ENGINE_DEATHS:
                 found.fail("the engine process ended while it was being loaded", now)
-            elif voice == blamed:
+            elif voice == suspect:
                 self._voices[voice] = NeuralVoice(found.size_bytes, failures=found.failures + 1)
             elif found.state is not VoiceState.FAILED:
                 del self._voices[voice]
-        why = self.failure(blamed) if blamed else None
-        return [VoiceWarning(f"voice {blamed} is left alone: {why}")] if why else []
+        why = self.failure(suspect) if suspect else None
+        return [VoiceWarning(f"voice {suspect} is left alone: {why}")] if why else []
 
     def is_loaded(self, voice: str) -> bool:
         """Return whether a voice is loaded."""
@@ -269,14 +272,20 @@ class VoiceScheduler:
     # -- memory
 
     def _loaded(self) -> dict[str, int]:
+        """Return the memory use of each loaded voice."""
         return {voice: each.size_bytes for voice, each in self._voices.items() if each.state is VoiceState.LOADED}
 
     def _unattributed_bytes(self) -> int:
-        """Return the memory that the engine has gained beyond the sizes of its voices."""
+        """Return the memory that the engine process has gained and no loaded voice accounts for."""
         return max(0, self._used_bytes - sum(self._loaded().values()))
 
     def _make_room(self, size_bytes: int, keep: Collection[str]) -> tuple[str, ...] | None:
-        """Return the voices to drop for this many bytes, the least recently used first; None if that isn't enough."""
+        """Return the voices to drop for a new one, least recently used first, or None if the new voice can't fit.
+
+        Args:
+            size_bytes: the memory use of the new voice and of the voices to keep.
+            keep: the loaded voices that must stay. If there are none, the new voice always fits.
+        """
         others = {voice: size for voice, size in self._loaded().items() if voice not in keep}
         total = size_bytes + self._unattributed_bytes() + sum(others.values())
         dropped = []
@@ -287,7 +296,7 @@ class VoiceScheduler:
         return None if keep and total > self._limit_bytes else tuple(dropped)
 
     def _warn_too_large(self) -> list[VoiceWarning]:
-        """Return a warning if the only loaded voice exceeds the limit and this is new."""
+        """Return a warning if the only loaded voice exceeds the memory limit, unless there was a warning before."""
         loaded = self._loaded()
         voice = next(iter(loaded), "")
         taken = self._unattributed_bytes() + sum(loaded.values())
@@ -298,6 +307,7 @@ class VoiceScheduler:
         return [VoiceWarning(f"voice {voice}: {why}")]
 
     def _forget_unneeded(self, needed: Collection[str]) -> None:
+        """Cancel the plans to load voices that no goal needs any more."""
         for voice, found in list(self._voices.items()):
             if found.wanted and voice not in needed:
                 found.wanted = False
@@ -305,4 +315,5 @@ class VoiceScheduler:
                     del self._voices[voice]
 
     def _new(self, voice: str) -> NeuralVoice:
+        """Return the entry of a voice that goals have not asked for before."""
         return NeuralVoice(self._measured_bytes.get(voice) or self._file_size(voice))

@@ -1,14 +1,14 @@
-"""The server: asyncio around the scheduler, with the engine thread beside it.
+"""The server: asyncio around the scheduler, with a thread for the engine.
 
-It only does I/O. `goals` decides what happens. Only `cli.serve` imports it.
+This package does the I/O. `goals` makes the decisions. Only `cli.serve` imports the server.
 
-    run          the server as a whole: its clients, its status and its end
+    run          the server as a whole: its clients, its status and its shutdown
     listener     the listening socket and its lock
-    stream       the bytes of a client
-    connection   the lines of a client, its limits, and its requests in progress
-    requests     what each request does and how it is answered
+    stream       sends and receives the bytes of a client
+    connection   the lines of a client, its limits and its unanswered requests
+    requests     carries out and answers each kind of request
     speech       carries out the scheduler's effects and passes on the engine's reports
-    subscribers  the events for clients that wait or watch
-    voices       the voices that there are
-    log          the lines of the log about goals, engines and senders
+    subscribers  sends events to clients that wait or watch
+    voices       finds the voices that clients ask for
+    log          log messages about goals, engines and senders
 """

@@ -1,7 +1,8 @@
-"""One client: its connection with its limits, and its requests in progress. It decides nothing.
+"""The connection of a client, with its limits and its unanswered requests.
 
-Requests go to a `Handler`. Answers come back through `send`, `send_list` and `publish`. A client that doesn't read its
-answers is not read from either. First its feedback is dropped, then the client itself.
+The connection passes requests to a `Handler`, which answers with `send`, `send_list` and `publish`. If a client doesn't
+read its answers, the server stops reading from the client. First the server drops the client's feedback, and then the
+connection.
 """
 
 from __future__ import annotations
@@ -30,78 +31,79 @@ if TYPE_CHECKING:
     from talkcli.goals.record import Record
     from talkcli.server.stream import ClientStreams
 
-    #: requests that wait for the same thing, in their order
+    #: requests that wait for the same condition, in the order of their arrival
     WaitingList = dict["PendingRequest", None]
     Steps = Coroutine[WaitingList, bool | None, None]
 
-#: Unread output of a client, past which its feedback is dropped and its requests are left unread.
+#: If a client has more unread output than this, its feedback is dropped and no more requests are read.
 CONGESTION_BYTES = 256 * 1024
-#: Unread results of a client, past which it is dropped.
+#: A client with more unread output than this is dropped.
 MAX_CLIENT_OUTPUT_BYTES = 4 * 1024 * 1024
-#: Messages held back while a list is sent to a slow client, past which the client is dropped.
+#: A client is dropped if more messages than this are held back while a list is sent to it.
 MAX_HELD_MESSAGES = 10_000
-#: From connecting to the first complete request. Clients send `hello` at once.
+#: Time from the start of a connection to the end of its first request. Clients send `hello` immediately.
 FIRST_REQUEST_S = 5.0
-#: From the beginning of a line to its end.
+#: Time from the start of a line to its end.
 LINE_LIMIT_S = 10.0
-#: Consecutive lines that are not JSON, after which the connection is closed.
+#: A connection is closed after this number of consecutive lines that are not JSON.
 MAX_BAD_LINES = 10
-#: Lines of one client that are read before other clients have a turn. A line takes 0.1 to 0.2 ms, so a hundred busy
-#: clients delay the others by 0.1 s.
+#: Lines of one client that are processed in one turn of the event loop. A line takes 0.1 to 0.2 ms, so a hundred busy
+#: clients delay all others by 0.1 s.
 LINES_PER_TURN = 8
-#: Lines that may be read and not yet answered. Past that, the client is not read from.
+#: If more lines of a client than this are waiting to be processed, no more are read.
 READ_AHEAD_LINES = 64
 
 
 class Handler(Protocol):
-    """The server, as a connection sees it."""
+    """The methods of the server that connections call."""
 
-    #: the first line for a client that is admitted
+    #: the first line sent to each admitted client
     greeting: bytes
 
     def joined(self, connection: ClientConnection) -> None:
-        """Identify a new client, and admit it, keep it waiting, or close its connection."""
+        """Identify a new client. Admit the client, keep it waiting, or close its connection."""
 
     def left(self, connection: ClientConnection) -> None:
-        """Forget a client that is gone."""
+        """Remove a client whose connection has ended."""
 
     def handle(self, connection: ClientConnection, seq: int | None, request: Request) -> None:
         """Carry out a request, and answer it now or later."""
 
     def is_waiting(self, connection: ClientConnection) -> bool:
-        """Return whether a client waits for an answer or an event, so that its connection must stay open."""
+        """Return whether a client still waits for an answer or an event."""
 
 
 class PendingRequest:
-    """A request of a client that is not answered yet, and the coroutine that carries it out.
+    """An unanswered request of a client, and the coroutine that carries it out.
 
-    The coroutine runs until it has to wait, and again as soon as another part of the server resumes it. It never waits
-    for a later turn of the event loop. So nothing comes in between, and requests that wait for the same thing continue
-    in their order.
+    The coroutine runs until it has to wait, and continues immediately when another part of the server resumes it.
+    Unlike an asyncio task, it never waits for a later turn of the event loop. Therefore, nothing happens in between,
+    and requests that wait for the same condition continue in their order.
     """
 
     def __init__(self, connection: ClientConnection, seq: int | None, request: Request) -> None:
         self.connection = connection
         self.seq = seq
         self.request = request
-        #: where it waits
+        #: the list in which the request waits, or None if it doesn't wait
         self.waiting_list: WaitingList | None = None
-        #: the memory that is counted for it while it waits
+        #: memory that is counted for the request while it waits
         self.kept_bytes = 0
-        #: why a goal can't wait, if it can't
+        #: reason why the request was not allowed to wait, if it wasn't
         self.refusal: Refusal | None = None
-        #: who cancelled a goal while it waited, and the goal as it ended then
+        #: the client that cancelled the goal while it waited
         self.canceled_by: By | None = None
+        #: the goal that was recalled because of `canceled_by`
         self.canceled_goal: Record | None = None
         self._steps: Steps
 
     def start(self, steps: Steps) -> None:
-        """Run a coroutine until it waits or ends. It must answer the request and raise no error."""
+        """Run a coroutine until it waits or ends. It must answer the request and must not raise an error."""
         self._steps = steps
         self._step(None)
 
     async def wait(self, waiting_list: WaitingList, limit_s: float | None = None) -> bool:
-        """Wait in a list until something resumes the request. Return False if the time limit ended the wait."""
+        """Wait in a list until the request is resumed. Return False if the time limit was reached."""
         timer = None if limit_s is None else asyncio.get_running_loop().call_later(limit_s, self.resume, False)
         try:
             return await _wait_in(waiting_list)
@@ -110,33 +112,33 @@ class PendingRequest:
                 timer.cancel()
 
     def resume(self, in_time: bool = True) -> None:
-        """Continue the request, if it waits."""
+        """Continue the request if it is waiting."""
         if self._leave():
             self._step(in_time)
 
     def move_to(self, waiting_list: WaitingList) -> None:
-        """Have the request wait in this list instead of another."""
+        """Move the request to another waiting list."""
         self._leave()
         self.waiting_list = waiting_list
         waiting_list[self] = None
 
     def drop(self) -> None:
-        """Forget the request, because its client is gone."""
+        """Give up the request, because its client has disconnected."""
         self._leave()
         self._steps.close()
 
     def answer(self, items: Iterable[JsonObject] = (), events: Iterable[JsonObject] = (), /, **fields: object) -> None:
-        """Answer that the request was carried out.
+        """Send a successful reply.
 
         Args:
-            items: lines of a list, which are sent before the reply.
-            events: events that are sent after the reply.
-            fields: fields of the reply.
+            items: the lines of a list to send before the reply.
+            events: the events to send after the reply.
+            fields: the fields of the reply.
         """
         self._reply(ok(self.seq, **fields), items, events)
 
     def refuse(self, code: str, message: str, items: Iterable[JsonObject] = ()) -> None:
-        """Answer with an error, after the lines of a list."""
+        """Send an error reply. `items` are the lines of a list to send before the reply."""
         self._reply(failure(self.seq, code, message), items)
 
     def _reply(self, reply: JsonObject, items: Iterable[JsonObject], events: Iterable[JsonObject] = ()) -> None:
@@ -147,11 +149,11 @@ class PendingRequest:
             self.connection.send(reply)
 
     def _step(self, value: bool | None) -> None:
-        with contextlib.suppress(StopIteration):  # it has been answered
+        with contextlib.suppress(StopIteration):  # raised after the request was answered
             self.move_to(self._steps.send(value))
 
     def _leave(self) -> bool:
-        """Leave the list where the request waits. Return False if it doesn't wait."""
+        """Remove the request from its waiting list. Return False if it isn't waiting."""
         if self.waiting_list is None:
             return False
         del self.waiting_list[self]
@@ -160,7 +162,7 @@ class PendingRequest:
 
 
 def resume_all(waiting_list: WaitingList) -> None:
-    """Continue the requests that wait in a list now, in their order."""
+    """Continue all requests in a waiting list, in their order."""
     for each in list(waiting_list):
         each.resume()
 
@@ -173,19 +175,18 @@ def _wait_in(waiting_list: WaitingList) -> Generator[WaitingList, bool, bool]:
 class ClientConnection(asyncio.Protocol):
     """The connection of one client.
 
-    If the server is full, the client is not `admitted`. It waits until another client leaves or until it sends an
-    urgent request.
+    If the server is full, a new client is not `admitted` until another client leaves or it sends an urgent request.
     """
 
     def __init__(self, handler: Handler, streams: ClientStreams, connected: socket.socket) -> None:
-        """Create the connection; call `begin` next.
+        """Create the connection. Call `begin` to start reading.
 
         Args:
             handler: the server.
             streams: the streams of all clients.
-            connected: the client's non-blocking socket, which is closed with the connection.
+            connected: the client's non-blocking socket. The connection closes it.
         """
-        #: who the client is; the handler sets it when the client joins
+        #: the program at the other end, set by `Handler.joined`
         self.client: Sender
         self.admitted = False
         self.stream = ClientStream(streams, connected, self, CONGESTION_BYTES)
@@ -193,9 +194,9 @@ class ClientConnection(asyncio.Protocol):
         self._loop = streams.loop
         self._splitter = LineSplitter(MAX_LINE_BYTES - 1)
         self._lines: deque[bytes] = deque()
-        #: lists that are being sent, and lines that must come after them
+        #: lists that are being sent, and lines to be sent after them
         self._outbox: deque[Iterator[JsonObject] | bytes] = deque()
-        #: the newest feedback, if the client was too slow to get it
+        #: the newest feedback that could not be sent because the client was too slow
         self._held_feedback = b""
         self._half_closed = self._turn_is_due = False
         self._bad_lines = 0
@@ -203,16 +204,16 @@ class ClientConnection(asyncio.Protocol):
         self._line_limit: asyncio.TimerHandle | None = None
 
     def begin(self) -> None:
-        """Introduce the client to the handler, and read its requests if it is admitted."""
+        """Register the client with the handler, and start reading its requests."""
         self._handler.joined(self)
         if self.admitted:
             self.stream.begin()
         else:
-            # In the next turn, because another client may have left whose end is seen only later in this turn.
+            # Read in the next turn, because the server may still notice in this turn that another client has left.
             self._loop.call_soon(self.stream.resume_reading)
 
     def admit(self) -> None:
-        """Admit the client, and greet it."""
+        """Admit the client, and send the greeting."""
         self.admitted = True
         self._write(self._handler.greeting)
 
@@ -222,7 +223,7 @@ class ClientConnection(asyncio.Protocol):
         self._first_limit.cancel()
         self._stop_line_limit()
         if error is not None and self.admitted:
-            self._take_last_requests()
+            self._process_last_requests()
         self._lines.clear()
         self._outbox.clear()
         self._handler.left(self)
@@ -230,9 +231,9 @@ class ClientConnection(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         self._lines.extend(self._splitter.feed(data))
         if self._splitter.size >= MAX_LINE_BYTES:
-            self._lines.append(self._splitter.take_rest())  # too long already
+            self._lines.append(self._splitter.take_rest())  # the line is already too long
         if b"\n" in data:
-            self._stop_line_limit()  # another line begins
+            self._stop_line_limit()  # a new line starts, with a new time limit
         self._work()
 
     def eof_received(self) -> bool:
@@ -249,8 +250,8 @@ class ClientConnection(asyncio.Protocol):
     # -- called by the handler
 
     def send(self, message: JsonObject | bytes) -> None:
-        """Send a reply or an encoded line, after the lists that are being sent."""
-        if self._half_closed:  # it may be the last answer; close in the next turn, as another request may wait
+        """Send a reply or an encoded line after the lists that are being sent."""
+        if self._half_closed:  # if this is the last answer, the next turn closes the connection
             self._ask_for_turn()
         line = message if isinstance(message, bytes) else encode(message)
         if not self._outbox:
@@ -262,12 +263,12 @@ class ClientConnection(asyncio.Protocol):
             self.stream.abort()
 
     def send_list(self, messages: Iterator[JsonObject]) -> None:
-        """Send a list and its reply as fast as the client reads. Later messages wait until all of it is sent."""
+        """Send a list and its reply as fast as the client reads. Later messages are sent after the list."""
         self._outbox.append(messages)
         self._ask_for_turn()
 
     def publish(self, event: bytes, *, feedback: bool = False) -> None:
-        """Send an encoded event. If the client doesn't read, only the newest feedback is kept."""
+        """Send an encoded event. If the client is too slow, keep only the newest feedback."""
         if feedback and self.stream.congested:
             self._held_feedback = event
         else:
@@ -275,7 +276,7 @@ class ClientConnection(asyncio.Protocol):
             self.send(held + event)
 
     def has_hung_up(self) -> bool:
-        """Send what is written, and return whether this showed that the client is gone."""
+        """Return whether the client has closed its socket. This also sends the output so far."""
         self.stream.flush()
         return self.stream.closing
 
@@ -287,10 +288,11 @@ class ClientConnection(asyncio.Protocol):
     # -- internal
 
     def _limit(self, seconds: float, words: str) -> asyncio.TimerHandle:
+        """Return a timer that closes the connection with an error message."""
         return self._loop.call_later(seconds, self.close_with, failure(None, "too_slow", words))
 
     def _set_reading(self) -> None:
-        """Read from the client only while it reads its answers and not too many requests wait."""
+        """Start or stop reading. Read only while the client reads its answers and has few unprocessed lines."""
         if self.stream.closing:
             return
         reading = not self.stream.congested and len(self._lines) <= READ_AHEAD_LINES
@@ -313,18 +315,21 @@ class ClientConnection(asyncio.Protocol):
         if self.stream.unsent_bytes > MAX_CLIENT_OUTPUT_BYTES:
             self.stream.abort()
 
-    def _take_last_requests(self) -> None:
-        """Take the requests of a client that closed without reading. They are still in the socket, after an error."""
+    def _process_last_requests(self) -> None:
+        """Process the last requests of a client that closed its socket without reading the answers.
+
+        The system reports this as an error of the connection, but the requests can still be read after that.
+        """
         with contextlib.suppress(OSError):
             while data := self.stream.socket.recv(CONGESTION_BYTES):
                 self._lines.extend(self._splitter.feed(data))
         while self._lines and self._bad_lines < MAX_BAD_LINES:
-            self._take(self._lines.popleft())
+            self._process_line(self._lines.popleft())
 
     def _work(self) -> None:
-        """Send what can be sent and take requests, as much as one turn allows."""
+        """Send output and process requests, as much as the limit for one turn allows."""
         for _ in range(LINES_PER_TURN):
-            if self.stream.closing or self.stream.congested or not self._step():
+            if self.stream.closing or self.stream.congested or not self._send_or_process_one():
                 break
         else:
             self._ask_for_turn()
@@ -342,8 +347,8 @@ class ClientConnection(asyncio.Protocol):
         self._turn_is_due = False
         self._work()
 
-    def _step(self) -> bool:
-        """Send one line or take one request. Return False if there is neither."""
+    def _send_or_process_one(self) -> bool:
+        """Send one line or process one request. Return False if there is neither."""
         if self._outbox:
             first = self._outbox[0]
             if isinstance(first, bytes):
@@ -358,13 +363,13 @@ class ClientConnection(asyncio.Protocol):
             held, self._held_feedback = self._held_feedback, b""
             self._write(held)
         elif self._lines:
-            self._take(self._lines.popleft())
+            self._process_line(self._lines.popleft())
         else:
             return False
         return True
 
-    def _take(self, line: bytes) -> None:
-        """Take the request in a line."""
+    def _process_line(self, line: bytes) -> None:
+        """Pass the request in a line to the handler, or answer with an error if the line is invalid."""
         seq = None
         try:
             message = decode(line)
@@ -372,7 +377,7 @@ class ClientConnection(asyncio.Protocol):
             seq = take_seq(message)
             request = read_request(message)
         except BadRequest as error:
-            # After a line that is too long, nobody knows where the next one begins.
+            # After a line that is too long, the start of the next line is unknown.
             self._bad_lines += MAX_BAD_LINES if isinstance(line, TruncatedLine) else 1
             self.send(failure(seq, error.code, str(error)))
             if self._bad_lines >= MAX_BAD_LINES or not self.admitted:

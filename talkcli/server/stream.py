@@ -1,9 +1,12 @@
-"""The sockets of clients, in the event loop's thread: accepted, read and written. It knows no lines and no requests.
+"""Accepts, reads and writes the sockets of clients. All of it runs in the event loop's thread.
 
-A stream is used like a transport of asyncio, and replaces it for three reasons. No request is lost: asyncio's transport
-stops reading when it can't write, and drops the last requests of a client that closes. It is faster: a client is
-greeted in the turn of the loop in which it connects, a third sooner, and its first request is carried out in the same
-turn. And all messages of one turn are sent together, because sending a message costs as much as making it.
+A stream replaces a transport of asyncio and has a similar interface. There are three reasons:
+
+- No request is lost. If a client closes its connection, asyncio's transport fails to write, stops reading, and drops
+  the client's last requests.
+- It is faster. A client is greeted, and its first request is carried out, in the same turn of the event loop in which
+  it connects.
+- All messages of one turn are sent together, because sending a message takes as long as creating it.
 """
 
 from __future__ import annotations
@@ -22,53 +25,49 @@ if TYPE_CHECKING:
     import socket
     from collections.abc import Callable
 
-#: Bytes that are read at once: the longest request.
+#: Bytes that are read at once. This is the length of the longest request.
 _READ_BYTES = 64 * 1024
-#: Written bytes of a stream, past which they are sent before the turn ends.
+#: If a stream has this much new output, it is sent before the turn ends.
 _FLUSH_BYTES = 64 * 1024
-#: Unread output of all clients together. 250 clients could hold a gigabyte within their own limits.
+#: Unread output of all clients together. Without this limit, 250 clients could use a gigabyte.
 MAX_TOTAL_OUTPUT_BYTES = 64 * 1024 * 1024
-#: Streams with new output, past which they are flushed before the turn ends. With a thousand clients, the first ones
-#: can read their result while those of the others are being written.
-_FLUSH_STREAMS = 128
 
-#: Connections that are accepted before other clients have a turn. Each is greeted, and may send requests at once.
+#: Connections that are accepted in one turn of the event loop. Each new client may send requests immediately.
 ACCEPTS_PER_TURN = 8
-#: Descriptors that clients can't use: nine for a restart of the engine, beside those of the old process; two for a new
-#: socket and its lock; one to look up a client's process.
+#: Descriptors that clients can't use: nine to restart the engine while the old process still exists, two to bind the
+#: socket again, one to look up a client's process, and some to spare.
 RESERVED_DESCRIPTORS = 16
-#: Descriptors of a server without clients: fourteen, and two for libraries.
+#: Descriptors of a server without clients: fourteen of its own, and two for libraries.
 OWN_DESCRIPTORS = 16
 _TOO_FEW_DESCRIPTORS = (
     "the server has too few file descriptors for more clients: raise LimitNOFILE= of its unit, or ulimit -n before "
     "talk serve"
 )
-#: How long to wait if no connection can be accepted.
+#: Delay before the next attempt after a connection could not be accepted.
 ACCEPT_RETRY_S = 1.0
-#: Errors of `accept` that mean that the system has run out of something. The connection waits.
+#: Errors of `accept` if the system has run out of descriptors or memory. New connections stay in the backlog.
 _EXHAUSTED = {errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM}
-#: Errors of `accept` that mean that there is no connection, or not any more.
+#: Errors of `accept` if there is no new connection, or if the client has closed it already.
 _NO_CONNECTION = {errno.EAGAIN, errno.ECONNABORTED, errno.EPROTO, errno.EINTR}
 
 
 class ClientStreams:
     """The streams of all clients of one event loop.
 
-    It flushes them at the end of each turn and limits their unread output. One callback for all streams is cheaper than
-    one for each: it saves a third of the time for a word that fifty clients watch.
+    It sends their output at the end of each turn, and limits the unread output of all clients together. All streams
+    share one callback per turn. This saves a third of the time if fifty clients watch the words.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self.loop = loop
-        #: the streams that have not ended
         self.open: set[ClientStream] = set()
-        #: unread output of all streams
+        #: size of the unread output of all streams
         self.unread_bytes = 0
-        #: the streams with new output in this turn, in their order
+        #: the streams with new output in this turn, in the order of their first output
         self._written: dict[ClientStream, None] = {}
 
     def shed_load(self) -> None:
-        """Drop the clients with the most unread output until the rest is within the limit."""
+        """Drop the clients with the most unread output until the total is within the limit."""
         while self.unread_bytes > MAX_TOTAL_OUTPUT_BYTES and self.open:
             max(self.open, key=lambda each: each.unsent_bytes + each.held_bytes).abort()
             total = MAX_TOTAL_OUTPUT_BYTES >> 20
@@ -79,32 +78,30 @@ class ClientStreams:
         if not self._written:
             self.loop.call_soon(self._flush)
         self._written[stream] = None
-        if len(self._written) >= _FLUSH_STREAMS:
-            self._flush()
 
     def _flush(self) -> None:
         written, self._written = self._written, {}
         for stream in written:
             try:
                 stream.flush()
-            except Exception as error:  # noqa: BLE001 - the other clients still get their answers
+            except Exception as error:  # noqa: BLE001 - the output of other clients must still be sent
                 stream.abort()
                 log.write_bug("sending to a client", error)
 
 
 class ClientStream:
-    """The socket of one client. It is closed after the receiver has been told of the end."""
+    """The socket of one client. It is closed after `connection_lost` of its receiver has been called."""
 
     def __init__(
         self, streams: ClientStreams, connected: socket.socket, receiver: asyncio.Protocol, congestion_bytes: int
     ) -> None:
-        """Create the stream; call `begin` or `resume_reading` to read.
+        """Create the stream. Call `begin` or `resume_reading` to start reading.
 
         Args:
             streams: the streams of all clients.
             connected: the client's non-blocking socket.
-            receiver: is called with the data. It learns of the end in a turn of its own, with the error, if any.
-            congestion_bytes: unread output past which the receiver is told to pause.
+            receiver: the protocol that gets the data. Its `connection_lost` is called in a later turn.
+            congestion_bytes: the size of unread output above which `pause_writing` of the receiver is called.
         """
         self.socket = connected
         self._streams = streams
@@ -112,13 +109,13 @@ class ClientStream:
         self._receiver = receiver
         self._congestion_bytes = congestion_bytes
         self._unread = bytearray()
-        #: bytes that the receiver keeps until the client has read what was sent before
+        #: size of the output that the receiver holds back until the client has read earlier output
         self.held_bytes = 0
-        #: whether nothing more can be written
+        #: whether the stream was closed, so that no more output is accepted
         self.closing = False
-        #: whether the receiver was told to pause
+        #: whether the receiver should pause writing
         self.congested = False
-        #: whether the output waits until the client reads
+        #: whether the socket's buffer is full until the client reads
         self._blocked = False
         self._reading = self._eof = False
         streams.open.add(self)
@@ -126,14 +123,14 @@ class ClientStream:
     # -- input
 
     def begin(self) -> None:
-        """Send what is written, and read from now on, at once if there is data already."""
+        """Send the output so far, and start reading. Data that has already arrived is read at once."""
         self.flush()
         self.resume_reading()
         if self._reading:
             self._read()
 
     def resume_reading(self) -> None:
-        """Read from the client, unless all was read."""
+        """Read from the client, unless the end of its input was reached."""
         if not (self._reading or self._eof or self.closing):
             self._reading = True
             self._loop.add_reader(self.socket, self._read)
@@ -161,25 +158,25 @@ class ClientStream:
             if not self._receiver.eof_received():
                 self.close()
         except Exception:
-            self.abort()  # otherwise the client would wait for an answer
+            self.abort()  # otherwise, the client would wait for an answer in vain
             raise
 
     # -- output
 
     @property
     def unsent_bytes(self) -> int:
-        """The number of bytes that are written and not sent."""
+        """The size of the output that has not been sent yet."""
         return len(self._unread)
 
     def count_held(self, size_bytes: int) -> None:
-        """Count bytes that the receiver keeps for the client, or with a negative size, no longer keeps."""
+        """Add to the size of the output that the receiver holds back. A negative size subtracts from it."""
         if self in self._streams.open:
             self.held_bytes += size_bytes
             self._streams.unread_bytes += size_bytes
             self._streams.shed_load()
 
     def write(self, data: bytes) -> None:
-        """Send data at the end of this turn, or when the client has read what was sent before."""
+        """Send data at the end of this turn, or after the client has read earlier output."""
         if self.closing:
             return
         self._unread += data
@@ -193,12 +190,12 @@ class ClientStream:
         self._streams.shed_load()
 
     def flush(self) -> None:
-        """Send what is written now. If this shows that the client is gone, the stream is `closing`."""
+        """Send the output now. If the client has closed its socket, the stream is `closing` after this call."""
         if self._unread and not self._blocked:
             self._send()
 
     def close(self) -> None:
-        """Close the stream when what is written has been sent."""
+        """Close the stream after all output has been sent."""
         if self.closing:
             return
         self.closing = True
@@ -238,11 +235,11 @@ class ClientStream:
     # -- the end
 
     def abort(self, error: OSError | None = None) -> None:
-        """Close the stream now. `error`: why the connection broke."""
+        """Close the stream now, and drop its output. `error` is the error that broke the connection, if any."""
         if self not in self._streams.open:
             return
         if self.closing:
-            error = None  # the server closed first, so later requests don't count
+            error = None  # the server closed the connection first, so later requests are not carried out
         self.closing = True
         self.pause_reading()
         if self._blocked:
@@ -261,7 +258,7 @@ class ClientStream:
 
 
 def raise_descriptor_limit(clients: int) -> int:
-    """Raise this process's limit of descriptors to what this number of clients needs. Return the limit."""
+    """Raise this process's limit of file descriptors for this number of clients. Return the new limit."""
     wanted = clients + RESERVED_DESCRIPTORS + OWN_DESCRIPTORS
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     allowed, most = (2**31 if each == resource.RLIM_INFINITY else each for each in limits)
@@ -279,17 +276,17 @@ def raise_descriptor_limit(clients: int) -> int:
 
 
 class Acceptor:
-    """Accepts the connections of a listening socket, but leaves the descriptors that the engine needs."""
+    """Accepts the connections of a listening socket. Some descriptors stay reserved for the engine."""
 
     def __init__(
         self, loop: asyncio.AbstractEventLoop, serve: Callable[[socket.socket], None], max_descriptors: int
     ) -> None:
-        """Create the acceptor; call `open` next.
+        """Create the acceptor. Call `open` to start.
 
         Args:
             loop: the event loop.
-            serve: is called with each connection, and has to close it.
-            max_descriptors: the number of descriptors that this process may have.
+            serve: function that is called with the socket of each connection and has to close it.
+            max_descriptors: this process's limit of file descriptors.
         """
         self._loop = loop
         self._serve = serve
@@ -298,13 +295,13 @@ class Acceptor:
         self._retry: asyncio.TimerHandle | None = None
 
     def open(self, listening: socket.socket) -> None:
-        """Accept the connections of this socket and of no other."""
+        """Start accepting connections from this socket, and stop accepting them from an earlier socket."""
         self.close()
         self._listening = listening
         self._loop.add_reader(listening, self._accept, listening)
 
     def close(self) -> None:
-        """Accept no more connections. Call this before the socket is closed."""
+        """Stop accepting connections. This must be called before the listening socket is closed."""
         if self._retry:
             self._retry.cancel()
             self._retry = None
@@ -321,28 +318,28 @@ class Acceptor:
                     self._pause(listening, error)
                 return
             connected.setblocking(False)
-            # The system gives the lowest free number, which tells how many descriptors are left.
+            # A new descriptor has the lowest free number, so a high number means that few descriptors are left.
             if connected.fileno() >= self._max_descriptors - RESERVED_DESCRIPTORS:
                 self._turn_away(connected)
                 continue
             try:
                 self._serve(connected)
-            except Exception as error:  # noqa: BLE001 - the other connections go on
+            except Exception as error:  # noqa: BLE001 - other connections must not be affected
                 log.write_bug("making a connection", error)
                 connected.close()
 
     def _turn_away(self, connected: socket.socket) -> None:
-        """Tell a client that the server is full."""
+        """Send a client the message that the server has too few descriptors, and close the connection."""
         log.write_limited(
             "descriptors",
             f"clients are turned away: only {self._max_descriptors} files may be open (raise LimitNOFILE= or ulimit "
             "-n)",
         )
-        with connected, contextlib.suppress(OSError):  # the client is gone
+        with connected, contextlib.suppress(OSError):  # the client may have closed the connection
             connected.send(encode(busy_greeting(_TOO_FEW_DESCRIPTORS)))
 
     def _pause(self, listening: socket.socket, error: OSError) -> None:
-        """Accept no connections for a while, because the loop would try again without a pause."""
+        """Accept no connections for a while. Otherwise, the event loop would try again without a pause."""
         if error.errno not in _EXHAUSTED:
             log.write_bug("taking up a connection", error)
         log.write_limited("accept", f"no connection can be taken up: {error.strerror}; they wait until one can")

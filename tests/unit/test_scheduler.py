@@ -109,7 +109,7 @@ def test_what_was_heard_only_moves_forward_and_stays_after_a_failure() -> None:
     assert robot.goals["a"].snapshot().spoken == ""
     assert robot.goals["b"].snapshot().spoken is None
     for end, spoken in ((4, "door"), (2, "door"), (0, "door"), (9, "door_open"), (4, "door_open")):
-        assert robot.scheduler.word_heard("4k7f-1", end) is robot.goals["a"]
+        robot.scheduler.word_heard("4k7f-1", end)
         assert robot.goals["a"].snapshot().spoken == spoken
     goal = play("a text=door_open; heard a; failed a").goals["a"].snapshot()
     assert (goal.spoken, goal.duration) == ("door", 1.5)
