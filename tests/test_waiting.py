@@ -162,7 +162,7 @@ async def test_waiting_requests_of_all_connections_have_a_limit_in_bytes() -> No
 @in_loop
 async def test_small_values_count_with_the_memory_that_they_take(request_: Say | Wait) -> None:
     server = Server()
-    assert server.requests._count_waiting(PendingRequest(cast("Any", Client()), None, request_))
+    assert server.requests._may_wait(PendingRequest(cast("Any", Client()), None, request_))
     assert server.requests._waiting_bytes > REQUEST_BYTES + 16_000
 
 
@@ -321,7 +321,7 @@ async def test_many_words_at_once_leave_the_clients_their_turns() -> None:
     taken: list[object] = []
     wakes = []
     served = Speech(Scheduler("4k7f", max_queue=1))
-    served._take = taken.append  # type: ignore[method-assign, assignment]
+    served._process_report = taken.append  # type: ignore[method-assign, assignment]
     call = loop.call_soon_threadsafe
     loop.call_soon_threadsafe = lambda *values: wakes.append(call(*values))  # type: ignore[assignment, method-assign]
     words = [protocol.Word("4k7f-1", 0, 1, number, 0.0) for number in range(count)]
@@ -355,7 +355,7 @@ async def test_bug_in_a_report_harms_no_other_report(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(log, "write_bug", lambda what, error: failed.append((what, type(error))))
     served = Speech(Scheduler("4k7f", max_queue=1))
-    served._take = take  # type: ignore[method-assign, assignment]
+    served._process_report = take  # type: ignore[method-assign, assignment]
     for number in range(3):
         served.report(protocol.Alive(f"4k7f-{number}"))
     await asyncio.sleep(0)

@@ -1,12 +1,12 @@
-"""The listening socket and the lock beside it: who may serve at a path, and how the files come and go.
+"""The listening socket and its lock, which ensures that only one server uses a path.
 
-The server that holds the lock serves, and only that server removes a socket that an earlier one has left. If people or
-cleaners of temporary directories remove the socket's file while it is served, it is bound again. `run` decides when to
-check that.
+Only the server that holds the lock may bind the socket and remove an old socket file. If the socket file is removed
+while the server runs, for example by a cleaner of temporary directories, the socket is bound again. `run` decides when
+to check this.
 
-The file of the lock stays when a server ends, and names the process that holds it. If it is removed, the first server
-that locks a new one goes on, and the other one ends. Only a regular file with a single name is opened, because somebody
-else may have put something in its place.
+The lock file contains the process id of its holder, and stays after the server has ended. If it is removed, the first
+server that creates and locks a new one continues, and the other server ends. Another user may have put something else
+in the place of the lock file, so only a regular file without other hard links is opened.
 """
 
 from __future__ import annotations
@@ -28,33 +28,37 @@ from talkcli.errors import AccessDenied, AddressInUse, ServerUnavailable, TalkEr
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-#: Connections that may wait to be accepted. The system has a limit of its own (net.core.somaxconn).
+#: Connections that may wait to be accepted. The system also has a limit (net.core.somaxconn).
 MAX_BACKLOG_CONNECTIONS = 1024
-#: How long to wait until the holder of the lock has written its process id.
+#: How long to wait for the holder of the lock to write its process id.
 HOLDER_ID_S = 1.0
-#: The first descriptor that systemd passes (SD_LISTEN_FDS_START).
+#: The first file descriptor passed by systemd (SD_LISTEN_FDS_START).
 _FIRST_PASSED = 3
 _RESTART_SOCKET = "restart the socket's unit (systemctl restart talk.socket)"
-#: Errors that may be gone at the next attempt: no memory, descriptor or space, or a disk that is read-only for a while.
+#: Errors that may not occur at the next attempt: the lack of memory, descriptors or disk space, or a disk that is
+#: read-only for a while.
 _TEMPORARY = {errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOBUFS, errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 
 
 class Listener:
-    """A listening socket that this server has bound, and its lock."""
+    """A listening socket bound by this server, and its lock."""
 
-    #: whether another program has made the socket and owns its file
+    #: whether systemd passed the socket and owns its file
     passed = False
 
     def __init__(self, path: str | None, mode: int) -> None:
-        """Bind the socket. AddressInUse if the path is served already, or its directory is not safe.
+        """Bind the socket.
 
         Args:
-            path: where the user wants the socket; None for the usual place.
-            mode: the mode of the socket's file, which decides who may connect.
+            path: the path of the socket file, or None for the usual place.
+            mode: the mode of the socket file, which determines the users that may connect.
+
+        Raises:
+            AddressInUse: if another server uses the path, or the directory is not safe.
         """
         self.mode = mode
         self.path = paths.server_socket(path)
-        #: absolute, because the current directory may be another one when the socket is bound again
+        #: the named path made absolute, because the current directory may change before the socket is bound again
         self._named_path = self.path if path else None
         _check_directory(os.path.dirname(self.path))
         _refuse_other_file(self.path)
@@ -68,17 +72,18 @@ class Listener:
         self._identity = _identity(self.path)
 
     def in_place(self) -> bool:
-        """Return whether the files of socket and lock are still the ones that this server made."""
-        # No other file can have the same inode meanwhile, because both are still open.
+        """Return whether the socket file and the lock file are still those of this server."""
+        # A new file can't have the same inode number, because both files are still open.
         return _identity(self.path) == self._identity and self._lock.in_place(self.path)
 
     def bind_again(self) -> socket.socket | None:
-        """Make the files that are no longer in place again, with all checks of the start.
-
-        AddressInUse if another server serves now or something else is in the way. Then nothing has changed.
+        """Create a missing socket file or lock file again, with the same checks as at the start.
 
         Returns:
-            The former socket, to be closed by the caller; None if it is still in use.
+            The old socket, which the caller must close, or None if it is still in use.
+
+        Raises:
+            AddressInUse: if another server or file is in the way. Nothing was changed.
         """
         path = paths.server_socket(self._named_path)
         _check_directory(os.path.dirname(path))
@@ -100,7 +105,7 @@ class Listener:
         return former
 
     def close(self) -> None:
-        """Close the socket and release the lock. Remove the socket's file if it is still the same one."""
+        """Close the socket and release the lock. Remove the socket file unless it was replaced."""
         if self._identity is not None and _identity(self.path) == self._identity:
             with contextlib.suppress(FileNotFoundError):
                 os.unlink(self.path)
@@ -109,7 +114,7 @@ class Listener:
 
 
 class InheritedListener:
-    """A listening socket that systemd has passed (LISTEN_FDS). Only systemd removes its file."""
+    """A listening socket passed by systemd (LISTEN_FDS). Only systemd removes the socket file."""
 
     passed = True
 
@@ -128,20 +133,25 @@ class InheritedListener:
         self.socket.setblocking(False)
 
     def in_place(self) -> bool:
-        """Return whether the socket's file is still the same one."""
+        """Return whether the socket file is still in place."""
         return _identity(self.path) == self._identity
 
     def bind_again(self) -> socket.socket | None:
-        """Raise AddressInUse, because systemd would pass the old socket again."""
+        """Raise AddressInUse. After a restart of the server alone, systemd would pass the old socket again."""
         raise AddressInUse(f"the file of the socket {self.path} was removed or replaced: {_RESTART_SOCKET}")
 
     def close(self) -> None:
-        """Close the socket. Its file stays."""
+        """Close the socket. The socket file stays."""
         self.socket.close()
 
 
 def listen(path: str | None, mode: int) -> Listener | InheritedListener:
-    """Return the socket to serve: the one that systemd has passed, or a new one at the path or the usual place."""
+    """Return the socket passed by systemd if its path is the wanted one, or else bind a new socket.
+
+    Args:
+        path: the path of the socket file, or None for the passed socket or the usual place.
+        mode: the mode of a new socket file.
+    """
     passed = os.environ.get("LISTEN_FDS")
     if passed and os.environ.get("LISTEN_PID") == str(os.getpid()):
         if passed != "1":
@@ -154,15 +164,15 @@ def listen(path: str | None, mode: int) -> Listener | InheritedListener:
 
 
 def is_temporary(error: AddressInUse) -> bool:
-    """Return whether binding may succeed at another time."""
+    """Return whether another attempt to bind the socket may succeed."""
     return isinstance(error.__cause__, OSError) and error.__cause__.errno in _TEMPORARY
 
 
 class Lock:
-    """The lock of a socket's path, held by this server."""
+    """The lock for a socket's path, held by this server."""
 
     def __init__(self, path: str) -> None:
-        """Take the lock. AddressInUse if another server holds it."""
+        """Acquire the lock. Raises AddressInUse if another server holds it."""
         self._path = path
         while True:
             self._fd, self._made = _open_lock(_lock_of(path))
@@ -174,20 +184,20 @@ class Lock:
                 raise _already_served(holder, path, here=holder is not None) from None
             if self.in_place(path):
                 break
-            os.close(self._fd)  # it was removed between the two steps, so another server may hold a new one
+            os.close(self._fd)  # the file was removed before it was locked, so another server may hold a new lock
         os.ftruncate(self._fd, 0)
-        with contextlib.suppress(OSError):  # on a full disk, the lock holds without the id, which is for people
+        with contextlib.suppress(OSError):  # the process id is only informative, so a full disk is no problem
             os.write(self._fd, f"{os.getpid()}\n".encode())
 
     def in_place(self, path: str) -> bool:
-        """Return whether the file of this lock is still the lock of a path."""
+        """Return whether this lock's file is still the lock file of a path."""
         status = os.fstat(self._fd)
         return _identity(_lock_of(path)) == (status.st_dev, status.st_ino)
 
     def undo(self) -> None:
-        """Release the lock, and remove its file if this server made it.
+        """Release the lock, and remove its file if this server created it.
 
-        Another server that has opened the file meanwhile notices, when it locks it, that the file is not in place.
+        If another server has already opened the file, it notices after locking that the file is no longer in place.
         """
         if self._made and self.in_place(self._path):
             with contextlib.suppress(OSError):
@@ -195,13 +205,13 @@ class Lock:
         self.close()
 
     def close(self) -> None:
-        """Release the lock. Its file stays."""
+        """Release the lock. The lock file stays."""
         os.close(self._fd)
 
 
 @contextlib.contextmanager
 def _refusing(what: str) -> Iterator[None]:
-    """Raise AddressInUse for an OSError."""
+    """Replace an OSError by AddressInUse. Its message starts with `what`."""
     try:
         yield
     except OSError as error:
@@ -209,7 +219,7 @@ def _refusing(what: str) -> Iterator[None]:
 
 
 def _identity(path: str) -> tuple[int, int] | None:
-    """Return device and inode of a file; None if there is no file, or it can't be seen."""
+    """Return the device and inode numbers of a file, or None if there is no accessible file."""
     try:
         status = os.lstat(path)
     except OSError:
@@ -218,7 +228,7 @@ def _identity(path: str) -> tuple[int, int] | None:
 
 
 def _already_served(pid: int | None, path: str, *, here: bool) -> AddressInUse:
-    """Return the error about another server. `here`: whether its process is on this machine."""
+    """Return the error about another server. `here` means that its process runs on this machine."""
     name = "unknown" if pid is None else pid
     how = f" (kill {pid})" if here else ""
     return AddressInUse(f"a server (pid {name}) serves {path} already: use it, or end it first{how}")
@@ -228,7 +238,7 @@ def _already_served(pid: int | None, path: str, *, here: bool) -> AddressInUse:
 
 
 def _path_of(passed: socket.socket) -> str:
-    """Return the file of a listening Unix socket; raise UsageError for any other socket."""
+    """Return the path of a listening Unix socket. Raises UsageError if the socket is of another type."""
     if passed.family != socket.AF_UNIX:
         raise UsageError("the socket that was passed (LISTEN_FDS) is not a Unix socket: use ListenStream=/path")
     if passed.type != socket.SOCK_STREAM or not passed.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):
@@ -240,34 +250,34 @@ def _path_of(passed: socket.socket) -> str:
 
 
 def _refuse_second_server(path: str | None) -> None:
-    """Raise AddressInUse if clients would find another server before this one or instead of it."""
+    """Raise AddressInUse if clients would find another server instead of this one."""
     try:
         found = connect(path, hello(None, urgent=True))
     except (ServerUnavailable, AccessDenied):
-        return  # no server that would answer our clients
+        return  # there is no server that would answer clients of this user
     except TalkError as error:
         raise AddressInUse(f"a server is there already: {error}") from error
     assert found.socket
-    here, _ = peers.credentials(found.socket)  # another process than the server if ssh forwards the socket
+    here, _ = peers.credentials(found.socket)  # if ssh forwards the socket, this is the process id of ssh
     found.socket.close()
     raise _already_served(found.pid, found.path, here=here == found.pid)
 
 
 def _refuse_live_socket(path: str) -> None:
-    """Raise AddressInUse if a program listens without the lock. Its users would lose it with its socket."""
+    """Raise AddressInUse if a program listens at the path without the lock. Its clients could no longer reach it."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         try:
             probe.connect(path)
         except BlockingIOError:
-            pass  # its backlog is full
+            pass  # a program listens, but its backlog is full
         except OSError:
             return
     raise AddressInUse(f"another program listens at {path} now")
 
 
 def _check_directory(directory: str) -> None:
-    """Make the directory, and raise AddressInUse if somebody else could replace the socket in it."""
+    """Create the directory. Raises AddressInUse if other users could replace the socket in the directory."""
     with _refusing(f"the socket's directory {directory} can't be made"), contextlib.suppress(FileExistsError):
         os.mkdir(directory, 0o700)
     status = os.lstat(directory)
@@ -285,7 +295,7 @@ def _check_directory(directory: str) -> None:
 
 
 def _refuse_other_file(path: str) -> None:
-    """Raise AddressInUse if the path exists and is no socket."""
+    """Raise AddressInUse if the path exists and is not a socket."""
     try:
         mode = os.lstat(path).st_mode
     except OSError:
@@ -307,12 +317,12 @@ def _bind(path: str, mode: int) -> socket.socket:
     try:
         listening.setblocking(False)
         if sys.platform.startswith("linux"):
-            # The mode is set before `bind`, so that the file never has a wider one. `bind` applies the umask, which
-            # `chmod` corrects. The umask can't be changed, because the engine may be starting in another thread.
+            # Set the mode before `bind`, so that the file is never accessible to more users. `bind` applies the umask,
+            # so `chmod` sets the mode again. Changing the umask could affect an engine that another thread is starting.
             os.fchmod(listening.fileno(), mode)
             listening.bind(path)
             os.chmod(path, mode)
-        else:  # a socket has no mode before `bind`
+        else:  # on other systems, a socket has no mode before `bind`
             umask = os.umask(0o777 & ~mode)
             try:
                 listening.bind(path)
@@ -333,17 +343,17 @@ def _lock_of(path: str) -> str:
 
 
 def _open_lock(name: str) -> tuple[int, bool]:
-    """Return the descriptor of the lock's file, and whether the file is new."""
+    """Open or create a lock file. Return its descriptor, and whether the file was created."""
     flags = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
     while True:
         with _refusing(f"the lock {name} can't be opened"):
             with contextlib.suppress(FileExistsError):
                 return os.open(name, flags | os.O_CREAT | os.O_EXCL, 0o600), True
             try:
-                _refuse_other_lock(name, os.lstat(name))  # before it is opened, because opening a device may act on it
+                _refuse_other_lock(name, os.lstat(name))  # checked before opening, which can have an effect on a device
                 fd = os.open(name, flags)
             except FileNotFoundError:
-                continue  # it was removed meanwhile
+                continue  # the file was removed in between
         try:
             _refuse_other_lock(name, os.fstat(fd))
         except AddressInUse:
@@ -353,7 +363,7 @@ def _open_lock(name: str) -> tuple[int, bool]:
 
 
 def _refuse_other_lock(name: str, status: os.stat_result) -> None:
-    """Raise AddressInUse unless the file is a regular one with a single name."""
+    """Raise AddressInUse unless the file is a regular file without other hard links."""
     if stat.S_ISLNK(status.st_mode):
         what = "a symbolic link"
     elif not stat.S_ISREG(status.st_mode):
@@ -365,25 +375,26 @@ def _refuse_other_lock(name: str, status: os.stat_result) -> None:
     raise AddressInUse(f"the lock {name} is {what}: remove it, or name another socket with --socket")
 
 
-def _lives(pid: int) -> bool:
+def _exists(pid: int) -> bool:
+    """Return whether a process with this id exists."""
     try:
         os.kill(pid, 0)
     except (ProcessLookupError, OverflowError):
         return False
     except PermissionError:
-        pass  # it belongs to another user
+        pass  # the process belongs to another user
     return True
 
 
 def _holder(fd: int) -> int | None:
-    """Return the process id in the lock; None if the holder doesn't write it in time.
+    """Return the process id in the lock file, or None if the holder doesn't write it in time.
 
-    Before that, the file may name an earlier server, which has ended.
+    A process id that the file contained before may be that of an earlier server, which no longer exists.
     """
     end = time.monotonic() + HOLDER_ID_S
     while True:
         words = os.pread(fd, 32, 0).decode(errors="replace")
-        if words.endswith("\n") and words.strip().isdecimal() and _lives(int(words)):
+        if words.endswith("\n") and words.strip().isdecimal() and _exists(int(words)):
             return int(words)
         if time.monotonic() > end:
             return None

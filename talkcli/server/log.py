@@ -1,6 +1,6 @@
-"""The lines of the server's log about goals, engines and senders. `talkcli.daemon.log` writes them.
+"""Log messages about goals, engines and senders. `talkcli.daemon.log` writes them.
 
-Texts of clients are made printable, so that they can neither forge a line nor send control codes to a terminal.
+Text from clients is escaped, so that it can neither forge log lines nor send control codes to a terminal.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import By, Sender
     from talkcli.goals.record import Record
 
-#: The length of a program's name or command line in the log.
+#: Length of a program's name or command line in the log.
 _MAX_LOGGED_COMMAND_CHARS = 80
 _NO_PLAYER_NEEDED = "which plays by itself"
 
 
 def goal_ended(record: Record, seconds: float) -> None:
-    """Log that a goal has ended. `seconds`: the time since it began to be spoken, if it did."""
+    """Log that a goal has ended. `seconds` is the time since it became ACTIVE, if it did."""
     took = "" if record.started_at is None else f" after {seconds:.1f} s"
     how = f"{record.id} {record.state.name}{took}"
     if record.state is not State.SUCCEEDED:
@@ -36,7 +36,7 @@ def goal_ended(record: Record, seconds: float) -> None:
 
 
 def engine_ready(engine: Ready, player_options: Sequence[str]) -> None:
-    """Log that an engine is ready. `player_options`: the options for the player that the server was given."""
+    """Log that an engine is ready. `player_options` are the names of the given player options."""
     version = f", {sanitize(engine.version)}" if engine.version else ""
     sound = describe_sound(engine)
     words = f"engine ready: driver {engine.driver}{version}, {sound}"
@@ -46,7 +46,7 @@ def engine_ready(engine: Ready, player_options: Sequence[str]) -> None:
 
 
 def voice_load_ended(voice: VoiceLoaded) -> None:
-    """Log that a neural voice was loaded, or why it could not be."""
+    """Log that a neural voice was loaded, or that it could not be loaded."""
     if voice.error is None:
         write(f"voice {sanitize(voice.voice)} loaded in {voice.seconds:.1f} s")
     else:
@@ -54,14 +54,14 @@ def voice_load_ended(voice: VoiceLoaded) -> None:
 
 
 def describe_sound(engine: Ready) -> str:
-    """Return a few words about what plays the sound."""
+    """Return a short description of the engine's audio output."""
     if engine.player:
         return f"player {engine.player}"
     return NO_PLAYER if is_own_driver(engine.driver) else _NO_PLAYER_NEEDED
 
 
 def describe_sender(sender: Sender) -> str:
-    """Return a few words about a sender."""
+    """Return a short description of the program that sent a request."""
     parts = [] if sender.uid is None else [f"uid {sender.uid}"]
     if sender.pid is not None:
         parts.append(f"pid {sender.pid}")
@@ -75,6 +75,7 @@ def describe_sender(sender: Sender) -> str:
 
 
 def _cause(by: By | None) -> str:
+    """Return a short description of the goal or client that ended a goal, or "" if there is none."""
     if by is None:
         return ""
     return f" by {by.goal}" if by.goal else f" by {describe_sender(by.client)}" if by.client else ""

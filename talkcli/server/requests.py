@@ -1,7 +1,7 @@
-"""What each request does and how it is answered: one coroutine for each kind of request.
+"""Carries out and answers requests, with one coroutine for each kind of request.
 
-A coroutine runs until it has to wait: for the voices, for room in the queue, or for silence. While a request waits, its
-connection stays open, and it is forgotten if the connection ends.
+A coroutine may wait for the list of voices, for room in the queue, or for silence. Meanwhile, the client's connection
+stays open. If the connection ends, its requests are dropped.
 """
 
 from __future__ import annotations
@@ -46,19 +46,19 @@ if TYPE_CHECKING:
     from talkcli.server.connection import ClientConnection, Steps, WaitingList
     from talkcli.server.speech import Speech
 
-#: Ended goals in the list of `status`.
+#: Ended goals in the reply to `status`.
 RECENT_GOALS = 10
-#: How long a request waits for the voices. A client gives up after five seconds.
+#: How long a request waits for the list of voices. Clients give up after five seconds.
 VOICES_LIMIT_S = 4.0
-#: When a pause is answered although speech is not known to be silent.
+#: How long a `pause` waits for silence before it is answered with an error.
 PAUSE_ANSWER_S = 2.0
-#: Waiting requests of one client. The wire's document names this limit. The client is read from all the while, because
-#: a cancel may follow.
+#: Waiting requests of one client, as promised in the protocol's document. The server keeps reading from such a client,
+#: because a cancel may follow.
 MAX_CLIENT_REQUESTS = 1_000
-#: Memory for all waiting requests, as much as for unread output.
+#: Memory for all waiting requests. The limit for unread output is the same.
 MAX_KEPT_REQUEST_BYTES = 64 * 1024 * 1024
-#: Memory that is counted for each waiting request, beside its values. It is ten times what a request takes, so that at
-#: most 8,000 requests wait and a cancel of all of them is answered within 2 s.
+#: Memory that is counted for each waiting request in addition to its values. A request actually uses a tenth of it. The
+#: higher number limits the waiting requests to 8,000, so that cancelling all of them takes less than 2 s.
 REQUEST_BYTES = 8 * 1024
 
 
@@ -66,15 +66,15 @@ class Requests:
     """Carries out the requests of a server's clients."""
 
     def __init__(self, speech: Speech, describe: Callable[[], JsonObject]) -> None:
-        """Start with no requests. `describe` returns what `status` shows about the server."""
+        """Start with no requests. `describe` returns the description of the server for `status`."""
         self._speech = speech
         self._scheduler = speech.scheduler
         self._describe = describe
-        #: goals that were cancelled while they waited, until their clients have been told
+        #: goals that were cancelled while they waited and have not been submitted yet
         self._canceled: WaitingList = {}
-        #: the requests of each connection that are not answered yet, in their order
+        #: the unanswered requests of each connection, in their order
         self._pending: dict[ClientConnection, WaitingList] = {}
-        #: the memory that is counted for waiting requests
+        #: memory that is counted for all waiting requests
         self._waiting_bytes = 0
         self._room_check: asyncio.Handle | None = None
         speech.on_queue_change = self._check_room_soon
@@ -86,17 +86,17 @@ class Requests:
         pending.start(self._carry_out(pending))
 
     def is_waiting(self, connection: ClientConnection) -> bool:
-        """Return whether a client waits for an answer or an event."""
+        """Return whether a client still waits for an answer or an event."""
         return connection in self._pending or self._speech.subscribers.is_subscribed(connection)
 
     def left(self, connection: ClientConnection) -> None:
-        """Forget the requests and subscriptions of a client that is gone."""
+        """Drop the requests and subscriptions of a client whose connection has ended."""
         for each in self._unanswered(connection):
             each.drop()
         self._speech.subscribers.left(connection)
 
     def shut_down(self) -> None:
-        """End all goals, also those that wait for room."""
+        """End all goals, including those that wait for room."""
         notifications = self._cancel_waiting(self._select_waiting(Cancel()), None)
         self._speech.shut_down()
         resume_all(self._speech.waiting_for_voices)
@@ -106,17 +106,17 @@ class Requests:
         request = pending.request
         try:
             if isinstance(request, Cancel | Pause):
-                self._skip_voices(pending.connection)  # never delayed, but earlier requests come first
+                self._stop_awaiting_voices(pending.connection)  # carry out earlier requests first, without a delay
             elif self._needs_voices(pending):
-                if self._count_waiting(pending):
+                if self._may_wait(pending):
                     await pending.wait(self._speech.waiting_for_voices, VOICES_LIMIT_S)
                 elif not isinstance(request, Say):
-                    self._skip_voices(pending.connection)
+                    self._stop_awaiting_voices(pending.connection)
             steps: Callable[[PendingRequest, Any], Steps] = getattr(self, f"_{request.kind}")
             await steps(pending, request)
         except RequestRefused as error:
             pending.refuse(error.code, str(error))
-        except Exception as error:  # noqa: BLE001 - the server goes on for other clients
+        except Exception as error:  # noqa: BLE001 - other clients must not be affected
             log.write_bug(request.kind, error)
             pending.refuse("internal_error", f"{request.kind} failed: a bug of talk's, see its log")
         finally:
@@ -131,14 +131,14 @@ class Requests:
     def _unanswered(self, connection: ClientConnection) -> list[PendingRequest]:
         return list(self._pending.get(connection, ()))
 
-    def _held_requests(self, connection: ClientConnection) -> list[PendingRequest]:
-        """Return the requests of a connection that wait for the voices."""
+    def _awaiting_voices(self, connection: ClientConnection) -> list[PendingRequest]:
+        """Return the requests of a connection that wait for the list of voices."""
         return [each for each in self._unanswered(connection) if each.waiting_list is self._speech.waiting_for_voices]
 
     def _needs_voices(self, pending: PendingRequest) -> bool:
-        """Return whether a request must wait for the voices, or for an earlier request that does."""
+        """Return whether a request must wait for the list of voices, or for an earlier request that waits for it."""
         request = pending.request
-        if self._speech.waiting_for_voices and (isinstance(request, Say) or self._held_requests(pending.connection)):
+        if self._speech.waiting_for_voices and (isinstance(request, Say) or self._awaiting_voices(pending.connection)):
             return True
         if not self._speech.awaits_voices:
             return False
@@ -146,17 +146,17 @@ class Requests:
             return request.voice is not None and not bad_option(request)
         return isinstance(request, Voices) or (isinstance(request, Say) and request.voice is not None)
 
-    def _skip_voices(self, connection: ClientConnection) -> None:
-        """Continue the requests of a connection that wait for the voices."""
-        for each in self._held_requests(connection):
+    def _stop_awaiting_voices(self, connection: ClientConnection) -> None:
+        """Continue the requests of a connection that wait for the list of voices."""
+        for each in self._awaiting_voices(connection):
             each.resume()
 
-    def _count_waiting(self, pending: PendingRequest) -> bool:
-        """Count a request that is about to wait. Return False if it can't wait, and note why."""
+    def _may_wait(self, pending: PendingRequest) -> bool:
+        """Return whether a request may wait. If it may, count its memory. If it may not, set its refusal."""
         if pending.kept_bytes:
             return True  # it has waited before
         size = REQUEST_BYTES + sum(map(_memory_of, fields(pending.request).values()))
-        if len(self._unanswered(pending.connection)) > MAX_CLIENT_REQUESTS:  # with this one
+        if len(self._unanswered(pending.connection)) > MAX_CLIENT_REQUESTS:  # including this one
             words = f"{MAX_CLIENT_REQUESTS:,} requests of this connection are waiting already"
         elif self._waiting_bytes + size > MAX_KEPT_REQUEST_BYTES:
             words = f"{MAX_KEPT_REQUEST_BYTES >> 20} MiB of requests are waiting already"
@@ -170,18 +170,18 @@ class Requests:
     def _check_room_soon(self) -> None:
         """Schedule a check of the goals that wait for room, because the queue has changed."""
         if self._speech.waiting_for_room and self._room_check is None:
-            # In the next turn, because the caller may be in the middle of other changes.
+            # Check in the next turn, because the caller may be in the middle of other changes.
             self._room_check = asyncio.get_running_loop().call_soon(self._check_room)
 
     def _check_room(self) -> None:
-        """Continue the goals that have room now."""
+        """Continue the goals for which the queue has room now."""
         self._room_check = None
         without_room: set[object] = set()
         resumed = False
         for each in list(self._speech.waiting_for_room):
             say = each.request
             assert isinstance(say, Say)
-            # Room depends on these values alone if the goal has no id. One check answers for a thousand such goals.
+            # If a goal has no id, only these values decide whether it has room. One check is enough for equal goals.
             kind = (say.priority, say.key, say.flush, say.preempt) if say.id is None else None
             if kind in without_room:
                 continue
@@ -192,18 +192,18 @@ class Requests:
                 each.resume()
                 resumed = True
         if resumed:
-            self._check_room_soon()  # they may have made room for goals before them
+            self._check_room_soon()  # the submitted goals may have made room for earlier ones
 
     def _select_waiting(self, selection: Cancel) -> list[PendingRequest]:
-        """Return the selected goals among those that wait."""
+        """Return the selected goals that wait for room or for the list of voices."""
         waiting = (*self._canceled, *self._speech.waiting_for_room, *self._speech.waiting_for_voices)
         goals = [(each, each.request) for each in waiting if isinstance(each.request, Say)]
         selected = (goals[index][0] for index in selection.select_waiting([say for _, say in goals]))
-        # A client that has hung up has withdrawn its goals.
+        # If a client has disconnected, its waiting goals are dropped and not cancelled.
         return [each for each in selected if not each.connection.has_hung_up()]
 
     def _cancel_waiting(self, goals: list[PendingRequest], by: By | None) -> list[Callable[[], None]]:
-        """Cancel goals that wait. Return the notifications that submit them, so that they end like other goals."""
+        """Cancel waiting goals. Return functions that submit them, so that they are recalled like other goals."""
         new = [each for each in goals if each.waiting_list is not self._canceled]
         for each in new:
             each.canceled_by = by
@@ -211,7 +211,7 @@ class Requests:
         return [each.resume for each in new]
 
     async def _await_room(self, pending: PendingRequest, say: Say) -> float:
-        """Wait until there is room or the goal has expired. Return the seconds that count towards its ttl."""
+        """Wait until the queue has room or the goal has expired. Return the waiting time in seconds."""
         ttl = (self._scheduler.settings.ttl if say.ttl is None else say.ttl) or None
         began = self._speech.now().monotonic
         self._speech.subscribers.keep_alive()
@@ -219,18 +219,18 @@ class Requests:
         waited = self._speech.now().monotonic - began
         return waited if in_time or ttl is None else max(waited, ttl)
 
-    # -- the coroutine of each request is named after its kind
+    # -- the coroutines, each named after the kind of its request
 
     async def _say(self, pending: PendingRequest, say: Say) -> None:
         speech, scheduler, connection = self._speech, self._scheduler, pending.connection
         waited = 0.0
         if pending.canceled_by is None:
             now = speech.now()
-            if self._room_check:  # a new goal must not take the room of one that waits
+            if self._room_check:  # waiting goals come first if there is room now
                 self._room_check.cancel()
                 self._check_room()
             _, refusal = self._resolve_voice(pending, say)
-            if say.patient and scheduler.lacks_room(say, now, refusal) and self._count_waiting(pending):
+            if say.patient and scheduler.lacks_room(say, now, refusal) and self._may_wait(pending):
                 waited = await self._await_room(pending, say)
         now = speech.now()
         say, refusal = self._resolve_voice(pending, say)
@@ -241,7 +241,7 @@ class Requests:
             state = record.state
             extra["attached"] = True
         else:
-            # As it was accepted. Its events tell if it has begun in the same step.
+            # The reply shows the goal as it was accepted. If the goal has already started, an event reports it.
             state = record.state if record.state is State.REJECTED else State.PENDING
             if pending.canceled_by and record.by is pending.canceled_by:
                 pending.canceled_goal = record
@@ -255,7 +255,7 @@ class Requests:
         speech.apply(submitted.effects)
 
     def _resolve_voice(self, pending: PendingRequest, say: Say) -> tuple[Say, Refusal | None]:
-        """Return a goal with the id of its voice, and why it is refused, if it is."""
+        """Return a goal with the id of its voice, and a refusal if it can't be spoken with this voice."""
         voice, refusal = self._speech.voices.look_up(say.voice, self._scheduler.settings.voice)
         say = replace(say, voice=voice)
         if say.pitch not in {None, INITIAL.pitch} and is_neural(voice or ""):
@@ -264,7 +264,7 @@ class Requests:
         return say, pending.refusal or refusal
 
     async def _wait(self, pending: PendingRequest, request: Wait) -> None:
-        await self._speech.notifications.wait_done(pending)  # the result must be the last event of a goal
+        await self._speech.notifications.wait_done(pending)  # earlier events of a goal must not follow its result
         if request.ids is None:
             records = self._scheduler.unfinished()
         else:
@@ -272,8 +272,8 @@ class Requests:
         for record in records:
             if not record.state.terminal:
                 self._speech.subscribers.await_result(record.id, pending.connection, feedback=request.feedback)
-        # The list has the goals as they are now, and events tell how they go on. A goal that has ended doesn't change,
-        # so its snapshot is made when it is sent.
+        # The list contains the goals as they are now, and events report later changes. The snapshot of the active goal
+        # must be made now. Those of pending and ended goals don't change, so they are made when they are sent.
         active = self._scheduler.active
         spoken = active.snapshot() if active else None
         states = [(record, record.state) for record in records]
@@ -288,7 +288,7 @@ class Requests:
         notifications = self._cancel_waiting(waiting, By(client=client))
         ids = {each.request.id for each in waiting if isinstance(each.request, Say)}
         result = self._scheduler.cancel(selection, client, now, ids)
-        speech.apply(result.effects)  # first, because thousands of notifications may follow
+        speech.apply(result.effects)  # before the notifications, because there may be thousands of them
         speech.notifications.add(notifications)
         if result.stopping:
             while not result.stopping.state.terminal:
@@ -326,14 +326,14 @@ class Requests:
         now = speech.now()
         changed, active = scheduler.paused, scheduler.active
         if active and active.state is not State.ACTIVE:
-            active = None  # it is being stopped
+            active = None  # it is being stopped, so it won't continue
         speech.silent_goal = None
         effects = scheduler.resume(now)
         if changed:
             self._publish_pause(active, pending)
         speech.apply(effects)
         if active:
-            resume_all(speech.waiting_for_silence(active))  # these requests will not see it silent any more
+            resume_all(speech.waiting_for_silence(active))  # the goal will not become silent any more
         self._answer_pause(pending, active)
 
     def _publish_pause(self, held: Record | None, pending: PendingRequest) -> None:
@@ -354,7 +354,7 @@ class Requests:
             pending.answer(goal=self._find(request.id).snapshot().to_json())
 
     async def _watch(self, pending: PendingRequest, _: Watch) -> None:
-        await self._speech.notifications.wait_done(pending)  # so that every event is later than the overview
+        await self._speech.notifications.wait_done(pending)  # earlier events must not follow the overview
         self._answer_overview(pending)
         self._speech.subscribers.watch(pending.connection)
 
@@ -388,7 +388,7 @@ class Requests:
             raise RequestRefused(refusal[1], refusal[0])
         changes = given_values(replace(request, voice=voice))
         effects = scheduler.change_settings(changes, speech.now())
-        self._check_room_soon()  # goals that preempt now may have room
+        self._check_room_soon()  # waiting goals may preempt now, and so have room
         speech.apply(effects)
         if changes:
             values = ", ".join(f"{name} {format_number(value)}" for name, value in changes.items())
@@ -407,11 +407,11 @@ def _unknown_message(*ids: str) -> str:
 
 
 def _goal_lines(name: str, records: Iterable[Record]) -> Iterator[JsonObject]:
-    """Return the lines of a list of goals. Each snapshot is made when it is sent."""
+    """Return the lines of a list of goals. The snapshot of each goal is made when its line is sent."""
     return ({name: each.snapshot().to_json()} for each in records)
 
 
 def _memory_of(value: object) -> int:
-    """Return the memory that a value of a request takes in bytes, which may be many times that of its JSON."""
+    """Return the memory that a value of a request uses, which may be many times the size of its JSON."""
     inside = value.values() if isinstance(value, dict) else value if isinstance(value, (list, tuple)) else ()
     return sys.getsizeof(value) + sum(map(_memory_of, inside))

@@ -1,4 +1,4 @@
-"""`talk serve`: one server as a whole, its clients, its status and its end."""
+"""`talk serve`: the server as a whole, with its clients, its status and its shutdown."""
 
 from __future__ import annotations
 
@@ -36,20 +36,20 @@ from talkcli.server.voices import VoiceCatalog
 if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
 
-#: Clients at the same time. Each takes one of the 1,024 descriptors that a process usually has.
+#: Connected clients. Each one uses a file descriptor, and a process can usually have 1,024 of them.
 MAX_CLIENTS = 256
-#: Goals that may be pending. At two seconds a sentence they take three minutes, and nobody wants to wait longer.
+#: Pending goals. Speaking them takes about three minutes, and nobody wants to wait longer.
 USUAL_QUEUE_GOALS = 100
-#: Memory for neural voices: four of middle size.
+#: Memory for neural voices, enough for four voices of medium size.
 VOICE_MEMORY_MB = 300
-#: Clients that may connect to a full server, to ask for its status or to silence it.
+#: Additional clients of a full server. They can only ask for its status or silence it.
 MAX_EXTRA_CLIENTS = 16
-#: How often to check that clients find the socket. The promise is that they can't reach the server for 30 s at most. A
-#: check costs two system calls.
+#: Interval of checks that clients can find the socket. A missing socket must be noticed within 30 s. A check takes two
+#: system calls.
 SOCKET_CHECK_S = 10.0
-#: How long clients may take to read their last answers.
+#: Time for clients to read their last answers before the server exits.
 _CLIENT_CLOSE_S = 0.3
-#: How long the engine process may take to end before the server leaves it to the system.
+#: Time for the engine process to exit before the server exits without waiting for it.
 _ENGINE_CLOSE_S = 1.0
 
 
@@ -57,7 +57,7 @@ _ENGINE_CLOSE_S = 1.0
 class ServerSettings:
     """The options of `talk serve`."""
 
-    #: the values of options that goals don't give; none of them is None
+    #: the values for options that a goal omits; every setting must have a value
     goals: Set = INITIAL
     max_queue: int = USUAL_QUEUE_GOALS
     max_text: int = MAX_TEXT_CHARS
@@ -74,19 +74,19 @@ class ServerSettings:
 
     @property
     def player_options(self) -> list[str]:
-        """The names of the options for the player that were given."""
+        """The names of the given player options."""
         given = {"--player": self.player, "--device": self.device, "--lead-in": self.lead_in}
         return [name for name, value in given.items() if value]
 
 
 def serve(settings: ServerSettings) -> int:
-    """Serve until SIGTERM or SIGINT, and return the exit code.
+    """Run a server until SIGTERM or SIGINT, and return the exit code.
 
     Raises:
-        AddressInUse: another server serves, or the socket's directory isn't safe.
-        UsageError: the voice is not known.
+        AddressInUse: if another server is running, or the socket's directory isn't safe.
+        UsageError: if the voice is unknown.
     """
-    # Imported modules stay for ever. A full collection that looks at them delays clients by 10 ms.
+    # Imported modules are never freed. Without this call, a garbage collection of all objects delays clients by 10 ms.
     gc.freeze()
     listener = listen(settings.socket, settings.socket_mode)
 
@@ -101,7 +101,7 @@ def serve(settings: ServerSettings) -> int:
 
 
 class Server:
-    """One server, and the handler of its connections. It is created in its event loop."""
+    """A server, which is also the handler of its connections. It must be created in its event loop."""
 
     def __init__(self, settings: ServerSettings, listener: Listener | InheritedListener) -> None:
         self._settings = settings
@@ -123,20 +123,20 @@ class Server:
         self.handle, self.is_waiting = self._requests.handle, self._requests.is_waiting
         self.greeting = encode(greeting(__version__, os.getpid(), self._scheduler.boot))
         self.connections: set[ClientConnection] = set()
-        #: set while there is no client
+        #: set while there are no connections
         self._no_clients = asyncio.Event()
         self._no_clients.set()
-        #: the error that ends the server, if there is one
+        #: the error that ended the server, if any
         self._fatal_error: TalkError | None = None
         self._started_at = time.time(), time.monotonic()
-        #: why clients can't reach the server, as last logged
+        #: the logged reason why clients can't reach the server, or "" if they can
         self._unreachable = ""
-        # A shell without job control starts background processes with SIGINT ignored, and it must stay so.
+        # A shell without job control starts background processes with SIGINT ignored. Keep ignoring it in this case.
         ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
         self._end_signals = [signal.SIGTERM] if ignored else [signal.SIGTERM, signal.SIGINT]
 
     async def run(self) -> None:
-        """Serve until the server is told to end."""
+        """Run the server until it is stopped or fails."""
         settings, speech = self._settings, self.speech
         descriptors = raise_descriptor_limit(settings.max_clients + MAX_EXTRA_CLIENTS)
         self._acceptor = Acceptor(
@@ -145,8 +145,8 @@ class Server:
         self._loop.set_exception_handler(log.handle_loop_error)
         for number in self._end_signals:
             self._loop.add_signal_handler(number, self._on_signal, number)
-        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the server goes on when its terminal is closed
-        signal.pthread_sigmask(signal.SIG_SETMASK, ())  # the parent process may have blocked some signals
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # keep running when the terminal is closed
+        signal.pthread_sigmask(signal.SIG_SETMASK, ())  # unblock signals that the parent process may have blocked
         voice = self._start_voice()
         speech.engine = Supervisor(
             protocol.Configure(
@@ -162,13 +162,13 @@ class Server:
         )
         try:
             speech.engine.thread.start()
-        except RuntimeError as error:  # Python raises nothing more specific
+        except RuntimeError as error:  # Python has no more specific exception
             raise TalkError(f"the engine's thread cannot be started: {memory_limits()}") from error
         try:
             self._acceptor.open(self._listener.socket)
             self._socket_check = self._loop.call_later(SOCKET_CHECK_S, self._check_socket)
             if voice or settings.driver:
-                # If the voice or the driver is unknown, the error must be the only message.
+                # Wait before logging, because an unknown voice or driver must produce nothing but an error message.
                 with contextlib.suppress(asyncio.TimeoutError):
                     await asyncio.wait_for(speech.engine_known.wait(), START_LIMIT_S)
             if not self._scheduler.closing:
@@ -189,9 +189,10 @@ class Server:
             raise self._fatal_error
 
     def _start_voice(self) -> str | None:
-        """Return the voice that the engine process checks when it starts; raise UsageError for an unknown neural voice.
+        """Return the voice that the engine process must check at its start, or None if there is none to check.
 
-        A neural voice is loaded later, so that its problems don't delay speech.
+        A neural voice is checked here, and loaded later so that it doesn't delay speech. Raises UsageError if a neural
+        voice is unknown.
         """
         voices = self.speech.voices
         voice, refusal = voices.look_up(self._settings.goals.voice)
@@ -203,7 +204,7 @@ class Server:
         return None
 
     def _check_socket(self) -> None:
-        """Bind the socket again if clients don't find it. Existing connections go on."""
+        """Bind the socket again if clients can't find it. Existing connections stay open."""
         self._socket_check = self._loop.call_later(SOCKET_CHECK_S, self._check_socket)
         if self._listener.in_place():
             self._unreachable = ""
@@ -212,7 +213,7 @@ class Server:
             former = self._listener.bind_again()
         except AddressInUse as error:
             if not (self._listener.passed or is_temporary(error)):
-                # Clients find another server or none. A supervisor that starts this one again gets the message.
+                # Clients find another server or none, so this server ends. A service manager may start it again.
                 self._socket_check.cancel()
                 log.write(log.sanitize(f"ending: {error}"))
                 self._end(error)
@@ -229,9 +230,9 @@ class Server:
     # -- called by connections
 
     def joined(self, connection: ClientConnection) -> None:
-        """Admit a client, keep it waiting if the server is full, or turn it away."""
+        """Admit a client, keep it waiting if the server is full, or refuse it."""
         pid, uid = peers.credentials(connection.stream.socket)
-        # The socket's mode may let other users in.
+        # Other users may connect only if the mode of the socket allows it.
         if uid not in {os.getuid(), 0} and not self._listener.mode & 0o066:
             words = f"this server is uid {os.getuid()}'s; it would have to be started with --socket-mode"
             refusal = {"talk": PROTOCOL, "error": "permission_denied", "message": words}
@@ -247,7 +248,7 @@ class Server:
         connection.close_with(refusal)
 
     def left(self, connection: ClientConnection) -> None:
-        """Forget a client, and admit one that waits. The goals of the client go on."""
+        """Remove a client, and admit a waiting client in its place. The goals of the removed client continue."""
         self.connections.discard(connection)
         if not self.connections:
             self._no_clients.set()
@@ -259,7 +260,7 @@ class Server:
     # -- the status
 
     def _describe(self) -> JsonObject:
-        """Return what `status` shows about the server."""
+        """Return the description of the server that `status` shows."""
         speech, settings, scheduler, ready = self.speech, self._settings, self._scheduler, self.speech.ready
         started_at, since = self._started_at
         return {
@@ -288,13 +289,13 @@ class Server:
     # -- the end
 
     def _end(self, fatal: TalkError | None = None) -> None:
-        """End all goals, and then the server. `fatal`: the error to raise, if the server can't go on."""
+        """End all goals, and then the server. `fatal` is the error that makes the server end, if any."""
         self._fatal_error = fatal or self._fatal_error
         self._systemd.notify_stopping()
         self._requests.shut_down()
 
     async def _close_connections(self) -> None:
-        """Give clients a short time to read their last answers."""
+        """Close all connections, after a short time in which clients can read their last answers."""
         for connection in list(self.connections):
             connection.stream.close()
         with contextlib.suppress(asyncio.TimeoutError):
@@ -305,18 +306,18 @@ class Server:
     def _on_signal(self, number: signal.Signals) -> None:
         log.write(f"{signal.Signals(number).name}: ending")
         for each in self._end_signals:
-            # Not handled by the loop, which may be busy. A second signal ends the server at once.
+            # A second signal ends the server immediately. The event loop may be busy, so it doesn't handle the signal.
             signal.signal(each, self._on_second_signal)
         self._end()
 
     def _on_second_signal(self, number: int, _: object) -> None:
-        """End at once. The engine process ends with this one."""
+        """Exit immediately. The engine process notices it and exits, too."""
         with contextlib.suppress(OSError):
             self._listener.close()
         os._exit(EXIT_SIGNAL + number)
 
 
 def _random_boot_id() -> str:
-    """Return the four characters that begin this server's ids of goals; see `goals.options.is_clients_id`."""
+    """Return the first four characters of this server's goal ids. `is_clients_id` describes the form of such an id."""
     choice = random.SystemRandom().choice
     return "".join(choice(each) for each in (string.digits, string.ascii_lowercase) * 2)

@@ -1,8 +1,7 @@
 """Carries out the scheduler's effects, and passes the engine's reports to the scheduler.
 
-All of it runs in the event loop's thread. The scheduler decides what happens, the engine thread speaks, and
-`subscribers` publishes the events. This module waits for none of them. It has the one timer, which calls the
-scheduler's `tick` at its `deadline`.
+All of it runs in the event loop's thread and never blocks. The scheduler makes the decisions, the engine thread speaks,
+and `subscribers` publishes the events. A timer in this module calls the scheduler's `tick` at its `deadline`.
 """
 
 from __future__ import annotations
@@ -39,22 +38,22 @@ if TYPE_CHECKING:
     from talkcli.goals.scheduler import Scheduler
     from talkcli.server.connection import WaitingList
 
-#: The monotonic clock of Linux stands still while the machine is suspended; the clock since the boot goes on, and so
-#: does the monotonic clock of macOS.
+#: A clock that keeps running while the machine is suspended. Linux has a special clock for this, because its monotonic
+#: clock stops.
 _CLOCK = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
-#: How often the timer compares its clock with the deadline. The event loop's own timers stand still in a suspend.
+#: How often to compare the clock with the deadline. The event loop's own timers stop while the machine is suspended.
 CLOCK_CHECK_S = 1.0
-#: The status of an engine that takes goals.
+#: Status of an engine that accepts goals.
 READY = "ready"
-#: Reports that are taken before clients have a turn. To publish as many words to fifty watchers takes 10 to 20 ms on a
-#: busy machine.
+#: Reports of the engine that are processed in one turn of the event loop. Publishing this number of words to fifty
+#: watchers takes 10 to 20 ms on a busy machine.
 REPORTS_PER_TURN = 8
 
 require_fields(protocol.Speak, ENGINE_OPTIONS)
 
 
 def elapsed() -> float:
-    """Return the time in seconds of a clock that goes on in a suspend and is never set."""
+    """Return the time in seconds of a clock that is never set and keeps running while the machine is suspended."""
     return time.clock_gettime(_CLOCK)
 
 
@@ -66,30 +65,30 @@ class Speech:
 
         Args:
             scheduler: the server's scheduler.
-            player_options: the options for the player that the server was given, for the log.
+            player_options: the names of the given player options, for the log.
         """
         self.scheduler = scheduler
         self._player_options = player_options
-        #: set before the first client connects
+        #: the engine thread, set before the first client connects
         self.engine: Supervisor
-        #: called when `status_words` may have changed
+        #: called if `status_words` may have changed
         self.on_status_change: Callable[[], None] = lambda: None
-        #: called when a goal has come to the queue or left it
+        #: called after a goal was added to the queue or removed from it
         self.on_queue_change: Callable[[], None] = lambda: None
-        #: called with the reason when nothing can be spoken any more
+        #: called with the error if nothing can be spoken any more
         self.on_failure: Callable[[TalkError], None] = lambda _: None
         #: set when all goals have ended after `shut_down`
         self.finished = asyncio.Event()
-        #: what the engine has said about itself; None before the first one is ready
+        #: the latest description that an engine gave of itself, or None before the first engine is ready
         self.ready: protocol.Ready | None = None
         self.voices = VoiceCatalog()
-        #: requests that wait until the voices are known, or won't be
+        #: requests that wait for the engine to list its voices or fail
         self.waiting_for_voices: WaitingList = {}
         #: goals that wait for room in the queue
         self.waiting_for_room: WaitingList = {}
-        #: the status of the engine, for people
+        #: human-readable status of the engine
         self.engine_status = "starting"
-        #: set when an engine is ready, when it is known that none will be, and when the server ends
+        #: set when an engine is ready or can't be started at all, and when the server shuts down
         self.engine_known = asyncio.Event()
         self._loop = asyncio.get_running_loop()
         self.subscribers = Subscribers(self._loop, lambda: (each.connection for each in self.waiting_for_room))
@@ -98,17 +97,17 @@ class Speech:
         self._timer: asyncio.TimerHandle | None = None
         #: requests that wait until a goal is silent or its end has been published
         self._waiting_for_silence: dict[Record, WaitingList] = {}
-        #: the goal that is held and known to be silent
+        #: the paused goal, if the engine has confirmed its silence
         self.silent_goal: Record | None = None
-        #: reports of the engine thread that have not been taken
+        #: reports from the engine thread that have not been processed
         self._reports: deque[Report] = deque()
-        #: whether the loop will take them. To wake it costs as much as to take a report.
+        #: whether the event loop was woken to process reports; waking it takes as long as processing a report
         self._reports_due = False
-        #: what the engine was last told: whether a goal follows the active one, and whether it has a neural voice
-        self._told_following = False, False
+        #: the latest announcement to the engine: whether a goal follows the active one, and whether its voice is neural
+        self._announced_next = False, False
 
     def status_words(self) -> str:
-        """Return a short status for people. It contains no text of a goal, because every user may read it."""
+        """Return a short human-readable status. It doesn't contain texts of goals, because every user may read it."""
         scheduler, ready = self.scheduler, self.ready
         if self.engine_status != READY:
             doing = f"engine: {self.engine_status}"
@@ -122,17 +121,17 @@ class Speech:
 
     @property
     def awaits_voices(self) -> bool:
-        """Whether the engine has yet to list its voices."""
+        """Whether the engine has not listed its voices yet, but is expected to."""
         return self.voices.listed is None and self.engine_status in {"starting", READY}
 
     def waiting_for_silence(self, record: Record) -> WaitingList:
-        """Return the list of requests that wait until the active goal is silent, resumed or ended."""
+        """Return the list of requests that wait until this goal is silent, resumed or ended."""
         return self._waiting_for_silence.setdefault(record, {})
 
     # -- the scheduler's effects
 
     def now(self) -> Now:
-        """Return the time, after everything that is due by now has been done."""
+        """Do everything that is due, and return the current time."""
         now = self._now()
         deadline = self.scheduler.deadline()
         if deadline is not None and deadline <= now.monotonic:
@@ -144,7 +143,7 @@ class Speech:
         return Now(elapsed(), time.time())
 
     def apply(self, effects: list[Effect]) -> None:
-        """Carry out the scheduler's effects: first the orders for the engine, so that it works meanwhile."""
+        """Carry out the scheduler's effects. The engine gets its orders first, because it can work meanwhile."""
         changes, queue_changed, at = [], False, time.time()
         for effect in effects:
             if isinstance(effect, StateChange):
@@ -158,7 +157,7 @@ class Speech:
         if queue_changed:
             self.on_queue_change()
         self.notifications.add(changes)
-        self._report_following()
+        self._announce_next()
         self._set_timer()
         self.on_status_change()
         self.check_finished()
@@ -192,7 +191,7 @@ class Speech:
                 self.engine.resume(record.id)
 
     def _start(self, record: Record) -> None:
-        self._told_following = next_waits, next_is_neural = self._following()
+        self._announced_next = next_waits, next_is_neural = self._following()
         options = engine_options(record.say, self.scheduler.settings)
         if not is_neural(options["voice"] or ""):
             options["voice_only"] = False
@@ -207,11 +206,11 @@ class Speech:
             )
         )
 
-    def _report_following(self) -> None:
-        """Tell the engine whether a goal follows the active one, because the change of goals takes time."""
+    def _announce_next(self) -> None:
+        """Tell the engine whether a goal follows the active one, so that it can prepare for the change."""
         active, following = self.scheduler.active, self._following()
-        if active and following != self._told_following:
-            self._told_following = following
+        if active and following != self._announced_next:
+            self._announced_next = following
             self.engine.announce_next(active.id, *following)
 
     def _following(self) -> tuple[bool, bool]:
@@ -237,43 +236,44 @@ class Speech:
     def _tick(self) -> None:
         self.apply(self.scheduler.tick(self._now()))
 
-    # -- the engine's reports
+    # -- reports from the engine
 
     def report(self, report: Report) -> None:
-        """Queue a report of the engine thread. May be called in any thread.
+        """Queue a report from the engine thread. This method may be called in any thread.
 
-        Only a few reports are taken in one turn, so that clients don't wait for a sentence of many words.
+        Only a few reports are processed in one turn of the event loop, so that a sentence of many words doesn't delay
+        other clients.
         """
         self._reports.append(report)
         if not self._reports_due:
             self._reports_due = True
-            with contextlib.suppress(RuntimeError):  # the loop is closed
-                self._loop.call_soon_threadsafe(self._take_reports)
+            with contextlib.suppress(RuntimeError):  # raised if the loop is closed
+                self._loop.call_soon_threadsafe(self._process_reports)
 
-    def _take_reports(self) -> None:
-        # Set before the first look, so that a report that comes after the last look wakes the loop again.
+    def _process_reports(self) -> None:
+        # This comes first, so that a report that arrives after the queue was found empty wakes the loop again.
         self._reports_due = False
         for _ in range(REPORTS_PER_TURN):
             if not self._reports:
                 return
             report = self._reports.popleft()
             try:
-                self._take(report)
+                self._process_report(report)
             except Exception as error:  # noqa: BLE001 - the other reports must not be lost
                 log.write_bug("a report of the engine", error)
         self._reports_due = True
-        self._loop.call_soon(self._take_reports)
+        self._loop.call_soon(self._process_reports)
 
-    def _take(self, report: Report) -> None:
+    def _process_report(self, report: Report) -> None:
         """Pass one report to the scheduler."""
         now, active = self.now(), self.scheduler.active
         if isinstance(report, protocol.GoalEvent):
-            if active and active.id == report.id:  # otherwise the goal was given up
-                self._take_goal_event(report, active, now)
-        elif not self._take_voice_event(report, now):
-            self._take_engine_event(report, now)
+            if active and active.id == report.id:  # ignore reports about a goal that was given up
+                self._process_goal_event(report, active, now)
+        elif not self._process_voice_event(report, now):
+            self._process_engine_event(report, now)
 
-    def _take_goal_event(self, event: protocol.GoalEvent, active: Record, now: Now) -> None:
+    def _process_goal_event(self, event: protocol.GoalEvent, active: Record, now: Now) -> None:
         scheduler = self.scheduler
         match event:
             case protocol.Word():
@@ -293,8 +293,8 @@ class Speech:
                     self.silent_goal = active
                     resume_all(self.waiting_for_silence(active))
 
-    def _take_voice_event(self, event: Report, now: Now) -> bool:
-        """Take an event about voices. Return False for every other event."""
+    def _process_voice_event(self, event: Report, now: Now) -> bool:
+        """Process an event about voices. Return False for every other event."""
         scheduler = self.scheduler
         match event:
             case protocol.VoiceList():
@@ -312,7 +312,7 @@ class Speech:
                 return False
         return True
 
-    def _take_engine_event(self, event: Report, now: Now) -> None:
+    def _process_engine_event(self, event: Report, now: Now) -> None:
         match event:
             case protocol.Ready():
                 self._engine_ready(event, now)
@@ -326,7 +326,7 @@ class Speech:
             case EngineMissing():
                 self.apply(self.scheduler.fail_next(event.message, now))
             case ThreadDied():
-                # Nothing can be spoken any more. A supervisor may start another server.
+                # Nothing can be spoken any more, so the server ends. A service manager may start another one.
                 self._engine_failed(event.message)
                 self.on_failure(TalkError(event.message))
                 if active := self.scheduler.active:
@@ -334,7 +334,7 @@ class Speech:
 
     def _goal_ended(self, ended: protocol.Ended, active: Record, now: Now) -> None:
         scheduler = self.scheduler
-        if self.ready and ended.player:  # the status shows the player that played
+        if self.ready and ended.player:  # `status` shows the player that was used
             self.ready = replace(self.ready, player=ended.player)
         if ended.outcome == protocol.OUTCOME_COMPLETED:
             effects = scheduler.completed(ended.id, ended.duration, now, ended.gaps, ended.gap_seconds)
@@ -373,11 +373,11 @@ class Speech:
     # -- the end
 
     def shut_down(self) -> None:
-        """End all goals, and reject every new one."""
+        """End all goals, and reject every new goal."""
         self.engine_known.set()
         self.apply(self.scheduler.shutdown(self._now()))
 
     def check_finished(self) -> None:
-        """Set `finished` if all goals have ended and all notifications have been made."""
+        """After a shutdown, set `finished` if all goals have ended and all notifications were sent."""
         if self.scheduler.closing and self.scheduler.active is None and self.notifications.done:
             self.finished.set()

@@ -1,6 +1,6 @@
-"""The events for clients that wait for a goal or watch all goals, and the signs of life while they do.
+"""Sends events and keep-alive messages to clients that wait for a goal or watch all goals.
 
-Events are sent in their order, and no faster than clients read them, because a cancel may end thousands of goals.
+A cancel may end thousands of goals. Therefore, events are sent no faster than clients read them.
 """
 
 from __future__ import annotations
@@ -25,18 +25,19 @@ if TYPE_CHECKING:
     from talkcli.server.connection import ClientConnection, PendingRequest
     from talkcli.server.stream import ClientStreams
 
-#: The interval of signs of life. A client gives a server up after three of them.
+#: Interval of keep-alive messages. A client considers a server dead after three missing messages.
 CLIENT_ALIVE_INTERVAL_S = 5.0
 
-#: Notifications before other work has a turn. They take three milliseconds.
+#: Notifications in one turn of the event loop. They take three milliseconds.
 _MAX_PER_TURN = 64
-#: Unread output of the notifications of one turn, past which clients get time to read.
+#: If the notifications of one turn cause more unread output than this, clients get time to read.
 _UNREAD_LIMIT_BYTES = 1024 * 1024
-#: How long clients get to read, and how often to check whether they have.
+#: Longest time that clients get to read.
 _READ_TIME_S = 0.05
+#: Interval of checks whether clients have read.
 _READ_CHECK_S = 0.002
-#: The factor by which the time to read shrinks each time that clients don't read. The sum is 0.8 s, so that a cancel
-#: is answered within 2 s even if its clients don't read.
+#: The time to read is multiplied by this factor each time that clients don't read. All these times add up to 0.8 s, so
+#: that a cancel is answered within 2 s even if no client reads.
 _READ_TIME_FACTOR = 0.94
 
 
@@ -50,25 +51,26 @@ class Subscribers:
 
         Args:
             loop: the event loop.
-            waiting_for_room: returns the connections that also get signs of life, because their goals wait for room.
+            waiting_for_room: function that returns the connections whose goals wait for room. They also get keep-alive
+                messages.
         """
         self._loop = loop
         self._waiting_for_room = waiting_for_room
-        #: numbers the events, so that a watcher notices dropped feedback
+        #: sequence numbers of events, by which watchers notice dropped feedback
         self._numbers = count(1)
-        #: the connections that wait for each goal, and whether they want its feedback
+        #: the connections that wait for each goal, and whether they want feedback
         self._waiters: dict[str, dict[ClientConnection, bool]] = {}
         self._watchers: dict[ClientConnection, None] = {}
         self._alive_timer: asyncio.TimerHandle | None = None
 
     def await_result(self, goal_id: str, connection: ClientConnection, *, feedback: bool = False) -> None:
-        """Send a connection the states and the result of a goal, and with `feedback` each word."""
+        """Subscribe a connection to the states and the result of a goal, and with `feedback` also to its words."""
         waiting = self._waiters.setdefault(goal_id, {})
         waiting[connection] = waiting.get(connection, False) or feedback
         self.keep_alive()
 
     def watch(self, connection: ClientConnection) -> None:
-        """Send a connection all events."""
+        """Subscribe a connection to all events."""
         self._watchers[connection] = None
         self.keep_alive()
 
@@ -77,7 +79,7 @@ class Subscribers:
         return connection in self._watchers or any(connection in each for each in self._waiters.values())
 
     def left(self, connection: ClientConnection) -> None:
-        """Forget a connection that is gone."""
+        """Remove a connection that has ended."""
         self._watchers.pop(connection, None)
         for waiting in self._waiters.values():
             waiting.pop(connection, None)
@@ -86,34 +88,34 @@ class Subscribers:
         """Publish a goal's new state, and its result if it has ended."""
         event = StateChanged(record.id, state, at, next(self._numbers))
         if self._watchers:
-            # The first and the last state come with the whole goal.
+            # The events of the first and the last state contain the whole goal.
             whole = record.snapshot(state) if state is State.PENDING or state.terminal else None
             _publish(replace(event, goal=whole).to_json(), self._watchers)
         if not state.terminal:
             _publish(event.to_json(), self._waiters.get(record.id, ()))
         elif record.id in self._waiters:
-            # Encoded once, because a thousand clients may wait for it.
+            # Encode the lines only once, because a thousand clients may wait for the goal.
             lines = encode(event.to_json()) + encode(Result(record.snapshot()).to_json())
             for connection in self._waiters.pop(record.id):
                 connection.publish(lines)
 
     def word_heard(self, word: Word, text: str, at: float) -> None:
-        """Publish that a word is being heard. `text`: the word as it is written."""
+        """Publish that a word is being heard. `text` is the spelling of the word."""
         event = WordHeard(word.id, text, word.start, word.end, word.number, word.time, at, next(self._numbers))
         _publish(event.to_json(), self._listeners([self._waiters.get(word.id, {})]), feedback=True)
 
     def paused_changed(self, held_id: str | None, *, paused: bool, by: By, at: float) -> None:
-        """Publish that speech is paused or resumed. `held_id`: the goal that is being spoken."""
+        """Publish that speech was paused or resumed. `held_id` is the id of the paused or resumed goal, if any."""
         event = PausedChanged(paused, held_id, by, at, next(self._numbers))
         _publish(event.to_json(), self._listeners(self._waiters.values()))
 
     def keep_alive(self) -> None:
-        """Send signs of life to the connections that wait for anything."""
+        """Schedule keep-alive messages for all connections that wait or watch."""
         if self._alive_timer is None:
             self._alive_timer = self._loop.call_later(CLIENT_ALIVE_INTERVAL_S, self._send_alive)
 
     def _listeners(self, waiting: Iterable[dict[ClientConnection, bool]]) -> dict[ClientConnection, None]:
-        """Return the watchers, and the connections that wait for goals with feedback."""
+        """Return the watchers and the waiting connections that want feedback, without duplicates."""
         listeners = dict(self._watchers)
         for each in waiting:
             listeners.update((connection, None) for connection, feedback in each.items() if feedback)
@@ -129,7 +131,7 @@ class Subscribers:
 
 def _publish(event: JsonObject, connections: Iterable[ClientConnection], *, feedback: bool = False) -> None:
     receivers = list(connections)
-    line = encode(event) if receivers else b""  # most words have no listener
+    line = encode(event) if receivers else b""  # usually, nobody receives the words
     for connection in receivers:
         connection.publish(line, feedback=feedback)
 
@@ -137,8 +139,8 @@ def _publish(event: JsonObject, connections: Iterable[ClientConnection], *, feed
 class Notifications:
     """A queue of functions that notify clients.
 
-    They are called at once, up to a limit in each turn of the event loop. Then other work has a turn, and the clients
-    get time to read.
+    Usually, they are called immediately. If there are many, only some are called in each turn of the event loop, so
+    that the server can do other work and the clients have time to read.
     """
 
     def __init__(self, streams: ClientStreams) -> None:
@@ -155,7 +157,7 @@ class Notifications:
         return not self._pending
 
     def add(self, notifications: Iterable[Callable[[], None]]) -> None:
-        """Add functions to the queue. If one of them adds others, these are called at once."""
+        """Add functions to the queue. If a notification itself adds functions, these are called immediately."""
         if self._working:
             for each in notifications:
                 self._call(each)
@@ -165,13 +167,13 @@ class Notifications:
             self._work(self._streams.unread_bytes)
 
     async def wait_done(self, request: PendingRequest) -> None:
-        """Wait until the functions that are in the queue now have been called."""
+        """Wait until all functions that are in the queue now have been called."""
         if self._pending:
             self._pending.append(request.resume)
             await request.wait({})
 
     def _work(self, unread_before: int) -> None:
-        """Call some functions. `unread_before`: the unread output of clients before the latest functions."""
+        """Call as many functions as allowed in one turn. `unread_before` is the clients' earlier unread output."""
         self._turn = None
         self._working = True
         for _ in range(min(_MAX_PER_TURN, len(self._pending))):
@@ -188,7 +190,7 @@ class Notifications:
             self._turn = self._loop.call_soon(self._work, min(unread_before, self._streams.unread_bytes))
 
     def _await_readers(self, unread_before: int, until: float) -> None:
-        """Continue when clients have read the output, or at this time, because other clients can't wait for them."""
+        """Continue after the clients have read the new output, or at the time `until` even if they have not."""
         if self._streams.unread_bytes <= unread_before:
             self._work(unread_before)
         elif self._loop.time() < until:
@@ -200,5 +202,5 @@ class Notifications:
     def _call(self, notification: Callable[[], None]) -> None:
         try:
             notification()
-        except Exception as error:  # noqa: BLE001 - the others are still called
+        except Exception as error:  # noqa: BLE001 - the other functions must still be called
             log.write_bug("telling clients", error)

@@ -1,6 +1,6 @@
-"""The voices that there are, and which one a word means. Which voices are loaded is in `goals.voices`.
+"""Finds the voice that a client asks for. Loading of voices is in `goals.voices`.
 
-The directories of neural voices are read only if somebody asks for a voice that the engine has not listed.
+The directories of neural voices are read only if a client asks for a voice that the engine has not listed.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ if TYPE_CHECKING:
 
 
 class VoiceCatalog:
-    """The voices of a server's engine, and the neural voices whose files are installed.
+    """The voices of a server's engine and the installed neural voices.
 
-    `settings_voice` is the voice that the server speaks with. If it is neural, its language means this voice, too.
+    `settings_voice` is the voice in the server's settings. If it is neural, its language is another name for it.
     """
 
     def __init__(self) -> None:
-        #: the voices that the engine has listed; None before that
+        #: the voices that the engine has listed, or None before that
         self.listed: tuple[Voice, ...] | None = None
-        #: the driver that speaks; None for the default, until it is known
+        #: name of the engine's driver, or None until the default driver is known
         self.driver: str | None = None
 
     def look_up(self, voice: str | None, settings_voice: str | None = None) -> tuple[str | None, Refusal | None]:
-        """Return the voice that a word means, and why it can't be had, if it can't.
+        """Return the voice that a client asks for, and a refusal if the voice is not available.
 
-        A neural voice is returned by its id, and every other voice as the word itself. A voice is not checked if it is
-        the default, or if the voices are not listed yet.
+        For a neural voice, the first value is the id. For every other voice, it is the client's input. The default
+        voice is never checked, and other voices are not checked before the engine has listed its voices.
         """
         if not voice or voice == DEFAULT_VOICE or not (self.listed or is_neural(voice)):
             return voice, None
@@ -48,7 +48,7 @@ class VoiceCatalog:
         return found.id, (Reason.UNKNOWN_VOICE, words) if missing else None
 
     def find_new_files(self) -> None:
-        """Update the list of neural voices to those that are installed now."""
+        """Update the list of neural voices from the installed files."""
         from talkcli.engine import models
 
         if self.listed and is_own_driver(self.driver):
@@ -56,19 +56,19 @@ class VoiceCatalog:
 
     @staticmethod
     def file_size(voice: str) -> int:
-        """Return the size of a neural voice's file in bytes; 0 if there is no file."""
+        """Return the size of a neural voice's file in bytes, or 0 if there is no file."""
         from talkcli.engine import models
 
         try:
             return os.path.getsize(models.find_models()[voice.removeprefix(NEURAL_PREFIX)])
-        except (KeyError, OSError):  # the engine will report it
+        except (KeyError, OSError):  # the engine will report the error when it loads the voice
             return 0
 
     def _find(self, voice: str, settings_voice: str | None) -> Voice | None:
         if not (is_neural(voice) or is_neural(settings_voice or "")):
             found = find_voice(voice, self._driver_voices)
             if found is not None:
-                return found  # without reading the directories of neural voices
+                return found  # the directories of neural voices needn't be read
         return find_voice(voice, self._candidates(voice), settings_voice)
 
     @property
@@ -76,7 +76,7 @@ class VoiceCatalog:
         return tuple(each for each in self.listed or () if not is_neural(each.id))
 
     def _candidates(self, voice: str) -> tuple[Voice, ...]:
-        """Return the voices that a word may mean, with the neural voices that are installed now."""
+        """Return the voices that a client may mean, including the neural voices that are installed now."""
         own = () if is_neural(voice) else self._driver_voices
         if self._foreign_driver is not None:
             return own
@@ -87,12 +87,12 @@ class VoiceCatalog:
 
     @property
     def _foreign_driver(self) -> str | None:
-        """The driver, if it is not one of `talk` and so has no neural voices."""
+        """The name of the driver if it is not `talk`'s own, so that there are no neural voices, or None."""
         return None if is_own_driver(self.driver) else self.driver or "the system's own"
 
     @staticmethod
     def _missing(voice: str) -> str | None:
-        """Return what is missing for a neural voice: a package, or the speaker that is asked for."""
+        """Return the problem if a neural voice's speaker doesn't exist or a package is not installed."""
         from talkcli.engine import models
 
         model, mark, speaker = voice.partition(SPEAKER_MARK)
@@ -102,6 +102,6 @@ class VoiceCatalog:
                 speaker_number(speaker, about.speaker_names, about.speakers)
             except UnknownVoice as error:
                 return str(error)
-            except (KeyError, models.VoiceFileError):  # the engine will report it
+            except (KeyError, models.VoiceFileError):  # the engine will report the error when it loads the voice
                 pass
         return models.missing_package()
