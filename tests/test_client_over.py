@@ -13,7 +13,7 @@ from talkcli.client.goal import GoalHandle, merged
 from talkcli.errors import Lost, ServerUnavailable
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import Cancel, Say
-from talkcli.protocol.events import Result, StateChanged
+from talkcli.protocol.events import Result, StateChanged, from_json
 from talkcli.protocol.lines import encode
 from talkcli.protocol.requests import Log, Status, Wait, Watch
 from tests.support.connection import PATIENCE
@@ -52,7 +52,7 @@ class Scripted(Connection):
     def _step(self, timeout: float, interruptible: bool) -> None:  # noqa: ARG002 - nothing takes time here
         with self.changed:
             if self.coming:
-                self.listeners.hear(self.coming.pop(0))
+                self.listeners.publish(from_json(self.coming.pop(0)))
             elif timeout > 0:
                 self.end("that was all")
 

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 import pytest
@@ -237,6 +238,19 @@ def test_watching_goes_on_with_another_snapshot(client: Client, scripted: Talk) 
     taking.join(PATIENCE)
     assert not taking.is_alive()
     assert Snapshot in {type(each) for each in seen}
+
+
+def test_threads_that_watch_outlast_an_absence_of_the_server(client: Client, scripted: Talk) -> None:
+    """One of the threads tries to connect, and the others wait for it without a limit."""
+    watches = [client.events(reconnect=True) for _ in range(3)]
+    for watch in watches:
+        next(watch)
+    scripted.kill()
+    with ThreadPoolExecutor(len(watches)) as pool:
+        found = [pool.submit(next, watch) for watch in watches]
+        time.sleep(0.3)
+        scripted.start_server()
+        assert {type(each.result(PATIENCE)) for each in found} == {Snapshot}
 
 
 def not_of(event: Event, word: str) -> bool:

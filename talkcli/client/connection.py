@@ -1,7 +1,7 @@
 """Blocking connections to a server: shells around the client core, for any number of threads.
 
-`Connection` is what the rest of the library uses, whatever the transport is. `SocketConnection` is a connection over a
-Unix socket. `ReconnectingConnection` is one that connects again after a break.
+`Connection` is the interface that the rest of the library uses, and the base class of all blocking transports.
+`SocketConnection` uses a Unix socket. `ReconnectingConnection` also uses a Unix socket, and reconnects after a break.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import os
 import select
 import threading
 import time
-from _socket import MSG_PEEK, SHUT_RDWR, SHUT_WR  # lighter than `socket`, see `peers`
+from _socket import SHUT_RDWR, SHUT_WR  # `socket` takes longer to import, see `peers`
 
 from talkcli import __version__, paths, peers
 from talkcli.client.connect import ANSWER_LIMIT_S, connect, hello, reach, sender_name, unreachable
@@ -33,21 +33,27 @@ if TYPE_CHECKING:
 
     _T = TypeVar("_T")
 
-#: The most bytes that are received at once.
+#: How many bytes are received at once.
 _RECEIVE_BYTES = 256 * 1024
-#: Seconds between two attempts to reconnect: the first pause, and the limit up to which it is doubled.
+#: The pause after the first failed attempt to reconnect, and the limit for the pause, which doubles after each failure.
 _FIRST_RECONNECT_PAUSE_S, _LONGEST_RECONNECT_PAUSE_S = 0.02, 0.5
-#: Reads before a request is sent, which are enough to find the end of a connection behind events.
+#: How often to read before a request is sent. This finds the end of a connection even if some events come before it.
 _MAX_READS = 4
-#: Seconds after which a waiting thread notices that another thread has reconnected.
+#: How long a thread waits without a socket before it checks whether another thread has reconnected.
 _RECONNECT_CHECK_S = 0.1
 
 
 def taken(connection: Connection, take: Callable[[], _T], end: float | None) -> Iterator[_T]:
-    """Iterate over the non-empty results of `take`, which is called under `changed` after each read.
+    """Iterate over the results of `take`, waiting for the connection as long as the result is empty.
 
-    At `end` (monotonic), or when the connection has ended, yield the result even if it is empty. Events received after
-    `end` don't count, because a goal may go on for ever.
+    After `end`, or when the connection has ended, yield empty results, too. Nothing is received after `end`, so that
+    the iteration ends even if events keep coming.
+
+    Args:
+        connection: the connection to wait for.
+        take: returns what has been received, and an empty or false value if there is nothing. It is called with the
+            lock `connection.changed`.
+        end: monotonic time; None for no limit.
     """
     found: _T
 
@@ -68,36 +74,38 @@ def taken(connection: Connection, take: Callable[[], _T], end: float | None) -> 
 
 
 class Connection(ClientCore):
-    """A connection to one server, for any number of threads. One of them reads, and the others wait for it.
+    """A connection to one server, for any number of threads. One of the waiting threads reads for all of them.
 
     The server carries out each request at most once, in the order of sending. A request that could have an effect is
-    never sent twice, except a goal with its id, which is spoken once. Messages are processed in the server's order and
-    under `changed`, so that a waiting thread sees a consistent state. They are only read while a thread is in `request`
-    or `wait_until`, which reads for all threads. No lock is held during a wait. The core's methods must be called under
-    `changed`.
+    never sent twice. The exception is a `say` with an id, because the server speaks it only once.
 
-    When the connection has ended, `ended` gives the reason. Events that were received before can still be read. Waiting
-    threads return, and later requests raise ServerUnavailable.
+    Messages are read only while a thread is in `request`, `submit` or `wait_until`. They are processed in the server's
+    order with the lock `changed`, so that a waiting thread sees a consistent state. No lock is held during a wait. The
+    core's methods may only be called with this lock.
+
+    When the connection has ended, `ended` is the reason. Waiting threads return then, and later requests raise
+    ServerUnavailable. Events that were received before can still be read.
     """
 
-    #: the process on this machine that listens at the socket, according to the kernel; None if the server is elsewhere
+    #: the process that listens at the socket, according to the kernel; None if the server is on another machine
     listener: int | None = None
-    #: the class of exchanges; a transport's own class can have more attributes
+    #: the class of the exchanges that `begin` creates
     exchange_type = Exchange
 
     def __init__(self, patience: float) -> None:
-        """`patience` is the time in seconds in which the server must answer."""
+        """Create the state of a connection. The server must answer each request within `patience` seconds."""
         super().__init__(patience, time.monotonic())
-        #: the lock under which messages are processed; notified after that
+        #: the lock for all state; it is notified after messages have been processed
         self.changed = threading.Condition()
         self._process = os.getpid()
         self._reading = False
         self._closing = False
 
     def close(self) -> None:
-        """Close the connection, from any thread. Goals that were sent are still spoken.
+        """Close the connection. Goals that were sent are still spoken.
 
-        Closing twice is no error. In a forked child, only the child's copies of the descriptors are closed.
+        Any thread may call this method, and it may be called twice. In a forked child process, it closes only the
+        child's copies of the descriptors.
         """
         if os.getpid() != self._process:
             self.ended = self.ended or "the connection was closed"
@@ -107,36 +115,39 @@ class Connection(ClientCore):
             self.end("the connection was closed")
             self._closing = True
             self._hang_up()
-            if not self._reading:  # the reader would poll a descriptor that may belong to another file by now
+            # If a thread is reading, it closes the socket. Otherwise it could poll the number of a newer file.
+            if not self._reading:
                 self._drop()
             self.changed.notify_all()
 
     def request(
         self, request: Request, on_reply: OnReply | None = None, *, slow: bool = False
     ) -> tuple[JsonObject, list[JsonObject]]:
-        """Send a request, and return its reply and the lines of its list.
+        """Send a request, and return its reply and the lines of the reply's list.
 
         Args:
             request: the request.
-            on_reply: called with both under `changed` if the server accepts the request, before any later event.
-            slow: the answer may take any time, during which the server sends signs of life.
+            on_reply: called with the lock `changed` if the server accepts the request, before any later event is
+                processed.
+            slow: whether the answer may take any time. Meanwhile, the server must send signs of life.
 
         Raises:
             RequestRefused: the server refused the request.
-            ServerUnavailable: the request was not sent, or not answered in time.
-            Lost: the request was sent and not answered, so it may have taken effect.
+            ServerUnavailable: the request was not sent, or a request without lasting effect was not answered in time.
+            Lost: the request was sent, but not answered. It may have taken effect.
             Interrupted: as in `wait_until`.
         """
-        # A goal may be accepted before its reply is read. Without the reply, the sender has no id to cancel it with, so
-        # this wait can't be interrupted. Closing the connection cancels a goal that is still waiting for room.
+        # The wait for the reply to a `say` can't be interrupted, because the caller needs the goal's id to cancel it.
+        # A patient `say` can be interrupted: closing the connection cancels a goal that is still waiting for room.
         interruptible = slow or not isinstance(request, Say)
         exchange = self.begin(request, on_reply, slow=slow)
         try:
-            last, deadline = 0.0, -1.0
-            while not exchange.over and self.ended is None and last != deadline:
-                last, deadline = deadline, self.answer_by(exchange)
-                limit = None if deadline == float("inf") else deadline
-                self.wait_until(lambda: exchange.over, limit, interruptible=interruptible)
+            deadline = self.answer_by(exchange)
+            while not self.wait_until(lambda: exchange.over, deadline, interruptible=interruptible):
+                # The limit is later after each line of the answer.
+                earlier, deadline = deadline, self.answer_by(exchange)
+                if deadline == earlier:
+                    break
         finally:
             with self.changed:
                 if not self.forget(exchange):
@@ -151,7 +162,9 @@ class Connection(ClientCore):
         *,
         slow: bool = False,
     ) -> Exchange:
-        """Send a request without waiting for the answer. If `on_failure` is None, `forget` the exchange in the end.
+        """Send a request without waiting for the answer. The arguments are those of `Exchange`.
+
+        If `on_failure` is None, the caller must call `forget` in the end.
 
         Raises:
             ServerUnavailable: nothing can be sent.
@@ -168,10 +181,14 @@ class Connection(ClientCore):
         return exchange
 
     def submit(self, request: Request, on_reply: OnReply, on_failure: OnFailure) -> None:
-        """Send a request without waiting. One of the two functions is called under `changed`, now or later.
+        """Send a request without waiting. Bytes that the server doesn't accept now are sent by later calls.
 
-        Bytes that the server doesn't accept now are sent by later calls. A refusal, and an answer that doesn't come in
-        time, count as failures.
+        One of the two functions is called with the lock `changed`, during this call or a later one.
+
+        Args:
+            request: the request.
+            on_reply: called if the server accepts the request.
+            on_failure: called if the request is refused, can't be sent, or isn't answered in time.
 
         Raises:
             ServerUnavailable: the connection has ended.
@@ -184,7 +201,11 @@ class Connection(ClientCore):
             self.begin(request, on_reply, on_failure, slow=slow)
 
     def post(self, request: Request) -> None:
-        """Send a request without waiting and ignore the answer; ServerUnavailable if it can't be sent."""
+        """Send a request without waiting, and ignore the answer.
+
+        Raises:
+            ServerUnavailable: the request can't be sent.
+        """
         failures: list[TalkError] = []
         self.submit(request, lambda *_: None, failures.append)
         if failures:
@@ -198,16 +219,20 @@ class Connection(ClientCore):
         since: float | None = None,
         interruptible: bool = True,
     ) -> bool:
-        """Read until `done()` is true. A server that is silent for SILENCE_LIMIT_S counts as gone.
+        """Read and process messages until `done()` is true. If the server is silent for too long, end the connection.
 
         Args:
-            done: called under `changed`, and not again after it has returned True.
-            deadline: monotonic time, or None for no limit. Messages that have arrived by then count.
-            since: the monotonic time from which silence counts; the default is now.
-            interruptible: raise Interrupted if one of the connection's interrupting descriptors is ready.
+            done: called with the lock `changed`, and never again after it has returned True.
+            deadline: monotonic time; None for no limit. All messages that have arrived by then are processed.
+            since: when the caller started to wait for the server (monotonic). Earlier silence doesn't count. The
+                default is now.
+            interruptible: whether the connection's interrupting descriptors end the wait.
 
         Returns:
-            False if the deadline has passed, or if the connection has ended.
+            False if the deadline has passed or the connection has ended.
+
+        Raises:
+            Interrupted: one of the interrupting descriptors is ready.
         """
         began = time.monotonic() if since is None else since
         last = False
@@ -231,7 +256,7 @@ class Connection(ClientCore):
                 last = now >= end
                 wait_s = max(0.0, min(end, self.next_expiry()) - now)
                 if self._reading:
-                    self.changed.wait(wait_s)
+                    self.changed.wait(min(wait_s, threading.TIMEOUT_MAX))
                     continue
                 self._reading = True
             try:
@@ -244,40 +269,53 @@ class Connection(ClientCore):
                     self.changed.notify_all()
 
     def _read_available(self) -> None:
-        """Read the messages that have arrived, without waiting. The end of the connection may follow them."""
+        """Process the messages that have arrived, without waiting. This also finds the end of the connection."""
         for _ in range(_MAX_READS):
             heard = self._heard
             self.wait_until(lambda: False, time.monotonic(), interruptible=False)
             if heard == self._heard:
                 break
 
-    # -- to be implemented by each transport
+    # -- to be implemented by each transport. `_send`, `_hang_up` and `_cut_off` are called with the lock `changed`
 
     def _prepare(self, request: Request, *, awaited: bool) -> None:
-        """Prepare the connection for a request. Raise a failure only if the answer will be awaited."""
+        """Prepare for sending a request, for example by reconnecting.
+
+        Args:
+            request: the request.
+            awaited: whether a thread will wait for the answer. Only then may this method raise ServerUnavailable.
+        """
 
     def _send(self, exchange: Exchange) -> None:
-        """Send or queue a registered request, under `changed`; ServerUnavailable if nothing can be sent."""
+        """Send or queue the request of a registered exchange.
+
+        Raises:
+            ServerUnavailable: nothing can be sent.
+        """
         raise NotImplementedError
 
     def _step(self, timeout: float, interruptible: bool) -> None:
-        """Wait for messages, up to the timeout, and process them; Interrupted. One thread at a time calls this."""
+        """Wait up to `timeout` seconds for messages, and process them. Only one thread at a time calls this.
+
+        Raises:
+            Interrupted: the wait is `interruptible`, and one of the interrupting descriptors is ready.
+        """
         raise NotImplementedError
 
     def _hang_up(self) -> None:
-        """Disconnect under `changed`, so that the reading thread notices it."""
+        """Disconnect, and wake the reading thread."""
         raise NotImplementedError
 
     def _drop(self) -> None:
-        """Close the descriptors of this process. A parent process keeps its own."""
+        """Close this process's descriptors. Those of a parent process stay open."""
         raise NotImplementedError
 
     def _cut_off(self) -> None:
-        """Disconnect under `changed`, after a line was sent only in part."""
+        """Disconnect, because only a part of a line could be sent."""
 
 
 class SocketConnection(Connection):
-    """A connection over a Unix socket. It has no thread of its own."""
+    """A connection over a Unix socket, without a thread of its own."""
 
     def __init__(
         self,
@@ -291,18 +329,20 @@ class SocketConnection(Connection):
         keep_trying: float = 0.0,
         end: float | None = None,
     ) -> None:
-        """Connect; the errors are those of `Client`.
+        """Connect to a server. The errors are those of `Client`.
 
         Args:
-            socket: path of the server's socket. The default is TALK_SOCKET, then the usual places.
-            name: what the sender calls itself. The default is TALK_NAME.
-            urgent: only `status` and `cancel` will be sent, for which a full server keeps some places.
-            interrupt: descriptors with the poll events that interrupt any wait, as in `polling.wait_ready`.
-            patience: seconds in which the server must greet, and must answer each request.
-            attempt: a connection that has already been opened. Its first request may have been sent.
-            keep_trying: seconds for which to try again if there is no server yet. The rest of this time replaces
-                `patience` if it is longer.
-            end: with `keep_trying`, the monotonic time by which the server must have greeted; None for no limit.
+            socket: path of the server's socket. The default is TALK_SOCKET, or else the usual places.
+            name: the sender's name. The default is TALK_NAME.
+            urgent: whether the client sends only `status` and `cancel`. A full server keeps some places for such
+                clients.
+            interrupt: descriptors that interrupt any wait, with their poll events, as in `polling.wait_ready`.
+            patience: seconds in which the server must send its greeting, and must answer each request.
+            attempt: an open connection, on which the first request may have been sent.
+            keep_trying: seconds for which to try again if there is no server yet. After connecting, the rest of this
+                time is the limit for each answer, unless `patience` is longer.
+            end: with `keep_trying`, the monotonic time by which the server must have sent its greeting. None for no
+                limit.
         """
         super().__init__(patience)
         self._interrupt = interrupt
@@ -311,21 +351,21 @@ class SocketConnection(Connection):
             raise UsageError(
                 f"the name of the sender has {len(name)} characters, the longest allowed is {MAX_SENDER_NAME_CHARS}"
             )
-        self._first_words = hello(name, urgent=urgent)
+        self._hello_message = hello(name, urgent=urgent)
         self._named = paths.named_socket(socket)
         give_up = time.monotonic() + keep_trying
-        attempt = connect(self._named, self._first_words, patience, self._interrupt, attempt, keep_trying, end)
+        attempt = connect(self._named, self._hello_message, patience, self._interrupt, attempt, keep_trying, end)
         self._patience = max(patience, round(give_up - time.monotonic(), 1))
-        #: None while there is no connection
+        #: None while disconnected
         self._socket: _socket.socket | None = attempt.socket
         self.path, self.boot, self.pid = attempt.path, attempt.boot, attempt.pid
         self._sent_early = attempt.request_sent
-        #: received together with the greeting, and processed after the request that was sent early is registered
+        #: bytes that were received after the greeting; they are processed once the early request is registered
         self._received_early = attempt.received
 
     @property
     def listener(self) -> int | None:  # type: ignore[override]
-        """The process that listens at the socket, according to the kernel; None while disconnected."""
+        """The id of the process that listens at the socket, according to the kernel. None while disconnected."""
         return None if self._socket is None else peers.credentials(self._socket)[0]
 
     def _send(self, exchange: Exchange) -> None:
@@ -341,25 +381,14 @@ class SocketConnection(Connection):
             self.fail(exchange, error)
         self._flush()
 
-    def _read_available(self) -> None:
-        try:
-            if self._socket is None:
-                return
-            self._socket.recv(1, MSG_PEEK)
-        except BlockingIOError:
-            return  # there is nothing to read, and the connection is open
-        except OSError:
-            pass  # the connection broke
-        super()._read_available()
-
     def _flush(self) -> None:
-        """Send as many of the outgoing bytes as the server accepts now, under `changed`."""
+        """Send as many of the outgoing bytes as the server accepts now. The caller holds the lock `changed`."""
         try:
             while self._socket is not None and (data := self.outgoing()):
                 self.mark_sent(self._socket.send(data))
         except BlockingIOError:
             pass
-        except OSError as error:  # the reader will find the end, after the server's last messages
+        except OSError as error:  # the server's last messages can still be read before the end of the connection
             if self.greeted:
                 self.stop_sending("the server went away", f"the server at {self.path} went away: {error.strerror}")
 
@@ -367,12 +396,13 @@ class SocketConnection(Connection):
         with self.changed:
             early, self._received_early = self._received_early, b""
             if early:
-                self._receive(early, time.monotonic())
+                self.receive(early, time.monotonic())
                 timeout = 0.0
             self._flush()
             connected = self._socket
             waits = bool(self.outgoing())
         if connected is None:
+            wait_ready({}, min(timeout, _RECONNECT_CHECK_S))
             return
         data, why = b"", "the server went away"
         try:
@@ -381,7 +411,7 @@ class SocketConnection(Connection):
                 return
             data = connected.recv(_RECEIVE_BYTES)
         except BlockingIOError:
-            return  # the socket is ready for sending only
+            return  # there is nothing to read: the socket has only become writable
         except ConnectionResetError:  # the server closed it without reading everything
             pass
         except (OSError, ValueError) as error:  # ValueError: another thread has closed it
@@ -391,16 +421,13 @@ class SocketConnection(Connection):
                 return  # another thread has disconnected
             now = time.monotonic()
             if data:
-                self._receive(data, now)
+                self.receive(data, now)
                 self._flush()
             else:
                 self.break_off(why, now)
 
-    def _receive(self, data: bytes, now: float) -> None:
-        self.receive(data, now)
-
     def _hang_up(self) -> None:
-        self._shut(SHUT_RDWR)  # this wakes the reading thread, unlike closing the socket
+        self._shut(SHUT_RDWR)  # unlike closing the socket, this wakes the reading thread
 
     def _drop(self) -> None:
         if self._socket is not None:
@@ -421,20 +448,18 @@ class SocketConnection(Connection):
 class ReconnectingConnection(SocketConnection):
     """A connection over a Unix socket that reconnects after a break. Only `close` ends it.
 
-    It has no thread of its own, so it reconnects during the next calls.
+    It has no thread of its own. It reconnects during later calls.
     """
 
     def __init__(self, socket: str | None = None, *, name: str | None = None, patience: float = ANSWER_LIMIT_S) -> None:
-        """Connect; the arguments are those of `SocketConnection`."""
+        """Connect to a server. The arguments are those of `SocketConnection`."""
         super().__init__(socket, name=name, patience=patience)
-        #: sockets that the reading thread is to close, because it may be polling them
+        #: former sockets that only the reading thread may close, because it may still be polling them
         self._given_up: list[_socket.socket] = []
-        #: the earliest time of the next attempt (monotonic), and the pause after it
-        self._retry_at, self._pause_s = 0.0, _FIRST_RECONNECT_PAUSE_S
-        #: by when the server must greet on a new connection (monotonic)
-        self._greet_by = 0.0
-        #: why the last attempt failed
-        self._failure: TalkError = ServerUnavailable("")
+        #: when the next attempt to connect is due; during an attempt, when the greeting is due (monotonic)
+        self._due = 0.0
+        #: the pause after the next failed attempt
+        self._pause_s = _FIRST_RECONNECT_PAUSE_S
 
     def _prepare(self, request: Request, *, awaited: bool) -> None:
         if awaited:
@@ -443,13 +468,8 @@ class ReconnectingConnection(SocketConnection):
             if self.ended is None:
                 self._connect_again(time.monotonic(), at_once=isinstance(request, Cancel))
             if self._socket is None and self.ended is None and awaited:
-                raise self._failure
-
-    def post(self, request: Request) -> None:
-        failures: list[TalkError] = []
-        self.submit(request, lambda *_: None, failures.append)
-        if failures and self.unsent_bytes:  # the buffer is full; after a break it would be empty
-            raise failures[0]
+                assert self.connect_error
+                raise self.connect_error
 
     def break_off(self, why: str, now: float) -> None:
         if self.ended is not None:
@@ -458,58 +478,58 @@ class ReconnectingConnection(SocketConnection):
         self._give_up_socket()
         if was_greeted:
             self.disconnected(why, now)
-            self._retry_at, self._pause_s = now, _FIRST_RECONNECT_PAUSE_S
+            self._due, self._pause_s = now, _FIRST_RECONNECT_PAUSE_S
         else:
             self._not_connected(ServerUnavailable(f"nothing was sent to the server at {self.path}: {why}"), now)
 
     def _step(self, timeout: float, interruptible: bool) -> None:
         with self.changed:
             now = time.monotonic()
-            if self._socket is not None and not self.greeted and now >= self._greet_by:
+            if self._socket is not None and not self.greeted and now >= self._due:
                 self._give_up_socket()
                 self._not_connected(ServerUnavailable(f"the server at {self.path} does not answer"), now)
             if self.ended is None:
                 self._connect_again(now)
-            if self._socket is None:
-                timeout = max(0.0, min(timeout, self._retry_at - now, _RECONNECT_CHECK_S))
-            elif not self.greeted:
-                timeout = max(0.0, min(timeout, self._greet_by - now))
-            absent = self._socket is None
-        if absent:
-            wait_ready({}, timeout)
-        else:
-            super()._step(timeout, interruptible)
+            if not self.greeted:
+                timeout = max(0.0, min(timeout, self._due - now))
+        super()._step(timeout, interruptible)
         with self.changed:
             for each in self._given_up:
                 each.close()
             self._given_up.clear()
 
-    def _receive(self, data: bytes, now: float) -> None:
+    def post(self, request: Request) -> None:
+        failures: list[TalkError] = []
+        self.submit(request, lambda *_: None, failures.append)
+        if failures and self.unsent_bytes:  # the buffer is full; if the connection had broken, it would be empty
+            raise failures[0]
+
+    def receive(self, data: bytes, now: float) -> None:
         try:
-            super()._receive(data, now)
-        except TalkError as error:  # the greeting
+            super().receive(data, now)
+        except TalkError as error:  # according to the greeting, the server can't be used
             self._give_up_socket()
             self._not_connected(error, now)
 
     def _connect_again(self, now: float, *, at_once: bool = False) -> None:
-        """Try to connect if there is no connection. Wait for the end of the pause, unless `at_once` is set."""
-        if self._socket is not None or (now < self._retry_at and not at_once):
+        """Try to connect if there is no socket and the pause is over. With `at_once`, ignore the pause."""
+        if self._socket is not None or (now < self._due and not at_once):
             return
         found = reach(self._named, only=self.path)
         if found.socket is None:
             self._not_connected(unreachable(found, self._named), now)
             return
-        self._socket, self._greet_by = found.socket, now + self._patience
-        self.connecting(request_line(self._first_words), __version__)
+        self._socket, self._due = found.socket, now + self._patience
+        self.connecting(request_line(self._hello_message), __version__)
         self._flush()
 
     def _not_connected(self, error: TalkError, now: float) -> None:
-        self._failure = error
-        self._retry_at, self._pause_s = now + self._pause_s, min(2 * self._pause_s, _LONGEST_RECONNECT_PAUSE_S)
-        self.not_connected(error, " ".join(error.message.split()))
+        """Record that an attempt has failed, and schedule the next one."""
+        self._due, self._pause_s = now + self._pause_s, min(2 * self._pause_s, _LONGEST_RECONNECT_PAUSE_S)
+        self.not_connected(error)
 
     def _give_up_socket(self) -> None:
-        """Disconnect under `changed`, and leave closing the socket to the reading thread if there is one."""
+        """Disconnect. If a thread is reading, it closes the socket later. The caller holds the lock `changed`."""
         self._hang_up()
         if self._socket is not None and self._reading:
             self._given_up.append(self._socket)

@@ -1,6 +1,6 @@
 """The client's side of the protocol, without I/O: requests become bytes, received bytes become replies and events.
 
-A transport is a shell around `ClientCore`. It connects, owns the lock or the event loop, and has these duties:
+A transport is a shell around `ClientCore`. The shell connects, and it owns the lock or the event loop. Its duties are:
 
 - Send the bytes that `outgoing()` returns, and report with `mark_sent()` how many were accepted.
 - Pass received bytes to `receive()`.
@@ -8,13 +8,13 @@ A transport is a shell around `ClientCore`. It connects, owns the lock or the ev
 - Call `end()` when the connection has ended for good, or `disconnected()` if the shell is going to connect again.
 
 Rules for this file: no socket, thread, lock, asyncio or clock. Times are seconds of a monotonic clock, and are passed
-as arguments. Only one thread at a time may call a method.
+as arguments. The caller must make sure that only one thread at a time calls a method.
 """
 
 from __future__ import annotations
 
 import itertools
-from _weakrefset import WeakSet  # as `threading` imports it: the rest of `weakref` takes longer
+from _weakrefset import WeakSet  # `weakref` has it, too, but takes longer to import
 from collections import deque
 from collections.abc import Callable
 
@@ -35,50 +35,51 @@ if TYPE_CHECKING:
     from talkcli.protocol.events import Event
     from talkcli.protocol.requests import Request
 
-#: Called with the reply to a request and the lines of its list.
+#: A function that receives the reply to a request and the lines of the reply's list.
 OnReply = Callable[["JsonObject", "list[JsonObject]"], None]
-#: Called with the reason why a request was refused, was not sent, or will not be answered.
+#: A function that receives the error if a request was refused, was not sent, or will not be answered.
 OnFailure = Callable[["TalkError"], None]
+#: A function that receives a goal's events. It receives the whole goal if events were missed during a break.
+Listener = Callable[["Event | Goal | GoalLost"], None]
 
-#: The longest silence of a server that owes the client anything. A server sends a sign of life every 5 s.
+#: A server that sends nothing for this time is treated as gone. It sends a sign of life every 5 s to waiting clients.
 SILENCE_LIMIT_S = 15.0
-#: The most bytes that may wait to be sent when a request is sent without waiting.
+#: Size limit of the send buffer for requests that are sent without waiting.
 MAX_UNSENT_BYTES = 256 * 1024
-#: The least ttl that is sent: 0 would mean no limit.
-_LEAST_TTL_S = 0.01
-#: Words and pauses kept for a slow reader, the newest ones. The longest text, 10,000 characters, has no more words, so
-#: a goal's words are complete even if they are read after its end.
+#: The minimum ttl in a request, because 0 would mean no limit.
+_MIN_TTL_S = 0.01
+#: How many words and pauses are kept for a slow reader. If there are more, the oldest are dropped. The longest text has
+#: 10,000 characters and thus at most 5,000 words, so no word of a single goal is dropped.
 MAX_FEEDBACK_EVENTS = 5_000
-#: State changes kept for a slow reader of all goals: those of about 3,000 goals. With more, the reader's stream ends.
+#: How many state changes are kept for a slow reader of all goals. They are enough for about 3,000 goals. If there are
+#: more, the reader's stream ends.
 MAX_STATE_EVENTS = 10_000
 
 
 @frozen
 class GoalLost:
-    """The end of a goal for its listeners, because the server sends no more events for it."""
+    """Tells a goal's listeners that the server sends no more events for the goal."""
 
-    #: the reason, for people
+    #: human-readable reason
     why: str
 
 
 class EventBuffer:
     """A bounded queue of events for one reader."""
 
-    __slots__ = ("__weakref__", "_count", "_feedback", "_last_number", "_states", "closed", "reconnects")
-
     def __init__(self, *, reconnects: bool = False) -> None:
-        # Two queues of numbered events, so that dropping the oldest feedback takes constant time.
+        # There are two queues of numbered events, so that dropping the oldest feedback takes constant time.
         self._states: deque[tuple[int, Event]] = deque()
         self._feedback: deque[tuple[int, Event]] = deque(maxlen=MAX_FEEDBACK_EVENTS)
         self._count = 0
         self._last_number: int | None = None
-        #: why no more events are added; None while the buffer is open
+        #: the reason why no more events are added; None while the buffer is open
         self.closed: str | None = None
         #: whether the buffer stays in use after the connection has broken
         self.reconnects = reconnects
 
     def add(self, event: Event) -> None:
-        """Add an event, unless it is the same as the last one.
+        """Add an event, unless it is the same as the last one or the buffer is closed.
 
         A connection that waits for a goal and also watches all goals receives each state twice.
         """
@@ -102,7 +103,7 @@ class EventBuffer:
         return len(self._states) + len(self._feedback)
 
     def take(self) -> Event | None:
-        """Remove the oldest event and return it; None if the buffer is empty."""
+        """Remove and return the oldest event. Return None if the buffer is empty."""
         queues = [each for each in (self._states, self._feedback) if each]
         return min(queues, key=lambda each: each[0][0]).popleft()[1] if queues else None
 
@@ -111,107 +112,95 @@ class EventListeners:
     """The listeners for single goals, and the buffers of readers that watch all goals."""
 
     def __init__(self) -> None:
-        self._goals: dict[str, list[Callable[[Event | Goal | GoalLost], None]]] = {}
-        #: the goals whose listeners also want each word
-        self._with_feedback: set[str] = set()
+        #: the listeners for each goal, with True for those that also want its words
+        self._goals: dict[str, dict[Listener, bool]] = {}
         #: weak references, because watching ends when the reader drops its iterator
         self._watches: WeakSet[EventBuffer] = WeakSet()
 
-    def add(self, goal_id: str, listener: Callable[[Event | Goal | GoalLost], None], *, feedback: bool = False) -> None:
-        """Pass the events of a goal, and all pauses, to a listener, until its Result or GoalLost."""
-        self._goals.setdefault(goal_id, []).append(listener)
-        self.want_feedback(goal_id, feedback=feedback)
+    def add(self, goal_id: str, listener: Listener, *, feedback: bool = False) -> None:
+        """Pass a goal's events and all pauses to a listener, until the goal's Result or GoalLost.
 
-    def want_feedback(self, goal_id: str, *, feedback: bool) -> None:
-        """Record that a listener wants each word of a goal, if `feedback` is set."""
-        if feedback:
-            self._with_feedback.add(goal_id)
+        Args:
+            goal_id: the goal's id.
+            listener: the function to call. Adding the same listener again has no effect, except for `feedback`.
+            feedback: also pass each word.
+        """
+        listeners = self._goals.setdefault(goal_id, {})
+        listeners[listener] = feedback or listeners.get(listener, False)
 
     def watch(self, buffer: EventBuffer) -> None:
-        """Add all events to this buffer, for as long as its reader keeps a reference to it."""
+        """Add all events to this buffer, as long as its reader keeps a reference to it."""
         self._watches.add(buffer)
 
     @property
     def watched(self) -> bool:
-        """Whether there is a reader that watches all goals."""
+        """Whether any reader watches all goals."""
         return bool(self._watches)
 
     @property
     def goals(self) -> dict[str, bool]:
-        """The ids of the goals with listeners, and whether one of these wants each word."""
-        return {each: each in self._with_feedback for each in self._goals}
+        """The ids of the goals with listeners, with True if one of the listeners wants the goal's words."""
+        return {goal_id: any(listeners.values()) for goal_id, listeners in self._goals.items()}
 
     def lose(self, goal_id: str, why: str) -> None:
-        """Tell a goal's listeners that it is lost, and remove them."""
-        for listener in self._remove(goal_id):
+        """Tell a goal's listeners that the goal is lost, and remove them. `why` is the human-readable reason."""
+        for listener in self._goals.pop(goal_id, {}):
             listener(GoalLost(why))
 
     def update(self, goal: Goal) -> None:
         """Pass the current state of a goal to its listeners."""
-        for listener in self._goals.get(goal.id, []):
+        for listener in self._goals.get(goal.id, {}):
             listener(goal)
 
-    def end_watches(self, why: str, *, all_of_them: bool) -> None:
+    def end_watches(self, why: str, *, include_reconnecting: bool) -> None:
         """Close the buffers of the readers that watch all goals.
 
         Args:
-            why: the reason, for people.
-            all_of_them: also close the buffers that stay in use after a break.
+            why: human-readable reason.
+            include_reconnecting: also close the buffers that would stay in use after a break.
         """
         for buffer in list(self._watches):
-            if all_of_them or not buffer.reconnects:
+            if include_reconnecting or not buffer.reconnects:
                 buffer.closed = buffer.closed or why
                 self._watches.discard(buffer)
 
-    def hear(self, message: JsonObject) -> None:
-        """Pass an event in the server's JSON form to its listeners; ValueError if it is malformed."""
-        event = events.from_json(message)
+    def publish(self, event: Event | None) -> None:
+        """Pass an event to the listeners for its goal and to the readers that watch all goals. Ignore None."""
         if isinstance(event, Result):
-            for listener in self._remove(event.goal.id):
+            for listener in self._goals.pop(event.goal.id, {}):
                 listener(event)
-        elif isinstance(event, Snapshot):
-            for buffer in self._watches:
-                buffer.add(event)
-        elif isinstance(event, StateChanged | WordHeard | PausedChanged):
-            if isinstance(event, PausedChanged):
-                listeners = [listener for each in self._goals.values() for listener in each]
-            else:
-                listeners = self._goals.get(event.id, [])
-            for listener in listeners:
-                listener(event)
+            return
+        if isinstance(event, StateChanged | WordHeard | PausedChanged):
+            for goal_id in self._goals if isinstance(event, PausedChanged) else [event.id]:
+                for listener in self._goals.get(goal_id, {}):
+                    listener(event)
             state = event.state if isinstance(event, StateChanged) and not event.goal else None
             if state is State.PENDING or (state and state.terminal):
-                return  # for watching clients, the server sends this event again with the whole goal
-            for buffer in self._watches:
-                buffer.add(event)
-
-    def _remove(self, goal_id: str) -> list[Callable[[Event | Goal | GoalLost], None]]:
-        self._with_feedback.discard(goal_id)
-        return self._goals.pop(goal_id, [])
+                return  # the server sends this event again, with the whole goal, to clients that watch all goals
+        elif not isinstance(event, Snapshot):
+            return
+        for buffer in self._watches:
+            buffer.add(event)
 
 
 class TrackedGoal:
     """A client's knowledge of one goal, with a buffer of its events."""
 
     def __init__(self, goal: Goal) -> None:
-        #: the goal as the server last described it
+        #: the goal as last described by the server
         self.goal = goal
-        #: whether an earlier `say` with the same id sent this goal, so that the text is not spoken again
+        #: whether the goal was already known by its id, so that the text is not spoken again
         self.attached = False
         #: whether the server has paused all speech, as far as is known
         self.speech_paused = False
-        #: when the server began to send the goal's events to this connection (monotonic); None if it doesn't
+        #: since when the server sends the goal's events to this connection (monotonic); None if it doesn't
         self._followed_at: float | None = None
-        #: whether each word is kept, too
+        #: whether words and pauses are buffered, too
         self._with_feedback = False
-        #: whether this object is among the goal's listeners
-        self._listening = False
         self._buffer = EventBuffer()
-        #: whether the Result has been taken
-        self._result_taken = False
 
     def _expect(self, request: Say, now: float) -> None:
-        """Take the goal's id from a `say` that has not been answered yet."""
+        """Copy the id and text of a `say` request that has not been answered yet."""
         self.goal = replace(self.goal, id=request.id or "", text=request.text)
         if request.wait:
             self._followed_at = now
@@ -223,36 +212,31 @@ class TrackedGoal:
         self.speech_paused = reply.get("paused") is True
 
     def _listen_to(self, listeners: EventListeners, *, feedback: bool, now: float) -> None:
-        """Become a listener for the goal's events, which the server sends from `now` on."""
+        """Start listening for the goal's events, which the server sends from `now` on."""
         self._with_feedback = self._with_feedback or feedback
         if self._followed_at is None:
             self._followed_at = now
-        if self._listening:
-            listeners.want_feedback(self.goal.id, feedback=feedback)
-        elif not self.goal.state.terminal:
-            self._listening = True
+        if not self.goal.state.terminal:
             listeners.add(self.goal.id, self._hear, feedback=feedback)
 
     def _fail(self, error: TalkError) -> None:
-        """End the goal because its `say` failed: as LOST if it may be spoken, otherwise as REJECTED."""
+        """End the goal because its `say` failed. It is LOST if it may be spoken, and otherwise REJECTED."""
         from talkcli.goals.reasons import Reason  # rarely needed, and slow to import
 
-        if self.goal.state.terminal:
-            return
         if isinstance(error, Lost):
-            self.goal = lost(self.goal, error.message)
+            self._update(lost(self.goal, error.message))
         else:
             reason = Reason.NOT_SENT.value if isinstance(error, ServerUnavailable) else error.code
             message = f"Talk rejected: {error.message}"
-            self.goal = replace(self.goal, state=State.REJECTED, reason=reason, message=message)
+            self._update(replace(self.goal, state=State.REJECTED, reason=reason, message=message))
 
-    def _settle(self, goal: Goal) -> None:
-        """Replace the goal with the server's current description, unless it has already ended."""
+    def _update(self, goal: Goal) -> None:
+        """Replace the goal with a newer description of it, unless it has already ended."""
         if not self.goal.state.terminal:
             self.goal = goal
 
     def _hear(self, event: Event | Goal | GoalLost) -> None:
-        """Update the goal from an event of its own, or from a pause of all speech."""
+        """Process an event of this goal, or a pause of all speech."""
         if self.goal.state.terminal:
             return
         if isinstance(event, Goal):
@@ -264,7 +248,7 @@ class TrackedGoal:
         elif isinstance(event, Result):
             self.goal = event.goal
         elif isinstance(event, StateChanged):
-            # A terminal state is followed by the result, which has the details.
+            # After a terminal state, the Result follows. Only the Result has the details.
             if not event.state.terminal:
                 self.goal = replace(self.goal, state=event.state)
             self._buffer.add(event)
@@ -277,31 +261,31 @@ class TrackedGoal:
                 self._buffer.add(event)
 
     def _has_event(self) -> bool:
-        """Return whether there is an event to take."""
+        """Return whether `_take` would return an event."""
         return self.goal.state.terminal or bool(self._buffer)
 
     def _take(self) -> Event | None:
-        """Remove and return the oldest event. An ended goal without events returns its Result, every time."""
+        """Remove and return the oldest event. After the last event of an ended goal, always return its Result."""
         return self._buffer.take() or (Result(self.goal) if self.goal.state.terminal else None)
 
 
 def lost(goal: Goal, why: str) -> Goal:
-    """Return a goal as LOST."""
+    """Return a copy of a goal that has ended as LOST. `why` is the human-readable reason."""
     from talkcli.goals.reasons import Reason  # rarely needed, and slow to import
 
     return replace(goal, state=State.LOST, reason=Reason.LOST.value, message=f"Talk lost: {why}")
 
 
 def read_greeting(line: bytes, path: str, version: str) -> JsonObject:
-    """Return the greeting of a server.
+    """Return a server's greeting, after checking that this client can use the server.
 
     Args:
         line: the server's first line, without its newline.
-        path: where the server is, for people.
-        version: this client's, for people.
+        path: the server's socket or address, for error messages.
+        version: this client's version, for error messages.
 
     Raises:
-        ServerUnavailable: this is no greeting.
+        ServerUnavailable: the line is no greeting.
         ProtocolMismatch, Busy, AccessDenied: the server can't be used.
     """
     try:
@@ -319,15 +303,13 @@ def read_greeting(line: bytes, path: str, version: str) -> JsonObject:
 
 
 def identity(server: JsonObject) -> tuple[str, int | None]:
-    """Return the boot id and the process in a greeting, or in another description of a server."""
+    """Return the boot id and the process id from a greeting or another description of a server."""
     boot, pid = server.get("boot"), server.get("pid")
     return boot if isinstance(boot, str) else "", pid if isinstance(pid, int) else None
 
 
 class Exchange:
-    """A request and its answer: the lines of a list, then the reply."""
-
-    __slots__ = ("error", "heard_at", "items", "number", "on_failure", "on_reply", "reply", "request", "sent", "slow")
+    """A request with its answer, which consists of the lines of a list, if there are any, and the reply."""
 
     def __init__(
         self,
@@ -337,26 +319,28 @@ class Exchange:
         *,
         slow: bool = False,
     ) -> None:
-        """Describe an exchange that is still to be registered.
+        """Create an exchange. It must be registered before its request is sent.
 
         Args:
             request: the request.
-            on_reply: called with the reply and the lines of the list, if the request was accepted.
-            on_failure: called if there is no such reply. Nobody waits for an exchange with this function.
-            slow: the answer may take any time.
+            on_reply: called if the server accepts the request.
+            on_failure: called if the server refuses the request or doesn't answer. Without this function, the caller
+                must wait for the answer.
+            slow: whether the answer may take any time.
         """
         self.request = request
         self.on_reply, self.on_failure = on_reply, on_failure
         self.slow = slow
-        #: the `seq` of its lines
+        #: the `seq` of the request and of all lines of its answer; 0 until the exchange is registered
         self.number = 0
         #: whether the whole line was sent, so that the server may carry out the request
         self.sent = False
+        #: the lines of the list that have been received
         self.items: list[JsonObject] = []
         self.reply: JsonObject | None = None
-        #: why there is no reply
+        #: the reason why there will be no reply; None if there is no such reason
         self.error: TalkError | None = None
-        #: when the exchange began, or when its last line was received (monotonic)
+        #: when the last line of the answer was received, or else when the exchange began (monotonic)
         self.heard_at = 0.0
 
     @property
@@ -368,85 +352,92 @@ class Exchange:
 class ClientCore:
     """The protocol state of one client's connection to a server."""
 
-    #: requests that may take effect although the client gets no answer
+    #: the requests that may have a lasting effect even if no answer is received
     lasting: tuple[type[Request], ...] = (Say,)
 
     def __init__(self, patience: float, now: float) -> None:
-        """`patience` is the time in seconds in which the server must answer."""
-        #: where the server is, for people
+        """Create the state of a connection that is already established.
+
+        Args:
+            patience: seconds in which the server must answer.
+            now: the monotonic time.
+        """
+        #: the server's socket or address, for error messages
         self.path = ""
-        #: the server's boot id, the first half of the ids that it gives
+        #: the server's boot id, which is the first half of the goal ids that the server gives
         self.boot = ""
         #: the process id that the server reports
         self.pid: int | None = None
         self.listeners = EventListeners()
-        #: why the connection has ended for good; None until then
+        #: the reason why the connection has ended for good; None until then
         self.ended: str | None = None
         #: the open exchanges by their numbers
         self.exchanges: dict[int, Exchange] = {}
-        #: bytes of requests that are waiting to be sent
-        self.unsent_bytes = 0
-        #: whether the server has greeted, so that requests may be sent
+        #: whether the server has sent its greeting, so that requests may be sent
         self.greeted = True
         #: since when there has been no connection (monotonic); None while there is one
         self.absent_since: float | None = None
-        #: why the connection broke the last time
+        #: the reason of the last break of the connection
         self.absence = ""
-        #: why the last attempt to reconnect failed; empty after a success
-        self._attempt_failure = ""
+        #: the error of the last attempt to reconnect; None after a success
+        self.connect_error: TalkError | None = None
         self._patience = patience
         self._numbers: Iterator[int] = itertools.count(FIRST_NUMBER)
         self._splitter = LineSplitter()
         #: when the last bytes were received (monotonic)
         self._heard = now
         #: lines that are waiting to be sent, each with its exchange
-        self._unsent: deque[tuple[bytes, Exchange | None]] = deque()
-        #: bytes of the first of these lines that have been sent
+        self._unsent: deque[tuple[bytes, Exchange]] = deque()
+        #: how many bytes of the first of these lines have been sent
         self._first_sent_bytes = 0
-        #: the unsent part of the hello line, which is sent before the server greets
+        #: the unsent part of the hello line, which is sent before the server's greeting is received
         self._hello = b""
-        #: this client's version, for people
+        #: this client's version, for error messages about a greeting
         self._version = ""
         #: the part of the first request that was sent before this object was created
         self._sent_early = b""
-        #: why nothing more can be sent, although answers may still be received; None while sending is possible
+        #: the reason why nothing more can be sent, although answers may still be received; None otherwise
         self._sending_ended: str | None = None
-        #: the server's last error that was no answer to a request, which tells why it closes the connection
-        self._last_words: str | None = None
+        #: the last error of the server that answers no request, as the reason why the server closes the connection
+        self._last_error: str | None = None
 
     # -- requests
 
     def register(self, exchange: Exchange, now: float) -> None:
-        """Expect the answer to a request. The exchange gets a number, unless it has one."""
+        """Start expecting the answer to a request, and number the exchange unless it has a number already."""
         exchange.number = exchange.number or next(self._numbers)
         exchange.heard_at = now
         self.exchanges[exchange.number] = exchange
 
     def line(self, exchange: Exchange) -> bytes:
-        """Return the request of a registered exchange as a line."""
+        """Return the request line of a registered exchange."""
         return request_line({"seq": exchange.number, **write_request(exchange.request)})
 
-    def queue(self, line: bytes, exchange: Exchange | None = None) -> None:
-        """Append a line to the outgoing bytes; ServerUnavailable if nothing more can be sent."""
+    def queue(self, line: bytes, exchange: Exchange) -> None:
+        """Append the line of an exchange to the outgoing bytes.
+
+        Raises:
+            ServerUnavailable: nothing more can be sent.
+        """
         why = self.ended or self._sending_ended
         if why:
             raise ServerUnavailable(f"nothing was sent to the server at {self.path}: {why}")
         self._unsent.append((line, exchange))
-        self.unsent_bytes += len(line)
         early, self._sent_early = self._sent_early, b""
         if not line.startswith(early):
             raise AssertionError(f"{early!r} was sent early instead of {line!r}")
         if early:
             self.mark_sent(len(early))
 
+    @property
+    def unsent_bytes(self) -> int:
+        """The size of the requests that are waiting to be sent."""
+        return sum(len(line) for line, _ in self._unsent) - self._first_sent_bytes
+
     def outgoing(self) -> bytes:
-        """Return the bytes to be sent now. Requests wait until the server has greeted."""
+        """Return the bytes to be sent now. Requests are held back until the server has sent its greeting."""
         if self._hello or not self.greeted:
             return self._hello
-        if not self._unsent:
-            return b""
-        if len(self._unsent) == 1:
-            return self._unsent[0][0][self._first_sent_bytes :]
         return b"".join(line for line, _ in self._unsent)[self._first_sent_bytes :]
 
     def mark_sent(self, count: int) -> None:
@@ -454,29 +445,26 @@ class ClientCore:
         if self._hello:
             self._hello = self._hello[count:]
             return
-        self.unsent_bytes -= count
         count += self._first_sent_bytes
         while self._unsent and count >= len(self._unsent[0][0]):
             line, exchange = self._unsent.popleft()
             count -= len(line)
-            if exchange:
-                exchange.sent = True
+            exchange.sent = True
         self._first_sent_bytes = count
 
     def forget(self, exchange: Exchange) -> bool:
         """Stop expecting an answer. If the request has not been sent, don't send it.
 
         Returns:
-            False if only a part of the line has been sent. The connection must be closed then. The server never carries
-            out a request without its newline.
+            False if a part of the line has been sent. The connection must then be closed before the newline is sent,
+            because the server never carries out a request without its newline.
         """
         self.exchanges.pop(exchange.number, None)
-        for place, (line, owner) in enumerate(self._unsent):
+        for place, (_, owner) in enumerate(self._unsent):
             if owner is exchange:
                 if place == 0 and self._first_sent_bytes:
                     return False
                 del self._unsent[place]
-                self.unsent_bytes -= len(line)
                 break
         return True
 
@@ -484,11 +472,11 @@ class ClientCore:
         """Fail the requests that have not been sent, and all later ones. Answers can still be received.
 
         Args:
-            why: the reason, for the errors of later requests.
+            why: the reason that the errors of later requests give.
             message: the error message of the requests that were waiting to be sent.
         """
         self._sending_ended = self._sending_ended or why
-        unsent = [exchange for _, exchange in self._unsent if exchange]
+        unsent = [exchange for _, exchange in self._unsent]
         self._drop_lines()
         for exchange in unsent:
             self.fail(exchange, ServerUnavailable(message))
@@ -498,8 +486,8 @@ class ClientCore:
 
         Raises:
             RequestRefused: the server refused the request.
-            ServerUnavailable: the request was not sent, or a request without lasting effect was not answered.
-            Lost: the request was sent and not answered, so it may have taken effect.
+            ServerUnavailable: the request was not sent, or the server didn't answer a request without lasting effect.
+            Lost: the request was sent, but not answered. It may have taken effect.
         """
         if exchange.error is not None:
             raise exchange.error
@@ -514,22 +502,19 @@ class ClientCore:
         request = exchange.request
         why = self.ended or (self.absence if self.absent_since is not None else "")
         if not exchange.sent:
-            why = self.ended or self._attempt_failure or why
+            if self.connect_error and not self.ended:
+                why = " ".join(self.connect_error.message.split())
             if not why:
                 return ServerUnavailable(f"the server at {self.path} does not answer")
             return ServerUnavailable(f"nothing was sent to the server at {self.path}: {why}")
-        words = f"{request.kind} was sent to the server at {self.path}, but {why or self.no_reply}"
+        why = why or f"it did not reply within {self._patience:g} s"
+        words = f"{request.kind} was sent to the server at {self.path}, but {why}"
         if isinstance(request, Say):
             return Lost(f"{words}; it may still be spoken")
         return Lost(words) if isinstance(request, self.lasting) else ServerUnavailable(words)
 
-    @property
-    def no_reply(self) -> str:
-        """Why the wait for an answer has ended, for people."""
-        return f"it did not reply within {self._patience:g} s"
-
     def refusal(self, reply: JsonObject, items: list[JsonObject]) -> TalkError:
-        """Return the error for a reply that is not ok. It gets the lines of the list as its `items`."""
+        """Return the error for a reply that is not ok. The lines of the list become the error's `items`."""
         from talkcli.terminal.text import printable  # rarely needed, and slow to import
 
         error = reply.get("error")
@@ -539,79 +524,81 @@ class ClientCore:
     # -- limits
 
     def answer_by(self, exchange: Exchange) -> float:
-        """Return the time limit for sending the request, or for the next line of the answer once it was sent."""
+        """Return when the request must have been sent, or if it was sent, when the answer's next line is due."""
         if exchange.sent:
             return float("inf") if exchange.slow else exchange.heard_at + self._patience
         ttl = exchange.request.ttl if isinstance(exchange.request, Say) else None
         return exchange.heard_at + min(self._patience, ttl or self._patience)
 
     def silent_by(self, began: float) -> tuple[float, str]:
-        """Return when a silent server counts as gone for a caller that has waited since `began`, and the reason."""
+        """Return when a silent server is treated as gone, and the reason to report then.
+
+        Args:
+            began: when the caller started to wait (monotonic). Earlier silence doesn't count.
+        """
         if self.absent_since is not None:
             return float("inf"), ""
         return max(began, self._heard) + SILENCE_LIMIT_S, f"it has said nothing for {SILENCE_LIMIT_S:g} s"
 
     def goals_lost_at(self) -> float:
-        """Return when the followed goals are lost if there is no new connection."""
+        """Return when the followed goals become LOST unless there is a new connection."""
         return float("inf") if self.absent_since is None else self.absent_since + self._patience
 
     def next_expiry(self) -> float:
-        """Return the time at which `expire` must be called."""
+        """Return the latest time for the next call of `expire`."""
         times = [self.answer_by(each) for each in self.exchanges.values() if each.on_failure]
         if self.listeners.goals:
             times.append(self.goals_lost_at())
         return min(times, default=float("inf"))
 
     def expire(self, now: float) -> bool:
-        """Fail what is over its time limit: exchanges with an `on_failure`, and followed goals without a connection.
+        """Fail exchanges with an `on_failure` that have reached their time limit, and lose goals after a long absence.
 
         Returns:
-            False if the connection must be closed, see `forget`.
+            False if the connection must be closed, because a part of a line has been sent (see `forget`).
         """
         intact = True
         for exchange in [each for each in self.exchanges.values() if each.on_failure and self.answer_by(each) <= now]:
             intact = self.forget(exchange) and intact
             self.fail(exchange, self.unanswered(exchange))
         if now >= self.goals_lost_at():
-            self._lose_goals(f"{self.absence}; it may still be spoken")
+            self._lose_goals()
         return intact
 
     # -- receiving
 
     def split(self, data: bytes, now: float) -> list[bytes]:
-        """Return the lines that received bytes complete. For shells that pass lines on undecoded."""
+        """Return the lines that are complete after receiving these bytes.
+
+        Shells that pass lines on undecoded use this method instead of `receive`.
+        """
         self._heard = now
         return self._splitter.feed(data)
 
     def begin_stream(self) -> None:
-        """Discard an incomplete line, because the next bytes are the beginning of another stream."""
+        """Discard an incomplete line, because the next bytes are the beginning of a new stream."""
         self._splitter = LineSplitter()
 
     def receive(self, data: bytes, now: float) -> None:
         """Process received bytes. A malformed line breaks the connection.
 
         Raises:
-            ServerUnavailable, AccessDenied, Busy, ProtocolMismatch: according to the greeting on a new connection, the
-                server can't be used.
+            ServerUnavailable, AccessDenied, Busy, ProtocolMismatch: the greeting shows that the server can't be used.
         """
         splitter = self._splitter
         for line in self.split(data, now):
             if self.ended is not None or self._splitter is not splitter:
                 return  # the previous line has broken the connection
-            if self.greeted:
-                self.take_line(line, now)
-            else:
+            if not self.greeted:
                 self.connected(*identity(read_greeting(line, self.path, self._version)), now)
-
-    def take_line(self, line: bytes, now: float) -> None:
-        """Process a received line."""
-        try:
-            self.dispatch(decode(line), now)
-        except (BadRequest, ValueError) as error:  # ValueError: a malformed goal or event
-            self.break_off(f"it sent what is no message: {error}", now)
+                continue
+            try:
+                self.dispatch(decode(line), now)
+            except (BadRequest, ValueError) as error:  # ValueError: a malformed goal or event
+                self.break_off(f"it sent what is no message: {error}", now)
 
     def match(self, message: JsonObject) -> Exchange | None:
-        """Return the open exchange that a message belongs to; None if there is none."""
+        """Return the open exchange that a message belongs to, or None if the message belongs to none."""
         number = message.get("seq")
         return self.exchanges.get(number) if isinstance(number, int) else None
 
@@ -619,16 +606,16 @@ class ClientCore:
         """Process a received message.
 
         Returns:
-            The exchange that has ended with this message, or None.
+            The exchange that has ended with this message, or None if none has.
 
         Raises:
             ValueError: the event, or a goal in the reply, is malformed.
         """
         if "event" in message:
-            self.listeners.hear(message)
+            self.listeners.publish(events.from_json(message))
             return None
         if message.get("seq") is None and message.get("ok") is False:
-            self._last_words = f"the server closed it: {self.refusal(message, [])}"
+            self._last_error = f"the server closed it: {self.refusal(message, [])}"
         exchange = self.match(message)
         if exchange is None or exchange.over:
             return None
@@ -640,7 +627,11 @@ class ClientCore:
         return exchange
 
     def _finish(self, exchange: Exchange, reply: JsonObject) -> None:
-        """End an exchange with its reply; Unreadable if a goal in the reply is malformed."""
+        """End an exchange with its reply.
+
+        Raises:
+            Unreadable: a goal in the reply is malformed.
+        """
         if exchange.on_failure:
             del self.exchanges[exchange.number]
         if reply.get("ok") is not True and exchange.on_failure:
@@ -649,105 +640,117 @@ class ClientCore:
             try:
                 exchange.on_reply(reply, exchange.items)
             except Unreadable as error:
-                if not isinstance(exchange.request, self.lasting):  # otherwise the request may have taken effect
+                # Without this error, `unanswered` reports that a request with a lasting effect may have taken effect.
+                if not isinstance(exchange.request, self.lasting):
                     exchange.error = error
                 if exchange.on_failure:
                     exchange.on_failure(exchange.error or self.unanswered(exchange))
                 raise
-        exchange.reply = reply  # a malformed reply doesn't count
+        exchange.reply = reply  # not reached if the reply is malformed
 
     # -- disconnecting and reconnecting
 
     def break_off(self, why: str, now: float) -> None:  # noqa: ARG002 - for subclasses that reconnect
-        """Give up the connection. Here, that is its end; a subclass may reconnect instead."""
+        """Abandon the connection. By default, this ends it for good. A subclass may reconnect instead."""
         self.end(why)
 
     def end(self, why: str) -> None:
         """End the connection for good. Events that were received before can still be read."""
         if self.ended is not None:
             return
-        self.ended = self._last_words or why
+        self.ended = self._last_error or why
         self._drop_lines()
         for exchange in [each for each in self.exchanges.values() if each.on_failure]:
             self.fail(exchange, self.unanswered(exchange))
 
     def disconnected(self, why: str, now: float) -> None:
         """Record that the connection has broken and is going to be made again. All open exchanges fail."""
-        self.absence = self._last_words or why
-        self.absent_since, self._last_words, self._sending_ended = now, None, None
-        self.greeted, self._hello, self._splitter = False, b"", LineSplitter()
+        self.absence = self._last_error or why
+        self.absent_since, self._last_error, self._sending_ended = now, None, None
+        self.greeted = False
+        self.begin_stream()
         self._drop_lines()
         for exchange in list(self.exchanges.values()):
             self.fail(exchange, self.unanswered(exchange))
-        self.listeners.end_watches(self._nothing_heard(), all_of_them=False)
+        why = f"nothing more is heard of the server at {self.path}: {self.absence}"
+        self.listeners.end_watches(why, include_reconnecting=False)
 
     def connecting(self, hello: bytes, version: str) -> None:
-        """Begin a new connection, on which requests wait for the server's greeting.
+        """Start a new connection. Requests are held back until the server has sent its greeting.
 
         Args:
             hello: the line to be sent first.
-            version: this client's version, for people.
+            version: this client's version, for error messages.
         """
-        self.greeted, self._hello, self._version, self._splitter = False, hello, version, LineSplitter()
-        self._sending_ended = None
+        self.greeted, self._hello, self._version = False, hello, version
+        self.begin_stream()
 
-    def not_connected(self, error: TalkError, why: str) -> None:
-        """Record that an attempt to reconnect has failed. Exchanges that somebody waits for fail, too."""
-        self._attempt_failure = why
-        self.greeted, self._hello = False, b""
+    def not_connected(self, error: TalkError) -> None:
+        """Record that an attempt to reconnect has failed. Exchanges without an `on_failure` fail, too."""
+        self.connect_error = error
         for exchange in [each for each in self.exchanges.values() if not each.on_failure]:
             self.forget(exchange)
             self.fail(exchange, error)
 
     def connected(self, boot: str, pid: int | None, now: float) -> None:
-        """Record that the server has greeted on a new connection.
+        """Record that the server has sent its greeting on a new connection.
 
-        Goals are followed again if the server is still the one of the last connection. Otherwise they are lost.
+        Goals are followed again if this is still the same run of the server. Otherwise they are LOST.
+
+        Args:
+            boot: the boot id in the greeting, which is different after each start of the server.
+            pid: the process id in the greeting.
+            now: the monotonic time.
         """
         restarted = boot != self.boot
-        self.boot, self.pid, self.greeted, self._attempt_failure = boot, pid, True, ""
+        self.boot, self.pid, self.greeted, self.connect_error = boot, pid, True, None
         self._heard, self.absent_since = now, None
         if restarted:
-            self._lose_goals(f"{self.absence}; it may still be spoken")
-        waiting, self._unsent, self.unsent_bytes = self._unsent, deque(), 0
+            self._lose_goals()
+        waiting, self._unsent = self._unsent, deque()
         for goal_id, feedback in self.listeners.goals.items():
             self._follow_again(goal_id, feedback=feedback, now=now)
         if self.listeners.watched:
             self._watch_again(now)
-        for line, exchange in waiting:
-            self.queue(line if exchange is None else self._line_now(exchange, now), exchange)
+        for _, exchange in waiting:
+            self.queue(self._line_now(exchange, now), exchange)
 
     def _line_now(self, exchange: Exchange, now: float) -> bytes:
-        """Return the line of a request that has waited for the connection, with the rest of its ttl."""
+        """Return the line of a request that has waited for the connection, with its ttl reduced by the time waited."""
         request = exchange.request
         if isinstance(request, Say) and request.ttl:
-            exchange.request = replace(request, ttl=max(_LEAST_TTL_S, request.ttl - (now - exchange.heard_at)))
+            exchange.request = replace(request, ttl=max(_MIN_TTL_S, request.ttl - (now - exchange.heard_at)))
         exchange.heard_at = now
         return self.line(exchange)
 
     def _follow_again(self, goal_id: str, *, feedback: bool, now: float) -> None:
+        """Ask the server to send a goal's events on the new connection."""
+
         def on_reply(_: JsonObject, items: list[JsonObject]) -> None:
             for goal in goals(items, "goal"):
                 if not goal.state.terminal:  # an ended goal's result follows
                     self.listeners.update(goal)
 
         def on_failure(error: TalkError) -> None:
-            if self.absent_since is None:  # otherwise the next connection follows it again
+            if self.absent_since is None:  # after another break, the goal is followed again on the next connection
                 self.listeners.lose(goal_id, f"{error.message}; it may have been spoken")
 
         self._begin(Exchange(Wait((goal_id,), feedback), on_reply, on_failure), now)
 
     def _watch_again(self, now: float) -> None:
+        """Ask the server to send the events of all goals on the new connection."""
+
         def on_reply(reply: JsonObject, items: list[JsonObject]) -> None:
-            self.listeners.hear(Snapshot(ServerStatus.from_reply(reply, items)).to_json())
+            self.listeners.publish(Snapshot(ServerStatus.from_reply(reply, items)))
 
         def on_failure(error: TalkError) -> None:
             if self.absent_since is None:
-                self.listeners.end_watches(error.message, all_of_them=True)
+                self.listeners.end_watches(error.message, include_reconnecting=True)
 
         self._begin(Exchange(Watch(), on_reply, on_failure), now)
 
     def _begin(self, exchange: Exchange, now: float) -> None:
+        """Register an exchange and queue its request."""
         self.register(exchange, now)
         self.queue(self.line(exchange), exchange)
 
@@ -760,13 +763,11 @@ class ClientCore:
             self.exchanges.pop(exchange.number, None)
             exchange.on_failure(error)
 
-    def _lose_goals(self, why: str) -> None:
+    def _lose_goals(self) -> None:
+        """End all followed goals as LOST, because the connection to their server has broken."""
         for goal_id in self.listeners.goals:
-            self.listeners.lose(goal_id, why)
+            self.listeners.lose(goal_id, f"{self.absence}; it may still be spoken")
 
     def _drop_lines(self) -> None:
         self._unsent.clear()
-        self._first_sent_bytes = self.unsent_bytes = 0
-
-    def _nothing_heard(self) -> str:
-        return f"nothing more is heard of the server at {self.path}: {self.absence}"
+        self._first_sent_bytes = 0

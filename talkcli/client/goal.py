@@ -37,6 +37,8 @@ class GoalHandle(TrackedGoal):
     def __init__(self, connection: Connection, goal: Goal) -> None:
         super().__init__(goal)
         self._connection = connection
+        #: whether the Result has been returned
+        self._result_taken = False
 
     @property
     def id(self) -> str:
@@ -127,7 +129,7 @@ class GoalHandle(TrackedGoal):
             goal = next((each for each in (*found.canceled, *found.ended) if each.id == self.id), None)
             goal = goal or Goal.from_json(self._connection.request(Status(self.id))[0].get("goal"))
             with self._connection.changed:
-                self._settle(goal)
+                self._update(goal)
         return self.goal
 
     # -- inside
@@ -153,7 +155,7 @@ class GoalHandle(TrackedGoal):
             return
 
         def accepted(_: JsonObject, items: list[JsonObject]) -> None:
-            self._settle(next(goals(items, "goal")))
+            self._update(next(goals(items, "goal")))
             self._listen(feedback=feedback)
 
         self._connection.request(Wait((self.id,), feedback), accepted)
@@ -168,7 +170,7 @@ class GoalHandle(TrackedGoal):
         ended = self._connection.ended
         if ended is not None:
             with self._connection.changed:
-                self._settle(lost(self.goal, f"{ended}; it may still be spoken"))
+                self._update(lost(self.goal, f"{ended}; it may still be spoken"))
         return ended is not None
 
 

@@ -406,7 +406,7 @@ def test_goals_are_lost_if_no_connection_is_made_in_time(reconnecting: ClientCor
     hear(reconnecting, {"seq": 1, "ok": True, "goal": goal()})
     reconnecting.disconnected("it is gone", 1.0)
     assert reconnecting.next_expiry() == 1.0 + PATIENCE
-    reconnecting.not_connected(ServerUnavailable("no server"), "no server")
+    reconnecting.not_connected(ServerUnavailable("no server"))
     reconnecting.expire(5.9)
     assert tracked.goal.state is State.PENDING
     reconnecting.expire(6.0)
@@ -417,7 +417,7 @@ def test_a_goal_that_is_said_without_a_connection_waits_for_one(reconnecting: Cl
     reconnecting.disconnected("it is gone", 1.0)
     tracked, other = say(reconnecting, now=2.0, ttl=4), say(reconnecting, now=2.0)
     waits_for = begin(reconnecting, Status(), now=2.0)
-    reconnecting.not_connected(ServerUnavailable("no server"), "no server")
+    reconnecting.not_connected(ServerUnavailable("no server"))
     with pytest.raises(ServerUnavailable, match="no server"):
         reconnecting.answer(waits_for)
     reconnecting.connecting(HELLO, "1.0")
@@ -435,7 +435,7 @@ def test_a_goal_that_is_said_without_a_connection_waits_for_one(reconnecting: Cl
 def test_a_goal_that_is_said_without_a_connection_is_rejected_in_time(reconnecting: ClientCore) -> None:
     reconnecting.disconnected("it is gone", 1.0)
     tracked = say(reconnecting, now=2.0)
-    reconnecting.not_connected(ServerUnavailable("no server"), "no server, tried: /s")
+    reconnecting.not_connected(ServerUnavailable("no server, tried:\n  /s"))
     assert reconnecting.next_expiry() == 2.0 + PATIENCE
     assert reconnecting.expire(7.0)
     message = "Talk rejected: nothing was sent to the server at /s: no server, tried: /s"
@@ -568,5 +568,5 @@ def test_ended_goal_hears_nothing_more(core: ClientCore) -> None:
         Result,
     ]
     tracked._fail(Lost("too late"))
-    tracked._settle(Goal("g", State.ACTIVE))
+    tracked._update(Goal("g", State.ACTIVE))
     assert (tracked.goal.state, core.listeners.goals) == (State.SUCCEEDED, {})
