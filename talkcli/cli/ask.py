@@ -159,7 +159,7 @@ def doctor(options: CommonOptions, silent: bool) -> int:
         return interrupts.exit_code
     if not options.json and not options.quiet:
         note(format_conclusion(findings, screen(), examination.question))
-    # A sentence that nobody would hear counts as an aborted goal.
+    # If a sentence would not be heard, the exit code is that of an aborted goal.
     return 0 if has_passed(findings, examination.question) else EXIT_CODES[State.ABORTED]
 
 
@@ -198,7 +198,7 @@ def _suggest_key(key: str, client: Client) -> None:
     try:
         status = client.status()
     except TalkError:
-        return  # the goals have been canceled, so this is no error
+        return  # the cancel itself has succeeded, so this is no error
     near = nearest(key, {each.key for each in unfinished(status) if each.key})
     if near:
         note(f"no goal has the key '{printable(key)}': did you mean '{printable(near)}'?")

@@ -35,7 +35,7 @@ _EXAMPLES = """
     talk cancel                       silence, now
     talk doctor                       silent? what to do next
 """
-#: Names that other programs have for a command, if they aren't similar to its name here.
+#: Names of commands in other programs, and the commands here that do the same. Names similar to ours are left out.
 _FOREIGN_NAMES = {
     "check": "doctor",
     "follow": "watch",
@@ -187,7 +187,7 @@ class ClickCommand(_HelpfulCommand):
         return self.row.run(options, given)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        ctx.allow_extra_args = True  # they are reported below
+        ctx.allow_extra_args = True  # `rest` is reported below
         try:
             rest = super().parse_args(ctx, args)
         except click.UsageError as error:
@@ -205,7 +205,7 @@ class ClickCommand(_HelpfulCommand):
 
 
 class _CommandGroup(_HelpfulCommand, click.Group):
-    """The group of all commands. Each is made from its row when it is needed."""
+    """The group of all commands. It makes each command from its row when it is needed."""
 
     examples, exit_codes = _EXAMPLES, ALL_EXIT_CODES
     common_heading = "Options, before or after the command"
@@ -269,7 +269,7 @@ def _run_group(arguments: list[str], options: CommonOptions) -> object:
     try:
         with talk.make_context("talk", [*arguments], obj=options) as context:
             return talk.invoke(context)
-    except click.exceptions.Exit as end:  # after the help or the version
+    except click.exceptions.Exit as end:  # the help or the version was printed
         return end.exit_code
     except KeyboardInterrupt:
         write_error_line()  # the terminal has shown ^C on the current line
@@ -292,7 +292,7 @@ def _complete_for_shell(options: CommonOptions) -> int:
     from talkcli.cli import completion  # noqa: F401 - this tells click about our classes for the shells
 
     try:
-        talk.main([], prog_name="talk", standalone_mode=False, obj=options)  # exits after completing
+        talk.main([], prog_name="talk", standalone_mode=False, obj=options)  # raises SystemExit after completing
     except Exception:
         if os.environ.get("TALK_DEBUG"):
             raise

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     #: with the names of the options on the command line.
     Rule = Callable[[Mapping[str, Any], frozenset[str]], str | None]
 
-#: A file to be written.
+#: The path of a file to be written.
 OUTPUT_FILE = Kind("string", (str,), "must be a string")
 #: The permissions of a file, in octal.
 FILE_MODE = Kind("string", (str,), "must be a string", "MODE")
@@ -91,7 +91,7 @@ class Command:
     uses_server: bool = True
     #: whether it connects to a single server, for which --connect-timeout can wait
     connects: bool = True
-    #: the function that sends the command to several robots, called like `function`; empty if there is none
+    #: the function that sends the command to several robots, in the form of `function`; empty if there is none
     fleet_function: str = ""
     rule: Rule | None = None
 
@@ -237,7 +237,7 @@ def _read_number(option: Option, text: str) -> float:
         value = int(text) if whole else float(text)
     except ValueError:
         raise ValueError(f"'{text}' is not {wanted}") from None
-    if value != value:  # NaN
+    if value != value:  # only true for NaN
         raise ValueError(f"{value!r} is not a number")
     if option.kind is SECONDS and value == float("inf"):
         raise ValueError("no limit is 0")

@@ -41,9 +41,9 @@ if TYPE_CHECKING:
 
 #: How long the server may take to answer, because a person has pressed a key and is waiting.
 COMPLETION_TIMEOUT_S = 0.5
-#: How many goals that have ended are offered.
+#: How many ended goals are offered at most.
 _MAX_ENDED_GOALS = 100
-#: Longer texts are cut in the help of a value.
+#: The length at which the text of a goal, or a name, is cut in the help of a value.
 _HELP_TEXT_CHARS = 60
 #: Characters that bash needs escaped. Letters and digits of all scripts can stay as they are.
 _BASH_SPECIAL = re.compile(r"[^\w@%+=:,./-]")
@@ -63,7 +63,7 @@ class _LineCompletion(ShellComplete):
     def get_completion_args(self) -> tuple[list[str], str]:
         line = os.environ["COMP_WORDS"]
         words = split_arg_string(line)
-        # Another character shows whether it would begin a new word or continue the last one.
+        # If one more character would begin a new word, the word to complete is still empty.
         if len(split_arg_string(f"{line}x")) > len(words):
             words.append("")
         return words[1:-1], words[-1]

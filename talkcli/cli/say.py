@@ -92,7 +92,7 @@ def _say_text(
         try:
             with options.connect(timeout, name=name, interrupt=interrupts.watched) as client:
                 if interrupts.signal_number is not None and not (options.early and options.early.request_sent):
-                    raise Interrupted  # a goal that was already sent is cancelled below, when its id is known
+                    raise Interrupted  # a goal that was sent early is cancelled below, when its id is known
                 goal = client.say(text, follow=wait, feedback=feedback, **goal_options)
                 reporter = GoalReporter(options, feedback=feedback)
                 if wait and goal.state is not State.REJECTED:

@@ -56,7 +56,7 @@ def _warn_about_player(player: str) -> None:
     from talkcli.engine.players import PACKAGES, PLAYERS, PlayerMissing, player_commands
 
     if player in PLAYERS and player not in PACKAGES:
-        return  # it isn't a program
+        return  # this player isn't a program, so it can't be missing
     try:
         player_commands(player, None, 0)
     except PlayerMissing as error:

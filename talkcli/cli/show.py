@@ -110,11 +110,10 @@ class CommonOptions:
         if not robot:
             from talkcli.client.connection import SocketConnection
 
-            return SocketConnection(self.socket, attempt=self.early, **{"urgent": self.urgent, **options})
+            return SocketConnection(self.socket, attempt=self.early, urgent=self.urgent, **options)
         broker = self.broker()
         from talkcli.fleet.desk.robot import connect_robot
 
-        options.pop("urgent", None)  # there is no client limit over a broker
         return connect_robot(robot, broker, **options)
 
 
@@ -199,7 +198,7 @@ def _is_read_only(error: OSError) -> bool:
 
 
 def show_if_possible(put: Callable[..., None], *what: object) -> None:
-    """Call a function that writes output. A full disk is reported and ignored; if the reader is gone, OSError."""
+    """Call a function that writes output. A full disk is reported and ignored; OSError if the reader is gone."""
     try:
         put(*what)
     except OSError as error:

@@ -2,7 +2,7 @@
 
 A text is read up to the length of the longest text allowed. With --lines each line becomes a goal, and all goals are
 sent over one connection. One thread reads lines into a `LineBuffer`, sends them while few of its goals are pending, and
-follows these goals. The input may never end, so a goal is forgotten after it was reported.
+follows these goals. The input may never end, so a goal is forgotten once it has been reported.
 """
 
 from __future__ import annotations
@@ -337,7 +337,7 @@ class LineSpeaker:
 
         def on_reply(reply: JsonObject, items: list[JsonObject]) -> None:
             accepted(reply, items)
-            self._accepted = handle.goal  # the handle may have the goal's end before the answer is reported
+            self._accepted = handle.goal  # the goal in the handle may have ended when the answer is reported
 
         self._unanswered = handle, self._connection.begin(request, on_reply)
 
@@ -438,7 +438,7 @@ class LineSpeaker:
     # -- stopping before the end of the input
 
     def _stop(self) -> None:
-        """End before the input does. With --wait, cancel all goals."""
+        """Stop before the end of the input. With --wait, cancel all goals."""
         if self._wait:
             # Closing the connection also takes back a line that waits for room in the queue. Otherwise it would be
             # accepted when the goals are cancelled.
@@ -449,13 +449,11 @@ class LineSpeaker:
 
     def _cancel(self, ids: list[str]) -> None:
         """Cancel these goals, and report how they ended."""
+        self._options.urgent = True
         try:
-            with self._options.connect(CANCEL_TIMEOUT_S, interrupt=self._interrupts.watched, urgent=True) as client:
+            with self._options.connect(CANCEL_TIMEOUT_S, interrupt=self._interrupts.watched) as client:
                 # The server may have accepted one more goal just before the connection was closed.
-                ids = list(dict.fromkeys([*ids, *_own_goals(client)]))
-                if not ids:
-                    return
-                ended = _cancel_goals(client, ids)
+                ended = _cancel_goals(client, list(dict.fromkeys([*ids, *_own_goals(client)])))
         except (TalkError, Interrupted) as error:
             self._feedback.note(f"cancelled, but it is not known whether it is silent: {str(error) or 'interrupted'}")
             return
@@ -469,7 +467,7 @@ class LineSpeaker:
             note(f"{recalled} that waited: recalled")
 
     def _report_unsent(self) -> None:
-        """Report the first line that was not accepted, if there is one."""
+        """Write a note about the first line that was not accepted, if there is one."""
         if self._options.quiet:
             return
         if self._sending is not None:
@@ -479,7 +477,7 @@ class LineSpeaker:
 
 
 def _own_goals(client: Client) -> list[str]:
-    """Return the ids of all unfinished goals of this process. There are none if the server is on another machine."""
+    """Return the ids of all unfinished goals of this process; none if the server is on another machine."""
     if client._connection.listener is None:
         return []  # process ids of another machine mean nothing here
     goals = unfinished(client.status())
@@ -492,4 +490,4 @@ def _cancel_goals(client: Client, ids: list[str]) -> list[Goal]:
         done = client.cancel(ids)
     except UnknownGoal as error:
         done = Canceled.from_items(error.items)
-    return sorted((*done.ended, *done.canceled), key=lambda each: ids.index(each.id) if each.id in ids else len(ids))
+    return sorted((*done.ended, *done.canceled), key=lambda each: ids.index(each.id))

@@ -127,7 +127,7 @@ def _find_hidden(files: Sequence[str]) -> tuple[str, str] | None:
 
 def _quote(word: str) -> str:
     """Return a word quoted for the command line in a unit."""
-    word = word.replace("%", "%%").replace("$", "$$")  # specifiers and variables
+    word = word.replace("%", "%%").replace("$", "$$")  # systemd expands specifiers and variables
     if word and all(each.isalnum() or each in "/._-+=:,@%{}" for each in word):
         return word
     escaped = word.replace("\\", "\\\\").replace('"', '\\"')
@@ -142,4 +142,4 @@ def _escape_path(path: str) -> str:
     """Return a path as the value of a setting, which can't be quoted; UsageError if systemd would misread it."""
     if re.search(_UNSAFE_CHARACTERS, path) or path.endswith(("\\", " ")):
         raise UsageError(f"a socket's unit can't name {printable(path)}: name a path without such signs")
-    return path.replace("%", "%%")  # specifiers
+    return path.replace("%", "%%")  # systemd expands specifiers

@@ -60,6 +60,7 @@ _UNKNOWN_SENDER = "nobody known"
 #: take a value, the options that replace the script, and the number of arguments before the script.
 _LAUNCHERS = {
     **dict.fromkeys(("sh", "bash", "dash", "ash", "zsh", "ksh", "fish"), ("o O rcfile init-file", "c s", 0)),
+    **dict.fromkeys(("nohup", "setsid"), ("", "", 0)),
     "python": ("W X", "c", 0),
     "perl": ("I", "e E", 0),
     "ruby": ("I r", "e", 0),
@@ -70,8 +71,6 @@ _LAUNCHERS = {
     "flock": ("w E timeout", "c", 1),
     "ionice": ("c n class classdata", "", 0),
     "nice": ("n adjustment", "", 0),
-    "nohup": ("", "", 0),
-    "setsid": ("", "", 0),
     "stdbuf": ("i o e input output error", "", 0),
     "sudo": ("u g h p C D R T user group host prompt chdir", "", 0),
     "taskset": ("", "", 1),

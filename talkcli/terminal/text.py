@@ -38,17 +38,15 @@ _FLAG_LETTERS = ("\U0001f1e6", "\U0001f1ff")
 #: characters), line and paragraph separators, surrogates, private characters and unassigned ones.
 _HIDDEN_CATEGORIES = frozenset({"Cc", "Cf", "Zl", "Zp", "Cs", "Co", "Cn"})
 
+#: A terminal code that begins or ends a colour.
 _COLOUR_CODE = re.compile("\x1b\\[[0-9;]*m")
+#: The parameters of the terminal code for each state's colour.
 _STATE_COLOURS = {
     State.PENDING: "36",
     State.ACTIVE: "1;32",
-    State.PREEMPTING: "33",
-    State.PREEMPTED: "33",
-    State.RECALLED: "33",
     State.SUCCEEDED: "32",
-    State.ABORTED: "31",
-    State.REJECTED: "31",
-    State.LOST: "31",
+    **dict.fromkeys((State.PREEMPTING, State.PREEMPTED, State.RECALLED), "33"),
+    **dict.fromkeys((State.ABORTED, State.REJECTED, State.LOST), "31"),
 }
 
 
