@@ -132,21 +132,22 @@ class LocalExamination:
 
     def _check_sound(self) -> Iterator[Finding]:
         """Check everything between the engine and the loudspeaker."""
+        env, session, device, by_server = self._env, self._session, self._setting("device"), self._client is not None
         if not is_own_driver(self._setting("driver")):
             return  # other drivers of pyttsx3 play on their own
-        env, session, device, by_server = self._env, self._session, self._setting("device"), self._client is not None
-        found = sound.find_sound_server(env, session)
-        self._hangs = found.hangs
+        sound_server = sound.find_sound_server(env, session)
+        self._hangs = sound_server.hangs
         if is_silent(self._player):
             yield sound.judge_silent_player(self._player, by_server=by_server)
             return
+        cards = sound.find_cards(session)
         chosen = None if by_server else self._engine.player
-        first = chosen or ("pulse" if found.name and found.accepts_pulse else None)
+        first = chosen or ("pulse" if sound_server.name and sound_server.accepts_pulse else None)
         players = sound.find_players(env, self._player, first, by_server=by_server)
-        used, cards = self._player or players.first, sound.find_cards(session)
-        devices = None if used == "pulse" and found.hangs else sound.find_devices(env, used, device)
-        yield from sound.judge_sound(players, devices, cards, found, session)
-        levels = tuple(sound.find_levels(env, found, cards))
+        used = self._player or players.first
+        devices = None if used == "pulse" and sound_server.hangs else sound.find_devices(env, used, device)
+        yield from sound.judge_sound(players, devices, cards, sound_server, session)
+        levels = tuple(sound.find_levels(env, sound_server, cards))
         yield from sound.judge_levels(levels, is_used=device is None and used in PLAYERS)
 
     def _check_sentence(self) -> Finding:
