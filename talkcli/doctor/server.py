@@ -128,7 +128,7 @@ def connect(option: str | None, interrupt: Mapping[int, int] | None) -> tuple[Cl
 
 
 def _client_message(lines: list[str], found: tuple[SocketPlace, ...]) -> str | None:
-    """Return why a listening process did not accept the client. An error that lists no places is returned as it is."""
+    """Return why a listening process did not accept the client, from the lines of the client's error message."""
     if not lines[0].startswith(_NO_SERVER_PREFIX):
         return lines[0]
     listening = [f"{each.path}: " for each in found if each.what in {PLACE_LISTENING, PLACE_STOPPED}]

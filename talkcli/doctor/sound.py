@@ -124,7 +124,7 @@ class ProgramOutput:
 
 @frozen
 class Players:
-    """The installed players, and the choice between them."""
+    """The installed players, and which of them is used."""
 
     #: installed player programs, best first
     found: tuple[str, ...]
@@ -134,7 +134,7 @@ class Players:
     runs: bool = True
     #: the player that an automatic choice tries first, or None if there is none
     first: str | None = None
-    #: whether the server plays, or else the doctor's own engine
+    #: whether a server plays. Otherwise, the doctor's own engine does.
     by_server: bool = False
 
 
@@ -161,7 +161,7 @@ class SoundServer:
     name: str | None = None
     #: the default sink, or None if unknown
     sink: str | None = None
-    #: whether clients of PulseAudio can connect, such as the player pulse
+    #: whether clients of PulseAudio can connect. The player pulse is one.
     accepts_pulse: bool = True
     #: existing sockets of sound servers if none answers
     sockets: tuple[str, ...] = ()
@@ -360,7 +360,7 @@ def run_program(program: str, *arguments: str, env: Mapping[str, str], limit: fl
 
 
 def is_custom(player: str | None) -> bool:
-    """Return whether a player is the user's own command, whose requirements are unknown."""
+    """Return whether a player is a command of the user's own. Nothing is known about what it needs."""
     program = _program_of(player) if player and not is_silent(player) else None
     return program is not None and program.rpartition("/")[2] not in PLAYERS
 
@@ -672,7 +672,7 @@ def judge_levels(levels: tuple[MixerLevel, ...], *, is_used: bool) -> list[Findi
 
     Args:
         levels: the mixer's outputs.
-        is_used: whether speech goes to these outputs, as far as is known.
+        is_used: whether speech is known to go to these outputs.
     """
     broken = failure if is_used else warning
     check = _LOUDNESS_CHECK
