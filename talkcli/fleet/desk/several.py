@@ -31,7 +31,7 @@ from talkcli.protocol.lines import FIRST_NUMBER
 from talkcli.protocol.requests import Pause, Request, Status, Wait
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from talkcli.fleet.broker import Broker
 
@@ -84,8 +84,8 @@ class FleetRequest:
         self._selection, self._name, self._interrupt, self._patience = selection, name, interrupt, patience
         #: the known robots by name, including those that came online too late for the request
         self._robots: dict[str, RobotRequest] = {}
-        #: names of the robots whose last outcome hasn't arrived
-        self._unfinished: set[str] = set()
+        #: names of the robots that the request is for, and of those whose last outcome hasn't arrived
+        self._included, self._unfinished = set[str](), set[str]()
         self._outcomes: deque[Outcome] = deque()
         self._numbers = itertools.count(FIRST_NUMBER)
         #: the number of the request, if it goes to a group
@@ -96,7 +96,9 @@ class FleetRequest:
         self._began = False
         #: whether all robots are known, so that later ones are ignored
         self._complete = False
-        self._canceled = self._closed = False
+        self._closed = False
+        #: the id of the goal to cancel on each robot; None if `cancel` was not called
+        self._canceled_id: str | None = None
         self._desk = DeskLink(broker)
         self._desk.handler = self
         try:
@@ -126,7 +128,7 @@ class FleetRequest:
 
     def __len__(self) -> int:
         """Return the number of selected robots that are known so far, including offline ones."""
-        return sum(each.is_included for each in self._robots.values())
+        return len(self._included)
 
     @property
     def unfinished_robots(self) -> list[str]:
@@ -187,11 +189,11 @@ class FleetRequest:
             return
         if self._closed:
             raise UsageError("all outcomes have been taken: cancel the goal by its id")
-        self._canceled = True
-        group, goal_id = self._selection.group, str(self.request.id)
+        goal_id = self._canceled_id = str(self.request.id)
+        group = self._selection.group
         if group is not None:
             self._desk.send(Cancel((goal_id,)), next(self._numbers), group, self._on_refused, is_group=True)
-        for name in self._unfinished:
+        for name in list(self._unfinished):
             # A robot that has left the group doesn't receive the message to the group.
             robot = self._robots[name]
             is_sent = group is not None and robot.presence is not None and self._selection.includes(robot.presence)
@@ -280,24 +282,23 @@ class FleetRequest:
         member looks like any other one, because some brokers send all retained messages late.
         """
         name = presence.name
-        if robot.is_included:
+        if name in self._included:
             self._update(name)
             return
         if self._complete:
             return
-        self._include(robot, name)
+        self._include(name)
         if (goal := self._rejected) is not None:
-            self._record([Outcome(name, goal.state.name, goal.exit_code or EXIT_OK, goal)])
+            self._record(Outcome(name, goal.state.name, goal.exit_code or EXIT_OK, goal))
         elif not presence.online:
-            self._record([failure_outcome(name, ServerUnavailable(f"{name} is offline: nothing was sent"), "OFFLINE")])
+            self._record(failure_outcome(name, ServerUnavailable(f"{name} is offline: nothing was sent"), "OFFLINE"))
         elif self._selection.group is not None:
             robot.expect_reply(self._number, self._latest)
         elif presence.server is None:
             words = f"{name} has no talk server at this moment: nothing was sent"
-            self._record([failure_outcome(name, NoServer(words))])
+            self._record(failure_outcome(name, NoServer(words)))
         else:
             robot.send()
-            self._update(name)
 
     def _on_reply(self, name: str, message: Message) -> None:
         """Process a robot's lines. A robot that answers the group's request is a member, even if it seemed absent."""
@@ -305,10 +306,10 @@ class FleetRequest:
             return
         robot = self._robot(name)
         if self._selection.group is not None and not robot.was_asked:
-            self._include(robot, name)
+            self._include(name)
             robot.expect_reply(self._number, self._latest)
-            if self._canceled and isinstance(self.request, Say):
-                robot.connection.cancel_permanently(str(self.request.id), is_sent=False)
+            if self._canceled_id is not None:
+                robot.connection.cancel_permanently(self._canceled_id, is_sent=False)
         robot.connection.on_message(message)
         self._update(name)
 
@@ -318,37 +319,40 @@ class FleetRequest:
             connection = RobotConnection(
                 name, self._desk, name=self._name, patience=self._patience, numbers=self._numbers
             )
-            self._robots[name] = RobotRequest(connection, name, self.request)
+            self._robots[name] = RobotRequest(connection, name, self.request, self._record)
         return self._robots[name]
 
-    def _include(self, robot: RobotRequest, name: str) -> None:
+    def _include(self, name: str) -> None:
         """Include a robot in the request."""
-        robot.is_included = True
+        self._included.add(name)
         self._unfinished.add(name)
 
     def _update(self, name: str, *, check_time: bool = False) -> None:
-        """Collect the new outcomes of a robot."""
+        """Record the new outcomes of a robot, unless its last one has been recorded."""
         if name in self._unfinished:
-            self._record(self._robots[name].new_outcomes(check_time=check_time))
+            self._robots[name].update(check_time=check_time)
 
-    def _record(self, outcomes: list[Outcome]) -> None:
-        self._outcomes += outcomes
-        self._unfinished -= {each.robot for each in outcomes if each.last}
+    def _record(self, outcome: Outcome) -> None:
+        self._outcomes.append(outcome)
+        if outcome.last:
+            self._unfinished.discard(outcome.robot)
 
 
 class RobotRequest:
     """The part of a `FleetRequest` that is for one robot."""
 
-    def __init__(self, connection: RobotConnection, name: str, request: Request) -> None:
+    def __init__(
+        self, connection: RobotConnection, name: str, request: Request, record: Callable[[Outcome], None]
+    ) -> None:
+        """Prepare the request. `record` is called with each outcome."""
         self.connection = connection
         #: the robot's last presence; None if unknown
         self.presence: Presence | None = None
-        #: whether the request is for this robot, and whether it was sent to the robot
-        self.is_included = self.was_asked = False
-        self._name, self._request = name, request
+        #: whether the request was sent to this robot or to its group
+        self.was_asked = False
+        self._name, self._request, self._record = name, request, record
         #: whether the answer may take any amount of time
         self._slow = isinstance(request, Pause) or (isinstance(request, Say) and request.patient)
-        self._outcomes: list[Outcome] = []
         #: the goals that haven't been reported as ended, and the start of the wait for them (monotonic)
         self._handles: deque[GoalHandle] = deque()
         self._since = time.monotonic()
@@ -374,11 +378,11 @@ class RobotRequest:
         self.connection.expect_reply(exchange)
         self.was_asked = True
 
-    def new_outcomes(self, *, check_time: bool) -> list[Outcome]:
-        """Return the outcomes that have arrived since the last call.
+    def update(self, *, check_time: bool) -> None:
+        """Record the outcomes of goals that have ended since the last call.
 
         Args:
-            check_time: whether to record a failure if the robot hasn't answered in time.
+            check_time: whether to record a failure, too, if the robot hasn't answered in time.
         """
         self.connection.keep_alive()
         if check_time:
@@ -392,9 +396,7 @@ class RobotRequest:
             # A wait without ids succeeds even if the goals fail.
             any_end = isinstance(self._request, Wait) and self._request.ids is None and handle.state is not State.LOST
             code = EXIT_OK if any_end else handle.goal.exit_code or EXIT_OK
-            self._outcomes.append(Outcome(self._name, handle.state.name, code, handle.goal, last=not self._handles))
-        outcomes, self._outcomes = self._outcomes, []
-        return outcomes
+            self._record(Outcome(self._name, handle.state.name, code, handle.goal, last=not self._handles))
 
     def _on_reply(self, reply: JsonObject, items: list[JsonObject]) -> None:
         """Follow the goals that the request waits for. If there are none, the reply has all outcomes."""
@@ -409,16 +411,17 @@ class RobotRequest:
         self._handles.extend(GoalHandle(self.connection, each) for each in found)
         for each in self._handles:
             each._listen(feedback=False)
-        if not found:
-            self._outcomes += reply_outcomes(self._name, request, reply, items)
+        for outcome in [] if found else reply_outcomes(self._name, request, reply, items):
+            self._record(outcome)
 
     def _on_failure(self, error: TalkError) -> None:
         try:
             items = error.items if isinstance(error, UnknownGoal) else []
-            self._outcomes += cancel_outcomes(self._name, items, last=False)
+            for outcome in cancel_outcomes(self._name, items, last=False):
+                self._record(outcome)
         except Unreadable as malformed:
             error = malformed
-        self._outcomes.append(failure_outcome(self._name, error))
+        self._record(failure_outcome(self._name, error))
 
 
 def _check_request(request: Request) -> None:
