@@ -49,8 +49,8 @@ _ECHO_RETURN_LIMIT_S = 1.0
 _ECHO_PAYLOAD = b"doctor"
 #: A certificate that expires within this time causes a warning.
 _RENEWAL_LIMIT_S = 14 * 86400
-#: The next step for each reason why the broker can't be reached.
 _NO_ANSWER = "no answer"
+#: The next step for each reason why the broker can't be reached.
 _UNREACHABLE_STEPS = {
     "connection refused": "on {host}: systemctl status mosquitto; others than {host} reach it where its mosquitto.conf "
     "has a line 'listener {port}'",
@@ -133,7 +133,7 @@ class BrokerExamination:
 
     @property
     def question(self) -> Question:
-        """The question that the report answers. With a robot's own login, no requests can be sent to robots."""
+        """The question that the report answers. A login as the robot's bridge can't send requests to robots."""
         return report.BRIDGE_QUESTION if self._is_robot else report.ROBOT_QUESTION
 
     def findings(self) -> Iterator[Finding]:

@@ -40,10 +40,10 @@ if TYPE_CHECKING:
 ABSENCE_LIMIT_S = 30.0
 #: The broker discards any request except a sentence after this time, because nobody waits for a later answer.
 _REQUEST_EXPIRY_S = 5
-#: How long to wait for more retained messages after the marker. Some brokers send a few of them late.
+#: How long to wait for more retained messages after the marker message. Some brokers send a few of them late.
 RETAINED_GRACE_S = 0.3
-#: The pause before an attempt to connect is random. These are its first upper limit, which doubles after each failed
-#: attempt, and the highest value of that limit.
+#: Upper limit of the random pause before reconnecting. It starts at the first value, and doubles after each failed
+#: attempt up to the second value.
 _FIRST_BROKER_PAUSE_S, _MAX_BROKER_PAUSE_S = 0.5, 10.0
 
 
@@ -76,16 +76,16 @@ class DeskLink:
             UsageError: The user name can't be part of a topic.
         """
         self.broker, self.user = broker, client_user(broker)
-        #: random part of the reply topics. It differs from that of the same user's other connections.
+        #: random part of the reply topics, which distinguishes this connection from the user's other ones
         self.session = os.urandom(8).hex()
         #: the current MQTT connection; None while disconnected
         self.link: Link | None = None
-        #: error of the last attempt to connect, or the broker's refusal of the marker
+        #: error of the last failed attempt to connect, or the broker's refusal of the marker message
         self.failure: TalkError | None = None
-        #: when the marker arrived, which follows the retained messages (monotonic); None before that
+        #: when the marker message came back, which follows the retained messages (monotonic); None until then
         self.marker_at: float | None = None
         self._inbox: deque[Message] = deque()
-        #: refused requests: each callback with its error. They are called in `poll`, after the link is unlocked.
+        #: callbacks of refused requests, with their errors. `poll` calls them later, when the link is not locked.
         self._refusals: deque[tuple[Callable[[TalkError], None], TalkError]] = deque()
         self._opening: LinkOpener | None = None
         self._failed_attempts = 0
@@ -122,7 +122,7 @@ class DeskLink:
         wake = self._wake_reader.fileno()
         watched = {wake: select.POLLIN}
         descriptor = -1 if link is None else link.fileno()
-        if link is not None and descriptor >= 0:  # it is -1 after another thread has closed the link
+        if link is not None and descriptor >= 0:  # the descriptor is -1 if another thread has closed the link
             watched[descriptor] = select.POLLIN | (select.POLLOUT if link.wants_write else 0)
         ready = wait_ready(watched, min(timeout, due), interrupt)
         if wake in ready:
@@ -261,7 +261,7 @@ class DeskLink:
             self._end_attempt(self._opening)
             return 0.0
         if self._opening is None and now >= self._next_attempt_at:
-            # A thousand robots may answer at the same time. By default, the broker would drop some of their messages.
+            # If a thousand robots answered at the same time, a broker would drop messages beyond its default limit.
             name = f"talk-desk-{self.user}-{self.session}"
             new = Link(self.broker, name, self._inbox.append, receive_maximum=MAX_RECEIVE_COUNT)
             self._opening = LinkOpener(new, self.wake)
@@ -282,7 +282,7 @@ class DeskLink:
         self._inbox.clear()
         link.subscribe(self.reply_topic(topics.MARKER), retained=False)
         self.handler.on_connected(link)
-        # The broker delivers this message to this desk after the retained messages.
+        # The broker sends this marker message back after the retained messages.
         link.publish(self.reply_topic(topics.MARKER), b"\n", acknowledged=self._on_marker_acknowledged)
 
     def _on_marker_acknowledged(self, code: int) -> None:

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 #: Interval of the messages that keep the bridge's session alive, which ends after 90 s of silence.
 _KEEP_ALIVE_INTERVAL_S = 30.0
-#: How many times a request is sent again at most, because the request itself may be what breaks the connection.
+#: Maximum number of times a request is sent again. The request itself may be the reason why the connection breaks.
 _MAX_RESENDS = 5
 #: Pause between two attempts to connect with `keep_trying`.
 _CONNECT_PAUSE_S = 0.25
@@ -53,7 +53,7 @@ class RobotExchange(Exchange):
 
     #: how many times the request was sent again
     resends = 0
-    #: the time by `boottime` after which a sentence is not sent again; None for no limit
+    #: time after which a sentence is no longer sent (`boottime`); None for no limit
     latest: float | None = None
 
 
@@ -172,7 +172,7 @@ class RobotConnection(Connection):
         return by if self._end is None else min(by, max(self._end, exchange.heard_at))
 
     def goals_lost_at(self) -> float:
-        return float("inf")  # the connection ends first, see `silent_by`
+        return float("inf")  # the connection ends before goals are lost, see `silent_by`
 
     def silent_by(self, began: float) -> tuple[float, str]:
         if self.absent_since is None:
@@ -222,7 +222,7 @@ class RobotConnection(Connection):
             self.absent_since = time.monotonic()
 
     def _update_presence(self, payload: bytes) -> None:
-        """Process a presence message from the robot's bridge, or the bridge's will."""
+        """Process the presence that the robot's bridge has published, or left as its will."""
         try:
             presence = decode(payload.strip())
         except BadRequest:
@@ -265,7 +265,7 @@ class RobotConnection(Connection):
     # -- after an absence
 
     def _resend_all(self) -> None:
-        """Send open requests again, and look up goals that were sent before."""
+        """Send open requests again, and look up the goals that the robot may already have."""
         now = time.monotonic()
         if self._sender:
             self._post(Hello(self._sender))
@@ -287,9 +287,9 @@ class RobotConnection(Connection):
             self._watch_again(now)
 
     def _resend(self, exchange: RobotExchange) -> None:
-        """Send a request again, or fail it if its time is over or too many attempts have failed."""
+        """Send a request again. Fail it if its ttl has expired, or if it was sent too many times."""
         if exchange.number not in self.exchanges:
-            return  # the sender has stopped waiting and reported that the goal may be lost
+            return  # nobody waits for the answer any more
         request = exchange.request
         left = 0.0 if exchange.latest is None else exchange.latest - boottime()
         exchange.resends += 1
@@ -393,5 +393,5 @@ def connect_robot(robot: str, broker: Broker, *, keep_trying: float = 0.0, **opt
 
 
 def new_goal_id(desk: DeskLink) -> str:
-    """Return a new goal id. It contains a colon, unlike the ids that servers give."""
+    """Return a new goal id. It contains a colon, unlike the ids that servers assign."""
     return f"{desk.user[:_ID_USER_CHARS]}:{os.urandom(5).hex()}"

@@ -2,7 +2,7 @@
 
 If a glob selects the robots, each robot is sent its own request. If the robots are a group, a single message is sent,
 which the broker delivers to all members. A member is recognized by its presence or by its answer. A request counts as
-successful only if the robot itself has confirmed that.
+successful only if the robot itself has confirmed it.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 DEFAULT_TTL_S = 10.0
 #: Interval of the checks for robots that haven't answered in time.
 _CHECK_INTERVAL_S = 0.25
-#: How many messages to process before such a check, because they may have arrived while this process was stopped.
+#: Maximum number of messages to process before such a check. Many may have arrived while this process was suspended.
 _MAX_MESSAGES_PER_CHECK = 5000
 #: How long `close` waits until the broker has acknowledged the request.
 _FLUSH_LIMIT_S = 1.0
@@ -109,7 +109,7 @@ class FleetRequest:
             #: the rejected goal, if the text is too long for any server; such a request is not sent
             self._rejected = too_long(request) if isinstance(request, Say) else None
             self._desk.wait_for_retained(patience, interrupt=interrupt)
-            #: the time by `boottime` after which the sentence is not sent again; None for no limit
+            #: time after which the sentence is no longer sent (`boottime`); None for no limit
             self._latest = boottime() + request.ttl if isinstance(request, Say) and request.ttl else None
             self._began = True
             self._send_to_known_robots()
@@ -178,9 +178,9 @@ class FleetRequest:
             raise self._no_robot_error()
 
     def cancel(self) -> None:
-        """Cancel the sentence on each robot on which it hasn't ended. Absent robots cancel it when they are back.
+        """Cancel the sentence on each robot that hasn't finished it. Absent robots cancel it when they are back.
 
-        Further outcomes report how the goals ended. Only sentences can be canceled; for other requests, do nothing.
+        Further outcomes report how the goals ended. This has no effect on requests other than sentences.
 
         Raises:
             UsageError: All outcomes have been returned. Cancel the goal by its id instead.
@@ -279,7 +279,7 @@ class FleetRequest:
 
         After all retained messages have arrived, further robots are ignored, because they came online too late. Before
         that, every member of a group is expected to answer, even if it came online after the request was sent. Such a
-        member looks like any other one, because some brokers send all retained messages late.
+        member can't be distinguished from the others, because some brokers send retained messages late.
         """
         name = presence.name
         if name in self._included:
@@ -371,7 +371,7 @@ class RobotRequest:
 
         Args:
             number: the number of that request.
-            latest: the time by `boottime` after which a sentence is not sent again; None for no limit.
+            latest: time after which a sentence is no longer sent (`boottime`); None for no limit.
         """
         exchange = RobotExchange(self._request, self._on_reply, self._on_failure, slow=self._slow)
         exchange.number, exchange.latest = number, latest

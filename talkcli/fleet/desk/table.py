@@ -90,7 +90,7 @@ def _last_cell(goal: LastGoal, now: float) -> Cell:
 
 
 def _format_age(seconds: float) -> str:
-    """Return a duration in its largest unit. It may be negative if the robot's clock is ahead; then return `0 s`."""
+    """Return a duration in its largest unit. A negative one, from a robot whose clock is ahead, counts as 0."""
     whole = max(0, int(seconds))
     for size, name in ((86400, "d"), (3600, "h"), (60, "min")):
         if whole >= size:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from talkcli.fleet.link import Link
     from talkcli.goals.goal import JsonObject
 
-#: Time for bridges to reconnect after the broker is back. Robots without a presence then count as gone.
+#: Time for bridges to reconnect after the broker is back. A robot that has no presence by then counts as gone.
 BRIDGES_BACK_LIMIT_S = 15.0
 #: Interval of the checks for time limits that have passed.
 _LIMIT_CHECK_INTERVAL_S = 0.5
@@ -44,7 +44,7 @@ class FleetSnapshot:
 
 @frozen
 class RobotChanged:
-    """A robot or its server has come or gone. `before` and `now` are None if the robot was or is unknown."""
+    """A robot or its server has come or gone. The broker doesn't know it if `before` or `now` is None."""
 
     name: str
     before: Presence | None
@@ -159,7 +159,7 @@ class FleetWatch:
         self._presences: dict[str, Presence] = {}
         #: for each robot, the ids of the goals that were last reported as ended (key True) and as started (key False)
         self._reported: dict[str, dict[bool, str]] = {}
-        #: robots that may have spoken while their events were missed, which their next status shows
+        #: robots whose events may have been missed. Their next status shows what they have spoken.
         self._maybe_missed: set[str] = set()
         #: the first messages on a new connection, until all retained ones have arrived; None after that
         self._retained: list[Message] | None = None
@@ -217,7 +217,7 @@ class FleetWatch:
                 self._missing.pop(name, None)
                 self._set_presence(name, presence if presence and self._selects(presence) else None)
         elif kind == topics.STATUS:
-            if name in self._maybe_missed:  # otherwise its events have more details
+            if name in self._maybe_missed:  # otherwise its events were received, and they have more details
                 self._report_missed(name, RobotStatus.read(message.payload))
         elif (event := _read_event(message)) is not None:
             self._report(event)
