@@ -1,1 +1,1 @@
-"""The operator's side of a fleet, which sends requests to robots through the broker."""
+"""The operator's side of a fleet: sends requests to robots, watches them, and formats their state as text."""
