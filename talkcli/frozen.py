@@ -59,22 +59,47 @@ def replace(instance: _T, **changes: Any) -> _T:
     return type(instance)(**{**fields(instance), **changes})
 
 
-def _generic_init(self: object, *arguments: object, **named: object) -> None:
-    """Set the fields of one of the first instances of a class, without compiling a function for the class."""
-    cls: Any = type(self)
-    names = cls.__match_args__
-    given = dict(zip(names, arguments, strict=False))
-    values = {**cls._defaults, **given, **named}
-    cls._made += 1
-    # Valid arguments set every field once and nothing else.
-    invalid = values.keys() != cls._names or len(given) != len(arguments) or not named.keys().isdisjoint(given)
-    if invalid or cls._made > _COMPILE_AFTER_COUNT:
-        cls.__init__ = _compile_init(cls)
-        cls.__init__(self, *arguments, **named)  # raises the usual TypeError if the arguments are invalid
-        return
-    put = object.__setattr__
-    for name, value in values.items():
-        put(self, name, value)
+class _Methods:
+    """The methods that every class made by `frozen` gets."""
+
+    def __init__(self, *arguments: object, **named: object) -> None:
+        """Set the fields of one of the first instances of a class, without compiling a function for the class."""
+        cls: Any = type(self)
+        names = cls.__match_args__
+        given = dict(zip(names, arguments, strict=False))
+        values = {**cls._defaults, **given, **named}
+        cls._made += 1
+        # Valid arguments set every field once and nothing else.
+        invalid = values.keys() != cls._names or len(given) != len(arguments) or not named.keys().isdisjoint(given)
+        if invalid or cls._made > _COMPILE_AFTER_COUNT:
+            cls.__init__ = _compile_init(cls)
+            cls.__init__(self, *arguments, **named)  # raises the usual TypeError if the arguments are invalid
+            return
+        put = object.__setattr__
+        for name, value in values.items():
+            put(self, name, value)
+
+    def __setattr__(self, name: str, *_: object) -> None:
+        raise AttributeError(f"{type(self).__name__} is a value: its {name} can't be changed")
+
+    __delattr__ = __setattr__
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self) and fields(other) == fields(self)
+
+    def __hash__(self) -> int:
+        return hash((type(self), *fields(self).values()))
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Tell `copy` and `pickle` to call the class, because they can't set fields."""
+        return type(self), tuple(fields(self).values())
+
+    def __repr__(self) -> str:
+        shown = ", ".join(f"{name}={each!r}" for name, each in fields(self).items())
+        return f"{type(self).__qualname__}({shown})"
+
+
+_METHODS = {name: each for name, each in vars(_Methods).items() if callable(each)}
 
 
 def _compile_init(cls: Any) -> Any:
@@ -86,36 +111,3 @@ def _compile_init(cls: Any) -> Any:
     namespace: dict[str, Any] = {**setters, "_defaults": cls._defaults}
     exec("\n".join([f"def __init__({', '.join(['self', *takes])}):", *sets]), namespace)
     return namespace["__init__"]
-
-
-def _refuse_change(self: object, name: str, *_: object) -> None:
-    raise AttributeError(f"{type(self).__name__} is a value: its {name} can't be changed")
-
-
-def _equal(self: object, other: object) -> bool:
-    return type(other) is type(self) and fields(other) == fields(self)
-
-
-def _hash(self: object) -> int:
-    return hash((type(self), *fields(self).values()))
-
-
-def _reduce(self: object) -> tuple[object, ...]:
-    """Tell `copy` and `pickle` to call the class, because they can't set fields."""
-    return type(self), tuple(fields(self).values())
-
-
-def _repr(self: object) -> str:
-    shown = ", ".join(f"{name}={each!r}" for name, each in fields(self).items())
-    return f"{type(self).__qualname__}({shown})"
-
-
-_METHODS: dict[str, object] = {
-    "__init__": _generic_init,
-    "__setattr__": _refuse_change,
-    "__delattr__": _refuse_change,
-    "__eq__": _equal,
-    "__hash__": _hash,
-    "__reduce__": _reduce,
-    "__repr__": _repr,
-}
