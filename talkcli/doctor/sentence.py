@@ -112,12 +112,12 @@ def _cancel_late(client: Client, goal: GoalHandle, limit: float) -> SentenceResu
     ended = goal.cancel()
     if ended.state in {State.SUCCEEDED, State.ABORTED}:  # it ended before the request arrived
         return _goal_result(ended)
-    position = next((number for number, each in enumerate(before.pending) if each.id == goal.id), None)
+    pending = [each.id for each in before.pending]
     if before.server.get("paused") is True:
         return SentenceResult(ended.state, "paused", "speech is paused")
-    if position is None:
+    if goal.id not in pending:
         return SentenceResult(ended.state, "late", f"it was begun and not over after {limit:g} s, and was cancelled")
-    ahead = position + bool(before.active)
+    ahead = pending.index(goal.id) + bool(before.active)
     goals = "1 goal" if ahead == 1 else f"{ahead} goals"
     return SentenceResult(ended.state, "late", f"it still waited behind {goals} after {limit:g} s, and was taken back")
 

@@ -131,7 +131,7 @@ def _client_message(lines: list[str], found: tuple[SocketPlace, ...]) -> str | N
     """Return why a listening process did not accept the client, from the lines of the client's error message."""
     if not lines[0].startswith(_NO_SERVER_PREFIX):
         return lines[0]
-    listening = [f"{each.path}: " for each in found if each.what in {PLACE_LISTENING, PLACE_STOPPED}]
+    listening = [f"{each.path}: " for each in found if each.what == PLACE_LISTENING]
     rest = (line.strip() for line in lines[1:])
     return next((line.removeprefix(each) for line in rest for each in listening if line.startswith(each)), None)
 
@@ -143,10 +143,11 @@ def _find_place(path: str, trusted: Container[str | None]) -> SocketPlace:
         try:
             probe.connect(path)
         except OSError as error:
-            backlog_full = isinstance(error, BlockingIOError)
             uid = file_owner(path)
             uid = file_owner(os.path.dirname(path)) if uid is None else uid
-            return SocketPlace(path, PLACE_LISTENING if backlog_full else paths.describe_place(path, error), uid)
+            if isinstance(error, BlockingIOError):  # its backlog is full
+                return SocketPlace(path, PLACE_LISTENING, uid)
+            return SocketPlace(path, paths.describe_place(path, error), uid)
         pid, uid = peers.credentials(probe)
     if path not in trusted and uid not in {os.getuid(), 0}:
         return SocketPlace(path, PLACE_FOREIGN, uid, pid)
