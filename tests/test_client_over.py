@@ -103,6 +103,13 @@ def test_a_handle_needs_no_client(scripted: Scripted) -> None:
     assert scripted.asked[2:] == [Wait(("g",))]
 
 
+def test_polling_an_ended_goal_receives_the_events_of_others(scripted: Scripted) -> None:
+    ended, other = GoalHandle(scripted, Goal("x", State.SUCCEEDED)), Client.over(scripted).say("a")
+    assert [ended.poll(), ended.poll()] == [Result(ended.goal), None]
+    scripted.coming = [result()]
+    assert (ended.poll(), other.state) == (None, State.SUCCEEDED)
+
+
 def test_goals_are_followed_as_one_stream(scripted: Scripted) -> None:
     (handle,) = Client.over(scripted).follow(["g"])
     scripted.coming = [state("PREEMPTING", 1), result("PREEMPTED")]

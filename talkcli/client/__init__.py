@@ -1,7 +1,10 @@
-"""The client library: it connects to a server, sends requests, and returns goals as handles with their events.
+"""The client library: connect to a server, send requests, and follow goals.
 
-It blocks, and any number of threads may use it. Every start of a command pays for it, so it imports neither click nor
-asyncio nor anything heavy. It may import protocol, goals and the ground, and from terminal the functions that make
-foreign text safe to show. Requests are methods of `client`, operations on one goal methods of `goal`. `core` has the
-client's side of the protocol without I/O. Another transport is another subclass of `Connection` in `connection`.
+`client` has the requests, and `goal` the operations on a single goal. `core` implements the client's side of the
+protocol without I/O. `connection` has the blocking transports, and `connect` finds the server's socket. A new blocking
+transport is a new subclass of `Connection`.
+
+Calls block, and any number of threads may use a client. Every command imports this package when it starts, so it must
+not import click, asyncio or anything else that is slow to import. It may import `protocol`, `goals`, the ground, and
+the functions of `terminal` that make foreign text safe to show.
 """

@@ -1,4 +1,4 @@
-"""The client library: send goals, follow them, and cancel them, from Python.
+"""The library's main class: send, follow and cancel goals from Python.
 
     with Client(name="patrol") as talk:
         goal = talk.say("battery low")
@@ -6,8 +6,8 @@
         if goal.wait(timeout=10).state is not State.SUCCEEDED:
             print(goal.goal.message)
 
-It starts no thread, and may be used from several. It imports neither click nor asyncio nor pyttsx3. Errors are
-subclasses of `talkcli.errors.TalkError`.
+The library starts no thread, and any number of threads may use it. It imports neither click nor asyncio nor pyttsx3.
+All errors except TimeoutError are subclasses of `talkcli.errors.TalkError`.
 """
 
 from __future__ import annotations
@@ -40,28 +40,33 @@ __all__ = ["Client", "GoalHandle"]
 
 #: The part of a request's line that is reserved for everything except the list of ids.
 _REST_OF_LINE_BYTES = 4096
-#: The longest JSON of one character: a quote with its backslash in ASCII, or else an escaped surrogate pair.
-_LONGEST_ASCII_BYTES, _LONGEST_CHARACTER_BYTES = 2, 12
-#: A number as long as any that requests are given.
-_LONGEST_NUMBER = 10**15
+#: The maximum size of an ASCII character in JSON (a quote with its backslash), and of any character (an escaped
+#: surrogate pair).
+_MAX_ASCII_BYTES, _MAX_CHARACTER_BYTES = 2, 12
+#: A `seq` with more digits than any request will have.
+_LONG_SEQ = 10**15
 
 
 class Client:
-    """A connection to a talk server, which is found in the same way as by the command `talk`.
+    """A connection to a talk server. The server is looked for in the same places as by the command `talk`.
 
-    After a break, for example because the server was restarted, the next call reconnects. Goals are still followed if
-    the server is the same as before. Otherwise they are LOST. While there is no server, a call tries to connect at most
-    every half second, and otherwise raises ServerUnavailable at once. `cancel` always tries.
+    If the connection breaks, for example because the server was restarted, the next call reconnects. If the server is
+    still the same process, its goals are followed again. Otherwise they are LOST.
+
+    While there is no server, calls raise ServerUnavailable at once. There is a pause of up to half a second between two
+    attempts to reconnect, which only a cancel ignores.
+
+    Every call that waits for an answer raises ServerUnavailable if there is none in time, or Lost if the request may
+    have had an effect.
     """
 
     def __init__(self, socket: str | None = None, *, name: str | None = None, timeout: float = ANSWER_LIMIT_S) -> None:
-        """Connect.
+        """Connect to the server.
 
         Args:
-            socket: path of the server's socket. The default is TALK_SOCKET, then the usual places.
-            name: what this sender calls itself in `talk status` and the log, up to 64 characters. The default is
-                TALK_NAME.
-            timeout: seconds in which the server must be reached, and must answer each request.
+            socket: path of the server's socket. The default is TALK_SOCKET, or else the usual places.
+            name: this sender's name in `talk status` and the log, up to 64 characters. The default is TALK_NAME.
+            timeout: seconds in which the client must connect, and in which the server must answer each request.
 
         Raises:
             UsageError: the name is too long, or the timeout is not positive.
@@ -74,19 +79,19 @@ class Client:
 
     @classmethod
     def over(cls, connection: Connection) -> Client:
-        """Return a client that uses an existing connection. Internal: for `talk`'s own commands."""
+        """Return a client that uses an existing connection. This method is not part of the library's interface."""
         client = cls.__new__(cls)
         client._use(connection)
         return client
 
     def _use(self, connection: Connection) -> None:
         self._connection = connection
-        #: the boot id of the first server, whose goals can be named by bare numbers
+        #: the boot id of the first server, which completes ids that are bare numbers
         self._first_boot = connection.boot
 
     @property
     def path(self) -> str:
-        """The socket of the server."""
+        """The path of the server's socket."""
         return self._connection.path
 
     @property
@@ -128,44 +133,45 @@ class Client:
         patient: bool = False,
         block: bool = True,
     ) -> GoalHandle:
-        """Send a goal, and return its handle when the server has accepted or REJECTED it.
+        """Send a goal, and return its handle once the server has accepted or REJECTED the goal.
 
         Args:
-            text: the sentence, up to 10,000 characters.
-            preempt: stop the goal that is being spoken, and go first. None means the server's setting.
+            text: the text to speak, up to 10,000 characters.
+            preempt: stop the active goal, and speak this one first. None means the server's setting.
             flush: like `preempt`, and also recall all pending goals of the same or a lower priority.
-            priority: goals with a higher priority go first.
-            ttl: seconds in which the goal must begin, or it is RECALLED; 0 for no limit, None for the server's setting.
+            priority: goals with a higher priority are spoken first.
+            ttl: seconds in which speaking must begin. Otherwise the goal is RECALLED. 0 means no limit, and None the
+                server's setting.
             key: a label of 1 to 64 characters. The goal replaces the pending goal with the same key.
-            throttle: reject the goal if another one with the same key began less than this many seconds ago. Without a
+            throttle: reject the goal if another goal with the same key began less than this many seconds ago. Without a
                 key, goals with the same text count.
-            id: the sender's own id, 1 to 64 of A-Z a-z 0-9 . _ : / -. A text that is sent twice with the same id is
-                spoken once, and the second handle is `attached` to the first goal.
-            rate: 80 to 450 words per minute. For this and the next three, None means the server's setting.
-            volume: 0 to 1.
-            voice: id, name or language of a voice.
-            pitch: 0 to 100.
-            voice_only: wait until a neural voice is loaded, and abort the goal with `voice_failed` if that fails. By
-                default, espeak may speak instead.
-            lead_in: 0 to 5,000 milliseconds of silence before the goal, even if the output was not idle. None means the
-                server's setting, which applies if the output was idle.
-            audible: abort the goal with `muted` if its output is muted. None means the server's setting.
-            data: an object of at most 1 KiB of JSON that travels with the goal.
-            follow: receive the goal's states and its result.
+            id: an id chosen by the sender: 1 to 64 of the characters A-Z a-z 0-9 . _ : / -. If a text is sent twice
+                with the same id, it is spoken once, and the second handle is `attached` to the first goal.
+            rate: speed in words per minute, 80 to 450. None means the server's setting.
+            volume: volume from 0 to 1. None means the server's setting.
+            voice: id, name or language of a voice. None means the server's setting.
+            pitch: pitch from 0 to 100. None means the server's setting.
+            voice_only: wait until a neural voice is loaded, and abort the goal with the reason `voice_failed` if
+                loading fails. By default, espeak may speak instead.
+            lead_in: silence before the goal in milliseconds, 0 to 5,000. It is always played. None means the server's
+                setting, which is only played if the output was idle.
+            audible: abort the goal with the reason `muted` if its output is muted. None means the server's setting.
+            data: a JSON object of at most 1 KiB, which is stored with the goal.
+            follow: receive the goal's states and its Result.
             feedback: also receive each word as it is heard, for `GoalHandle.feedback` and `events`.
-            patient: if the queue is full, wait for room, however long it takes.
+            patient: if the queue is full, wait until there is room, without a time limit.
             block: wait for the server's answer. If False, the call returns at once, and the client chooses the id if
-                none is given. Bytes that the server doesn't accept yet, up to 256 KiB, are sent by later calls. The
-                goal ends as REJECTED with the reason `not_sent` if it could not be sent. It ends as LOST if it was
-                sent, but the connection broke or no answer came within the client's timeout.
+                none is given. Up to 256 KiB that the server doesn't accept yet are sent by later calls. If the goal
+                can't be sent, it ends as REJECTED with the reason `not_sent`. If it was sent, but the connection broke
+                or the server didn't answer within the client's timeout, it ends as LOST.
 
         Raises:
             UsageError: a value is out of its range. Nothing was sent.
             ServerUnavailable: the server can't be reached. Nothing was sent. With `block=False`, this is raised only
                 if the client is closed.
-            Lost: the goal was sent, but no answer came. It may be spoken.
-            Interrupted: a patient goal was waiting for room. It is not spoken if the client is closed; the server
-                notices that within 5 s.
+            Lost: the goal was sent, but the server didn't answer. The goal may be spoken.
+            Interrupted: a patient goal was waiting for room, in one of `talk`'s own commands. The goal is not spoken if
+                the client is then closed, because the server notices that within 5 s.
         """
         request = Say(
             text,
@@ -201,14 +207,15 @@ class Client:
         return handle
 
     def follow(self, ids: Iterable[str] | None = None, *, feedback: bool = False) -> list[GoalHandle]:
-        """Return handles of goals, whoever sent them.
+        """Follow goals of any sender, and return their handles.
 
         Args:
-            ids: the goals' ids; None for all goals that have not ended.
-            feedback: also receive each of their words.
+            ids: ids of goals; None for all goals that have not ended.
+            feedback: also receive each word of these goals as it is heard.
 
         Raises:
-            UnknownGoal: the server doesn't know one of them.
+            UsageError: an id is empty.
+            UnknownGoal: the server doesn't know one of the goals.
         """
         wanted = None if ids is None else [self._full_id(each) for each in ids]
         handles: dict[str, GoalHandle] = {}
@@ -230,15 +237,18 @@ class Client:
         before: str | None = None,
         key: str | None = None,
     ) -> Canceled:
-        """Cancel the selected goals, or everything if nothing is selected. Return once they are silent.
+        """Cancel the selected goals, and return once they are silent. Without arguments, cancel all goals.
+
+        A goal is cancelled if any of the arguments selects it.
 
         Args:
-            ids: these goals; an empty list selects none.
-            current: the goal that is being spoken.
-            before: this goal, and all that were accepted before it.
-            key: the goals with this key, pending or active.
+            ids: select the goals with these ids. An empty list selects no goal.
+            current: select the goal that is being spoken.
+            before: select the goal with this id, and all goals that were accepted before it.
+            key: select the active and the pending goals with this key.
 
         Raises:
+            UsageError: an id or the key is not valid.
             UnknownGoal: an id is unknown. The other goals are cancelled, and are listed in the error's `items`.
         """
         wanted = None if ids is None else [self._full_id(each) for each in ids]
@@ -264,30 +274,43 @@ class Client:
         return ServerStatus.from_reply(*self._connection.request(Status()))
 
     def goal(self, goal_id: str) -> Goal:
-        """Return one goal as it is now; UnknownGoal if the server doesn't know it."""
+        """Return the current state of a goal.
+
+        Raises:
+            UsageError: the id is empty.
+            UnknownGoal: the server doesn't know the goal.
+        """
         reply, _ = self._connection.request(Status(self._full_id(goal_id)))
         return Goal.from_json(reply.get("goal"))
 
     def log(self, count: int = 20) -> list[Goal]:
-        """Return the last `count` goals that ended, including REJECTED ones, oldest first. At most 2,200 are kept."""
+        """Return the goals that ended last, including REJECTED ones, with the oldest first.
+
+        Args:
+            count: the maximum number of goals, 1 to 2,200. The server keeps no more than 2,200.
+
+        Raises:
+            UsageError: the count is out of its range.
+        """
         if not 0 < count <= MAX_LOG_GOALS:
             raise UsageError(f"a log has 1 to {MAX_LOG_GOALS} goals, not {count}")
         _, items = self._connection.request(Log(count))
         return list(goals(items, "goal"))
 
     def voices(self) -> list[JsonObject]:
-        """Return the voices of the server's engine: objects with id, language, name, quality and speakers.
+        """Return the voices of the server's engine, as objects with `id`, `language`, `name`, `quality` and `speakers`.
 
-        Only neural voices have a quality and speakers; for others, both are None. The quality is a word such as
-        "medium". The speakers are a list of names, or None if there is only one.
+        The quality of a neural voice is a word such as "medium". Its speakers are a list of names, or None if there is
+        only one speaker. Other voices have None for both.
         """
         _, items = self._connection.request(Voices())
         return [each["voice"] for each in items if isinstance(each.get("voice"), dict)]  # type: ignore[misc]
 
     def settings(self) -> JsonObject:
-        """Return the settings for goals that don't bring their own: rate, volume, voice, pitch, preempt and ttl.
+        """Return the server's settings, which apply to goals without such options of their own.
 
-        The units are those of `say`. A voice of None is the driver's own, a ttl of None means no limit.
+        The object has `rate`, `volume`, `voice`, `pitch`, `preempt` and `ttl`, in the units of `say`. A voice of None
+        is the default voice of the driver. A ttl of None means no limit.
         """
         return self.set()
 
@@ -300,10 +323,18 @@ class Client:
         preempt: bool | None = None,
         ttl: float | None = None,
     ) -> JsonObject:
-        """Change the running server's settings for goals that have not begun, and return all of them.
+        """Change the server's settings, and return all of them as `settings` does.
 
-        Settings that are not given stay the same. The values are those of `say`. The voice "default" is the driver's
-        own, and a ttl of 0 means no limit.
+        The new settings apply to goals that have not begun to be spoken. They last until the server ends. The units are
+        those of `say`.
+
+        Args:
+            rate: words per minute. For all arguments, None leaves the setting unchanged.
+            volume: volume from 0 to 1.
+            voice: id, name or language of a voice, or "default" for the default voice of the driver.
+            pitch: pitch from 0 to 100.
+            preempt: whether each goal stops the active goal.
+            ttl: seconds in which speaking must begin; 0 for no limit.
 
         Raises:
             UsageError: a value is out of its range.
@@ -316,30 +347,33 @@ class Client:
         return settings if isinstance(settings, dict) else {}
 
     def pause(self) -> Goal | None:
-        """Pause speech, and return the paused goal once it is silent; None if no goal was being spoken.
+        """Pause all speech, and return the paused goal once it is silent. Return None if no goal was being spoken.
 
-        Nothing is spoken until `resume`, whoever sends it. Pausing twice is no error.
+        Nothing is spoken until any client calls `resume`. Pausing twice is no error.
         """
         return goal_in(self._connection.request(Pause(), slow=True)[0])
 
     def resume(self) -> Goal | None:
-        """Resume speech, and return the goal that goes on; None if no goal was paused. Resuming twice is no error."""
+        """Resume speech, and return the goal that continues. Return None if no goal was paused.
+
+        Resuming twice is no error.
+        """
         return goal_in(self._connection.request(Resume())[0])
 
     def events(self, *, reconnect: bool = False) -> Iterator[Event]:
-        """Iterate over everything that happens to any goal from now on.
+        """Iterate over the events of all goals from now on.
 
         The first event is a Snapshot. It is followed by StateChanged, WordHeard and PausedChanged events. The first and
-        the last StateChanged of a goal have the whole goal. The iteration can be stopped at any time.
+        the last StateChanged of a goal contain the whole goal. The iteration can be stopped at any time.
 
-        If the events are not taken in time because other threads use the client, the oldest words are dropped, and `n`
-        has gaps. States are never dropped.
+        If events are read too slowly while other threads use the client, the oldest words are dropped, and `n` has
+        gaps. States are never dropped.
 
         Args:
-            reconnect: after a break of the connection, go on with another Snapshot.
+            reconnect: reconnect after a break of the connection, and continue with a new Snapshot.
 
         Raises:
-            Lost: the connection broke and `reconnect` is not set, or more than 10,000 states were not taken.
+            Lost: the connection broke and `reconnect` is False, or more than 10,000 states were not read in time.
         """
         buffer = EventBuffer(reconnects=reconnect)
 
@@ -353,9 +387,9 @@ class Client:
     # -- inside
 
     def _handle(self, request: Say) -> tuple[GoalHandle, OnReply]:
-        """Return the handle of a goal that will be sent, and the function that processes the reply.
+        """Return a handle for a new goal, and the function that processes the reply to its request.
 
-        If the text is too long to be sent, the goal is already REJECTED.
+        If the text is too long for a request, the goal is already REJECTED.
 
         Raises:
             UsageError: a value is out of its range.
@@ -371,13 +405,14 @@ class Client:
         return handle, accepted
 
     def _full_id(self, goal_id: str) -> str:
-        """Return the whole id for a bare number, and any other id unchanged. The errors are those of `check_id`."""
+        """Complete an id that is a bare number, and check it. The errors are those of `check_id`."""
         if goal_id.isascii() and goal_id.isdecimal():
             goal_id = f"{self._first_boot}-{goal_id}"
         check_id(goal_id)
         return goal_id
 
     def _take_all(self, buffer: EventBuffer) -> Iterator[Event]:
+        """Iterate over the events in a buffer, and raise Lost when the buffer or the connection is closed."""
         for event in taken(self._connection, lambda: buffer.take() or buffer.closed, None):
             if event is None or isinstance(event, str):
                 break
@@ -387,7 +422,12 @@ class Client:
 
 
 def check_id(goal_id: str) -> None:
-    """Raise UsageError for an empty id, and UnknownGoal for one that no goal can have."""
+    """Check the length of an id.
+
+    Raises:
+        UsageError: the id is empty.
+        UnknownGoal: the id is too long for any goal.
+    """
     if not goal_id:
         raise UsageError("an id is empty: is the variable set that it comes from?")
     if len(goal_id) > MAX_ID_CHARS:
@@ -395,12 +435,12 @@ def check_id(goal_id: str) -> None:
 
 
 def batches(ids: Iterable[str]) -> list[tuple[str, ...]]:
-    """Return the ids in their order, each once, in groups that each fit into the line of a request."""
+    """Split ids into groups that each fit into the line of a request. Keep the order, and drop duplicates."""
     groups: list[list[str]] = []
     room = 0
     for each in dict.fromkeys(ids):
         plain = each.isascii() and each.isprintable()
-        size = (_LONGEST_ASCII_BYTES if plain else _LONGEST_CHARACTER_BYTES) * len(each) + len('"", ')
+        size = (_MAX_ASCII_BYTES if plain else _MAX_CHARACTER_BYTES) * len(each) + len('"", ')
         if not groups or size > room or len(groups[-1]) == MAX_IDS:
             groups.append([])
             room = MAX_LINE_BYTES - _REST_OF_LINE_BYTES
@@ -410,7 +450,11 @@ def batches(ids: Iterable[str]) -> list[tuple[str, ...]]:
 
 
 def check(request: Say | Set) -> None:
-    """Raise UsageError for options of the wrong type or out of their range, as the server would."""
+    """Check the types and ranges of a request's options, as the server does.
+
+    Raises:
+        UsageError: an option is not valid.
+    """
     for option in request.options:
         try:
             fault = option.type_error(getattr(request, option.name))
@@ -423,9 +467,13 @@ def check(request: Say | Set) -> None:
 
 
 def too_long(request: Say) -> Goal | None:
-    """Return the REJECTED goal for a text that doesn't fit into a request; None if it fits."""
+    """Return a REJECTED goal if a text doesn't fit into a request, or None if the text fits.
+
+    Raises:
+        UsageError: `data` has no JSON form.
+    """
     try:
-        line = request_line({"seq": _LONGEST_NUMBER, **write_request(request)})
+        line = request_line({"seq": _LONG_SEQ, **write_request(request)})
     except ValueError as error:  # NaN in `data`
         raise UsageError(f"'data' is no JSON: {error}") from None
     if len(line) <= MAX_LINE_BYTES:

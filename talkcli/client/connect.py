@@ -1,15 +1,17 @@
-"""How a client connects: it tries the usual places, explains failures, and may send its first request early.
+"""Connect a client: find the server's socket, send the first request early, and explain failures.
 
-There are two stages. `reach` opens a connection, and a caller that already knows its request sends it with
-`send_early`, before the rest of the client is imported: the server works meanwhile. This stage imports next to nothing,
-not even `socket` and `json`, which together take as long as the interpreter's start. It covers only the plain case, a
-server of this protocol that answers at once. The second stage, `connect`, takes over wherever the first one ended. It
-waits, tries the other places, and explains what is wrong. A request that could have an effect is never sent twice.
+Connecting has two stages. In the first stage, `reach` opens a connection. A caller that already knows its request sends
+it with `send_early`, so that the server works on it while the rest of the client is imported. This stage imports next
+to nothing, not even `socket` and `json`, which together take as long as the interpreter's start. It handles only the
+plain case of a server that has the same protocol and answers at once.
+
+The second stage, `connect`, continues where the first one stopped. It waits for the server, tries the other places, and
+explains what is wrong. A request that could have an effect is never sent twice.
 """
 
 from __future__ import annotations
 
-import _socket  # lighter than `socket`, see `peers`
+import _socket  # `socket` takes longer to import, see `peers`
 import os
 import time
 
@@ -23,25 +25,25 @@ if TYPE_CHECKING:
     from talkcli.errors import AccessDenied, TalkError
     from talkcli.goals.goal import JsonObject
 
-#: The beginning of the greeting of a server of this protocol, as `protocol.lines` writes it; a test compares the two.
+#: The beginning of a server's greeting in this protocol. A test compares it with the result of `protocol.lines`.
 GREETING_START = b'{"talk": 1, "version": '
-#: Seconds in which an idle server greets. A longer wait must be interruptible.
+#: Time in which an idle server sends its greeting. A longer wait must be interruptible.
 GREETING_WAIT_S = 0.2
-#: The longest time for which a client leaves the processor to the server.
+#: The longest time in `yield_processor`.
 _LONGEST_YIELD_S = 0.2
-#: Parts of an answer after which there is nothing to wait for.
-_REFUSED = (b'"ok": false', b'"state": "REJECTED"')
-#: Seconds in which a server must greet, and must answer each request.
+#: Parts of an answer which show that the goal will not be spoken.
+_REFUSALS = (b'"ok": false', b'"state": "REJECTED"')
+#: Time in which a server must send its greeting, and must answer each request.
 ANSWER_LIMIT_S = 5.0
-#: Seconds for which a server that is full, or whose backlog is full, is tried again.
+#: How long to keep trying to connect to a server that has reached its client limit or has a full backlog.
 BUSY_LIMIT_S = 5.0
-#: The least and the longest pause between two of these attempts. It is random, so that many clients that were turned
-#: away together don't come back together.
+#: The minimum and the maximum pause between two of these attempts. The pause is random, so that many clients that were
+#: refused at the same time don't all return at the same time.
 BUSY_PAUSE_S = (0.02, 0.2)
-#: Seconds between two attempts to reach a server that is not there yet: the first pause, which doubles up to the
-#: second.
+#: The first and the longest pause between two attempts to reach a server that has not started yet. Each pause is twice
+#: as long as the one before.
 _FIRST_RETRY_PAUSE_S, _LONGEST_RETRY_PAUSE_S = 0.02, 0.25
-#: The next step if there is no server, and if the server refuses this user.
+#: What the user can do if there is no server, or if the server refuses this user.
 _START_STEP = "start one with: talk serve"
 _LET_IN_STEP = "have its owner let you in, with `talk serve --socket-mode 0660` and the socket's group"
 _START_OWN_STEP = "or start your own with: talk serve"
@@ -51,42 +53,42 @@ _START_OWN_STEP = "or start your own with: talk serve"
 class ConnectionAttempt:
     """The progress of connecting to a server."""
 
-    #: non-blocking; None if no place has accepted a connection
+    #: a non-blocking socket; None if no connection was accepted
     socket: _socket.socket | None
-    #: the place of the socket
+    #: path of the server's socket
     path: str = ""
-    #: the places that failed before it, each with its error
+    #: the paths that were tried without success, each with its error
     failures: tuple[tuple[str, Exception], ...] = ()
     #: whether `hello` was sent
     hello_sent: bool = False
-    #: received bytes that have not been processed; before the greeting was read, they begin with it
+    #: received bytes that have not been processed, starting with the greeting until `connect` has read it
     received: bytes = b""
     #: the part of the first request that has been sent
     request_sent: bytes = b""
-    #: the server's boot id, the first half of the ids that it gives; empty until the greeting is read
+    #: the server's boot id, which is the first half of the goal ids that it gives; empty until the greeting is read
     boot: str = ""
-    #: the process id that the server reports
+    #: the process id that the server reports; None until the greeting is read
     pid: int | None = None
 
     @property
     def backlog_full(self) -> bool:
-        """Whether the server at the last place has a full backlog and accepts no connection now."""
+        """Whether the last path has a server that accepts no connection now, because its backlog is full."""
         return self.socket is None and bool(self.failures) and isinstance(self.failures[-1][1], BlockingIOError)
 
 
 def reach(
     named: str | None, failures: tuple[tuple[str, Exception], ...] = (), only: str | None = None
 ) -> ConnectionAttempt:
-    """Open a connection to the first place that accepts one. Nothing is sent.
+    """Open a connection to the first place that accepts one, without sending anything.
 
     Args:
-        named: the only socket to try, as the user named it; None for the usual places.
-        failures: the errors of the first of these places, which are not tried again.
-        only: the only one of the usual places to try.
+        named: path of the only socket to try, as the user named it; None for the usual places.
+        failures: the places that have already been tried, with their errors. They are skipped.
+        only: the only one of the usual places to try; None for all of them.
     """
     for path in [only] if only else paths.client_sockets(named)[len(failures) :]:
         connected = _socket.socket(_socket.AF_UNIX, _socket.SOCK_STREAM)
-        # Non-blocking: a stopped server whose backlog is full would hold the client for ever.
+        # If this call could block, a stopped server with a full backlog would block the client for ever.
         connected.setblocking(False)
         error: Exception | None
         try:
@@ -98,13 +100,13 @@ def reach(
             return ConnectionAttempt(connected, path, failures)
         connected.close()
         failures = (*failures, (path, error))
-        if isinstance(error, BlockingIOError):  # a busy server is still the right one
+        if isinstance(error, BlockingIOError):  # the right server is there, but its backlog is full
             break
     return ConnectionAttempt(None, failures=failures)
 
 
 def _foreign(connected: _socket.socket) -> AccessDenied | None:
-    """Return an error if another user has put a server where this user's belongs: it would hear everything."""
+    """Return an error if the server belongs to another user, who could then read everything that is sent."""
     from talkcli import peers
 
     _, uid = peers.credentials(connected)
@@ -118,18 +120,18 @@ def _foreign(connected: _socket.socket) -> AccessDenied | None:
 def send_early(
     attempt: ConnectionAttempt, hello: JsonObject, request: JsonObject, before: Callable[[], None]
 ) -> ConnectionAttempt | None:
-    """Send hello, and the first request as soon as the server has greeted.
+    """Send hello, and the first request as soon as the server's greeting is received.
 
-    The request is not sent if the greeting is late, or differs from the expected one.
+    The request is not sent if the greeting is late or unexpected.
 
     Args:
         attempt: an open connection.
-        hello: the first line.
+        hello: the hello message.
         request: the first request.
-        before: called before the request is sent.
+        before: called immediately before the request is sent.
 
     Returns:
-        The connection; None if it broke before a request was sent.
+        The connection with its progress, or None if the connection broke before a request was sent.
     """
     from talkcli.protocol.lines import FIRST_NUMBER, request_line
 
@@ -153,16 +155,16 @@ def send_early(
 
 
 def yield_processor(attempt: ConnectionAttempt, timeout: float | None) -> ConnectionAttempt:
-    """Leave the processor to the server for a moment. Return the connection with the bytes received in that time.
+    """Leave the processor to the server for a moment, and return the connection with the bytes received meanwhile.
 
-    It is for a client that waits for its goal to end and has nothing else to do. Until the first sound, the server, the
-    engine, the player and the sound server together take about as much processor time as this process has taken so far,
-    on any machine. With the client's other imports in that time, the first sound took 1.4 times as long on two busy
-    cores.
+    A client that only waits for the end of its goal calls this before its other imports. The server, the engine, the
+    player and the sound server need the processor until the first sound. Together they use about as much processor time
+    as this process has used so far, on any machine. On two busy cores, the first sound took 1.4 times as long if the
+    client went on importing.
 
     Args:
         attempt: a connection on which a request was sent.
-        timeout: seconds that the whole command may take; None for no limit.
+        timeout: time limit of the whole command in seconds; None for no limit.
     """
     longest = _LONGEST_YIELD_S if timeout is None else min(_LONGEST_YIELD_S, timeout)
     end = time.monotonic() + min(time.process_time(), longest)
@@ -173,23 +175,28 @@ def yield_processor(attempt: ConnectionAttempt, timeout: float | None) -> Connec
             connected.settimeout(left)
             data = connected.recv(65536)
             received += data
-            if not data or any(each in data for each in _REFUSED):
+            if not data or any(each in data for each in _REFUSALS):
                 break
-    except OSError:  # the time is up, or the connection broke, as the next read will show
+    except OSError:  # the time is over, or the connection broke, in which case the next read fails, too
         pass
     connected.setblocking(False)
     return replace(attempt, received=received)
 
 
 def sender_name(name: str | None) -> str | None:
-    """Return the name that a sender goes by: the given one, or else TALK_NAME."""
-    # A variable that is not UTF-8 must not make a cancel fail.
+    """Return the sender's name, which is the given name or else TALK_NAME. Return None if there is neither."""
+    # Even if the variable is not valid UTF-8, a cancel must not fail.
     variable = os.environ.get("TALK_NAME", "").encode(errors="surrogateescape").decode(errors="replace")
     return name or variable or None
 
 
 def hello(name: str | None, *, urgent: bool) -> JsonObject:
-    """Return the first message of a client. It avoids importing `requests.Hello`; a test compares the two."""
+    """Return the first message of a client. Importing `requests.Hello` would take too long. A test compares the two.
+
+    Args:
+        name: the sender's name, or None.
+        urgent: whether the client sends only `status` and `cancel`.
+    """
     return {"request": "hello", **({"name": name} if name else {}), **({"urgent": True} if urgent else {})}
 
 
@@ -202,19 +209,21 @@ def connect(
     keep_trying: float = 0.0,
     end: float | None = None,
 ) -> ConnectionAttempt:
-    """Return a connection to the first server that answers, with its greeting read.
+    """Connect to the first server that accepts this client, and read its greeting.
 
     Args:
-        named: the only socket to try, or None for the usual places.
-        hello: the first message.
-        patience: seconds in which the server must greet.
-        interrupt: descriptors with the poll events that interrupt the wait, as in `polling.wait_ready`.
+        named: path of the only socket to try; None for the usual places.
+        hello: the hello message.
+        patience: seconds in which the server must send its greeting.
+        interrupt: descriptors that interrupt the wait, with their poll events, as in `polling.wait_ready`.
         attempt: a connection that has already been opened.
-        keep_trying: seconds for which to try again if there is no server yet, and in which a server may greet.
-        end: the monotonic time by which the server must have greeted in any case, or None.
+        keep_trying: seconds for which to try again if there is no server yet. If this time is longer than `patience`,
+            the server may use the rest of it for its greeting.
+        end: with `keep_trying`, the monotonic time by which the server must have sent its greeting. None for no limit.
 
     Raises:
         ServerUnavailable, AccessDenied, ProtocolMismatch, Busy: there is no server that can be used.
+        Interrupted: one of the interrupting descriptors is ready.
     """
     from talkcli.errors import AccessDenied, Busy, ServerUnavailable
 
@@ -256,7 +265,7 @@ def connect(
 
 
 def _may_start(attempt: ConnectionAttempt) -> bool:
-    """Return whether a server may soon start at one of the places that were tried."""
+    """Return whether a server may soon start at one of the failed places."""
     found = (paths.describe_place(path, error) for path, error in attempt.failures if isinstance(error, OSError))
     return any(each in {paths.PLACE_ABSENT, paths.PLACE_STALE} for each in found)
 
@@ -268,14 +277,18 @@ def _greet(
     end: float,
     interrupt: Mapping[int, int] | None,
 ) -> ConnectionAttempt:
-    """Send hello, unless that was done, and read the greeting by `end`. Close the connection if that fails.
+    """Send hello unless that was done, and read the greeting by `end` (monotonic). Close the connection on any error.
 
     Raises:
-        ConnectionError: the server hangs up first.
+        ConnectionError: the server closed the connection before it sent a greeting.
         ServerUnavailable, AccessDenied, ProtocolMismatch, Busy: the server can't be used.
+        Interrupted: one of the interrupting descriptors is ready.
     """
-    from talkcli import __version__
+    from select import POLLIN
+
+    from talkcli import __version__, peers
     from talkcli.client.core import identity, read_greeting
+    from talkcli.errors import ServerUnavailable
     from talkcli.protocol.lines import request_line
 
     received = attempt.received
@@ -284,9 +297,16 @@ def _greet(
             try:
                 connected.send(request_line(hello))
             except (BrokenPipeError, ConnectionResetError):
-                pass  # the server has closed it, but its reason can be read
+                pass  # the server has closed the connection, but the reason can still be read
         while b"\n" not in received:
-            received += _receive(connected, attempt.path, end, interrupt)
+            if not wait_ready({connected.fileno(): POLLIN}, end - time.monotonic(), interrupt):
+                listener, _ = peers.credentials(connected)
+                hint = f"look at process {listener}, and restart it if it hangs"
+                raise ServerUnavailable(f"the server at {attempt.path} does not answer; {hint}")
+            data = connected.recv(65536)
+            if not data:
+                raise ConnectionResetError
+            received += data
         line, _, received = received.partition(b"\n")
         boot, pid = identity(read_greeting(line, attempt.path, __version__))
     except BaseException:
@@ -295,32 +315,15 @@ def _greet(
     return replace(attempt, received=received, boot=boot, pid=pid)
 
 
-def _receive(connected: _socket.socket, path: str, end: float, interrupt: Mapping[int, int] | None) -> bytes:
-    """Return the next bytes of a greeting, which must be received by `end`."""
-    from select import POLLIN
-
-    from talkcli import peers
-    from talkcli.errors import ServerUnavailable
-
-    if not wait_ready({connected.fileno(): POLLIN}, end - time.monotonic(), interrupt):
-        pid, _ = peers.credentials(connected)
-        hint = f"look at process {pid}, and restart it if it hangs"
-        raise ServerUnavailable(f"the server at {path} does not answer; {hint}")
-    data = connected.recv(65536)
-    if not data:
-        raise ConnectionResetError
-    return data
-
-
 def unreachable(attempt: ConnectionAttempt, named: str | None) -> TalkError:
-    """Return an error that lists the places that were tried, and the next step."""
+    """Return an error that lists the failed places, and tells the user what to do next."""
     from talkcli.errors import AccessDenied, ServerUnavailable
 
     if attempt.backlog_full:
         path = attempt.failures[-1][0]
         return ServerUnavailable(f"the server at {path} does not take up connections: restart it if it hangs")
     tried = ""
-    found = ""  # at the last place, which is the only one if the user named it
+    found = ""  # what is at the last place; there is only one place if the user named it
     denied = False
     for path, error in attempt.failures:
         words = str(error)
@@ -342,7 +345,13 @@ def unreachable(attempt: ConnectionAttempt, named: str | None) -> TalkError:
 
 
 def _named_step(named: str, found: str, *, denied: bool) -> str:
-    """Return the next step if only the place that the user named was tried."""
+    """Return what the user can do next if the socket was named by an option or a variable.
+
+    Args:
+        named: the path as the user named it.
+        found: what is there, as described by `paths.describe_place`.
+        denied: whether the server there refuses this user.
+    """
     import shlex  # slow to import
 
     from talkcli.terminal.text import printable
@@ -361,5 +370,5 @@ def _named_step(named: str, found: str, *, denied: bool) -> str:
 
 
 def _inside(directory: str) -> str:
-    """Return the path of the socket in a directory."""
+    """Return the path of a socket with the usual name in a directory."""
     return f"{directory.rstrip('/')}/{paths.SOCKET_NAME}"

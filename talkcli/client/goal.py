@@ -1,7 +1,7 @@
 """Handles of goals, and the merged events of several goals.
 
-A handle needs a connection, but no client. Handles don't read: a thread that waits on the connection reads for all of
-them. They only change under the connection's lock, and never after their goal has ended.
+A handle needs a connection, but no client. The connection delivers the events of all handles while any thread waits for
+one of them. A handle changes only while the connection's lock is held, and never after its goal has ended.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 
 
 class GoalHandle(TrackedGoal):
-    """A goal that was sent or is followed. Any number of threads may use it.
+    """A goal that this client has sent or follows. Any number of threads may use it.
 
-    Events are kept until they are taken; of words and pauses, the last 5,000. `events`, `feedback` and `poll` take from
-    the same buffer, so each event is returned once, and a loop that was left can be continued by a new one. An iterator
-    is for one thread. Another thread needs its own.
+    Events are buffered until they are read. If there are more than 5,000 words and pauses, the oldest are dropped.
+    `events`, `feedback` and `poll` read from the same buffer, so each event is returned only once. A new loop continues
+    where an interrupted one stopped. Each thread needs an iterator of its own.
     """
 
     def __init__(self, connection: Connection, goal: Goal) -> None:
@@ -42,7 +42,7 @@ class GoalHandle(TrackedGoal):
 
     @property
     def id(self) -> str:
-        """The goal's id; empty if the goal was REJECTED before it had one."""
+        """The goal's id. It is empty if the goal was REJECTED before it was given an id."""
         return self.goal.id
 
     @property
@@ -53,13 +53,13 @@ class GoalHandle(TrackedGoal):
     def wait(self, timeout: float | None = None) -> Goal:
         """Wait until the goal has ended, and return it.
 
-        If the server goes away first, the goal ends as LOST: it may have been spoken or not.
+        If the connection to the server is lost for good, the goal ends as LOST. It may or may not have been spoken.
 
         Args:
-            timeout: the longest wait in seconds; None for no limit.
+            timeout: time limit in seconds; None for no limit.
 
         Raises:
-            TimeoutError: the goal has not ended in this time. It goes on.
+            TimeoutError: the goal has not ended in this time. The goal itself is not affected.
         """
         end = _end(timeout)
         self._follow(feedback=False)
@@ -68,14 +68,14 @@ class GoalHandle(TrackedGoal):
         return self.goal
 
     def events(self, timeout: float | None = None) -> Iterator[Event]:
-        """Iterate over the goal's events as they happen. The last one is its Result.
+        """Iterate over the goal's events as they happen. The last event is the Result.
 
-        There is a StateChanged for each state. A goal that was sent or followed with `feedback` also has a WordHeard
-        for each word as it is heard, and a PausedChanged when speech is paused or resumed. If the server goes away
-        first, the goal ends as LOST.
+        There is a StateChanged for each state. If the goal was sent or followed with `feedback`, there is also a
+        WordHeard for each word as it is heard, and a PausedChanged whenever speech is paused or resumed. If the
+        connection to the server is lost for good, the goal ends as LOST.
 
         Args:
-            timeout: seconds from this call in which the goal must end; None for no limit.
+            timeout: seconds in which the goal must end, counted from this call; None for no limit.
 
         Raises:
             TimeoutError: the goal has not ended in this time.
@@ -85,27 +85,34 @@ class GoalHandle(TrackedGoal):
         return self._events(end, timeout)
 
     def feedback(self, timeout: float | None = None) -> Iterator[WordHeard]:
-        """Iterate over the goal's words as they are heard, until it has ended.
+        """Iterate over the goal's words as they are heard, until the goal has ended.
 
-        A goal that was sent without `feedback` yields the words from this call on. The timeout is that of `events`.
+        If the goal was sent without `feedback`, only words that are heard after this call are yielded.
+
+        Args:
+            timeout: seconds in which the goal must end, counted from this call; None for no limit.
+
+        Raises:
+            TimeoutError: the goal has not ended in this time.
         """
         end = _end(timeout)
         self._follow(feedback=True)
         return (each for each in self._events(end, timeout) if isinstance(each, WordHeard))
 
     def poll(self) -> Event | None:
-        """Return the goal's next event without waiting, None if there is none now. The last event is the Result.
+        """Return the goal's next event without waiting, or None if there is no new event. The last event is the Result.
 
-        It is for loops that must not wait. Each call reads from the server, and sends the rest of earlier requests, so
-        call it regularly.
+        This is for loops that must not wait. Call it regularly, because each call also receives the events of other
+        goals, and sends the rest of earlier requests.
 
         Raises:
             UsageError: the goal was sent with `follow=False`, and neither `wait` nor `events` has been called.
         """
         if self._followed_at is None and not self.state.terminal:
             raise UsageError(f"nothing is heard of {self.id}, which was sent with follow=False: leave that out")
-        now, since = time.monotonic(), self._followed_at
-        if not self._connection.wait_until(self._has_event, now, since=since, interruptible=False):
+        since = None if self.state.terminal else self._followed_at
+        self._connection.wait_until(lambda: False, time.monotonic(), since=since, interruptible=False)
+        if not self._has_event():
             self._lose()
         with self._connection.changed:
             event = self._take()
@@ -114,7 +121,7 @@ class GoalHandle(TrackedGoal):
         return event
 
     def request_cancel(self) -> None:
-        """Ask the server to cancel the goal, without waiting. `wait` or `poll` tells how the goal ended.
+        """Ask the server to cancel the goal, without waiting. Use `wait` or `poll` to learn how the goal ends.
 
         Raises:
             ServerUnavailable: the client is closed, or 256 KiB of requests are waiting to be sent.
@@ -123,7 +130,13 @@ class GoalHandle(TrackedGoal):
             self._connection.post(Cancel((self.id,)))
 
     def cancel(self) -> Goal:
-        """Cancel the goal, and return it after it has ended. If it was being spoken, it is silent then."""
+        """Cancel the goal, and return it once it has ended and is silent.
+
+        Raises:
+            UnknownGoal: the server doesn't know the goal, for example because the server was restarted.
+            ServerUnavailable: the server can't be reached.
+            Lost: the server didn't answer. The goal may have been cancelled.
+        """
         if not self.state.terminal:
             found = Canceled.from_items(self._connection.request(Cancel((self.id,)))[1])
             goal = next((each for each in (*found.canceled, *found.ended) if each.id == self.id), None)
@@ -135,7 +148,7 @@ class GoalHandle(TrackedGoal):
     # -- inside
 
     def _listen(self, *, feedback: bool) -> None:
-        """Become a listener for the goal's events, under the connection's lock."""
+        """Start listening for the goal's events. The caller holds the connection's lock."""
         self._listen_to(self._connection.listeners, feedback=feedback, now=time.monotonic())
 
     def _events(self, end: float | None, timeout: float | None) -> Iterator[Event]:
@@ -150,7 +163,7 @@ class GoalHandle(TrackedGoal):
                 yield event
 
     def _follow(self, *, feedback: bool) -> None:
-        """Have the server send the goal's events to this connection, if it doesn't yet."""
+        """Ask the server to send the goal's events to this connection, unless it already does."""
         if self.state.terminal or (self._followed_at is not None and (self._with_feedback or not feedback)):
             return
 
@@ -161,7 +174,7 @@ class GoalHandle(TrackedGoal):
         self._connection.request(Wait((self.id,), feedback), accepted)
 
     def _give_up(self, timeout: float | None) -> None:
-        """End the goal as LOST if the connection has ended; otherwise raise TimeoutError."""
+        """End the goal as LOST if the connection has ended. Raise TimeoutError if it hasn't."""
         if not self._lose():
             raise TimeoutError(f"{self.id} has not ended after {0 if timeout is None else round(timeout, 1):g} s")
 
@@ -175,23 +188,30 @@ class GoalHandle(TrackedGoal):
 
 
 def merged(handles: Sequence[GoalHandle], timeout: float | None = None) -> Iterator[tuple[GoalHandle, Event]]:
-    """Iterate over the events of several goals of one connection, each with its handle, until all goals have ended.
+    """Iterate over the events of several goals as they happen, until all goals have ended.
 
-    The last event of each goal is its Result. A pause of all speech is yielded once. If the server goes away, the
+    The last event of each goal is its Result. A pause of all speech is yielded only once. If the connection ends, the
     remaining goals end as LOST.
 
+    Args:
+        handles: the goals, which must use the same connection.
+        timeout: seconds in which all goals must end; None for no limit.
+
+    Yields:
+        The handle of a goal, and an event of this goal.
+
     Raises:
-        TimeoutError: some goals have not ended `timeout` seconds after the iteration began.
+        TimeoutError: some goals have not ended in this time.
     """
     stream = _EventStream(handles)
     if not handles:
         return
     for found in taken(handles[0]._connection, stream.take, _end(timeout)):
         if not found:
-            for each in stream.going:
+            for each in stream.unfinished:
                 each._give_up(timeout)
         yield from found
-        if not stream.going:
+        if not stream.unfinished:
             return
 
 
@@ -200,15 +220,16 @@ class _EventStream:
 
     def __init__(self, handles: Sequence[GoalHandle]) -> None:
         #: the goals that have not ended, without duplicates
-        self.going = list({each.id: each for each in handles}.values())
-        #: the number of each goal's last event, which its Result follows
-        self._last_numbers = dict.fromkeys((each.id for each in self.going), 0)
+        self.unfinished = list({each.id: each for each in handles}.values())
+        #: the number of the last event of each goal, by which the goal's Result is sorted
+        self._last_numbers: dict[str, int] = {}
+        #: the number of the last pause, which each goal receives
         self._pause_number: int | None = None
 
     def take(self) -> list[tuple[GoalHandle, Event]]:
-        """Remove and return the events of all goals, under the connection's lock."""
+        """Remove and return the events of all goals. The caller holds the connection's lock."""
         found = []
-        for handle in self.going:
+        for handle in self.unfinished:
             event: Event | None = None
             while not isinstance(event, Result) and (event := handle._take()):
                 number = getattr(event, "n", None)
@@ -219,11 +240,11 @@ class _EventStream:
                 if number is not None:
                     self._last_numbers[handle.id] = number
                 found.append((self._last_numbers.get(handle.id, 0), handle, event))
-        self.going = [each for each in self.going if not each.state.terminal]
-        # The sort is stable, so a Result stays behind its goal's last event, whose number it shares.
+        self.unfinished = [each for each in self.unfinished if not each.state.terminal]
+        # A Result has the number of its goal's last event. It stays behind this event, because the sort is stable.
         return [(handle, event) for _, handle, event in sorted(found, key=lambda each: each[0])]
 
 
 def _end(timeout: float | None) -> float | None:
-    """Return the monotonic time of a timeout's end."""
+    """Return the monotonic time at which a timeout ends, or None if there is no timeout."""
     return None if timeout is None else time.monotonic() + timeout
