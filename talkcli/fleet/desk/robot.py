@@ -97,7 +97,7 @@ class RobotConnection(Connection):
             raise UsageError(
                 f"the name of the sender has {len(self._sender)} characters, the longest is {MAX_SENDER_NAME_CHARS}"
             )
-        self._robot, self._desk = robot, desk
+        self.robot, self._desk = robot, desk
         self._numbers = numbers or self._numbers
         self.path = f"{robot} ({desk.broker.url})"
         self._interrupt, self._end = interrupt, end
@@ -156,7 +156,7 @@ class RobotConnection(Connection):
 
         if self.ended is not None or self.absent_since is not None:
             return False
-        if not self._desk.send(exchange.request, exchange.number, self._robot, on_refused):
+        if not self._desk.send(exchange.request, exchange.number, self.robot, on_refused):
             return False
         self._published_at = time.monotonic()
         exchange.sent = True
@@ -183,7 +183,7 @@ class RobotConnection(Connection):
         error = super().refusal(reply, items)
         kinds = {"not_allowed": AccessDenied, "no_server": NoServer, "stale": ServerUnavailable, "lost": Lost}
         kind = kinds.get(error.code)
-        return kind(f"{self._robot}: {error.message}") if kind else error
+        return kind(f"{self.robot}: {error.message}") if kind else error
 
     # -- messages from the robot
 
@@ -198,8 +198,8 @@ class RobotConnection(Connection):
 
     def on_connected(self, link: Link) -> None:
         """Subscribe to the robot's replies and its presence."""
-        link.subscribe(self._desk.reply_topic(self._robot), retained=False)
-        link.subscribe(topics.robot(self._robot, topics.PRESENCE), retained=True)
+        link.subscribe(self._desk.reply_topic(self.robot), retained=False)
+        link.subscribe(topics.robot(self.robot, topics.PRESENCE), retained=True)
 
     def on_disconnected(self, why: str) -> None:
         """Treat the robot as absent until its presence is received again."""
@@ -211,7 +211,7 @@ class RobotConnection(Connection):
     def on_message(self, message: Message) -> None:
         """Process the robot's presence, or lines from its server."""
         with self.changed:
-            if message.topic == topics.robot(self._robot, topics.PRESENCE):
+            if message.topic == topics.robot(self.robot, topics.PRESENCE):
                 self._update_presence(message.payload)
             else:
                 self.receive(message.payload, time.monotonic())
@@ -230,9 +230,9 @@ class RobotConnection(Connection):
         self._presence = presence
         server = presence.get("server")
         if presence.get("online") is not True:
-            self._mark_absent(f"{self._robot} is offline")
+            self._mark_absent(f"{self.robot} is offline")
         elif not isinstance(server, dict):
-            self._mark_absent(f"{self._robot} has no talk server at this moment")
+            self._mark_absent(f"{self.robot} has no talk server at this moment")
         elif self._bridge_session != presence.get("session") or self.absent_since is not None:
             self.boot, self.pid = identity(server)
             self._bridge_session = presence.get("session")
@@ -252,8 +252,8 @@ class RobotConnection(Connection):
             self._desk.poll(left, self._interrupt)
         self._patience = max(self._patience, round(give_up - time.monotonic(), 1))
         if not self._presence:
-            words = f"no robot '{self._robot}' is known at {self._desk.broker.url}: nothing was sent"
-            raise ServerUnavailable(f"{words}; on the robot: talk bridge --name {self._robot}")
+            words = f"no robot '{self.robot}' is known at {self._desk.broker.url}: nothing was sent"
+            raise ServerUnavailable(f"{words}; on the robot: talk bridge --name {self.robot}")
         self.check_online()
 
     def check_online(self) -> None:
@@ -353,7 +353,7 @@ class RobotConnection(Connection):
     def end_session(self) -> None:
         """End this desk's session with the robot's bridge."""
         if self._bridge_session is not None:
-            self._desk.end_session(self._robot)
+            self._desk.end_session(self.robot)
 
     def _hang_up(self) -> None:
         self.end_session()

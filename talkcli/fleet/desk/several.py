@@ -319,7 +319,7 @@ class FleetRequest:
             connection = RobotConnection(
                 name, self._desk, name=self._name, patience=self._patience, numbers=self._numbers
             )
-            self._robots[name] = RobotRequest(connection, name, self.request, self._record)
+            self._robots[name] = RobotRequest(connection, self.request, self._record)
         return self._robots[name]
 
     def _include(self, name: str) -> None:
@@ -332,25 +332,22 @@ class FleetRequest:
         if name in self._unfinished:
             self._robots[name].update(check_time=check_time)
 
-    def _record(self, outcome: Outcome) -> None:
-        self._outcomes.append(outcome)
-        if outcome.last:
-            self._unfinished.discard(outcome.robot)
+    def _record(self, *outcomes: Outcome) -> None:
+        self._outcomes += outcomes
+        self._unfinished -= {each.robot for each in outcomes if each.last}
 
 
 class RobotRequest:
     """The part of a `FleetRequest` that is for one robot."""
 
-    def __init__(
-        self, connection: RobotConnection, name: str, request: Request, record: Callable[[Outcome], None]
-    ) -> None:
-        """Prepare the request. `record` is called with each outcome."""
+    def __init__(self, connection: RobotConnection, request: Request, record: Callable[..., None]) -> None:
+        """Prepare the request. `record` is called with all outcomes."""
         self.connection = connection
         #: the robot's last presence; None if unknown
         self.presence: Presence | None = None
         #: whether the request was sent to this robot or to its group
         self.was_asked = False
-        self._name, self._request, self._record = name, request, record
+        self._name, self._request, self._record = connection.robot, request, record
         #: whether the answer may take any amount of time
         self._slow = isinstance(request, Pause) or (isinstance(request, Say) and request.patient)
         #: the goals that haven't been reported as ended, and the start of the wait for them (monotonic)
@@ -411,14 +408,13 @@ class RobotRequest:
         self._handles.extend(GoalHandle(self.connection, each) for each in found)
         for each in self._handles:
             each._listen(feedback=False)
-        for outcome in [] if found else reply_outcomes(self._name, request, reply, items):
-            self._record(outcome)
+        if not found:
+            self._record(*reply_outcomes(self._name, request, reply, items))
 
     def _on_failure(self, error: TalkError) -> None:
         try:
             items = error.items if isinstance(error, UnknownGoal) else []
-            for outcome in cancel_outcomes(self._name, items, last=False):
-                self._record(outcome)
+            self._record(*cancel_outcomes(self._name, items, last=False))
         except Unreadable as malformed:
             error = malformed
         self._record(failure_outcome(self._name, error))
