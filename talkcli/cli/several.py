@@ -16,6 +16,7 @@ from talkcli.cli.show import note, retry_without_output, show, show_error, show_
 from talkcli.cli.wait import CANCEL_TIMEOUT_S, seconds_left, timeout_error
 from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.errors import EXIT_DIFFER, EXIT_OK, EXIT_TIMEOUT, TalkError, UsageError
+from talkcli.frozen import replace
 from talkcli.goals.options import Cancel, Say, Set
 from talkcli.polling import Interrupted
 from talkcli.protocol.requests import Pause, Request, Resume, Status, Wait
@@ -147,10 +148,8 @@ class _OutcomePrinter:
 
     def __init__(self, options: CommonOptions, request: Request) -> None:
         self._options, self._request = options, request
-        #: the first failure of each robot, or its last outcome if nothing has failed
+        #: each robot's first failure, or its last outcome if nothing has failed. `last` is that of its last outcome.
         self._outcomes: dict[str, Outcome] = {}
-        #: robots whose last outcome hasn't arrived
-        self._unfinished: set[str] = set()
         shows_count = not options.quiet and sys.stderr is not None and sys.stderr.isatty()
         self._terminal = sys.stderr if shows_count else None
 
@@ -167,14 +166,11 @@ class _OutcomePrinter:
             self._clear_count()
 
     def _add(self, outcome: Outcome) -> None:
-        # If a robot seemed absent but then answers, its answer replaces the failure.
-        robot = outcome.robot
-        if robot not in self._unfinished or not self._outcomes[robot].exit_code:
-            self._outcomes[robot] = outcome
-        if outcome.last:
-            self._unfinished.discard(robot)
-        else:
-            self._unfinished.add(robot)
+        before = self._outcomes.get(outcome.robot)
+        # A failure that was the last outcome is replaced, because the robot only seemed to be absent.
+        if before is not None and before.exit_code and not before.last:
+            outcome = replace(before, last=outcome.last)
+        self._outcomes[outcome.robot] = outcome
 
     def summarize(self, fleet_request: FleetRequest, unknown: str = "not done") -> int:
         """Show how many robots carried out the request, and why others failed. Return the exit code.
@@ -184,14 +180,14 @@ class _OutcomePrinter:
             unknown: how to describe the robots whose last outcome hasn't arrived.
         """
         failures = [each for each in self._outcomes.values() if each.exit_code]
-        done = [robot for robot, each in self._outcomes.items() if not each.exit_code and robot not in self._unfinished]
+        done = sum(each.last and not each.exit_code for each in self._outcomes.values())
         if not self._options.quiet:
             for words in _failure_notes(failures)[:_MAX_NOTES]:
                 note(words)
             if fleet_request.unfinished_robots:
                 why = f": {fleet_request.why_disconnected}" if fleet_request.why_disconnected else ""
                 note(f"{unknown}: {_join_names(fleet_request.unfinished_robots)}{why}")
-            note(f"{len(done)} of {len(fleet_request)} as asked")
+            note(f"{done} of {len(fleet_request)} as asked")
         codes = {each.exit_code for each in failures}
         return EXIT_DIFFER if len(codes) > 1 else next(iter(codes), EXIT_OK)
 
@@ -209,7 +205,8 @@ class _OutcomePrinter:
     def _show_count(self, fleet_request: FleetRequest) -> None:
         """Show how many robots have finished, if standard error is a terminal."""
         if self._terminal:
-            self._terminal.write(f"\r{len(self._outcomes) - len(self._unfinished)} of {len(fleet_request)}")
+            finished = sum(each.last for each in self._outcomes.values())
+            self._terminal.write(f"\r{finished} of {len(fleet_request)}")
             self._terminal.flush()
 
     def _clear_count(self) -> None:

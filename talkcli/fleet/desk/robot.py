@@ -124,7 +124,7 @@ class RobotConnection(Connection):
             self._desk.wake()  # the request will be sent when the robot is back
 
     def expect_reply(self, exchange: RobotExchange) -> None:
-        """Wait for the robot's answer to a request that was sent to its group."""
+        """Register a request that was sent to the robot's group, so that its answer is processed."""
         exchange.sent = True
         self._published_at = time.monotonic()
         self.register(exchange, self._published_at)

@@ -84,7 +84,7 @@ class FleetRequest:
         self._selection, self._name, self._interrupt, self._patience = selection, name, interrupt, patience
         #: the known robots by name, including those that came online too late for the request
         self._robots: dict[str, RobotRequest] = {}
-        #: names of the robots that the request is for, and of those whose last outcome hasn't arrived
+        #: names of the robots that the request includes, and of those among them whose last outcome hasn't arrived
         self._included, self._unfinished = set[str](), set[str]()
         self._outcomes: deque[Outcome] = deque()
         self._numbers = itertools.count(FIRST_NUMBER)
@@ -364,7 +364,7 @@ class RobotRequest:
             self._on_failure(error)
 
     def expect_reply(self, number: int, latest: float | None) -> None:
-        """Wait for the robot's answer to the request that was sent to its group.
+        """Register the request that was sent to the robot's group, so that its answer is processed.
 
         Args:
             number: the number of that request.

@@ -151,7 +151,7 @@ class FleetTranscript:
         return self._transcripts[name].lines(event, screen, now)
 
     def change(self, before: Presence | None, robot: Presence, screen: Screen, now: float) -> list[str]:
-        """Return the line for a robot that has come or gone, or whose server has. Goals seen before are forgotten.
+        """Return the line that reports a change of a robot or its server. The robot's earlier goals are forgotten.
 
         Args:
             before: the presence before the change; None if the robot was unknown.

@@ -44,7 +44,7 @@ class FleetSnapshot:
 
 @frozen
 class RobotChanged:
-    """A robot or its server has come or gone. The broker doesn't know it if `before` or `now` is None."""
+    """A robot or its server has come or gone. `before` or `now` is None if its presence is unknown."""
 
     name: str
     before: Presence | None
