@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from talkcli.cli.show import CommonOptions
     from talkcli.client.client import Client, GoalHandle
     from talkcli.client.core import Exchange
-    from talkcli.goals.goal import JsonObject
 
     _T = TypeVar("_T")
 
@@ -209,13 +208,9 @@ class LineSpeaker:
         self._sending: int | None = None
         #: the goal that was sent and has not been answered yet, with its request
         self._unanswered: tuple[GoalHandle, Exchange] | None = None
-        #: the last goal that was accepted, as the server's answer described it
-        self._accepted = Goal("", State.PENDING)
         #: the goals that have not ended, with their line numbers, in the order of the lines; with --wait also the ended
         #: goals that have not been reported
         self._goals: deque[tuple[int, GoalHandle]] = deque()
-        #: the time from which the server must send answers or signs of life (monotonic)
-        self._expected_since = 0.0
         #: whether a note has already said that speech is paused
         self._pause_known = False
         #: the error after which nothing more is read or sent
@@ -332,14 +327,7 @@ class LineSpeaker:
         if handle.state is State.REJECTED:
             self._report_refused(line.number, handle.goal)
             return
-        if not self._goals:
-            self._expected_since = time.monotonic()
-
-        def on_reply(reply: JsonObject, items: list[JsonObject]) -> None:
-            accepted(reply, items)
-            self._accepted = handle.goal  # the goal in the handle may have ended when the answer is reported
-
-        self._unanswered = handle, self._connection.begin(request, on_reply)
+        self._unanswered = handle, self._connection.begin(request, accepted)
 
     def _take_answer(self) -> None:
         """Handle the server's answer to the last line if it has come or the connection has ended."""
@@ -348,15 +336,15 @@ class LineSpeaker:
         (handle, exchange), number = self._unanswered, self._sending or 0
         self._unanswered = None
         self._connection.forget(exchange)
-        self._connection.answer(exchange)
+        reply, _ = self._connection.answer(exchange)
         if handle.state is State.REJECTED:
             self._report_refused(number, handle.goal)
             return
         self._sending = None
         self._show(self._reporter.show_accepted, handle, self._pause_known)
         self._pause_known = handle.speech_paused
-        if not self._wait:
-            self._show(self._reporter.report, self._accepted)
+        if not self._wait:  # the goal in the handle may have ended since the reply
+            self._show(self._reporter.report, Goal.from_json(reply.get("goal")))
         elif not self._goals:
             self._feedback.begin([handle.goal])
         self._goals.append((number, handle))
@@ -399,7 +387,9 @@ class LineSpeaker:
                 return True  # without a goal, the server sends no signs of life
             return self._full != was_full or (self._wait and bool(self._goals) and self._goals[0][1]._has_event())
 
-        wait = partial(self._connection.wait_until, has_news, since=self._expected_since)
+        # While it has goals, the server sends signs of life. Without goals, its silence counts from the request.
+        since = self._unanswered[1].heard_at if self._unanswered and not self._goals else 0.0
+        wait = partial(self._connection.wait_until, has_news, since=since)
         if self._wants_input:
             watched[0] = select.POLLIN
         try:
