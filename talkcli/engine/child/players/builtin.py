@@ -20,8 +20,9 @@ if TYPE_CHECKING:
 
     from talkcli.engine.child.players.base import Interest
 
-#: Seconds of sound that the null player accepts ahead of its clock, which is as much as a real player buffers.
-NULL_AHEAD_S = 0.06
+#: Seconds of sound that the null player accepts ahead of its clock: as much as a real player buffers, and 1 ms for
+#: rounding.
+NULL_AHEAD_S = 0.061
 
 _WAV_HEADER = struct.Struct("<4sI4s4sIHHIIHH4sI")
 #: The number of header bytes that the length after "RIFF" counts.
@@ -76,30 +77,24 @@ class NullPlayer(BuiltInPlayer):
     def __init__(self, rate: int, _device: str | None = None, _audible: bool = False) -> None:
         super().__init__()
         self._bytes_per_second = rate * SAMPLE_BYTES
-        self._started: float | None = None
+        #: the time at which the last accepted sample would have been heard
+        self._end_time = 0.0
 
     def offer(self, data: memoryview) -> int:
         now = self._clock()
-        if self._started is None:
-            self._started = now
-        self._started += max(0.0, now - self._end_time())  # the time without samples counts as silence
-        if self._taken + len(data) > (now - self._started + NULL_AHEAD_S) * self._bytes_per_second:
+        end = max(now, self._end_time) + len(data) / self._bytes_per_second
+        if end > now + NULL_AHEAD_S:
             return 0
+        self._end_time = end
         self._taken += len(data)
         return len(data)
 
     def ended(self) -> bool:
-        return self._closed and (self._started is None or self._clock() >= self._end_time())
+        return self._closed and self._clock() >= self._end_time
 
     def wake_at(self) -> float | None:
-        if self._started is None:
-            return self._clock()
         # A third of the buffer is free then, so this player wakes up no more often than a real one.
-        return self._end_time() if self._closed else self._end_time() - NULL_AHEAD_S * 2 / 3
-
-    def _end_time(self) -> float:
-        """Return the time at which the last accepted sample would have been heard."""
-        return (self._started or 0.0) + self._taken / self._bytes_per_second
+        return self._end_time if self._closed else self._end_time - NULL_AHEAD_S * 2 / 3
 
 
 class WavPlayer(BuiltInPlayer):

@@ -159,17 +159,15 @@ def load() -> Any:
     """Return an object with libpulse's functions (without the prefix "pa_") and the C library's `poll`.
 
     Raises:
-        OSError: libpulse isn't installed, or lacks a function.
+        OSError: libpulse can't be loaded.
+        AttributeError: libpulse lacks a function.
     """
     library, poll = ctypes.CDLL(_LIBPULSE), ctypes.CDLL(None).poll
     poll.argtypes = [POINTER(PollDescriptor), ctypes.c_ulong, c_int]
     functions = {"poll": poll}
     for names, result, arguments in _SIGNATURES:
         for name in names.split():
-            try:
-                function = getattr(library, f"pa_{name}")
-            except AttributeError as error:
-                raise OSError(str(error)) from error
+            function = getattr(library, f"pa_{name}")
             function.restype, function.argtypes = result, arguments
             functions[name] = function
     return SimpleNamespace(**functions)

@@ -191,11 +191,9 @@ def _tie(leash: int, group: int) -> None:
 
 def _exit_descriptor(pid: int) -> int | None:
     """Return a descriptor that becomes readable when the process exits, or None if the system has none."""
-    if not hasattr(os, "pidfd_open"):
-        return None
     try:
         return os.pidfd_open(pid)
-    except OSError:  # the kernel is old, or a sandbox forbids it
+    except (AttributeError, OSError):  # the system or the kernel is too old, or a sandbox forbids it
         return None
 
 
@@ -257,8 +255,8 @@ class ProgramPlayer(Player):
         except OSError as error:
             text = error.strerror or str(error)
             raise CannotSpeak(Reason.NO_PLAYER, f"{self.name} cannot be started: {text}") from error
-        self._overhead = len(command.preamble)
-        self._written = 0
+        #: the number of sample bytes in the pipe so far
+        self._written = -len(command.preamble)
         self._consumed = 0
         self._broken_at: float | None = None
         self._closed = False
@@ -280,10 +278,9 @@ class ProgramPlayer(Player):
     def consumed(self) -> int:
         """Return the number of sample bytes that the program has read from the pipe."""
         if self._process.stdin is not None and self._broken_at is None:
-            read = self._written - _unread_bytes(self._process.stdin) - self._overhead
-            self._consumed = max(self._consumed, read)
+            self._consumed = max(self._consumed, self._written - _unread_bytes(self._process.stdin))
         elif self._closed:
-            self._consumed = self._written - self._overhead
+            self._consumed = self._written
         if self._consumed > self._command.read_ahead:
             self.proven = True
         return self._consumed

@@ -100,7 +100,7 @@ class PulsePlayer(Player):
         self._muted = self._level_refused = False
         try:
             self._lib = libpulse.load()
-        except OSError as error:
+        except (OSError, AttributeError) as error:
             raise CannotSpeak(Reason.NO_PLAYER, f"libpulse cannot be loaded: {error}") from error
         self._started_callback = libpulse.StreamCallback(self._on_started)
         self._underflow_callback = libpulse.StreamCallback(self._on_underflow)

@@ -103,29 +103,18 @@ def load_library() -> tuple[Any, str, int]:
     origin, data = _preload()
     from pyttsx3.drivers import _espeak
 
-    with _hidden_sound_server():
-        rate = _espeak.Initialize(_espeak.AUDIO_OUTPUT_SYNCHRONOUS, _CALLBACK_MS, data, _DONT_EXIT)
+    # The library connects to PulseAudio, although it doesn't play anything. This takes 7 ms, or 30 s if PulseAudio
+    # hangs. The server gives up the engine process earlier than that, so the sound server is hidden.
+    sound_server = os.environ.get("PULSE_SERVER")
+    os.environ["PULSE_SERVER"] = "unix:/dev/null"
+    rate = _espeak.Initialize(_espeak.AUDIO_OUTPUT_SYNCHRONOUS, _CALLBACK_MS, data, _DONT_EXIT)
+    del os.environ["PULSE_SERVER"]
+    if sound_server is not None:
+        os.environ["PULSE_SERVER"] = sound_server
     if rate <= 0:
         raise NotInstalled("there is no espeak-ng data: sudo apt-get install -y libespeak-ng1 espeak-ng-data")
     version = (_espeak.Info(None) or b"").decode("utf-8", "replace").split(" ")[0]
     return _espeak, f"eSpeak NG {version} ({origin})", rate
-
-
-@contextlib.contextmanager
-def _hidden_sound_server() -> Iterator[None]:
-    """Hide PulseAudio from the library.
-
-    Although the library doesn't play anything, its initialization connects to PulseAudio. This takes 7 ms, or 30 s if
-    PulseAudio hangs. The server gives up the engine process earlier than that.
-    """
-    before = os.environ.get("PULSE_SERVER")
-    os.environ["PULSE_SERVER"] = "unix:/dev/null"
-    try:
-        yield
-    finally:
-        del os.environ["PULSE_SERVER"]
-        if before is not None:
-            os.environ["PULSE_SERVER"] = before
 
 
 def _preload() -> tuple[str, bytes | None]:

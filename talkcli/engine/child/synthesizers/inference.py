@@ -18,18 +18,17 @@ import stat
 import tempfile
 import time
 
+from talkcli import install
 from talkcli.engine.child.synthesizers.vits import NotSplit, split_model
 from talkcli.engine.models import BEGIN_SYMBOL, END_SYMBOL, NO_TELEMETRY, PAD_SYMBOL, VoiceFileError, open_checked
 from talkcli.frozen import TYPE_CHECKING, frozen
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
-    from typing import Any, TypeVar
+    from typing import Any
 
     from talkcli.engine.child.synthesizers.vits import Buffer
     from talkcli.engine.models import VoiceDescription
-
-    _T = TypeVar("_T")
 
 os.environ.update(NO_TELEMETRY)  # onnxruntime reads this when it is imported
 
@@ -98,7 +97,7 @@ class ModelCache:
             return None
         return paths
 
-    def store(self, key: str, make_encoder: Callable[[str | None], _T], decoder: Iterable[Buffer]) -> _T:
+    def store(self, key: str, make_encoder: Callable[[str | None], Any], decoder: Iterable[Buffer]) -> Any:
         """Make the encoder, and store both halves.
 
         Args:
@@ -188,7 +187,7 @@ class Model:
             content: bytes = file.read(size)
         key = f"{hashlib.sha256(content).hexdigest()}-{_SPLIT_VERSION}-{onnxruntime.__version__}"
         cached = cache.find(key) if cache is not None else None
-        if cache is not None and cached is not None:
+        if cached is not None:
             try:
                 # the cached encoder is already optimized
                 unchanged = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
@@ -315,8 +314,7 @@ def load_libraries(path: str) -> None:
         path: The path of the model for the error message.
 
     Raises:
-        VoiceFileError: There is not enough memory.
-        ImportError: The packages can't be imported.
+        VoiceFileError: The packages can't be imported, or there is not enough memory.
     """
     try:
         import numpy as np  # noqa: F401 - first, because onnxruntime doesn't report why numpy fails
@@ -324,7 +322,7 @@ def load_libraries(path: str) -> None:
     except Exception as error:
         if _is_out_of_memory(error):
             raise no_memory_error(path) from error
-        raise ImportError(_first_line(error)) from error
+        raise VoiceFileError(f"{path} cannot be loaded ({_first_line(error)}): {install.neural()}") from error
 
 
 def _split(path: str, content: bytes, cache: ModelCache | None, key: str) -> tuple[Any, Any]:

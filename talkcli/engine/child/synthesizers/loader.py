@@ -15,17 +15,19 @@ import traceback
 from collections import deque
 from typing import Generic, TypeVar
 
-from talkcli import install
 from talkcli.engine import models
 from talkcli.engine.child.synthesizers.inference import Model, ModelCache, load_libraries
 from talkcli.engine.models import VoiceFileError
 from talkcli.engine.protocol import LOAD_LIMIT_S, VoiceLoaded, VoiceMemory, VoiceUnloaded
-from talkcli.frozen import TYPE_CHECKING, frozen
+from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import NEURAL_PREFIX
 from talkcli.paths import cache_directory
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+
+    #: the inode, the size and the time of the last change of each file
+    _Stamps = tuple[tuple[int, int, int], ...]
 
 #: The growth of the process in bytes that triggers a new measurement and the return of freed memory to the system.
 #: Smaller amounts aren't returned, because the next sentence would need them again.
@@ -107,21 +109,14 @@ class BackgroundIterator(threading.Thread, Generic[_T]):
                 os.write(self._write_end, b"\0")
 
 
-@frozen
-class LoadedModel:
-    """A model in memory, with the stamps of its files from before it was loaded."""
-
-    model: Model
-    stamps: tuple[tuple[int, int, int], ...]
-
-
 class ModelLoader:
     """Keeps the loaded models, and loads queued voices one after the other."""
 
     def __init__(self) -> None:
-        self._models: dict[str, LoadedModel] = {}
+        #: the models by their voices, with the stamps of their files from before the load
+        self._models: dict[str, tuple[Model, _Stamps]] = {}
         self._waiting: deque[str] = deque()
-        self._load: BackgroundIterator[LoadedModel] | None = None
+        self._load: BackgroundIterator[tuple[Model, _Stamps]] | None = None
         #: the voice that is being loaded, and the monotonic time when its load started
         self._voice = ""
         self._started_at = 0.0
@@ -164,12 +159,12 @@ class ModelLoader:
     def model(self, voice: str) -> Model | None:
         """Return the model of a voice, or None if it isn't loaded."""
         self._check_load()
-        found = self._models.get(voice)
-        if found and voice in self._suspect and found.stamps != _stamps(found.model.path):
+        model, stamps = self._models.get(voice, (None, ()))
+        if model and voice in self._suspect and stamps != _stamps(model.path):
             self.drop(voice)
             self._events.append(VoiceUnloaded(voice))
             return None
-        return found.model if found else None
+        return model
 
     def error(self, voice: str) -> str | None:
         """Return the error message of a voice's last load, or None if the load didn't fail."""
@@ -208,10 +203,10 @@ class ModelLoader:
             loaded = load.take()
             assert loaded is not None
         except VoiceFileError as error:
-            self._record_failure(str(error), self._elapsed())
+            self._record_failure(str(error))
         except Exception as error:  # noqa: BLE001 - a faulty voice must not cost the engine process
             traceback.print_exception(error)
-            self._record_failure(f"{voice} cannot be loaded: {type(error).__name__}: {error}", self._elapsed())
+            self._record_failure(f"{voice} cannot be loaded: {type(error).__name__}: {error}")
         else:
             self._models[voice] = loaded
             self._measure(voice)
@@ -233,9 +228,9 @@ class ModelLoader:
     def _elapsed(self) -> float:
         return round(time.monotonic() - self._started_at, 3)
 
-    def _record_failure(self, why: str, seconds: float) -> None:
+    def _record_failure(self, why: str) -> None:
         self._errors[self._voice] = why
-        self._events.append(VoiceLoaded(self._voice, seconds, why))
+        self._events.append(VoiceLoaded(self._voice, self._elapsed(), why))
 
     def _start_next(self) -> None:
         """Start the next load. Only one runs at a time because it needs a processor and twice the model's memory."""
@@ -244,7 +239,7 @@ class ModelLoader:
             try:
                 path = _model_path(self._voice)
             except VoiceFileError as error:
-                self._record_failure(str(error), 0.0)
+                self._record_failure(str(error))
                 continue
             if self._initial_bytes is None:
                 self._initial_bytes = _own_bytes()
@@ -266,7 +261,7 @@ def _model_path(voice: str) -> str:
     return path
 
 
-def _stamps(path: str) -> tuple[tuple[int, int, int], ...]:
+def _stamps(path: str) -> _Stamps:
     """Return values that change whenever a voice's files change, or () if a file can't be examined."""
     try:
         found = [os.stat(each) for each in (path, path + models.JSON_SUFFIX)]
@@ -275,7 +270,7 @@ def _stamps(path: str) -> tuple[tuple[int, int, int], ...]:
     return tuple((each.st_ino, each.st_size, each.st_mtime_ns) for each in found)
 
 
-def _load(path: str) -> Iterator[LoadedModel]:
+def _load(path: str) -> Iterator[tuple[Model, _Stamps]]:
     """Yield the model at a path.
 
     Raises:
@@ -284,11 +279,9 @@ def _load(path: str) -> Iterator[LoadedModel]:
     try:
         load_libraries(path)  # this comes first, so that any load that takes long has already imported them
         stamps = _stamps(path)
-        yield LoadedModel(Model(path, models.read_description(path), _open_cache()), stamps)
+        yield Model(path, models.read_description(path), _open_cache()), stamps
     except OSError as error:
         raise VoiceFileError(f"{path} cannot be read: {error.strerror}") from error
-    except ImportError as error:
-        raise VoiceFileError(f"{path} cannot be loaded ({error}): {install.neural()}") from error
     except MemoryError as error:
         raise VoiceFileError(f"{path} cannot be loaded: there is no memory for it; end another program") from error
 

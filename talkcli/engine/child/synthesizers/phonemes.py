@@ -174,14 +174,10 @@ def _align(first: str, second: str, places: Sequence[int]) -> list[int]:
         return [place * len(second) // len(first) for place in places]
     import difflib
 
-    blocks = difflib.SequenceMatcher(None, first, second, autojunk=False).get_matching_blocks()
-    begins = [each.a for each in blocks]
+    matcher = difflib.SequenceMatcher(None, first, second, autojunk=False)
+    blocks = [difflib.Match(0, 0, 0), *matcher.get_matching_blocks()]
     found = []
     for place in places:
-        number = bisect.bisect_right(begins, place) - 1
-        if number < 0:
-            found.append(0)
-        else:
-            block = blocks[number]
-            found.append(block.b + min(place - block.a, block.size))
+        block = blocks[bisect.bisect_right(blocks, place, key=lambda each: each.a) - 1]
+        found.append(block.b + min(place - block.a, block.size))
     return found
