@@ -252,7 +252,7 @@ def players(_: CommonOptions, __: str) -> Offers:
     """Offer the names of the players."""
     from talkcli.engine.players import PLAYERS
 
-    return [(name, each.about) for name, each in PLAYERS.items()]
+    return [(name, each.description) for name, each in PLAYERS.items()]
 
 
 def _status(options: CommonOptions) -> ServerStatus:

@@ -245,6 +245,7 @@ def _others_can_write(path: str, status: os.stat_result, file: str | int) -> boo
 
 
 def _check_owner(path: str, status: os.stat_result) -> None:
+    """Raise VoiceFileError if a file belongs to another user, who could change it."""
     if status.st_uid not in {0, os.geteuid()}:
         words = f"{path} is another user's (#{status.st_uid}), who could change the voice"
         raise VoiceFileError(f"{words}: put it into a directory of your own")
@@ -294,6 +295,7 @@ def _model_directories(environment: Mapping[str, str] | None) -> Iterator[str]:
 
 
 def _described_voice(name: str, path: str) -> Voice:
+    """Return the voice with a model at a path, with its description if that can be read."""
     try:
         found = read_description(path)
     except VoiceFileError:
@@ -314,50 +316,52 @@ def _parse_description(found: Any) -> VoiceDescription:
     """
     if found.get("phoneme_type", "espeak") != "espeak":
         raise ValueError(f"its sounds are not libespeak-ng's, but {found['phoneme_type']!r}")
-    phoneme_ids = {str(key): tuple(map(_integer, value)) for key, value in found["phoneme_id_map"].items()}
+    phoneme_ids = {str(key): tuple(map(_checked_integer, value)) for key, value in found["phoneme_id_map"].items()}
     if max(map(len, phoneme_ids.values()), default=0) > _MAX_IDS_PER_PHONEME:
         raise ValueError(f"phoneme_id_map has more than {_MAX_IDS_PER_PHONEME} numbers for a sound")
     for each in (PAD_SYMBOL, BEGIN_SYMBOL, END_SYMBOL):
         if not phoneme_ids.get(each):
             raise ValueError(f"phoneme_id_map has no {each}")
-    rate = _integer(found["audio"]["sample_rate"])
+    rate = _checked_integer(found["audio"]["sample_rate"])
     if rate not in _RATES_HZ:
         raise ValueError(f"{rate} samples a second")
     inference = found.get("inference", {})
     names = found.get("speaker_id_map") or {}
-    quality = _shortened(found["audio"].get("quality") or "")
-    speakers = _integer(found.get("num_speakers", 1))
+    quality = _shorten(found["audio"].get("quality") or "")
+    speakers = _checked_integer(found.get("num_speakers", 1))
     if speakers > _MAX_SPEAKERS:
         raise ValueError(f"{speakers} speakers")
-    parts = [_shortened(found.get("dataset") or ""), quality, f"{speakers} speakers" if speakers > 1 else ""]
+    parts = [_shorten(found.get("dataset") or ""), quality, f"{speakers} speakers" if speakers > 1 else ""]
     code = found.get("language", {}).get("code") or found["espeak"]["voice"]
     return VoiceDescription(
         rate=rate,
-        espeak_voice=_shortened(found["espeak"]["voice"]),
-        language=_shortened(code).replace("_", "-").lower(),
+        espeak_voice=_shorten(found["espeak"]["voice"]),
+        language=_shorten(code).replace("_", "-").lower(),
         name=", ".join(filter(None, parts)) or "Piper",
         quality=quality or None,
         speakers=speakers,
-        speaker_names={str(key): _integer(value) for key, value in names.items()},
+        speaker_names={str(key): _checked_integer(value) for key, value in names.items()},
         phoneme_ids=phoneme_ids,
-        noise=_factor(inference.get("noise_scale", 0.667)),
-        duration_noise=_factor(inference.get("noise_w", 0.8)),
-        duration_scale=_factor(inference.get("length_scale", 1.0), least=0.1),
+        noise=_checked_factor(inference.get("noise_scale", 0.667)),
+        duration_noise=_checked_factor(inference.get("noise_w", 0.8)),
+        duration_scale=_checked_factor(inference.get("length_scale", 1.0), least=0.1),
     )
 
 
-def _shortened(value: object) -> str:
+def _shorten(value: object) -> str:
     words = str(value)
     return words if len(words) <= _MAX_SHOWN_CHARS else f"{words[:_MAX_SHOWN_CHARS]}…"
 
 
-def _integer(value: object) -> int:
+def _checked_integer(value: object) -> int:
+    """Return a value from a JSON file if it is an integer from 0 to 2,147,483,647, or else raise ValueError."""
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 31:
         raise ValueError(f"{value!r} is no number of a kind that is expected")
     return value
 
 
-def _factor(value: object, least: float = 0.0) -> float:
+def _checked_factor(value: object, least: float = 0.0) -> float:
+    """Return a value from a JSON file if it is a number from `least` to 10, or else raise ValueError."""
     if not isinstance(value, int | float) or not least <= value <= 10:
         raise ValueError(f"{value!r} is no factor")
     return float(value)

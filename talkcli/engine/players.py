@@ -65,14 +65,14 @@ class KnownPlayer:
     """A player with a name of its own: either a program or a class in `talkcli.engine.child.players`."""
 
     #: a short description of its output, such as "ALSA"
-    about: str
+    description: str
     #: the Debian package that contains it
     package: str = ""
     #: for a program: the function that builds its command line from the sample rate and the device
     command: Callable[[int, str | None], PlayerCommand] | None = None
     #: for a class: its location as "module:Class". The class is called with the sample rate, the device, and whether a
     #: muted output is an error.
-    opens: str = ""
+    class_path: str = ""
     #: whether the automatic choice includes it. If the user names only a device, the choice includes only programs.
     automatic: bool = False
     #: whether it makes no sound and therefore needs no device
@@ -120,9 +120,9 @@ PLAYERS = {
     "pacat": KnownPlayer("PulseAudio", "pulseaudio-utils", _pacat, automatic=True),
     "pw-cat": KnownPlayer("PipeWire", "pipewire-bin", _pw_cat, automatic=True),
     "pulse": KnownPlayer(
-        "the sound server, PulseAudio's or PipeWire's", "libpulse0", opens="pulse:PulsePlayer", automatic=True
+        "the sound server, PulseAudio's or PipeWire's", "libpulse0", class_path="pulse:PulsePlayer", automatic=True
     ),
-    "null": KnownPlayer("silent, in real time", opens="builtin:NullPlayer", silent=True),
+    "null": KnownPlayer("silent, in real time", class_path="builtin:NullPlayer", silent=True),
 }
 #: The Debian package of each player program.
 PACKAGES = {name: each.package for name, each in PLAYERS.items() if each.command is not None}
@@ -180,6 +180,7 @@ def player_commands(player: str | None, device: str | None, rate: int, last: str
 
 
 def _custom_command(player: str, device: str | None, rate: int) -> PlayerCommand:
+    """Return the command line for a custom player command with its placeholders filled in."""
     import shlex
 
     try:
@@ -196,7 +197,7 @@ def _custom_command(player: str, device: str | None, rate: int) -> PlayerCommand
 
 def playback_devices(nodes: str = "/dev/snd") -> list[str]:
     """Return the paths of the kernel's playback devices, such as /dev/snd/pcmC0D0p."""
-    return [f"{nodes}/{each}" for each in _listed(nodes) if each.startswith("pcmC") and each.endswith("p")]
+    return [f"{nodes}/{each}" for each in _list_directory(nodes) if each.startswith("pcmC") and each.endswith("p")]
 
 
 def sound_server_sockets(env: Mapping[str, str], *uids: int) -> list[str]:
@@ -212,8 +213,8 @@ def sound_server_sockets(env: Mapping[str, str], *uids: int) -> list[str]:
     if env.get("PIPEWIRE_RUNTIME_DIR"):
         found.append(f"{env['PIPEWIRE_RUNTIME_DIR']}/pipewire-0")
     # If there is no runtime directory, PulseAudio creates one in /tmp, and a link to it in its configuration directory.
-    settings = f"{_settings(env)}/pulse"
-    found += [f"{settings}/{each}/native" for each in _listed(settings) if each.endswith("-runtime")]
+    config = f"{_config_home(env)}/pulse"
+    found += [f"{config}/{each}/native" for each in _list_directory(config) if each.endswith("-runtime")]
     return [each for each in dict.fromkeys(found) if os.path.exists(each)]
 
 
@@ -225,24 +226,26 @@ def has_no_output(env: Mapping[str, str], nodes: str = "/dev/snd", etc: str = "/
     """
     if playback_devices(nodes) or any(map(env.get, _SOUND_VARIABLES)) or sound_server_sockets(env, os.getuid()):
         return False
-    alsa = (f"{env.get('HOME', '')}/.asoundrc", f"{_settings(env)}/alsa/asoundrc", f"{etc}/asound.conf")
-    pulse = [f"{each}/pulse/client.conf" for each in (_settings(env), etc)]
-    pulse += [f"{each}.d/{name}" for each in pulse for name in _listed(f"{each}.d")]
-    return not any(map(os.path.exists, alsa)) and not any(map(_names_a_server, pulse))
+    alsa = (f"{env.get('HOME', '')}/.asoundrc", f"{_config_home(env)}/alsa/asoundrc", f"{etc}/asound.conf")
+    pulse = [f"{each}/pulse/client.conf" for each in (_config_home(env), etc)]
+    pulse += [f"{each}.d/{name}" for each in pulse for name in _list_directory(f"{each}.d")]
+    return not any(map(os.path.exists, alsa)) and not any(map(_has_default_server, pulse))
 
 
-def _settings(env: Mapping[str, str]) -> str:
+def _config_home(env: Mapping[str, str]) -> str:
+    """Return the user's configuration directory."""
     return env.get("XDG_CONFIG_HOME") or f"{env.get('HOME', '')}/.config"
 
 
-def _names_a_server(path: str) -> bool:
+def _has_default_server(path: str) -> bool:
     """Return whether a configuration file of PulseAudio's clients names a server; Debian's default file doesn't."""
     with contextlib.suppress(OSError), open(path, "rb") as file:
         return any(line.lstrip().startswith(b"default-server") for line in file)
     return False
 
 
-def _listed(directory: str) -> list[str]:
+def _list_directory(directory: str) -> list[str]:
+    """Return the sorted names in a directory, or an empty list if it can't be read."""
     with contextlib.suppress(OSError):
         return sorted(os.listdir(directory))
     return []

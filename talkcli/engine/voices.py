@@ -160,6 +160,7 @@ def _short_names(neural: str) -> list[str]:
 
 
 def _find_exact(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> Voice | None:
+    """Return the voice with a name in one of the documented forms, or None."""
     if is_neural(wanted):
         return _find_neural(wanted, voices)
     if preferred is not None and is_neural(preferred):
@@ -207,6 +208,7 @@ def speaker_number(word: str, numbers: Mapping[str, int], count: int) -> int:
 
 
 def _find_neural(wanted: str, voices: tuple[Voice, ...]) -> Voice | None:
+    """Return the neural voice with an id and possibly a speaker, or None."""
     name, mark, speaker = wanted.partition(SPEAKER_MARK)
     found = _by_name(name, [each for each in voices if is_neural(each.id)], by_id=True)
     if found is None or (mark and not speaker):
@@ -291,6 +293,7 @@ def _by_name(wanted: str, voices: Sequence[Voice], *, by_id: bool = False) -> Vo
 
 
 def _fold(word: str) -> str:
+    """Return a name in the form in which names are compared: lower case, with dashes instead of underscores."""
     return word.casefold().replace("_", "-")
 
 
@@ -330,6 +333,7 @@ def _similar(wanted: str, words: dict[str, Voice]) -> list[str]:
 
 
 def _to_voice(found: Any) -> Voice:
+    """Return a voice of a pyttsx3 engine as a `Voice`."""
     language = found.languages[0] if found.languages else None
     if isinstance(language, bytes):  # drivers for older pyttsx3 versions prepend a priority byte
         language = language[1:].decode("utf-8", "replace")

@@ -352,7 +352,7 @@ def test_libespeak_speaks_on_as_before_after_it_was_asked_how_another_language_s
     try:
         espeak.load("gmw/de")
         before = _spoken(espeak, "zwanzig Züge", SpeechSettings(rate=300))
-        with espeak.lend("en-us") as speller:
+        with espeak.phonemizer("en-us") as speller:
             assert speller.word_positions("twenty trains") == [(0, 6), (7, 6)]
         _assert_alike(_spoken(espeak, "zwanzig Züge", SpeechSettings(rate=300)), before)
     finally:
@@ -377,7 +377,7 @@ def test_the_end_of_a_spelling_waits_for_nothing_and_the_next_sentence_for_the_l
             speller.clauses("hello")
         order.append("stopped")
 
-    with espeak.lend("de") as speller:
+    with espeak.phonemizer("de") as speller:
         library, speller._to_phonemes = speller._to_phonemes, held
         thread = threading.Thread(target=spell)
         thread.start()
@@ -401,7 +401,7 @@ def test_the_end_of_a_spelling_waits_for_nothing_and_the_next_sentence_for_the_l
     ],
 )
 def test_a_sentence_ends_where_libespeak_makes_a_pause(language: str, text: str, ends: list[str]) -> None:
-    with _espeak().lend(language) as speller:
+    with _espeak().phonemizer(language) as speller:
         found = list(split_text(speller, text))
     starts = [each.words[0][1] for each in found]
     sentences = [text[begin:end].rstrip() for begin, end in zip(starts, [*starts[1:], None], strict=True)]

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import Output
 
 #: The players of the automatic choice that run in this process. They are tried before any program.
-_AUTOMATIC = [name for name, each in PLAYERS.items() if each.automatic and each.opens]
+_AUTOMATIC_CLASSES = [name for name, each in PLAYERS.items() if each.automatic and each.class_path]
 
 #: Seconds without sound after which a device counts as idle. The next sentence then starts with the lead-in. Sound
 #: cards with power saving (snd_hda_intel) sleep after 1 s, and sound servers suspend a device after 5 s. Silence that
@@ -104,8 +104,8 @@ class PlayerChooser:
         #: the names of the players in this process that are tried first
         self._in_process: Sequence[str] = ()
         if configure.player is configure.device is None:
-            self._in_process = _AUTOMATIC
-        elif configure.player in PLAYERS and PLAYERS[configure.player].opens:
+            self._in_process = _AUTOMATIC_CLASSES
+        elif configure.player in PLAYERS and PLAYERS[configure.player].class_path:
             self._in_process = [configure.player]
         self._streaming = False
         self.handovers = HandoverTimes()
@@ -199,9 +199,9 @@ class PlayerChooser:
 
 def _open(name: str, rate: int, device: str | None = None, audible: bool = False) -> Player:
     """Open a player in this process by its name in PLAYERS."""
-    module, _, member = PLAYERS[name].opens.partition(":")
-    opens = getattr(import_module(f"talkcli.engine.child.players.{module}"), member)
-    player: Player = opens(rate, device, audible)
+    module, _, member = PLAYERS[name].class_path.partition(":")
+    player_class = getattr(import_module(f"talkcli.engine.child.players.{module}"), member)
+    player: Player = player_class(rate, device, audible)
     return player
 
 

@@ -97,7 +97,7 @@ class PlayerProcess:
             if hasattr(fcntl, "F_SETPIPE_SZ"):
                 fcntl.fcntl(our_stdin, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
             self.pid = _spawn(argv, stdin, stderr, [tied, *inherited])
-            _tie(tied, self.pid)
+            _attach_leash(tied, self.pid)
         except BaseException:
             close(our_stdin, our_stderr, leash)
             raise
@@ -179,7 +179,7 @@ def _spawn(argv: tuple[str, ...], stdin: int, stderr: int, inherited: Sequence[i
             os.set_inheritable(each, False)
 
 
-def _tie(leash: int, group: int) -> None:
+def _attach_leash(leash: int, group: int) -> None:
     """Make the kernel kill a process group when the other end of its leash is closed."""
     if not hasattr(fcntl, "F_SETSIG"):
         return

@@ -166,7 +166,7 @@ class Espeak:
         self._sink: SampleSink | None = None
         self._raised: BaseException | None = None
         #: the phonemizer that was created last. It may still be using the library, unless it is None.
-        self._borrower: EspeakPhonemizer | None = None
+        self._phonemizer: EspeakPhonemizer | None = None
         found = (each for each in _ENGLISH if espeak.SetVoiceByName(each.encode()) == espeak.EE_OK)
         self.voice = next(found, "")
         if not self.voice:
@@ -175,13 +175,13 @@ class Espeak:
 
     def voices(self) -> tuple[Voice, ...]:
         """Return the normal voices, the usable MBROLA voices, and the variants."""
-        self._take_back()
+        self._stop_phonemizer()
         espeak = self._espeak
         return (*_list_voices(espeak, None), *_mbrola_voices(espeak), *_variants(espeak))
 
     def load(self, voice: str) -> None:
         """Load a voice by its id, with or without a variant, or by another name that the library knows."""
-        self._take_back()
+        self._stop_phonemizer()
         # After some voices, the next voice is up to a third slower unless the rate is set again.
         self._parameters.clear()
         if not voice or self._espeak.SetVoiceByName(voice.encode("utf-8", "replace")) != self._espeak.EE_OK:
@@ -193,7 +193,7 @@ class Espeak:
 
     def speak(self, text: str, settings: SpeechSettings, sink: SampleSink) -> None:
         """Speak as `Synthesizer` describes; the samples vary slightly between calls."""
-        self._take_back()
+        self._stop_phonemizer()
         sink.begin(self._rate, self.voice)
         espeak = self._espeak
         self._set_parameters(settings)
@@ -208,12 +208,12 @@ class Espeak:
 
     def load_language(self, language: str) -> None:
         """Load a voice of a language, such as "de-at", or of its first part, or else an English voice."""
-        self._take_back()
-        found = (self._find(each) for each in (language, language.partition("-")[0], *_ENGLISH))
+        self._stop_phonemizer()
+        found = (self._find_voice(each) for each in (language, language.partition("-")[0], *_ENGLISH))
         self.load(next((each.id for each in found if each), self.voice))
 
     @contextlib.contextmanager
-    def lend(self, language: str) -> Iterator[EspeakPhonemizer]:
+    def phonemizer(self, language: str) -> Iterator[EspeakPhonemizer]:
         """Return a context manager with a phonemizer, which another thread may use until the end of the `with` block.
 
         The synthesizer must not be used in the block. After it, calls of the phonemizer raise Stopped. A call that is
@@ -223,10 +223,10 @@ class Espeak:
         Raises:
             UnknownVoice: The library has no voice of this language.
         """
-        self._take_back()
-        voice = self._find(language)
+        self._stop_phonemizer()
+        voice = self._find_voice(language)
         voice_id = voice.id if voice is not None else ""
-        self._borrower = phonemizer = EspeakPhonemizer(self._espeak, voice_id)
+        self._phonemizer = phonemizer = EspeakPhonemizer(self._espeak, voice_id)
         if not voice_id or self._espeak.SetVoiceByName(voice_id.encode()) != self._espeak.EE_OK:
             raise UnknownVoice(f'{self.version} has no voice "{language}", which knows its sounds')
         self._espeak.SetParameter(self._espeak.RATE, _ESPEAK_DEFAULT_WPM, 0)
@@ -235,15 +235,16 @@ class Espeak:
         finally:
             phonemizer.end()
 
-    def _find(self, word: str) -> Voice | None:
+    def _find_voice(self, word: str) -> Voice | None:
+        """Return the voice with a name or language, or None."""
         self._listed = self._listed or _list_voices(self._espeak, None)
         return find_voice(word, self._listed)
 
-    def _take_back(self) -> None:
+    def _stop_phonemizer(self) -> None:
         """Wait until the last phonemizer has finished, and restore the synthesizer's voice."""
-        borrower, self._borrower = self._borrower, None
-        if borrower is not None:
-            borrower.wait()
+        phonemizer, self._phonemizer = self._phonemizer, None
+        if phonemizer is not None:
+            phonemizer.wait()
             self._espeak.SetSynthCallback(self._on_audio)
             self._espeak.SetVoiceByName(self.voice.encode())
             self._parameters.clear()

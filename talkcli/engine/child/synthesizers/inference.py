@@ -248,7 +248,7 @@ class Model:
         samples = self._run_half(self._decoder, parts, run)[0].reshape(-1)
         hop, rest = divmod(len(samples), high - low)
         if rest or not 0 < hop <= _MAX_FRAME_SAMPLES:
-            raise self._not_piper(f"it makes {len(samples)} samples of {high - low} frames")
+            raise self._not_piper_error(f"it makes {len(samples)} samples of {high - low} frames")
         part = samples[(begin - low) * hop : (end - low) * hop]
         if not np.isfinite(part).all():
             raise VoiceFileError(f"{self.path} makes no sound, but what is no number: get the voice anew")
@@ -268,11 +268,11 @@ class Model:
         names = {each.name for each in encoder.get_inputs()}
         self._has_speakers = _SPEAKER_INPUT in names
         if names - {_SPEAKER_INPUT} != {*_INPUTS}:
-            raise self._not_piper(f"it takes {', '.join(sorted(names))[:_MAX_ERROR_CHARS]}")
+            raise self._not_piper_error(f"it takes {', '.join(sorted(names))[:_MAX_ERROR_CHARS]}")
         if [each.type for each in decoder.get_outputs()] != ["tensor(float)"]:
-            raise self._not_piper("it makes no samples")
+            raise self._not_piper_error("it makes no samples")
         if self._has_speakers != (self.description.speakers > 1):
-            raise self._mismatch("one has several speakers, the other has one")
+            raise self._mismatch_error("one has several speakers, the other has one")
         self._frame_inputs = [each.name for each in decoder.get_inputs()]
         self._samples_per_frame = self._try_out()
 
@@ -294,15 +294,15 @@ class Model:
         except VoiceFileError as error:
             if _is_out_of_memory(error.__cause__):
                 raise
-            raise self._mismatch(str(error.__cause__ or error)) from error
+            raise self._mismatch_error(str(error.__cause__ or error)) from error
         if not frames.count:
             raise VoiceFileError(f"{self.path} speaks nothing: get the voice anew")
         return len(self.decode(frames, 0, frames.count, run)) // frames.count
 
-    def _not_piper(self, why: str) -> VoiceFileError:
+    def _not_piper_error(self, why: str) -> VoiceFileError:
         return VoiceFileError(f"{self.path} is none of Piper's models ({why}): get the voice anew")
 
-    def _mismatch(self, why: str) -> VoiceFileError:
+    def _mismatch_error(self, why: str) -> VoiceFileError:
         both = f"{self.path} and {os.path.basename(self.path)}.json"
         return VoiceFileError(f"{both} do not belong together ({why[:_MAX_ERROR_CHARS]}): get both from the same place")
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     #: the inode, the size and the time of the last change of each file
-    _Stamps = tuple[tuple[int, int, int], ...]
+    _Fingerprints = tuple[tuple[int, int, int], ...]
 
 #: The growth of the process in bytes that triggers a new measurement and the return of freed memory to the system.
 #: Smaller amounts aren't returned, because the next sentence would need them again.
@@ -113,10 +113,10 @@ class ModelLoader:
     """Keeps the loaded models, and loads queued voices one after the other."""
 
     def __init__(self) -> None:
-        #: the models by their voices, with the stamps of their files from before the load
-        self._models: dict[str, tuple[Model, _Stamps]] = {}
+        #: the models by their voices, with the fingerprints of their files from before the load
+        self._models: dict[str, tuple[Model, _Fingerprints]] = {}
         self._waiting: deque[str] = deque()
-        self._load: BackgroundIterator[tuple[Model, _Stamps]] | None = None
+        self._load: BackgroundIterator[tuple[Model, _Fingerprints]] | None = None
         #: the voice that is being loaded, and the monotonic time when its load started
         self._voice = ""
         self._started_at = 0.0
@@ -159,8 +159,8 @@ class ModelLoader:
     def model(self, voice: str) -> Model | None:
         """Return the model of a voice, or None if it isn't loaded."""
         self._check_load()
-        model, stamps = self._models.get(voice, (None, ()))
-        if model and voice in self._suspect and stamps != _stamps(model.path):
+        model, fingerprints = self._models.get(voice, (None, ()))
+        if model and voice in self._suspect and fingerprints != _fingerprints(model.path):
             self.drop(voice)
             self._events.append(VoiceUnloaded(voice))
             return None
@@ -170,11 +170,11 @@ class ModelLoader:
         """Return the error message of a voice's last load, or None if the load didn't fail."""
         return self._errors.get(voice)
 
-    def suspect(self, voice: str) -> None:
+    def mark_suspect(self, voice: str) -> None:
         """Record that a loaded voice failed to speak. It is dropped after its files have changed."""
         self._suspect.add(voice)
 
-    def spoken(self, voice: str) -> None:
+    def mark_spoken(self, voice: str) -> None:
         """Record that a voice has spoken, because its first sentences allocate memory that is kept."""
         if voice not in self._models:
             self._unmeasured = ""  # the voice was dropped during the sentence, so its memory is only released now
@@ -218,11 +218,11 @@ class ModelLoader:
     def _measure(self, voice: str, min_growth: float = -math.inf) -> None:
         """Report the growth of the process's memory, unless a voice that spoke added less than `min_growth` bytes."""
         self._unmeasured = None
-        before, now = self._initial_bytes, _own_bytes()
+        before, now = self._initial_bytes, _private_bytes()
         if before is None or now is None or (voice and now - before - self._reported_growth < min_growth):
             return
         _trim_heap()
-        self._reported_growth = max(0, (_own_bytes() or now) - before)
+        self._reported_growth = max(0, (_private_bytes() or now) - before)
         self._events.append(VoiceMemory(voice, self._reported_growth))
 
     def _elapsed(self) -> float:
@@ -242,7 +242,7 @@ class ModelLoader:
                 self._record_failure(str(error))
                 continue
             if self._initial_bytes is None:
-                self._initial_bytes = _own_bytes()
+                self._initial_bytes = _private_bytes()
             self._load = BackgroundIterator(_load(path), max_ahead=1)
 
 
@@ -261,7 +261,7 @@ def _model_path(voice: str) -> str:
     return path
 
 
-def _stamps(path: str) -> _Stamps:
+def _fingerprints(path: str) -> _Fingerprints:
     """Return values that change whenever a voice's files change, or () if a file can't be examined."""
     try:
         found = [os.stat(each) for each in (path, path + models.JSON_SUFFIX)]
@@ -270,7 +270,7 @@ def _stamps(path: str) -> _Stamps:
     return tuple((each.st_ino, each.st_size, each.st_mtime_ns) for each in found)
 
 
-def _load(path: str) -> Iterator[tuple[Model, _Stamps]]:
+def _load(path: str) -> Iterator[tuple[Model, _Fingerprints]]:
     """Yield the model at a path.
 
     Raises:
@@ -278,8 +278,8 @@ def _load(path: str) -> Iterator[tuple[Model, _Stamps]]:
     """
     try:
         load_libraries(path)  # this comes first, so that any load that takes long has already imported them
-        stamps = _stamps(path)
-        yield Model(path, models.read_description(path), _open_cache()), stamps
+        fingerprints = _fingerprints(path)
+        yield Model(path, models.read_description(path), _open_cache()), fingerprints
     except OSError as error:
         raise VoiceFileError(f"{path} cannot be read: {error.strerror}") from error
     except MemoryError as error:
@@ -295,7 +295,7 @@ def _open_cache() -> ModelCache | None:
         return None
 
 
-def _own_bytes() -> int | None:
+def _private_bytes() -> int | None:
     """Return this process's private memory, including swapped pages, or None if it is unknown (in a sandbox)."""
     try:
         with open("/proc/self/status", "rb") as file:

@@ -23,6 +23,8 @@ else:
 #: The maximum number of phonemes in a part. The time and memory that a model needs grow with their square. On a PC, 250
 #: phonemes take 0.25 s and 60 MB, and 800 phonemes take 2 s and 450 MB.
 MAX_PART_PHONEMES = 250
+#: The maximum number of phonemes in a part without the pause mark at its end.
+_MAX_SECTION_PHONEMES = MAX_PART_PHONEMES - 1
 #: The number of phonemes after which a part may also end at a comma.
 _LONG_PART_PHONEMES = 150
 #: The maximum number of comparisons for aligning two strings, which take up to 50 ms. This is enough for a clause of
@@ -80,57 +82,48 @@ def split_text(phonemizer: Phonemizer, text: str) -> Iterator[SpeechPart]:
 
     The phonemizer is only used when the next part is requested.
     """
+    phonemes: list[str] = []
+    words: list[tuple[int, int, int]] = []
+
+    def finish(*, ends_sentence: bool) -> SpeechPart:
+        """Return the collected part, and start a new one."""
+        part = SpeechPart(tuple(phonemes), tuple(words), ends_sentence)
+        phonemes.clear()
+        words.clear()
+        return part
+
     offset = 0
-    pending = _PendingPart()
     for clause, ipa in phonemizer.clauses(text):
         groups = _phoneme_groups(ipa)
         clause_words = _locate_words(phonemizer, clause, groups) if groups else []
         at = 0
-        if len(pending.phonemes) > _LONG_PART_PHONEMES:
-            yield pending.finish(ends_sentence=False)
-        for group in groups:
-            inside = [each for each in clause_words if at <= each[0] < at + len(group)]
-            words = [(place - at, offset + start, length) for place, start, length in inside]
-            at += len(group)
-            # There must be room for a blank before the group and for a pause mark after it.
-            if pending.phonemes and len(pending.phonemes) + 1 + len(group) >= MAX_PART_PHONEMES:
-                yield pending.finish(ends_sentence=False)
-            yield from pending.add(group, words)
+        if len(phonemes) > _LONG_PART_PHONEMES:
+            yield finish(ends_sentence=False)
+        for section in _sections(groups):
+            if phonemes and len(phonemes) + 1 + len(section) > _MAX_SECTION_PHONEMES:
+                yield finish(ends_sentence=False)
+            if phonemes:
+                phonemes.append(" ")
+            inside = [each for each in clause_words if at <= each[0] < at + len(section)]
+            words += [(len(phonemes) + place - at, offset + start, length) for place, start, length in inside]
+            phonemes += section
+            at += len(section)
         mark = _LAST_PUNCTUATION.search(clause) if groups else None
         last = offset + len(clause) == len(text)
         if mark is not None and (last or mark.group() != "." or not phonemizer.ends_with_abbreviation(clause)):
-            pending.phonemes.append(_PUNCTUATION[mark.group()])
-            if pending.phonemes[-1] in _SENTENCE_ENDS:
-                yield pending.finish(ends_sentence=True)
+            phonemes.append(_PUNCTUATION[mark.group()])
+            if phonemes[-1] in _SENTENCE_ENDS:
+                yield finish(ends_sentence=True)
         offset += len(clause)
-    if pending.phonemes:
-        yield pending.finish(ends_sentence=True)
+    if phonemes:
+        yield finish(ends_sentence=True)
 
 
-class _PendingPart:
-    """The part that is being filled."""
-
-    def __init__(self) -> None:
-        self.phonemes: list[str] = []
-        self._words: list[tuple[int, int, int]] = []
-
-    def add(self, group: str, words: Sequence[tuple[int, int, int]]) -> Iterator[SpeechPart]:
-        """Add a group of phonemes and the words that begin in it, and yield full parts."""
-        if self.phonemes:
-            self.phonemes.append(" ")
-        for at in range(0, len(group), MAX_PART_PHONEMES - 1):
-            if at:
-                yield self.finish(ends_sentence=False)
-            section = group[at : at + MAX_PART_PHONEMES - 1]
-            inside = [each for each in words if at <= each[0] < at + len(section)]
-            self._words += [(len(self.phonemes) + place - at, start, length) for place, start, length in inside]
-            self.phonemes += section
-
-    def finish(self, *, ends_sentence: bool) -> SpeechPart:
-        """Return the part, and start a new one."""
-        part = SpeechPart(tuple(self.phonemes), tuple(self._words), ends_sentence)
-        self.phonemes, self._words = [], []
-        return part
+def _sections(groups: Sequence[str]) -> Iterator[str]:
+    """Yield the groups of phonemes, and those that are too long for a part in several sections."""
+    for group in groups:
+        for begin in range(0, len(group), _MAX_SECTION_PHONEMES):
+            yield group[begin : begin + _MAX_SECTION_PHONEMES]
 
 
 def _phoneme_groups(ipa: str) -> list[str]:

@@ -138,12 +138,12 @@ class Piper:
             raise CannotSpeak(Reason.UNKNOWN_VOICE, f"{self.voice}: {error}") from error
         try:
             sink.begin(about.rate, self.voice)
-            with self._espeak.lend(about.espeak_voice) as phonemizer:
+            with self._espeak.phonemizer(about.espeak_voice) as phonemizer:
                 self._write(model, speaker, split_text(phonemizer, text), settings, sink)
         except MemoryError as error:
             raise CannotSpeak(Reason.VOICE_FAILED, str(no_memory_error(self._path))) from error
         except (VoiceFileError, UnknownVoice) as error:
-            self.loader.suspect(voice)
+            self.loader.mark_suspect(voice)
             known = isinstance(error, VoiceFileError)
             words = str(error) if known else f"{model.path}.json: {error}: get the voice anew"
             raise CannotSpeak(Reason.VOICE_FAILED, words) from error
@@ -179,7 +179,7 @@ class Piper:
         finally:
             run.end()
             spoken_parts.close()
-            self.loader.spoken(self._model_id)
+            self.loader.mark_spoken(self._model_id)
 
 
 def _speak_parts(
