@@ -1,4 +1,4 @@
-"""The files of neural voices: finding them, checking who can change them, and reading their descriptions.
+"""Functions to find the files of neural voices, to check who can change them, and to read their descriptions.
 
 A voice consists of NAME.onnx and NAME.onnx.json, either in one of `paths.voice_directories` or in an installed package
 `*_piper_voice`. Users give the name of the file and never a path, so a client can't make the server read any other
@@ -167,10 +167,10 @@ def open_checked(path: str, missing: str = "put it there again", model: str | No
 
 
 def _check_paths(*paths: str) -> None:
-    """Check that no other user can replace files, nor any directory or link in their paths.
+    """Check that no other user can replace some files, or the directories and links in their paths.
 
     A sticky directory such as /tmp may be writable for everyone, because only the owner of an entry can replace it. But
-    it must not contain a voice file, or a link to one, directly.
+    it must not directly contain a voice file or a link to one.
 
     Raises:
         VoiceFileError: Another user could replace a file.
@@ -189,10 +189,10 @@ def _check_paths(*paths: str) -> None:
 
 
 def _walk_path(path: str) -> Iterator[tuple[str, bool]]:
-    """Yield the directories in a file's path and the file itself, each with whether another directory follows.
+    """Yield the directories in a file's path and the file itself, each with a flag.
 
-    Links are resolved. If a path doesn't exist, the walk ends before it, because opening the file then reports the
-    error.
+    The flag is True if another directory follows. Links are resolved. If a path doesn't exist, the walk ends before it,
+    because opening the file then reports the error.
 
     Raises:
         VoiceFileError: A link belongs to another user.
@@ -295,7 +295,7 @@ def _model_directories(environment: Mapping[str, str] | None) -> Iterator[str]:
 
 
 def _described_voice(name: str, path: str) -> Voice:
-    """Return the voice with a model at a path, with its description if that can be read."""
+    """Return the voice whose model is at a path, with its description if that can be read."""
     try:
         found = read_description(path)
     except VoiceFileError:
@@ -354,14 +354,14 @@ def _shorten(value: object) -> str:
 
 
 def _checked_integer(value: object) -> int:
-    """Return a value from a JSON file if it is an integer from 0 to 2,147,483,647, or else raise ValueError."""
+    """Return a value from a JSON file, or raise ValueError unless it is an integer from 0 to 2,147,483,647."""
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 31:
         raise ValueError(f"{value!r} is no number of a kind that is expected")
     return value
 
 
 def _checked_factor(value: object, least: float = 0.0) -> float:
-    """Return a value from a JSON file if it is a number from `least` to 10, or else raise ValueError."""
+    """Return a value from a JSON file, or raise ValueError unless it is a number from `least` to 10."""
     if not isinstance(value, int | float) or not least <= value <= 10:
         raise ValueError(f"{value!r} is no factor")
     return float(value)

@@ -1,4 +1,4 @@
-"""The known players, the command lines of player programs, and the playback devices of the machine.
+"""The players that users can name, the command lines of player programs, and the machine's playback devices.
 
 This module neither starts a program nor opens a device, so the server, doctor and the command line may use it. The
 classes that play sound are in `talkcli.engine.child.players`.
@@ -15,10 +15,10 @@ from talkcli.frozen import TYPE_CHECKING, frozen
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-#: Bytes of one sample (signed 16 bit, one channel).
+#: The size of a sample in bytes (signed 16 bit, one channel).
 SAMPLE_BYTES = 2
 
-#: Seconds of sound that a player is offered at a time. Short pieces keep the sound that follows a stop short.
+#: Seconds of sound that a player is offered at a time. With short pieces, little sound is still played after a stop.
 PIECE_S = 0.02
 
 #: Milliseconds of sound that a player may buffer. More would delay words, and would lose more sound if the player
@@ -62,20 +62,20 @@ class PlayerCommand:
 
 @frozen
 class KnownPlayer:
-    """A player with a name of its own: either a program or a class in `talkcli.engine.child.players`."""
+    """A player that users can select by name: a program, or a class in `talkcli.engine.child.players`."""
 
-    #: a short description of its output, such as "ALSA"
+    #: a short description of the player's output, such as "ALSA"
     description: str
-    #: the Debian package that contains it
+    #: the Debian package that contains the player
     package: str = ""
-    #: for a program: the function that builds its command line from the sample rate and the device
+    #: the function that builds a program's command line from the sample rate and the device, or None for a class
     command: Callable[[int, str | None], PlayerCommand] | None = None
-    #: for a class: its location as "module:Class". The class is called with the sample rate, the device, and whether a
-    #: muted output is an error.
+    #: the location of a class as "module:Class", or "" for a program. The class is called with the sample rate, the
+    #: device, and whether a muted output is an error.
     class_path: str = ""
-    #: whether the automatic choice includes it. If the user names only a device, the choice includes only programs.
+    #: whether the automatic choice includes this player. If the user names only a device, it includes only programs.
     automatic: bool = False
-    #: whether it makes no sound and therefore needs no device
+    #: whether this player makes no sound and therefore needs no device
     silent: bool = False
 
 
@@ -112,9 +112,9 @@ def _au_header(rate: int) -> bytes:
     return b"dns." + struct.pack("<5I", 24, unknown_length, pcm16, rate, 1)
 
 
-#: The known players by name. The automatic choice tries classes before programs, and otherwise keeps this order. The
-#: sound server comes first because it starts at once and reports more than any program does. aplay comes before the
-#: other programs because robots without a desktop have it, and because it loses no samples if it can't open the device.
+#: The players by name. The automatic choice tries classes before programs, and otherwise keeps this order. The sound
+#: server comes first because it starts at once and reports more than any program does. aplay comes before the other
+#: programs because robots without a desktop have it, and because it loses no samples if it can't open the device.
 PLAYERS = {
     "aplay": KnownPlayer("ALSA", "alsa-utils", _aplay, automatic=True),
     "pacat": KnownPlayer("PulseAudio", "pulseaudio-utils", _pacat, automatic=True),
@@ -219,7 +219,7 @@ def sound_server_sockets(env: Mapping[str, str], *uids: int) -> list[str]:
 
 
 def has_no_output(env: Mapping[str, str], nodes: str = "/dev/snd", etc: str = "/etc") -> bool:
-    """Return whether the players of this process certainly have no output.
+    """Return whether this process certainly has no output to play sound to.
 
     The function only looks at file names, so it wakes up no device. Any custom configuration counts as an output,
     because it may lead anywhere.

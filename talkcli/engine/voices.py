@@ -71,15 +71,15 @@ def find_voice(wanted: str, voices: tuple[Voice, ...], preferred: str | None = N
         wanted: The name that the user wrote.
         voices: The voices to choose from.
         preferred: The name of the server's own voice, as written in its settings. If it is a neural voice, its language
-            selects this voice: for an "en-us" voice, both "en-us" and "en". A voice of libespeak-ng is then only found
-                by its id or name.
+            selects this voice. For an "en-us" voice, these are "en-us" and "en". Voices of libespeak-ng are then only
+            found by their ids or names.
     """
     fitting = _matches(wanted, voices, preferred)
     return next(iter(fitting.values())) if len(fitting) == 1 else None
 
 
 def matching_languages(wanted: str, voices: Sequence[Voice]) -> set[str]:
-    """Return the languages of the voices that match a code or an English name: "en-gb" and others for "English"."""
+    """Return the languages of the voices that match a code or an English name, such as "en-gb" for "English"."""
     known = {each.language for each in voices if each.language}
     word = _fold(wanted)
     region = _WITH_REGION.fullmatch(word)
@@ -92,7 +92,7 @@ def matching_languages(wanted: str, voices: Sequence[Voice]) -> set[str]:
 
 
 def _matches(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> dict[str, Voice]:
-    """Return the voices that match a name, each by a name that only this voice has."""
+    """Return the voices that a name may refer to, by their unambiguous names."""
     found = _find_exact(wanted, voices, preferred)
     if found is not None:
         return {wanted: found}
@@ -128,7 +128,7 @@ def _readings(wanted: str, voices: tuple[Voice, ...]) -> Iterator[list[str]]:
 
 
 def _by_english_name(word: str, voices: Sequence[Voice]) -> list[str]:
-    """Return the languages with an English name, found in the names of voices: "English (Great Britain)".
+    """Return the languages with an English name, which is a part of a voice's name: "English (Great Britain)".
 
     If a language has several voices, and its code alone ("en") names one of them, only the code is returned.
     """
@@ -160,7 +160,7 @@ def _short_names(neural: str) -> list[str]:
 
 
 def _find_exact(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> Voice | None:
-    """Return the voice with a name in one of the documented forms, or None."""
+    """Return the voice whose name matches without trying other forms of the name, or None."""
     if is_neural(wanted):
         return _find_neural(wanted, voices)
     if preferred is not None and is_neural(preferred):
@@ -249,7 +249,7 @@ def _suggestions(wanted: str, voices: tuple[Voice, ...]) -> list[str]:
         near = _similar(suffix, {each.id.removeprefix(VARIANT_PREFIX): each for each in variants})
         return [f"{name}{VARIANT_PREFIX}{each}" for each in near]
     words: dict[str, Voice] = {}
-    # the form in `talk voices` has precedence: the language "en-us" over the id "en-US"
+    # the form shown by `talk voices` has precedence: the language "en-us" over the id "en-US"
     for place in reversed(range(4)):
         for each in plain:
             words.setdefault(_names_of(each)[place] or each.id, each)
@@ -275,7 +275,7 @@ def _neural_step() -> str:
 
 
 def _split_variants(voices: Sequence[Voice]) -> tuple[list[Voice], list[Voice]]:
-    """Return libespeak-ng's voices (or another driver's), and the variants."""
+    """Return the ordinary voices, which are neither neural nor variants, and the variants."""
     plain = [each for each in voices if not each.id.startswith((VARIANT_PREFIX, NEURAL_PREFIX))]
     return plain, [each for each in voices if each.id.startswith(VARIANT_PREFIX)]
 

@@ -47,12 +47,12 @@ MAX_HANDOVER_S = 0.5
 
 
 class HandoverTimes:
-    """Measures the gaps between sentences, and tells how much silence to cut in return.
+    """Measures the pauses between sentences, and determines how much silence to cut in return.
 
-    A handover is the time between the last sample of one sentence and the first sample of the next. In it, the player
-    drains and exits, the server gets the result, and the next sentence starts. This would lengthen the pause between
-    queued sentences by 25 to 40 ms. If another goal is waiting, the playback therefore cuts as much inaudible silence
-    from the end of the sentence as recent handovers took. The last sentence in the queue is played completely.
+    A handover is the time between the last sample of one sentence and the first sample of the next. During a handover,
+    the player drains and exits, the server gets the result, and the next sentence starts. This would lengthen the pause
+    between queued sentences by 25 to 40 ms. If another goal is waiting, the playback therefore cuts as much inaudible
+    silence from the end of the sentence as recent handovers took. The last sentence in the queue is played completely.
 
     Handovers are measured for each player. Those to neural voices are measured separately, because such a voice needs
     about 0.1 s more for its first sound. Nothing is cut before the first measurement. The class is pure: it gets all

@@ -192,7 +192,7 @@ class MainLoop:
         return self._library.mainloop_get_api(self._pointer)  # type: ignore[no-any-return]
 
     def iterate(self) -> bool:
-        """Run one iteration without waiting, and return whether to run another because it did some work."""
+        """Run one iteration without waiting, and return whether it did any work."""
         if self.freed or self._library.mainloop_prepare(self._pointer, -1) < 0:
             return False
         self._library.mainloop_poll(self._pointer)  # without it, dispatch would abort the process

@@ -5,7 +5,7 @@ that it has started.
 
 With `subprocess`, a child can be tied to its parent only by a function between fork and exec. This needs a real fork,
 which copies the page tables of the engine process. On a PC, the fork takes 3 ms before every sentence, while
-`posix_spawn` takes 0.4 ms. A Raspberry Pi takes five to ten times as long. Therefore no code of ours runs in the child.
+`posix_spawn` takes 0.4 ms. A Raspberry Pi takes five to ten times as long. Therefore the child runs no Python code.
 Instead, every program has a leash. This is a pipe that nobody writes to, and only this process has its write end. When
 this process ends for any reason, the kernel closes the write end and sends SIGKILL to the program's process group.
 
@@ -73,7 +73,7 @@ _ERROR = (
 #: The source location in "aplay: main:831: text", which doesn't help users.
 _SOURCE_LOCATION = r"^(?P<program>[^\s:]+): \w+:\d+: "
 
-#: Signals that Python ignores. Programs must not inherit this.
+#: Signals that Python ignores. A program has to start with their default actions.
 _RESET_SIGNALS = [getattr(signal, name) for name in ("SIGPIPE", "SIGXFSZ") if hasattr(signal, name)]
 
 
@@ -200,9 +200,9 @@ def _exit_descriptor(pid: int) -> int | None:
 class ErrorOutput:
     """Finds the error message in a program's standard error.
 
-    Only the first line that looks like an error and the first line of all are stored, because a player may write
-    underrun messages for hours. The last line is rarely the error, because some programs print their parameters after
-    it. The patterns are compiled when the first message comes, because compiling them at the start of each engine
+    Only two lines are stored, the first line that looks like an error and the very first line, because a player may
+    write underrun messages for hours. The last line is rarely the error, because some programs print their parameters
+    after it. The patterns are compiled when the first message comes, because compiling them at the start of each engine
     process would take 1 ms.
     """
 
@@ -255,7 +255,7 @@ class ProgramPlayer(Player):
         except OSError as error:
             text = error.strerror or str(error)
             raise CannotSpeak(Reason.NO_PLAYER, f"{self.name} cannot be started: {text}") from error
-        #: the number of sample bytes in the pipe so far
+        #: the number of sample bytes written so far, which is negative until the preamble is written
         self._written = -len(command.preamble)
         self._consumed = 0
         self._broken_at: float | None = None

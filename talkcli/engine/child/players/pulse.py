@@ -313,7 +313,7 @@ class PulsePlayer(Player):
         self._release(self._lib.context_get_sink_input_info(self._context, index, self._stream_callback, None))
 
     def _release(self, operation: int | None) -> None:
-        """Release an operation, which continues; None means that the context has failed, as its state shows."""
+        """Release the handle of an operation, which keeps running; None means that the context has failed."""
         if operation is not None:
             self._lib.operation_unref(operation)
 

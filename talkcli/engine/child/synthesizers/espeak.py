@@ -48,8 +48,8 @@ _EVENT_SAMPLERATE = 8
 
 #: The library's default rate in words per minute.
 _ESPEAK_DEFAULT_WPM = 175
-#: The shortest pause that isn't due to an abbreviation. There are up to a hundred samples of pause after "Mr.", and
-#: 6,000 after a sentence.
+#: The shortest pause after a sentence in samples. The pause after an abbreviation such as "Mr." has at most a hundred
+#: samples, and the pause after a sentence has 6,000.
 _PAUSE_SAMPLES = 2000
 
 #: The library's output mode for phonemes in IPA.
@@ -159,13 +159,13 @@ class Espeak:
         self._espeak, self.version, self._rate = load_library()
         espeak = self._espeak
         self._listed: tuple[Voice, ...] = ()
-        #: the current parameters. Only changed parameters are set, so that the samples in a new process are those that
-        #: the library makes on its own.
+        #: the current parameters. Only changed parameters are set, so that a new process makes the same samples as the
+        #: library with its defaults.
         self._parameters = {espeak.RATE: _ESPEAK_DEFAULT_WPM, espeak.VOLUME: 100, espeak.PITCH: 50}
         self._text = ""
         self._sink: SampleSink | None = None
         self._raised: BaseException | None = None
-        #: the phonemizer that was created last. It may still be using the library, unless it is None.
+        #: the last phonemizer, which may still be using the library; None after it was stopped
         self._phonemizer: EspeakPhonemizer | None = None
         found = (each for each in _ENGLISH if espeak.SetVoiceByName(each.encode()) == espeak.EE_OK)
         self.voice = next(found, "")
@@ -207,7 +207,10 @@ class Espeak:
             raise CannotSpeak(Reason.ENGINE_FAILED, f"espeak_Synth failed with {status}")
 
     def load_language(self, language: str) -> None:
-        """Load a voice of a language, such as "de-at", or of its first part, or else an English voice."""
+        """Load a voice of a language such as "de-at".
+
+        If there is no such voice, load a voice of the language's first part ("de"), or else an English voice.
+        """
         self._stop_phonemizer()
         found = (self._find_voice(each) for each in (language, language.partition("-")[0], *_ENGLISH))
         self.load(next((each.id for each in found if each), self.voice))

@@ -1,6 +1,6 @@
 """The guard for libespeak-ng, which replaces the few characters of a text that would crash the library.
 
-The module is pure. It replaces single characters by single characters, so every position in the text stays the same.
+The module is pure. It replaces each of these characters by another one, so every position in the text stays the same.
 Ordinary text must pass unchanged. Each rule is for a known cause of a crash, documents its numbers, and changes nothing
 without that cause. The guard only makes crashes rare. If a crash happens nevertheless, only the engine process is lost.
 
@@ -114,7 +114,7 @@ def _split_number(number: str, least: int, most: int) -> str:
 
 
 def _without_long_initials(text: str) -> str:
-    """Replace the dots after initials that would overrun the library's buffers by blanks."""
+    """Blank the dots after initials that would overrun the library's buffers."""
     result = list(text)
     looked_up = spelled = words = size = 0
     dots: list[int] = []
@@ -149,7 +149,7 @@ def _ends_clause(text: str, start: int, end: int) -> bool:
 
 
 def _is_letter(character: str) -> bool:
-    """Return whether a character counts as a letter, unlike the quotes, joiners and symbols in words."""
+    """Return whether a character of a word counts as a letter, unlike quotes and joiners."""
     return character.isalnum() or character in _SYMBOL_LETTERS or unicodedata.category(character).startswith("M")
 
 
@@ -166,7 +166,7 @@ def _max_bytes(character: str) -> int:
 
 
 def _without_leading_hyphens(text: str) -> str:
-    """Replace a hyphen between the first symbol of a clause and a word by a blank, as in "'-o".
+    """Blank a hyphen between the first symbol of a clause and a word, as in "'-o".
 
     The library doesn't mark the beginning of this word, and searches for the mark before the start of its list of
     phonemes. This crashes Vietnamese, Danish, Hindi and other voices. The library doesn't report the word either.

@@ -45,7 +45,8 @@ class BackgroundIterator(threading.Thread, Generic[_T]):
         super().__init__(daemon=False)
         self._items = items
         self._room = threading.Semaphore(max_ahead)
-        #: the items that were not taken yet, each without an error, and at the end None with the error (if any)
+        #: the items that were not taken yet, as pairs (item, None). The last pair is (None, error), or (None, None) if
+        #: the iterator ended without an error.
         self._made: deque[tuple[_T | None, BaseException | None]] = deque()
         #: held while the thread writes to its descriptor, so that `close` can't free the descriptor's number meanwhile
         self._lock = threading.Lock()
@@ -277,7 +278,7 @@ def _load(path: str) -> Iterator[tuple[Model, _Fingerprints]]:
         VoiceFileError: The model can't be loaded.
     """
     try:
-        load_libraries(path)  # this comes first, so that any load that takes long has already imported them
+        load_libraries(path)  # comes first, so that the libraries are certainly imported if a load hangs later
         fingerprints = _fingerprints(path)
         yield Model(path, models.read_description(path), _open_cache()), fingerprints
     except OSError as error:

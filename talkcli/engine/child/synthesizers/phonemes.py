@@ -153,7 +153,7 @@ def _locate_words(phonemizer: Phonemizer, clause: str, groups: Sequence[str]) ->
 
 
 def _increasing(positions: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return the positions without those that are before an earlier one or repeat it."""
+    """Return only the positions that come after all previous ones."""
     found: list[tuple[int, int]] = []
     for position in positions:
         if not found or position[0] > found[-1][0]:
