@@ -26,7 +26,6 @@ from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from talkcli.errors import AccessDenied, ProtocolMismatch, RequestRefused, ServerUnavailable, TalkError
 from talkcli.fleet.payloads import Message
-from talkcli.frozen import frozen
 from talkcli.polling import wait_ready
 from talkcli.terminal.text import printable
 
@@ -69,14 +68,6 @@ def boottime() -> float:
     return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
 
-@frozen
-class Will:
-    """A retained message that the broker publishes if the connection breaks."""
-
-    topic: str
-    payload: bytes
-
-
 class Link:
     """A connection to the broker. Any thread may use it. The thread that calls `read` runs the callbacks."""
 
@@ -85,7 +76,7 @@ class Link:
         broker: Broker,
         client_id: str,
         on_message: Callable[[Message], None],
-        will: Will | None = None,
+        will: Message | None = None,
         max_packet_bytes: int = MAX_PACKET_BYTES,
         receive_maximum: int | None = None,
     ) -> None:
@@ -95,7 +86,7 @@ class Link:
             broker: the broker's address and login.
             client_id: unique name of this connection.
             on_message: called with each received message.
-            will: published by the broker if the connection breaks.
+            will: retained message that the broker publishes if the connection breaks.
             max_packet_bytes: largest packet that the broker may send.
             receive_maximum: how many unacknowledged QoS 1 messages the broker may send; None for the broker's default.
 
@@ -362,10 +353,8 @@ class Link:
 
 
 @lru_cache(maxsize=32)
-def _properties(expiry: float | None, response: str | None, correlation: bytes | None) -> Properties | None:
-    """Return the MQTT properties of a message, or None if it has none. Cached, because paho creates them slowly."""
-    if (expiry, response, correlation) == (None, None, None):
-        return None
+def _properties(expiry: float | None, response: str | None, correlation: bytes | None) -> Properties:
+    """Return the MQTT properties of a message. Cached, because paho creates them slowly."""
     properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
     if expiry is not None:
         properties.MessageExpiryInterval = max(1, math.ceil(min(expiry, 2**31)))

@@ -27,7 +27,7 @@ MAX_NAME_CHARS = MAX_SENDER_NAME_CHARS - len(REMOTE_PREFIX)
 _NAME_PATTERN = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{MAX_NAME_CHARS - 1}}}")
 
 # The levels below a robot's name. Clients publish requests on the first three.
-REQUEST, PLAIN_SAY, PLAIN_CANCEL = "request", "say", "cancel"
+REQUEST_LEVELS = REQUEST, PLAIN_SAY, PLAIN_CANCEL = "request", "say", "cancel"
 PRESENCE, STATUS, EVENT, ECHO = "presence", "status", "event", "echo"
 
 #: Home Assistant's user name at the broker, and the prefix of its own topics.
@@ -85,12 +85,11 @@ class RequestTopic:
 
 def parse_request(topic: str) -> RequestTopic | None:
     """Return the parts of a request topic, or None if it is another kind of topic."""
-    prefix, _, rest = topic.partition("/")
-    levels = rest.split("/")
-    if prefix != PREFIX or len(levels) != 4 or name_fault(levels[3]):
+    levels = topic.split("/")
+    if len(levels) != 5 or levels[0] != PREFIX or name_fault(levels[4]):
         return None
-    receiver, _, kind, user = levels
-    kinds = {ROBOT_LEVEL: (REQUEST, PLAIN_SAY, PLAIN_CANCEL), _GROUP: (REQUEST,)}.get(receiver, ())
+    _, receiver, _, kind, user = levels
+    kinds = {ROBOT_LEVEL: REQUEST_LEVELS, _GROUP: (REQUEST,)}.get(receiver, ())
     return RequestTopic(kind, user) if kind in kinds else None
 
 
@@ -123,9 +122,7 @@ def access_rules(
     """
     lines = [
         "# Robots: each logs in by its own name, %u, and is heard under that alone.",
-        f"pattern read {robot('%u', REQUEST, '+')}",
-        f"pattern read {robot('%u', PLAIN_SAY, '+')}",
-        f"pattern read {robot('%u', PLAIN_CANCEL, '+')}",
+        *(f"pattern read {robot('%u', level, '+')}" for level in REQUEST_LEVELS),
         f"pattern read {group('+', REQUEST, '+')}",
         f"pattern readwrite {robot('%u', PRESENCE)}",
         f"pattern readwrite {robot('%u', ECHO)}",
@@ -140,9 +137,7 @@ def access_rules(
             "",
             "# An operator, who may ask every robot, and hear what each says: such lines for each login.",
             f"user {each}",
-            f"topic write {robot('+', REQUEST, each)}",
-            f"topic write {robot('+', PLAIN_SAY, each)}",
-            f"topic write {robot('+', PLAIN_CANCEL, each)}",
+            *(f"topic write {robot('+', level, each)}" for level in REQUEST_LEVELS),
             f"topic write {group('+', REQUEST, each)}",
             f"topic read {robot('+', PRESENCE)}",
             f"topic read {robot('+', STATUS)}",

@@ -109,7 +109,10 @@ async def test_a_read_ends_with_the_connection(listening: socket.socket, who: st
     async with greeted(listening) as (local, server):
         reading = asyncio.create_task(local.read())
         await asyncio.sleep(0.05)
-        (server if who == "the server" else local).close()
+        if who == "the server":
+            server.close()
+        else:
+            local.abort()
         assert await reading == []
         for _ in range(2):
             local.send(Exchange(Status()))

@@ -27,8 +27,8 @@ _CHUNK_BYTES = 64 * 1024
 class LocalConnection(ClientCore):
     """A connection to the robot's server. Only one task at a time may read from it.
 
-    It uses the event loop's callbacks for descriptors. With asyncio's transports, each new connection takes 1.6 times
-    the processor time, which matters when an operator cancels everything on a thousand robots.
+    It has no asyncio transport. With a transport, each new connection takes 1.6 times the processor time, which matters
+    when an operator cancels everything on a thousand robots.
     """
 
     def __init__(self, socket: _socket.socket, path: str) -> None:
@@ -37,10 +37,8 @@ class LocalConnection(ClientCore):
         super().__init__(connect.ANSWER_LIMIT_S, self._loop.time())
         self.path = path
         self._socket = socket
+        #: received lines that `read` has not returned yet
         self._lines: list[bytes] = []
-        #: completed when there may be data to read
-        self._readable: asyncio.Future[None] | None = None
-        self._closed = False
 
     async def greet(self, hello: JsonObject) -> None:
         """Send a hello line, and wait for the server's greeting. If that fails, close the connection.
@@ -51,10 +49,10 @@ class LocalConnection(ClientCore):
         self.connecting(request_line(hello), __version__)
         self._flush()
         pid, _ = peers.credentials(self._socket)
-        limit = self._loop.call_later(connect.ANSWER_LIMIT_S, self.close)
+        limit = self._loop.call_later(connect.ANSWER_LIMIT_S, self.abort)
         try:
             first, *self._lines = await self.read() or [b""]
-            if not first and self._closed:
+            if not first and self._loop.time() >= limit.when():
                 hint = f"look at process {pid}, and restart it if it hangs"
                 raise ServerUnavailable(f"the server at {self.path} does not answer; {hint}")
             if not first:
@@ -70,7 +68,11 @@ class LocalConnection(ClientCore):
     async def read(self) -> list[bytes]:
         """Wait for lines and return them without newlines, or return an empty list if the connection has ended."""
         while not self._lines:
-            data = await self._receive()
+            await asyncio.sleep(0)  # let other tasks run even if data is always available
+            try:
+                data = await self._loop.sock_recv(self._socket, _CHUNK_BYTES)  # type: ignore[arg-type]
+            except OSError:
+                return []
             if not data:
                 return []
             self._lines = self.split(data, self._loop.time())
@@ -91,40 +93,23 @@ class LocalConnection(ClientCore):
         return True
 
     def close(self) -> None:
-        """Close the connection. The server then cancels the unanswered requests, unless it is too late."""
-        if not self._closed:
-            self._closed = True
+        """Close the connection, which cancels its unanswered requests if possible. No `read` may be waiting.
+
+        A cancelled `read` doesn't count as waiting.
+        """
+        if self._socket.fileno() >= 0:
             self._loop.remove_reader(self._socket)
             self._loop.remove_writer(self._socket)
             self._socket.close()
-            self._wake()
 
-    async def _receive(self) -> bytes:
-        """Wait for data and return it, or return b"" if the connection has ended."""
-        await asyncio.sleep(0)  # let other tasks run even if data is always available
-        while not self._closed:
-            try:
-                return self._socket.recv(_CHUNK_BYTES)
-            except BlockingIOError:
-                pass
-            except OSError:
-                break
-            self._readable = self._loop.create_future()
-            self._loop.add_reader(self._socket, self._wake)
-            try:
-                await self._readable
-            finally:
-                if not self._closed:
-                    self._loop.remove_reader(self._socket)
-        return b""
-
-    def _wake(self) -> None:
-        if self._readable and not self._readable.done():
-            self._readable.set_result(None)
+    def abort(self) -> None:
+        """Let `read` report the end of the connection. Its caller closes the connection."""
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(_socket.SHUT_RDWR)
 
     def _flush(self) -> None:
         """Send as much as possible without waiting. Send the rest when the socket becomes writable."""
-        if self._closed:
+        if self._socket.fileno() < 0:
             return
         try:
             self.mark_sent(self._socket.send(self.outgoing()))
@@ -133,8 +118,7 @@ class LocalConnection(ClientCore):
         except OSError as error:
             # Nothing may follow, because part of a line may have been sent. `read` will report the end.
             self.stop_sending("the server went away", str(error))
-            with contextlib.suppress(OSError):
-                self._socket.shutdown(_socket.SHUT_RDWR)
+            self.abort()
         if self.outgoing():
             self._loop.add_writer(self._socket, self._flush)
         else:

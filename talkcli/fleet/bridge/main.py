@@ -21,8 +21,8 @@ from talkcli.fleet import topics
 from talkcli.fleet.bridge.policy import ECHO_EVERY_S, STALE_CODE, EchoTracker, Goodbye, Ignored, Policy, Refusal
 from talkcli.fleet.bridge.publisher import Publisher
 from talkcli.fleet.bridge.session import RemoteSessions
-from talkcli.fleet.link import REASON_NOT_AUTHORIZED, Link, LinkOpener, Will, boottime
-from talkcli.fleet.payloads import HOMEASSISTANT_ONLINE, Presence, bridge_rank, homeassistant_device
+from talkcli.fleet.link import REASON_NOT_AUTHORIZED, Link, LinkOpener, boottime
+from talkcli.fleet.payloads import HOMEASSISTANT_ONLINE, Message, Presence, bridge_rank, homeassistant_device
 from talkcli.frozen import frozen
 from talkcli.protocol.lines import MAX_LINE_BYTES, encode
 
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from typing import Any
 
     from talkcli.fleet.broker import Broker
-    from talkcli.fleet.payloads import Message
     from talkcli.goals.goal import JsonObject
 
 #: How long the broker keeps a robot's presence, and the interval at which the bridge renews it.
@@ -133,20 +132,15 @@ class Bridge:
             self._sessions, self._publish_to_all, self._server_changed, with_text=settings.with_text
         )
         self._link: Link | None = None
-        #: the link's descriptor in the event loop, or -1, and whether the loop waits for it to become writable
-        self._descriptor, self._writing = -1, False
+        #: the link's descriptor in the event loop, or -1
+        self._descriptor = -1
         self._disconnected = asyncio.Event()
-        #: whether this bridge has claimed the robot's name on the current connection
-        self._owns_name = False
-        #: whether the broker has retained the presence of another bridge
-        self._rival_seen = False
-        #: claims the name unless another bridge answers before
-        self._rival_timer: asyncio.TimerHandle | None = None
-        self._echoes = EchoTracker(boottime())
+        #: upper limit of the next pause before reconnecting
+        self._retry_s = _FIRST_BROKER_RETRY_S
+        #: whether this bridge has claimed the robot's name and accepts requests
+        self._online = False
         #: when the last echo was sent (loop clock)
         self._echo_at = 0.0
-        #: when the first echo after the last returned one was sent (loop clock); None if no echo is outstanding
-        self._unanswered_since: float | None = None
         #: when the presence was last published (loop clock)
         self._presence_at = 0.0
         #: describes the robot to a Home Assistant that has just started
@@ -162,7 +156,7 @@ class Bridge:
         tasks = [asyncio.create_task(each) for each in (self._stay_connected(), self._publisher.run())]
         for task in tasks:
             task.add_done_callback(self._on_task_done)
-        self._tick_timer = self._loop.call_later(ECHO_EVERY_S, self._tick, self._loop.time() + ECHO_EVERY_S)
+        self._tick_timer = self._loop.call_later(ECHO_EVERY_S, self._tick)
         await self._ending.wait()
         self._systemd.notify_stopping()
         self._tick_timer.cancel()
@@ -189,29 +183,25 @@ class Bridge:
     @property
     def ready(self) -> bool:
         """Whether the robot is online and its server is running."""
-        return self._owns_name and self._link is not None and self._publisher.server is not None
+        return self._online and self._publisher.server is not None
 
     def _status_text(self) -> str:
         """Return the status line for systemd."""
-        broker, server = ("online" if self._owns_name and self._link else "OFFLINE"), self._publisher.server
-        there = "server there" if server else "no server"
+        broker = "online" if self._online else "OFFLINE"
+        there = "server there" if self._publisher.server else "no server"
         pending = len(self._sessions.goals)
         goals = f"{pending} goal{'' if pending == 1 else 's'} pending"
         return f"{self._settings.name} at {self._settings.broker.url}: {broker}, {there}, {goals}"
 
     # -- the connection
 
-    def _new_link(self) -> Link:
-        client_id = f"talk-{self._settings.name}-{self._session}"
-        will = Will(self._presence_topic, self._offline_presence())
-        return Link(self._broker, client_id, self._on_message, will, _MAX_INCOMING_BYTES)
-
     async def _stay_connected(self) -> None:
         """Connect to the broker, and reconnect whenever the connection ends."""
-        retry_s = _FIRST_BROKER_RETRY_S
+        client_id = f"talk-{self._settings.name}-{self._session}"
+        will = Message(self._presence_topic, self._offline_presence(), retained=True)
         while True:
             try:
-                link = self._new_link()
+                link = Link(self._broker, client_id, self._on_message, will, _MAX_INCOMING_BYTES)
                 try:
                     await self._open(link)
                     self._on_connect(link)
@@ -219,11 +209,10 @@ class Bridge:
                 finally:
                     self._disconnect(link)
                 log.write(f"the connection to the broker has ended: {log.sanitize(str(link.ended))}")
-                retry_s = _FIRST_BROKER_RETRY_S if self._owns_name else retry_s
             except TalkError as error:
                 log.write_limited("broker", log.sanitize(str(error)))
-            await asyncio.sleep(random.uniform(0, retry_s))
-            retry_s = min(_LAST_BROKER_RETRY_S, retry_s * 2)
+            await asyncio.sleep(random.uniform(0, self._retry_s))
+            self._retry_s = min(_LAST_BROKER_RETRY_S, self._retry_s * 2)
             try:
                 self._broker = self._read_broker()
             except TalkError as error:
@@ -245,10 +234,14 @@ class Bridge:
         """Start to use a new connection, first to find out whether another bridge has the robot's name."""
         self._disconnected.clear()
         self._link, self._descriptor = link, link.fileno()
-        self._owns_name, self._rival_seen, self._rival_timer = False, False, None
-        self._loop.add_reader(self._descriptor, self._use, Link.read)
+        #: whether the broker has retained the presence of another bridge
+        self._rival_seen = False
+        #: claims the name unless another bridge answers before
+        self._rival_timer: asyncio.TimerHandle | None = None
         self._echoes = EchoTracker(boottime())
-        self._unanswered_since = None
+        #: when the first echo after the last returned one was sent (loop clock); None if no echo is outstanding
+        self._unanswered_since: float | None = None
+        self._loop.add_reader(self._descriptor, self._use, Link.read)
         link.subscribe(self._presence_topic, retained=True)
         link.subscribe(self._echo_topic, retained=False)
         # The retained presence of another bridge arrives before this question returns. If the other bridge is still
@@ -258,12 +251,11 @@ class Bridge:
 
     def _take_name(self) -> None:
         """Claim the robot's name, accept requests, and publish the robot's presence."""
-        if self._owns_name or self._link is None:
+        if self._online or self._link is None:
             return
-        self._owns_name = True
+        self._online, self._retry_s = True, _FIRST_BROKER_RETRY_S
         name = self._settings.name
-        kinds = topics.REQUEST, topics.PLAIN_SAY, topics.PLAIN_CANCEL
-        wanted = [topics.robot(name, each, topics.ANY) for each in kinds]
+        wanted = [topics.robot(name, each, topics.ANY) for each in topics.REQUEST_LEVELS]
         wanted += [topics.group(each, topics.REQUEST, topics.ANY) for each in self._groups]
         if self._settings.homeassistant:
             wanted.append(topics.HOMEASSISTANT_STATUS)
@@ -277,7 +269,7 @@ class Bridge:
     def _disconnect(self, link: Link) -> None:
         """Close a connection and end all sessions. Do nothing if that has been done."""
         if self._link is link:
-            self._link = None
+            self._link, self._online = None, False
             self._forget_descriptor()
             if self._rival_timer:
                 self._rival_timer.cancel()
@@ -292,7 +284,7 @@ class Bridge:
                 # If paho has closed the socket, the loop removes the descriptor but raises an error.
                 with contextlib.suppress(OSError):
                     forget(self._descriptor)
-            self._descriptor, self._writing = -1, False
+            self._descriptor = -1
 
     def _use(self, action: Callable[[Link], None]) -> None:
         """Read from the link or write to it, after the loop has found it ready."""
@@ -321,24 +313,22 @@ class Bridge:
             self._sessions.may_read.clear()
         else:
             self._sessions.may_read.set()
-        if link.wants_write != self._writing:
-            self._writing = link.wants_write
-            if self._writing:
-                self._loop.add_writer(self._descriptor, self._use, Link.write)
-            else:
-                self._loop.remove_writer(self._descriptor)
+        if link.wants_write:
+            self._loop.add_writer(self._descriptor, self._use, Link.write)
+        else:
+            self._loop.remove_writer(self._descriptor)
 
-    def _publish(self, topic: str, payload: bytes, qos: int = 1, **more: Any) -> bool:
+    def _publish(self, topic: str, payload: bytes, qos: int = 1, **more: Any) -> None:
+        """Publish a message if there is a connection. Drop it if it is too long for the broker."""
         link = self._link
         if link is None:
-            return False
+            return
         if len(payload) > link.max_payload_bytes:  # the broker would end the connection
             words = f"{len(payload):,} bytes for {topic} are not published"
             log.write_limited("long", f"{words}: the broker takes {link.max_payload_bytes:,}")
-            return False
-        done = link.publish(topic, payload, qos, **more)
+            return
+        link.publish(topic, payload, qos, **more)
         self._check_link(link)
-        return done
 
     def _publish_reply(self, topic: str, payload: bytes, qos: int, correlation: bytes | None) -> None:
         """Publish lines for a remote client."""
@@ -348,7 +338,7 @@ class Bridge:
     def _publish_to_all(self, topic: str, payload: bytes, expiry: float | None) -> None:
         """Publish an event that expires, or a retained message. Drop events if the broker is slow."""
         retain = expiry is None
-        if self._owns_name and self._link and (retain or self._link.outstanding_bytes <= SLOW_BROKER_BYTES):
+        if self._online and self._link and (retain or self._link.outstanding_bytes <= SLOW_BROKER_BYTES):
             self._publish(topic, payload, retain=retain, expiry=expiry)
 
     def _check_rights(self, reason: int) -> None:
@@ -377,7 +367,7 @@ class Bridge:
             delay = random.uniform(0, _DEVICE_DELAY_S)
             self._device_timer = self._device_timer or self._loop.call_later(delay, self._publish_device)
         topic = topics.parse_request(message.topic)
-        if topic is None or not self._owns_name:
+        if topic is None or not self._online:
             return
         now = boottime()
         decision = self._policy.decide(message, topic, now, stale=self._echoes.is_stale(now))
@@ -400,9 +390,9 @@ class Bridge:
     def _handle_echo(self, payload: bytes) -> None:
         if payload.startswith(_RIVAL_QUESTION):
             if payload != _RIVAL_QUESTION + self._session.encode():
-                if self._owns_name:
+                if self._online:
                     self._publish_presence()
-            elif not (self._owns_name or self._rival_timer):
+            elif not (self._online or self._rival_timer):
                 wait = _RIVAL_LIMIT_S if self._rival_seen else 0
                 self._rival_timer = self._loop.call_later(wait, self._take_name)
             return
@@ -419,10 +409,10 @@ class Bridge:
             log.write_limited("presence", f"a message on this robot's presence topic is ignored: {words}")
         if rank and rank[1] == self._session:
             return
-        if not self._rival_timer and not self._owns_name:
+        if not self._rival_timer and not self._online:
             self._rival_seen = rank is not None  # the bridge of a retained message may have ended
         elif rank is None:
-            if self._owns_name:
+            if self._online:
                 self._publish_presence()  # replace a late will or an ignored message
         elif rank < (self._since, self._session):
             words = f"another bridge is '{self._settings.name}' already: session {log.sanitize(rank[1])}"
@@ -456,13 +446,13 @@ class Bridge:
     def _publish_device(self) -> None:
         """Publish the robot's description for Home Assistant as a retained message, if enabled."""
         self._device_timer = None
-        if self._settings.homeassistant and self._owns_name:
+        if self._settings.homeassistant and self._online:
             topic, device = homeassistant_device(self._settings.name, self._settings.allow, __version__)
             self._publish(topic, device, retain=True, acknowledged=self._check_rights)
 
     def _server_changed(self) -> None:
         self._systemd.schedule_status()
-        if self._owns_name:
+        if self._online:
             self._publish_presence()
 
     def _send_echo(self) -> None:
@@ -472,10 +462,10 @@ class Bridge:
         number = self._echoes.add(boottime())
         self._publish(self._echo_topic, f"{self._session} {number}".encode())
 
-    def _tick(self, due: float) -> None:
-        """Do the periodic work. `due` is the time for which this call was scheduled."""
-        now = self._loop.time()
-        self._tick_timer = self._loop.call_at(now + ECHO_EVERY_S, self._tick, now + ECHO_EVERY_S)
+    def _tick(self) -> None:
+        """Do the periodic work."""
+        now, due = self._loop.time(), self._tick_timer.when()
+        self._tick_timer = self._loop.call_later(ECHO_EVERY_S, self._tick)
         self._sessions.tick()
         self._publisher.tick()
         link = self._link
@@ -491,7 +481,7 @@ class Bridge:
                 self._disconnect(link)
                 return
         self._send_echo()
-        if self._owns_name and now - self._presence_at >= PRESENCE_EVERY_S:
+        if self._online and now - self._presence_at >= PRESENCE_EVERY_S:
             self._publish_presence()
 
     async def _go_offline(self) -> None:
@@ -500,8 +490,8 @@ class Bridge:
         if link is None:
             return
         taken = asyncio.Event()
-        was_online = self._owns_name and not isinstance(self._error, AddressInUse)
-        self._owns_name = False  # otherwise the returning message would be contradicted
+        was_online = self._online and not isinstance(self._error, AddressInUse)
+        self._online = False  # otherwise the returning message would be contradicted
         if was_online:
             topic, payload = self._presence_topic, self._offline_presence()
         else:

@@ -136,11 +136,12 @@ class Policy:
             if reply_topic is None or topic.kind == topics.PLAIN_SAY:
                 return Ignored("empty", f"an empty message on {message.topic} asks for nothing")
             return Goodbye(topic.user, reply_topic)
-        seq, correlation = None, _repeatable(message.correlation)
+        repeatable = len(message.correlation or b"") <= MAX_CORRELATION_BYTES
+        seq, correlation = None, message.correlation if repeatable else None
         try:
             fields = _request_fields(topic.kind, message.payload)
             seq = take_seq(fields)
-            if correlation != message.correlation:
+            if not repeatable:
                 raise BadRequest(f"correlation data have at most {MAX_CORRELATION_BYTES} bytes", "bad_field")
             request = read_request(fields)
             if request.kind not in self._allow:
@@ -174,11 +175,6 @@ def _request_fields(kind: str, payload: bytes) -> JsonObject:
     except UnicodeDecodeError as error:
         words = f"a text is UTF-8, but byte {error.start} of this one is not"
         raise BadRequest(words, "bad_encoding") from None
-
-
-def _repeatable(correlation: bytes | None) -> bytes | None:
-    """Return correlation data, or None if it is too long to be repeated in answers."""
-    return correlation if len(correlation or b"") <= MAX_CORRELATION_BYTES else None
 
 
 class EchoTracker:

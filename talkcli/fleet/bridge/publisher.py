@@ -119,13 +119,13 @@ class Publisher:
             self._timer = self._loop.call_at(due, self._publish_status)
 
     def tick(self) -> None:
-        """Close the connection if the server counts as hung. Call this every few seconds."""
+        """End the connection if the server counts as hung. Call this every few seconds."""
         server = self._connection
         if server and self._loop.time() - self._heard_at > _SERVER_SILENCE_LIMIT_S:
             log.write_limited(
                 "silence", f"the server at {log.sanitize(server.path)} says nothing: restart it if it hangs"
             )
-            server.close()
+            server.abort()
 
     def close(self) -> None:
         """Cancel the timer for the next status."""
