@@ -142,7 +142,7 @@ def _parse_url(url: str) -> tuple[str, int, bool]:
     """
     try:
         parts = urlsplit(url)
-    except ValueError:  # its message contains the URL, so it is dropped
+    except ValueError:  # the original message contains the URL, so it isn't shown
         raise UsageError(f"{URL} is no URL: write mqtts://HOST or mqtt://HOST") from None
     if parts.scheme not in _SCHEMES:
         raise UsageError(

@@ -64,7 +64,7 @@ _LINGER_DISCARD, _LINGER_DELIVER = struct.pack("ii", 1, 0), struct.pack("ii", 0,
 
 
 def boottime() -> float:
-    """Return the seconds since the machine started, on Linux including the time in suspend."""
+    """Return the seconds since the machine started. On Linux, this includes the time in suspend."""
     return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
 
@@ -156,7 +156,7 @@ class Link:
             raise AccessDenied(f"{words}; TALK_MQTT_CA names the file of the CA that it is of") from error
         except ssl.SSLError as error:
             raise ServerUnavailable(f"no TLS with the broker at {url}: {error.reason or error}") from error
-        except (OSError, ValueError) as error:  # ValueError: an impossible host name
+        except (OSError, ValueError) as error:  # ValueError: an invalid host name
             why = error.strerror if isinstance(error, OSError) else None
             raise ServerUnavailable(f"no broker at {url}: {why or error}") from error
         found = self._paho.socket()
@@ -173,10 +173,9 @@ class Link:
             events = select.POLLIN | (select.POLLOUT if self.wants_write else 0)
             if self._tls_pending() or wait_ready({self.fileno(): events}, left):
                 self.read()
-        fault = self._login_fault()
-        if fault:
+        if login_error := self._login_error():
             self.close()
-            raise fault
+            raise login_error
 
     def fileno(self) -> int:
         """Return the descriptor to poll, or -1 after the end of the connection."""
@@ -227,7 +226,7 @@ class Link:
         correlation: bytes | None = None,
         acknowledged: OnAcknowledged | None = None,
     ) -> bool:
-        """Publish a message, or return False if the connection has ended.
+        """Publish a message. Return False if the connection has ended, otherwise True.
 
         Args:
             topic: the topic.
@@ -254,7 +253,7 @@ class Link:
         return True
 
     def size_error(self, line: bytes, kind: str) -> RequestRefused | None:
-        """Return an error if a request of this kind is longer than the broker accepts, or None if it isn't."""
+        """Return an error if a request of this kind is longer than the broker accepts, or None if it fits."""
         if len(line) <= self.max_payload_bytes:
             return None
         words = f"{kind} has {len(line):,} bytes, and the broker takes {self.max_payload_bytes:,}: nothing was sent"
@@ -292,13 +291,13 @@ class Link:
         if self._socket is not None:
             os.close(self._socket.detach())
 
-    # -- inside
+    # -- internals
 
     def _tls_pending(self) -> bool:
         """Return whether TLS holds decrypted data, which polling the descriptor doesn't show."""
         return isinstance(self._socket, ssl.SSLSocket) and self._socket.pending() > 0
 
-    def _login_fault(self) -> TalkError | None:
+    def _login_error(self) -> TalkError | None:
         """Return an error if the login has failed, or None if the broker has accepted it."""
         url, answer = self._broker.url, self._answer
         if answer is None and self._broker.tls and (self._alert or self.ended):

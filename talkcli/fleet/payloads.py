@@ -34,7 +34,7 @@ class Message:
     retained: bool = False
     #: the topic for answers, if the sender named one
     response: str | None = None
-    #: data that the sender wants to be repeated in answers
+    #: data that answers repeat, if the sender gave any
     correlation: bytes | None = None
     #: seconds until the message expires; None if it never does
     expiry: int | None = None
@@ -42,7 +42,7 @@ class Message:
 
 @frozen
 class Presence:
-    """Whether a robot is online, and its latest description by its bridge."""
+    """Whether a robot is online, and what its bridge last published about it."""
 
     name: str
     online: bool

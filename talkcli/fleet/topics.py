@@ -18,7 +18,7 @@ ROBOT_LEVEL, _GROUP, _REPLY = "robot", "group", "reply"
 ALL_ROBOTS = "all"
 #: Wildcard for one level of a topic in a subscription.
 ANY = "+"
-#: Level in place of a robot's name, in the topic that a desk publishes to itself. It is not a valid robot name.
+#: Placeholder for a robot's name in the topic that a desk publishes to itself. It is not a valid robot name.
 MARKER = "_"
 #: Prefix of a remote client's name at the server, followed by the client's user name.
 REMOTE_PREFIX = "mqtt:"
@@ -111,8 +111,8 @@ def access_rules(
 
     Robots are covered by patterns, because each robot logs in under its own name. Operators are listed by name, because
     mosquitto applies patterns to all users. With a pattern for operators, each robot could command the others. The
-    patterns for robots also apply to operators, which is harmless. They let operators read requests to groups, and use
-    the topics of a robot with the operator's name, if there were such a robot.
+    patterns for robots also apply to operators, which is harmless. They only let operators read requests to groups, and
+    use the topics of a nonexistent robot with the operator's name.
 
     Args:
         operators: the users who may command every robot.

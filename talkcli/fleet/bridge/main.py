@@ -1,4 +1,4 @@
-"""The bridge connects one robot's server to the broker.
+"""The bridge, which connects one robot's server to the broker.
 
 This module maintains the connection to the broker, publishes the robot's presence, and detects outdated messages.
 `policy` decides which requests are accepted, `session` carries them out, and `publisher` watches the server.
@@ -42,11 +42,11 @@ _RIVAL_LIMIT_S = 1.0
 _FIRST_BROKER_RETRY_S, _LAST_BROKER_RETRY_S = 0.5, 10.0
 #: Time without a returned echo after which the connection is closed.
 _ECHO_TIMEOUT_S = 15.0
-#: Minimum time between the last echo and the extra echo that follows the refusal of a stale message.
+#: Minimum time since the last echo before a refused stale message triggers an extra one.
 _ECHO_PAUSE_S = 1.0
-#: Amount of unsent data above which events are dropped and nothing is read from the server.
+#: Amount of unacknowledged data above which events are dropped and nothing is read from the server.
 SLOW_BROKER_BYTES = 256 * 1024
-#: Amount of unsent data above which the connection is closed.
+#: Amount of unacknowledged data above which the connection is closed.
 STUCK_BROKER_BYTES = 4 * 1024 * 1024
 #: Largest packet that the broker may send. Requests that are slightly too long fit, so that they can be answered with
 #: an error. A larger limit would be risky, because paho needs several seconds to parse 250 kB of MQTT properties.
@@ -102,7 +102,7 @@ async def _run(settings: BridgeSettings, read_broker: Callable[[], Broker]) -> N
         bridge.end()
 
     loop.set_exception_handler(log.handle_loop_error)
-    # If SIGINT is ignored, leave it so: a shell without job control starts background programs like this.
+    # Leave SIGINT ignored if it is. A shell without job control starts background programs that way.
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
         loop.add_signal_handler(signal.SIGINT, on_signal, signal.SIGINT)
     loop.add_signal_handler(signal.SIGTERM, on_signal, signal.SIGTERM)
@@ -143,7 +143,7 @@ class Bridge:
         self._echo_at = 0.0
         #: when the presence was last published (loop clock)
         self._presence_at = 0.0
-        #: describes the robot to a Home Assistant that has just started
+        #: timer that describes the robot to a Home Assistant that has just started
         self._device_timer: asyncio.TimerHandle | None = None
         self._ending = asyncio.Event()
         self._error: BaseException | None = None
@@ -231,12 +231,12 @@ class Bridge:
             raise opener.error
 
     def _on_connect(self, link: Link) -> None:
-        """Start to use a new connection, first to find out whether another bridge has the robot's name."""
+        """Start to use a new connection. Before going online, check for another bridge with the robot's name."""
         self._disconnected.clear()
         self._link, self._descriptor = link, link.fileno()
         #: whether the broker has retained the presence of another bridge
         self._rival_seen = False
-        #: claims the name unless another bridge answers before
+        #: timer that claims the name unless another bridge answers first
         self._rival_timer: asyncio.TimerHandle | None = None
         self._echoes = EchoTracker(boottime())
         #: when the first echo after the last returned one was sent (loop clock); None if no echo is outstanding
@@ -249,7 +249,7 @@ class Bridge:
         self._publish(self._echo_topic, _RIVAL_QUESTION + self._session.encode())
         self._send_echo()
 
-    def _take_name(self) -> None:
+    def _go_online(self) -> None:
         """Claim the robot's name, accept requests, and publish the robot's presence."""
         if self._online or self._link is None:
             return
@@ -267,7 +267,7 @@ class Bridge:
         log.write(f"online, at {self._settings.broker.url}")
 
     def _disconnect(self, link: Link) -> None:
-        """Close a connection and end all sessions. Do nothing if that has been done."""
+        """Close a connection and end all sessions, unless that has already been done."""
         if self._link is link:
             self._link, self._online = None, False
             self._forget_descriptor()
@@ -294,7 +294,7 @@ class Bridge:
             self._check_link(link)
 
     def _check_link(self, link: Link) -> None:
-        """Handle a broken link, and adapt to the amount of unsent data. Call this after each use of the link."""
+        """Handle a broken link, and adapt to the amount of unsent data. Call this after each use of it."""
         if link is not self._link or self._descriptor < 0:
             return
         if link.ended is None and link.outstanding_bytes > STUCK_BROKER_BYTES:
@@ -332,7 +332,7 @@ class Bridge:
 
     def _publish_reply(self, topic: str, payload: bytes, qos: int, correlation: bytes | None) -> None:
         """Publish lines for a remote client."""
-        acknowledged = self._check_rights if qos else None
+        acknowledged = self._log_denial if qos else None
         self._publish(topic, payload, qos, correlation=correlation, acknowledged=acknowledged)
 
     def _publish_to_all(self, topic: str, payload: bytes, expiry: float | None) -> None:
@@ -341,7 +341,8 @@ class Bridge:
         if self._online and self._link and (retain or self._link.outstanding_bytes <= SLOW_BROKER_BYTES):
             self._publish(topic, payload, retain=retain, expiry=expiry)
 
-    def _check_rights(self, reason: int) -> None:
+    def _log_denial(self, reason: int) -> None:
+        """Log that the broker has denied a message, if it has, for the reason code of an acknowledgement."""
         if reason == REASON_NOT_AUTHORIZED:
             log.write_limited("rights", f"the broker doesn't let this robot publish all that it says: {_RIGHTS}")
 
@@ -394,14 +395,14 @@ class Bridge:
                     self._publish_presence()
             elif not (self._online or self._rival_timer):
                 wait = _RIVAL_LIMIT_S if self._rival_seen else 0
-                self._rival_timer = self._loop.call_later(wait, self._take_name)
+                self._rival_timer = self._loop.call_later(wait, self._go_online)
             return
         session, _, number = payload.partition(b" ")
         if session == self._session.encode() and self._echoes.returned(number):
             self._unanswered_since = None
 
     def _handle_presence(self, payload: bytes) -> None:
-        """Process a presence message of this robot, from this bridge, an ended one, or a rival."""
+        """Process a message on the robot's presence topic, from this bridge, an earlier one, or a rival."""
         presence = Presence.read(self._settings.name, payload)
         rank = bridge_rank(presence)
         if payload and (presence is None or (presence.online and rank is None)):
@@ -410,7 +411,7 @@ class Bridge:
         if rank and rank[1] == self._session:
             return
         if not self._rival_timer and not self._online:
-            self._rival_seen = rank is not None  # the bridge of a retained message may have ended
+            self._rival_seen = rank is not None  # retained, so its bridge may have ended
         elif rank is None:
             if self._online:
                 self._publish_presence()  # replace a late will or an ignored message
@@ -418,7 +419,7 @@ class Bridge:
             words = f"another bridge is '{self._settings.name}' already: session {log.sanitize(rank[1])}"
             self.end(AddressInUse(f"{words}; each robot has a name of its own, give another --name"))
         else:
-            self._take_name()
+            self._go_online()
             self._publish_presence()  # tell the younger bridge that the name is in use
 
     # -- what this bridge publishes about itself
@@ -436,9 +437,7 @@ class Bridge:
             "server": self._publisher.server,
         }
         line = encode(presence)
-        self._publish(
-            self._presence_topic, line, retain=True, expiry=PRESENCE_EXPIRY_S, acknowledged=self._check_rights
-        )
+        self._publish(self._presence_topic, line, retain=True, expiry=PRESENCE_EXPIRY_S, acknowledged=self._log_denial)
 
     def _offline_presence(self) -> bytes:
         return encode({"talk": 1, "online": False, "session": self._session, "groups": list(self._groups)})
@@ -448,7 +447,7 @@ class Bridge:
         self._device_timer = None
         if self._settings.homeassistant and self._online:
             topic, device = homeassistant_device(self._settings.name, self._settings.allow, __version__)
-            self._publish(topic, device, retain=True, acknowledged=self._check_rights)
+            self._publish(topic, device, retain=True, acknowledged=self._log_denial)
 
     def _server_changed(self) -> None:
         self._systemd.schedule_status()
@@ -491,7 +490,7 @@ class Bridge:
             return
         taken = asyncio.Event()
         was_online = self._online and not isinstance(self._error, AddressInUse)
-        self._online = False  # otherwise the returning message would be contradicted
+        self._online = False  # otherwise `_handle_presence` would contradict the next message
         if was_online:
             topic, payload = self._presence_topic, self._offline_presence()
         else:

@@ -40,7 +40,7 @@ STALE_AFTER_S = ECHO_EVERY_S + 1.0
 _MAX_ECHOES = 32
 #: Maximum number of pending goals from remote clients. The rest of the queue, usually 100, is for local clients.
 MAX_REMOTE_GOALS = 20
-#: Maximum number of remembered goal ids, by which a goal that the server has forgotten isn't spoken twice.
+#: Maximum number of remembered goal ids. They prevent goals that the server has forgotten from being spoken twice.
 MAX_REMEMBERED_IDS = 1_000
 #: Maximum size of correlation data, which the header of each answer repeats.
 MAX_CORRELATION_BYTES = 256
@@ -100,7 +100,7 @@ class Goodbye:
 class Ignored:
     """A message that is logged but not answered."""
 
-    #: the log limits how often messages of the same kind are shown
+    #: key for the log's rate limit
     kind: str
     words: str
 
@@ -186,7 +186,7 @@ class EchoTracker:
     """
 
     def __init__(self, now: float) -> None:
-        """Start on a connection that was made at the time `now`."""
+        """Start to track a connection that was opened at the time `now`."""
         self._newest_at = now
         self._sent: dict[int, float] = {}
         self._number = 0
@@ -279,7 +279,7 @@ class RemoteGoals:
 
         Args:
             goal_id: the goal's id.
-            pending: whether the goal is pending. False if the reply isn't awaited any more.
+            pending: whether the goal is pending. Pass False if there will be no reply.
         """
         key, is_known = self._goals.get(goal_id, (None, True))
         if not is_known and pending:
@@ -300,17 +300,13 @@ class RemoteGoals:
         self._goals = {each: found for each, found in self._goals.items() if not found[1]}
         self._goals |= {goal_id: (key, True) for goal_id, key in pending}
 
-    def clear(self) -> None:
-        """Forget all goals, because the connection to the server has ended."""
-        self._goals.clear()
-
 
 def end_unsent(
     request: RemoteRequest, goal_id: str, state: State, reason: str, words: str, at: float, by: By | None = None
 ) -> tuple[Goal, list[JsonObject]]:
     """End a goal that was not sent to the server, and return it with the lines for its client.
 
-    The lines are the same as the server's would be.
+    The server would send the same lines.
 
     Args:
         request: the `say`.

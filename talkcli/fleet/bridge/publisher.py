@@ -1,6 +1,6 @@
 """Publishes a robot's status and the events of its goals for all subscribers.
 
-A connection watches the robot's server as long as the bridge runs. If the broker is too slow, events are dropped. If a
+The publisher watches the robot's server as long as the bridge runs. If the broker is too slow, events are dropped. If a
 payload is too long for the broker, it is published without texts.
 """
 
@@ -167,7 +167,7 @@ class Publisher:
         self._texts = {each.id: _shown_text(each) for each in unfinished(status)}
         self._last = status.recent[-1] if status.recent else self._last
         self._paused = status.server.get("paused") is True
-        self._sessions.on_server_connected(list(status.pending), server.boot)
+        self._sessions.reset_pending(status.pending, server.boot)
         log.write(f"the server at {log.sanitize(server.path)} is there (pid {server.pid})")
         self._on_server_change()
         self.schedule_status()
@@ -177,7 +177,7 @@ class Publisher:
         self._active = None
         self._texts.clear()
         self._paused = False
-        self._sessions.on_server_disconnected()
+        self._sessions.reset_pending((), "")
         if self.server:
             self.server = None
             self._on_server_change()

@@ -92,7 +92,7 @@ class RemoteSessions:
         self._loop = asyncio.get_running_loop()
         self._sessions: dict[tuple[str, str | None], RemoteSession] = {}
         self._release_handle: asyncio.Handle | None = None
-        #: the client that canceled the goals that left the server's queue most recently
+        #: the client that canceled pending goals since the last release
         self._canceled_by: By | None = None
 
     # -- from the broker
@@ -125,7 +125,7 @@ class RemoteSessions:
         self.may_read.set()
 
     def tick(self) -> None:
-        """End the sessions of silent clients, and send signs of life to others. Call this every few seconds."""
+        """End the sessions of silent clients, and send signs of life to the others. Call this every few seconds."""
         now = self._loop.time()
         for session in list(self._sessions.values()):
             if now - session.used_at > CLIENT_SILENCE_LIMIT_S:
@@ -135,9 +135,9 @@ class RemoteSessions:
                 session.send_alive()
 
     def _new_session(self, request: RemoteRequest) -> RemoteSession | None:
-        """Return a new session, or None if there are too many sessions.
+        """Return a new session, or None if there is no place for it.
 
-        If there are too many, end an idle one first. For a cancel or status request, end any session.
+        If all places are taken, an idle session is ended. For a cancel or status request, any session may be ended.
         """
         if len(self._sessions) >= MAX_SESSIONS:
             sessions = list(self._sessions.values())
@@ -163,7 +163,7 @@ class RemoteSessions:
         return in_sessions + sum(request.size_bytes for request, _, _ in self.waiting)
 
     def cancel_waiting(self, selection: Cancel, by: By | None) -> list[Goal]:
-        """End the goals that a `cancel` selects among those that wait for room, and return them."""
+        """End the waiting goals that a `cancel` selects, and return them."""
         selected = [self.waiting[each] for each in selection.select_waiting([say for _, say, _ in self.waiting])]
         self.waiting = [each for each in self.waiting if not any(each is other for other in selected)]
         words = "canceled before it was spoken"
@@ -187,7 +187,7 @@ class RemoteSessions:
         self._release_handle = None
         canceled_by, self._canceled_by = self._canceled_by, None
         if canceled_by and not self.goals.pending_count:
-            # The client canceled all pending goals, so cancel the goals that were waiting for their places, too.
+            # A client canceled all pending goals, so cancel the goals that were waiting for their places, too.
             self.cancel_waiting(Cancel(), canceled_by)
         while self.waiting and self.goals.has_room(self.waiting[0][1]):
             request, say, session = self.waiting.pop(0)
@@ -214,14 +214,9 @@ class RemoteSessions:
         if policy.is_remote(goal) and self.ids.boot_of(goal.id) != boot:
             self.ids.add(goal.id, boot)
 
-    def on_server_connected(self, pending: list[Goal], boot: str) -> None:
+    def reset_pending(self, pending: tuple[Goal, ...], boot: str) -> None:
         """Replace the pending goals by those of the server with this boot id."""
         self.goals.reset((each.id, each.key) for each in pending if self.ids.is_counted(each.id, boot))
-        self.schedule_release()
-
-    def on_server_disconnected(self) -> None:
-        """Forget all pending goals."""
-        self.goals.clear()
         self.schedule_release()
 
 
@@ -286,7 +281,7 @@ class RemoteSession:
     def submit(self, request: RemoteRequest) -> None:
         """Carry out a request after the earlier ones, or refuse it if too many are waiting."""
         self.used_at = self._loop.time()
-        if self._goodbye_timer:  # the client has come back
+        if self._goodbye_timer:  # the client has returned
             self._goodbye_timer.cancel()
             self._goodbye_timer, self._reply_topic = None, request.reply_topic
         urgent = isinstance(request.request, Cancel | Status)
@@ -303,10 +298,10 @@ class RemoteSession:
                 self._task = asyncio.create_task(self._run(urgent=urgent))
 
     def say_goodbye(self) -> None:
-        """Stop answering, drop goals that wait for room, and end after the server has answered other requests."""
+        """Stop answering, drop waiting goals, and end once the server has answered requests with a lasting effect."""
         self._reply_topic = None
         self._drop_waiting()
-        self._queue = deque(each for each in self._queue if _outlives_client(each))
+        self._queue = deque(each for each in self._queue if _has_lasting_effect(each))
         self._goodbye_timer = self._goodbye_timer or self._loop.call_later(_GOODBYE_LIMIT_S, self.end)
         self._end_if_done()
 
@@ -348,8 +343,8 @@ class RemoteSession:
         self._sessions.waiting = [each for each in self._sessions.waiting if each[2] is not self]
 
     def _end_if_done(self) -> None:
-        """End the session if the client has said goodbye and only requests without a lasting effect are unanswered."""
-        if self._goodbye_timer and not any(map(_outlives_client, self._unanswered)):
+        """End the session after a goodbye, unless a request with a lasting effect is still unanswered."""
+        if self._goodbye_timer and not any(map(_has_lasting_effect, self._unanswered)):
             self.end()
 
     # -- to the server
@@ -536,7 +531,7 @@ class RemoteSession:
             self._sessions.publish(self._reply_topic, payload, int(reliable), current)
 
     def _shortened(self, line: bytes, limit: int) -> bytes:
-        """Return a line without texts, an error, or nothing, to replace a line that is too long for the broker."""
+        """Return the line without texts, an error, or nothing, because the line is too long for the broker."""
         message = decode(line)
         shorter = encode(policy.without_texts(message))
         if len(shorter) <= limit:
@@ -562,7 +557,7 @@ class RemoteSession:
         shared.schedule_release()
 
 
-def _outlives_client(remote: RemoteRequest) -> bool:
-    """Return whether a request takes effect even if its client has left. A `patient` goal doesn't."""
+def _has_lasting_effect(remote: RemoteRequest) -> bool:
+    """Return whether a request has a lasting effect, even after a goodbye. A `patient` goal doesn't."""
     request = remote.request
     return not request.patient if isinstance(request, Say) else isinstance(request, Cancel | Set | Pause | Resume)
