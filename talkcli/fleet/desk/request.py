@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from fnmatch import translate
+from fnmatch import fnmatchcase
 
 from talkcli.errors import EXIT_OK, Lost, ServerUnavailable, TalkError, UnknownGoal
 from talkcli.fleet import topics
@@ -40,7 +40,6 @@ class Selection:
         self.text = text
         self.group = text.removeprefix(_GROUP_PREFIX) if text.startswith(_GROUP_PREFIX) else None
         self.name = None if selects_several(text) else text
-        self._glob = re.compile(translate(text)) if self.group is None and self.name is None else None
 
     @property
     def fault(self) -> str | None:
@@ -58,9 +57,7 @@ class Selection:
         """Return whether a robot is selected, online or not."""
         if self.group is not None:
             return self.group == topics.ALL_ROBOTS or self.group in presence.groups
-        if self._glob is not None:
-            return self._glob.match(presence.name) is not None
-        return self.text == presence.name
+        return fnmatchcase(presence.name, self.text)
 
 
 class NoServer(ServerUnavailable):
