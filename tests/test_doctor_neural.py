@@ -17,8 +17,8 @@ from talkcli.doctor import examine, voice
 from talkcli.doctor.report import FAILURE, OK, WARNING
 from talkcli.doctor.sound import UserSession
 from talkcli.doctor.voice import EngineOptions, EngineReport, NeuralVoices, VoiceTrial
-from talkcli.engine.models import MODEL_PACKAGES
 from talkcli.frozen import replace
+from talkcli.install import NEURAL_PACKAGES
 from talkcli.polling import Interrupted
 from tests.conformance.bareserve import environment, serving
 from tests.support import tiny_voice
@@ -43,7 +43,7 @@ LIMIT = 20.0
 @pytest.fixture
 def alone(home: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
     """Return an environment with the voice that hums, and no other."""
-    needs_packages(*MODEL_PACKAGES)
+    needs_packages(*NEURAL_PACKAGES)
     monkeypatch.setattr("talkcli.engine.models._PACKAGE_SUFFIX", "no such package")
     tiny_voice.put(Path(home) / "v", "tiny")
     return _environment(home, tmp_path, ALONE)
@@ -123,7 +123,7 @@ def test_a_voice_that_cannot_speak_says_why(
     ],
 )
 def test_a_broken_package_is_a_finding(tmp_path: Path, code: str, words: str, step: str, used: str | None) -> None:
-    needs_packages(*MODEL_PACKAGES)
+    needs_packages(*NEURAL_PACKAGES)
     package = f"import os\nassert os.environ['ORT_DISABLE_TELEMETRY'] == '1'\n{code}\n"
     (tmp_path / "onnxruntime.py").write_text(package)
     found = _found(used, {**os.environ, "PYTHONPATH": str(tmp_path)})
@@ -134,7 +134,7 @@ def test_a_broken_package_is_a_finding(tmp_path: Path, code: str, words: str, st
 
 
 def test_slow_packages_are_not_to_be_installed_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    needs_packages(*MODEL_PACKAGES)
+    needs_packages(*NEURAL_PACKAGES)
     monkeypatch.setattr(voice, "_IMPORT_LIMIT_S", 0.2)
     (tmp_path / "onnxruntime.py").write_text("import time\ntime.sleep(60)\n")
     found = _found(None, {**os.environ, "PYTHONPATH": str(tmp_path)}, 5.0)["neural"]
@@ -218,7 +218,7 @@ def test_a_voice_that_takes_too_long_is_given_up(alone: dict[str, str]) -> None:
 
 
 def test_a_voice_that_kills_the_engine_process_is_a_fact(home: str, tmp_path: Path) -> None:
-    needs_packages(*MODEL_PACKAGES)
+    needs_packages(*NEURAL_PACKAGES)
     tiny_voice.put(Path(home) / "v", "tiny")
     dies = (
         "from talkcli.engine.child.synthesizers import inference\nimport os\n"

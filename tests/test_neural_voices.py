@@ -14,9 +14,9 @@ import pytest
 
 from talkcli import install
 from talkcli.client.client import Client
-from talkcli.engine.models import MODEL_PACKAGES
 from talkcli.engine.protocol import Voice
 from talkcli.engine.voices import find_voice
+from talkcli.install import NEURAL_PACKAGES
 from tests.conformance.bareserve import LIMIT, SERVE, TALK, environment, run, serving
 from tests.engine.test_neural import SLOW_TO_SPEAK, WITHOUT
 from tests.support import tiny_voice
@@ -64,7 +64,7 @@ sys.meta_path.insert(0, Held())
 @pytest.fixture
 def env(home: str, tmp_path: Path) -> dict[str, str]:
     """Return the environment of a server with two voices."""
-    needs_packages(*MODEL_PACKAGES)
+    needs_packages(*NEURAL_PACKAGES)
     tiny_voice.put(tmp_path / "voices", "tiny")
     tiny_voice.put(tmp_path / "voices", "broken", b"no model")
     (tmp_path / "site").mkdir()

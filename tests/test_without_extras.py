@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli import install
-from talkcli.engine.models import MODEL_PACKAGES
+from talkcli.install import NEURAL_PACKAGES
 from tests.conformance.bareserve import TALK, environment, run, serving
 from tests.engine.test_neural import NEURAL_MODULES
 from tests.support import census, tiny_voice
@@ -61,7 +61,7 @@ def test_without_the_extra_a_fleet_tells_what_to_install(words: list[str], tmp_p
 
 
 #: The modules that only neural voices use; a server needs the others of `NEURAL_MODULES` anyway.
-OWN = {*MODEL_PACKAGES, *(each for each in NEURAL_MODULES if each.startswith("talkcli."))}
+OWN = {*NEURAL_PACKAGES, *(each for each in NEURAL_MODULES if each.startswith("talkcli."))}
 #: Differences of memory between two starts, in kB.
 SLACK = 400
 ASKED = (["voices"], ["status"], ["say", "--wait", "hello"])
@@ -99,8 +99,8 @@ def measure(directory: Path, *options: str, without: Sequence[str] = ()) -> Cost
 
 
 def test_neither_server_nor_engine_nor_clients_import_start_or_keep_anything_for_them(tmp_path: Path) -> None:
-    needs_packages(*MODEL_PACKAGES)
-    installed, missing = measure(tmp_path / "with"), measure(tmp_path / "without", without=MODEL_PACKAGES)
+    needs_packages(*NEURAL_PACKAGES)
+    installed, missing = measure(tmp_path / "with"), measure(tmp_path / "without", without=NEURAL_PACKAGES)
     assert all("talkcli" in each for each in (installed.server, installed.engine, installed.clients))
     assert (installed.server | installed.engine | installed.clients) & OWN == set()
     assert installed.engine & {*NEURAL_MODULES} == set()
@@ -112,7 +112,7 @@ def test_neither_server_nor_engine_nor_clients_import_start_or_keep_anything_for
 
 
 def test_for_a_neural_voice_the_engine_alone_imports_its_modules(tmp_path: Path) -> None:
-    needs_packages(*MODEL_PACKAGES)
+    needs_packages(*NEURAL_PACKAGES)
     found = measure(tmp_path, "--voice", "piper/tiny")
-    assert {*MODEL_PACKAGES} <= found.engine
+    assert {*NEURAL_PACKAGES} <= found.engine
     assert (found.server | found.clients) & OWN == set()

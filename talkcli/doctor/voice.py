@@ -245,7 +245,7 @@ def find_neural(used: str | None, options: EngineOptions, limit: float) -> Neura
         except models.VoiceFileError as error:
             invalid.append((NEURAL_PREFIX + name, *_split_step(str(error))))
     trial = None if used is None or fault else _try_voice(used, options, limit)
-    installed = tuple(map(_with_version, models.MODEL_PACKAGES))
+    installed = tuple(map(_with_version, install.NEURAL_PACKAGES))
     return NeuralVoices(fault, installed, tuple(valid), tuple(invalid), used, trial)
 
 
@@ -255,7 +255,7 @@ def _find_package_fault(env: Mapping[str, str]) -> tuple[str, str] | None:
     if missing is not None:
         return _split_step(missing)
     env = {**env, **models.NO_TELEMETRY}
-    for package in reversed(models.MODEL_PACKAGES):  # onnxruntime imports numpy, so numpy is first
+    for package in reversed(install.NEURAL_PACKAGES):  # onnxruntime imports numpy, so numpy is first
         output = run_program(sys.executable, "-c", _IMPORT_PROGRAM + package, env=env, limit=_IMPORT_LIMIT_S)
         if output.error is not None:
             message = f"{_with_version(package)} cannot be imported: "

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from typing import Any
 
-#: The packages that are needed to run a model.
-MODEL_PACKAGES = install.NEURAL_PACKAGES
 #: Since version 1.30, onnxruntime writes a device id into ~/.cache/Microsoft when it is imported, and contacts a
 #: telemetry host some seconds later. A robot must not report to anyone, so even a value that the user has set is
 #: overwritten.
@@ -78,7 +76,7 @@ def missing_package() -> str | None:
     """Return the error message for a missing package, or None if all packages for neural voices are installed."""
     from importlib.util import find_spec
 
-    missing = next((each for each in MODEL_PACKAGES if find_spec(each) is None), None)
+    missing = next((each for each in install.NEURAL_PACKAGES if find_spec(each) is None), None)
     return None if missing is None else f"{missing} is missing: {install.neural()}"
 
 

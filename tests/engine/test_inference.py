@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine.child.synthesizers.inference import CONTEXT_FRAMES, Model, ModelCache, ModelRun
-from talkcli.engine.models import MODEL_PACKAGES, VoiceFileError, read_description
+from talkcli.engine.models import VoiceFileError, read_description
+from talkcli.install import NEURAL_PACKAGES
 from tests.support import tiny_voice
 from tests.support.real_voice import real_voice, silence_noise
 from tests.support.surroundings import needs_packages
@@ -32,7 +33,7 @@ NUMBERS = [1, 0, *(number for sound in range(14, 32) for number in (sound, 0)), 
 
 @pytest.fixture(autouse=True)
 def _needs_the_extra() -> None:
-    needs_packages(*MODEL_PACKAGES)
+    needs_packages(*NEURAL_PACKAGES)
 
 
 @pytest.fixture(scope="module")

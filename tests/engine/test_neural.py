@@ -21,7 +21,7 @@ import pytest
 
 from talkcli import install
 from talkcli.engine import protocol
-from talkcli.engine.models import MODEL_PACKAGES
+from talkcli.install import NEURAL_PACKAGES
 from tests.engine.programs import Player, without_silence
 from tests.engine.spawned import SOON, Shared, Spawned, first
 from tests.support import tiny_voice
@@ -57,7 +57,7 @@ sys.meta_path.insert(0, Without())
 """
 #: Modules that an engine process without a neural voice has no use for.
 NEURAL_MODULES = [
-    *MODEL_PACKAGES,
+    *NEURAL_PACKAGES,
     *("difflib", "hashlib", "queue"),
     *(f"talkcli.engine.child.synthesizers.{each}" for each in ("inference", "loader", "phonemes", "piper", "vits")),
 ]
@@ -66,7 +66,7 @@ NEURAL_MODULES = [
 @pytest.fixture(scope="module")
 def voices(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a directory with a voice that hums, in some milliseconds."""
-    needs_packages(*MODEL_PACKAGES)
+    needs_packages(*NEURAL_PACKAGES)
     path = tmp_path_factory.mktemp("neural") / "voices"
     tiny_voice.put(path, "tiny")
     return path
@@ -195,7 +195,7 @@ atexit.register(lambda: sys.stderr.write(repr([each for each in {NEURAL_MODULES!
         assert engine.errors() == "[]"
 
 
-@pytest.mark.parametrize("package", MODEL_PACKAGES)
+@pytest.mark.parametrize("package", NEURAL_PACKAGES)
 def test_without_the_extra_a_voice_says_what_to_install(tmp_path: Path, package: str) -> None:
     tiny_voice.put(tmp_path / "voices", "tiny")
     before = WITHOUT.format(names=[package])

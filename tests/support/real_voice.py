@@ -6,7 +6,7 @@ import json
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
-from talkcli.engine.models import MODEL_PACKAGES
+from talkcli.install import NEURAL_PACKAGES
 from tests.support.surroundings import needs_packages
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ def real_voice() -> Path:
     """Return its model's path; the test is skipped where it, or what it takes, is not installed."""
     from pathlib import Path
 
-    needs_packages(*MODEL_PACKAGES, REAL_PACKAGE)
+    needs_packages(*NEURAL_PACKAGES, REAL_PACKAGE)
     spec = find_spec(REAL_PACKAGE)
     assert spec is not None
     assert spec.origin is not None

@@ -117,8 +117,8 @@ class Piper:
         if path is None:
             raise UnknownVoice("its file is not there any more")
         with contextlib.suppress(VoiceFileError):
-            about = models.read_description(path)
-            speaker_number(speaker, about.speaker_names, about.speakers)
+            description = models.read_description(path)
+            speaker_number(speaker, description.speaker_names, description.speakers)
         self.voice, self._model_id, self._speaker, self._path = voice, model, speaker, path
 
     def speak(self, text: str, settings: SpeechSettings, sink: SampleSink) -> None:
@@ -131,14 +131,14 @@ class Piper:
             raise CannotSpeak(Reason.BAD_OPTION, words)
         voice = self._model_id
         model = self._wait_for_model(voice, sink)
-        about = model.description
+        description = model.description
         try:
-            speaker = speaker_number(self._speaker, about.speaker_names, about.speakers)
+            speaker = speaker_number(self._speaker, description.speaker_names, description.speakers)
         except UnknownVoice as error:
             raise CannotSpeak(Reason.UNKNOWN_VOICE, f"{self.voice}: {error}") from error
         try:
-            sink.begin(about.rate, self.voice)
-            with self._espeak.phonemizer(about.espeak_voice) as phonemizer:
+            sink.begin(description.rate, self.voice)
+            with self._espeak.phonemizer(description.espeak_voice) as phonemizer:
                 self._write(model, speaker, split_text(phonemizer, text), settings, sink)
         except MemoryError as error:
             raise CannotSpeak(Reason.VOICE_FAILED, str(no_memory_error(self._path))) from error
