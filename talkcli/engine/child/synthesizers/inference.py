@@ -213,13 +213,12 @@ class Model:
         """
         import numpy as np
 
-        description = self.description
+        duration_scale = self.description.duration_scale * scale
+        scales = [self.description.noise, duration_scale, self.description.duration_noise]
         feed = {
             "input": np.array([ids], np.int64),
             "input_lengths": np.array([len(ids)], np.int64),
-            "scales": np.array(
-                [description.noise, description.duration_scale * scale, description.duration_noise], np.float32
-            ),
+            "scales": np.array(scales, np.float32),
         }
         if self._has_speakers:
             feed[_SPEAKER_INPUT] = np.array([speaker], np.int64)
@@ -227,7 +226,7 @@ class Model:
         durations = durations.reshape(-1)
         if len(durations) != len(ids) or not np.isfinite(durations).all() or (durations < 0).any():
             raise VoiceFileError(f"{self.path} does not tell how long each sound lasts: get the voice anew")
-        limit = _MAX_MEAN_FRAMES * len(ids) * max(1.0, description.duration_scale * scale)
+        limit = _MAX_MEAN_FRAMES * len(ids) * max(1.0, duration_scale)
         if durations.sum() > limit:
             words = f"makes more than {limit:.0f} frames of {len(ids)} sounds"
             raise VoiceFileError(f"{self.path} {words}: get the voice anew")
