@@ -128,7 +128,6 @@ class BrokerExamination:
         self._interrupt = interrupt
         #: whether the login belongs to the robot's bridge
         self._is_robot = environment.get(USER) == robot
-        self._session = os.urandom(8).hex()
         self._inbox: list[Message] = []
 
     @property
@@ -196,7 +195,7 @@ class BrokerExamination:
 
     def _test_rights(self, link: Link, name: str) -> AccessRights:
         """Test the access rights that an operator or the bridge of this robot needs."""
-        robot, replies = partial(topics.robot, self._robot), partial(topics.reply, name, self._session)
+        robot, replies = partial(topics.robot, self._robot), partial(topics.reply, name, os.urandom(8).hex())
         if self._is_robot:
             echo = robot(topics.ECHO)
             others = [robot(topics.STATUS), robot(topics.EVENT, "doctor"), replies(self._robot)]
