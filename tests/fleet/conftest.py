@@ -138,9 +138,9 @@ def fleet(pair: RealRobots, monkeypatch: pytest.MonkeyPatch) -> Iterator[Fleet]:
 def fleet_of(broker: Broker, monkeypatch: pytest.MonkeyPatch, *, grace: float = 0.05, user: str | None = None) -> Fleet:
     """Return the library for a broker; `grace`: seconds in which the broker may still tell what it keeps."""
     needs_packages("paho")
-    from talkcli.fleet.desk import desk
+    from talkcli.fleet.desk import link
 
-    monkeypatch.setattr(desk, "RETAINED_GRACE_S", grace)  # mosquitto tells at once all that it keeps
+    monkeypatch.setattr(link, "RETAINED_GRACE_S", grace)  # mosquitto tells at once all that it keeps
     for each in [name for name in os.environ if name.startswith("TALK_") and not name.startswith("TALK_TEST_")]:
         monkeypatch.delenv(each)
     if user:

@@ -13,7 +13,7 @@ import pytest
 
 from talkcli.errors import Lost
 from talkcli.fleet.broker import from_environment
-from talkcli.fleet.desk import desk, watch
+from talkcli.fleet.desk import link, watch
 from talkcli.fleet.desk.request import Selection
 from talkcli.fleet.desk.watch import (
     BrokerAway,
@@ -93,7 +93,7 @@ def robots(broker: Broker) -> Iterator[Listener]:
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A desk that reconnects soon after its broker is back."""
-    monkeypatch.setattr(desk, "_MAX_BROKER_PAUSE_S", 0.1)
+    monkeypatch.setattr(link, "_MAX_BROKER_PAUSE_S", 0.1)
 
 
 def names(events: list[FleetEvent]) -> list[str]:

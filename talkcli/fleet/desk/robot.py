@@ -18,7 +18,7 @@ from talkcli.client.connection import Connection
 from talkcli.client.core import Exchange, identity
 from talkcli.errors import AccessDenied, BadRequest, Lost, ServerUnavailable, TalkError, UnknownGoal, UsageError
 from talkcli.fleet import topics
-from talkcli.fleet.desk.desk import ABSENCE_LIMIT_S, DeskLink
+from talkcli.fleet.desk.link import ABSENCE_LIMIT_S, DeskLink
 from talkcli.fleet.desk.request import NoServer
 from talkcli.fleet.link import Link, boottime
 from talkcli.frozen import replace

@@ -17,7 +17,7 @@ from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.client.goal import GoalHandle
 from talkcli.errors import EXIT_OK, Lost, ServerUnavailable, TalkError, UnknownGoal, Unreadable, UsageError
 from talkcli.fleet import topics
-from talkcli.fleet.desk.desk import DeskLink
+from talkcli.fleet.desk.link import DeskLink
 from talkcli.fleet.desk.request import NoServer, Outcome, Selection, cancel_outcomes, failure_outcome, reply_outcomes
 from talkcli.fleet.desk.robot import RobotConnection, RobotExchange, new_goal_id
 from talkcli.fleet.link import Link, boottime

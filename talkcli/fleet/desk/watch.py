@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.errors import BadRequest, Lost
 from talkcli.fleet import topics
-from talkcli.fleet.desk.desk import ABSENCE_LIMIT_S, DeskLink
+from talkcli.fleet.desk.link import ABSENCE_LIMIT_S, DeskLink
 from talkcli.fleet.payloads import Message, Presence, RobotInfo, RobotStatus
 from talkcli.frozen import frozen
 from talkcli.goals.states import State
