@@ -67,12 +67,12 @@ class Broker:
             return None
         try:
             context = ssl.create_default_context(cafile=self.ca)
-        except (OSError, ssl.SSLError) as error:
+        except OSError as error:
             raise UsageError(f"{CA}: {_file_error(self.ca, error)}") from error
         if self.cert:
             try:
                 context.load_cert_chain(self.cert, self.key, password=_no_passphrase)
-            except (OSError, ssl.SSLError, UsageError) as error:
+            except (OSError, UsageError) as error:
                 raise UsageError(f"{CERT} and {KEY}: {_file_error(self.cert, error)}") from error
         return context
 

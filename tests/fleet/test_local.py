@@ -1,4 +1,4 @@
-"""The bridge's connection to its server: nothing is lost or left over."""
+"""The bridge's connection to its server. No data may get lost, and no resources may leak."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ async def test_a_server_that_says_much_does_not_block_the_loop(listening: socket
 
 @in_loop
 async def test_a_connection_on_which_a_line_can_not_be_sent_has_ended(listening: socket.socket) -> None:
-    """Part of the line may have been sent: the next line would be another request."""
+    """After a partly sent line, the next line would be read as part of the same request."""
     async with greeted(listening) as (local, server):
         lines(server, 1)
         reading = asyncio.create_task(local.read())
@@ -165,7 +165,7 @@ async def test_a_refused_connection_raises_busy_or_unavailable(
     monkeypatch.setattr("talkcli.client.connect.BUSY_LIMIT_S", 0.3)
     dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
     with contextlib.suppress(TimeoutError):
-        while not dialing.done():  # a busy one is tried again
+        while not dialing.done():  # a busy server is tried again
             listening.settimeout(0.5)
             with await accepted(listening) as server:
                 server.sendall(said)
@@ -189,7 +189,7 @@ async def test_a_dial_that_is_cancelled_keeps_its_slot_until_the_server_has_gree
         server.sendall(GREETING)
         await slots.acquire()
         assert lines(server, 2) == [encode({"request": "hello", "name": "bob"}), b""]
-    gc.collect()  # which would warn of a socket that is left open
+    gc.collect()  # reports sockets that were left open
 
 
 @in_loop

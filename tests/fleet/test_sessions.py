@@ -1,4 +1,4 @@
-"""Sessions of remote clients: their ends, their places, and their limits. With a real server and no broker."""
+"""Sessions of remote clients: how they end, and their limits. The tests use a real server and no broker."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from tests.conftest import MakeTalk
     from tests.support.processes import Talk
 
-#: Seconds without a request after which an asker counts as gone.
+#: Seconds without a request after which a client's session ends.
 GONE = 90.0
 
 
@@ -51,7 +51,7 @@ def say(number: int, **more: object) -> dict[str, object]:
 
 
 async def await_clients(talk: Talk, most: int) -> None:
-    """Wait until the server has no more clients than this; it tells nobody that one has left."""
+    """Wait until the server has at most this number of clients. The server doesn't report that a client has left."""
     end = time.monotonic() + 5
     while talk.request("status")["server"]["clients"] > most:
         assert time.monotonic() < end, "a connection to the server is kept"
@@ -74,7 +74,7 @@ async def test_an_asker_that_is_silent_for_90_s_is_gone_whatever_it_waits_for(
         await anna.ask(say(100, wait=True))
     else:
         await anna.ask({"seq": 100, "request": "watch"})
-    for _ in range(8):  # what it is told is no sign of its life
+    for _ in range(8):  # lines sent to the client don't prove that it is alive
         pass_time(11)
         anna.sessions.tick()
         if waits == "for events":
@@ -120,7 +120,7 @@ async def test_an_asker_to_whom_nothing_is_owed_is_let_go_without_a_word(
 
 @in_loop
 async def test_requests_before_a_goodbye_are_carried_out_except_goals_that_wait_for_room(talk: Talk) -> None:
-    """With and without a connection to the server; an asker that comes back after its goodbye is told again."""
+    """With and without a connection to the server. A client that returns after a goodbye gets answers again."""
     anna = SessionsWithoutBroker(talk.socket)
     before = talk.request("status")["server"]["clients"]
     await anna.ask({"seq": 1, "request": "hello"}, "s2")
@@ -154,15 +154,15 @@ async def test_a_cancel_takes_the_place_of_the_asker_that_is_silent_for_longest(
     for each in range(32):
         gone = [line for line in anna.lines(f"w{each}") if line.get("event") == "gone"]
         assert bool(gone) == (each == 1), each
-    assert (await anna.ask({"seq": 4, "request": "status"}, "urgent"))["ok"]  # in the place that it has
-    assert (await anna.ask({"seq": 5, "request": "log"}, "another"))["ok"]  # to which nothing is owed now
+    assert (await anna.ask({"seq": 4, "request": "status"}, "urgent"))["ok"]  # in its existing session
+    assert (await anna.ask({"seq": 5, "request": "log"}, "another"))["ok"]  # it isn't waiting for anything now
     await anna.ask({"seq": 5, "request": "cancel"}, "w0")
     anna.sessions.end_all()
 
 
 @in_loop
 async def test_askers_that_come_and_go_at_a_server_that_hangs_take_32_connections_and_no_threads() -> None:
-    """A closed connection stays in the backlog; an asker that has gone before its turn is not connected."""
+    """A closed connection stays in the backlog. A client that leaves before its turn is not connected."""
     with short_directory() as directory, socket.socket(socket.AF_UNIX) as listening:
         listening.bind(f"{directory}/s")
         listening.listen(256)

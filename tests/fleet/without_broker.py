@@ -1,4 +1,4 @@
-"""The sessions of a robot without a broker: the test hands over requests, and looks at what is published."""
+"""A robot's sessions without a broker. The test submits requests and inspects what is published."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ if TYPE_CHECKING:
 
 
 class SessionsWithoutBroker:
-    """The sessions of anna, in the running event loop."""
+    """The sessions of the robot anna, in the running event loop."""
 
     def __init__(self, socket: str, room: int = 200_000) -> None:
-        """`socket`: the server's; `room`: bytes of the largest payload."""
+        """`socket` is the path of the server's socket, and `room` the size of the largest payload in bytes."""
         needs_packages("paho")
         from talkcli.fleet.bridge.session import RemoteSessions
         from talkcli.fleet.link import boottime
 
-        #: the topic and the lines of each message
+        #: the topic and the lines of each published message
         self.published: list[tuple[str, list[dict[str, Any]]]] = []
         self._more = asyncio.Event()
         self._boottime = boottime
@@ -35,7 +35,7 @@ class SessionsWithoutBroker:
         self.sessions: RemoteSessions = RemoteSessions("anna", socket, self._publish, lambda: room, lambda: None)
 
     def post(self, fields: object, session: str = "s1", *, correlation: bytes | None = None) -> None:
-        """Send a request of bob, an object or bytes. b"" is a goodbye."""
+        """Send a request as bob, from an object or bytes. An empty payload is a goodbye."""
         payload = fields if isinstance(fields, bytes) else json.dumps(fields).encode()
         topic, response = "talk/robot/anna/request/bob", f"talk/reply/bob/{session}"
         asked = topics.parse_request(topic)
@@ -52,7 +52,7 @@ class SessionsWithoutBroker:
         return [each for topic, lines in self.published if topic == f"talk/reply/bob/{session}/anna" for each in lines]
 
     async def line(self, wanted: Callable[[dict[str, Any]], bool], session: str = "s1") -> dict[str, Any]:
-        """Return the first wanted line, also of those that came before."""
+        """Return the first line that matches. It may have been published before this call."""
 
         async def find() -> dict[str, Any]:
             while not (found := list(filter(wanted, self.lines(session)))):
@@ -66,7 +66,7 @@ class SessionsWithoutBroker:
             raise AssertionError(f"no such line within {PATIENCE} s: {self.published}") from None
 
     async def ask(self, fields: dict[str, Any], session: str = "s1") -> dict[str, Any]:
-        """Send a request of bob, and return its reply."""
+        """Send a request as bob, and return the reply."""
         self.post(fields, session)
         return await self.line(lambda each: each.get("seq") == fields["seq"] and "ok" in each, session)
 

@@ -1,4 +1,4 @@
-"""The broker and the login that the environment names, and mistakes there, of which no secret is shown."""
+"""Reading the broker and the login from the environment. Error messages must not show secrets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The payload by which a robot is announced to Home Assistant: its rules, its templates, its topic."""
+"""The description of a robot for Home Assistant: its rules, templates and topic."""
 
 from __future__ import annotations
 
@@ -86,5 +86,5 @@ def test_each_name_has_a_topic_of_its_own() -> None:
     names = ["a" + "".join(each) for length in range(5) for each in product("._d", repeat=length)]
     assert len({topics.homeassistant_device(each) for each in names}) == len(names)
     assert all(TOPIC.fullmatch(topics.homeassistant_device(each)) for each in names)
-    for name in ("anna", "A_1", "wh-07"):  # so that an ACL's pattern is enough
+    for name in ("anna", "A_1", "wh-07"):  # one pattern of an ACL matches it
         assert topics.homeassistant_device(name) == topics.homeassistant_device("%u").replace("%u", name)

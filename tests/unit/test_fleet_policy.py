@@ -1,4 +1,4 @@
-"""What a robot takes from the broker: each rule, its order among the others, and the limits of what is remembered."""
+"""The rules for messages from the broker: each rule, the order of the rules, and the limits of stored data."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def asked(judged: Judged) -> RemoteRequest:
     return judged
 
 
-# What a message asks for
+# Accepted requests
 
 
 @pytest.mark.parametrize("topic", [OWN, "talk/group/all/request/bob", "talk/group/g/request/bob"])
@@ -90,7 +90,7 @@ def test_an_empty_request_is_the_goodbye_of_the_session_that_it_names() -> None:
         assert isinstance(judge(request(b"", topic, response)), Ignored)
 
 
-# What is refused, and in which order
+# Refusals, and their order
 
 
 @pytest.mark.parametrize("payload", [b"", json.dumps(SAY).encode(), b"{", b"x" * 100_000])
@@ -168,7 +168,7 @@ def test_a_stale_sentence_is_refused_and_a_stale_cancel_is_not() -> None:
     assert asked(judge(request({"request": "cancel"}), stale=True)).request == Cancel()
 
 
-# How old it may be
+# Maximum age
 
 
 @pytest.mark.parametrize(
@@ -195,7 +195,7 @@ def test_a_sentence_must_begin_before_its_message_expires(
 
 
 def text(number: int) -> bytes:
-    """Return the number of an echo as the echo has it."""
+    """Return the number of an echo in the form of its payload."""
     return f"{number}".encode()
 
 
@@ -224,7 +224,7 @@ def test_an_unknown_echo_tells_nothing(unknown: bytes) -> None:
 
 @given(st.lists(st.tuples(st.sampled_from(["send", "come", "wait"]), st.integers(0, 12)), max_size=60))
 def test_messages_older_than_the_newest_echo_allows_are_refused(steps: list[tuple[str, int]]) -> None:
-    """A message that comes with an echo was forwarded by the broker no earlier than that echo was sent."""
+    """The broker forwards a message that arrives after an echo no earlier than the echo was sent."""
     now, proved, echoes = 0.0, 0.0, EchoTracker(0.0)
     sent: dict[int, float] = {}
     for what, number in steps:
@@ -244,14 +244,14 @@ def test_of_a_thousand_echoes_the_newest_alone_counts() -> None:
     assert echoes.add(0.0) == 1001
 
 
-# What was sent before
+# Goals that were sent before
 
 
 def test_the_last_thousand_ids_are_remembered_with_the_servers_start() -> None:
     ids = SentIds()
     for each in range(1200):
         ids.add(f"goal-{each}", "1a1a")
-    ids.add("goal-200", "2b2b")  # again: now it is the newest
+    ids.add("goal-200", "2b2b")  # added again, it becomes the newest
     ids.add("more", "2b2b")
     known = {each: ids.boot_of(each) for each in ("goal-200", "goal-201", "goal-202", "more")}
     assert known == {"goal-200": "2b2b", "goal-201": None, "goal-202": "1a1a", "more": "2b2b"}
@@ -268,7 +268,7 @@ def test_twenty_goals_may_be_pending_whichever_of_reply_and_event_comes_first() 
         if each % 2:
             share.queued(f"g{each}", "battery" if each == 7 else None)
             share.answered(f"g{each}", pending=True)
-        elif each:  # the first is still on its way
+        elif each:  # the first goal is still on its way
             share.answered(f"g{each}", pending=True)
             share.queued(f"g{each}", None)
     assert (len(share), share.pending_count) == (20, 19)
@@ -317,7 +317,7 @@ def test_the_share_counts_like_a_slow_model(steps: list[tuple[str, int]]) -> Non
         assert (len(share), share.pending_count) == (len(on_way | pending), len(pending))
 
 
-# What a robot says in its server's place
+# Goals that end before they are sent to the server
 
 
 @pytest.mark.parametrize(("wait", "feedback"), [(False, False), (True, False), (False, True)])

@@ -1,4 +1,4 @@
-"""Presence and status as a reader takes them, whoever wrote them, and the robots that `--robot` picks."""
+"""Reading presence and status from arbitrary payloads, and the selection of robots by `--robot`."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_only_a_presence_with_a_time_and_a_session_is_compared_with_other_bridge
     assert bridge_rank(presence(HERE | changed)) == found
 
 
-# The robots that `--robot` means
+# Selection by `--robot`
 
 
 def robot(name: str, *groups: str, online: bool = True) -> Presence:

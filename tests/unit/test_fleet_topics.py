@@ -1,4 +1,4 @@
-"""The topics of a fleet: names, what a topic asks for, where an answer may go, and who may use which topic."""
+"""The topics of a fleet: valid names, request topics, reply topics, and access rules."""
 
 from __future__ import annotations
 
@@ -85,13 +85,13 @@ HOME = {
 
 
 def may(way: str, login: str | None, rules: str) -> set[str]:
-    """Return the topics that a login may read or write by its own rules, or any login by the patterns (None)."""
+    """Return the topics that a login may read or write by its own rules, or by the patterns if it is None."""
     found, user = set(), None
     for kind, *words in (each.split() for each in rules.splitlines() if each):
         if kind == "user":
             (user,) = words
         elif kind in ("pattern", "topic"):
-            assert (kind == "topic") == (user is not None)  # mosquitto would read a later pattern as that user's
+            assert (kind == "topic") == (user is not None)  # mosquitto would apply a later pattern to that user only
             found |= {words[1]} if user == login and words[0] in (way, "readwrite") else set()
     return found
 
@@ -102,7 +102,7 @@ def talk(topics_of: str) -> set[str]:
 
 @pytest.mark.parametrize("way", ["read", "write"])
 def test_each_login_may_use_its_own_topics_and_no_others(way: str) -> None:
-    """A robot's name is %u, so a rule with it in the place of the user would let one robot command another."""
+    """If a pattern had %u in the place of the user, each robot could command the others."""
     rules = topics.access_rules(("olga",), name="r2.d2")
     assert may(way, None, rules) == talk(ROBOT[way])
     assert may(way, "olga", rules) == talk(OPERATOR[way])

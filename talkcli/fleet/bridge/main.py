@@ -161,7 +161,6 @@ class Bridge:
         self._systemd.notify_stopping()
         self._tick_timer.cancel()
         self._sessions.end_all()
-        self._publisher.close()
         tasks[1].cancel()
         await self._go_offline()
         tasks[0].cancel()
@@ -241,7 +240,7 @@ class Bridge:
         self._echoes = EchoTracker(boottime())
         #: when the first echo after the last returned one was sent (loop clock); None if no echo is outstanding
         self._unanswered_since: float | None = None
-        self._loop.add_reader(self._descriptor, self._use, Link.read)
+        self._loop.add_reader(self._descriptor, self._on_ready, Link.read)
         link.subscribe(self._presence_topic, retained=True)
         link.subscribe(self._echo_topic, retained=False)
         # The retained presence of another bridge arrives before this question returns. If the other bridge is still
@@ -286,8 +285,8 @@ class Bridge:
                     forget(self._descriptor)
             self._descriptor = -1
 
-    def _use(self, action: Callable[[Link], None]) -> None:
-        """Read from the link or write to it, after the loop has found it ready."""
+    def _on_ready(self, action: Callable[[Link], None]) -> None:
+        """Read from the link or write to it, because its descriptor is ready."""
         link = self._link
         if link:
             action(link)
@@ -314,7 +313,7 @@ class Bridge:
         else:
             self._sessions.may_read.set()
         if link.wants_write:
-            self._loop.add_writer(self._descriptor, self._use, Link.write)
+            self._loop.add_writer(self._descriptor, self._on_ready, Link.write)
         else:
             self._loop.remove_writer(self._descriptor)
 
@@ -389,6 +388,7 @@ class Bridge:
             self._send_echo()
 
     def _handle_echo(self, payload: bytes) -> None:
+        """Process an echo, or the question of a new bridge whether the robot's name is in use."""
         if payload.startswith(_RIVAL_QUESTION):
             if payload != _RIVAL_QUESTION + self._session.encode():
                 if self._online:
@@ -490,7 +490,7 @@ class Bridge:
             return
         taken = asyncio.Event()
         was_online = self._online and not isinstance(self._error, AddressInUse)
-        self._online = False  # otherwise `_handle_presence` would contradict the next message
+        self._online = False  # otherwise the bridge would correct its own offline message
         if was_online:
             topic, payload = self._presence_topic, self._offline_presence()
         else:

@@ -127,11 +127,6 @@ class Publisher:
             )
             server.abort()
 
-    def close(self) -> None:
-        """Cancel the timer for the next status."""
-        if self._timer:
-            self._timer.cancel()
-
     # -- from the server
 
     def _receive(self, server: LocalConnection, lines: list[bytes]) -> None:

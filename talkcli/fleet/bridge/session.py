@@ -327,6 +327,7 @@ class RemoteSession:
 
     @property
     def _exchanges(self) -> list[_RemoteExchange]:
+        """The requests that were sent to the server and have not been answered."""
         exchanges = self._server.exchanges.values() if self._server else ()
         return [each for each in exchanges if isinstance(each, _RemoteExchange)]
 
@@ -336,6 +337,7 @@ class RemoteSession:
         return [*self._queue, *(each.remote for each in self._exchanges)]
 
     def _waiting_for_room(self) -> list[RemoteRequest]:
+        """Return the goals of this session that wait for room."""
         return [request for request, _, session in self._sessions.waiting if session is self]
 
     def _drop_waiting(self) -> None:
@@ -440,9 +442,6 @@ class RemoteSession:
         """Publish the server's lines for the client."""
         answers: list[tuple[bytes, bytes | None]] = []
         for line in lines:
-            if line.startswith(_UNRELIABLE):
-                answers.append((line + b"\n", None))
-                continue
             try:
                 message = decode(line)
             except BadRequest as error:
@@ -512,6 +511,7 @@ class RemoteSession:
         return goal
 
     def _send_gone(self, why: str) -> None:
+        """Tell the client that the session has ended."""
         self._publish([(encode({"event": "gone", "message": why}), None)])
 
     def _publish(self, lines: list[tuple[bytes, bytes | None]]) -> None:
