@@ -152,7 +152,7 @@ class FleetWatch:
         Raises:
             UsageError: The user name can't be part of a topic.
         """
-        self._selection = selection
+        self._broker, self._selection = broker, selection
         self._desk = DeskLink(broker)
         self._desk.handler = self
         self._events: deque[FleetEvent] = deque()
@@ -238,9 +238,7 @@ class FleetWatch:
             if not self._has_started and away >= ANSWER_LIMIT_S:
                 raise self._desk.no_answer_error(ANSWER_LIMIT_S)
             if away >= ABSENCE_LIMIT_S:
-                raise Lost(
-                    f"the broker at {self._desk.broker.url} was away for {ABSENCE_LIMIT_S:g} s: {self._away_why}"
-                )
+                raise Lost(f"the broker at {self._broker.url} was away for {ABSENCE_LIMIT_S:g} s: {self._away_why}")
         for name in [name for name, until in self._missing.items() if now >= until]:
             del self._missing[name]
             self._set_presence(name, None)
