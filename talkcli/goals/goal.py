@@ -38,7 +38,7 @@ class Sender:
 
     @classmethod
     def from_json(cls, value: object) -> Sender:
-        return cls(**read_fields(cls, value if isinstance(value, dict) else {}))
+        return cls(**read_fields(cls, value))
 
 
 @frozen
@@ -75,7 +75,7 @@ class Output:
 
     @classmethod
     def from_json(cls, value: object) -> Output | None:
-        found = read_fields(cls, value) if isinstance(value, dict) else {}
+        found = read_fields(cls, value)
         return cls(**found) if len(found) == len(cls.__annotations__) else None
 
 
@@ -146,17 +146,18 @@ class Goal:
     @classmethod
     def from_json(cls, value: object) -> Goal:
         """Return the goal in a server's message. Raises Unreadable if its id or state is missing or invalid."""
-        found = read_fields(cls, value if isinstance(value, dict) else {})
+        found = read_fields(cls, value)
         if not str(found.get("id", "\n")).isprintable() or "state" not in found:  # ids are printed without escaping
             raise Unreadable("what the server sent for a goal has no id that can be one, or an unknown state")
         return cls(**found)
 
 
-def read_fields(cls: type, message: JsonObject) -> dict[str, Any]:
+def read_fields(cls: type, message: object) -> dict[str, Any]:
     """Return the values that a JSON object has for the fields of a class. Values of the wrong type are left out."""
     found = {}
+    values = message if isinstance(message, dict) else {}
     for name, annotation in cls.__annotations__.items():
-        value = message.get(name)
+        value = values.get(name)
         if value is not None and (read := _READERS[annotation.partition(" ")[0]](value)) is not None:
             found[name] = read
     return found

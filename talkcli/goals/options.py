@@ -178,7 +178,7 @@ class Option:
     check: Callable[[Any], str | None] | None = None
     #: note on the allowed values, for the documents
     form: str = ""
-    #: note on the default, for the documents
+    #: note on the default, for the documents; by default, settings and options for the engine have the server's value
     default_words: str = ""
     #: spellings on a command line: "-w, --wait", or "--preempt/--queue" with one for yes and one for no
     flags: str = ""
@@ -315,7 +315,6 @@ OPTIONS = (
         "preempt",
         FLAG,
         "stop what is being spoken, if its priority is not higher, and go first",
-        default_words="the server's",
         flags="--preempt/--queue",
         help="Stop what is spoken and go first, or wait in the queue. [default: as 'talk serve' was told]",
         setting=Setting(
@@ -353,7 +352,6 @@ OPTIONS = (
         SECONDS,
         "seconds from now in which it must begin, else RECALLED; 0 for no limit",
         limits=(0, None),
-        default_words="the server's",
         flags="--ttl",
         help="Drop it if it has not begun within SEC seconds; 0: no limit.",
         setting=Setting(
@@ -406,7 +404,6 @@ OPTIONS = (
         # libespeak-ng accepts no other rates.
         limits=(80, 450),
         unit=" words per minute",
-        default_words="the server's",
         flags="--rate",
         help="Words per minute.",
         env="TALK_RATE",
@@ -418,7 +415,6 @@ OPTIONS = (
         NUMBER,
         "loudness",
         limits=(0.0, 1.0),
-        default_words="the server's",
         flags="--volume",
         help="Loudness.",
         env="TALK_VOLUME",
@@ -430,7 +426,6 @@ OPTIONS = (
         WORD,
         f"id, name or language; `{DEFAULT_VOICE}` for the driver's own",
         check=_voice_error,
-        default_words="the server's",
         flags="--voice",
         metavar="VOICE",
         help="Voice by id, name or language: see 'talk voices'.",
@@ -460,7 +455,6 @@ OPTIONS = (
         INTEGER,
         "50 is the voice's own; a neural voice has no other",
         limits=(0, 100),
-        default_words="the server's",
         flags="--pitch",
         help="Pitch of the voice; 50 is its own, and a neural voice has no other.",
         setting=Setting(50, words="pitch {}"),
@@ -472,7 +466,6 @@ OPTIONS = (
         "milliseconds of silence before it, also where the output was not idle; 0 for none",
         limits=(0, MAX_LEAD_IN_MS),
         unit=" milliseconds",
-        default_words="the server's",
         flags="--lead-in",
         metavar="MS",
         help="Milliseconds of silence before it; also where the output was not idle; 0: none. [default: as 'talk "
@@ -483,7 +476,6 @@ OPTIONS = (
         "audible",
         FLAG,
         "whether it is ABORTED, `muted`, where its output is muted; where that can't be known it is spoken",
-        default_words="the server's",
         flags="--audible",
         help="Abort it where its output is muted. [default: as 'talk serve' was told]",
         for_engine=True,

@@ -16,18 +16,9 @@ from math import inf
 from typing import TYPE_CHECKING
 
 from talkcli.frozen import frozen, replace
+from talkcli.goals import options
 from talkcli.goals.goal import By
 from talkcli.goals.history import EarlyCancels, History, SpeechTimes
-from talkcli.goals.options import (
-    INITIAL,
-    MAX_TEXT_CHARS,
-    bad_option,
-    bad_text,
-    format_number,
-    is_clients_id,
-    is_neural,
-    without_speaker,
-)
 from talkcli.goals.queue import Queue
 from talkcli.goals.reasons import Reason, Refusal
 from talkcli.goals.record import Record
@@ -122,8 +113,8 @@ class Scheduler:
         boot: str,
         *,
         max_queue: int,
-        max_text: int = MAX_TEXT_CHARS,
-        settings: Set = INITIAL,
+        max_text: int = options.MAX_TEXT_CHARS,
+        settings: Set = options.INITIAL,
         voices: VoiceScheduler | None = None,
     ) -> None:
         """Start without goals and without an engine.
@@ -211,7 +202,7 @@ class Scheduler:
             canceled: the client that cancelled the goal while it waited for room. The goal is accepted and recalled.
             waited_s: how long the goal waited for room, which counts towards its time to live.
         """
-        first = self.find(say.id) if say.id is not None and is_clients_id(say.id) else None
+        first = self.find(say.id) if say.id is not None and options.is_clients_id(say.id) else None
         if first is not None and first.has_text(say.text):
             return Submission(first, [], attached=True)
         self._count += 1
@@ -257,7 +248,7 @@ class Scheduler:
         result = Cancellation()
         by = By(client=sender)
         chosen = self._select(selection, result, waiting)
-        for goal_id in filter(is_clients_id, result.unknown):
+        for goal_id in filter(options.is_clients_id, result.unknown):
             self._early_cancels.add(goal_id, by, now.monotonic)
         for record in chosen:
             if record.state is State.PENDING:
@@ -274,7 +265,7 @@ class Scheduler:
         self.settings = replace(self.settings, **changes)
         voice = changes.get("voice")
         if isinstance(voice, str):
-            self.voices.forget_failure(without_speaker(voice))
+            self.voices.forget_failure(options.without_speaker(voice))
             self._request_voice(voice, now)
         return self.tick(now)  # the next goal may no longer have to wait for its voice
 
@@ -474,11 +465,11 @@ class Scheduler:
         """
         if self.closing:
             return Reason.SHUTDOWN, "the server is being stopped"
-        if words := bad_option(say):
+        if words := options.bad_option(say):
             return Reason.BAD_OPTION, words
         if first is not None:
             return Reason.ID_CONFLICT, f"the id {say.id} is that of another text already"
-        return bad_text(say.text, self.max_text) or refusal
+        return options.bad_text(say.text, self.max_text) or refusal
 
     def _throttle(self, say: Say, record: Record, now: Now) -> Refusal | None:
         """Return the refusal if a goal is throttled, and set `record.by` to the goal that it repeats."""
@@ -494,7 +485,7 @@ class Scheduler:
             last = self._speech_times.find(now.monotonic - say.throttle, say.key, say.text)
             if last is None:
                 return None
-            first, words = last, f"was said less than {format_number(say.throttle)} s ago"
+            first, words = last, f"was said less than {options.format_number(say.throttle)} s ago"
         record.by = By(goal=first)
         return Reason.THROTTLED, f"the same {words}"
 
@@ -537,7 +528,7 @@ class Scheduler:
 
     def _request_voice(self, voice: str, now: Now) -> None:
         """Plan to load the voice for a goal if it is a neural voice and an engine process is running."""
-        if self._loads_voices and is_neural(model := without_speaker(voice)):
+        if self._loads_voices and options.is_neural(model := options.without_speaker(voice)):
             self.voices.request(model, now.monotonic)
 
     def _needed_voices(self) -> list[str]:
@@ -545,8 +536,8 @@ class Scheduler:
 
         If the active goal already has a voice, it needs no other. The engine keeps that voice until the goal ends.
         """
-        voices = (without_speaker(self.wanted_voice(each)) for each in self.unfinished() if each.voice is None)
-        return list(filter(is_neural, dict.fromkeys(voices)))
+        voices = (options.without_speaker(self.wanted_voice(each)) for each in self.unfinished() if each.voice is None)
+        return list(filter(options.is_neural, dict.fromkeys(voices)))
 
     def _load_next(self, now: Now) -> list[Effect]:
         """Return the order to load the next voice, if there is one.
@@ -558,14 +549,16 @@ class Scheduler:
             return []
         if self.active and not self.voices.has_libraries:
             return []
-        order = self.voices.load_next(self._needed_voices(), without_speaker(self.settings.voice), now.monotonic)
+        order = self.voices.load_next(
+            self._needed_voices(), options.without_speaker(self.settings.voice), now.monotonic
+        )
         return [order] if order else []
 
     def _drop_excess(self) -> list[Effect]:
         """Return orders to drop voices if the voices use more memory than allowed."""
         needed = self._needed_voices()
-        speaking = without_speaker(self.active.voice) if self.active else ""
-        if is_neural(speaking) and not self.voices.is_loaded(speaking):
+        speaking = options.without_speaker(self.active.voice) if self.active else ""
+        if options.is_neural(speaking) and not self.voices.is_loaded(speaking):
             return []  # a dropped voice that still speaks uses its memory until then, and is measured again after that
         return [*self.voices.drop_excess(next(iter(needed), speaking), needed)]
 
@@ -669,4 +662,4 @@ class Scheduler:
 
 
 def _expiry_message(record: Record) -> str:
-    return f"its time to live of {format_number(record.say.ttl)} s was over before it was spoken"
+    return f"its time to live of {options.format_number(record.say.ttl)} s was over before it was spoken"

@@ -16,18 +16,9 @@ from typing import TYPE_CHECKING
 from talkcli.daemon import log
 from talkcli.errors import RequestRefused, UnknownGoal
 from talkcli.frozen import fields, replace
+from talkcli.goals import options
 from talkcli.goals.goal import By
-from talkcli.goals.options import (
-    INITIAL,
-    Cancel,
-    Say,
-    Set,
-    bad_option,
-    format_number,
-    given_values,
-    is_neural,
-    shown_settings,
-)
+from talkcli.goals.options import Cancel, Say, Set
 from talkcli.goals.reasons import Reason
 from talkcli.goals.states import State
 from talkcli.protocol.events import Result
@@ -143,7 +134,7 @@ class Requests:
         if not self._speech.awaits_voices:
             return False
         if isinstance(request, Set):
-            return request.voice is not None and not bad_option(request)
+            return request.voice is not None and not options.bad_option(request)
         return isinstance(request, Voices) or (isinstance(request, Say) and request.voice is not None)
 
     def _stop_awaiting_voices(self, connection: ClientConnection) -> None:
@@ -258,7 +249,7 @@ class Requests:
         """Return a goal with the id of its voice, and a refusal if it can't be spoken with this voice."""
         voice, refusal = self._speech.voices.look_up(say.voice, self._scheduler.settings.voice)
         say = replace(say, voice=voice)
-        if say.pitch not in {None, INITIAL.pitch} and is_neural(voice or ""):
+        if say.pitch not in {None, options.INITIAL.pitch} and options.is_neural(voice or ""):
             words = f"the voice {voice} has no pitch but its own: leave the pitch out, or take one of espeak's"
             refusal = refusal or (Reason.BAD_OPTION, words)
         return say, pending.refusal or refusal
@@ -381,19 +372,19 @@ class Requests:
 
     async def _set(self, pending: PendingRequest, request: Set) -> None:
         speech, scheduler = self._speech, self._scheduler
-        if words := bad_option(request):
+        if words := options.bad_option(request):
             raise RequestRefused(words, Reason.BAD_OPTION)
         voice, refusal = speech.voices.look_up(request.voice)
         if refusal:
             raise RequestRefused(refusal[1], refusal[0])
-        changes = given_values(replace(request, voice=voice))
+        changes = options.given_values(replace(request, voice=voice))
         effects = scheduler.change_settings(changes, speech.now())
         self._check_room_soon()  # waiting goals may preempt now, and so have room
         speech.apply(effects)
         if changes:
-            values = ", ".join(f"{name} {format_number(value)}" for name, value in changes.items())
+            values = ", ".join(f"{name} {options.format_number(value)}" for name, value in changes.items())
             log.write(f"set to {log.sanitize(values)} by {describe_sender(pending.connection.client)}")
-        pending.answer(settings=shown_settings(scheduler.settings))
+        pending.answer(settings=options.shown_settings(scheduler.settings))
 
     def _find(self, goal_id: str) -> Record:
         record = self._scheduler.find(goal_id)

@@ -164,8 +164,16 @@ class Speech:
 
     def _carry_out(self, effect: EngineOrder | VoiceLoadOrder | VoiceDropOrder | VoiceWarning) -> None:
         match effect:
-            case EngineOrder(record=record, order=order):
-                self._give_order(record, order)
+            case EngineOrder(record=record, order=Order.START):
+                self._start(record)
+            case EngineOrder(record=record, order=Order.STOP):
+                self.engine.stop(record.id)
+            case EngineOrder(record=record, order=Order.GIVE_UP):
+                self.engine.give_up(record.id)
+            case EngineOrder(record=record, order=Order.HOLD):
+                self.engine.pause(record.id, record.pause_count)
+            case EngineOrder(record=record, order=Order.RESUME):
+                self.engine.resume(record.id)
             case VoiceLoadOrder(voice=voice, dropped=dropped):
                 for each in dropped:
                     log.write(f"voice {log.sanitize(each)} dropped, to make room for {log.sanitize(voice)}")
@@ -176,19 +184,6 @@ class Speech:
                 self.engine.drop(voice)
             case VoiceWarning(message=message):
                 log.write(log.sanitize(message))
-
-    def _give_order(self, record: Record, order: Order) -> None:
-        match order:
-            case Order.START:
-                self._start(record)
-            case Order.STOP:
-                self.engine.stop(record.id)
-            case Order.GIVE_UP:
-                self.engine.give_up(record.id)
-            case Order.HOLD:
-                self.engine.pause(record.id, record.pause_count)
-            case Order.RESUME:
-                self.engine.resume(record.id)
 
     def _start(self, record: Record) -> None:
         self._announced_next = next_waits, next_is_neural = self._following()

@@ -57,7 +57,8 @@ def _field(option: Option, *, changes: bool) -> str:
     null = "null" if option.default is None else json.dumps(option.default)
     default = f"`{option.default}`" if option.default and isinstance(option.default, str) else null
     meaning = (changes and option.setting and option.setting.meaning) or option.meaning
-    absent = "" if changes else option.default_words
+    servers = option.default is None and (option.setting or option.for_engine)
+    absent = "" if changes else option.default_words or ("the server's" if servers else "")
     return f"| | `{option.name}` | {_values(option)} | {absent or default} | {meaning} |\n"
 
 
