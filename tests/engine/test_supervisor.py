@@ -434,7 +434,7 @@ def test_a_process_that_dies_while_idle_was_of_use_if_it_has_spoken(spoken: bool
     engine = _watching(process, [])
     engine._restarts.start_failed(0.0, 0.0, None)
     if spoken:
-        engine._goal = SupervisedGoal(YES, last_sign_at=0.0)
+        engine._goal = SupervisedGoal(YES, sent=True)
         engine._handle_event(process, SPOKEN)
     engine._handle_event(process, protocol.Alive(""))  # as from a process that loads a voice
     before = time.monotonic()
@@ -451,7 +451,7 @@ def test_a_goal_ends_once_when_its_process_is_gone_or_should_be(monkeypatch: pyt
     process = cast("EngineProcess", undying)
     engine = _watching(process, posted)
     monkeypatch.setattr(engine, "_start_process", lambda: None)
-    engine._goal = SupervisedGoal(YES, last_sign_at=0.0, started=True)
+    engine._goal = SupervisedGoal(YES, sent=True, started=True)
     engine._lose_process("it hangs", Reason.ENGINE_HUNG)
     due = process.exit_deadline
     engine._check_deadlines(due - KILL_LIMIT_S / 2)

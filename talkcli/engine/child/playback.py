@@ -151,7 +151,6 @@ class PlayerFeed:
         #: time at which the player last accepted samples or had consumed everything; the start of a possible stall
         self.progress_at = time.monotonic()
         self._rate = rate
-        self._zeros = bytes(self.piece_bytes)
         self._clock = clock
         self._first_write_at = 0.0
         #: time at which everything written will have been heard
@@ -180,7 +179,7 @@ class PlayerFeed:
             position: position in the audio of the next sample.
             limit: maximum number of bytes to offer, or None for a whole piece.
         """
-        taken = self.offer(memoryview(self._zeros)[:limit])
+        taken = self.offer(memoryview(bytes(self.piece_bytes))[:limit])
         if taken:
             self._clock.add_silence(position, self._seconds(taken))
         return taken
@@ -253,7 +252,6 @@ class Playback:
         self._complete = False  # whether all samples were written
         self._begin = 0  # offset of the current player's first sample
         self._sent = 0  # offset after the last sample accepted by the player
-        self._start_reported = False  # whether the beginning of the sentence was reported
         self._stopped = False
         #: whether `_skipped` is final
         self._start_known = False
@@ -281,7 +279,7 @@ class Playback:
             fallback_reason: human-readable reason for a fallback voice, or None for the requested voice.
         """
         if self._feed is not None and rate != self._rate:
-            self._release_player(0)  # the player was started with another rate
+            self._release_player(self._feed, 0)  # the player was started with another rate
         self._rate = rate
         self._runner.report_voice(voice, fallback_reason)
         if self._players.takes_time and not self._runner.hold_number:
@@ -408,8 +406,7 @@ class Playback:
         first = self._first_error
         if first is None or first.reason == Reason.NO_PLAYER:  # a failed player's error is more useful
             first = self._first_error = error
-        proven = feed is not None and feed.player.proven
-        lost = proven or error.final or (feed is not None and error.reason == Reason.AUDIO_STALLED)
+        lost = error.final or error.reason == Reason.AUDIO_STALLED or (feed is not None and feed.player.proven)
         others = list(self._untried or ())
         self._untried = iter(others) if others else None
         if lost or not (others or self._is_busy(first)):
@@ -427,10 +424,10 @@ class Playback:
         self._busy_until = self._busy_until or time.monotonic() + DEVICE_BUSY_LIMIT_S
         return time.monotonic() < self._busy_until
 
-    def _release_player(self, begin: int) -> None:
+    def _release_player(self, feed: PlayerFeed, begin: int) -> None:
         """Release the player. The next player continues at the offset `begin`."""
-        feed, self._begin, self._sent = self._feed, begin, begin
-        if feed is not None and feed.player.proven:
+        self._begin = self._sent = begin
+        if feed.player.proven:
             self._players.last_player = feed.player.name  # will be tried first
         self._untried = self._first_error = None
         self.silence()
@@ -438,7 +435,7 @@ class Playback:
     def _rewind(self, feed: PlayerFeed) -> None:
         """Release a player although it still has sound in its buffer. The next player repeats the unheard sound."""
         feed.update(time.monotonic(), complete=False)
-        self._release_player(self._unheard_begin() if feed.player.proven else self._begin)
+        self._release_player(feed, self._unheard_begin() if feed.player.proven else self._begin)
 
     # -- steps
 
@@ -466,7 +463,6 @@ class Playback:
         """Wait once for more samples. Meanwhile, keep playing."""
         if self._runner.hold_number:
             self._keep_silent(feed)
-        self._update(feed)
         feed.player.ended()  # raises an error if the player has failed, because the wait below would not notice
         self._wait_for(feed, None, more)
         self._update(feed)
@@ -549,11 +545,9 @@ class Playback:
         if not player.proven:
             return
         self._players.update_output(player)
-        if feed.consumed and not self._start_reported:
-            self._start_reported = True
-            self._players.handovers.sentence_started(
-                player.name, now - self._clock.elapsed(now), neural=self._in_background
-            )
+        if feed.consumed:
+            began_at = now - self._clock.elapsed(now)
+            self._players.handovers.sentence_started(player.name, began_at, neural=self._in_background)
         self._samples.drop_until(self._unheard_begin() if player.real_time else self._sent)
         self._report_words(self._clock.pop_started(now) if player.real_time else self._clock.pop_all())
 
@@ -593,7 +587,7 @@ class Playback:
                 release_at = 0.0  # a player that fails during a hold is replaced
             due = min(release_at, feed.progress_at + STALL_LIMIT_S)
             if time.monotonic() >= due:
-                self._release_player(self._sent)  # everything sent so far was heard
+                self._release_player(feed, self._sent)  # everything sent so far was heard
                 raise _PlayerReleased
             if not taken:
                 self._wait_for(feed, due)

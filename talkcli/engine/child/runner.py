@@ -149,7 +149,7 @@ class GoalRunner:
         engine: Any,
         set_properties: Callable[[protocol.Speak], str | None],
         pump: Callable[[], None] | None,
-        synthesizer: CombinedSynthesizer | None = None,
+        synthesizer: CombinedSynthesizer | None,
     ) -> None:
         """Set the engine that speaks the goals.
 
@@ -158,7 +158,7 @@ class GoalRunner:
             set_properties: sets the engine's properties for a goal. It returns the reason for a fallback voice, or None
                 if the goal has the requested voice. It raises CannotSpeak if the goal can't be spoken.
             pump: called about 20 times a second while a third-party driver speaks; None for `talk`'s own driver.
-            synthesizer: the synthesizer of `talk`'s own driver, which loads neural voices.
+            synthesizer: the synthesizer of `talk`'s own driver, or None with a third-party driver.
         """
         self._engine = engine
         self._set_properties = set_properties
@@ -174,23 +174,20 @@ class GoalRunner:
         Args:
             send_voices: whether to send the list of voices first.
         """
-        try:
-            if send_voices:
-                try:
-                    voices = list_voices(self._engine)
-                except Exception:  # noqa: BLE001 - a third-party driver may raise any error, yet be able to speak
-                    traceback.print_exc()
-                    voices = ()
-                self._channel.send(protocol.VoiceList(voices))
-            while not self._channel.closed:
-                if not self._backlog:
-                    self.wait((), None)
-                    continue
-                command = self._backlog.popleft()
-                if isinstance(command, protocol.GoalCommand):  # other commands are for goals that have ended
-                    self._speak(command)
-        finally:
-            self._engine.endLoop()
+        if send_voices:
+            try:
+                voices = list_voices(self._engine)
+            except Exception:  # noqa: BLE001 - a third-party driver may raise any error, and yet be able to speak
+                traceback.print_exc()
+                voices = ()
+            self._channel.send(protocol.VoiceList(voices))
+        while not self._channel.closed:
+            if not self._backlog:
+                self.wait((), None)
+                continue
+            command = self._backlog.popleft()
+            if isinstance(command, protocol.GoalCommand):  # other commands are for goals that have ended
+                self._speak(command)
 
     def wait(self, interests: Sequence[Interest], until: float | None) -> None:
         """Wait for a descriptor, a command or a monotonic time, and execute the commands. It may return early.

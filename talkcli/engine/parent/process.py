@@ -113,11 +113,9 @@ class EngineProcess:
         """Send a command without blocking, and return whether it was sent. May be called from any thread."""
         line = protocol.encode(command)
         with self._sending:
-            if self.socket.fileno() < 0:
-                return False  # closed
             try:
                 return self.socket.send(line) == len(line)
-            except OSError:  # the process is dead, the buffer is full, or the system is out of memory
+            except OSError:  # the socket is closed, the process is dead, the buffer is full, or memory is short
                 return False
 
     def receive(self) -> Iterator[protocol.Event | None]:

@@ -195,8 +195,8 @@ class SupervisedGoal:
     """The state of a goal from its submission until its `Ended` is posted. Times are monotonic."""
 
     command: protocol.GoalCommand
-    #: time at which the goal was sent or last reported by the process; None while it waits for a process
-    last_sign_at: float | None = None
+    #: whether the goal was sent to the current process
+    sent: bool = False
     #: whether the process has sent `Started`
     started: bool = False
     #: whether the goal was retried because a process crashed before it started the goal
@@ -211,11 +211,6 @@ class SupervisedGoal:
     end: protocol.Ended | None = None
     #: the killed process that was speaking the goal
     lost_process: EngineProcess | None = None
-
-    @property
-    def sent(self) -> bool:
-        """Whether the goal was sent to the current process."""
-        return self.last_sign_at is not None
 
 
 class Supervisor:
@@ -243,7 +238,7 @@ class Supervisor:
         self._goal: SupervisedGoal | None = None
         #: ID of the neural voice that the process is loading
         self._loading: str | None = None
-        #: time of the last event from the process
+        #: time of the last event from the process, or of a later command that the process must answer
         self._last_sign_at = 0.0
         #: killed processes that may not have exited yet
         self._dying: list[EngineProcess] = []
@@ -336,9 +331,9 @@ class Supervisor:
         if goal and goal.stop_sent_at is not None:
             limit_ms = STOP_LIMIT_S * 1000
             yield goal.stop_sent_at + STOP_LIMIT_S, f"the engine did not confirm a stop within {limit_ms:.0f} ms"
-        if goal and goal.last_sign_at is not None:
-            yield goal.last_sign_at + HANG_LIMIT_S, no_sign
-        if self._loading is not None:
+        if goal and goal.sent:
+            yield self._last_sign_at + HANG_LIMIT_S, no_sign
+        elif self._loading is not None:
             yield self._last_sign_at + HANG_LIMIT_S, f"{no_sign} while it loaded {self._loading}"
         if goal and goal.hold_sent_at is not None:
             yield goal.hold_sent_at + HOLD_LIMIT_S, f"the engine did not confirm a pause within {HOLD_LIMIT_S:g} s"
@@ -391,7 +386,7 @@ class Supervisor:
         """
         self._goal = SupervisedGoal(command)
         if sent_to is not None and sent_to is self._process:
-            self._goal.last_sign_at = at
+            self._goal.sent, self._last_sign_at = True, at
         elif self._restarts.permanent_error is not None:
             self._fail_goal(self._goal, Reason.ENGINE_FAILED, self._restarts.permanent_error)
         else:
@@ -402,7 +397,7 @@ class Supervisor:
         goal, process = self._goal, self._process
         waits = goal and not (goal.sent or goal.hold_number or goal.end)
         if goal and waits and process and process.ready:
-            goal.last_sign_at = time.monotonic()
+            goal.sent, self._last_sign_at = True, time.monotonic()
             if not process.send(goal.command):
                 self._requeue_goal(goal.command.id, process)
 
@@ -411,7 +406,7 @@ class Supervisor:
         if process is self._process:
             goal = self._current(goal_id)
             if goal:
-                goal.last_sign_at = None
+                goal.sent = False
             self._replace_unresponsive(process)
 
     def _send_voice_command(self, command: protocol.LoadVoice | protocol.DropVoice) -> None:
@@ -435,7 +430,7 @@ class Supervisor:
     def _hold_goal(self, goal_id: str, number: int | None) -> None:
         """Hold the goal, or continue it if `number` is None."""
         goal = self._current(goal_id)
-        if goal is None or goal.stop_sent_at is not None or goal.end or goal.hold_number is number is None:
+        if goal is None or goal.stop_sent_at is not None or goal.end or goal.hold_number == number:
             return
         goal.hold_number = number
         goal.hold_sent_at = time.monotonic() if goal.sent and number is not None else None
@@ -510,7 +505,6 @@ class Supervisor:
             self._handle_event(process, event)
 
     def _handle_crash(self, process: EngineProcess) -> None:
-        self._direct_process = None
         self._lose_process(f"the engine crashed: {process.describe_exit()}", Reason.ENGINE_CRASHED)
 
     def _handle_event(self, process: EngineProcess, event: protocol.Event) -> None:
@@ -534,7 +528,6 @@ class Supervisor:
         self._send_goal()
 
     def _handle_goal_event(self, goal: SupervisedGoal, event: protocol.GoalEvent) -> None:
-        goal.last_sign_at = self._last_sign_at
         if isinstance(event, protocol.Started):
             goal.started = True
         elif isinstance(event, protocol.Ended):
@@ -588,7 +581,7 @@ class Supervisor:
             if goal.stop_sent_at is not None:
                 goal.end = protocol.Ended(goal.command.id, protocol.OUTCOME_STOPPED)
             goal.lost_process = process
-        goal.last_sign_at = goal.stop_sent_at = goal.hold_sent_at = None
+        goal.sent, goal.stop_sent_at, goal.hold_sent_at = False, None, None
 
     def _handle_failed_start(self, message: str, *, permanent: bool = False) -> None:
         """Schedule another start, and fail the waiting goal if it should wait no longer."""
