@@ -234,7 +234,8 @@ def test_watching_goes_on_with_another_snapshot(client: Client, scripted: Talk) 
     )
     taking.start()
     restart(scripted)
-    scripted.request("say", text="length=0 hello")
+    # The client may reconnect up to 0.5 s later, and must still see the end of this goal.
+    scripted.request("say", text="length=0.8 hello")
     taking.join(PATIENCE)
     assert not taking.is_alive()
     assert Snapshot in {type(each) for each in seen}

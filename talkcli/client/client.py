@@ -200,7 +200,7 @@ class Client:
         if handle.state.terminal:
             return handle
         if block:
-            self._connection.request(request, accepted, slow=patient)
+            self._connection.request(request, accepted)
         else:
             handle._expect(request, time.monotonic())
             self._connection.submit(request, accepted, handle._fail)
@@ -351,7 +351,7 @@ class Client:
 
         Nothing is spoken until any client calls `resume`. Pausing twice is no error.
         """
-        return goal_in(self._connection.request(Pause(), slow=True)[0])
+        return goal_in(self._connection.request(Pause())[0])
 
     def resume(self) -> Goal | None:
         """Resume speech, and return the goal that continues. Return None if no goal was paused.

@@ -35,24 +35,24 @@ if TYPE_CHECKING:
 
 #: How many bytes are received at once.
 _RECEIVE_BYTES = 256 * 1024
-#: The pause after the first failed attempt to reconnect, and the limit for the pause, which doubles after each failure.
+#: The first and the longest pause between two attempts to reconnect. Each pause is twice as long as the one before.
 _FIRST_RECONNECT_PAUSE_S, _LONGEST_RECONNECT_PAUSE_S = 0.02, 0.5
-#: How often to read before a request is sent. This finds the end of a connection even if some events come before it.
+#: How many times to read before a request is sent. Some events may have to be read before the end of the connection.
 _MAX_READS = 4
 #: How long a thread waits without a socket before it checks whether another thread has reconnected.
 _RECONNECT_CHECK_S = 0.1
 
 
 def taken(connection: Connection, take: Callable[[], _T], end: float | None) -> Iterator[_T]:
-    """Iterate over the results of `take`, waiting for the connection as long as the result is empty.
+    """Iterate over the results of `take`, and wait for the server while the result is empty.
 
-    After `end`, or when the connection has ended, yield empty results, too. Nothing is received after `end`, so that
-    the iteration ends even if events keep coming.
+    An empty result is yielded if `end` has passed or the connection has ended. Nothing more is received after `end`, so
+    that a loop over the results ends even if the server keeps sending events.
 
     Args:
         connection: the connection to wait for.
-        take: returns what has been received, and an empty or false value if there is nothing. It is called with the
-            lock `connection.changed`.
+        take: removes and returns received events, or returns a false value if there are none. It is called while
+            `connection.changed` is held.
         end: monotonic time; None for no limit.
     """
     found: _T
@@ -80,8 +80,8 @@ class Connection(ClientCore):
     never sent twice. The exception is a `say` with an id, because the server speaks it only once.
 
     Messages are read only while a thread is in `request`, `submit` or `wait_until`. They are processed in the server's
-    order with the lock `changed`, so that a waiting thread sees a consistent state. No lock is held during a wait. The
-    core's methods may only be called with this lock.
+    order while the lock `changed` is held, so that a waiting thread sees a consistent state. No lock is held during a
+    wait. Callers of the core's methods must hold this lock.
 
     When the connection has ended, `ended` is the reason. Waiting threads return then, and later requests raise
     ServerUnavailable. Events that were received before can still be read.
@@ -115,21 +115,19 @@ class Connection(ClientCore):
             self.end("the connection was closed")
             self._closing = True
             self._hang_up()
-            # If a thread is reading, it closes the socket. Otherwise it could poll the number of a newer file.
+            # If a thread is reading, that thread closes the descriptor. Otherwise the thread might poll the descriptor
+            # after its number was given to another file.
             if not self._reading:
                 self._drop()
             self.changed.notify_all()
 
-    def request(
-        self, request: Request, on_reply: OnReply | None = None, *, slow: bool = False
-    ) -> tuple[JsonObject, list[JsonObject]]:
+    def request(self, request: Request, on_reply: OnReply | None = None) -> tuple[JsonObject, list[JsonObject]]:
         """Send a request, and return its reply and the lines of the reply's list.
 
         Args:
             request: the request.
-            on_reply: called with the lock `changed` if the server accepts the request, before any later event is
-                processed.
-            slow: whether the answer may take any time. Meanwhile, the server must send signs of life.
+            on_reply: called if the server accepts the request, before any later event is processed. The lock `changed`
+                is held during the call.
 
         Raises:
             RequestRefused: the server refused the request.
@@ -137,14 +135,14 @@ class Connection(ClientCore):
             Lost: the request was sent, but not answered. It may have taken effect.
             Interrupted: as in `wait_until`.
         """
-        # The wait for the reply to a `say` can't be interrupted, because the caller needs the goal's id to cancel it.
-        # A patient `say` can be interrupted: closing the connection cancels a goal that is still waiting for room.
-        interruptible = slow or not isinstance(request, Say)
-        exchange = self.begin(request, on_reply, slow=slow)
+        exchange = self.begin(request, on_reply)
+        # The wait for the reply to a `say` can't be interrupted, because the caller needs the goal's id to cancel it. A
+        # patient `say` can be interrupted, because a goal that is waiting for room is cancelled with the connection.
+        interruptible = exchange.slow or not isinstance(request, Say)
         try:
             deadline = self.answer_by(exchange)
             while not self.wait_until(lambda: exchange.over, deadline, interruptible=interruptible):
-                # The limit is later after each line of the answer.
+                # Each line of the answer moves the deadline.
                 earlier, deadline = deadline, self.answer_by(exchange)
                 if deadline == earlier:
                     break
@@ -154,14 +152,7 @@ class Connection(ClientCore):
                     self._cut_off()
         return self.answer(exchange)
 
-    def begin(
-        self,
-        request: Request,
-        on_reply: OnReply | None = None,
-        on_failure: OnFailure | None = None,
-        *,
-        slow: bool = False,
-    ) -> Exchange:
+    def begin(self, request: Request, on_reply: OnReply | None = None, on_failure: OnFailure | None = None) -> Exchange:
         """Send a request without waiting for the answer. The arguments are those of `Exchange`.
 
         If `on_failure` is None, the caller must call `forget` in the end.
@@ -169,8 +160,7 @@ class Connection(ClientCore):
         Raises:
             ServerUnavailable: nothing can be sent.
         """
-        self._prepare(request, awaited=on_failure is None)
-        exchange = self.exchange_type(request, on_reply, on_failure, slow=slow)
+        exchange = self.exchange_type(request, on_reply, on_failure)
         with self.changed:
             self.register(exchange, time.monotonic())
             try:
@@ -183,7 +173,7 @@ class Connection(ClientCore):
     def submit(self, request: Request, on_reply: OnReply, on_failure: OnFailure) -> None:
         """Send a request without waiting. Bytes that the server doesn't accept now are sent by later calls.
 
-        One of the two functions is called with the lock `changed`, during this call or a later one.
+        One of the two functions is called during this call or a later one, while the lock `changed` is held.
 
         Args:
             request: the request.
@@ -194,11 +184,10 @@ class Connection(ClientCore):
             ServerUnavailable: the connection has ended.
         """
         self._read_available()
-        slow = isinstance(request, Say) and request.patient
         with self.changed:
             if self.ended is not None:
                 raise ServerUnavailable(f"nothing was sent to the server at {self.path}: {self.ended}")
-            self.begin(request, on_reply, on_failure, slow=slow)
+            self.begin(request, on_reply, on_failure)
 
     def post(self, request: Request) -> None:
         """Send a request without waiting, and ignore the answer.
@@ -219,10 +208,10 @@ class Connection(ClientCore):
         since: float | None = None,
         interruptible: bool = True,
     ) -> bool:
-        """Read and process messages until `done()` is true. If the server is silent for too long, end the connection.
+        """Read and process messages until `done()` is true. A server that is silent for too long is treated as gone.
 
         Args:
-            done: called with the lock `changed`, and never again after it has returned True.
+            done: called while the lock `changed` is held, and never again after it has returned True.
             deadline: monotonic time; None for no limit. All messages that have arrived by then are processed.
             since: when the caller started to wait for the server (monotonic). Earlier silence doesn't count. The
                 default is now.
@@ -276,15 +265,7 @@ class Connection(ClientCore):
             if heard == self._heard:
                 break
 
-    # -- to be implemented by each transport. `_send`, `_hang_up` and `_cut_off` are called with the lock `changed`
-
-    def _prepare(self, request: Request, *, awaited: bool) -> None:
-        """Prepare for sending a request, for example by reconnecting.
-
-        Args:
-            request: the request.
-            awaited: whether a thread will wait for the answer. Only then may this method raise ServerUnavailable.
-        """
+    # -- to be implemented by each transport. Callers of `_send`, `_hang_up` and `_cut_off` hold the lock `changed`.
 
     def _send(self, exchange: Exchange) -> None:
         """Send or queue the request of a registered exchange.
@@ -411,7 +392,7 @@ class SocketConnection(Connection):
                 return
             data = connected.recv(_RECEIVE_BYTES)
         except BlockingIOError:
-            return  # there is nothing to read: the socket has only become writable
+            return  # the socket has only become writable
         except ConnectionResetError:  # the server closed it without reading everything
             pass
         except (OSError, ValueError) as error:  # ValueError: another thread has closed it
@@ -461,15 +442,16 @@ class ReconnectingConnection(SocketConnection):
         #: the pause after the next failed attempt
         self._pause_s = _FIRST_RECONNECT_PAUSE_S
 
-    def _prepare(self, request: Request, *, awaited: bool) -> None:
-        if awaited:
+    def begin(self, request: Request, on_reply: OnReply | None = None, on_failure: OnFailure | None = None) -> Exchange:
+        if on_failure is None:
             self._read_available()  # finds a break since the last call
         with self.changed:
             if self.ended is None:
                 self._connect_again(time.monotonic(), at_once=isinstance(request, Cancel))
-            if self._socket is None and self.ended is None and awaited:
+            if self._socket is None and self.ended is None and on_failure is None:
                 assert self.connect_error
                 raise self.connect_error
+        return super().begin(request, on_reply, on_failure)
 
     def break_off(self, why: str, now: float) -> None:
         if self.ended is not None:

@@ -14,7 +14,7 @@ as arguments. The caller must make sure that only one thread at a time calls a m
 from __future__ import annotations
 
 import itertools
-from _weakrefset import WeakSet  # `weakref` has it, too, but takes longer to import
+from _weakrefset import WeakSet  # importing it from `weakref` takes longer
 from collections import deque
 from collections.abc import Callable
 
@@ -26,7 +26,7 @@ from talkcli.goals.states import State
 from talkcli.protocol import events
 from talkcli.protocol.events import PausedChanged, Result, ServerStatus, Snapshot, StateChanged, WordHeard, goals
 from talkcli.protocol.lines import FIRST_NUMBER, LineSplitter, decode, request_line, write_request
-from talkcli.protocol.requests import Wait, Watch
+from talkcli.protocol.requests import Pause, Wait, Watch
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 OnReply = Callable[["JsonObject", "list[JsonObject]"], None]
 #: A function that receives the error if a request was refused, was not sent, or will not be answered.
 OnFailure = Callable[["TalkError"], None]
-#: A function that receives a goal's events. It receives the whole goal if events were missed during a break.
+#: A function that receives the events of a goal. After a break of the connection, it also receives the current goal.
 Listener = Callable[["Event | Goal | GoalLost"], None]
 
 #: A server that sends nothing for this time is treated as gone. It sends a sign of life every 5 s to waiting clients.
@@ -58,9 +58,9 @@ MAX_STATE_EVENTS = 10_000
 
 @frozen
 class GoalLost:
-    """Tells a goal's listeners that the server sends no more events for the goal."""
+    """A message to a goal's listeners that the goal is lost, and that no more events will follow."""
 
-    #: human-readable reason
+    #: a human-readable reason
     why: str
 
 
@@ -112,7 +112,7 @@ class EventListeners:
     """The listeners for single goals, and the buffers of readers that watch all goals."""
 
     def __init__(self) -> None:
-        #: the listeners for each goal, with True for those that also want its words
+        #: for each goal id, the listeners, and whether each of them also wants the goal's words
         self._goals: dict[str, dict[Listener, bool]] = {}
         #: weak references, because watching ends when the reader drops its iterator
         self._watches: WeakSet[EventBuffer] = WeakSet()
@@ -139,7 +139,7 @@ class EventListeners:
 
     @property
     def goals(self) -> dict[str, bool]:
-        """The ids of the goals with listeners, with True if one of the listeners wants the goal's words."""
+        """The ids of all goals with listeners, and whether any listener wants the goal's words."""
         return {goal_id: any(listeners.values()) for goal_id, listeners in self._goals.items()}
 
     def lose(self, goal_id: str, why: str) -> None:
@@ -156,7 +156,7 @@ class EventListeners:
         """Close the buffers of the readers that watch all goals.
 
         Args:
-            why: human-readable reason.
+            why: a human-readable reason.
             include_reconnecting: also close the buffers that would stay in use after a break.
         """
         for buffer in list(self._watches):
@@ -189,11 +189,11 @@ class TrackedGoal:
     def __init__(self, goal: Goal) -> None:
         #: the goal as last described by the server
         self.goal = goal
-        #: whether the goal was already known by its id, so that the text is not spoken again
+        #: whether a goal with this id had been sent before, so that the text is not spoken again
         self.attached = False
         #: whether the server has paused all speech, as far as is known
         self.speech_paused = False
-        #: since when the server sends the goal's events to this connection (monotonic); None if it doesn't
+        #: when the server started to send the goal's events to this connection (monotonic); None before that
         self._followed_at: float | None = None
         #: whether words and pauses are buffered, too
         self._with_feedback = False
@@ -309,16 +309,9 @@ def identity(server: JsonObject) -> tuple[str, int | None]:
 
 
 class Exchange:
-    """A request with its answer, which consists of the lines of a list, if there are any, and the reply."""
+    """A request and its answer: a reply, which may follow the lines of a list."""
 
-    def __init__(
-        self,
-        request: Request,
-        on_reply: OnReply | None = None,
-        on_failure: OnFailure | None = None,
-        *,
-        slow: bool = False,
-    ) -> None:
+    def __init__(self, request: Request, on_reply: OnReply | None = None, on_failure: OnFailure | None = None) -> None:
         """Create an exchange. It must be registered before its request is sent.
 
         Args:
@@ -326,11 +319,9 @@ class Exchange:
             on_reply: called if the server accepts the request.
             on_failure: called if the server refuses the request or doesn't answer. Without this function, the caller
                 must wait for the answer.
-            slow: whether the answer may take any time.
         """
         self.request = request
         self.on_reply, self.on_failure = on_reply, on_failure
-        self.slow = slow
         #: the `seq` of the request and of all lines of its answer; 0 until the exchange is registered
         self.number = 0
         #: whether the whole line was sent, so that the server may carry out the request
@@ -338,10 +329,15 @@ class Exchange:
         #: the lines of the list that have been received
         self.items: list[JsonObject] = []
         self.reply: JsonObject | None = None
-        #: the reason why there will be no reply; None if there is no such reason
+        #: the error, if there will be no reply; None otherwise
         self.error: TalkError | None = None
         #: when the last line of the answer was received, or else when the exchange began (monotonic)
         self.heard_at = 0.0
+
+    @property
+    def slow(self) -> bool:
+        """Whether the answer may take any time."""
+        return isinstance(self.request, Pause) or (isinstance(self.request, Say) and self.request.patient)
 
     @property
     def over(self) -> bool:
@@ -398,7 +394,7 @@ class ClientCore:
         self._sent_early = b""
         #: the reason why nothing more can be sent, although answers may still be received; None otherwise
         self._sending_ended: str | None = None
-        #: the last error of the server that answers no request, as the reason why the server closes the connection
+        #: the last error that answered no request; if the server then closes the connection, this is the reason
         self._last_error: str | None = None
 
     # -- requests
@@ -472,8 +468,8 @@ class ClientCore:
         """Fail the requests that have not been sent, and all later ones. Answers can still be received.
 
         Args:
-            why: the reason that the errors of later requests give.
-            message: the error message of the requests that were waiting to be sent.
+            why: the reason, which becomes a part of the error messages of later requests.
+            message: the whole error message of requests that are waiting to be sent.
         """
         self._sending_ended = self._sending_ended or why
         unsent = [exchange for _, exchange in self._unsent]
@@ -524,7 +520,7 @@ class ClientCore:
     # -- limits
 
     def answer_by(self, exchange: Exchange) -> float:
-        """Return when the request must have been sent, or if it was sent, when the answer's next line is due."""
+        """Return the time limit for sending a request, or if it was already sent, for the next line of its answer."""
         if exchange.sent:
             return float("inf") if exchange.slow else exchange.heard_at + self._patience
         ttl = exchange.request.ttl if isinstance(exchange.request, Say) else None
@@ -606,7 +602,7 @@ class ClientCore:
         """Process a received message.
 
         Returns:
-            The exchange that has ended with this message, or None if none has.
+            The exchange that this message ends, or None if the message ends no exchange.
 
         Raises:
             ValueError: the event, or a goal in the reply, is malformed.
@@ -640,7 +636,7 @@ class ClientCore:
             try:
                 exchange.on_reply(reply, exchange.items)
             except Unreadable as error:
-                # Without this error, `unanswered` reports that a request with a lasting effect may have taken effect.
+                # A request with a lasting effect may have taken effect, so `unanswered` makes its error instead.
                 if not isinstance(exchange.request, self.lasting):
                     exchange.error = error
                 if exchange.on_failure:
@@ -664,7 +660,7 @@ class ClientCore:
             self.fail(exchange, self.unanswered(exchange))
 
     def disconnected(self, why: str, now: float) -> None:
-        """Record that the connection has broken and is going to be made again. All open exchanges fail."""
+        """Record a break of the connection, after which the shell will reconnect. All open exchanges fail."""
         self.absence = self._last_error or why
         self.absent_since, self._last_error, self._sending_ended = now, None, None
         self.greeted = False
@@ -698,7 +694,7 @@ class ClientCore:
         Goals are followed again if this is still the same run of the server. Otherwise they are LOST.
 
         Args:
-            boot: the boot id in the greeting, which is different after each start of the server.
+            boot: the boot id in the greeting. Each start of the server has another one.
             pid: the process id in the greeting.
             now: the monotonic time.
         """

@@ -107,7 +107,7 @@ def say(core: ClientCore, now: float = 0.0, **options: Any) -> TrackedGoal:
         tracked._accept(reply)
         tracked._listen_to(core.listeners, feedback=request.feedback, now=now)
 
-    begin(core, request, now, on_reply=on_reply, on_failure=tracked._fail, slow=request.patient)
+    begin(core, request, now, on_reply=on_reply, on_failure=tracked._fail)
     return tracked
 
 
@@ -291,7 +291,7 @@ def test_an_answer_must_come_in_time_and_each_line_of_it_counts(core: ClientCore
     sent(core)
     hear(core, {"seq": 1, "recent": goal()}, now=3.0)
     assert core.answer_by(exchange) == 3.0 + PATIENCE
-    slow = begin(core, Say("a", patient=True), now=1.0, slow=True)
+    slow = begin(core, Say("a", patient=True), now=1.0)
     assert core.answer_by(slow) == 1.0 + PATIENCE  # it must be sent
     sent(core)
     assert core.answer_by(slow) == float("inf")

@@ -28,7 +28,7 @@ from talkcli.goals.options import Cancel, Say, Set, key_error
 from talkcli.goals.states import State
 from talkcli.protocol.events import goals
 from talkcli.protocol.lines import FIRST_NUMBER
-from talkcli.protocol.requests import Pause, Request, Status, Wait
+from talkcli.protocol.requests import Request, Status, Wait
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -348,8 +348,6 @@ class RobotRequest:
         #: whether the request was sent to this robot or to its group
         self.was_asked = False
         self._name, self._request, self._record = connection.robot, request, record
-        #: whether the answer may take any amount of time
-        self._slow = isinstance(request, Pause) or (isinstance(request, Say) and request.patient)
         #: the goals that haven't been reported as ended, and the start of the wait for them (monotonic)
         self._handles: deque[GoalHandle] = deque()
         self._since = time.monotonic()
@@ -358,7 +356,7 @@ class RobotRequest:
         """Send the request to this robot alone."""
         try:
             self.connection.check_online()
-            self.connection.begin(self._request, self._on_reply, self._on_failure, slow=self._slow)
+            self.connection.begin(self._request, self._on_reply, self._on_failure)
             self.was_asked = True
         except TalkError as error:
             self._on_failure(error)
@@ -370,7 +368,7 @@ class RobotRequest:
             number: the number of that request.
             latest: time after which a sentence is no longer sent (`boottime`); None for no limit.
         """
-        exchange = RobotExchange(self._request, self._on_reply, self._on_failure, slow=self._slow)
+        exchange = RobotExchange(self._request, self._on_reply, self._on_failure)
         exchange.number, exchange.latest = number, latest
         self.connection.expect_reply(exchange)
         self.was_asked = True
