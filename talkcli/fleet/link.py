@@ -203,7 +203,7 @@ class Link:
             self.write()
 
     def write(self) -> None:
-        """Send as much unsent data as possible without waiting. During `on_message`, `read` does it later."""
+        """Send as much unsent data as possible without waiting. During `on_message`, leave this to `read`."""
         with self._lock:
             if self.wants_write and not self._delivering:
                 self._paho.loop_write()

@@ -235,7 +235,7 @@ class Bridge:
         self._link, self._descriptor = link, link.fileno()
         #: whether the broker has retained the presence of another bridge
         self._rival_seen = False
-        #: timer that claims the name unless another bridge answers first
+        #: timer that claims the name unless another bridge answers first; None until this bridge's question returns
         self._rival_timer: asyncio.TimerHandle | None = None
         self._echoes = EchoTracker(boottime())
         #: when the first echo after the last returned one was sent (loop clock); None if no echo is outstanding
@@ -293,7 +293,7 @@ class Bridge:
             self._check_link(link)
 
     def _check_link(self, link: Link) -> None:
-        """Handle a broken link, and adapt to the amount of unsent data. Call this after each use of it."""
+        """React to the end of a link, and to the amount of unsent data. Call this after each use of a link."""
         if link is not self._link or self._descriptor < 0:
             return
         if link.ended is None and link.outstanding_bytes > STUCK_BROKER_BYTES:
@@ -341,7 +341,7 @@ class Bridge:
             self._publish(topic, payload, retain=retain, expiry=expiry)
 
     def _log_denial(self, reason: int) -> None:
-        """Log that the broker has denied a message, if it has, for the reason code of an acknowledgement."""
+        """Log a warning if the reason code of an acknowledgement means that a message was denied."""
         if reason == REASON_NOT_AUTHORIZED:
             log.write_limited("rights", f"the broker doesn't let this robot publish all that it says: {_RIGHTS}")
 
@@ -393,7 +393,7 @@ class Bridge:
             if payload != _RIVAL_QUESTION + self._session.encode():
                 if self._online:
                     self._publish_presence()
-            elif not (self._online or self._rival_timer):
+            elif not self._rival_timer:
                 wait = _RIVAL_LIMIT_S if self._rival_seen else 0
                 self._rival_timer = self._loop.call_later(wait, self._go_online)
             return
@@ -410,8 +410,8 @@ class Bridge:
             log.write_limited("presence", f"a message on this robot's presence topic is ignored: {words}")
         if rank and rank[1] == self._session:
             return
-        if not self._rival_timer and not self._online:
-            self._rival_seen = rank is not None  # retained, so its bridge may have ended
+        if not self._rival_timer:
+            self._rival_seen = rank is not None  # it may be from a bridge that has ended
         elif rank is None:
             if self._online:
                 self._publish_presence()  # replace a late will or an ignored message

@@ -315,7 +315,7 @@ def end_unsent(
         reason: the machine-readable reason for the end.
         words: the human-readable reason for the end.
         at: the current time, in seconds since 1970 UTC.
-        by: the client that canceled the goal, if it was canceled.
+        by: the client that canceled the goal, or None.
     """
     say = request.request
     assert isinstance(say, Say)

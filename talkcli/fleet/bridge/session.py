@@ -40,9 +40,9 @@ if TYPE_CHECKING:
 
 #: Maximum number of sessions. Each has a connection to the server, which accepts 256 connections by default.
 MAX_SESSIONS = 32
-#: Maximum number of a client's requests that wait for the connection, for room, or for their answers.
+#: Maximum number of one client's requests that are waiting for the connection, for room, or for answers.
 MAX_WAITING_REQUESTS = 64
-#: Maximum total size of the waiting requests of all clients. For a cancel or status request, it is twice as much.
+#: Maximum total size of all clients' waiting requests. Cancel and status requests are allowed twice as much.
 MAX_WAITING_BYTES = 4 * 1024 * 1024
 #: Time without a message after which a client's session ends, because MQTT doesn't report that a client has left.
 #: Waiting clients say hello every 30 s, and two of these messages may get lost.
@@ -86,7 +86,7 @@ class RemoteSessions:
         #: cleared while the broker is slow, so that sessions stop reading from the server
         self.may_read = asyncio.Event()
         self.may_read.set()
-        #: goals that wait for room, oldest first
+        #: goals waiting for room, oldest first
         self.waiting: list[tuple[RemoteRequest, Say, RemoteSession]] = []
         self._on_change = on_change
         self._loop = asyncio.get_running_loop()
@@ -258,7 +258,7 @@ class RemoteSession:
         self._loop = asyncio.get_running_loop()
         self._server: LocalConnection | None = None
         self._task: asyncio.Task[None] | None = None
-        #: requests that wait for the connection to the server
+        #: requests waiting for the connection to the server
         self._queue: deque[RemoteRequest] = deque()
         #: ids of the goals whose results the client is waiting for
         self._awaited: set[str] = set()
@@ -275,7 +275,7 @@ class RemoteSession:
 
     @property
     def waiting_bytes(self) -> int:
-        """Total size of the requests that wait for the connection or for their answers."""
+        """Total size of the requests waiting for the connection or for answers."""
         return sum(each.size_bytes for each in self._unanswered)
 
     def submit(self, request: RemoteRequest) -> None:
@@ -321,7 +321,7 @@ class RemoteSession:
         self._clean_up()
 
     def send_alive(self) -> None:
-        """Publish a sign of life if a goal waits for room. The server sends one only for goals that it knows."""
+        """Publish a sign of life if a goal is waiting for room, because the server doesn't know about the goal."""
         if self._waiting_for_room():
             self._publish([(_ALIVE, None)])
 
@@ -333,15 +333,15 @@ class RemoteSession:
 
     @property
     def _unanswered(self) -> list[RemoteRequest]:
-        """The requests that wait for the connection or for their answers."""
+        """The requests waiting for the connection or for answers."""
         return [*self._queue, *(each.remote for each in self._exchanges)]
 
     def _waiting_for_room(self) -> list[RemoteRequest]:
-        """Return the goals of this session that wait for room."""
+        """Return this session's goals that are waiting for room."""
         return [request for request, _, session in self._sessions.waiting if session is self]
 
     def _drop_waiting(self) -> None:
-        """Remove the session's goals from those that wait for room."""
+        """Remove this session's goals from the goals waiting for room."""
         self._sessions.waiting = [each for each in self._sessions.waiting if each[2] is not self]
 
     def _end_if_done(self) -> None:
@@ -365,7 +365,7 @@ class RemoteSession:
             self._send(_RemoteExchange(remote, request))
 
     def send_say(self, remote: RemoteRequest, say: Say, *, has_room: bool = False) -> None:
-        """Send a goal to the server, let it wait for room, or refuse it.
+        """Send a goal to the server, keep it until there is room, or refuse it.
 
         Args:
             remote: the client's request.
@@ -391,7 +391,7 @@ class RemoteSession:
             self.end_goal(remote, None, State.REJECTED, "queue_full", words, None)
 
     def _send_cancel(self, remote: RemoteRequest, cancel: Cancel) -> None:
-        """Cancel goals that wait for room, then goals at the server, which doesn't know the waiting goals."""
+        """Cancel goals waiting for room, then goals at the server. The server doesn't know about the waiting goals."""
         goals = self._sessions.cancel_waiting(cancel, By(client=Sender(name=self._name)))
         canceled = {each.id for each in goals}
         if cancel.ids is not None:
