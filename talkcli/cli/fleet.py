@@ -12,7 +12,7 @@ from talkcli.cli.show import note, screen, show, show_result
 from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.errors import EXIT_SIGPIPE, ServerUnavailable, UsageError
 from talkcli.fleet import topics
-from talkcli.fleet.bridge.policy import ASKABLE
+from talkcli.fleet.bridge.policy import ALLOWABLE_REQUESTS
 from talkcli.fleet.desk.request import Selection
 from talkcli.fleet.desk.table import FleetTranscript, robot_lines
 from talkcli.fleet.payloads import Presence, RobotInfo
@@ -37,9 +37,9 @@ def bridge(options: CommonOptions, print_unit: str | None, print_acl: bool, **gi
     groups, allow = _split_list(given["group"]), _split_list(given["allow"])
     _check_names("--group", groups)
     for each in allow:
-        if each not in ASKABLE:
-            near = nearest(each, ASKABLE)
-            hint = f"did you mean '{near}'?" if near else f"there are {', '.join(ASKABLE)}"
+        if each not in ALLOWABLE_REQUESTS:
+            near = nearest(each, ALLOWABLE_REQUESTS)
+            hint = f"did you mean '{near}'?" if near else f"there are {', '.join(ALLOWABLE_REQUESTS)}"
             raise UsageError(f"--allow: no request is called '{printable(each)}': {hint}")
     if print_unit:
         units.print_bridge_unit(options, print_unit, given)

@@ -12,7 +12,7 @@ import pytest
 
 from talkcli import Fleet
 from talkcli.fleet import topics
-from talkcli.fleet.bridge.policy import ASKABLE
+from talkcli.fleet.bridge.policy import ALLOWABLE_REQUESTS
 from tests.fleet.many import RealRobots, request
 from tests.fleet.robot import Robot
 from tests.support.bridge import Bridge, Desk
@@ -113,7 +113,7 @@ def pair() -> Iterator[RealRobots]:
 
     All tests of a module share them: each leaves them silent, and with nothing to say.
     """
-    allowed = ("--allow", ",".join(sorted(ASKABLE)))
+    allowed = ("--allow", ",".join(sorted(ALLOWABLE_REQUESTS)))
     with Broker() as broker, RealRobots(broker, ["wh-1", "wh-2"], ["warehouse"], allowed) as result:
         yield result
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.fleet.bridge.policy import ASKABLE
+from talkcli.fleet.bridge.policy import ALLOWABLE_REQUESTS
 from tests.fleet import told as robots_told
 from tests.fleet.many import RealRobots, alike, assert_told, at_once, objects, request, told
 from tests.fleet.robot import LONG
@@ -36,7 +36,7 @@ def broker() -> Iterator[Broker]:
 @pytest.fixture(scope="module")
 def robots(broker: Broker) -> Iterator[RealRobots]:
     """Two that allow all requests; besides them wh-3, which allows little, wh-4 without a server, seven offline."""
-    all_allowed = ("--allow", ",".join(ASKABLE))
+    all_allowed = ("--allow", ",".join(ALLOWABLE_REQUESTS))
     with (
         Listener(broker, "talk/robot/wh-4/presence") as publisher,
         RealRobots(broker, BOTH, ["willing", "day", "night"], all_allowed) as result,

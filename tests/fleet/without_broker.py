@@ -31,7 +31,7 @@ class SessionsWithoutBroker:
         self.published: list[tuple[str, list[dict[str, Any]]]] = []
         self._more = asyncio.Event()
         self._boottime = boottime
-        self._policy = policy.Policy("anna", policy.ASKABLE)
+        self._policy = policy.Policy("anna", policy.ALLOWABLE_REQUESTS)
         self.sessions: RemoteSessions = RemoteSessions("anna", socket, self._publish, lambda: room, lambda: None)
 
     def post(self, fields: object, session: str = "s1", *, correlation: bytes | None = None) -> None:

@@ -28,7 +28,7 @@ from talkcli import __version__
 from talkcli.daemon import log
 from talkcli.engine import protocol
 from talkcli.fleet.bridge.main import Bridge, BridgeSettings
-from talkcli.fleet.bridge.policy import ASKABLE
+from talkcli.fleet.bridge.policy import ALLOWABLE_REQUESTS
 from talkcli.fleet.broker import from_environment
 from talkcli.goals.goal import Sender
 from talkcli.goals.options import shown_settings
@@ -136,7 +136,8 @@ async def run(names: list[str], broker_url: str, directory: str, spoken: TextIO)
 
     servers = [Server(f"{directory}/{name}", lambda *goal, name=name: note(name, *goal), descriptors) for name in names]
     bridges = [
-        Bridge(BridgeSettings(name, broker, ASKABLE, (), f"{directory}/{name}"), lambda: broker) for name in names
+        Bridge(BridgeSettings(name, broker, ALLOWABLE_REQUESTS, (), f"{directory}/{name}"), lambda: broker)
+        for name in names
     ]
 
     look: asyncio.TimerHandle | None = None

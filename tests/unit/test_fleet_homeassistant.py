@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from talkcli.fleet import topics
-from talkcli.fleet.bridge.policy import ASKABLE
+from talkcli.fleet.bridge.policy import ALLOWABLE_REQUESTS
 from talkcli.fleet.payloads import homeassistant_device
 from talkcli.goals.states import State
 from tests.fleet.homeassistant import TOPIC, faults, rendered
@@ -19,7 +19,7 @@ ENDED = {"id": "door-17", "state": "ABORTED", "reason": "no_engine", "text": "it
 UNTOLD = {name: each for name, each in ENDED.items() if name != "text"}
 
 
-def announced(name: str = "anna", allow: tuple[str, ...] = ASKABLE) -> dict[str, Any]:
+def announced(name: str = "anna", allow: tuple[str, ...] = ALLOWABLE_REQUESTS) -> dict[str, Any]:
     topic, payload = homeassistant_device(name, allow, "0.1.0")
     assert faults(topic, payload) == []
     found: dict[str, Any] = json.loads(payload)

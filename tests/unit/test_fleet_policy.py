@@ -37,7 +37,7 @@ LONGEST = b"c" * policy.MAX_CORRELATION_BYTES
 Judged = RemoteRequest | Refusal | Goodbye | Ignored
 
 
-def judge(message: Message, *, stale: bool = False, allow: tuple[str, ...] = policy.ASKABLE) -> Judged:
+def judge(message: Message, *, stale: bool = False, allow: tuple[str, ...] = policy.ALLOWABLE_REQUESTS) -> Judged:
     asked = topics.parse_request(message.topic)
     assert asked
     return Policy("anna", allow).decide(message, asked, NOW, stale=stale)
@@ -152,10 +152,10 @@ def test_correlation_data_that_are_too_long_are_on_no_answer(fields: object, cod
 
 
 def test_each_kind_of_request_can_be_forbidden_but_hello_and_watch() -> None:
-    assert {*policy.ASKABLE, *policy.ALWAYS_ALLOWED} == {*REQUEST_TYPES}
+    assert {*policy.ALLOWABLE_REQUESTS, *policy.ALWAYS_ALLOWED} == {*REQUEST_TYPES}
     for kind in policy.ALWAYS_ALLOWED:
         assert asked(judge(request({"request": kind}), allow=())).request.kind == kind
-    for kind in policy.ASKABLE:
+    for kind in policy.ALLOWABLE_REQUESTS:
         fields = {"request": kind, **({"text": "a"} if kind == "say" else {})}
         assert refused(judge(request(fields), allow=())) == "not_allowed"
         assert asked(judge(request(fields), allow=(kind,))).request.kind == kind

@@ -30,7 +30,7 @@ STALE_CODE = "stale"
 #: Requests that are always allowed. They reveal nothing that the bridge doesn't publish anyway.
 ALWAYS_ALLOWED = ("hello", "watch")
 #: Requests that the option `--allow` can contain.
-ASKABLE = tuple(each for each in REQUEST_TYPES if each not in ALWAYS_ALLOWED)
+ALLOWABLE_REQUESTS = tuple(each for each in REQUEST_TYPES if each not in ALWAYS_ALLOWED)
 
 #: Interval at which the bridge sends an echo to itself.
 ECHO_EVERY_S = 5.0
