@@ -86,3 +86,9 @@ def test_links_lead_somewhere(document: Document) -> None:
 def test_files_that_are_named_exist(document: Document) -> None:
     for path in PATH.findall(document.text):
         assert (ROOT / path).exists() or (ROOT / "talkcli" / path).exists(), path
+
+
+def test_the_tests_of_each_part_exist() -> None:
+    """Contributors run these lines, and pytest stops at a file that isn't there."""
+    for pattern in re.findall(r"\btests/[\w/*.]+", CONTRIBUTING.section("Set up, and test")):
+        assert any(ROOT.glob(pattern)), pattern
