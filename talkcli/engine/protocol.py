@@ -160,8 +160,8 @@ class Voice:
     language: str | None
     name: str
     quality: str | None = None  # quality level of a neural voice, such as "medium"
-    #: speakers of a neural voice, ordered by number; None if the engine process sent the voice, because pyttsx3's list
-    #: has no field for them
+    #: speakers of a neural voice, ordered by number; None in messages, because pyttsx3's list of voices has no field
+    #: for them
     speakers: tuple[str, ...] | None = None
 
 
@@ -213,7 +213,7 @@ class VoiceMemory:
     """The memory used by neural voices. Sent before `VoiceLoaded`, and after a sentence or a `DropVoice`."""
 
     voice: str  # ID (without a speaker) of the voice that was loaded or has spoken; empty after `DropVoice`
-    memory: int  # growth of the process in bytes since just before it loaded its first neural voice
+    memory: int  # bytes by which the process has grown since before its first neural voice
 
 
 @frozen

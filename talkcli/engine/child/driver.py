@@ -162,8 +162,8 @@ class DriverProperties:
     def apply(self, command: protocol.Speak) -> str | None:
         """Set the properties for a goal.
 
-        If a neural voice has disappeared since the goal was accepted, the driver falls back to one of its other voices,
-        preferably in the same language. It doesn't do so if `voice_only` is set.
+        A neural voice may have disappeared since the goal was accepted. The driver then falls back to another of its
+        voices, preferably in the same language. It doesn't do so if `voice_only` is set.
 
         Returns:
             The reason for the fallback, or None if the goal has the requested voice.

@@ -213,7 +213,7 @@ class PlayerFeed:
             return 0.0
         return max(0.0, now - self._heard_at)
 
-    def missing(self, now: float) -> float:
+    def missing_seconds(self, now: float) -> float:
         """Return the length in seconds of the audio that would be missing if the player ended now."""
         return self._first_write_at + self._seconds(self.written) - now
 
@@ -487,7 +487,7 @@ class Playback:
                     Reason.AUDIO_STALLED, f"{player.name} did not end {DRAIN_LIMIT_S:g} s after the sound"
                 )
             self._wait_for(feed, deadline)
-        missing = feed.missing(time.monotonic())
+        missing = feed.missing_seconds(time.monotonic())
         if player.real_time and missing > EARLY_END_LIMIT_S - self._seconds(self._samples.end - self._sent):
             raise CannotSpeak(Reason.AUDIO_LOST, f"{player.name} ended {missing:.1f} s before the sound did")
 

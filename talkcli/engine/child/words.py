@@ -37,7 +37,7 @@ class WordFinder:
 
     Synthesizers repeat locations, go back, report blanks, return lengths that extend into the next word, and report
     only the first part of "it's". `find` returns each word at most once, in the order of the text. If two words are
-    spoken as one ("in the"), it returns only the first, because the end of the pair is only known at the next report.
+    spoken as one ("in the"), it returns only the first. The end of the pair is only known at the next report.
     """
 
     def __init__(self, text: str) -> None:

@@ -101,8 +101,8 @@ class EngineProcess:
                 stderr=stderr,
                 env={**environment, protocol.LIVENESS_VARIABLE: str(liveness)},
                 pass_fds=[each for each in (liveness, configure.output_fd) if each is not None],
-                # In a session of its own, the process doesn't get Ctrl-C from the server's terminal, and the server can
-                # kill it together with its whole process group.
+                # In a session of its own, the process doesn't get Ctrl-C from the server's terminal. It also has its
+                # own process group, which can be killed as a whole.
                 start_new_session=True,
             )
             kept.pop_all()
@@ -295,8 +295,7 @@ class PrivateEngine:
             now = time.monotonic()
             if now >= self._deadline:
                 raise TimeoutError
-            if now < self._last_event_at + limit:
-                continue
-            if process.ready:
-                raise EngineFailed(Reason.ENGINE_HUNG, f"the engine gave no sign of life for {limit:g} s", limit)
-            raise EngineFailed(Reason.ENGINE_FAILED, f"the engine was not ready after {limit:g} s", limit)
+            if now >= self._last_event_at + limit:
+                if process.ready:
+                    raise EngineFailed(Reason.ENGINE_HUNG, f"the engine gave no sign of life for {limit:g} s", limit)
+                raise EngineFailed(Reason.ENGINE_FAILED, f"the engine was not ready after {limit:g} s", limit)
