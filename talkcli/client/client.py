@@ -119,7 +119,7 @@ class Client:
         ttl: float | None = None,
         key: str | None = None,
         throttle: float | None = None,
-        id: str | None = None,  # noqa: A002 - the name that it has everywhere
+        id: str | None = None,  # noqa: A002 - the option has this name everywhere
         rate: int | None = None,
         volume: float | None = None,
         voice: str | None = None,
@@ -384,7 +384,7 @@ class Client:
         self._connection.request(Watch(), accepted)
         return self._take_all(buffer)
 
-    # -- inside
+    # -- internal
 
     def _handle(self, request: Say) -> tuple[GoalHandle, OnReply]:
         """Return a handle for a new goal, and the function that processes the reply to its request.
@@ -458,7 +458,7 @@ def check(request: Say | Set) -> None:
     for option in request.options:
         try:
             fault = option.type_error(getattr(request, option.name))
-        except (TypeError, ValueError) as error:  # something in `data`
+        except (TypeError, ValueError) as error:  # `data` contains a value without a JSON form
             fault = f"is no JSON: {error}"
         if fault:
             raise UsageError(f"{option.name!r} {fault}")
@@ -474,7 +474,7 @@ def too_long(request: Say) -> Goal | None:
     """
     try:
         line = request_line({"seq": _LONG_SEQ, **write_request(request)})
-    except ValueError as error:  # NaN in `data`
+    except ValueError as error:  # `data` contains NaN or an infinite number
         raise UsageError(f"'data' is no JSON: {error}") from None
     if len(line) <= MAX_LINE_BYTES:
         return None

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 GREETING_START = b'{"talk": 1, "version": '
 #: Time in which an idle server sends its greeting. A longer wait must be interruptible.
 GREETING_WAIT_S = 0.2
-#: The longest time in `yield_processor`.
+#: The longest time for which `yield_processor` waits.
 _LONGEST_YIELD_S = 0.2
 #: Parts of an answer which show that the goal will not be spoken.
 _REFUSALS = (b'"ok": false', b'"state": "REJECTED"')
@@ -146,7 +146,7 @@ def send_early(
             before()
             sent = line[: connected.send(line)]
     except TimeoutError:
-        pass  # the server may be busy
+        pass  # the server may be busy, and `connect` waits for it
     except OSError:
         connected.close()
         return None
@@ -191,7 +191,9 @@ def sender_name(name: str | None) -> str | None:
 
 
 def hello(name: str | None, *, urgent: bool) -> JsonObject:
-    """Return the first message of a client. Importing `requests.Hello` would take too long. A test compares the two.
+    """Return the first message of a client, as an object for the wire.
+
+    This function doesn't use `requests.Hello`, because importing it takes long. A test compares the results.
 
     Args:
         name: the sender's name, or None.
@@ -352,7 +354,7 @@ def _named_step(named: str, found: str, *, denied: bool) -> str:
         found: what is there, as described by `paths.describe_place`.
         denied: whether the server there refuses this user.
     """
-    import shlex  # slow to import
+    import shlex  # rarely needed, and slow to import
 
     from talkcli.terminal.text import printable
 

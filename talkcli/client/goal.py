@@ -47,13 +47,14 @@ class GoalHandle(TrackedGoal):
 
     @property
     def state(self) -> State:
-        """The goal's last known state. It is updated by `wait`, `poll` and all other calls of the client."""
+        """The goal's last known state. Calls that read from the server update it, for example `wait` and `poll`."""
         return self.goal.state
 
     def wait(self, timeout: float | None = None) -> Goal:
         """Wait until the goal has ended, and return it.
 
-        If the connection to the server is lost for good, the goal ends as LOST. It may or may not have been spoken.
+        If the goal can no longer be followed, for example because the server was restarted, the goal ends as LOST. It
+        may or may not have been spoken.
 
         Args:
             timeout: time limit in seconds; None for no limit.
@@ -71,8 +72,8 @@ class GoalHandle(TrackedGoal):
         """Iterate over the goal's events as they happen. The last event is the Result.
 
         There is a StateChanged for each state. If the goal was sent or followed with `feedback`, there is also a
-        WordHeard for each word as it is heard, and a PausedChanged whenever speech is paused or resumed. If the
-        connection to the server is lost for good, the goal ends as LOST.
+        WordHeard for each word as it is heard, and a PausedChanged whenever speech is paused or resumed. If the goal
+        can no longer be followed, for example because the server was restarted, the goal ends as LOST.
 
         Args:
             timeout: seconds in which the goal must end, counted from this call; None for no limit.
@@ -145,7 +146,7 @@ class GoalHandle(TrackedGoal):
                 self._update(goal)
         return self.goal
 
-    # -- inside
+    # -- internal
 
     def _listen(self, *, feedback: bool) -> None:
         """Start listening for the goal's events. The caller holds the connection's lock."""
