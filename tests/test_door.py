@@ -1,4 +1,4 @@
-"""A full server: waiting clients are let in when others leave, and refused only if no place gets free."""
+"""A full server admits waiting clients when others leave, and refuses them only if no place becomes free."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ URGENT = b'{"request": "hello", "urgent": true}\n'
 
 
 class Client:
-    """A client's end of a connection, in this process."""
+    """The client's end of a connection. The server runs in the same process."""
 
     def __init__(self, says: bytes = b"") -> None:
         self.theirs, self.socket = socket.socketpair()
@@ -29,7 +29,7 @@ class Client:
         self.socket.sendall(says)
 
     def heard(self) -> list[str]:
-        """Return one word for each line that has arrived."""
+        """Return one word for each received line."""
         told = b""
         with contextlib.suppress(BlockingIOError):
             while data := self.socket.recv(65536):
@@ -38,7 +38,7 @@ class Client:
 
 
 class Unused:
-    """A listener that is never asked: the clients here have sockets already."""
+    """A placeholder for the listener. These clients already have connected sockets."""
 
     path, mode = "unused", 0o600
 
@@ -86,7 +86,7 @@ async def test_client_comes_in_when_another_leaves() -> None:
         first = connect(HELLO)
         await turns()
         first.socket.close()
-        second = connect(HELLO)  # the server has read nothing since
+        second = connect(HELLO)  # the server has not read anything since then
         await turns()
         assert second.heard() == ["greeting", "True"]
     await turns()
@@ -99,7 +99,7 @@ async def test_silent_client_waits_and_urgent_client_is_let_in() -> None:
         urgent, other = connect(URGENT), connect(HELLO)
         await turns()
         assert (urgent.heard(), other.heard()) == (["greeting", "True"], ["busy"])
-        urgent.socket.close()  # it took no place, so its end frees none
+        urgent.socket.close()  # the client was never admitted, so no place becomes free
         late = connect(b"")
         await turns()
         assert late.heard() == []

@@ -20,7 +20,7 @@ from tests.support.connection import Wire
 from tests.support.surroundings import needs
 
 NOBODY = 65534
-#: Starts a program and passes it a socket, like systemd.
+#: A script that starts a program and passes a socket to it, as systemd does.
 PASSING = """
 import os, sys
 os.dup2(int(sys.argv[1]), 3)
@@ -60,7 +60,7 @@ def test_what_is_left_in_the_place_of_socket_and_lock_is_no_obstacle(home: str) 
 
 
 def test_second_server_names_the_one_that_serves_and_never_the_one_before_it(home: str) -> None:
-    """A server that has just taken the lock may not have replaced the number in it yet."""
+    """A server that has just acquired the lock may not have written its process id yet."""
     with subprocess.Popen(["true"]) as gone:
         gone.wait()
     path = f"{home}/lock"
@@ -93,7 +93,7 @@ def test_file_in_the_place_of_the_socket_is_not_removed(home: str) -> None:
 def test_server_that_is_refused_leaves_no_lock(home: str) -> None:
     os.mkdir(f"{home}/directory")
     os.mkfifo(f"{home}/pipe")
-    too_long = "s" * (100 - len(home))  # the lock's name is none too long for a file, the socket's for a socket
+    too_long = "s" * (100 - len(home))  # the name of the lock file is not too long, but the path of the socket is
     for name in ("directory", "pipe", too_long + "s" * 20):
         refused(home, "--socket", f"{home}/{name}")
     assert sorted(os.listdir(home)) == ["directory", "pipe"]
@@ -147,7 +147,7 @@ def test_directory_that_is_not_safe_is_refused(home: str) -> None:
 @pytest.mark.skipif(os.getuid() != 0 or not shutil.which("setpriv"), reason="only root can act as another user")
 def test_client_of_another_user_ends_with_10(home: str) -> None:
     path = f"{home}/s"
-    # Another user may be unable to read this checkout and its interpreter, so it gets a copy and the system's.
+    # The other user may be unable to read this checkout and its interpreter, so use a copy and the system's Python.
     needs("/usr/bin/python3")
     for package in (talkcli, click):
         folder = os.path.dirname(str(package.__file__))
@@ -182,7 +182,7 @@ def test_socket_that_is_passed_is_served_and_left(home: str) -> None:
             assert done.code == 0, done
         assert os.path.exists(path)
         with socket.socket(socket.AF_UNIX) as client:
-            client.connect(path)  # systemd still listens
+            client.connect(path)  # systemd still listens on the socket
     several = run([sys.executable, "-c", PASSING, "1", *SERVE], environment(home, LISTEN_FDS="2"))
     assert several.code == 2
     assert "LISTEN_FDS" in several.err

@@ -1,4 +1,4 @@
-"""`talk log`: the goals that ended, with their times, senders and reasons."""
+"""`talk log` shows ended goals with their times, senders and reasons."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LONG = "please step back from the door and from the lift " * 5
 
 @pytest.fixture
 def history(scripted: Talk) -> list[str]:
-    """The ids of one goal for each end state, in the order of their ends."""
+    """The ids of one goal for each terminal state, in the order in which they ended."""
     talk = scripted
     succeeded = talk.run("say", "--wait", "--as", "patrol\x1b[m", "length=0").id
     aborted = talk.run("say", "--wait", "fail=audio_lost message=no_cable").id
@@ -52,7 +52,7 @@ def test_a_line_tells_when_how_what_who_and_why(scripted: Talk, history: list[st
     assert re.search(r", pid \d+  audio_lost: no cable$", lines[1])
     assert re.search(r'"" .*, pid \d+ +invalid_text: the text is empty$', lines[2])
     assert re.search(rf'"waits" .*, pid \d+ +canceled by \S*{script}.*, pid \d+$', lines[3])
-    assert f'"never-ends {LONG}"' in lines[4]  # in a pipe, the whole text
+    assert f'"never-ends {LONG}"' in lines[4]  # a pipe gets the whole text
     assert "\x1b" not in done.out
     goals = [json.loads(each) for each in scripted.run("--json", "log").out.splitlines()]
     assert [each["id"] for each in goals] == history
@@ -70,7 +70,7 @@ def test_count_and_order(scripted: Talk) -> None:
 
 
 def test_lines_fit_the_terminal_and_line_up(scripted: Talk, history: list[str]) -> None:
-    """`tests/unit/test_transcript.py` has all widths."""
+    """Other widths are tested in `tests/unit/test_transcript.py`."""
     columns = 80
     env = {"TERM": "xterm", **scripted.env}
     with Terminal([*TALK, "log"], env, columns) as shown:

@@ -1,4 +1,4 @@
-"""A client's socket in the server: input is read at once, output goes out in one piece, and the end is told once.
+"""The streams of clients: input is read at once, output is sent in one piece, and the end is reported once.
 
 The tests count turns of the event loop and system calls, not time.
 """
@@ -63,7 +63,7 @@ class Told(asyncio.Protocol):
 
 
 class Pair:
-    """A stream, the record of its calls, and the client's end of its socket."""
+    """A stream, its recorded calls, and the client's end of the socket."""
 
     def __init__(self) -> None:
         ours, self.client = socket.socketpair()
@@ -75,7 +75,7 @@ class Pair:
         self.stream = ClientStream(ClientStreams(loop), self.socket, self.told, HIGH)
 
     def receive(self) -> bytes:
-        """Return the bytes that have arrived at the client's end."""
+        """Return the bytes that the client has received."""
         received = b""
         with contextlib.suppress(BlockingIOError, ConnectionResetError):
             while data := self.client.recv(1 << 20):
@@ -95,7 +95,7 @@ async def paired() -> AsyncIterator[Pair]:
 
 
 async def turn() -> None:
-    """Let the loop run the callbacks that are due, and those that follow from them."""
+    """Let the event loop run the callbacks that are due, and the callbacks that these schedule."""
     await asyncio.sleep(0)
     await asyncio.sleep(0)
 
@@ -277,18 +277,18 @@ async def test_past_the_limit_for_all_output_the_largest_backlog_is_dropped(monk
         pairs = [await stack.enter_async_context(paired()) for _ in range(3)]
         for pair in pairs:
             pair.stream = ClientStream(streams, pair.socket, pair.told, HIGH)
-            pair.stream.write(b"x" * 1_000_000)  # more than the system takes
+            pair.stream.write(b"x" * 1_000_000)  # more than the socket's buffer holds
         taken = 1_000_000 - pairs[0].stream.unsent_bytes
         monkeypatch.setattr(stream, "MAX_TOTAL_OUTPUT_BYTES", streams.unread_bytes + 3_000)
         pairs[0].stream.write(b"x" * 1_000)
-        pairs[1].stream.count_held(1_500)  # as for a list that its client doesn't read
+        pairs[1].stream.count_held(1_500)  # as if the client didn't read a list
         pairs[1].stream.count_held(500)
         assert not any(each.stream.closing for each in pairs)
         pairs[2].stream.write(b"x" * 1_000)
         await until_lost(pairs[1])
         assert [each.stream.closing for each in pairs] == [False, True, False]
         assert streams.unread_bytes == 2 * (1_000_000 - taken) + 2_000
-        pairs[1].stream.count_held(-2_000)  # released after its end
+        pairs[1].stream.count_held(-2_000)  # must have no effect after the end of the stream
         assert len(pairs[0].receive()) == taken
         await turn()
         assert streams.unread_bytes == pairs[0].stream.unsent_bytes + pairs[2].stream.unsent_bytes

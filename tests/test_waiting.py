@@ -1,6 +1,6 @@
-"""The server between engine and clients: waiting requests, portions of news, and the order of reports.
+"""The server between engine and clients: waiting requests, batches of notifications, and the order of reports.
 
-The tests count steps and bytes, not time. `conformance/test_goals_order.py` holds the order of waiting goals.
+The tests count steps and bytes, not time. `conformance/test_goals_order.py` tests the order of waiting goals.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Client:
         return False
 
     def goals(self) -> list[str]:
-        """Return the texts of the goals in its replies."""
+        """Return the texts of the goals in the recorded replies."""
         return [str(cast("Any", each)["goal"]["text"]) for each in self.told]
 
 
@@ -74,7 +74,7 @@ class Engine:
 
 
 class Server:
-    """The server's requests, with a goal that is spoken and a full queue behind it."""
+    """The requests of a server with an active goal and a full queue."""
 
     def __init__(self, max_queue: int = 1) -> None:
         self.speech = Speech(Scheduler("4k7f", max_queue=max_queue))
@@ -206,7 +206,7 @@ async def test_bug_in_a_request_that_waited_harms_no_other_request(monkeypatch: 
 
 
 class Readers:
-    """All clients' streams, with the numbers that they got and the bytes that they have not read."""
+    """Imitates the streams of all clients. It records the received numbers and counts unread bytes."""
 
     def __init__(self) -> None:
         self.loop = asyncio.get_running_loop()
@@ -281,7 +281,7 @@ async def test_wait_for_clients_that_do_not_read_news_has_a_limit(monkeypatch: p
     assert len(readers.told) < 20
     await all_told(line)
     assert readers.told == list(range(400))
-    # One wait after each of a hundred portions but the last, and one every two milliseconds for the first few.
+    # There is a wait after each of a hundred batches except the last, and one every two milliseconds for the first few.
     assert 99 <= len(waits) < 120
 
 
@@ -300,7 +300,7 @@ async def test_news_about_news_is_told_in_order_and_a_bug_harms_no_other() -> No
 
 
 class _Written:
-    """An engine that writes its requests into the list in which the test writes the clients' events."""
+    """An engine that appends its requests to the list to which the test appends the clients' events."""
 
     def __init__(self, written: list[str]) -> None:
         self.written = written

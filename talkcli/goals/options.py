@@ -178,7 +178,7 @@ class Option:
     check: Callable[[Any], str | None] | None = None
     #: note on the allowed values, for the documents
     form: str = ""
-    #: note on the default, for the documents; by default, settings and options for the engine have the server's value
+    #: note on the default, for the documents; not needed if the default is the server's value
     default_words: str = ""
     #: spellings on a command line: "-w, --wait", or "--preempt/--queue" with one for yes and one for no
     flags: str = ""

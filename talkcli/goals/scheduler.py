@@ -124,7 +124,7 @@ class Scheduler:
             max_queue: the maximum number of pending goals.
             max_text: the maximum number of characters in a text.
             settings: the values for options that a goal omits. Every setting must have a value.
-            voices: the scheduler of neural voices, or None for one without a memory limit or file sizes.
+            voices: the scheduler of neural voices, or None to create one.
         """
         self.boot = boot
         self.settings = settings
@@ -164,7 +164,7 @@ class Scheduler:
         return ([self.active] if self.active else []) + list(self._queue)
 
     def find(self, goal_id: str) -> Record | None:
-        """Return the active, pending or ended goal with this id. Old goals have been dropped from the history."""
+        """Return the active, pending or ended goal with this id. The oldest ended goals are no longer known."""
         return self._by_id.get(goal_id) or self.history.find(goal_id)
 
     def has_room(self, say: Say) -> bool:
@@ -367,8 +367,8 @@ class Scheduler:
     def failed(self, goal_id: str, reason: Reason, message: str, duration: float | None, now: Now) -> list[Effect]:
         """End the active goal, because the engine or the audio failed.
 
-        A failure while the goal is being stopped makes it silent, so the goal ends PREEMPTED. `not_silent` is an
-        exception.
+        If the goal was being stopped, the failure has made it silent, so it ends PREEMPTED. It ends ABORTED only with
+        the reason `not_silent`.
         """
         record = self._require_active(goal_id)
         record.duration = duration
@@ -407,7 +407,7 @@ class Scheduler:
     # -- time
 
     def deadline(self) -> float | None:
-        """Return the time at which `tick` has something to do (monotonic), or None if nothing is due in future."""
+        """Return the time at which `tick` must be called (monotonic), or None if no time limit is running."""
         due = (self._active_deadline(), self._queue.next_expiry(), self._next_deadline())
         return min((each for each in due if each is not None), default=None)
 

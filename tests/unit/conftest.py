@@ -1,6 +1,6 @@
-"""Settings of the unit tests: no deadline for one example, and in CI the same examples each time.
+"""Settings of the unit tests: examples have no deadline, and CI uses the same examples every time.
 
-`HYPOTHESIS_PROFILE=deep pytest -m '' tests/unit` looks longer than every run can afford.
+`HYPOTHESIS_PROFILE=deep pytest -m '' tests/unit` searches longer for failing examples.
 """
 
 from __future__ import annotations

@@ -1,16 +1,17 @@
-"""A scheduler for tests: a script goes in, and one line comes out that tells what became of each goal.
+"""A scheduler for tests, which plays a script and describes the outcome of each goal in one line.
 
-The steps of a script are parted by semicolons. A goal is a single letter, which is its text, with its options; every
-other step is a verb:
+The steps of a script are separated by semicolons. A single letter sends a goal with this text, followed by its options.
+Every other step is a verb:
 
     a 5 preempt key=k ttl=1     send a goal of priority 5 that preempts; "queue" is preempt=False
-    heard a; completed a; failed a; stopped a; deaf a   report this of a goal, as the engine does; * is the active one
+    heard a; completed a; failed a; stopped a; deaf a   report this as the engine; * is the active goal
     cancel; cancel a b; cancel current before=c key=k
     wait 1; pass 1              let a second pass, with or without a look at the clock
     pause; resume; shutdown; lost; ready; unavailable; missing; room 2 (the places in the queue); set ttl=5 preempt=yes
-    loaded joe; unloadable joe; unloaded joe; measured joe 2; chosen a joe      report this of the voice piper/joe
+    loaded joe; unloadable joe; unloaded joe; measured joe 2; chosen a joe      report this about the voice piper/joe
 
-In the outcome, "a ACTIVE; c b PENDING; d e RECALLED replaced by c", pending goals have their order in the queue.
+An outcome is "a ACTIVE; c b PENDING; d e RECALLED replaced by c", for example. It lists pending goals in the order of
+the queue.
 """
 
 from __future__ import annotations
@@ -39,14 +40,14 @@ WORDS = {"yes": True, "no": False}
 
 @dataclass
 class Robot:
-    """A scheduler whose effects are written down, at a time that only the test moves."""
+    """A scheduler whose effects are recorded. Its time only changes if the test changes it."""
 
     max_queue: int = 100
     seconds: float = 100.0
-    #: the effects in their order, as "a PENDING", "a Start"
+    #: the effects in their order, such as "a PENDING" and "a Start"
     seen: list[str] = field(default_factory=list)
     goals: dict[str, Record] = field(default_factory=dict)
-    #: the attached ones, as "b is a"
+    #: the goals that were attached to earlier goals, such as "b is a"
     attached: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -73,7 +74,7 @@ class Robot:
     def name_of(self, record: Record) -> str:
         return next((name for name, each in self.goals.items() if each is record), str(record.number))
 
-    # -- one step each
+    # -- single steps
 
     def submits(self, say: Say, name: str = "", **known: Any) -> Submission:
         done = self.scheduler.submit(say, ARM, self.now, **known)
@@ -100,11 +101,11 @@ class Robot:
         self.see(self.scheduler.tick(self.now))
 
     def loads(self, voice: str, error: str | None) -> None:
-        """Let the engine tell that it has loaded a voice, or why it could not."""
+        """Report as the engine that a voice was loaded or could not be loaded."""
         self.see(self.scheduler.voice_load_ended(f"piper/{voice}", error, self.now, has_libraries=True))
 
     def tells(self, event: str, goal_id: str) -> None:
-        """Let the engine tell this of a goal."""
+        """Report an event of a goal as the engine."""
         match event:
             case "heard":
                 self.scheduler.word_heard(goal_id, 4)
@@ -170,7 +171,7 @@ class Robot:
         return self.goals[name].id if name in self.goals else name
 
     def outcome(self) -> str:
-        """Return what became of the goals, and check that each of them and what was told of it agree."""
+        """Return the outcome of all goals. Check that each goal agrees with the published events."""
         unfinished = self.scheduler.unfinished()
         groups: dict[str, list[str]] = {}
         for record in [*unfinished, *(each for each in self.goals.values() if each not in unfinished)]:
@@ -198,7 +199,7 @@ def play(script: str) -> Robot:
 
 
 def rules(table: str) -> list[Any]:
-    """Return the rows of a table as parameters. A row is a rule and below it, indented, "script -> outcome"."""
+    """Return the rows of a table as test parameters. A row is a rule, followed by an indented "script -> outcome"."""
     blocks = re.findall(r"^(#|\w)(.*)\n((?:    .*\n)*)", table, re.MULTILINE)
     title, found = "", []
     for first, rest, example in blocks:
@@ -211,7 +212,7 @@ def rules(table: str) -> list[Any]:
 
 
 def options(words: list[str]) -> dict[str, Any]:
-    """Return the options of a step: a number is a priority, a word alone is a flag."""
+    """Return the options of a goal in a step. A number is a priority, and a single word is a flag."""
     found: dict[str, Any] = {}
     for word in words:
         name, is_value, value = word.partition("=")

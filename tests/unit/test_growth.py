@@ -1,7 +1,8 @@
-"""What a step costs with ten thousand goals waiting, the most that there can be: about as much as with a hundred.
+"""A step of the scheduler costs about as much with ten thousand pending goals as with a hundred.
 
-Counted are the interpreter's own steps, so that no machine matters. What the interpreter does within one of them is
-timed, and compared on the same machine: a look at every goal that waits would take a hundred times as long.
+The tests count the bytecode instructions of a step, which don't depend on the machine. They also compare times on the
+same machine, because a single instruction can do much work. A search of all pending goals would take a hundred times as
+long.
 """
 
 from __future__ import annotations
@@ -25,16 +26,16 @@ if TYPE_CHECKING:
     from typing import Any
 
 FEW, MANY = 100, 10_000
-#: The most that the hundredfold may cost in steps: a search in what is sorted takes seven steps more, of some ten.
+#: Limit for the ratio of instructions. A binary search takes seven more steps in a queue of a hundred times the length.
 AT_MOST = 1.5
-#: The most in seconds, which leaves room for caches and for others who use the machine.
+#: Limit for the ratio of times. It allows for caches and for other programs on the machine.
 AT_MOST_TIME = 5
-#: Bytes that a pending goal of a short text may take.
+#: Memory of a pending goal with a short text, in bytes.
 MEMORY = 1024
 
 
 def steps(action: Callable[[], object]) -> int:
-    """Return how many steps the interpreter takes for this."""
+    """Return the number of bytecode instructions that an action takes."""
     taken = 0
 
     def trace(frame: FrameType, event: str, _: object) -> Any:
@@ -53,7 +54,7 @@ def steps(action: Callable[[], object]) -> int:
 
 
 def crowd(size: int) -> Robot:
-    """Return a robot that is saying something while this many goals wait, of many priorities, half with a time."""
+    """Return a robot with an active goal and many pending goals. These have many priorities, and half of them a ttl."""
     robot = Robot(max_queue=size)
     robot.says("active", priority=9)
     for number in range(size):
@@ -66,7 +67,7 @@ def crowd(size: int) -> Robot:
 
 @pytest.fixture(scope="module")
 def crowds() -> Iterator[tuple[Robot, Robot]]:
-    gc.disable()  # else a collection that looks at all of them falls into what is measured
+    gc.disable()  # otherwise, a garbage collection of all goals could distort the measurement
     yield crowd(FEW), crowd(MANY)
     gc.enable()
 
@@ -80,7 +81,7 @@ def write_a_status_line(robot: Robot) -> None:
     encode(events.item(7, pending=next(robot.scheduler.pending()).snapshot().to_json()))
 
 
-#: Each a script, with the news that it must bring, or a function.
+#: The steps to measure: a function, or a script with an effect that it must have.
 STEPS: dict[str, tuple[str, str] | Callable[[Robot], None]] = {
     "speak the next": ("completed *; z", "z PENDING"),
     "reject": ("z -1000", "z REJECTED"),
@@ -111,7 +112,7 @@ def take(robot: Robot, name: str) -> None:
 @pytest.mark.parametrize("name", STEPS)
 def test_a_step_costs_no_more_because_many_wait(crowds: tuple[Robot, Robot], name: str) -> None:
     def count(robot: Robot) -> int:
-        # The median: what one goal brings, another doesn't.
+        # The median is used because some goals cause more work than others.
         return sorted(steps(lambda: take(robot, name)) for _ in range(9))[4]
 
     def seconds(robot: Robot) -> float:

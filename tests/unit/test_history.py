@@ -1,4 +1,4 @@
-"""What is remembered of goals that ended: the last ones, by count and by the size of their texts."""
+"""The history of ended goals, which is limited by number and by the size of the texts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The lines of standard input between reading and sending: their numbers, and until when each may be sent."""
+"""The buffer of lines that were read from standard input and not sent yet, with their numbers and deadlines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lines of JSON: how a stream is cut into them, their limits, and JSON that is bad in every way."""
+"""Lines of JSON: splitting a stream into lines, their limits, and invalid JSON of all kinds."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 KIB = 1024
 
-#: Any character but halves of surrogate pairs, of which JSON cannot tell two in a row from a whole pair.
+#: All characters except lone surrogates. In JSON, two of them in a row could be a surrogate pair.
 whole_texts = st.text(st.characters(exclude_categories=["Cs"]))
 texts = whole_texts | st.builds(
     lambda a, b, half: a + half + b, whole_texts, whole_texts, st.sampled_from("\ud800\udfff")
@@ -101,7 +101,7 @@ def test_any_bytes_are_an_object_that_can_be_written_again_or_a_bad_request(line
 
 
 def read(line: bytes) -> JsonObject:
-    """Return what a server makes of a line: the object, or the reply to what is none."""
+    """Return the object in a line, or the server's error reply if there is none."""
     try:
         return decode(line)
     except BadRequest as refused:
@@ -123,7 +123,7 @@ def test_a_number_that_is_no_json_is_never_written(number: float) -> None:
         encode({"ttl": number})
 
 
-# A stream is cut into lines
+# Splitting a stream into lines
 
 MOST = 8
 
@@ -178,7 +178,7 @@ def test_a_line_that_never_ends_is_not_kept() -> None:
 
 
 def feed(stream: bytes, segment: int) -> list[bytes]:
-    """Return the lines of a stream that comes in such segments, the last as if it ended there."""
+    """Return the lines of a stream that arrives in these segments, including the incomplete last line."""
     splitter = LineSplitter(MAX_LINE_BYTES - 1)
     lines = [each for at in range(0, len(stream), segment) for each in splitter.feed(stream[at : at + segment])]
     return [*lines, splitter.take_rest()]

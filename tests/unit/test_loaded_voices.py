@@ -1,4 +1,4 @@
-"""Which neural voice is loaded next, which are dropped for it, and what becomes of one that fails."""
+"""Which neural voice is loaded next, which voices are dropped for it, and how failures are handled."""
 
 from __future__ import annotations
 
@@ -21,11 +21,12 @@ from tests.unit.robot import rules
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-#: A goal asks for a voice ("want a"), the server asks which is next while goals need some ("next a b", "next : b" with
-#: b as its own), and the engine tells what it has loaded ("loaded a", "failed a", "load a" for all of it), what it has
-#: dropped ("unloaded a"), how many bytes it has grown to by a voice, or by none ("grown a 40"), and its death ("lost").
-#: "excess a : b c" asks which are dropped if a speaks and goals need b and c. "memory 2" are the bytes allowed; a voice
-#: takes one, until it is known better. The outcome: the last answer, the voices that were dropped, and all states.
+#: In a script, a goal requests a voice ("want a"). The server asks for the next voice to load and names the voices that
+#: goals need ("next a b"), with its own voice after a colon ("next : b"). The engine reports that a voice was loaded
+#: ("loaded a"), has failed ("failed a") or was dropped ("unloaded a"), its memory in bytes after a voice was loaded
+#: ("grown a 40"), and its death ("lost"). "load a" stands for all steps of loading a voice. "excess a : b c" asks which
+#: voices are dropped if a speaks and goals need b and c. "memory 2" sets the limit in bytes. A voice takes one byte
+#: until it is measured. The outcome consists of the last answer, the dropped voices, and all states.
 RULES = """
 # what is next
 
@@ -119,7 +120,7 @@ a death is forgotten once the voice is loaded
 
 
 class Asked(VoiceScheduler):
-    """Voices whose files have one byte each."""
+    """A scheduler of voices whose files have a size of one byte."""
 
     answer = "nothing"
     warnings: tuple[str, ...] | list[str] = ()

@@ -1,4 +1,4 @@
-"""Goals and senders in JSON: all keys always, there and back, and whatever a newer or a broken server may send."""
+"""The JSON form of goals and senders: all keys, the way back, and messages from newer or broken servers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from talkcli.goals.goal import read_seconds as seconds_of
 from talkcli.goals.states import State
 from tests.unit.test_lines import values
 
-#: A goal always has all of these, null where unknown.
+#: All keys of a goal. Unknown values are null.
 KEYS = [
     "id", "state", "status", "reason", "by", "message", "text", "format", "spoken", "priority", "key", "ttl", "data",
     "client", "paused", "queued_at", "started_at", "ended_at", "duration", "voice", "output",

@@ -1,4 +1,4 @@
-"""The options of a goal: their limits, the form of ids, and what else names them and must say the same."""
+"""The options of a goal: their limits, the form of ids, and all other places that repeat them."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ BAD: list[tuple[str, list[object]]] = [
 ]
 OWN_IDS = [
     *("a", "A", ".", "_", ":", "/", "a" * 64, "1.", "1-1", "_-_", "a/b", "/patrol/goal-1", "/arm-1-1712.5"),
-    *("arm-1", "goal-1", "task-2", "move-10", "wp01-3", "2024-12", "k3fz-12"),  # of four characters and a number
+    *("arm-1", "goal-1", "task-2", "move-10", "wp01-3", "2024-12", "k3fz-12"),  # four characters and a number
     *("4K7F-1", "4k7f-", "4k7f-x", "4k7f", "4k7-1", "4k7ff-1", "4k7f-1-1", "a4k7f-1", "44k7-1", "4k77-1", "4kf7-1"),
 ]
 OTHER_IDS = [
@@ -134,11 +134,11 @@ def test_an_id_of_a_server_is_no_client_s() -> None:
     assert not [boot for boot in (run._random_boot_id() for _ in range(1_000)) if is_clients_id(f"{boot}-1")]
 
 
-# What stands twice, for type checkers and readers, is what the rows say
+# The classes and signatures that repeat the rows must agree with them
 
 
 def declared(function: Callable[..., object]) -> dict[str, tuple[str, object]]:
-    """Return the parameters of a function but the first: what each is annotated with, and its default."""
+    """Return the annotations and defaults of a function's parameters, except the first."""
     parameters = list(inspect.signature(function).parameters.values())[1:]
     return {each.name: (str(each.annotation), each.default) for each in parameters}
 
@@ -147,7 +147,7 @@ def annotated(message: type[object]) -> dict[str, str]:
     return {name: kind for name, kind in message.__annotations__.items() if not kind.startswith("ClassVar")}
 
 
-#: How Python's type checkers are told of a kind.
+#: The annotation for each kind.
 TYPES = {
     "boolean": "bool",
     "string": "str",
@@ -175,7 +175,7 @@ def test_the_fields_of_a_request_are_its_rows(kind: str) -> None:
 
 def test_what_the_library_takes_is_what_the_rows_say() -> None:
     asked = declared(Client.say)
-    # `wait` is called `follow` there, and is what one mostly wants; no other format than text can be asked for.
+    # `wait` is called `follow` in the library and has another default. The library only offers the format text.
     assert asked.pop("follow") == ("bool", True)
     assert asked.pop("block") == ("bool", True)
     assert asked.pop("text") == ("str", inspect.Parameter.empty)
@@ -197,13 +197,13 @@ def test_what_a_goal_shows_and_what_the_engine_is_told_are_what_the_rows_say() -
     }
 
 
-#: Options that only travel with the goal: nothing has to obey them.
+#: Options that are only stored with the goal, so no code has to obey them.
 CARRIED = {"data", "format"}
 
 
 @pytest.mark.parametrize("option", [each for each in OPTIONS if each.name not in CARRIED], ids=lambda each: each.name)
 def test_every_option_is_obeyed(option: Option) -> None:
-    """By the scheduler or the server, which have it in a `Say`, or by the engine process, which has it in a command."""
+    """The scheduler and the server read options from a `Say`, and the engine process reads them from a command."""
     places, owners = ["goals", "server"], {"say", "request"}
     if option.for_engine:
         places, owners = ["engine/child"], {"command", "say", "settings"}
@@ -333,7 +333,7 @@ def test_limits_hold_on_the_wire_and_on_the_command_line_alike() -> None:
 
 
 def test_a_plain_line_is_read_before_an_option_is_worth_compiling() -> None:
-    """It is read before anything is sent: some hundred rows are made for it."""
+    """A client creates about a hundred rows when it starts. Compiling their constructor would take longer than that."""
     code = "import talkcli.cli.plain; from talkcli import frozen; from talkcli.goals.options import Option; "
     code += "print(Option.__init__ is frozen._METHODS['__init__'])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "True\n"

@@ -1,4 +1,4 @@
-"""The reasons why goals end: strings on the wire, documented, and the only ones that the code names."""
+"""The reasons why goals end: their strings, their documentation, and their use in the code."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from talkcli.goals.states import State
 from talkcli.protocol.lines import encode
 from tests.support.documents import WIRE, tables, words
 
-#: What the doctor says of its own sentence, besides the reasons of goals.
+#: Additional reasons that the doctor reports for its own sentence.
 OF_THE_DOCTOR = {"late", "paused"}
-#: The doctor's sentence has no option that a driver could refuse.
+#: Reasons that the doctor's sentence can't have, because it has no option that a driver could refuse.
 WITHOUT_ADVICE = {Reason.BAD_OPTION}
 
 
@@ -53,7 +53,7 @@ def test_the_code_names_no_other_reason() -> None:
 
 
 def named(node: ast.AST) -> list[str]:
-    """Return the reasons that stand as strings in a call, a comparison or an assignment."""
+    """Return the reasons that occur as plain strings in a call, a comparison or an assignment."""
     match node:
         case ast.keyword(arg="reason", value=ast.Constant(value=str() as found)):
             return [found]

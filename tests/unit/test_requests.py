@@ -1,4 +1,4 @@
-"""Requests: written and read back, and refused with a code where a field or a type is not known."""
+"""Requests are written and read back. An unknown field or a wrong type is refused with a code."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ ALL_FIELDS = sorted({option.name for kind in REQUEST_TYPES.values() for option i
 
 
 def least(kind: str, **fields: object) -> JsonObject:
-    """Return a request of a kind with these fields, and the text that it needs."""
+    """Return a request of a kind with these fields, and with a text if the kind requires one."""
     return {"request": kind, **({"text": "hi"} if kind == "say" else {}), **fields}
 
 
@@ -128,7 +128,7 @@ def test_an_object_without_a_request_is_refused(message: JsonObject) -> None:
     assert refusal(message).code == "bad_request"
 
 
-#: Values that are none of a kind.
+#: Invalid values of each kind.
 WRONG: dict[str, list[object]] = {
     "boolean": [0, 1, "true", [], {}],
     "string": [1, True, ["hi"], {}],
@@ -138,7 +138,7 @@ WRONG: dict[str, list[object]] = {
     "id": ["", 7, True, [], ["4k7f-1"], "a" * 65],
     "list": ["4k7f-1", 7, {"4k7f-1": 1}, [1], [None], [True], [""], ["a" * 65], [["4k7f-1"]], ["a"] * 4_097],
 }
-#: Values that are none of a field.
+#: Invalid values of single fields.
 OUTSIDE: dict[str, list[object]] = {"hello name": ["", "a" * 65], "log count": [0, -1, 2_201]}
 
 

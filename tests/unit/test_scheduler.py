@@ -1,4 +1,4 @@
-"""What the scheduler answers and tells: messages, news, times, the answer to a cancel, and what is remembered."""
+"""The scheduler's results: messages, effects, times, the result of a cancel, and the history."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ MESSAGES = {
     "a; completed a; b text=a throttle=2.5": "Talk rejected: the same was said less than 2.5 s ago",
 }
 
-#: What is told of each script, in its order; of the first, everything.
+#: The effects of each script in their order. Only the first row lists all of them.
 NEWS = {
     "a; b; completed a": "a PENDING, a ACTIVE, a Start, b PENDING, a SUCCEEDED, b ACTIVE, b Start",
     "a; b preempt; c preempt": "b PENDING, a PREEMPTING, a Stop, c PENDING, b RECALLED",
@@ -54,7 +54,7 @@ NEWS = {
     "cancel mine; a id=mine": "a PENDING, a RECALLED",
 }
 
-#: When the scheduler has something to do next, in monotonic seconds; a script begins at 100.
+#: The scheduler's next deadline after each script, in monotonic seconds. A script starts at 100.
 DEADLINES = {
     "a; b": None,
     "a ttl=1": None,

@@ -1,4 +1,4 @@
-"""What the engine may not say of a goal is refused and changes nothing."""
+"""Invalid reports from the engine about a goal are refused and change nothing."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from tests.unit.robot import Robot
 
 EVENTS = ["heard", "completed", "failed", "deaf", "stopped", "voice_chosen", "output_changed"]
-#: Goals that are not spoken, while another one is; the last was given up.
+#: Goals that are not active. Another goal is active meanwhile. The last one was given up.
 SCENE = "a; completed a; b; failed b; c text=; d; cancel d; stopped d; e; f; cancel f; g; cancel e; pass 2; wait 0; h"
 SPOKEN = "g ACTIVE; h PENDING; a SUCCEEDED; b ABORTED audio_lost; c REJECTED invalid_text; "
 SPOKEN += "d PREEMPTED canceled by door; e ABORTED not_silent by door; f RECALLED canceled by door"

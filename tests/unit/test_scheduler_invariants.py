@@ -1,4 +1,4 @@
-"""What is always true of the scheduler, whatever clients ask and whatever the engine says.
+"""Invariants of the scheduler, which hold for all requests from clients and all reports from the engine.
 
 Random scripts in the language of `tests.unit.robot`, whose effects are checked one by one. The tables in
 `test_scheduler_*.py` say which goal goes first, and which reason it ends with.
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from talkcli.goals.record import Record
     from talkcli.goals.scheduler import Cancellation, Effect, Submission
 
-#: Few values of each, so that goals meet. Times are multiples of the clock's steps, so that they fall together.
+#: Few values for each option, so that goals collide. Times are multiples of the clock's steps, so that they coincide.
 OPTIONS = [
     ["text=door", "text=battery", "text=é日🤖"],
     ["", "", "", "preempt", "preempt", "queue", "flush"],
@@ -46,7 +46,7 @@ BUSY = {State.ACTIVE, State.PREEMPTING}
 
 
 def script(seed: int, length: int = 40) -> list[str]:
-    """Return random steps. A step for the goal that is spoken names it "*"."""
+    """Return random steps. A step for the active goal refers to it by "*"."""
     chance = random.Random(seed)
     pick = chance.choice
     names = iter(ascii_letters)
@@ -83,13 +83,13 @@ class Checked(Robot):
         self.ended: dict[str, Goal] = {}
         self.started: set[str] = set()
         self.busy: set[str] = set()
-        #: what the engine does: the goal that it has, and what it was told to do with that
+        #: the state of the engine: its current goal, and its last order for this goal
         self.engine: Record | None = None
         self.orders: list[Order] = []
 
     @property
     def now(self) -> Now:
-        """The wall clock jumps, and nothing may depend on it."""
+        """The current time. The wall clock jumps, because nothing may depend on it."""
         return Now(self.seconds, 1.7e9 + self.seconds * 7_919 % 7_200)
 
     def submits(self, say: Say, name: str = "", **known: Any) -> Submission:
@@ -121,7 +121,7 @@ class Checked(Robot):
 
     def tells(self, event: str, goal_id: str) -> None:
         if goal_id == "*":
-            return  # nothing is spoken
+            return  # no goal is active
         if self.engine and goal_id == self.engine.id:
             stopping = self.engine.state is State.PREEMPTING
             super().tells(event if stopping or event not in {"deaf", "stopped"} else "heard", goal_id)
@@ -131,7 +131,7 @@ class Checked(Robot):
                 super().tells(event, goal_id)
             assert self.scheduler.unfinished() == before
 
-    # -- what is always true
+    # -- the invariants
 
     def see(self, effects: list[Effect]) -> list[Effect]:
         for effect in effects:
@@ -196,11 +196,11 @@ class Checked(Robot):
         if waiting and not (scheduler.active or scheduler.paused) and scheduler.has_engine:
             waits_for_voice = scheduler._start_time(waiting[0]) > self.seconds
             deadline = scheduler.deadline()
-            is_due = deadline is not None and deadline <= self.seconds  # the next tick starts it
+            is_due = deadline is not None and deadline <= self.seconds  # the next tick starts the goal
             assert waits_for_voice or is_due, "a goal waits without a reason"
 
     def end(self) -> None:
-        """End everything: each goal has exactly one result, which never changed."""
+        """End all goals, and check that each goal has exactly one result, which never changed."""
         self.play("shutdown")
         if self.scheduler.active:
             self.play("stopped *")
@@ -209,7 +209,7 @@ class Checked(Robot):
 
 
 def fault(steps: list[str]) -> BaseException | None:
-    """Return the first thing that is wrong if these steps are played."""
+    """Play these steps, and return the first error."""
     robot = Checked()
     try:
         for step in steps:
@@ -222,9 +222,9 @@ def fault(steps: list[str]) -> BaseException | None:
 
 
 @settings(
-    max_examples=12 * settings().max_examples,  # what goes wrong only where three options meet is rare
+    max_examples=12 * settings().max_examples,  # errors that need a combination of three options are rare
     phases=[Phase.explicit, Phase.generate],
-    suppress_health_check=[HealthCheck.too_slow],  # a busy machine is no fault of it
+    suppress_health_check=[HealthCheck.too_slow],  # a busy machine must not fail the test
 )
 @given(st.integers(0, 2**32))
 def test_the_rules_hold_whatever_is_asked_and_told(seed: int) -> None:

@@ -1,4 +1,4 @@
-"""The rules of who is spoken when, in one table: each with a script, in the language of `tests.unit.robot`."""
+"""All rules about the order of goals in one table. Each rule has a script for `tests.unit.robot`."""
 
 from __future__ import annotations
 

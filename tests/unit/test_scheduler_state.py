@@ -1,4 +1,4 @@
-"""Only `talkcli.goals` writes to the scheduler's state: read from the source of all other packages."""
+"""Only `talkcli.goals` changes the scheduler's state. The source of all other packages is checked for this."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from talkcli.goals.scheduler import Scheduler
 from talkcli.goals.voices import NeuralVoice, VoiceScheduler
 
 PACKAGE = Path(talkcli.__file__).parent
-#: Attributes of the scheduler, of its records and of what it keeps.
+#: Attributes of the scheduler, of its records and of its other objects.
 STATE = {
     *(name for each in (Record, NeuralVoice) for name in each.__slots__),
     *(name for each in (Scheduler("4k7f", max_queue=1), History(), Queue(), VoiceScheduler()) for name in vars(each)),
 }
-#: Parts of the scheduler that others may read, by these methods.
+#: Objects of the scheduler that other packages may read, with the methods that they may call.
 READ = {"history": {"find", "latest", "log"}, "voices": {"failure", "to_json"}}
 
 
@@ -44,12 +44,12 @@ def writes(source: str) -> list[str]:
 
 
 def users() -> list[Path]:
-    """Return the modules that may get hold of a scheduler or a record: those of the server."""
+    """Return the modules that can access a scheduler or a record."""
     return sorted((PACKAGE / "server").glob("*.py"))
 
 
 def test_only_the_server_knows_the_scheduler() -> None:
-    """So the test below looks at all that could write to it."""
+    """This ensures that the test below checks all modules that could change the state."""
     names = ("goals.scheduler", "goals.record", "goals.queue", "goals.history", "goals.voices")
     for path in PACKAGE.rglob("*.py"):
         if path.parent.name not in {"goals", "server"}:

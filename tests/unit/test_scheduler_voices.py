@@ -1,4 +1,4 @@
-"""Which voices the scheduler has loaded, and how long goals wait: rules in the language of `tests.unit.robot`."""
+"""Which voices the scheduler loads, and how long goals wait for them. The scripts are for `tests.unit.robot`."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ an engine that stays away fails a goal that waited for its voice
     a voice=piper/joe; lost; missing  ->  a ABORTED engine_failed
 """
 
-#: When the goal whose turn it is waits no longer, in monotonic seconds; a script begins at 100.
+#: The time at which the next goal stops waiting, in monotonic seconds. A script starts at 100.
 DEADLINES = {
     "set voice=piper/joe; wait 4; a voice=piper/joe": 110,
     "a; b voice=piper/joe; wait 60": None,
@@ -88,7 +88,7 @@ ORDERS = {
     "a voice=piper/joe": "load piper/joe",
     "a voice=piper/joe; b voice=piper/amy": "load piper/joe",
     "a voice=piper/joe; b voice=piper/amy; loaded joe": "load piper/joe, load piper/amy",
-    "a; b voice=piper/joe": "",  # the libraries would be imported while a goal is heard
+    "a; b voice=piper/joe": "",  # loading would import the libraries while a goal is active
     "a; b voice=piper/joe; completed a": "load piper/joe",
     "a voice=piper/joe; loaded joe; b voice=piper/amy": "load piper/joe, load piper/amy",
     "set voice=piper/joe": "load piper/joe",

@@ -1,4 +1,4 @@
-"""The table of states: every pair, the allowed ones written out here, all others refused."""
+"""The table of transitions. The allowed ones are listed here, and all others must be refused."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NAMES = [
     *("REJECTED", "PREEMPTING", "RECALLING", "RECALLED", "LOST"),
 ]
 NUMBERS = {name: number for number, name in enumerate(NAMES)}
-#: What may follow each; LOST is what a client concludes for a goal that had not ended when the connection did.
+#: The allowed transitions. A client sets LOST if the connection ends before the goal.
 ALLOWED = {
     "PENDING": ["ACTIVE", "RECALLING", "LOST"],
     "RECALLING": ["RECALLED", "LOST"],

@@ -1,4 +1,4 @@
-"""What may be spoken: texts that are refused before they are queued, with the reason, and texts that are not."""
+"""Texts that are refused before they are queued, each with the reason, and texts that are accepted."""
 
 from __future__ import annotations
 

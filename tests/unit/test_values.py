@@ -1,4 +1,4 @@
-"""Values are what frozen, slotted dataclasses are, and cost nothing until one is made."""
+"""`frozen` classes behave like frozen, slotted dataclasses, but are cheap to define until a value is created."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_it_is_made_as_a_dataclass_is(given: tuple[int, ...]) -> None:
     assert point == Point(x=model.x, y=model.y, name=model.name)
 
 
-#: Arguments that do not fit.
+#: Invalid arguments.
 ODD: list[tuple[tuple[Any, ...], dict[str, Any]]] = [
     *(((), {}), ((), {"y": 1}), ((1, 2, "a", 4), {}), ((1,), {"x": 1}), ((1, 2), {"y": 2})),
     *(((1,), {"z": 1}), ((), {"z": 1}), ((1, 2, "a"), {"z": 1})),
