@@ -105,13 +105,14 @@ class DeskLink:
         return topics.reply(self.user, self.session, robot)
 
     def poll(self, timeout: float, interrupt: Mapping[int, int] | None = None) -> bool:
-        """Wait for messages, pass them to the handler, and return whether there were any.
-
-        This also connects, reconnects and keeps the connection alive.
+        """Wait for messages, and pass them to the handler. Connect or reconnect if necessary.
 
         Args:
             timeout: seconds to wait at most.
             interrupt: descriptors that interrupt the wait, as in `wait_ready`.
+
+        Returns:
+            Whether the connection was ready. More data may be waiting then, even if no message was complete.
         """
         link = self.link
         now = time.monotonic()
@@ -133,14 +134,13 @@ class DeskLink:
         while self._refusals:
             on_refused, error = self._refusals.popleft()
             on_refused(error)
-        received = bool(self._inbox)
         while self._inbox:
             message = self._inbox.popleft()
             if message.topic == self.reply_topic(topics.MARKER):
                 self.marker_at = time.monotonic()
             else:
                 self.handler.on_message(message)
-        return received
+        return descriptor in ready
 
     def wait_for_retained(
         self, timeout: float, is_enough: Callable[[], bool] = lambda: True, interrupt: Mapping[int, int] | None = None
