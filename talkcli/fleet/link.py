@@ -229,8 +229,8 @@ class Link:
         """Publish a message. Return False if the connection has ended, otherwise True.
 
         Args:
-            topic: the topic.
-            payload: the payload.
+            topic: the topic, without wildcards.
+            payload: at most `max_payload_bytes`.
             qos: 0 or 1.
             retain: whether the broker keeps the message for later subscribers.
             expiry: seconds after which the broker discards an undelivered message.

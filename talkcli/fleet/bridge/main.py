@@ -83,7 +83,7 @@ def run_bridge(settings: BridgeSettings, read_broker: Callable[[], Broker]) -> i
     """Run the bridge until SIGTERM or SIGINT, and return the exit code.
 
     Args:
-        settings: the settings.
+        settings: the bridge's settings, including the broker for the first connection.
         read_broker: called before each reconnection to read the broker's settings, because a password may have changed.
 
     Raises:

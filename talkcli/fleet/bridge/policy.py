@@ -119,7 +119,7 @@ class Policy:
         """Decide what to do with a message.
 
         Args:
-            message: the message.
+            message: a message on a request topic of the robot or one of its groups.
             topic: the parts of the message's topic.
             now: the time by a clock that includes the time in suspend.
             stale: whether the message may be outdated.
@@ -181,8 +181,8 @@ class EchoTracker:
     """Detects outdated messages by means of echoes, which are messages that the bridge sends to itself.
 
     The broker forwards messages in order. A message that arrives after an echo was forwarded after that echo had been
-    sent. Therefore the age of the newest returned echo limits the delay of the next message. This needs no comparison
-    of the clocks of different machines.
+    sent. Therefore, the age of the newest returned echo limits the delay of the next message. The clocks of different
+    machines needn't be compared.
     """
 
     def __init__(self, now: float) -> None:
