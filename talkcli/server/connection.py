@@ -200,7 +200,7 @@ class ClientConnection(asyncio.Protocol):
         self._held_feedback = b""
         self._half_closed = self._turn_is_due = False
         self._bad_lines = 0
-        self._first_limit = self._limit(FIRST_REQUEST_S, f"no request came within {FIRST_REQUEST_S:g} s")
+        self._first_limit = self._close_after(FIRST_REQUEST_S, f"no request came within {FIRST_REQUEST_S:g} s")
         self._line_limit: asyncio.TimerHandle | None = None
 
     def begin(self) -> None:
@@ -287,8 +287,8 @@ class ClientConnection(asyncio.Protocol):
 
     # -- internal
 
-    def _limit(self, seconds: float, words: str) -> asyncio.TimerHandle:
-        """Return a timer that closes the connection with an error message."""
+    def _close_after(self, seconds: float, words: str) -> asyncio.TimerHandle:
+        """Close the connection with an error message after this time. Return the timer."""
         return self._loop.call_later(seconds, self.close_with, failure(None, "too_slow", words))
 
     def _set_reading(self) -> None:
@@ -303,7 +303,7 @@ class ClientConnection(asyncio.Protocol):
         if not reading or not self._splitter.size:
             self._stop_line_limit()
         elif self._line_limit is None:
-            self._line_limit = self._limit(LINE_LIMIT_S, f"a line took more than {LINE_LIMIT_S:g} s")
+            self._line_limit = self._close_after(LINE_LIMIT_S, f"a line took more than {LINE_LIMIT_S:g} s")
 
     def _stop_line_limit(self) -> None:
         if self._line_limit:
