@@ -14,8 +14,6 @@ from typing import TYPE_CHECKING, TypeVar
 from talkcli.goals.states import State
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from talkcli.goals.goal import By
     from talkcli.goals.record import Record
 
@@ -68,13 +66,10 @@ class History:
         """Return the goal with this id."""
         return self._all.get(goal_id)
 
-    def latest(self, count: int) -> Iterator[Record]:
-        """Return the goals that ended last, newest first, without REJECTED ones."""
-        return islice((each for each in reversed(self._all.values()) if each.state is not State.REJECTED), count)
-
-    def log(self, count: int) -> Iterator[Record]:
-        """Return the goals that ended last, newest first, including REJECTED ones."""
-        return islice(reversed(self._all.values()), count)
+    def latest(self, count: int, *, rejected: bool) -> list[Record]:
+        """Return the goals that ended last, oldest first. `rejected` includes REJECTED goals."""
+        newest = (each for each in reversed(self._all.values()) if rejected or each.state is not State.REJECTED)
+        return list(islice(newest, count))[::-1]
 
 
 class SpeechTimes:

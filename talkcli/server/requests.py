@@ -350,10 +350,10 @@ class Requests:
         self._speech.subscribers.watch(pending.connection)
 
     def _answer_overview(self, pending: PendingRequest) -> None:
-        recent = list(self._scheduler.history.latest(RECENT_GOALS))
+        recent = self._scheduler.history.latest(RECENT_GOALS, rejected=False)
         active = self._scheduler.active
         now = active.snapshot().to_json() if active else None
-        goals = chain(_goal_lines("pending", list(self._scheduler.pending())), _goal_lines("recent", reversed(recent)))
+        goals = chain(_goal_lines("pending", list(self._scheduler.pending())), _goal_lines("recent", recent))
         pending.answer(goals, server=self._describe(), active=now)
 
     async def _voices(self, pending: PendingRequest, _: Voices) -> None:
@@ -367,8 +367,8 @@ class Requests:
         pending.answer(({"voice": fields(each)} for each in voices), count=len(voices))
 
     async def _log(self, pending: PendingRequest, request: Log) -> None:
-        records = list(self._scheduler.history.log(request.count))
-        pending.answer(_goal_lines("goal", reversed(records)), count=len(records))
+        records = self._scheduler.history.latest(request.count, rejected=True)
+        pending.answer(_goal_lines("goal", records), count=len(records))
 
     async def _set(self, pending: PendingRequest, request: Set) -> None:
         speech, scheduler = self._speech, self._scheduler

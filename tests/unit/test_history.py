@@ -37,14 +37,14 @@ def test_many_goals_that_end_alike_drive_out_no_other(state: State, limit: int) 
     assert kept == [*others, *alike[-limit:]]
 
 
-def test_the_newest_end_comes_first_and_latest_leaves_rejected_ones_out() -> None:
+def test_the_newest_end_comes_last_and_rejected_goals_can_be_left_out() -> None:
     history = History()
     states = [State.ABORTED, State.REJECTED, State.RECALLED, State.SUCCEEDED, State.REJECTED, State.RECALLED]
     for number, state in zip((9, 1, 4, 0, 3, 5), states, strict=True):
         history.add(ended(number, state))
     for count in (0, 2, 10):
-        assert [each.number for each in history.log(count)] == [5, 3, 0, 4, 1, 9][:count]
-        assert [each.number for each in history.latest(count)] == [5, 0, 4, 9][:count]
+        assert [each.number for each in history.latest(count, rejected=True)] == [5, 3, 0, 4, 1, 9][:count][::-1]
+        assert [each.number for each in history.latest(count, rejected=False)] == [5, 0, 4, 9][:count][::-1]
 
 
 def test_an_id_that_was_forgotten_may_come_again() -> None:
@@ -53,7 +53,7 @@ def test_an_id_that_was_forgotten_may_come_again() -> None:
         history = History()
         for number in (1, 2, 3, 1):
             history.add(ended(number))
-        assert [each.number for each in history.log(5)] == [1, 3]
+        assert [each.number for each in history.latest(5, rejected=True)] == [3, 1]
 
 
 def test_texts_take_eight_mebibytes_and_the_oldest_goes_first_but_its_result_stays() -> None:
@@ -104,7 +104,7 @@ def test_limits_hold_after_any_goals_and_only_the_oldest_texts_are_gone(goals: l
     assert [each for each in kept if each.state is State.SUCCEEDED] == [
         each for each in records if each.state is State.SUCCEEDED
     ][-7:]
-    assert list(history.log(100)) == kept[::-1]
+    assert history.latest(100, rejected=True) == kept
     assert sum(len(each.text.encode()) for each in kept if each.text is not None) <= 40
     with_text = [each.text is not None for each in kept]
     assert with_text == sorted(with_text), "a newer text went before an older one"
