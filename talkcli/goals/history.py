@@ -76,8 +76,9 @@ class SpeechTimes:
     """The last time that a goal with each key and each text was spoken."""
 
     def __init__(self) -> None:
-        #: start time and goal id
+        #: start time and id of the last goal with each key
         self._by_key: OrderedDict[str, tuple[float, str]] = OrderedDict()
+        #: start time and id of the last goal with each text, by a hash of the text
         self._by_text: OrderedDict[bytes, tuple[float, str]] = OrderedDict()
 
     def add(self, record: Record) -> None:

@@ -559,7 +559,7 @@ class Scheduler:
         needed = self._needed_voices()
         speaking = options.without_speaker(self.active.voice) if self.active else ""
         if options.is_neural(speaking) and not self.voices.is_loaded(speaking):
-            return []  # a dropped voice that still speaks uses its memory until then, and is measured again after that
+            return []  # a dropped voice that still speaks keeps its memory, and is measured again when it has spoken
         return [*self.voices.drop_excess(next(iter(needed), speaking), needed)]
 
     # -- starting and ending goals
@@ -584,7 +584,7 @@ class Scheduler:
         return None if self.has_engine or goal.spoken_end else goal.expires_at
 
     def _next_deadline(self) -> float | None:
-        """Return the time at which the next goal stops waiting for its voice (monotonic), or None without a limit."""
+        """Return the time at which the next goal stops waiting for its voice, or None if there is no such time."""
         record = None if self.active or self.paused or not self.has_engine else self._queue.first()
         if record is None:
             return None

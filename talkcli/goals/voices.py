@@ -221,7 +221,7 @@ class VoiceScheduler:
 
     def load_ended(self, voice: str, error: str | None, now: float) -> None:
         """Record that a voice was loaded, or with `error`, that it could not be loaded."""
-        if voice == self._loading:  # not true if the engine loaded the voice on its own for a `voice_only` goal
+        if voice == self._loading:  # the engine also loads voices on its own, for `voice_only` goals
             self._loading = None
         found = self._voices.setdefault(voice, self._new(voice))
         found.wanted = False
@@ -315,5 +315,5 @@ class VoiceScheduler:
                     del self._voices[voice]
 
     def _new(self, voice: str) -> NeuralVoice:
-        """Return the entry of a voice that goals have not asked for before."""
+        """Return a new entry for a voice that is not loaded."""
         return NeuralVoice(self._measured_bytes.get(voice) or self._file_size(voice))

@@ -350,7 +350,7 @@ def _open_lock(name: str) -> tuple[int, bool]:
             with contextlib.suppress(FileExistsError):
                 return os.open(name, flags | os.O_CREAT | os.O_EXCL, 0o600), True
             try:
-                _refuse_other_lock(name, os.lstat(name))  # checked before opening, which can have an effect on a device
+                _refuse_other_lock(name, os.lstat(name))  # check this first, because opening a device may act on it
                 fd = os.open(name, flags)
             except FileNotFoundError:
                 continue  # the file was removed in between

@@ -145,7 +145,7 @@ class Requests:
     def _may_wait(self, pending: PendingRequest) -> bool:
         """Return whether a request may wait. If it may, count its memory. If it may not, set its refusal."""
         if pending.kept_bytes:
-            return True  # it has waited before
+            return True  # the request has waited before
         size = REQUEST_BYTES + sum(map(_memory_of, fields(pending.request).values()))
         if len(self._unanswered(pending.connection)) > MAX_CLIENT_REQUESTS:  # including this one
             words = f"{MAX_CLIENT_REQUESTS:,} requests of this connection are waiting already"
@@ -255,7 +255,7 @@ class Requests:
         return say, pending.refusal or refusal
 
     async def _wait(self, pending: PendingRequest, request: Wait) -> None:
-        await self._speech.notifications.wait_done(pending)  # earlier events of a goal must not follow its result
+        await self._speech.notifications.wait_done(pending)  # earlier events of a goal must come before its result
         if request.ids is None:
             records = self._scheduler.unfinished()
         else:
@@ -279,7 +279,7 @@ class Requests:
         notifications = self._cancel_waiting(waiting, By(client=client))
         ids = {each.request.id for each in waiting if isinstance(each.request, Say)}
         result = self._scheduler.cancel(selection, client, now, ids)
-        speech.apply(result.effects)  # before the notifications, because there may be thousands of them
+        speech.apply(result.effects)  # apply these effects first, because thousands of notifications may follow
         speech.notifications.add(notifications)
         if result.stopping:
             while not result.stopping.state.terminal:
@@ -317,14 +317,14 @@ class Requests:
         now = speech.now()
         changed, active = scheduler.paused, scheduler.active
         if active and active.state is not State.ACTIVE:
-            active = None  # it is being stopped, so it won't continue
+            active = None  # a goal that is being stopped won't continue
         speech.silent_goal = None
         effects = scheduler.resume(now)
         if changed:
             self._publish_pause(active, pending)
         speech.apply(effects)
         if active:
-            resume_all(speech.waiting_for_silence(active))  # the goal will not become silent any more
+            resume_all(speech.waiting_for_silence(active))  # these requests no longer have to expect silence
         self._answer_pause(pending, active)
 
     def _publish_pause(self, held: Record | None, pending: PendingRequest) -> None:
@@ -345,7 +345,7 @@ class Requests:
             pending.answer(goal=self._find(request.id).snapshot().to_json())
 
     async def _watch(self, pending: PendingRequest, _: Watch) -> None:
-        await self._speech.notifications.wait_done(pending)  # earlier events must not follow the overview
+        await self._speech.notifications.wait_done(pending)  # earlier events must not be sent after the overview
         self._answer_overview(pending)
         self._speech.subscribers.watch(pending.connection)
 
@@ -379,7 +379,7 @@ class Requests:
             raise RequestRefused(refusal[1], refusal[0])
         changes = options.given_values(replace(request, voice=voice))
         effects = scheduler.change_settings(changes, speech.now())
-        self._check_room_soon()  # waiting goals may preempt now, and so have room
+        self._check_room_soon()  # with the new settings, a waiting goal may preempt and so have room
         speech.apply(effects)
         if changes:
             values = ", ".join(f"{name} {options.format_number(value)}" for name, value in changes.items())

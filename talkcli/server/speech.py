@@ -194,7 +194,7 @@ class Speech:
             if why := self.scheduler.voices.failure(without_speaker(options["voice"])):
                 self.report(protocol.Ended(record.id, protocol.OUTCOME_FAILED, Reason.VOICE_FAILED, why))
                 return
-            options["pitch"] = INITIAL.pitch  # a neural voice has no other
+            options["pitch"] = INITIAL.pitch  # a neural voice has no other pitch
         self.engine.speak(
             protocol.Speak(
                 record.id, record.text or "", next_waits=next_waits, next_is_neural=next_is_neural, **options
@@ -209,7 +209,7 @@ class Speech:
             self.engine.announce_next(active.id, *following)
 
     def _following(self) -> tuple[bool, bool]:
-        """Return whether a goal is pending, and whether the next one has a neural voice."""
+        """Return whether a goal is pending, and whether the next goal has a neural voice."""
         following = next(self.scheduler.pending(), None)
         return following is not None, following is not None and is_neural(self.scheduler.wanted_voice(following))
 

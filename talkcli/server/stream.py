@@ -1,6 +1,6 @@
 """Accepts, reads and writes the sockets of clients. All of it runs in the event loop's thread.
 
-A stream replaces a transport of asyncio and has a similar interface. There are three reasons:
+A stream replaces a transport of asyncio and has a similar interface. There are three reasons for this:
 
 - No request is lost. If a client closes its connection, asyncio's transport fails to write, stops reading, and drops
   the client's last requests.
