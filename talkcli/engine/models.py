@@ -1,8 +1,8 @@
-"""Functions to find the files of neural voices, to check who can change them, and to read their descriptions.
+"""Functions to find the files of neural voices, check their permissions, and read their descriptions.
 
 A voice consists of NAME.onnx and NAME.onnx.json, either in one of `paths.voice_directories` or in an installed package
 `*_piper_voice`. Users give the name of the file and never a path, so a client can't make the server read any other
-file. Nothing is cached, so a new voice is found by the next call. This module doesn't run models.
+file. Nothing is cached, so the next call finds a newly installed voice. This module doesn't run models.
 """
 
 from __future__ import annotations
@@ -23,57 +23,57 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from typing import Any
 
-#: Since version 1.30, onnxruntime writes a device id into ~/.cache/Microsoft when it is imported, and contacts a
-#: telemetry host some seconds later. A robot must not report to anyone, so even a value that the user has set is
-#: overwritten.
+#: Environment variables that turn off onnxruntime's telemetry. Since version 1.30, it writes a device id into
+#: ~/.cache/Microsoft when it is imported, and contacts a server some seconds later. A robot must never do this, so
+#: these values replace any that the user has set.
 NO_TELEMETRY = {"ORT_DISABLE_TELEMETRY": "1"}
 
 _MODEL_SUFFIX, JSON_SUFFIX = ".onnx", ".json"
-#: The suffix of packages that contain voices, and the directories in such a package that may contain models.
+#: The suffix of Python packages that contain voices, and where to look for models in such a package.
 _PACKAGE_SUFFIX, _PACKAGE_DIRS = "_piper_voice", ("", "data")
-#: The maximum size of a JSON file. The file of a model with a thousand speakers has 30,000 bytes.
+#: The maximum size of a voice's JSON file. With a thousand speakers, it has about 30,000 bytes.
 _MAX_JSON_BYTES = 1 << 20
-#: The maximum number of speakers. Piper's largest model has 904.
+#: The maximum number of speakers in a model. Piper's largest model has 904.
 _MAX_SPEAKERS = 4096
-#: The maximum length of a displayed text from a JSON file, and of a speaker's name.
+#: The maximum lengths of a text from a JSON file that is shown to users, and of a speaker's name.
 _MAX_SHOWN_CHARS, _MAX_SPEAKER_CHARS = 40, 64
 #: The sample rates that players support.
 _RATES_HZ = range(4000, 192001)
-#: The maximum number of symbolic links in a path, as in Linux.
+#: The maximum number of symbolic links to follow in a path. Linux has the same limit.
 _MAX_LINKS = 40
-#: The maximum number of ids per phoneme. Piper's voices use one, and a model's memory grows with the square of all ids
-#: in a sentence.
+#: The maximum number of ids per phoneme. Piper's voices use one. A model needs memory in proportion to the square of
+#: the number of ids in a sentence.
 _MAX_IDS_PER_PHONEME = 4
-#: The keys in `phoneme_id_map` for the padding between phonemes and for the beginning and end of a sentence.
+#: The keys of `phoneme_id_map` for the padding between phonemes, and for the beginning and end of a sentence.
 PAD_SYMBOL, BEGIN_SYMBOL, END_SYMBOL = "_", "^", "$"
 
 
 class VoiceFileError(Exception):
-    """A voice's file is missing, unsafe or invalid. The text is an error message with the file and the next step."""
+    """Raised if a file of a voice is missing, unsafe or invalid. The message names the file and says what to do."""
 
 
 @frozen
 class VoiceDescription:
-    """The content of the JSON file beside a model."""
+    """The description of a neural voice from its JSON file."""
 
     rate: int  # samples per second
-    #: the voice of libespeak-ng that provides the phonemes
+    #: the libespeak-ng voice that turns text into phonemes for this voice
     espeak_voice: str
-    #: the language that the voice's author states, as libespeak-ng writes it: "en-us". `espeak_voice` may have another
-    #: code for the same language: "cmn" instead of "zh-cn".
+    #: the language code stated by the voice's author, such as "en-us". `espeak_voice` may use another code for the same
+    #: language, such as "cmn" instead of "zh-cn".
     language: str
-    name: str  # for display: "joe, medium" or "thorsten, medium, 8 speakers"
-    quality: str | None  # "medium"
+    name: str  # the name shown to users, such as "joe, medium" or "thorsten, medium, 8 speakers"
+    quality: str | None  # for example "medium"
     speakers: int
     speaker_names: Mapping[str, int]
-    phoneme_ids: Mapping[str, tuple[int, ...]]  # the ids of each IPA character in the model
-    noise: float  # random variation of the sound; with 0, a text always sounds the same
-    duration_noise: float  # random variation of the durations
-    duration_scale: float  # factor by which durations are multiplied for the voice's natural pace
+    phoneme_ids: Mapping[str, tuple[int, ...]]  # the model's ids for each IPA character
+    noise: float  # how much the sound varies randomly; at 0, a text always sounds the same
+    duration_noise: float  # how much the durations vary randomly
+    duration_scale: float  # all durations are multiplied by this factor
 
 
 def missing_package() -> str | None:
-    """Return the error message for a missing package, or None if all packages for neural voices are installed."""
+    """Return an error message if a package for neural voices is missing, otherwise None."""
     from importlib.util import find_spec
 
     missing = next((each for each in install.NEURAL_PACKAGES if find_spec(each) is None), None)
@@ -81,19 +81,19 @@ def missing_package() -> str | None:
 
 
 def find_models(environment: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Return the paths of the models by their names.
+    """Return the paths of all installed models, by name.
 
-    If several directories contain the same name, the first directory has precedence. Names that a user can't type, or
-    that contain control characters, are left out.
+    If several directories contain a model with the same name, the first directory wins. Models are ignored if their
+    names contain "#" or control characters, or begin with a dot.
 
     Args:
-        environment: The environment variables that name the directories, or None for this process's environment.
+        environment: The environment variables that name the directories. By default, use those of this process.
     """
     result: dict[str, str] = {}
     for directory in _model_directories(environment):
         try:
             names = sorted(os.listdir(directory))
-        except OSError:  # most of these directories don't exist
+        except OSError:  # usually because the directory doesn't exist
             continue
         for each in names:
             name = each.removesuffix(_MODEL_SUFFIX)
@@ -103,17 +103,17 @@ def find_models(environment: Mapping[str, str] | None = None) -> dict[str, str]:
 
 
 def installed_voices() -> tuple[Voice, ...]:
-    """Return all voices that have a model file, including voices that can't be loaded."""
+    """Return all installed neural voices, even those that can't be loaded."""
     return tuple(_described_voice(name, path) for name, path in find_models().items())
 
 
 def installed_names(environment: Mapping[str, str] | None = None) -> tuple[Voice, ...]:
-    """Return all voices that have a model file, but only with their names; no file is read."""
+    """Return all installed neural voices with only their names, without reading any file."""
     return tuple(Voice(NEURAL_PREFIX + name, None, name) for name in find_models(environment))
 
 
 def read_description(path: str) -> VoiceDescription:
-    """Read the JSON file that belongs to a model.
+    """Read the description of a voice from the JSON file beside its model.
 
     Raises:
         VoiceFileError: The file is missing, unsafe or invalid.
@@ -135,11 +135,11 @@ def read_description(path: str) -> VoiceDescription:
 
 
 def open_checked(path: str, missing: str = "put it there again", model: str | None = None) -> Any:
-    """Open a file to read bytes, after checking that only this user and root can have written it.
+    """Open a binary file for reading, but only if no other user can change it.
 
     Args:
         path: The path of the file.
-        missing: The next step for the error message if the file is missing.
+        missing: What the error message tells the user to do if the file is missing.
         model: The path of the model that the file belongs to. It is checked too, so that one error message covers both.
 
     Raises:
@@ -165,10 +165,10 @@ def open_checked(path: str, missing: str = "put it there again", model: str | No
 
 
 def _check_paths(*paths: str) -> None:
-    """Check that no other user can replace some files, or the directories and links in their paths.
+    """Check that no other user can replace these files, or a directory or link in their paths.
 
-    A sticky directory such as /tmp may be writable for everyone, because only the owner of an entry can replace it. But
-    it must not directly contain a voice file or a link to one.
+    In a sticky directory such as /tmp, only the owner of an entry can replace it. Everyone may write to such a
+    directory, but it must not directly contain a voice file or a link to one.
 
     Raises:
         VoiceFileError: Another user could replace a file.
@@ -187,10 +187,10 @@ def _check_paths(*paths: str) -> None:
 
 
 def _walk_path(path: str) -> Iterator[tuple[str, bool]]:
-    """Yield the directories in a file's path and the file itself, each with a flag.
+    """Yield each directory in a file's path and then the file, following symbolic links.
 
-    The flag is True if another directory follows. Links are resolved. If a path doesn't exist, the walk ends before it,
-    because opening the file then reports the error.
+    Each path comes with a flag, which is True if another directory follows. If part of the path doesn't exist, the
+    walk stops there, because opening the file reports the error later.
 
     Raises:
         VoiceFileError: A link belongs to another user.
@@ -224,12 +224,12 @@ def _walk_path(path: str) -> Iterator[tuple[str, bool]]:
 
 
 def _others_can_write(path: str, status: os.stat_result, file: str | int) -> bool:
-    """Return whether anyone except root and this user may write a file.
+    """Return whether anyone except root and this user can write to a file.
 
     Args:
-        path: The file's name for the error message.
-        status: The file's status.
-        file: The file's path or descriptor, for reading its access control list.
+        path: The name of the file for the error message.
+        status: The result of `os.stat` for the file.
+        file: The path or descriptor of the file, used to read its access control list.
 
     Raises:
         VoiceFileError: The file belongs to another user.
@@ -243,14 +243,14 @@ def _others_can_write(path: str, status: os.stat_result, file: str | int) -> boo
 
 
 def _check_owner(path: str, status: os.stat_result) -> None:
-    """Raise VoiceFileError if a file belongs to another user, who could change it."""
+    """Raise VoiceFileError if a file belongs to another user."""
     if status.st_uid not in {0, os.geteuid()}:
         words = f"{path} is another user's (#{status.st_uid}), who could change the voice"
         raise VoiceFileError(f"{words}: put it into a directory of your own")
 
 
 def _has_acl(file: str | int) -> bool:
-    """Return whether a file has an access control list, which may give other users the group's permissions."""
+    """Return whether a file has an access control list, which can allow more users to write to it."""
     try:
         return hasattr(os, "listxattr") and "system.posix_acl_access" in os.listxattr(file)
     except OSError as error:
@@ -258,7 +258,7 @@ def _has_acl(file: str | int) -> bool:
 
 
 def _is_private_group(user: int, group: int) -> bool:
-    """Return whether a user is the only member of a group, as in the private groups of Debian and Fedora."""
+    """Return whether a group has this user as its only member, like the groups that Debian creates for each user."""
     import grp
     import pwd
 
@@ -272,8 +272,8 @@ def _is_private_group(user: int, group: int) -> bool:
 
 
 def _writable_error(*paths: str) -> VoiceFileError:
-    """Return the error for paths that others can write, with a single command that repairs all of them."""
-    import shlex  # every engine process imports this module, but rarely needs shlex
+    """Return the error for files that other users can write to. It includes a command that fixes all of them."""
+    import shlex  # imported here because it is rarely needed
 
     names = f"{', '.join(paths[:-1])} and {paths[-1]}" if len(paths) > 1 else paths[0]
     needs_root = os.geteuid() != 0 and any(os.stat(each).st_uid == 0 for each in paths)
@@ -293,7 +293,7 @@ def _model_directories(environment: Mapping[str, str] | None) -> Iterator[str]:
 
 
 def _described_voice(name: str, path: str) -> Voice:
-    """Return the voice whose model is at a path, with its description if that can be read."""
+    """Return the voice of a model, with the details from its description if it can be read."""
     try:
         found = read_description(path)
     except VoiceFileError:
@@ -307,7 +307,7 @@ def _described_voice(name: str, path: str) -> Voice:
 
 
 def _parse_description(found: Any) -> VoiceDescription:
-    """Return the description from the content of a JSON file.
+    """Convert the content of a voice's JSON file.
 
     Raises:
         KeyError, TypeError, ValueError, AttributeError: The content is invalid.
@@ -352,14 +352,14 @@ def _shorten(value: object) -> str:
 
 
 def _checked_integer(value: object) -> int:
-    """Return a value from a JSON file, or raise ValueError unless it is an integer from 0 to 2,147,483,647."""
+    """Return the value if it is an integer from 0 to 2,147,483,647. Otherwise raise ValueError."""
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 31:
         raise ValueError(f"{value!r} is no number of a kind that is expected")
     return value
 
 
 def _checked_factor(value: object, least: float = 0.0) -> float:
-    """Return a value from a JSON file, or raise ValueError unless it is a number from `least` to 10."""
+    """Return the value if it is a number from `least` to 10. Otherwise raise ValueError."""
     if not isinstance(value, int | float) or not least <= value <= 10:
         raise ValueError(f"{value!r} is no factor")
     return float(value)

@@ -1,14 +1,14 @@
-"""The lookup of voices by the names that users write.
+"""Functions to find a voice by the name that a user typed.
 
-A neural voice is called "piper/NAME", and any unambiguous part of NAME is enough. A speaker follows a "#":
-"piper/NAME#3". A language selects a voice of libespeak-ng. The only exception is the language of the server's own
-neural voice, which selects that voice.
+A neural voice is called "piper/NAME", and any unambiguous part of NAME is enough. To choose a speaker, append "#" and
+its number or name: "piper/NAME#3". The name of a language selects a voice of libespeak-ng. The only exception is the
+language of the server's own neural voice, which selects that voice.
 
-If a name matches nothing, other common forms of it are tried, such as "de-DE" for "de", "german", or "joe" (see
-`_readings`).
+If no voice has the name, similar names are tried: "de" for "de-DE", a language for "german", or
+"piper/en_US-joe-medium" for "joe" (see `_other_forms`).
 
-Clients' names are never passed to libespeak-ng, because it doesn't look up languages ("en-gb"), silently drops unknown
-variants, and copies a variant of any length into 40 bytes. It only gets ids and variants from its own lists.
+A name from a client is never passed to libespeak-ng. The library doesn't look up languages ("en-gb"), silently drops
+unknown variants, and copies a variant of any length into 40 bytes. It only gets ids and variants from its own lists.
 """
 
 from __future__ import annotations
@@ -25,61 +25,64 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from typing import Any
 
-#: The prefix of variants, which change the sound of any libespeak-ng voice: "en-us+f3". A variant alone stands for the
-#: default voice, which is English, with this variant.
+#: The prefix of a libespeak-ng variant, which changes the sound of a voice: "en-us+f3". A variant without a voice is
+#: applied to the English voice.
 VARIANT_PREFIX = "+"
 _DEFAULT_LANGUAGE = "en"
 
-#: The maximum number of suggestions for an unknown name, and their minimum similarity to it (0 to 1). With this
-#: minimum, "Dutch" is not suggested for "nosuch".
+#: The maximum number of suggestions for an unknown name, and how similar they must be to it (0 to 1). At this value,
+#: "Dutch" is not suggested for "nosuch".
 _MAX_SUGGESTIONS, _MIN_SIMILARITY = 3, 0.7
-#: A language with a region in lower case: "de-at", "es-419".
+#: Matches a language code with a region, such as "de-at" or "es-419".
 _WITH_REGION = re.compile(r"([a-z]{2,3})-(?:[a-z]{2}|[0-9]{3})")
-#: The maximum length of an unknown name in an error message. The rest is cut off.
+#: Unknown names are cut off at this length in error messages.
 _MAX_WORD_CHARS = 60
 
-#: The synthesizers by the names that --driver accepts, the default first. Each is made by a "module:callable" in
-#: `talkcli.engine.child.synthesizers`. It replaces the pyttsx3 driver with the same name.
+#: The built-in synthesizers, which replace the pyttsx3 drivers of the same name. The keys are values of --driver, the
+#: default first. The values are "module:class" in `talkcli.engine.child.synthesizers`.
 SYNTHESIZERS = {"espeak": "combined:CombinedSynthesizer"}
 
 
 class UnknownVoice(Exception):
-    """A voice can't be loaded. The text is the reason, worded to follow "it cannot be loaded"."""
+    """Raised if a voice can't be loaded. The message gives only the reason."""
 
 
 def is_own_driver(driver: str | None) -> bool:
-    """Return whether a driver is one of `talk`'s synthesizers.
+    """Return whether a driver is one of the built-in synthesizers.
 
-    The synthesizers play through a player, while all other drivers play sound on their own.
+    A built-in synthesizer plays through a player, while any other driver plays its sound itself.
     """
     return sys.platform.startswith("linux") and driver in (None, *SYNTHESIZERS)
 
 
 def list_voices(engine: Any) -> tuple[Voice, ...]:
-    """Return all voices of a pyttsx3 engine; the variants of libespeak-ng, such as "+f3", come last."""
+    """Return all voices of a pyttsx3 engine.
+
+    The variants of libespeak-ng, such as "+f3", come last.
+    """
     return tuple(_to_voice(each) for each in engine.getProperty("voices") or ())
 
 
 def find_voice(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> Voice | None:
-    """Return the voice with a name, or None if no voice or several voices match.
+    """Find a voice by name. Return None if no voice matches, or more than one.
 
     The name is compared with the ids, the last parts of the ids, the names and the languages of the voices, in this
     order, ignoring case. It may end with a variant ("en-us+f3"). The returned voice's id includes the variant. If
-    nothing matches, other forms of the name are tried (see `_readings`).
+    nothing matches, other forms of the name are tried (see `_other_forms`).
 
     Args:
-        wanted: The name that the user wrote.
+        wanted: The name that the user typed.
         voices: The voices to choose from.
-        preferred: The name of the server's own voice, as written in its settings. If it is a neural voice, its language
-            selects this voice. For an "en-us" voice, these are "en-us" and "en". Voices of libespeak-ng are then only
-            found by their ids or names.
+        preferred: The name of the server's own voice from its settings. If it is a neural voice, its language selects
+            it: "en-us" and "en" select an "en-us" voice. The voices of libespeak-ng in this language are then found
+            only by their ids or names.
     """
     fitting = _matches(wanted, voices, preferred)
     return next(iter(fitting.values())) if len(fitting) == 1 else None
 
 
 def matching_languages(wanted: str, voices: Sequence[Voice]) -> set[str]:
-    """Return the languages of the voices that match a code or an English name, such as "en-gb" for "English"."""
+    """Return the languages that match a language code or an English name, such as "en-gb" for "English"."""
     known = {each.language for each in voices if each.language}
     word = _fold(wanted)
     region = _WITH_REGION.fullmatch(word)
@@ -92,11 +95,11 @@ def matching_languages(wanted: str, voices: Sequence[Voice]) -> set[str]:
 
 
 def _matches(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> dict[str, Voice]:
-    """Return the voices that a name may refer to, by their unambiguous names."""
+    """Return the voices that a name may refer to, each with an unambiguous name as the key."""
     found = _find_exact(wanted, voices, preferred)
     if found is not None:
         return {wanted: found}
-    for words in _readings(wanted, voices):
+    for words in _other_forms(wanted, voices):
         fitting: dict[Voice, str] = {}
         for word in words:
             found = _find_exact(word, voices, preferred)
@@ -107,8 +110,8 @@ def _matches(wanted: str, voices: tuple[Voice, ...], preferred: str | None = Non
     return {}
 
 
-def _readings(wanted: str, voices: tuple[Voice, ...]) -> Iterator[list[str]]:
-    """Yield lists of other forms of an unknown name, the most likely list first."""
+def _other_forms(wanted: str, voices: tuple[Voice, ...]) -> Iterator[list[str]]:
+    """Yield lists of names that the user may have meant by an unknown name, the most likely ones first."""
     name, mark, speaker = wanted.partition(SPEAKER_MARK)
     word = _fold(name)
     neural = [each.id for each in voices if is_neural(each.id)]
@@ -128,9 +131,10 @@ def _readings(wanted: str, voices: tuple[Voice, ...]) -> Iterator[list[str]]:
 
 
 def _by_english_name(word: str, voices: Sequence[Voice]) -> list[str]:
-    """Return the languages with an English name, which is a part of a voice's name: "English (Great Britain)".
+    """Return the codes of the languages with this English name.
 
-    If a language has several voices, and its code alone ("en") names one of them, only the code is returned.
+    The names come from the voices' names, such as "English (Great Britain)". If a language has several voices, and its
+    code alone ("en") names one of them, only this code is returned.
     """
     groups: dict[str, list[Voice]] = {}
     for each in voices:
@@ -144,15 +148,15 @@ def _by_english_name(word: str, voices: Sequence[Voice]) -> list[str]:
 
 
 def _english_names(voice: Voice) -> list[str]:
-    """Return the English names in a voice's name: "Chinese" and "Mandarin" for "Chinese (Mandarin)"."""
+    """Return the English words for a voice's language: "Chinese" and "Mandarin" for "Chinese (Mandarin)"."""
     names = [each.strip() for each in re.split("[(),]", voice.name)]
     return [each for each in (*names, names[0].partition(" ")[0]) if each]
 
 
 def _short_names(neural: str) -> list[str]:
-    """Return the short names of a neural voice: "joe", "en_US-joe" and three more for "piper/en_US-joe-low".
+    """Return the short names of a neural voice, such as "joe" and "en_US-joe" for "piper/en_US-joe-low".
 
-    The language alone isn't one of them.
+    They don't include the language alone.
     """
     parts = neural.removeprefix(NEURAL_PREFIX).split("-")
     first = 1 if _WITH_REGION.fullmatch(_fold(parts[0])) else 0
@@ -160,7 +164,7 @@ def _short_names(neural: str) -> list[str]:
 
 
 def _find_exact(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> Voice | None:
-    """Return the voice whose name matches without trying other forms of the name, or None."""
+    """Find a voice by its exact name, ignoring case. Return None if there is none."""
     if is_neural(wanted):
         return _find_neural(wanted, voices)
     if preferred is not None and is_neural(preferred):
@@ -181,20 +185,20 @@ def _find_exact(wanted: str, voices: tuple[Voice, ...], preferred: str | None = 
 
 
 def neural_language(voice: str) -> str:
-    """Return the language in a neural voice's id, as libespeak-ng writes it: "en-us" for "piper/en_US-joe"."""
+    """Return the language code from the id of a neural voice: "en-us" for "piper/en_US-joe"."""
     return voice.removeprefix(NEURAL_PREFIX).partition("-")[0].replace("_", "-").lower()
 
 
 def speaker_number(word: str, numbers: Mapping[str, int], count: int) -> int:
-    """Return the number of a neural voice's speaker.
+    """Return the number of a speaker of a neural voice.
 
     Args:
         word: The name or the number of the speaker, or "" for the first speaker.
-        numbers: The number of each named speaker.
-        count: The number of speakers that the voice has.
+        numbers: The numbers of the speakers, by name.
+        count: How many speakers the voice has.
 
     Raises:
-        UnknownVoice: There is no such speaker.
+        UnknownVoice: The voice has no such speaker.
     """
     number = numbers.get(word, -1)
     if not word:
@@ -208,7 +212,7 @@ def speaker_number(word: str, numbers: Mapping[str, int], count: int) -> int:
 
 
 def _find_neural(wanted: str, voices: tuple[Voice, ...]) -> Voice | None:
-    """Return the neural voice with an id and possibly a speaker, or None."""
+    """Find a neural voice by its id, which may end with "#" and a speaker. Return None if there is none."""
     name, mark, speaker = wanted.partition(SPEAKER_MARK)
     found = _by_name(name, [each for each in voices if is_neural(each.id)], by_id=True)
     if found is None or (mark and not speaker):
@@ -217,12 +221,12 @@ def _find_neural(wanted: str, voices: tuple[Voice, ...]) -> Voice | None:
 
 
 def unknown_voice_message(wanted: str, voices: tuple[Voice, ...], foreign: str | None = None) -> str:
-    """Return the error message for an unknown voice, with similar voices or the next step.
+    """Return the error message for an unknown voice. It suggests similar voices, or says what to do next.
 
     Args:
-        wanted: The name that the user wrote.
+        wanted: The name that the user typed.
         voices: All voices.
-        foreign: The name of the driver, unless it is one of `talk`'s synthesizers.
+        foreign: The name of the driver, unless it is a built-in synthesizer.
     """
     shown = wanted if len(wanted) <= _MAX_WORD_CHARS else f"{wanted[:_MAX_WORD_CHARS]}…"
     if is_neural(wanted) and foreign is not None:
@@ -244,7 +248,7 @@ def unknown_voice_message(wanted: str, voices: tuple[Voice, ...], foreign: str |
 
 
 def _suggestions(wanted: str, voices: tuple[Voice, ...]) -> list[str]:
-    """Return the names of similar voices, in a form that users may write."""
+    """Return names similar to an unknown one, written so that a user can type them."""
     plain, variants = _split_variants(voices)
     neural = [each for each in voices if is_neural(each.id)]
     if is_neural(wanted):
@@ -254,13 +258,13 @@ def _suggestions(wanted: str, voices: tuple[Voice, ...]) -> list[str]:
         near = _similar(suffix, {each.id.removeprefix(VARIANT_PREFIX): each for each in variants})
         return [f"{name}{VARIANT_PREFIX}{each}" for each in near]
     words: dict[str, Voice] = {}
-    # the form shown by `talk voices` has precedence: the language "en-us" over the id "en-US"
+    # Suggest the spelling that `talk voices` shows, which is "en-us" rather than the id "en-US".
     for place in reversed(range(4)):
         for each in plain:
             words.setdefault(_names_of(each)[place] or each.id, each)
     for each in neural:
         words.update(dict.fromkeys(_short_names(each.id), each))
-    # Only libespeak-ng's voices have English names of languages. On macOS, voices have names of people.
+    # Only libespeak-ng names its voices after languages. On macOS, voices are named after people.
     for each in plain if variants else ():
         for called in _english_names(each):
             words.setdefault(called, each)
@@ -268,13 +272,13 @@ def _suggestions(wanted: str, voices: tuple[Voice, ...]) -> list[str]:
 
 
 def _split_variants(voices: Sequence[Voice]) -> tuple[list[Voice], list[Voice]]:
-    """Return the ordinary voices, which are neither neural nor variants, and the variants."""
+    """Return two lists: the voices of libespeak-ng or another driver, and the variants. Omit neural voices."""
     plain = [each for each in voices if not each.id.startswith((VARIANT_PREFIX, NEURAL_PREFIX))]
     return plain, [each for each in voices if each.id.startswith(VARIANT_PREFIX)]
 
 
 def _by_name(wanted: str, voices: Sequence[Voice], *, by_id: bool = False) -> Voice | None:
-    """Return the voice with a name; if several match, a voice with the same case and dashes has precedence."""
+    """Find a voice by name, ignoring case. If several match, prefer the one with the same spelling."""
     word = _fold(wanted)
     found = [
         (called != wanted, place, voice)
@@ -286,19 +290,19 @@ def _by_name(wanted: str, voices: Sequence[Voice], *, by_id: bool = False) -> Vo
 
 
 def _fold(word: str) -> str:
-    """Return a name in the form in which names are compared: lower case, with dashes instead of underscores."""
+    """Normalize a name for comparisons: lower case, with dashes instead of underscores."""
     return word.casefold().replace("_", "-")
 
 
 def _names_of(voice: Voice) -> tuple[str, str, str, str]:
-    """Return the names that a voice can be called by, in order of precedence."""
+    """Return the names by which a voice can be found, in the order in which they are tried."""
     return voice.id, voice.id.rpartition("/")[2], voice.name, voice.language or ""
 
 
 def _find_variant(suffix: str, variants: list[Voice]) -> Voice | None:
-    """Return the variant with the name after a "+".
+    """Find a variant by the part of a voice's name after the "+".
 
-    As in libespeak-ng, the numbers 1 to 9 stand for male variants, and numbers from 11 on for female variants.
+    As in libespeak-ng, the numbers 1 to 9 select male variants, and the numbers from 11 on select female variants.
     """
     word = suffix.casefold()
     if word.isdecimal() and word.isascii() and len(word) < 3:
@@ -308,7 +312,7 @@ def _find_variant(suffix: str, variants: list[Voice]) -> Voice | None:
 
 
 def _similar(wanted: str, words: dict[str, Voice]) -> list[str]:
-    """Return the names that are most similar to `wanted`, at most one for each voice."""
+    """Return the names most similar to `wanted`, at most one for each voice."""
     import difflib
 
     folded: dict[str, str] = {}
@@ -326,8 +330,8 @@ def _similar(wanted: str, words: dict[str, Voice]) -> list[str]:
 
 
 def _to_voice(found: Any) -> Voice:
-    """Return a voice of a pyttsx3 engine as a `Voice`."""
+    """Convert a voice of pyttsx3."""
     language = found.languages[0] if found.languages else None
-    if isinstance(language, bytes):  # drivers for older pyttsx3 versions prepend a priority byte
+    if isinstance(language, bytes):  # In old drivers of pyttsx3, a priority byte comes before the language.
         language = language[1:].decode("utf-8", "replace")
     return Voice(id=str(found.id), language=language or None, name=str(found.name or found.id))

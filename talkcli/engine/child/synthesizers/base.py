@@ -1,7 +1,7 @@
-"""The interface of a synthesizer, and of the sink that receives the sentence.
+"""Interfaces for synthesizers, and for the sinks that receive their sound.
 
-Positions in a text are characters from 0. Samples are signed 16 bit, little-endian, one channel.
-`tests/engine/test_synthesizer_contract.py` tests that every synthesizer keeps the promises of `Synthesizer`.
+Positions in a text are counted in characters from 0. Samples are signed 16 bit, little-endian, one channel.
+`tests/engine/test_synthesizer_contract.py` tests that every synthesizer behaves as `Synthesizer` describes.
 """
 
 from __future__ import annotations
@@ -17,103 +17,103 @@ else:
 
 
 class NotInstalled(Exception):
-    """A part of a synthesizer is not installed. The text is an error message with what to install."""
+    """Raised if software that a synthesizer needs is not installed. The message says what to install."""
 
 
 @frozen
 class SpeechSettings:
-    """The settings of a sentence except its voice, with pyttsx3's defaults."""
+    """The settings for speaking a sentence, except the voice. The defaults are those of pyttsx3."""
 
     rate: int = 200  # words per minute, 80 to 450
     volume: float = 1.0  # 0.0 to 1.0; 1.0 is the voice's natural volume
     pitch: int = 50  # 0 to 100; 50 is the voice's natural pitch
-    voice_only: bool = False  # whether the sentence fails if its voice can't speak it
+    voice_only: bool = False  # whether to fail if the voice can't be used, instead of using another one
 
 
 class SampleSink(Protocol):
-    """Receives the samples and words of one sentence, as the playback does.
+    """Receives the samples of one sentence and the positions of its words.
 
-    Every method may block while the sentence is held. It may raise Stopped if the sentence has to end, or CannotSpeak
+    Every method may block while the sentence is paused. It may raise Stopped if the sentence has to end, or CannotSpeak
     if the sentence can't be played. After such an exception, the sink must not be called again.
     """
 
     def begin(self, rate: int, voice: str, fallback_reason: str | None = None) -> None:
-        """Announce the sample rate and the voice before anything else.
+        """Set the sample rate and the voice.
 
-        Until the first word or sample, it may be called again with other values.
+        This must be called first. It may be called again with other values until the first word or sample.
 
         Args:
             rate: Samples per second.
             voice: The id of the voice that speaks.
-            fallback_reason: Why the requested voice doesn't speak, as a message, or None if it does.
+            fallback_reason: A message saying why the requested voice is not used, or None if it is used.
         """
 
     def word(self, start: int, length: int, position: float) -> None:
-        """Announce a word.
+        """Report when a word will be heard.
 
         Args:
             start: The position of the word in the text.
             length: The length of the word in characters, at least 1.
-            position: The position of the word in the samples, in seconds.
+            position: The time at which the word begins, in seconds from the first sample.
         """
 
     def write(self, samples: bytes) -> None:
-        """Write whole samples. An empty write only lets the sink raise Stopped."""
+        """Play these samples. With `b""`, only raise Stopped if the sentence has to end."""
 
     def wait(self, descriptor: int) -> None:
-        """Keep playing the written samples until a descriptor is readable, for a synthesizer that works in a thread.
+        """Play the samples written so far until a descriptor is readable.
 
-        It may return earlier. It may also be called before `begin`. The sentence can be held or stopped during the
-        wait.
+        A synthesizer calls this while it waits for its own thread. The method may return early, and it may be called
+        before `begin`. The sentence can be paused or stopped during the wait.
         """
 
 
 class Synthesizer(Protocol):
-    """Turns texts into samples and words, in the voice that was loaded last.
+    """Turns text into sound, using the voice that was loaded last.
 
     All calls come from the thread that created the synthesizer, and the synthesizer calls its sink only in this thread.
-    The constructor raises NotInstalled if a part of the synthesizer is missing.
+    The constructor raises NotInstalled if software is missing.
     """
 
-    #: the synthesizer's name and version for display, such as "eSpeak NG 1.51 (system)", or None
+    #: the name and version shown to users, such as "eSpeak NG 1.51 (system)", or None if unknown
     version: str | None
-    #: the id of the voice that was loaded last, or of the default voice
+    #: the id of the current voice, which is the default voice until another one is loaded
     voice: str
 
     def voices(self) -> tuple[Voice, ...]:
-        """Return all voices with unique ids, the common voices first; a later call may return more voices.
+        """Return all voices, the common ones first.
 
-        An id that begins with "+" is a variant, to be appended to the id of a voice.
+        The ids are unique. An id that begins with "+" is a variant, which can be appended to the id of a voice. The
+        result of a later call may contain more voices.
         """
 
     def load(self, voice: str) -> None:
-        """Make this voice the current one.
+        """Choose the voice for the next sentences.
 
-        This returns quickly, because it can't be stopped. If a voice takes seconds to load, `speak` waits for it in its
-        sink.
+        This must return quickly, because it can't be interrupted. If a voice takes seconds to load, `speak` waits for
+        it by calling `SampleSink.wait`.
 
         Args:
             voice: The id of the voice.
 
         Raises:
-            UnknownVoice: The voice can't be loaded. The previous voice stays the current one.
+            UnknownVoice: The voice can't be loaded. The synthesizer keeps the previous voice.
         """
 
     def speak(self, text: str, settings: SpeechSettings, sink: SampleSink) -> None:
-        """Synthesize a sentence, and return after all of it was written.
+        """Synthesize a sentence, and return after writing all of it to the sink.
 
-        The sample rate comes first, and every word comes before its first sample. The positions of words in the samples
-        never decrease, but their positions in the text may jump and repeat.
+        The sample rate comes first, and every word is reported before its first sample is written. The times of words
+        never decrease, but their positions in the text may jump back and repeat.
 
-        Samples are written as soon as they exist and in small parts, because a sentence can be stopped or held only in
-        a call of the sink. If a synthesizer needs more than some milliseconds for a part, it writes `b""` meanwhile, or
-        works in a thread and waits in the sink.
+        Samples are written in small parts as soon as they are ready, because a sentence can only be stopped or paused
+        while the sink is called. If the next part takes more than a few milliseconds, the synthesizer calls `write`
+        with `b""` from time to time, or works in a thread and calls `wait`.
 
         Every string is a valid text. Control characters and lone surrogates are silent. A text without any speech
         produces no words, and either no samples or silence.
 
-        However a sentence ends, it doesn't affect later ones: the next sentence has the same samples as without it,
-        except for noise.
+        A sentence never changes the sound of later ones, even if it was stopped or failed.
 
         Raises:
             CannotSpeak: The reason is `engine_failed`, `voice_failed` if the files of the voice are faulty, or

@@ -1,8 +1,8 @@
 """The default synthesizer, which combines libespeak-ng and Piper's neural voices.
 
-The code for neural voices is imported only after a neural voice was requested. If a neural voice isn't loaded, or fails
-before any sound was heard, libespeak-ng speaks in the same language instead. A sentence with `voice_only` fails in this
-case.
+The code for neural voices is imported when a neural voice is first requested. If a neural voice isn't loaded yet, or
+fails before any sound was heard, libespeak-ng speaks in the same language instead. With `voice_only`, the sentence
+fails instead.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class CombinedSynthesizer:
-    """A synthesizer that speaks every voice, either with libespeak-ng or with Piper."""
+    """A synthesizer that supports the voices of both libespeak-ng and Piper."""
 
     def __init__(self, espeak: Espeak | None = None) -> None:
         self._espeak = espeak or Espeak()
@@ -43,7 +43,7 @@ class CombinedSynthesizer:
         self._current, self.voice = current, current.voice
 
     def speak(self, text: str, settings: SpeechSettings, sink: SampleSink) -> None:
-        """Speak with the current voice, or with libespeak-ng if a neural voice can't speak."""
+        """Speak with the current voice. If it is a neural voice and can't be used, speak with libespeak-ng."""
         neural = self._neural
         if neural is None or self._current is not neural or settings.voice_only:
             self._current.speak(text, settings, sink)
@@ -63,18 +63,18 @@ class CombinedSynthesizer:
             except Exception as error:
                 if watched.used:
                     raise
-                traceback.print_exc()  # a bug must not cause silence
+                traceback.print_exc()  # Log the bug, and let the other synthesizer speak instead.
                 why = f"{neural.voice} failed: {type(error).__name__}: {error}"
         self._espeak.load_language(neural.language)
         self._espeak.speak(text, settings, _WatchedSink(sink, why))
 
     @property
     def loader(self) -> ModelLoader | None:
-        """The loader of neural voices, or None until a neural voice has been requested."""
+        """The object that loads neural voices, or None if no neural voice has been requested yet."""
         return self._neural.loader if self._neural else None
 
     def carry_out(self, command: LoadVoice | DropVoice) -> None:
-        """Start to load a neural voice in the background, or drop a loaded one."""
+        """Start loading a neural voice in the background, or unload one."""
         loader = self._piper().loader
         if isinstance(command, protocol.DropVoice):
             loader.drop(command.voice)
@@ -90,11 +90,11 @@ class CombinedSynthesizer:
 
 
 class _WatchedSink:
-    """Passes a sentence to another sink, and records whether it has had any words or samples.
+    """Passes all calls to another sink, and records whether any words or samples were sent.
 
     Args:
-        sink: The sink that receives the sentence.
-        fallback_reason: Why the requested voice doesn't speak, as a message, or None if it does.
+        sink: The other sink.
+        fallback_reason: A message saying why the requested voice is not used, or None if it is used.
     """
 
     def __init__(self, sink: SampleSink, fallback_reason: str | None = None) -> None:

@@ -1,8 +1,8 @@
-"""libespeak-ng as a synthesizer, and as the source of phonemes for neural voices.
+"""A synthesizer that uses libespeak-ng, which also provides the phonemes for neural voices.
 
-The library speaks a text in a single call. In this call, it passes about 50 ms of samples at a time to a callback in
-the same thread. An exception can't pass through the library, so it is stored until the call returns. A process has only
-one instance of the library. This module is for Linux. On other systems, pyttsx3's own drivers find their libraries.
+The library speaks a whole text in one call. During this call, it passes about 50 ms of samples at a time to a callback
+in the same thread. An exception can't pass through the library, so it is stored until the call returns. A process has
+only one instance of the library. This module is for Linux. Other systems use pyttsx3's drivers.
 """
 
 from __future__ import annotations
@@ -32,40 +32,40 @@ if TYPE_CHECKING:
 
 _LIBESPEAK = "libespeak-ng.so.1"
 
-#: Milliseconds of sound per callback. The library rounds this up to 49 ms at 22,050 Hz. Longer parts would delay the
-#: first sound.
+#: How many milliseconds of sound each callback receives. The library rounds this up to 49 ms at 22,050 Hz. A higher
+#: value would delay the first sound.
 _CALLBACK_MS = 20
 
-#: The option that keeps the library from calling exit() if its data is missing.
+#: A flag that stops the library from calling exit() if its data is missing.
 _DONT_EXIT = 0x8000
 
-#: The names of the English voice. The first is a file name, which saves 4 to 40 ms, because the library doesn't have to
-#: read all voices to find the language.
+#: Two names of the English voice, the faster one first. It is the name of a file, so the library finds it without
+#: reading all voices, which takes 4 to 40 ms.
 _ENGLISH = ("gmw/en", "en")
 
-#: The type of the event that reports the sample rate before the first samples, which pyttsx3's binding doesn't define.
+#: The type of the event that reports the sample rate. pyttsx3's binding doesn't define it.
 _EVENT_SAMPLERATE = 8
 
 #: The library's default rate in words per minute.
 _ESPEAK_DEFAULT_WPM = 175
-#: The shortest pause after a sentence in samples. The pause after an abbreviation such as "Mr." has at most a hundred
-#: samples, and the pause after a sentence has 6,000.
+#: If the library makes a shorter pause after a dot, the dot belongs to an abbreviation. The pause has at most a hundred
+#: samples after an abbreviation such as "Mr.", and 6,000 after a sentence.
 _PAUSE_SAMPLES = 2000
 
-#: The library's output mode for phonemes in IPA.
+#: The mode in which the library returns phonemes in IPA.
 _IPA = 2
 
-#: The names of the lists of variants and of MBROLA voices, which the library accepts in place of a language.
+#: If the library is asked for these languages, it lists its variants or the MBROLA voices.
 _VARIANTS, _MBROLA = b"variant", b"mbrola"
-#: The paths of an MBROLA voice's data. Without its data and the program mbrola, the library can't speak the voice.
+#: Where the data of an MBROLA voice may be. The library also needs the program mbrola to use such a voice.
 _MBROLA_PATHS = ("/usr/share/mbrola/{0}", "/usr/share/mbrola/{0}/{0}", "/usr/share/mbrola/voices/{0}")
 
 
 class _EspeakEvent(ctypes.Structure):
     """The C structure `espeak_EVENT` of speak_lib.h.
 
-    The structure in pyttsx3's binding lacks `id.string`, so it is 4 bytes too short on 32-bit systems. The second event
-    of a callback can't be read there.
+    pyttsx3's binding has this structure without `id.string`. On 32-bit systems, it is therefore 4 bytes too short to
+    read the second event of a callback.
     """
 
     _fields_ = (
@@ -76,35 +76,36 @@ class _EspeakEvent(ctypes.Structure):
         ("audio_position", ctypes.c_int),
         ("sample", ctypes.c_int),
         ("user_data", ctypes.c_void_p),
-        # The union `id`, which has 8 bytes even if pointers have 4.
+        # These two fields are the union `id`, which always has 8 bytes.
         ("id_number", ctypes.c_int),
         ("id_padding", ctypes.c_int),
     )
 
 
 def _events_of(pointer: Any) -> Iterator[_EspeakEvent]:
-    """Yield the events of a callback, up to the final event of type 0."""
+    """Yield the events passed to a callback. An event of type 0 marks the end."""
     return itertools.takewhile(lambda each: each.type, iter(ctypes.cast(pointer, ctypes.POINTER(_EspeakEvent))))
 
 
 def load_library() -> tuple[Any, str, int]:
-    """Load and initialize libespeak-ng, from the system or else from the package espeakng-loader.
+    """Load and initialize libespeak-ng.
 
-    This must be called once per process, before anything imports `pyttsx3.drivers._espeak`, which loads the library.
+    The library of the system is preferred. If it is missing, the library from the package espeakng-loader is used. Call
+    this once per process, before anything imports `pyttsx3.drivers._espeak`, which also loads the library.
 
     Returns:
-        pyttsx3's binding, the library's name and version for display ("eSpeak NG 1.51 (system)"), and the number of
-        samples per second, which a voice may change.
+        pyttsx3's binding, the name and version of the library to show to users ("eSpeak NG 1.51 (system)"), and the
+        number of samples per second, which a voice may change.
 
     Raises:
         NotInstalled: The library or its data is missing.
-        OSError: There is not enough memory, or there are not enough descriptors. A later attempt may succeed.
+        OSError: There is not enough memory, or too many files are open. A later attempt may succeed.
     """
     origin, data = _preload()
     from pyttsx3.drivers import _espeak
 
-    # The library connects to PulseAudio, although it doesn't play anything. This takes 7 ms, or 30 s if PulseAudio
-    # hangs. The server gives up the engine process earlier than that, so the sound server is hidden.
+    # The library connects to PulseAudio although it won't play anything. This takes 7 ms, or 30 s if PulseAudio hangs.
+    # The server wouldn't wait that long, so the connection is prevented with a false address.
     sound_server = os.environ.get("PULSE_SERVER")
     os.environ["PULSE_SERVER"] = "unix:/dev/null"
     rate = _espeak.Initialize(_espeak.AUDIO_OUTPUT_SYNCHRONOUS, _CALLBACK_MS, data, _DONT_EXIT)
@@ -118,7 +119,7 @@ def load_library() -> tuple[Any, str, int]:
 
 
 def _preload() -> tuple[str, bytes | None]:
-    """Load the library so that the binding finds it, and return its origin and the directory of its data."""
+    """Load the library before pyttsx3's binding does. Return where it came from, and the directory of its data."""
     try:
         ctypes.CDLL(_LIBESPEAK)
         return "system", None
@@ -129,8 +130,7 @@ def _preload() -> tuple[str, bytes | None]:
     try:
         import espeakng_loader
 
-        # The binding loads the library by the name of the system's. As this library is loaded globally, it is found by
-        # that name.
+        # pyttsx3's binding looks for the system's library by name, and finds this one because it is loaded globally.
         ctypes.CDLL(espeakng_loader.get_library_path(), mode=ctypes.RTLD_GLOBAL)
     except (ImportError, OSError) as error:
         if _is_temporary(error):
@@ -140,7 +140,7 @@ def _preload() -> tuple[str, bytes | None]:
 
 
 def _is_temporary(error: Exception) -> bool:
-    """Return whether an error message reports a lack of memory or descriptors."""
+    """Return whether an error was caused by a lack of memory or by too many open files."""
     return str(error).endswith(tuple(map(os.strerror, (errno.EMFILE, errno.ENFILE, errno.ENOMEM))))
 
 
@@ -150,7 +150,7 @@ class Espeak:
     version: str | None
 
     def __init__(self) -> None:
-        """Load the library.
+        """Load the library and its English voice.
 
         Raises:
             NotInstalled, OSError: See `load_library`.
@@ -159,13 +159,13 @@ class Espeak:
         self._espeak, self.version, self._rate = load_library()
         espeak = self._espeak
         self._listed: tuple[Voice, ...] = ()
-        #: the current parameters. Only changed parameters are set, so that a new process makes the same samples as the
-        #: library with its defaults.
+        #: the parameters last passed to the library. Setting a parameter can change the sound even if its value stays
+        #: the same, so only changed ones are passed.
         self._parameters = {espeak.RATE: _ESPEAK_DEFAULT_WPM, espeak.VOLUME: 100, espeak.PITCH: 50}
         self._text = ""
         self._sink: SampleSink | None = None
         self._raised: BaseException | None = None
-        #: the last phonemizer, which may still be using the library; None after it was stopped
+        #: the last phonemizer, which may still be using the library, or None if it has been stopped
         self._phonemizer: EspeakPhonemizer | None = None
         found = (each for each in _ENGLISH if espeak.SetVoiceByName(each.encode()) == espeak.EE_OK)
         self.voice = next(found, "")
@@ -174,25 +174,25 @@ class Espeak:
         espeak.SetSynthCallback(self._on_audio)
 
     def voices(self) -> tuple[Voice, ...]:
-        """Return the normal voices, the usable MBROLA voices, and the variants."""
+        """Return the normal voices, the installed MBROLA voices, and the variants."""
         self._stop_phonemizer()
         espeak = self._espeak
         return (*_list_voices(espeak, None), *_mbrola_voices(espeak), *_variants(espeak))
 
     def load(self, voice: str) -> None:
-        """Load a voice by its id, with or without a variant, or by another name that the library knows."""
+        """Load a voice by its id, which may end with a variant, or by another name known to the library."""
         self._stop_phonemizer()
-        # After some voices, the next voice is up to a third slower unless the rate is set again.
+        # Forget the rate, so that it is set again. Otherwise some voices would make the next one up to a third slower.
         self._parameters.clear()
         if not voice or self._espeak.SetVoiceByName(voice.encode("utf-8", "replace")) != self._espeak.EE_OK:
-            # If a part of the voice is missing, the library has switched to the voice nevertheless, and would be
-            # silent.
+            # Even after an error, the library has switched to the new voice. If a file of that voice is missing, the
+            # library would be silent, so switch back.
             self._espeak.SetVoiceByName(self.voice.encode())
             raise UnknownVoice("part of it is missing")
         self.voice = voice
 
     def speak(self, text: str, settings: SpeechSettings, sink: SampleSink) -> None:
-        """Speak as `Synthesizer` describes; the samples vary slightly between calls."""
+        """Synthesize a sentence. The samples vary slightly from call to call."""
         self._stop_phonemizer()
         sink.begin(self._rate, self.voice)
         espeak = self._espeak
@@ -207,9 +207,9 @@ class Espeak:
             raise CannotSpeak(Reason.ENGINE_FAILED, f"espeak_Synth failed with {status}")
 
     def load_language(self, language: str) -> None:
-        """Load a voice of a language such as "de-at".
+        """Load a voice for a language code such as "de-at".
 
-        If there is no such voice, load a voice of the language's first part ("de"), or else an English voice.
+        If there is none, try the code without its region ("de"), and then English.
         """
         self._stop_phonemizer()
         found = (self._find_voice(each) for each in (language, language.partition("-")[0], *_ENGLISH))
@@ -217,11 +217,12 @@ class Espeak:
 
     @contextlib.contextmanager
     def phonemizer(self, language: str) -> Iterator[EspeakPhonemizer]:
-        """Return a context manager with a phonemizer, which another thread may use until the end of the `with` block.
+        """Provide a phonemizer for a language in a `with` block.
 
-        The synthesizer must not be used in the block. After it, calls of the phonemizer raise Stopped. A call that is
-        still running at the end of the block continues for some milliseconds, or up to 130 ms if it gets phonemes. The
-        block doesn't wait for this call, but the next use of the synthesizer does.
+        Another thread may use the phonemizer during the block, but nothing may use the synthesizer. After the block,
+        calls of the phonemizer raise Stopped. If a call is still running at the end of the block, it continues for a
+        few milliseconds, or for up to 130 ms in `clauses`. The block doesn't wait for this call, but the next use of
+        the synthesizer does.
 
         Raises:
             UnknownVoice: The library has no voice of this language.
@@ -239,12 +240,12 @@ class Espeak:
             phonemizer.end()
 
     def _find_voice(self, word: str) -> Voice | None:
-        """Return the voice with a name or language, or None."""
+        """Find a voice by its name or language. Return None if there is none."""
         self._listed = self._listed or _list_voices(self._espeak, None)
         return find_voice(word, self._listed)
 
     def _stop_phonemizer(self) -> None:
-        """Wait until the last phonemizer has finished, and restore the synthesizer's voice."""
+        """Wait for the last phonemizer to finish, and switch back to the synthesizer's voice."""
         phonemizer, self._phonemizer = self._phonemizer, None
         if phonemizer is not None:
             phonemizer.wait()
@@ -262,12 +263,12 @@ class Espeak:
                 self._parameters[parameter] = value
 
     def _on_audio(self, samples: Any, count: int, events: Any) -> int:
-        """Process samples and events from the library, and return 1 to end the synthesis."""
+        """Handle samples and events from the library. Return 1 to stop the synthesis, otherwise 0."""
         if self._sink is None or self._raised is not None:
             return 1
         try:
             self._pass_on(self._sink, samples, count, events)
-        except BaseException as error:  # noqa: BLE001 - raised again after the library has returned
+        except BaseException as error:  # noqa: BLE001 - `speak` raises it again
             self._raised = error
             return 1
         return 0
@@ -287,10 +288,10 @@ class Espeak:
 
 
 class EspeakPhonemizer:
-    """A `phonemes.Phonemizer` that uses libespeak-ng without any sound.
+    """Converts text to phonemes with libespeak-ng, as `phonemes.Phonemizer` describes.
 
     Args:
-        espeak: The binding of the library.
+        espeak: pyttsx3's binding of the library.
         voice: The id of the library's current voice.
     """
 
@@ -299,7 +300,7 @@ class EspeakPhonemizer:
 
         self._espeak = espeak
         self._voice = voice
-        #: held during each call of the library
+        #: a lock that is held during each call of the library
         self._busy = threading.Lock()
         self._ended = False
         self._text = ""
@@ -310,7 +311,7 @@ class EspeakPhonemizer:
         espeak.SetSynthCallback(self._on_audio)
 
     def clauses(self, text: str) -> list[tuple[str, str]]:
-        # All clauses are read at once, because any other call would discard the text that the library has read ahead.
+        # The library reads ahead, and any other call discards that text. So get all clauses before doing anything else.
         raw = ctypes.create_string_buffer(guard.guarded(text, self._voice).encode("utf-8", "replace"))
         base = ctypes.addressof(raw)
         at = ctypes.c_void_p(base)
@@ -320,7 +321,7 @@ class EspeakPhonemizer:
             ipa = self._call(self._to_phonemes, ctypes.byref(at), self._espeak.CHARS_UTF8, _IPA) or b""
             end = len(raw) - 1 if at.value is None else at.value - base
             clause = raw.raw[begin:end].decode("utf-8", "replace")
-            if at.value and clause and not clause[-1].isspace():  # this is the first character of the next clause
+            if at.value and clause and not clause[-1].isspace():  # the last character belongs to the next clause
                 end -= len(clause[-1].encode())
                 clause = clause[:-1]
             end_character = begin_character + len(clause)
@@ -329,22 +330,25 @@ class EspeakPhonemizer:
         return found
 
     def word_positions(self, clause: str) -> list[tuple[int, int]]:
-        """Return the positions after speaking the clause without output, which takes 1 ms per second of sound."""
+        """Return the start and the length of each word in a clause.
+
+        The library has to speak the clause without output, which takes 1 ms per second of sound.
+        """
         self._speak(clause)
         return self._positions
 
     def ends_with_abbreviation(self, clause: str) -> bool:
-        """Return whether the library makes no pause between the clause's last word and another word after it."""
+        """Return whether a clause ends with an abbreviation such as "Mr.", after which the library makes no pause."""
         word = clause.rsplit(maxsplit=1)[-1]
         alone = self._speak(word)
         return self._speak(f"{word} A") - alone < _PAUSE_SAMPLES
 
     def end(self) -> None:
-        """Make the current call and all later calls raise Stopped; may be called from any thread."""
+        """Make the current call and all later ones raise Stopped. Any thread may call this."""
         self._ended = True
 
     def wait(self) -> None:
-        """Wait until the current call of the library returns; `end` has to be called first."""
+        """Wait until the current call of the library returns. Call `end` first."""
         with self._busy:
             pass
 
@@ -353,19 +357,19 @@ class EspeakPhonemizer:
             if self._ended:
                 raise Stopped
             result = function(*arguments, **more)
-        if self._ended:  # the result may be incomplete
+        if self._ended:  # the call was cut short, so its result may be incomplete
             raise Stopped
         return result
 
     def _speak(self, text: str) -> int:
-        """Speak a text without output, store its words, and return the end of its first clause in samples."""
+        """Speak a text without output, and record its words. Return the length of its first clause in samples."""
         self._text, self._positions, self._clause_ends = guard.guarded(text, self._voice), [], []
         self._call(self._espeak.Synth, self._text.encode("utf-8", "replace"), flags=self._espeak.CHARS_UTF8)
         return self._clause_ends[0] if self._clause_ends else 0
 
     def _on_audio(self, _samples: Any, _count: int, events: Any) -> int:
         if self._ended:
-            return 1  # ends the synthesis
+            return 1  # tells the library to stop
         for event in _events_of(events):
             if event.type == self._espeak.EVENT_WORD and (position := _word_position(event, self._text)):
                 self._positions.append(position)
@@ -375,36 +379,39 @@ class EspeakPhonemizer:
 
 
 def _word_position(event: _EspeakEvent, text: str) -> tuple[int, int] | None:
-    """Return the start and length of an event's word in the text, or None if there is no word."""
+    """Return the start and the length of the word that an event reports, or None if no word is there."""
     start = event.text_position - 1
     length = event.length if event.length > 0 else count_letters(text, start)
     return (start, length) if length else None
 
 
 def _variants(espeak: Any) -> list[Voice]:
-    """Return the variants, whose ids in the library's list are files such as "!v/f3"."""
+    """Return the library's variants."""
     found = [(each.id.rpartition("/")[2], each.name) for each in _list_voices(espeak, _VARIANTS)]
     return [Voice(VARIANT_PREFIX + file, None, f"variant {name}") for file, name in found]
 
 
 def _mbrola_voices(espeak: Any) -> list[Voice]:
-    """Return the installed MBROLA voices, which are only a part of the library's list."""
+    """Return the installed MBROLA voices. The library also lists those that aren't installed."""
     if not on_path("mbrola"):
         return []
     return [each for each in _list_voices(espeak, _MBROLA) if _has_mbrola_data(each.id)]
 
 
 def _has_mbrola_data(identifier: str) -> bool:
-    """Return whether the data of an MBROLA voice is installed, which is "de4" for the id "mb/mb-de4-en"."""
+    """Return whether the data of an MBROLA voice is installed.
+
+    For the id "mb/mb-de4-en", the data is called "de4".
+    """
     name = identifier.rpartition("/")[2].split("-")[1]
     return any(os.path.isfile(path.format(name)) for path in _MBROLA_PATHS)
 
 
 def _list_voices(espeak: Any, kind: bytes | None) -> tuple[Voice, ...]:
-    """Return one of the library's lists of voices, or the normal voices if `kind` is None."""
+    """Return the library's voices of one kind. By default, return the normal voices."""
     found = []
     for each in espeak.ListVoices(None if kind is None else espeak.VOICE(languages=kind)):
-        # The first byte of the languages is a priority.
+        # The first byte of `languages` is a priority, not a part of the language.
         fields = (each.identifier, (each.languages or b"")[1:], each.name)
         identifier, language, name = ((field or b"").decode("utf-8", "replace") for field in fields)
         found.append(Voice(identifier, language or None, name or identifier))

@@ -1,8 +1,8 @@
-"""The guard for libespeak-ng, which replaces the few characters of a text that would crash the library.
+"""Protection against texts that crash libespeak-ng.
 
-The module is pure. It replaces each of these characters by another one, so every position in the text stays the same.
-Ordinary text must pass unchanged. Each rule is for a known cause of a crash, documents its numbers, and changes nothing
-without that cause. The guard only makes crashes rare. If a crash happens nevertheless, only the engine process is lost.
+Dangerous characters are replaced one by one, so all positions in the text stay the same. Ordinary text is never
+changed. Each rule prevents one known crash, and a comment explains its numbers. Some crashes remain possible, but they
+only affect the engine process. The module is pure.
 
 The numbers are the sizes of buffers that libespeak-ng 1.51 overruns (N_WORD_BYTES, N_CLAUSE_WORDS and N_TR_SOURCE in
 `translate.h`). Version 1.52 has fixed some of these faults.
@@ -13,51 +13,53 @@ from __future__ import annotations
 import re
 import unicodedata
 
-#: The characters that become blanks. 0x01 starts a command to the library (a new pitch or voice), 0x02 after a "["
-#: starts phonemes, and NUL ends the text. Tabs and line ends are harmless. U+FFFD, the replacement for unreadable
-#: bytes, is silent, but the library would report it as a word instead of the next word.
+#: Characters to replace with blanks. For the library, 0x01 starts a command (such as a new pitch or voice), 0x02 after
+#: a "[" starts phonemes, and NUL ends the text. Tabs and line ends are harmless. U+FFFD, which replaces unreadable
+#: bytes, is silent, but the library would report it as a word in place of the next word.
 _BLANKED = {code: " " for code in (*range(0x20), *range(0x7F, 0xA0), 0xFFFD) if chr(code) not in "\t\n\r"}
 
-#: The usable size of the buffer for looking up initials such as "U.S.A.". It contains each letter with its dot, and the
-#: whole word after the last dot (N_WORD_BYTES is 160, including the end). 'a.' * 85 and 'a.' + 'b' * 170 overrun it.
+#: The usable size of the buffer for initials such as "U.S.A.", which the library looks up as one word. The buffer holds
+#: each letter with its dot, and the whole word after the last dot. It has 160 bytes (N_WORD_BYTES), including the end
+#: mark. 'a.' * 85 and 'a.' + 'b' * 170 overrun it.
 _LOOKUP_BYTES = 156
-#: The usable size of the buffer for spelling out initials, which has 80 bytes. At most 50 letters are spoken anyway.
+#: The usable size of the buffer in which the library spells out initials. It has 80 bytes. The library never speaks
+#: more than 50 of the letters anyway.
 _SPELLING_BYTES = 78
-#: The maximum number of words before initials in a clause. Each initial marks up to two words after it as spoken, in a
-#: table of 300 words per clause (N_CLAUSE_WORDS), without a check of the limit.
+#: The maximum number of words before initials in a clause. For each initial, the library marks up to two later words as
+#: spoken. Its table has room for 300 words per clause (N_CLAUSE_WORDS), and it doesn't check this limit.
 _MAX_CLAUSE_WORDS = 220
-#: The number of bytes after which the library ends a clause at the next blank (N_TR_SOURCE is 800, of which 75 are
-#: reserved).
+#: After this number of bytes, the library ends a clause at the next blank. The buffer has 800 bytes (N_TR_SOURCE), of
+#: which 75 are reserved.
 _MAX_CLAUSE_BYTES = 725
-#: The maximum length of a word from which the library may remove an ending: N_WORD_BYTES without room for the
-#: replacement.
+#: The maximum length of a word. The library may replace the ending of a word, so the result has to fit into a buffer of
+#: 160 bytes (N_WORD_BYTES).
 _MAX_WORD_BYTES = 150
-#: The maximum number of apostrophes in a word. Each "'s" is an ending, and the phonemes of all endings share a buffer
-#: of 200 bytes, which 70 endings overrun.
+#: The maximum number of apostrophes in a word. The library treats each "'s" as an ending. The phonemes of all endings
+#: share a buffer of 200 bytes, which 70 endings overrun.
 _MAX_WORD_APOSTROPHES = 30
 
-#: A character that the library treats as a part of a word: a letter, a digit, an apostrophe, and nearly every character
-#: outside ASCII, including separate accents.
+#: Matches a character that the library treats as part of a word. This is a letter, a digit, an apostrophe, or nearly
+#: any character outside ASCII, including combining accents.
 _WORD_CHARACTER = (
     r"(?:[A-Za-z0-9'’]|(?![\s\u0080-\u00a9\u00ab-\u00b4\u00b6-\u00b9\u00bb-\u00bf\u2000-\u200a\u2010-\u205f\u3000-\u303f"
     r"\uff00-\uff0f])[^\x00-\x7f])"
 )
 _WORD_OR_GAP = re.compile(f"({_WORD_CHARACTER}+)|((?:(?!{_WORD_CHARACTER}).)+)", re.DOTALL)
-#: Symbols that the library treats as letters (enclosed characters and Braille).
+#: Symbols that the library treats as letters: circled letters and numbers, and Braille.
 _SYMBOL_LETTERS = frozenset(map(chr, (*range(0x2460, 0x2500), *range(0x2800, 0x2900))))
-#: The end of a clause: Western punctuation before a blank, a bracket or the end of the text, and other punctuation
-#: anywhere.
+#: Matches the end of a clause. Western punctuation ends a clause only before a blank, a bracket, a quote or the end of
+#: the text. Other punctuation always does.
 _CLAUSE_END = re.compile(r"[.,;:!?…](?:[\s()\[\]{}<>\"«»“”‘’„]|\Z)|[。、，！？：；︒؟،؛।॥։՝]|\n\s*\n")
-#: A hyphen between a symbol and a letter.
+#: Matches a hyphen between a symbol and a letter.
 _HYPHEN = re.compile(r"(?<=[^\w\s]|_)-(?=[^\W\d_])")
-#: The first character of the scripts in which each character is a word, and the first and last Hangul syllables. The
-#: library splits these syllables into letters of three bytes.
+#: From the first of these characters on, the library treats each character as a word. The other two are the first and
+#: the last Hangul syllable. The library splits each syllable into letters of three bytes.
 _IDEOGRAPHS, _HANGUL, _HANGUL_END = "\u2e80", "\uac00", "\ud7a3"
-#: Characters that have no name in the default language of their script, with the languages that can process them. For
-#: any other voice, the library loads that default language, finds no name, loads English instead, and continues with
-#: memory that it has just freed (`LookupLetter` in `numbers.c`). The characters were found in 1.51 by speaking every
-#: character in each of the 131 voices while freed memory was overwritten. These voices are silent for all of them
-#: except the four Greek symbols.
+#: Characters that crash all voices except those of the given languages. If a voice doesn't know a character, the
+#: library loads the default language of its script. If that language has no name for the character, the library loads
+#: English, and then uses memory that it has just freed (`LookupLetter` in `numbers.c`). To find these characters, every
+#: character was spoken with each of the 131 voices of version 1.51 while freed memory was overwritten. Blanking them
+#: loses no speech, except for the four Greek symbols.
 _CRASHING_CHARACTERS = {
     ("el", "grc"): "\u0384\u0385\u0387\u03f6",
     ("hy",): "\u055a\u058d-\u058f",
@@ -72,19 +74,19 @@ _CRASHING_CHARACTERS = {
     ("ka",): "\u10fb",
     ("ko",): "\u1180-\u11a7\u11c3-\u11ff",
 }
-#: A number, with or without thousands separators.
+#: Matches a number, with or without thousands separators.
 _SPOKEN_NUMBER = re.compile(r"[0-9]+(?:,[0-9]{3})*")
-#: The minimum and maximum number of digits with which a number crashes the Cantonese and Shan voices, because its words
-#: have more than 200 bytes of phonemes (N_WORD_PHONEMES). Longer numbers are spoken digit by digit. This was measured
-#: by speaking 382 numbers of 6 to 39 digits in each of the 131 voices.
+#: Numbers with this many digits (minimum and maximum) crash the Cantonese and Shan voices, because their phonemes need
+#: more than 200 bytes (N_WORD_PHONEMES). Longer numbers are spoken digit by digit. All 131 voices were tested with 382
+#: numbers of 6 to 39 digits.
 _UNSAFE_DIGIT_COUNTS = {"yue": (13, 14), "shn": (13, 14)}
-#: Replacements for digits that these voices speak separately, so that they split a number. Two of them in a row would
-#: be silent.
+#: Replaces a digit with its superscript, which the Cantonese and Shan voices speak separately. This splits a number in
+#: two. Two superscripts in a row would be silent.
 _SEPARATE_DIGITS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def guarded(text: str, voice: str = "") -> str:
-    """Return a text of the same length that doesn't crash libespeak-ng.
+    """Replace characters that would crash libespeak-ng. The length of the text stays the same.
 
     Args:
         text: The text to make safe.
@@ -100,13 +102,13 @@ def guarded(text: str, voice: str = "") -> str:
 
 
 def _unsafe_characters(language: str) -> re.Pattern[str]:
-    """Return a pattern for the characters that crash the voices of a language."""
+    """Return a pattern that matches the characters that crash the voices of a language."""
     found = (signs for languages, signs in _CRASHING_CHARACTERS.items() if language not in languages)
     return re.compile(f"[{''.join(found)}]")
 
 
 def _split_number(number: str, least: int, most: int) -> str:
-    """Return a number, with one digit replaced to split it if it has `least` to `most` digits."""
+    """Split a number in two if it has `least` to `most` digits. Only one digit is replaced."""
     if not least <= sum(map(str.isdigit, number)) <= most:
         return number
     middle = next(place for place in range(len(number) // 2, len(number)) if number[place].isdigit())
@@ -114,7 +116,7 @@ def _split_number(number: str, least: int, most: int) -> str:
 
 
 def _without_long_initials(text: str) -> str:
-    """Blank the dots after initials that would overrun the library's buffers."""
+    """Replace dots with blanks in long sequences of initials, which would overrun the library's buffers."""
     result = list(text)
     looked_up = spelled = words = size = 0
     dots: list[int] = []
@@ -142,34 +144,37 @@ def _without_long_initials(text: str) -> str:
 
 
 def _ends_clause(text: str, start: int, end: int) -> bool:
-    """Return whether a clause ends between two positions; a dot before a lower-case letter means an abbreviation."""
+    """Return whether a clause ends between two positions.
+
+    A dot doesn't end a clause if a lower-case letter follows, because it then belongs to an abbreviation.
+    """
     behind = text[end : end + 1]
     stops = _CLAUSE_END.finditer(text, start, end + len(behind))
     return any(text[each.start()] != "." or not behind.islower() for each in stops)
 
 
 def _is_letter(character: str) -> bool:
-    """Return whether a character of a word counts as a letter, unlike quotes and joiners."""
+    """Return whether the library counts a character of a word as a letter. Quotes and joiners don't count."""
     return character.isalnum() or character in _SYMBOL_LETTERS or unicodedata.category(character).startswith("M")
 
 
 def _utf8_bytes(text: str) -> int:
-    """Return the length of a text in UTF-8, where the library gets a single byte for a lone surrogate."""
+    """Return the length of a text in UTF-8. A lone surrogate counts as one byte, because it is replaced."""
     return len(text.encode("utf-8", "replace"))
 
 
 def _max_bytes(character: str) -> int:
-    """Return the number of bytes that a character may need, because some voices replace it by other letters."""
+    """Return the maximum number of bytes that the library may need for a character or its replacement."""
     if _HANGUL <= character <= _HANGUL_END:
         return 9
     return max(2, _utf8_bytes(character), _utf8_bytes(character.lower()))
 
 
 def _without_leading_hyphens(text: str) -> str:
-    """Blank a hyphen between the first symbol of a clause and a word, as in "'-o".
+    """Replace a hyphen with a blank if only symbols come before it in its clause, as in "'-o".
 
-    The library doesn't mark the beginning of this word, and searches for the mark before the start of its list of
-    phonemes. This crashes Vietnamese, Danish, Hindi and other voices. The library doesn't report the word either.
+    The library doesn't mark the beginning of the word after such a hyphen. Later, it looks for the mark and reads
+    beyond the start of its list of phonemes. This crashes Vietnamese, Danish, Hindi and other voices.
     """
 
     def blanked(found: re.Match[str]) -> str:
@@ -182,9 +187,9 @@ def _without_leading_hyphens(text: str) -> str:
 
 
 def _split_word(piece: re.Match[str]) -> str:
-    """Split a word that would overrun the library's buffers, by blanking apostrophes or capitalizing letters."""
+    """Split a word that is too long for the library, by removing apostrophes or capitalizing letters."""
     word = piece.group(1) or ""
-    # Words in scripts without capital letters can only be split at an apostrophe.
+    # If a script has no capital letters, its words can only be split at apostrophes.
     short = _utf8_bytes(word) <= _MAX_WORD_BYTES or word.lower() == word.upper()
     if short and word.count("'") + word.count("’") <= _MAX_WORD_APOSTROPHES:
         return piece.group()

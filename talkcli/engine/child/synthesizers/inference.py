@@ -1,9 +1,9 @@
-"""Piper's models in onnxruntime, each split into two halves, and the cache of these halves.
+"""Functions to run Piper's models with onnxruntime.
 
-The encoder turns phoneme ids into frames, and the decoder turns any part of the frames into samples. onnxruntime starts
-no threads. A model runs in the thread that calls it, so a voice uses one processor, and none between sentences. Another
-thread can end a run within milliseconds. This is the only module that imports onnxruntime. For a faulty model it raises
-VoiceFileError, with the name of the file.
+Each model is split into two halves, which are cached as files. The encoder turns phoneme ids into frames, and the
+decoder turns any range of frames into samples. A model runs in the thread that calls it, and onnxruntime starts no
+other threads. A voice therefore uses one processor while it speaks, and none between sentences. Another thread can end
+a run within milliseconds. This is the only module that imports onnxruntime.
 """
 
 from __future__ import annotations
@@ -30,47 +30,48 @@ if TYPE_CHECKING:
     from talkcli.engine.child.synthesizers.vits import Buffer
     from talkcli.engine.models import VoiceDescription
 
-os.environ.update(NO_TELEMETRY)  # onnxruntime reads this when it is imported
+os.environ.update(NO_TELEMETRY)  # must be set before onnxruntime is imported
 
-#: The number of frames on either side of a part that affect its samples. For Piper's largest decoder ("high"), 13.4 was
-#: calculated. With 10 frames, the samples of a "medium" decoder differ by 1 in 400,000.
+#: How many extra frames to decode before and after a part, because they affect its samples. The calculated value for
+#: Piper's largest decoder ("high") is 13.4. With 10 frames, the samples of a "medium" decoder differ by 1 in 400,000.
 CONTEXT_FRAMES = 14
-#: The maximum size of a model. Piper's have 15 to 120 million bytes.
+#: The maximum size of a model. Piper's models have 15 to 120 million bytes.
 _MAX_MODEL_BYTES = 1 << 28
-#: The maximum average number of frames per phoneme (including padding), and the maximum number of samples per frame. At
-#: its natural pace, en_US-joe-medium has 4 frames per phoneme on average and 35 at most. Piper's frames have 256
-#: samples. Higher values would mean minutes of sound for a sentence, and gigabytes of memory.
+#: The maximum average number of frames per phoneme (including padding), and the maximum number of samples per frame. A
+#: model that exceeds them could make minutes of sound from one sentence and use gigabytes of memory. At its natural
+#: pace, en_US-joe-medium has 4 frames per phoneme on average, and 35 at most. Piper's frames have 256 samples.
 _MAX_MEAN_FRAMES, _MAX_FRAME_SAMPLES = 40, 4096
-#: Parts of the messages of onnxruntime and the dynamic linker if they can't get memory.
+#: If an error message contains one of these texts, onnxruntime or the dynamic linker has run out of memory.
 _NO_MEMORY = (
     *("bad_alloc", "bad allocation", "Failed to allocate memory", os.strerror(errno.ENOMEM)),
     "failed to map segment from shared object",
 )
-#: The maximum length of onnxruntime's message in an error message.
+#: Messages from onnxruntime are cut off at this length.
 _MAX_ERROR_CHARS = 200
-#: The version of `vits.split_model`, which is a part of the cache's keys. Raise it whenever the result of this function
-#: changes.
+#: The version of `vits.split_model`. Increase it whenever that function returns different halves, so that old cached
+#: halves are no longer used.
 _SPLIT_VERSION = 1
-#: The inputs of every model, and the additional input of a model with several speakers.
+#: The names of the inputs that every model has, and of the extra input of a model with several speakers.
 _INPUTS, _SPEAKER_INPUT = ("input", "input_lengths", "scales"), "sid"
 
-#: The maximum size of the cache, which is enough for about eight voices. If it is exceeded, the oldest files are
+#: The maximum size of the cache, which has room for about eight voices. If the cache gets larger, the oldest files are
 #: removed.
 MAX_CACHE_BYTES = 500_000_000
-#: Bytes of a half to write at a time. All other threads wait while these bytes are copied.
+#: How much of a half to write at a time. All other threads wait while these bytes are copied.
 _WRITE_BYTES = 1 << 20
 _ENCODER_SUFFIX, _DECODER_SUFFIX = ".encoder.onnx", ".decoder.onnx"
-#: The suffix of a directory that is being written, which takes seconds, and the age at which its writer must be dead.
+#: The suffix of a temporary directory in the cache, and the age at which it is removed. Writing takes only seconds, so
+#: the process that created an older directory must have died.
 _UNFINISHED_SUFFIX, _UNFINISHED_LIMIT_S = ".new", 3600.0
-#: The names of cached files. The cache never removes any other file.
+#: Matches the names of cached files and temporary directories. Nothing else is ever removed.
 _CACHED_NAME = re.compile(r"[0-9a-f]{64}-.*(\.encoder\.onnx|\.decoder\.onnx|\.new)")
 
 
 class ModelCache:
-    """A directory with the halves of models, which only this user can read and write.
+    """A directory in which the halves of models are cached. Only this user can read and write it.
 
-    The encoder is stored as optimized by onnxruntime. Speech never depends on the cache: if files are damaged or can't
-    be written, the halves are made again. A key consists of 64 hexadecimal digits, a hyphen and anything else.
+    The encoder is stored after onnxruntime has optimized it. If a file is damaged or can't be written, the halves are
+    made again, so voices work without the cache. A key consists of 64 hexadecimal digits, a hyphen and anything else.
     """
 
     def __init__(self, directory: str) -> None:
@@ -88,7 +89,7 @@ class ModelCache:
         self._directory = directory
 
     def find(self, key: str) -> tuple[str, str] | None:
-        """Return the paths of both halves and mark them as used, or return None if they aren't cached."""
+        """Return the paths of the encoder and the decoder, or None if they aren't cached."""
         paths = self._path(key, _ENCODER_SUFFIX), self._path(key, _DECODER_SUFFIX)
         try:
             for each in paths:
@@ -98,19 +99,19 @@ class ModelCache:
         return paths
 
     def store(self, key: str, make_encoder: Callable[[str | None], Any], decoder: Iterable[Buffer]) -> Any:
-        """Make the encoder, and store both halves.
+        """Create the encoder, and store both halves.
 
         Args:
             key: The key of the model.
-            make_encoder: A function that makes the encoder and writes it to a path. It is called with None if the
+            make_encoder: A function that creates the encoder and writes it to a path. It is called with None if the
                 halves can't be stored.
-            decoder: The parts of the decoder's file.
+            decoder: The content of the decoder's file, in parts.
 
         Returns:
             The result of `make_encoder`.
         """
         try:
-            # Each writer has a directory of its own, because another process may be storing the same model.
+            # Use a temporary directory, because another process may be storing the same model.
             with tempfile.TemporaryDirectory(_UNFINISHED_SUFFIX, key, self._directory) as folder:
                 unfinished = os.path.join(folder, "half")
                 with open(unfinished, "wb", _WRITE_BYTES) as file:
@@ -118,7 +119,7 @@ class ModelCache:
                 os.replace(unfinished, self._path(key, _DECODER_SUFFIX))
                 made = make_encoder(unfinished)
                 os.replace(unfinished, self._path(key, _ENCODER_SUFFIX))
-        except Exception:  # noqa: BLE001 - an error with another cause is raised again below
+        except Exception:  # noqa: BLE001 - if the encoder is at fault, the next line raises the error again
             made = make_encoder(None)
         self._shrink()
         return made
@@ -127,9 +128,9 @@ class ModelCache:
         return os.path.join(self._directory, key + suffix)
 
     def _shrink(self) -> None:
-        """Remove the oldest files beyond the maximum size, and the directories of dead writers."""
+        """Remove the oldest files if the cache is too large, and temporary directories of processes that have died."""
         size = 0
-        with contextlib.suppress(OSError):  # another process may be removing files too
+        with contextlib.suppress(OSError):  # Another process may be removing the same files.
             cached = [each for each in os.scandir(self._directory) if _CACHED_NAME.fullmatch(each.name)]
             for each in sorted(cached, key=lambda each: each.stat().st_mtime, reverse=True):
                 if not each.name.endswith(_UNFINISHED_SUFFIX):
@@ -142,10 +143,10 @@ class ModelCache:
 
 @frozen
 class Frames:
-    """The encoder's output for some phoneme ids."""
+    """The encoder's output for a sequence of phoneme ids."""
 
     values: tuple[Any, ...]
-    #: the number of the frame at which each phoneme id ends
+    #: for each phoneme id, the number of the frame at which it ends
     ends: tuple[int, ...]
 
     @property
@@ -154,24 +155,24 @@ class Frames:
 
 
 class ModelRun:
-    """Handle to end all runs of a model for one sentence."""
+    """A handle that can end all runs of a model for one sentence."""
 
     def __init__(self) -> None:
         import onnxruntime
 
         self.options = onnxruntime.RunOptions()
-        self.options.log_severity_level = 4  # only fatal errors, because the others are also raised
+        self.options.log_severity_level = 4  # Log only fatal errors. Other errors raise exceptions.
 
     def end(self) -> None:
-        """Make the current run and all later runs raise an exception; may be called from any thread."""
+        """Make the current run and all later ones raise an exception. Any thread may call this."""
         self.options.terminate = True
 
 
 class Model:
-    """A loaded model of a Piper voice."""
+    """The loaded model of a Piper voice."""
 
     def __init__(self, path: str, description: VoiceDescription, cache: ModelCache | None = None) -> None:
-        """Load a model, which takes 0.3 to 3 s, or much less if its halves are cached.
+        """Load a model. This takes 0.3 to 3 s, or much less if its halves are cached.
 
         Raises:
             VoiceFileError: The model can't be loaded.
@@ -189,24 +190,25 @@ class Model:
         cached = cache.find(key) if cache is not None else None
         if cached is not None:
             try:
-                # the cached encoder is already optimized
+                # The cached encoder has already been optimized.
                 unchanged = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
                 self._set_halves(_session(cached[0], unchanged), _session(cached[1]))
                 return
             except Exception as error:
                 if _is_out_of_memory(error):
                     raise no_memory_error(path) from error
-                # A full disk may have truncated the halves, so they are made again. This also finds a faulty model.
+                # A full disk may have truncated the cached halves. Split the model again, which also detects a faulty
+                # model.
         self._set_halves(*_split(path, content, cache, key))
 
     def encode(self, ids: Sequence[int], speaker: int, scale: float, run: ModelRun) -> Frames:
-        """Return the frames of some phoneme ids.
+        """Encode a sequence of phoneme ids as frames.
 
         Args:
-            ids: The ids of the phonemes in the model.
-            speaker: The number of the speaker, which is ignored if there is only one.
-            scale: The factor by which all durations are multiplied, in addition to the voice's own factor.
-            run: The handle to end the run.
+            ids: The model's ids of the phonemes.
+            speaker: The number of the speaker. It is ignored if the model has only one.
+            scale: A factor by which all durations are multiplied, in addition to the voice's own factor.
+            run: The handle that can end the run.
 
         Raises:
             VoiceFileError: The model is faulty, or the run was ended.
@@ -233,7 +235,7 @@ class Model:
         return Frames(tuple(values), tuple(int(each) for each in np.cumsum(durations)))
 
     def decode(self, frames: Frames, begin: int, end: int, run: ModelRun) -> Any:
-        """Return the samples of the frames from `begin` up to `end`, as floats from -1.0 to 1.0.
+        """Decode the frames from `begin` up to but not including `end`. The samples are floats from -1.0 to 1.0.
 
         Raises:
             VoiceFileError: The model is faulty, or the run was ended.
@@ -241,7 +243,7 @@ class Model:
         import numpy as np
 
         low, high = max(0, begin - CONTEXT_FRAMES), min(frames.count, end + CONTEXT_FRAMES)
-        # Values without a dimension for frames, such as the speaker's, belong to the whole sentence.
+        # If a value doesn't have one item per frame, it belongs to the whole sentence, like the speaker.
         parts = {
             name: each[..., low:high] if each.shape[-1:] == (frames.count,) else each
             for name, each in zip(self._frame_inputs, frames.values, strict=True)
@@ -256,11 +258,11 @@ class Model:
         return part
 
     def seconds(self, frames: int) -> float:
-        """Return the duration of a number of frames."""
+        """Return the duration of this many frames in seconds."""
         return frames * self._samples_per_frame / self.description.rate
 
     def _set_halves(self, encoder: Any, decoder: Any) -> None:
-        """Set both halves after checking them and letting them speak a phoneme.
+        """Check both halves of the model, and speak a test phoneme with them.
 
         Raises:
             VoiceFileError: The halves are faulty, or don't match the description.
@@ -309,7 +311,9 @@ class Model:
 
 
 def load_libraries(path: str) -> None:
-    """Import numpy and onnxruntime, which takes 0.25 s and blocks all other threads for a tenth of that time.
+    """Import numpy and onnxruntime.
+
+    This takes 0.25 s, and blocks all other threads for a tenth of that time.
 
     Args:
         path: The path of the model for the error message.
@@ -318,7 +322,7 @@ def load_libraries(path: str) -> None:
         VoiceFileError: The packages can't be imported, or there is not enough memory.
     """
     try:
-        import numpy as np  # noqa: F401 - first, because onnxruntime doesn't report why numpy fails
+        import numpy as np  # noqa: F401 - onnxruntime would hide the reason if numpy can't be imported
         import onnxruntime  # noqa: F401
     except Exception as error:
         if _is_out_of_memory(error):
@@ -327,7 +331,7 @@ def load_libraries(path: str) -> None:
 
 
 def _split(path: str, content: bytes, cache: ModelCache | None, key: str) -> tuple[Any, Any]:
-    """Split a model, cache its halves, and return the sessions of the halves.
+    """Split a model, cache its halves, and return an onnxruntime session for each half.
 
     Raises:
         VoiceFileError: The model can't be split or loaded.
@@ -346,28 +350,28 @@ def _split(path: str, content: bytes, cache: ModelCache | None, key: str) -> tup
 
 
 def _session_of(half: Sequence[Buffer], optimized_path: str | None = None) -> Any:
-    """Return the session of a half in memory.
+    """Create an onnxruntime session for a half of a model.
 
-    onnxruntime reads the half from a temporary file in memory. If it got bytes instead, they would have to be joined,
-    and onnxruntime would copy and keep them. For joe, each of these steps takes 30 to 110 ms in which all other threads
-    wait.
+    onnxruntime reads the half from a temporary file in memory. To pass bytes instead, the parts would have to be
+    joined, and onnxruntime would keep a copy of them. For the voice joe, each of these steps takes 30 to 110 ms, during
+    which all other threads wait.
     """
     try:
         with open(os.memfd_create("half"), "wb", _WRITE_BYTES) as file:
             file.writelines(half)
             file.flush()
             return _session(f"/proc/self/fd/{file.fileno()}", optimized_path=optimized_path)
-    except (OSError, AttributeError):  # the system limits the size of files, or has no files in memory
+    except (OSError, AttributeError):  # The system doesn't support files in memory, or limits their size.
         return _session(b"".join(half), optimized_path=optimized_path)
 
 
 def _session(model: str | bytes, level: Any = None, optimized_path: str | None = None) -> Any:
-    """Return an onnxruntime session.
+    """Create an onnxruntime session.
 
     Args:
         model: The path or the content of a model.
         level: The level of optimization, or None for the basic level.
-        optimized_path: The path to write the optimized model to, or None.
+        optimized_path: Where to write the optimized model, or None not to write it.
     """
     import onnxruntime
 
@@ -375,9 +379,9 @@ def _session(model: str | bytes, level: Any = None, optimized_path: str | None =
     options.log_severity_level = 4
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    # The arena keeps as much memory as was ever needed, and isn't faster.
+    # onnxruntime's memory arena never shrinks, and isn't faster.
     options.enable_cpu_mem_arena = options.enable_mem_pattern = False
-    # Higher levels take 0.15 s longer and aren't faster, and their result fits only one type of processor.
+    # Higher levels take 0.15 s longer, the model is no faster, and the result fits only one type of processor.
     options.graph_optimization_level = level or onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
     if optimized_path is not None:
         options.optimized_model_filepath = optimized_path
@@ -385,14 +389,14 @@ def _session(model: str | bytes, level: Any = None, optimized_path: str | None =
 
 
 def _load_error(path: str, what: str, error: Exception) -> VoiceFileError:
-    """Return the error for an exception of onnxruntime."""
+    """Convert an exception of onnxruntime to a VoiceFileError."""
     if _is_out_of_memory(error):
         return no_memory_error(path)
     return VoiceFileError(f"{path} {what} ({_first_line(error)}): get the voice anew")
 
 
 def no_memory_error(path: str) -> VoiceFileError:
-    """Return the error for a model that needs more memory than is available."""
+    """Return the error to raise if there isn't enough memory for a model."""
     return VoiceFileError(f"{path} cannot be spoken with: there is no memory for it; end another program")
 
 
