@@ -1,4 +1,4 @@
-"""Speech for robots, with the semantics of actions and without robot middleware.
+"""Speech for robots: goals can be followed and cancelled like robot actions, but no robot middleware is needed.
 
 The library is `from talkcli import Client`, and the command `talk` is in `talkcli.cli`. A module is only imported when
 one of its names is used, because every start of the command has to wait for imports.
@@ -6,7 +6,7 @@ one of its names is used, because every start of the command has to wait for imp
 
 from __future__ import annotations
 
-TYPE_CHECKING = False  # importing it from `typing` takes as long as a server takes to answer
+TYPE_CHECKING = False  # importing `typing` takes as long as a request
 if TYPE_CHECKING:
     from talkcli.client.client import Client
     from talkcli.client.goal import GoalHandle
@@ -37,7 +37,7 @@ __all__ = [
 ]
 
 
-#: The modules of the names that are not in `protocol.events`.
+#: Modules that define the exported names. All other names are defined in `protocol.events`.
 _MODULES = {
     "Client": "client.client",
     "Fleet": "fleet.api",

@@ -1,4 +1,4 @@
-"""The exceptions of `talk`. Each class has an error code for programs and an exit code for the command.
+"""The exceptions that `talk` raises, each with an error code and an exit code.
 
 Rules for this file:
 
@@ -15,13 +15,13 @@ EXIT_ERROR = 1
 EXIT_USAGE = 2
 EXIT_DIFFER = 13
 EXIT_TIMEOUT = 124  # the same as timeout(1)
-EXIT_SIGNAL = 128  # plus the number of the signal, like in a shell
+EXIT_SIGNAL = 128  # the signal's number is added, as in a shell
 EXIT_SIGINT = EXIT_SIGNAL + 2
 EXIT_SIGPIPE = EXIT_SIGNAL + 13  # standard output was closed
 
 
 class TalkError(Exception):
-    """Base class of all errors that `talk` reports. `code` is for programs, and `message` is for people."""
+    """Base class for all errors. `code` is machine-readable, and `message` is human-readable."""
 
     code = "error"
     exit_code = EXIT_ERROR
@@ -32,7 +32,7 @@ class TalkError(Exception):
 
 
 class UsageError(TalkError):
-    """The command or call makes no sense: an invalid value, or options that exclude each other."""
+    """A value is invalid, or two options can't be used together."""
 
     code = "usage"
     exit_code = EXIT_USAGE
@@ -67,7 +67,7 @@ class TimedOut(TalkError):
 
 
 class AddressInUse(TalkError):
-    """`talk serve` can't use the socket: another server uses it, or its directory is not safe."""
+    """`talk serve` can't use the socket, because another server is using it or its directory is not safe."""
 
     code = "address_in_use"
     exit_code = 11
@@ -101,7 +101,10 @@ class RequestRefused(TalkError):
 
 
 class UnknownGoal(RequestRefused):
-    """The server knows no goal with this id: it never existed, belongs to an earlier server, or is too old."""
+    """The server doesn't know a goal with this id.
+
+    The goal never existed, belonged to an earlier server, or is too old.
+    """
 
     code = "unknown_goal"
     exit_code = 8
@@ -115,14 +118,14 @@ class Busy(RequestRefused):
 
 
 class BadOption(RequestRefused):
-    """The server refused a setting: its value is out of range, or the voice doesn't exist."""
+    """The server refused a setting, because the value is out of range or the voice doesn't exist."""
 
     code = "bad_option"
     exit_code = EXIT_USAGE
 
 
 class BadRequest(RequestRefused):
-    """A client sent an invalid request. `code` gives the problem."""
+    """A client sent an invalid request. `code` says what is wrong."""
 
     code = "bad_request"
 
@@ -133,7 +136,7 @@ class LineTooLong(BadRequest):
     code = "line_too_long"
 
 
-#: The exception that a client raises for each of the server's error codes. The default is RequestRefused.
+#: Exceptions by the server's error code. Clients raise RequestRefused for any other code.
 _ERRORS_BY_CODE: dict[str, type[RequestRefused]] = {
     **{each.code: each for each in (UnknownGoal, Busy, BadOption)},
     "unknown_voice": BadOption,
@@ -141,13 +144,13 @@ _ERRORS_BY_CODE: dict[str, type[RequestRefused]] = {
 
 
 def refusal(code: str, message: str, items: list[dict[str, object]] | None = None) -> RequestRefused:
-    """Return the exception for a server's error reply. The arguments become its attributes."""
+    """Return the exception that matches a server's error reply."""
     return _ERRORS_BY_CODE.get(code, RequestRefused)(message, code, items)
 
 
 def memory_limits() -> str:
-    """Return the end of a message about too little memory: the limit of this process, or where to find it."""
-    import resource  # here, so that it doesn't slow down the start of every command
+    """Return a hint for an out-of-memory message, such as this process's memory limit."""
+    import resource  # rarely needed, and slow to import
 
     # Each limit with its unit, and with the shell command and the systemd option that set it.
     for number, what, where in (

@@ -20,18 +20,18 @@ if TYPE_CHECKING:
 else:
 
     def dataclass_transform(**_):
-        """Do nothing, because only type checkers need the real function."""
+        """Replace the real decorator, which only type checkers need."""
         return lambda decorator: decorator
 
 
-#: How many instances of a class to make before its `__init__` is compiled. With fewer, compiling takes longer than it
-#: saves.
+#: Number of instances after which a class's `__init__` is compiled. With fewer instances, compiling would cost more
+#: time than it saves.
 _COMPILE_AFTER_COUNT = 100
 
 
 @dataclass_transform(frozen_default=True)
 def frozen(cls: type[_T]) -> type[_T]:
-    """Make the instances of a class immutable, and compare, hash and print them by their annotated fields."""
+    """Turn a class into an immutable value class, which is compared, hashed and printed by its fields."""
     # Annotations are strings, because every module has `from __future__ import annotations`.
     names = tuple(name for name, kind in cls.__annotations__.items() if not kind.startswith("ClassVar"))
     own = {name: each for name, each in cls.__dict__.items() if name not in {*names, "__dict__", "__weakref__"}}
@@ -60,16 +60,16 @@ def replace(instance: _T, **changes: Any) -> _T:
 
 
 class _Methods:
-    """The methods that every class made by `frozen` gets."""
+    """The methods that `frozen` adds to a class."""
 
     def __init__(self, *arguments: object, **named: object) -> None:
-        """Set the fields of one of the first instances of a class, without compiling a function for the class."""
+        """Set the fields of an instance whose class has no compiled `__init__` yet."""
         cls: Any = type(self)
         names = cls.__match_args__
         given = dict(zip(names, arguments, strict=False))
         values = {**cls._defaults, **given, **named}
         cls._made += 1
-        # Valid arguments set every field once and nothing else.
+        # The arguments are valid if they set each field exactly once.
         invalid = values.keys() != cls._names or len(given) != len(arguments) or not named.keys().isdisjoint(given)
         if invalid or cls._made > _COMPILE_AFTER_COUNT:
             cls.__init__ = _compile_init(cls)
@@ -91,7 +91,7 @@ class _Methods:
         return hash((type(self), *fields(self).values()))
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Tell `copy` and `pickle` to call the class, because they can't set fields."""
+        """Make `copy` and `pickle` call the class, because they can't set the fields of an instance."""
         return type(self), tuple(fields(self).values())
 
     def __repr__(self) -> str:
@@ -103,9 +103,9 @@ _METHODS = {name: each for name, each in vars(_Methods).items() if callable(each
 
 
 def _compile_init(cls: Any) -> Any:
-    """Compile an `__init__` for a class. It is five times as fast as the generic one."""
+    """Compile an `__init__` for a class, which is five times as fast as the generic one."""
     takes = [f"{each}=_defaults[{each!r}]" if each in cls._defaults else each for each in cls.__match_args__]
-    # `__setattr__` always refuses, so the compiled function calls the setters of the slots directly.
+    # `__setattr__` always raises an error, so the compiled function calls the slots' setters directly.
     sets = [f"    _{each}_(self, {each})" for each in cls.__match_args__] or ["    pass"]
     setters = {f"_{each}_": getattr(cls, each).__set__ for each in cls.__match_args__}
     namespace: dict[str, Any] = {**setters, "_defaults": cls._defaults}

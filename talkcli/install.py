@@ -1,6 +1,6 @@
-"""The command that installs a package into the environment that runs this process.
+"""Shell commands that install packages into this process's Python environment.
 
-Error messages show this command if a package is missing.
+Error messages show these commands if a package is missing.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from talkcli.frozen import TYPE_CHECKING, frozen
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-#: Whether this process has 64 bits. Neither onnxruntime nor espeakng-loader has a 32-bit build. `platform.machine()`
-#: can't tell, because it gives the architecture of the kernel, and a 32-bit system can run on a 64-bit kernel.
+#: Whether this process is 64-bit. Neither onnxruntime nor espeakng-loader has a 32-bit build. `platform.machine()`
+#: doesn't help, because it returns the kernel's architecture, and a 64-bit kernel can run a 32-bit system.
 IS_64_BIT = sys.maxsize > 2**32
 
 #: The packages that neural voices need.
@@ -23,10 +23,10 @@ NEURAL_PACKAGES = ("onnxruntime", "numpy")
 
 @frozen
 class Environment:
-    """Facts about a Python environment that decide how to install packages into it."""
+    """The properties of a Python environment that determine how to install packages into it."""
 
     python: str  # path to the interpreter
-    pipx: str | None = None  # directory of the environment if pipx made it
+    pipx: str | None = None  # directory of the environment, if pipx made it
     user_home: str = ""
     has_pip: bool = True
     made_by_uv: bool = False
@@ -35,7 +35,7 @@ class Environment:
 
 
 def command(*packages: str, again: bool = False) -> str:
-    """Return the command that installs packages into the environment of this process.
+    """Return the shell command that installs packages into this process's environment.
 
     Args:
         packages: names of the packages.
@@ -45,20 +45,23 @@ def command(*packages: str, again: bool = False) -> str:
 
 
 def neural(*more: str, again: bool = False) -> str:
-    """Return the next step that makes neural voices work. The arguments are more packages to install."""
+    """Return the shell command that installs the packages for neural voices, and any further packages.
+
+    On a 32-bit system, return advice to use an espeak voice instead.
+    """
     if not IS_64_BIT:
         return "neural voices need a 64-bit system: choose one of espeak's voices, such as en"
     return command(*NEURAL_PACKAGES, *more, again=again)
 
 
 def espeak_library() -> str:
-    """Return the next step that installs libespeak-ng."""
+    """Return the shell command that installs libespeak-ng."""
     package = "sudo apt-get install -y libespeak-ng1"
     return f"{package}, or {command('espeakng-loader')}" if IS_64_BIT else package
 
 
 def command_for(environment: Environment, packages: Sequence[str], *, again: bool = False) -> str:
-    """Return the command that installs packages into the given environment, quoted for a shell."""
+    """Return the shell command that installs packages into the given environment."""
     from shlex import join, quote
 
     sudo = "sudo " if environment.needs_sudo else ""
@@ -79,12 +82,12 @@ def command_for(environment: Environment, packages: Sequence[str], *, again: boo
 
 
 def _environment() -> Environment:
-    """Return the facts about the environment of this process."""
+    """Return the properties of this process's environment."""
     from importlib.util import find_spec
 
     is_virtual = sys.prefix != sys.base_prefix
-    # Outside a virtual environment, the owner of this file may install packages: it is in a user's own site-packages or
-    # in a checkout.
+    # Outside a virtual environment, the owner of this file can install packages without sudo, because the file is in
+    # site-packages or in a checkout.
     owner = os.stat(sys.prefix if is_virtual else os.path.dirname(__file__)).st_uid
     return Environment(
         python=sys.executable or "python3",
@@ -103,5 +106,5 @@ def _is_made_by_uv() -> bool:
     try:
         with open(os.path.join(sys.prefix, "pyvenv.cfg"), encoding="utf-8") as file:
             return any(line.startswith("uv =") for line in file)
-    except FileNotFoundError:  # this is no virtual environment
+    except FileNotFoundError:  # this is not a virtual environment
         return False

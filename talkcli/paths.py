@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 #: File name of the socket.
 SOCKET_NAME = "talk.sock"
-#: Socket of a server for the whole machine. systemd makes the directory because of `RuntimeDirectory=talk`.
+#: Socket of the system-wide server. systemd creates the directory if the unit has `RuntimeDirectory=talk`.
 SYSTEM_SOCKET = f"/run/talk/{SOCKET_NAME}"
 
-#: What is at a path if no client can connect to it, for people.
+#: Descriptions of what is at a path to which no client can connect.
 PLACE_ABSENT = "not there"
 PLACE_FILE = "a file, and no socket"
 PLACE_DIRECTORY = "a directory, and no socket"
@@ -29,12 +29,12 @@ PLACE_FORBIDDEN = "no permission"
 
 
 def named_socket(option: str | None) -> str | None:
-    """Return the socket given by the option or by TALK_SOCKET, or None."""
+    """Return the socket path from the option or from TALK_SOCKET, or None if neither is set."""
     return option or os.environ.get("TALK_SOCKET") or None
 
 
 def named_robot(option: str | None, socket: str | None) -> str | None:
-    """Return the robot given by the option or by TALK_ROBOT, or None.
+    """Return the robot's name from the option or from TALK_ROBOT, or None if neither is set.
 
     Both options take precedence over the variables, and TALK_ROBOT over TALK_SOCKET.
     """
@@ -42,7 +42,7 @@ def named_robot(option: str | None, socket: str | None) -> str | None:
 
 
 def client_sockets(named: str | None) -> list[str]:
-    """Return the sockets that a client tries, in order: only the named one, or else the usual ones."""
+    """Return the socket paths that a client tries, in order. If a socket is named, it is the only one."""
     if named:
         return [named]
     directories = [os.environ.get("XDG_RUNTIME_DIR"), *_runtime_directories(os.getuid())]
@@ -51,10 +51,10 @@ def client_sockets(named: str | None) -> list[str]:
 
 
 def describe_place(path: str, error: OSError) -> str:
-    """Return why a connection to this path failed: one of the PLACE texts, or else the system's error message."""
+    """Return why connecting to this path failed, as one of the PLACE texts or the system's error message."""
     try:
         mode = os.stat(path).st_mode
-    except OSError:  # `error` has the reason, unless the file was removed a moment ago
+    except OSError:  # `error` gives the reason, unless the file has just been removed
         mode = stat.S_IFSOCK
     if stat.S_ISDIR(mode):
         return PLACE_DIRECTORY
@@ -73,8 +73,8 @@ def _runtime_directories(uid: int) -> list[str]:
     """Return the directories that platformdirs may use if XDG_RUNTIME_DIR isn't set."""
     if sys.platform == "darwin":
         return [os.path.expanduser("~/Library/Caches/TemporaryItems")]
-    # Without systemd's directory, platformdirs uses the first writable one of these temporary directories. A client
-    # can't know which one that was for the server, so it tries all of them.
+    # If systemd's directory doesn't exist, platformdirs uses the first writable one of these temporary directories. A
+    # client can't know which one the server used, so it tries all of them.
     temporary = [os.environ.get(name) for name in ("TMPDIR", "TEMP", "TMP")]
     fallbacks = [
         os.path.join(os.path.abspath(each), f"runtime-{uid}") for each in [*temporary, "/tmp", "/var/tmp"] if each
@@ -95,7 +95,7 @@ def sudo_hint() -> str | None:
 
 
 def server_socket(named: str | None) -> str:
-    """Return the socket for a server, and create its directory.
+    """Return the path for a server's socket, and create its directory.
 
     Raises:
         AddressInUse: the directory is missing or not safe.
@@ -116,7 +116,7 @@ def server_socket(named: str | None) -> str:
     import platformdirs
 
     with warnings.catch_warnings():
-        # It warns if XDG_RUNTIME_DIR isn't set, but clients know the directory that it uses in that case.
+        # platformdirs warns if XDG_RUNTIME_DIR isn't set, but clients also try the directory that it uses instead.
         warnings.simplefilter("ignore", platformdirs.RuntimeDirWarning)
         try:
             return str(platformdirs.PlatformDirs("talk", appauthor=False).place_runtime_file(SOCKET_NAME))
@@ -125,7 +125,7 @@ def server_socket(named: str | None) -> str:
 
 
 def voice_directories(environment: Mapping[str, str] | None = None) -> list[str]:
-    """Return the directories that may contain neural voices, in the order of the search. Some may not exist.
+    """Return the directories to search for neural voices, in order. Some may not exist.
 
     The directories in TALK_VOICES, a list like PATH, come first. Then come the data directories of the user and of the
     system, as platformdirs gives them on Linux. A test compares the two. Importing platformdirs would slow down every
@@ -143,13 +143,13 @@ def voice_directories(environment: Mapping[str, str] | None = None) -> list[str]
 
 
 def cache_directory() -> str:
-    """Return the cache directory, which may not exist yet. A service uses the directory that systemd gives it."""
+    """Return the path of the cache directory, which may not exist yet."""
     given = os.environ.get("CACHE_DIRECTORY")
     if given:
-        return os.path.realpath(given.split(":")[0])  # with DynamicUser= it is a link
+        return os.path.realpath(given.split(":")[0])  # a symbolic link, if the unit has DynamicUser=
     return os.path.join(_user_directory(os.environ.get("XDG_CACHE_HOME"), "~/.cache"), "talk")
 
 
 def _user_directory(named: str | None, default: str) -> str:
-    """Return the directory that a variable names, or the default if it isn't an absolute path."""
+    """Return the given directory if it is an absolute path, or else the default."""
     return named if named and os.path.isabs(named) else os.path.expanduser(default)

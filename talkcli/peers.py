@@ -1,4 +1,4 @@
-"""The process at the other end of a Unix socket, and other processes in /proc.
+"""Information about processes: the peer of a Unix socket, and the processes in /proc.
 
 Every client imports this module when it starts. It uses `_socket` instead of `socket`, because `socket` makes enums of
 all its constants. That takes a tenth of the time of a command that sends one request.
@@ -14,12 +14,13 @@ from talkcli.frozen import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-#: Length limit for a command line. It leaves room for an interpreter, a script and its first arguments.
+#: Maximum length of a command line. This is enough for an interpreter, a script and its first arguments.
 _MAX_COMMAND_LINE_CHARS = 200
 
-#: Programs that run another program and wait for it. Their parents say more about where a request comes from.
+#: Programs that run another program and wait for it. The parent of such a program tells more about where a request
+#: comes from.
 _WRAPPER_PROGRAMS = frozenset({b"timeout", b"time", b"flock", b"xargs", b"sudo"})
-#: How many parents of a process to look at. A shell that a script runs is three levels below cron.
+#: Maximum number of a process's ancestors to examine. A shell that was started by a script is three levels below cron.
 _MAX_PARENTS_COUNT = 8
 
 _LOCAL_PEERCRED = 0x001  # <sys/un.h> on macOS
@@ -28,7 +29,10 @@ _SOL_LOCAL = 0
 
 
 def credentials(peer: _socket.socket) -> tuple[int, int]:
-    """Return the process id and user id of the other end, from the moment when it connected or began to listen."""
+    """Return the process id and user id of a socket's peer.
+
+    The kernel recorded them when the peer connected or began to listen.
+    """
     if hasattr(_socket, "SO_PEERCRED"):
         found = peer.getsockopt(_socket.SOL_SOCKET, _socket.SO_PEERCRED, 12)  # struct ucred: pid, uid, gid
         return _integer(found[:4]), _integer(found[4:8])
@@ -48,7 +52,7 @@ def command_name(pid: int) -> str | None:
 
 
 def parents(pid: int) -> Iterator[int]:
-    """Yield the id of a process's parent, then of the parent's parent, and so on."""
+    """Yield the process ids of a process's parent, grandparent, and so on."""
     for _ in range(_MAX_PARENTS_COUNT):
         stat = process_stat(pid)
         pid = int(stat[1]) if stat else 0
@@ -75,12 +79,12 @@ def parent_command_line(pid: int) -> str | None:
 
 
 def process_stat(pid: int) -> list[bytes]:
-    """Return the fields of /proc/PID/stat from the state on: state, parent, group, session and so on.
+    """Return the fields of /proc/PID/stat, starting with the state, parent, group and session.
 
     The list is empty if the process is unknown.
     """
     stat = read_proc_file(f"/proc/{pid}/stat") or b""
-    # The program's name comes before the state, in brackets. The name can contain blanks and brackets, too.
+    # The program's name comes before the state, in brackets. The name itself can contain spaces and brackets.
     return stat.rpartition(b")")[2].split()
 
 
@@ -94,5 +98,5 @@ def read_proc_file(path: str, max_bytes: int = 4096) -> bytes | None:
     try:
         with open(path, "rb", buffering=0) as file:
             return file.read(max_bytes)
-    except OSError:  # reading can fail, too, if the process has just ended
+    except OSError:  # reading also fails if the process has just ended
         return None

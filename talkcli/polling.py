@@ -1,4 +1,4 @@
-"""Waiting for descriptors with a time limit. Other descriptors can interrupt the wait."""
+"""Wait for file descriptors, with a time limit. Other descriptors can interrupt the wait."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ if TYPE_CHECKING:
 
 
 class Interrupted(Exception):
-    """A descriptor that interrupts the wait became ready."""
+    """The wait was interrupted."""
 
 
 def wait_ready(
     watched: Mapping[int, int], timeout: float | None, interrupt: Mapping[int, int] | None = None
 ) -> set[int]:
-    """Return the descriptors that are ready.
+    """Wait until at least one descriptor is ready, and return the ready ones.
 
     Args:
         watched: the poll events to wait for, by descriptor. Errors and hang-ups always count.
@@ -25,15 +25,15 @@ def wait_ready(
     Raises:
         Interrupted: one of the descriptors in `interrupt` is ready.
     """
-    # Imported here, so that they do not slow down commands that never wait.
+    # Imported here, because commands that never wait don't need them.
     import math
     import select
 
     interrupt = interrupt or {}
-    poll = select.poll()  # unlike select(), it works in a program with more than 1,024 descriptors
+    poll = select.poll()  # unlike select(), poll() supports more than 1,024 descriptors
     for fd, events in (*watched.items(), *interrupt.items()):
         poll.register(fd, events)
-    # poll takes milliseconds as a C int, at most 24 days. After a longer timeout the caller looks again.
+    # poll() takes a C int of milliseconds, which is at most 24 days. If the timeout is longer, the caller waits again.
     milliseconds = None if timeout is None else math.ceil(min(max(0.0, timeout * 1000), 2**31 - 1))
     found = {fd for fd, _ in poll.poll(milliseconds)}
     if not found.isdisjoint(interrupt):

@@ -1,4 +1,4 @@
-"""Pipes that show which processes still run, and signals for those processes."""
+"""Pipes that show whether processes are still running, and functions to kill those processes."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from talkcli.frozen import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-#: How long to wait for a killed process to close its pipe before looking for other holders. It usually takes 1 to 2 ms.
+#: How long to wait for a killed process to close its pipe. This usually takes 1 to 2 ms. After that time, other
+#: processes that hold the pipe open are searched for.
 _RELEASE_S = 0.01
 
 
 def open_pipes(count: int) -> list[tuple[int, int]]:
-    """Open all of the pipes or none, and return each one's reading and writing end."""
+    """Open pipes, and return the reading and writing end of each. If one can't be opened, none is left open."""
     with contextlib.ExitStack() as opened:
         pipes = []
         for _ in range(count):
@@ -35,14 +36,14 @@ def close(*descriptors: int) -> None:
 
 
 def is_held(pipe: int, seconds: float = 0.0) -> bool:
-    """Return whether any process still holds the other end of the pipe after this many seconds."""
+    """Wait up to `seconds` for the other end of the pipe to close, and return whether it is still open."""
     poll = select.poll()
-    poll.register(pipe, 0)  # poll always reports a closed other end
+    poll.register(pipe, 0)  # poll() always reports when the other end is closed
     return not poll.poll(seconds * 1000)
 
 
 def kill_holders(pipe: int) -> bool:
-    """Kill all other processes that keep the pipe open, and return whether any was killed.
+    """Kill all other processes that hold the pipe open, and return whether any was killed.
 
     Another user's process can't be killed, and without /proc no process can be found.
     """
@@ -55,7 +56,7 @@ def kill_holders(pipe: int) -> bool:
 
 
 def kill(pids: Iterable[int]) -> bool:
-    """Kill the processes, and return whether any was killed. A negative number stands for a process group."""
+    """Kill the processes, and return whether any was killed. A negative id means a process group."""
     killed = False
     for pid in pids:
         with contextlib.suppress(ProcessLookupError, PermissionError):
@@ -65,25 +66,25 @@ def kill(pids: Iterable[int]) -> bool:
 
 
 def processes() -> list[int]:
-    """Return the ids of all processes. The list is empty without a readable /proc."""
+    """Return the ids of all processes, or an empty list if /proc can't be read."""
     return [int(name) for name in _names("/proc") if name.isdigit()]
 
 
 def _links(folder: str) -> Iterator[str]:
     for name in _names(folder):
-        with contextlib.suppress(OSError):  # it was closed in the meantime
+        with contextlib.suppress(OSError):  # the descriptor has been closed in the meantime
             yield os.readlink(f"{folder}/{name}")
 
 
 def _names(folder: str) -> list[str]:
     try:
         return os.listdir(folder)
-    except OSError:  # it belongs to another user, is gone, or doesn't exist on this system
+    except OSError:  # the directory belongs to another user, or doesn't exist
         return []
 
 
 def signal_name(number: int) -> str:
-    """Return the name of a signal for people."""
+    """Return the name of a signal, such as SIGTERM."""
     try:
         return signal.Signals(number).name
     except ValueError:

@@ -1,4 +1,4 @@
-"""The log of a long-running process, and its notifications for the service manager.
+"""Logging and service manager notifications for a long-running process.
 
 This package knows nothing about goals, clients or engines. `talkcli.server.log` has the server's log lines about those.
 """

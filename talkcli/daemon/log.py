@@ -1,4 +1,4 @@
-"""The log of a long-running process: lines on standard error, for people and for journald.
+"""The log of a long-running process, which is written to standard error.
 
 Writing a line never blocks and never fails. Text from other programs must go through `sanitize`, so that it can't forge
 a line or send control characters to a terminal.
@@ -21,28 +21,29 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from typing import Any
 
-#: Length limit for a line. Writing this many bytes never blocks if poll reports a pipe as writable (PIPE_BUF on Linux).
+#: Maximum length of a line, which is PIPE_BUF on Linux. If poll() reports a pipe as writable, writing this many bytes
+#: never blocks.
 _MAX_LOG_LINE_BYTES = 4096
-#: Length limit for text from other programs.
+#: Maximum length of text from other programs.
 _MAX_LOGGED_TEXT_CHARS = 200
-#: Time between two lines of the same kind that are written by `write_limited`.
+#: Minimum time between two lines of the same kind in `write_limited`.
 _REPEAT_AFTER_S = 60.0
 
 
 class RateLimit:
-    """A limit for events that can happen many times a second: at most `max_events` in each period."""
+    """A limit of `max_events` events per period."""
 
     def __init__(self, max_events: int, period_s: float) -> None:
         self._max_events = max_events
         self._period_s = period_s
         self._period_end = float("-inf")
-        #: events in this period, allowed or not
+        #: number of events in this period, including suppressed events
         self._event_count = 0
 
     def allow(self, now: float) -> int | None:
-        """Count an event at this time. Return None to suppress it.
+        """Count an event, and return None if it exceeds the limit and must be suppressed.
 
-        If the event is allowed, return how many events were suppressed since the last event that was allowed.
+        If the event is allowed, return how many events have been suppressed since the last allowed event.
         """
         if now >= self._period_end:
             suppressed = max(0, self._event_count - self._max_events)
@@ -52,14 +53,14 @@ class RateLimit:
         return 0 if self._event_count <= self._max_events else None
 
 
-#: How many lines could not be written since the last line that was.
+#: Number of lines that were lost since the last successful write.
 _lost_lines = 0
-#: The limits of `write_limited`, by the kind of line.
+#: The rate limits of `write_limited`, by kind of line.
 _rate_limits: dict[str, RateLimit] = {}
 
 
 def write(message: str) -> None:
-    """Write one line, or drop it if standard error is closed or nobody reads it."""
+    """Write a line to the log. The line is dropped if standard error can't accept it at once."""
     global _lost_lines  # noqa: PLW0603
     if _lost_lines:
         message = f"{message} ({_lost_lines} lines before this one could not be written)"
@@ -76,14 +77,17 @@ def write(message: str) -> None:
 
 
 def write_limited(kind: str, message: str) -> None:
-    """Write at most one line of each kind per minute. The next line of this kind gives the number of those left out."""
+    """Write at most one line of this kind per minute.
+
+    The next line of the kind gives the number of suppressed lines.
+    """
     suppressed = _rate_limits.setdefault(kind, RateLimit(1, _REPEAT_AFTER_S)).allow(time.monotonic())
     if suppressed is not None:
         write(f"{message} ({suppressed} more of these were not logged)" if suppressed else message)
 
 
 def write_bug(what: str, error: Exception) -> None:
-    """Write a line about an unexpected exception, with the file and line that raised it."""
+    """Log an unexpected exception, with the file and line that raised it."""
     frames = traceback.extract_tb(error.__traceback__)
     place = f" at {os.path.basename(frames[-1].filename)}:{frames[-1].lineno}" if frames else ""
     write(f"a bug in {what}{place}: {sanitize(f'{type(error).__name__}: {error}')}")
@@ -99,5 +103,5 @@ def handle_loop_error(_loop: object, context: Mapping[str, Any]) -> None:
 
 
 def sanitize(text: str) -> str:
-    """Return text from elsewhere in a form that is safe for the log: escaped, shortened and on one line."""
+    """Make untrusted text safe for the log, by escaping and shortening it."""
     return printable(text, _MAX_LOGGED_TEXT_CHARS)

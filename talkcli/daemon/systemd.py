@@ -1,4 +1,4 @@
-"""Notifications for the service manager: that the process is ready, works, is alive or is about to end.
+"""Notifications that tell the service manager when the process is ready, alive or stopping.
 
 The notifications are datagrams as in sd_notify(3), for systemd and others. Without NOTIFY_SOCKET nothing is sent.
 Sending never waits. If the service manager can't accept a notification, its fields are sent again later. The status
@@ -17,16 +17,16 @@ if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable
 
-#: Delay between a change and its notification, so that many goals in a row cause only one.
+#: Delay between a status change and its notification, so that many changes in a row cause only one notification.
 STATUS_DELAY_S = 0.5
 #: Delay before a failed notification is sent again.
 NOTIFY_RETRY_DELAY_S = 0.5
-#: Watchdog notifications per watchdog timeout. With more than two, one of them can be late.
+#: Number of watchdog notifications per watchdog timeout. As there are more than two, one may be late.
 _NOTIFICATIONS_PER_TIMEOUT_COUNT = 2.5
 
 
 class ServiceManager:
-    """The service manager that started this process, if there is one.
+    """Sends notifications to the service manager, if one started this process.
 
     Call every method in the event loop's thread.
     """
@@ -36,21 +36,22 @@ class ServiceManager:
 
         Args:
             loop: the loop that sends delayed notifications.
-            describe_status: returns the status of the process in one line for people.
+            describe_status: returns a one-line description of the process's status.
         """
         self._loop = loop
         self._describe_status = describe_status
         self._address = _notify_address(os.environ.get("NOTIFY_SOCKET", ""))
         self._socket: socket.socket | None = None
         self._watchdog_interval = _watchdog_interval()
-        #: fields that could not be sent yet, with the newest value of each
+        #: unsent fields, with their newest values
         self._unsent: dict[str, str] = {}
-        #: the newest status
+        #: the last status that was sent
         self._status = ""
-        #: timers of notifications that are due later, by name
+        #: timers of scheduled notifications, by name
         self._timers: dict[str, asyncio.TimerHandle] = {}
         if self._address:
-            # Opened at the start, because a process without free descriptors must still reach its watchdog.
+            # Open the socket now, because watchdog notifications must still be sent if the process runs out of
+            # descriptors.
             self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
             self._socket.setblocking(False)
 
@@ -64,7 +65,7 @@ class ServiceManager:
         self._schedule("status", STATUS_DELAY_S, self._notify_status)
 
     def notify_stopping(self) -> None:
-        """Report that the process is about to end. Watchdog notifications continue until `close`."""
+        """Report that the process is stopping. Watchdog notifications continue until `close`."""
         if self._status != "ending":
             self._send(STOPPING="1", STATUS="ending")
 
@@ -106,7 +107,7 @@ class ServiceManager:
         try:
             self._socket.sendto(data, self._address)
         except OSError as error:
-            if not isinstance(error, BlockingIOError):  # BlockingIOError: its queue is full at the moment
+            if not isinstance(error, BlockingIOError):  # BlockingIOError: its queue is full
                 log.write_limited(
                     "supervisor", f"the supervisor (NOTIFY_SOCKET) can't be told anything: {error.strerror}"
                 )
@@ -118,13 +119,13 @@ class ServiceManager:
 def _notify_address(name: str) -> str:
     """Return the socket address in NOTIFY_SOCKET, or "" if it is unset or invalid."""
     if name.startswith("@"):
-        return "\0" + name[1:]  # an abstract socket of Linux, which has no file
+        return "\0" + name[1:]  # a Linux abstract socket
     return name if os.path.isabs(name) else ""
 
 
 def _watchdog_interval() -> float | None:
     """Return the seconds between two watchdog notifications, or None if there is no watchdog."""
     timeout, own_pid = os.environ.get("WATCHDOG_USEC", ""), str(os.getpid())
-    is_for_us = os.environ.get("WATCHDOG_PID", own_pid) == own_pid  # and not for another process of this unit
+    is_for_us = os.environ.get("WATCHDOG_PID", own_pid) == own_pid  # it may be meant for another process of the unit
     timeout_us = int(timeout) if timeout.isdecimal() and is_for_us else 0
     return timeout_us / 1e6 / _NOTIFICATIONS_PER_TIMEOUT_COUNT or None

@@ -1,7 +1,7 @@
-"""The checks of `talk doctor`: everything between a sentence and the loudspeaker.
+"""The checks of `talk doctor`, which find out why a sentence would not be heard.
 
-- `voice`, `sound`, `server` and `sentence` have the checks of one subject each. Every check consists of facts, a
-  function that finds them, and a `judge_…` function that turns them into findings. Judging is pure.
+- `voice`, `sound`, `server` and `sentence` have the checks of one subject each. A check gathers facts, and a pure
+  `judge_…` function turns the facts into findings.
 - `examine` runs the checks in order.
 - `broker` has all checks of a robot behind an MQTT broker.
 - `report` defines findings and shows them.

@@ -1,7 +1,7 @@
-"""The checks of a fleet's broker and of one robot: connection, login, access rights, and the robot's answer.
+"""The checks of a fleet's broker, and of one robot that is connected to it.
 
 The checks use the rights of an operator, or those of the robot's bridge if the login is the robot's name. They have no
-side effects, because the messages that test access rights are not retained, and bridges ignore them.
+side effects, because the broker doesn't retain the test messages, and bridges ignore them.
 """
 
 from __future__ import annotations
@@ -41,13 +41,15 @@ if TYPE_CHECKING:
 
 _Result = TypeVar("_Result")
 
-#: Time limit for each check. The broker must answer within `LOGIN_LIMIT_S`, but resolving its host may take longer.
+#: Time limit for each check. It is longer than `LOGIN_LIMIT_S`, because looking up the broker's host name also takes
+#: time.
 _STEP_LIMIT_S = 2 * LOGIN_LIMIT_S
-#: Time limit for a test message to come back after the broker has acknowledged it.
+#: How long to wait for a test message to come back after the broker has acknowledged it.
 _ECHO_RETURN_LIMIT_S = 1.0
-#: Payload of the test message that should come back. It differs from the payload that bridges use for their echoes.
+#: Payload of the test message that the broker should send back. Bridges use another payload for their own test
+#: messages.
 _ECHO_PAYLOAD = b"doctor"
-#: A certificate that expires within this time causes a warning.
+#: A warning is shown if the certificate expires within this time.
 _RENEWAL_LIMIT_S = 14 * 86400
 _NO_ANSWER = "no answer"
 #: The next step for each reason why the broker can't be reached.
@@ -57,14 +59,14 @@ _UNREACHABLE_STEPS = {
     "no such host": "spell the host in TALK_BROKER rightly: getent hosts {host}",
     _NO_ANSWER: "see whether {host} is up, and no firewall is between: ping {host}",
 }
-#: OpenSSL's error codes for a certificate that is not yet valid or has expired, and for one of another host.
+#: OpenSSL's error codes for a certificate with an invalid date, and for a certificate of another host.
 _DATE_CODES, _HOST_CODES = (9, 10), (62, 64)
 _LOG_STEP = "see what the broker's log says: journalctl -u mosquitto"
 
 
 @frozen
 class BrokerConnection:
-    """The result of a connection to the broker without a login.
+    """The result of connecting to the broker without logging in.
 
     Attributes:
         took: seconds that it took to connect, including TLS.
@@ -83,12 +85,12 @@ class BrokerConnection:
 
 @frozen
 class AccessRights:
-    """The user's access rights, found out with test messages.
+    """The user's access rights, as shown by test messages.
 
     Attributes:
         presence: the robot's presence; None if it is unknown to the broker, or if the user may not read it.
         unwritable: topics to which the user must not publish.
-        unreadable: topics from which no message came back, so that the user can't read them.
+        unreadable: topics that the user can't read, because no message came back.
         trouble: why the rights could not be tested, or None if they could.
     """
 
@@ -126,17 +128,17 @@ class BrokerExamination:
         self._robot = robot
         self._environment, self._insecure = environment, insecure
         self._interrupt = interrupt
-        #: whether the login belongs to the robot's bridge
+        #: whether the doctor logs in as the robot's bridge
         self._is_robot = environment.get(USER) == robot
         self._inbox: list[Message] = []
 
     @property
     def question(self) -> Question:
-        """The question that the report answers. A login as the robot's bridge can't send requests to robots."""
+        """The question that the report answers."""
         return report.BRIDGE_QUESTION if self._is_robot else report.ROBOT_QUESTION
 
     def findings(self) -> Iterator[Finding]:
-        """Yield each finding as soon as it is known, up to the first failure that prevents other checks."""
+        """Run the checks, and yield their findings. Stop at a failure that makes further checks impossible."""
         try:
             broker = from_environment(self._environment, insecure=self._insecure)
             name, context = client_user(broker), broker.ssl_context()
@@ -186,7 +188,7 @@ class BrokerExamination:
         return link
 
     def _anonymous_refusal(self, broker: Broker) -> str | None:
-        """Return why the broker refuses a client without credentials, or None if it accepts one."""
+        """Return why the broker refuses clients without credentials, or None if it accepts them."""
         try:
             self._log_in(replace(broker, user=None, password=None, cert=None, key=None), lambda _: None).close()
         except TalkError as error:
@@ -194,7 +196,7 @@ class BrokerExamination:
         return None
 
     def _test_rights(self, link: Link, name: str) -> AccessRights:
-        """Test the access rights that an operator or the bridge of this robot needs."""
+        """Find out whether the user has the access rights of an operator, or of this robot's bridge."""
         robot, replies = partial(topics.robot, self._robot), partial(topics.reply, name, os.urandom(8).hex())
         if self._is_robot:
             echo = robot(topics.ECHO)
@@ -229,7 +231,7 @@ class BrokerExamination:
         return AccessRights(presence, unwritable, () if is_back or echo in unwritable else (echo,), trouble)
 
     def _known_robots(self, broker: Broker) -> tuple[str, ...]:
-        """Return the names of all robots that the broker knows, or an empty tuple if they can't be read."""
+        """Return the names of all robots that the broker knows. The tuple is empty if they can't be read."""
         try:
             found = self._wait_for(partial(read_robots, broker, LOGIN_LIMIT_S, with_status=False))
             return tuple(each.presence.name for each in found)
@@ -237,7 +239,7 @@ class BrokerExamination:
             return ()
 
     def _ask_robot(self, broker: Broker) -> Finding:
-        """Request the status of the robot's server, and return the finding."""
+        """Check whether the robot's server answers a status request."""
         end = time.monotonic() + _STEP_LIMIT_S
         try:
             connection = connect_robot(
@@ -253,7 +255,7 @@ class BrokerExamination:
             return failure("bridge", wrong, remedy or step)
 
     def _wait_for(self, work: Callable[[], _Result]) -> _Result:
-        """Run blocking work in a thread, and return its result.
+        """Run a blocking function in a thread, and return its result.
 
         Raises:
             TimeoutError: The work takes too long. The thread continues, but its result is ignored.
@@ -310,7 +312,7 @@ def _describe_error(error: OSError) -> str:
 
 
 def judge_settings(words: str, *, named: bool) -> Finding:
-    """Return the finding for settings that don't name a usable broker.
+    """Return the finding about invalid broker settings.
 
     Args:
         words: the error message.
@@ -330,7 +332,7 @@ def judge_connection(broker: Broker, connection: BrokerConnection) -> Finding:
 
 
 def judge_certificate(broker: Broker, connection: BrokerConnection, now: float, *, near: bool) -> list[Finding]:
-    """Return the findings about the broker's certificate, or its absence.
+    """Return the findings about TLS and the broker's certificate.
 
     Args:
         broker: the broker.
@@ -358,7 +360,7 @@ def judge_certificate(broker: Broker, connection: BrokerConnection, now: float, 
 
 
 def _trust_step(broker: Broker, connection: BrokerConnection, now: float) -> str:
-    """Return the next step if TLS failed."""
+    """Return the next step after a TLS error."""
     if connection.certificate_code in _DATE_CODES:
         clock = time.strftime("%Y-%m-%d %H:%M", time.gmtime(now))
         return f"renew the certificate of {broker.host}; or set this machine's clock: it says {clock} UTC"
@@ -373,13 +375,13 @@ def _trust_step(broker: Broker, connection: BrokerConnection, now: float) -> str
 
 
 def judge_login(broker: Broker, refusal: str | None) -> Finding:
-    """Return the finding about the login. `refusal` is the reason if the broker refused it."""
+    """Return the finding about the login. `refusal` is the broker's reason for refusing it, or None."""
     if refusal is not None:
         wrong, _, remedy = refusal.partition("; ")
         step = _LOG_STEP
         if remedy:
             step = f"log in as somebody whom it knows: {remedy}"
-        elif broker.tls and broker.cert is None:  # the broker disconnects at once, so its reason may be lost
+        elif broker.tls and broker.cert is None:  # the broker disconnects at once, so the reason may be missing
             step += "; where it wants a certificate, TALK_MQTT_CERT and TALK_MQTT_KEY name it"
         elif not broker.tls:
             step += f"; where port {broker.port} is for TLS: {URL}=mqtts://{broker.host}:{broker.port}"
@@ -390,7 +392,7 @@ def judge_login(broker: Broker, refusal: str | None) -> Finding:
 
 
 def judge_anonymous(refusal: str | None) -> Finding:
-    """Return the finding about a login without credentials. `refusal` is the reason if the broker refused it."""
+    """Return the finding about a login without credentials. `refusal` is the reason for refusing it, or None."""
     if refusal is not None:
         return ok("anonymous", "who has no credentials is not let in")
     words = "the broker lets in who has no credentials: anybody on the network can make the robots speak"
@@ -416,7 +418,7 @@ def judge_presence(presence: Presence, now: float) -> Finding:
 
 
 def judge_unknown(robot: str, known: tuple[str, ...], name: str, *, privileged: bool) -> Finding:
-    """Return the finding for a robot whose presence the broker doesn't have or doesn't send.
+    """Return the finding about a robot for which the broker sends no presence message.
 
     Args:
         robot: the robot's name.
@@ -441,7 +443,7 @@ def judge_unknown(robot: str, known: tuple[str, ...], name: str, *, privileged: 
 def judge_rights(name: str, rights: AccessRights) -> Finding:
     """Return the finding about the user's access rights."""
     parts = [f"write {' and '.join(rights.unwritable)}"] if rights.unwritable else []
-    # If the connection has broken, a missing message doesn't show that reading is forbidden.
+    # If the connection broke, a missing message doesn't prove that reading is forbidden.
     parts += [f"read {' and '.join(rights.unreadable)}"] if rights.unreadable and rights.trouble is None else []
     if parts:
         words = f"the broker does not let '{name}' {', nor '.join(parts)}"
@@ -452,7 +454,7 @@ def judge_rights(name: str, rights: AccessRights) -> Finding:
 
 
 def judge_bridge(robot: str, server: JsonObject, took: float) -> Finding:
-    """Return the finding about the robot's answer, which took `took` seconds."""
+    """Return the finding about the robot's answer, which arrived after `took` seconds."""
     words = f"{robot} answers in {took * 1000:.0f} ms: {summarize_server(server)}"
     if server.get("paused") is True:
         return warning("bridge", f"speech is paused; {words}", f"talk --robot {robot} resume")

@@ -1,7 +1,7 @@
-"""The checks of this machine, in the order of a sentence's way from the voice to the loudspeaker.
+"""Run all checks of this machine, in order from the voice to the loudspeaker.
 
-Each check is judged as soon as its facts are known. The examination never hangs, because everything that it waits for
-has a time limit. It changes nothing: the only thing that it sends is one goal.
+Findings are reported as soon as they are known. The examination never hangs, because every wait has a time limit. It
+changes nothing, and speaks only one sentence.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ if TYPE_CHECKING:
     from talkcli.doctor.report import Finding
     from talkcli.goals.goal import JsonObject
 
-#: Time limit for the sentence, including the time that it waits for other goals.
+#: Time limit for the sentence, including the time in the queue.
 SENTENCE_LIMIT_S = 20.0
 
 
 class LocalExamination:
-    """One examination of this machine and its server."""
+    """Examines this machine and its server for `talk doctor`."""
 
     question = SENTENCE_QUESTION
 
@@ -52,12 +52,12 @@ class LocalExamination:
         self._silent = silent
         self._interrupt = interrupt
         self._client: Client | None = None
-        #: the server's description of itself, or empty without a server
+        #: the server's description of itself, or an empty object if there is no server
         self._server: JsonObject = {}
-        #: the server's process id if it runs on this machine
+        #: the server's process id, if the server runs on this machine
         self._server_pid: int | None = None
         self._engine = voice.EngineReport()
-        #: session and environment of the player
+        #: session and environment in which the player runs
         self._session = sound.UserSession(0, "")
         self._env: Mapping[str, str] = os.environ
         #: whether the sound server accepts connections but doesn't answer
@@ -65,7 +65,7 @@ class LocalExamination:
         self._findings: list[Finding] = []
 
     def findings(self) -> Iterator[Finding]:
-        """Run all checks, and yield each finding at once. May raise Interrupted."""
+        """Run all checks, and yield each finding as soon as it is known."""
         client, search = server.connect(self._socket, self._interrupt)
         with client or contextlib.nullcontext():
             for each in self._run_checks(client, search):
@@ -74,7 +74,7 @@ class LocalExamination:
                 yield finding
 
     def _run_checks(self, client: Client | None, search: server.SocketSearch) -> Iterator[Finding]:
-        """Run the checks with this connection to the server, or without a server."""
+        """Run all checks. `client` is None if there is no server."""
         of_server: list[Finding] = []
         if client is not None:
             try:
@@ -103,7 +103,7 @@ class LocalExamination:
         yield self._check_sentence()
 
     def _setting(self, name: str, variable: str = "") -> str | None:
-        """Return a setting of the server, or the value of a variable if there is no server. None if it isn't set."""
+        """Return a server setting, or an environment variable if there is no server. None if it isn't set."""
         value = self._server.get(name) if self._server else os.environ.get(variable)
         return str(value) if value else None
 
@@ -118,12 +118,12 @@ class LocalExamination:
         reported = self._server.get("neural_voices")
         server_voices = reported if isinstance(reported, dict) else {}
         if used and not is_neural(used):
-            # The engine reports which voice a short name stands for, unless it failed because of this name.
+            # The engine resolves a short name of a voice, unless it failed because of the name.
             used = used if engine.reason and find_voice(used, models.installed_names(env)) else engine.neural_voice
         needed = used or server_voices or engine.neural_count or env.get("TALK_VOICES")
         if not needed or not is_own_driver(self._setting("driver")):
             return
-        if self._client and self._session.server_pid is None:  # the server has its own files and Python
+        if self._client and self._session.server_pid is None:  # the server's voices may be elsewhere
             yield from voice.judge_server_voices(server_voices)
             return
         options = voice.EngineOptions(env=env, interrupt=self._interrupt)
@@ -134,7 +134,7 @@ class LocalExamination:
         """Check everything between the engine and the loudspeaker."""
         env, session, device, by_server = self._env, self._session, self._setting("device"), self._client is not None
         if not is_own_driver(self._setting("driver")):
-            return  # other drivers of pyttsx3 play on their own
+            return  # pyttsx3's other drivers play the sound themselves
         sound_server = sound.find_sound_server(env, session)
         self._hangs = sound_server.hangs
         if is_silent(self._player):
@@ -151,7 +151,7 @@ class LocalExamination:
         yield from sound.judge_levels(levels, is_used=device is None and used in PLAYERS)
 
     def _check_sentence(self) -> Finding:
-        """Speak the sentence, and judge how it ended."""
+        """Speak the sentence, and return the finding."""
         client, engine, player = self._client, self._engine, self._player
         if client is not None and self._silent:
             if self._server_pid is None:
@@ -168,7 +168,8 @@ class LocalExamination:
         custom = sound.is_custom(player)
         step = sentence.find_playback_step(self._findings, custom=custom)
         if self._silent and self._server_pid is not None and self._session.server_pid is None:
-            # This is another user's server, whose environment can't be read. With hidepid, /proc also hides the owner.
+            # The server belongs to another user, so its environment can't be read. If /proc is mounted with hidepid,
+            # its owner is hidden, too.
             owner = sound.file_owner(f"/proc/{self._server_pid}")
             step = step if owner is None else sentence.RUN_AS_OWNER.format(owner)
         if result.reason == Reason.AUDIO_STALLED and not (self._hangs or custom):
@@ -177,11 +178,11 @@ class LocalExamination:
         return sentence.judge_sentence(result, silent=silent, device=device, playback_step=step, hangs=self._hangs)
 
     def _server_options(self, server_pid: int) -> voice.EngineOptions:
-        """Return the options that make the doctor's engine play like the server's."""
+        """Return the options with which the doctor's engine plays in the same way as the server's engine."""
         player, first = self._player, None
         if is_silent(player):
-            player = "null"  # the server's output file must not get another sentence
+            player = "null"  # nothing may be added to the server's output file
         elif player in PLAYERS and not sound.names_a_player(server_pid, self._env):
-            player, first = None, player  # the server chose this player, and would also try the others
+            player, first = None, player  # the server chose this player automatically
         device, used, driver = map(self._setting, ("device", "voice", "driver"))
         return voice.EngineOptions(player, device, used, driver, first, self._env, self._interrupt)

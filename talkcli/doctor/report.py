@@ -1,6 +1,6 @@
-"""The findings of the doctor, the conclusion from all of them, and how to show both.
+"""The doctor's findings and conclusion, and their output.
 
-This module is pure. The caller passes the screen.
+This module has no side effects.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ if TYPE_CHECKING:
 
     from talkcli.goals.goal import JsonObject
 
-#: The states of a finding. After a warning, a sentence may be inaudible. After a failure, it certainly is.
+#: The states of a finding. A warning means that speech may be inaudible, and a failure that it certainly is.
 OK, WARNING, FAILURE = "ok", "warning", "failed"
-#: The check that speaks a sentence.
+#: Name of the check that speaks a sentence.
 SENTENCE_CHECK = "sentence"
-#: How many names to show of a list that is shortened.
+#: Number of names that are shown if a list is shortened.
 _SHOWN_NAMES_COUNT = 4
-#: Widths of the first two columns, for the longest state and the longest name of a check.
+#: Widths of the columns for the state and the name of a check.
 _STATE_WIDTH_CHARS, _CHECK_WIDTH_CHARS = 7, 12
 _MESSAGE_INDENT = " " * (_STATE_WIDTH_CHARS + _CHECK_WIDTH_CHARS + 2 * len(COLUMN_GAP))
 _ARROW = "-> "
 _FINAL_STEP_INDENT = "  "
-#: For each state of a finding, the goal state that is shown in the same colour.
+#: The goal state that has the same colour as a finding's state.
 _FINDING_COLOURS = {OK: State.SUCCEEDED, WARNING: State.PREEMPTED, FAILURE: State.ABORTED}
 
 
@@ -39,9 +39,9 @@ class Finding:
     check: str
     #: OK, WARNING or FAILURE
     state: str
-    #: description for people, with text from other programs already escaped
+    #: human-readable description, in which text from other programs is escaped
     message: str
-    #: what to do next, or None if nothing is wrong
+    #: what the user should do next, or None if nothing is wrong
     next: str | None = None
 
     def to_json(self) -> JsonObject:
@@ -52,9 +52,9 @@ class Finding:
 class Question:
     """The question that an examination answers."""
 
-    #: the check that has to succeed for the answer "yes"
+    #: the check that must succeed for the answer "yes"
     check: str
-    #: the two answers, for people
+    #: the human-readable answers
     yes: str
     no: str
 
@@ -63,45 +63,48 @@ SENTENCE_QUESTION = Question(
     SENTENCE_CHECK, "a sentence is heard, unless the loudspeaker itself is off", "a sentence would not be heard"
 )
 ROBOT_QUESTION = Question("bridge", "the robot answers", "the robot would not answer")
-#: The question if a robot examines its own access to the broker.
+#: The question that is answered if a robot checks its own access to the broker.
 BRIDGE_QUESTION = Question(
     "rights", "the broker takes what this robot's bridge says", "this robot's bridge would not be heard"
 )
 
 
 def ok(check: str, message: str) -> Finding:
-    """Return a finding for a check that found no fault."""
+    """Return a finding that no fault was found."""
     return Finding(check, OK, printable(message))
 
 
 def warning(check: str, message: str, step: str) -> Finding:
-    """Return a finding about a fault that may prevent sound, with the next step."""
+    """Return a finding about a fault that may prevent sound. `step` is what the user should do next."""
     return Finding(check, WARNING, printable(message), printable(step))
 
 
 def failure(check: str, message: str, step: str) -> Finding:
-    """Return a finding about a fault that certainly prevents sound, with the next step."""
+    """Return a finding about a fault that certainly prevents sound. `step` is what the user should do next."""
     return Finding(check, FAILURE, printable(message), printable(step))
 
 
 def join_names(names: tuple[str, ...]) -> str:
-    """Return a list of names for people. A long list is shortened."""
+    """Join names with commas. A long list is shortened."""
     hidden = len(names) - _SHOWN_NAMES_COUNT
     return ", ".join(names) if hidden <= 1 else f"{', '.join(names[:_SHOWN_NAMES_COUNT])} and {hidden} more"
 
 
 def has_passed(findings: Sequence[Finding], question: Question = SENTENCE_QUESTION) -> bool:
-    """Return whether the answer is yes: the check of the question was made, and no check failed."""
+    """Return whether the question is answered with yes, because its check was made and no check failed."""
     return any(each.check == question.check for each in findings) and all(each.state != FAILURE for each in findings)
 
 
 def next_step(findings: Sequence[Finding]) -> str | None:
-    """Return the next step of the first failure, or None if nothing failed."""
+    """Return the next step for the first failure, or None if nothing failed."""
     return next((each.next for each in findings if each.state == FAILURE), None)
 
 
 def format_finding(finding: Finding, screen: Screen) -> list[str]:
-    """Return the lines that show a finding: a single line in a pipe. On a terminal, the next step has its own lines."""
+    """Format a finding as lines of text.
+
+    In a pipe, a finding is a single line. On a terminal, the next step has lines of its own.
+    """
     state = screen.coloured(pad(finding.state, _STATE_WIDTH_CHARS), _FINDING_COLOURS[finding.state])
     head = COLUMN_GAP.join((state, pad(finding.check, _CHECK_WIDTH_CHARS), ""))
     room = screen.columns_left(len(_MESSAGE_INDENT))
@@ -114,7 +117,7 @@ def format_finding(finding: Finding, screen: Screen) -> list[str]:
 
 
 def format_conclusion(findings: Sequence[Finding], screen: Screen, question: Question = SENTENCE_QUESTION) -> str:
-    """Return the answer to the question, followed by the next step if something failed."""
+    """Format the answer to the question, and the next step if a check failed."""
     if has_passed(findings, question):
         warned = sum(each.state == WARNING for each in findings)
         return question.yes + ("" if not warned else "; 1 warning" if warned == 1 else f"; {warned} warnings")
@@ -126,8 +129,8 @@ def format_conclusion(findings: Sequence[Finding], screen: Screen, question: Que
 
 
 def _wrap(text: str, room: int | None) -> list[str]:
-    """Return the text in lines of this width. If `room` is None, it is one line."""
+    """Wrap a text to `room` columns. If `room` is None, return it as one line."""
     if room is None:
         return [text]
-    # People copy paths and commands, so a word is only cut if it is longer than a line.
+    # Don't break words at hyphens, because users copy paths and commands.
     return textwrap.wrap(text, room, break_on_hyphens=False)

@@ -1,6 +1,6 @@
-"""The doctor's sentence, spoken through the server or by an engine process, and what its end means.
+"""The check that speaks a sentence, through the server or with the doctor's own engine.
 
-For the server it is an ordinary goal, which waits in the queue and can be canceled.
+The server treats the sentence like any other goal.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
     from talkcli.doctor.voice import EngineOptions
     from talkcli.goals.goal import Goal
 
-#: The silent sentence that is played while the server may speak. It is short and fast, because some devices accept only
-#: one player at a time. It is long enough to show whether the player really plays.
+#: The sentence that is played silently beside a running server. It is short and fast, because some devices accept only
+#: one player at a time, but long enough to show whether the player works.
 SILENT_TEXT, _SILENT_RATE_WPM = "talk works well", 450
-#: The next step for the reasons of goals, and for two reasons that only the doctor gives. A test checks that no reason
-#: of an aborted goal is missing.
+#: The next step for each reason why a goal can end. The reasons "late" and "paused" are only used by the doctor. A test
+#: checks that no reason for aborting a goal is missing.
 ADVICE: dict[str, str] = {
     Reason.NO_PLAYER: "sudo apt-get install -y alsa-utils",
     Reason.AUDIO_DEVICE: "plug in and switch on the loudspeaker, close what else plays, and try: aplay -l",
@@ -52,18 +52,19 @@ ADVICE: dict[str, str] = {
     "late": "see what is in the way with 'talk status', or end it with 'talk cancel'",
     "paused": "talk resume",
 }
-#: The finding if the doctor's own process can't use the server's player.
+#: The finding if the server's player can't be tested, because it runs elsewhere.
 SENTENCE_ELSEWHERE = failure(
     SENTENCE_CHECK,
     "not played: the server runs on another machine or in a container, and so does its player",
     "run talk doctor --silent there; or here without --silent, so that the server plays",
 )
-#: The next step if a player of another user's server failed. The doctor can't use that server's environment.
+#: The next step if the player of another user's server failed, because the doctor can't use the environment of that
+#: server.
 RUN_AS_OWNER = "play as the server's own user, who may have another sound: sudo -u '#{}' talk doctor --silent"
 _BUSY_STEP = "another program holds the device: close it, or play through a sound server (PipeWire, PulseAudio)"
 _PLAYER_REASONS = {Reason.AUDIO_DEVICE, Reason.AUDIO_LOST, Reason.AUDIO_STALLED}
 _START_REASONS = {Reason.ENGINE_FAILED, Reason.ENGINE_HUNG}
-#: The checks that can explain why a player fails, the most likely cause first.
+#: The checks that can explain why a player failed, with the most likely cause first.
 _PLAYBACK_CHECKS = ("player", "device", "sound server", "group", "cards", "session")
 
 
@@ -72,10 +73,10 @@ class SentenceResult:
     """How the doctor's sentence ended."""
 
     state: State
-    #: the goal's reason, or "late" or "paused" if the doctor canceled the sentence
+    #: why the goal ended this way, or "late" or "paused" if the doctor cancelled the sentence
     reason: str | None = None
     message: str | None = None
-    #: seconds of sound
+    #: length of the sound in seconds
     duration: float | None = None
     player: str | None = None
     #: whether the server spoke the sentence
@@ -87,14 +88,14 @@ class SentenceResult:
 
 
 def speak_by_server(client: Client, text: str, limit: float) -> SentenceResult:
-    """Speak a sentence through the server. It is canceled if it has not ended after `limit` seconds."""
+    """Speak a sentence through the server. Cancel it if it has not ended after `limit` seconds."""
     try:
         goal = client.say(text, preempt=False, ttl=0)
         try:
             if goal.speech_paused:
                 return SentenceResult(goal.cancel().state, "paused", "speech is paused")
             result = _goal_result(goal.wait(limit))
-            with contextlib.suppress(TalkError):  # the result stands even if the server ends now
+            with contextlib.suppress(TalkError):  # the result is valid even if the server ends now
                 result = replace(result, player=client.status().server.get("player"))
             return result
         except TimeoutError:
@@ -107,10 +108,10 @@ def speak_by_server(client: Client, text: str, limit: float) -> SentenceResult:
 
 
 def _cancel_late(client: Client, goal: GoalHandle, limit: float) -> SentenceResult:
-    """Cancel a goal that has not ended in time, and return what it was waiting for."""
+    """Cancel a goal that took too long, and return the reason for the delay."""
     before = client.status()
     ended = goal.cancel()
-    if ended.state in {State.SUCCEEDED, State.ABORTED}:  # it ended before the request arrived
+    if ended.state in {State.SUCCEEDED, State.ABORTED}:  # it ended before it could be cancelled
         return _goal_result(ended)
     pending = [each.id for each in before.pending]
     if before.server.get("paused") is True:
@@ -123,12 +124,12 @@ def _cancel_late(client: Client, goal: GoalHandle, limit: float) -> SentenceResu
 
 
 def _goal_result(goal: Goal) -> SentenceResult:
-    """Return how a goal of the server ended."""
+    """Return the result of a goal that the server has ended."""
     return SentenceResult(goal.state, goal.reason, goal.message, goal.duration, by_server=True)
 
 
 def speak_beside_server(client: Client, options: EngineOptions, limit: float) -> SentenceResult:
-    """Play a silent sentence with the doctor's own engine, and note whether the server spoke meanwhile."""
+    """Play a silent sentence with the doctor's own engine, while the server may also be speaking."""
     try:
         before = client.status()
         result = speak_by_engine(SILENT_TEXT, options, 0.0, limit)
@@ -141,7 +142,7 @@ def speak_beside_server(client: Client, options: EngineOptions, limit: float) ->
 
 
 def speak_by_engine(text: str, options: EngineOptions, volume: float, limit: float) -> SentenceResult:
-    """Speak a sentence with the doctor's own engine process, in at most `limit` seconds."""
+    """Speak a sentence with the doctor's own engine. Give up after `limit` seconds."""
     try:
         with start_engine(options, limit) as engine:
             player = engine.wait_for(protocol.Ready).player
@@ -158,11 +159,11 @@ def speak_by_engine(text: str, options: EngineOptions, volume: float, limit: flo
 
 
 def find_playback_step(findings: Sequence[Finding], *, custom: bool = False) -> str | None:
-    """Return the next step of the most likely cause of a playback fault, or None if no check found one.
+    """Return the next step for the most likely cause of a playback fault, or None if no cause was found.
 
     Args:
         findings: the findings of all checks before the sentence.
-        custom: whether the player is the user's own command. Only its own check counts then.
+        custom: whether the player is the user's own command. In that case, only the check of the player counts.
     """
     steps = {each.check: each.next for each in findings}
     checks = _PLAYBACK_CHECKS[:1] if custom else _PLAYBACK_CHECKS
@@ -172,7 +173,7 @@ def find_playback_step(findings: Sequence[Finding], *, custom: bool = False) -> 
 def advise(
     reason: str | None, message: str | None, player: object = None, device: object = None, text: str | None = None
 ) -> str:
-    """Return the next step after a goal ended for this reason.
+    """Return what the user should do next if a goal ended for this reason.
 
     Args:
         reason: the goal's reason.
@@ -200,14 +201,14 @@ def advise(
 def judge_sentence(
     result: SentenceResult, *, silent: bool, device: object, playback_step: str | None = None, hangs: bool = False
 ) -> Finding:
-    """Judge the sentence.
+    """Return the finding about the sentence.
 
     Args:
         result: how the sentence ended.
         silent: whether it was played without sound.
         device: the device that was configured for the player, or None.
         playback_step: the result of `find_playback_step`.
-        hangs: whether the sound server hangs. Engines wait for it when they start.
+        hangs: whether the sound server hangs, which also blocks engines when they start.
     """
     if result.state is State.SUCCEEDED:
         how = "through the server" if result.by_server else "by an engine of this command's own"
@@ -224,7 +225,7 @@ def judge_sentence(
     if result.reason == Reason.AUDIO_STALLED and result.suspended:
         message = f"{message}; suspended: {', '.join(result.suspended)}"
         step = f"pactl suspend-sink {result.suspended[0]} 0"
-    # The other checks know more about the player and the device, unless the player itself gave the cause.
+    # The other checks give better advice, unless the player itself reported that its device is busy.
     elif playback_step is not None and step != _BUSY_STEP:
         causes = {*_PLAYER_REASONS, Reason.NO_PLAYER, *(_START_REASONS if hangs else ())}
         step = playback_step if result.reason in causes else step

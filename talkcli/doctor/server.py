@@ -1,4 +1,4 @@
-"""The server: its socket, its description of itself, and the goals that failed recently.
+"""The checks of the server: its socket, state and settings, and the goals that failed recently.
 
 The doctor connects like any client, with time limits.
 """
@@ -30,28 +30,28 @@ if TYPE_CHECKING:
 
     from talkcli.goals.goal import Goal, JsonObject
 
-#: The client name that the doctor sends to the server.
+#: The name under which the doctor connects to the server.
 DOCTOR_NAME = "talk doctor"
-#: The start of a client's error message that lists the places. `SocketSearch` describes them in more detail.
+#: The beginning of a client's error message that only lists the places where no server was found.
 _NO_SERVER_PREFIX = "no server"
-#: How many goals of the log to check for failures.
+#: Number of recently ended goals to check for failures.
 _LOG_GOALS_COUNT = 100
 _RECENT_CHECK = "recent goals"
-#: Time within which an engine should be ready, and the time between two requests for its state.
+#: How long to wait for a starting engine, and how often to ask for its state.
 _ENGINE_START_LIMIT_S, _ENGINE_POLL_S = 1.0, 0.05
-#: What is at a path if a connection succeeds. The kernel accepts it even if the process never answers. `paths` has the
-#: texts for failed connections.
+#: Descriptions of what is at a path to which a client can connect. The kernel accepts connections even if the process
+#: never answers. `paths` has the descriptions for failed connections.
 PLACE_FOREIGN = "another user's server"
 PLACE_LISTENING = "something listens"
 PLACE_STOPPED = "a process listens that is stopped"
 PLACE_SERVER = "the server"
-#: The next step if a server answers but accepts no client, by the code of the client's error.
+#: The next step if the server refuses the client, by error code.
 _REFUSAL_ADVICE = {
     "protocol_mismatch": "install the same talk on both sides, and start the server again",
     "busy": "end some of its clients, or raise the limit that is named: talk serve --max-clients 512, or LimitNOFILE=",
     "permission_denied": "have its owner let you in: talk serve --socket-mode 0660, and join the socket's group",
 }
-#: The next step for each kind of place. If the search found several kinds, the first one here counts.
+#: The next step for each kind of place. If several kinds were found, the first one in this table counts.
 _PLACE_ADVICE = {
     PLACE_FORBIDDEN: "have {whose} let you in: talk serve --socket-mode 0660, and join the socket's group; "
     "or start your own",
@@ -62,10 +62,10 @@ _PLACE_ADVICE = {
     PLACE_DIRECTORY: "remove {path}, and: talk serve",
     PLACE_STALE: "talk serve (it takes the place of what was left over)",
 }
-#: How to name a socket by the option or the variable, and how to undo that.
+#: How to name a socket with the option or the variable, and how to undo that.
 _NAMING = {"TALK_SOCKET": "TALK_SOCKET=", "--socket": "--socket "}
 _UNNAMING: dict[str | None, str] = {"TALK_SOCKET": "unset TALK_SOCKET", "--socket": "leave --socket out"}
-#: Below this volume setting, speech may be inaudible. The loudest setting is 1.
+#: Speech may be inaudible if the volume setting is lower than this. The maximum is 1.
 _FAINT_VOLUME = 0.2
 
 
@@ -74,11 +74,11 @@ class SocketPlace:
     """A path where a server may listen, and what is there."""
 
     path: str
-    #: one of the PLACE texts, or the system's error message
+    #: what is there: one of the PLACE texts, or the system's error message
     what: str
-    #: owner of the server or the file, or None if unknown
+    #: owner of the process or the file, or None if unknown
     uid: int | None = None
-    #: the listening process, or None if unknown
+    #: id of the listening process, or None if unknown
     pid: int | None = None
 
 
@@ -86,22 +86,24 @@ class SocketPlace:
 class SocketSearch:
     """The result of searching for a server."""
 
-    #: the places tried; if a server was found, it is the last one
+    #: the places that were tried. If a server was found, its place is the last one.
     places: tuple[SocketPlace, ...]
-    #: what named the only place, "--socket" or "TALK_SOCKET", or None if the usual places were tried
+    #: "--socket" or "TALK_SOCKET" if one of them named the only place, or None if the usual places were tried
     named_by: str | None = None
-    #: why a client was not accepted, or None if no process listens
+    #: why the server refused the client, or None if no server was found
     message: str | None = None
-    #: code of the client's error, or None
+    #: code of the client's error, or None if there was none
     code: str | None = None
-    #: a server of this user at a usual place, if another place was named
+    #: path of this user's server at one of the usual places, if the user named another place
     usual_server: str | None = None
-    #: sockets of other users' servers
+    #: paths of other users' sockets
     foreign_sockets: tuple[str, ...] = ()
 
 
 def connect(option: str | None, interrupt: Mapping[int, int] | None) -> tuple[Client | None, SocketSearch]:
-    """Connect to the server. Return the client, or None if that failed, and what is at each place.
+    """Connect to the server, and find out what is at each place where a server may listen.
+
+    The client is None if no connection was possible.
 
     Args:
         option: the value of --socket.
@@ -110,7 +112,7 @@ def connect(option: str | None, interrupt: Mapping[int, int] | None) -> tuple[Cl
     named = paths.named_socket(option)
     named_by = "--socket" if option else "TALK_SOCKET" if named else None
     tried = paths.client_sockets(named)
-    # Places where a client trusts a server of any user.
+    # At these places, clients trust a server of any user.
     trusted = {named, paths.SYSTEM_SOCKET}
     try:
         client = Client.over(SocketConnection(option, name=DOCTOR_NAME, interrupt=interrupt))
@@ -118,7 +120,7 @@ def connect(option: str | None, interrupt: Mapping[int, int] | None) -> tuple[Cl
         found = tuple(_find_place(each, trusted) for each in tried)
         usual = paths.client_sockets(None) if named else []
         usual_server = next((each for each in usual if _find_place(each, set()).what == PLACE_LISTENING), None)
-        # Root sees the sockets of all users, but most users see none of the others'.
+        # Only root can see the sockets of all users.
         others = sorted({*glob.glob(f"/run/user/*/talk/{paths.SOCKET_NAME}")}.difference(tried))
         message = _client_message(error.message.splitlines(), found)
         return None, SocketSearch(found, named_by, message, error.code, usual_server, tuple(others))
@@ -128,7 +130,7 @@ def connect(option: str | None, interrupt: Mapping[int, int] | None) -> tuple[Cl
 
 
 def _client_message(lines: list[str], found: tuple[SocketPlace, ...]) -> str | None:
-    """Return why a listening process did not accept the client, from the lines of the client's error message."""
+    """Return the part of an error message that says why a listening process refused the client."""
     if not lines[0].startswith(_NO_SERVER_PREFIX):
         return lines[0]
     listening = [f"{each.path}: " for each in found if each.what == PLACE_LISTENING]
@@ -137,7 +139,7 @@ def _client_message(lines: list[str], found: tuple[SocketPlace, ...]) -> str | N
 
 
 def _find_place(path: str, trusted: Container[str | None]) -> SocketPlace:
-    """Connect to a socket and disconnect at once, to find out what is there."""
+    """Find out what is at a path, by connecting to it and disconnecting at once."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         try:
@@ -145,33 +147,35 @@ def _find_place(path: str, trusted: Container[str | None]) -> SocketPlace:
         except OSError as error:
             uid = file_owner(path)
             uid = file_owner(os.path.dirname(path)) if uid is None else uid
-            if isinstance(error, BlockingIOError):  # its backlog is full
+            if isinstance(error, BlockingIOError):  # the server's backlog is full
                 return SocketPlace(path, PLACE_LISTENING, uid)
             return SocketPlace(path, paths.describe_place(path, error), uid)
         pid, uid = peers.credentials(probe)
     if path not in trusted and uid not in {os.getuid(), 0}:
         return SocketPlace(path, PLACE_FOREIGN, uid, pid)
-    stopped = peers.process_stat(pid)[:1] == [b"T"]  # for example by Ctrl-Z
+    stopped = peers.process_stat(pid)[:1] == [b"T"]  # for example with Ctrl-Z
     return SocketPlace(path, PLACE_STOPPED if stopped else PLACE_LISTENING, uid, pid)
 
 
 def describe_server(client: Client) -> tuple[JsonObject, list[Goal]]:
     """Return a server's description of itself and its recently ended goals, oldest first.
 
-    A server that has just started doesn't know its player yet, so this waits a short time for its engine.
+    If the server has just started, wait a moment until its engine has reported the player.
     """
     end = time.monotonic() + _ENGINE_START_LIMIT_S
     server, log = client.status().server, client.log(_LOG_GOALS_COUNT)
     while server.get("engine") == "starting" and time.monotonic() < end:
-        time.sleep(_ENGINE_POLL_S)  # the server sends no event when the engine is ready
+        time.sleep(_ENGINE_POLL_S)  # there is no event for this change
         server = client.status().server
     return server, log
 
 
 def local_pid(client: Client) -> int | None:
-    """Return the server's process id, or None if it runs elsewhere, for example behind a socket forwarded by ssh.
+    """Return the server's process id, or None if the server runs on another machine.
 
-    If systemd made the socket, the kernel reports systemd as the process that listens.
+    The server's socket may be forwarded by ssh, for example.
+
+    If systemd created the socket, the kernel reports systemd as the listening process.
     """
     pid = client._connection.listener
     is_local = pid is not None and (pid == client.server_pid or peers.command_name(pid) == "systemd")
@@ -179,7 +183,7 @@ def local_pid(client: Client) -> int | None:
 
 
 def judge_search(search: SocketSearch) -> Finding:
-    """Judge whether the server was found, and whether clients may find something else at a place before it."""
+    """Return the finding about the server's socket, and about anything at the places that clients try first."""
     *before, last = search.places
     if last.what == PLACE_SERVER:
         obstacles = [each for each in before if each.what != PLACE_ABSENT]
@@ -207,7 +211,7 @@ def _search_step(search: SocketSearch) -> str:
     if search.usual_server is not None:
         return f"{_UNNAMING[named_by]}: a server is on {search.usual_server}"
     place = next((each for what in _PLACE_ADVICE for each in search.places if each.what == what), None)
-    if place is None:  # nothing is in the way of a new server
+    if place is None:  # no place is blocked
         if search.foreign_sockets:
             return f"talk serve; or use another user's server: talk --socket {search.foreign_sockets[0]} doctor"
         if named_by is None:
@@ -225,12 +229,18 @@ def _search_step(search: SocketSearch) -> str:
 
 
 def judge_gone(message: str) -> Finding:
-    """Judge a server that accepted the doctor and then did not answer."""
+    """Return the finding about a server that accepted the connection, but didn't answer."""
     return failure("server", message, "look at its log, and start it again: talk serve")
 
 
 def judge_server(server: JsonObject, log: Sequence[Goal], now: float) -> list[Finding]:
-    """Judge a server by its description of itself and by its recently ended goals, oldest first."""
+    """Return the findings about the server's state and settings, and about recent failures.
+
+    Args:
+        server: the server's description of itself.
+        log: the recently ended goals, oldest first.
+        now: the current time in seconds since 1970.
+    """
     return [_judge_state(server), _judge_settings(server), _judge_recent(log, now, server)]
 
 
@@ -247,7 +257,7 @@ def _judge_state(server: JsonObject) -> Finding:
 
 
 def summarize_server(server: JsonObject) -> str:
-    """Return a server's description of itself in one line for people."""
+    """Summarize a server's description of itself in one line."""
     up = format_span(server.get("uptime"))
     parts = [f"talk {server.get('version')}", f"up {up}", f"engine {server.get('engine')}"]
     parts += [f"{name} {server[name]}" for name in ("synthesizer", "player", "device") if server.get(name)]
@@ -285,7 +295,7 @@ def _judge_recent(log: Sequence[Goal], now: float, server: JsonObject) -> Findin
 
 
 def format_span(seconds: object) -> str:
-    """Return a duration in its largest unit for people, or "?" if it isn't a number."""
+    """Format a duration in its largest unit, such as "3 min", or return "?" if it isn't a number."""
     if not isinstance(seconds, int | float):
         return "?"
     for unit, length in (("d", 86400), ("h", 3600), ("min", 60)):

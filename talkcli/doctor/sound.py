@@ -1,8 +1,8 @@
-"""The sound: user session, sound cards, players, devices, sound servers and volume.
+"""The checks of the sound: user session, sound cards, players, devices, sound servers and volume.
 
-Facts come from files of the kernel and from programs such as pactl. Programs have a time limit. No device is opened,
-because that would wake it. Only a sentence proves that there is sound, so most faults are warnings. A missing or silent
-player is a failure, and so is a muted output.
+Facts come from the kernel's files and from programs such as pactl, which have a time limit. No device is opened,
+because that would wake it. Only a spoken sentence proves that there is sound, so most faults are warnings. A missing or
+silent player is a failure, and so is a muted output.
 """
 
 from __future__ import annotations
@@ -38,54 +38,54 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
     from typing import Any
 
-#: The group of sound cards in Debian.
+#: The group that may use sound cards in Debian.
 _AUDIO_GROUP = "audio"
 #: Files that container runtimes create in every container.
 _CONTAINER_FILES = ("/.dockerenv", "/run/.containerenv", "/run/systemd/container")
 _CRON_PROGRAMS = frozenset({"cron", "crond", "cronie", "anacron"})
 _SSH_PROGRAMS = frozenset({"ssh", "sshd"})
 _CONTAINER, _CRON_JOB, _SYSTEM_SERVICE = "a container", "a cron job", "a system service"
-#: The finding if the server doesn't run on this machine.
+#: The finding if the server runs on another machine.
 SESSION_ELSEWHERE = ok(
     "session", "the server runs on another machine or in a container: run talk doctor there to look at its sound"
 )
-#: Tags and permission bits of an access control list in <linux/posix_acl.h>.
+#: Tags and permission bits of access control lists, from <linux/posix_acl.h>.
 _ACL_USER, _ACL_GROUP, _ACL_READ_WRITE = 2, 8, 6
 
-#: Plugins and converters in ALSA's list of devices.
+#: Entries in ALSA's device list that are plugins or converters, not devices.
 _NOT_DEVICES = frozenset(
     {"null", "lavrate", "samplerate", "speexrate", "jack", "oss", "speex", "upmix", "vdownmix", "usbstream"}
 )
 _SOUND_SERVER_CHECK, _LOUDNESS_CHECK = "sound server", "loudness"
-#: Below this volume, a sentence may be inaudible across a room.
+#: A sentence may be inaudible across a room if the volume is lower than this.
 _FAINT_PERCENT = 20
-#: ALSA's mixer controls for loudspeakers, as `amixer scontrols` shows them.
+#: The names of ALSA's mixer controls for loudspeakers.
 _ALSA_CONTROLS = ("Master", "PCM", "Speaker", "Headphone", "Digital")
-#: Name of a sound server's output, for people.
+#: The human-readable name of a sound server's output.
 _DEFAULT_SINK = "the default sink"
-#: For each mixer program, the commands that unmute the default sink and make it louder.
+#: The commands of each mixer program that unmute the default sink and make it louder.
 _PACTL_COMMANDS = ("pactl set-sink-mute @DEFAULT_SINK@ 0", "pactl set-sink-volume @DEFAULT_SINK@ 70%")
 _WPCTL_COMMANDS = ("wpctl set-mute @DEFAULT_AUDIO_SINK@ 0", "wpctl set-volume @DEFAULT_AUDIO_SINK@ 0.7")
-#: Time limit for a program. Every program answers within milliseconds, unless the sound server hangs.
+#: Time limit for a program. Programs answer within milliseconds, unless the sound server hangs.
 PROGRAM_LIMIT_S = 3.0
-#: How much of a program's output to read. The device list of a large machine is a tenth of this.
+#: Maximum size of a program's output. Even a long list of devices is only a tenth of this.
 _MAX_OUTPUT_BYTES = 64 * 1024
 
 
 @frozen
 class UserSession:
-    """The user and environment of a process: this one, or the server."""
+    """The user and session of a process, which is the server or this process."""
 
     uid: int
     user: str
     #: the server's process id, or None if this describes the current process
     server_pid: int | None = None
-    #: names and ids of the process's groups
+    #: names of the process's groups, and their ids
     groups: tuple[str, ...] = ()
     gids: tuple[int, ...] = ()
-    #: the user who called sudo, or None if this isn't root under sudo
+    #: id of the user who called sudo, or None if the process isn't root under sudo
     sudo_uid: int | None = None
-    #: what started the process, for people, such as "a system service" or "an ssh session"
+    #: what started the process, such as "a system service" or "an ssh session"
     origins: tuple[str, ...] = ()
     #: XDG_RUNTIME_DIR, or None if it isn't set
     runtime_dir: str | None = None
@@ -97,12 +97,12 @@ class UserSession:
 
 @frozen
 class Cards:
-    """The sound cards that the kernel knows."""
+    """The sound cards that the kernel has found."""
 
-    #: whether /proc/asound exists. Containers can hide it.
+    #: whether /proc/asound exists, which containers can hide
     in_kernel: bool
     names: tuple[str, ...] = ()
-    #: device files for playback, such as /dev/snd/pcmC0D0p
+    #: the device files for playback, such as /dev/snd/pcmC0D0p
     nodes: tuple[str, ...] = ()
     #: device files that the user may not open
     forbidden: tuple[str, ...] = ()
@@ -114,7 +114,7 @@ class Cards:
 
 @frozen
 class ProgramOutput:
-    """The output of a program, and how it ended."""
+    """A program's output, and the reason if it failed."""
 
     #: why the program failed, or None if it succeeded
     error: str | None
@@ -126,50 +126,50 @@ class ProgramOutput:
 class Players:
     """The installed players, and which of them is used."""
 
-    #: installed player programs, best first
+    #: the installed player programs, best first
     found: tuple[str, ...]
     #: the player set by the server or by TALK_PLAYER, or None for the automatic choice
     configured: str | None
-    #: whether the configured player can be run
+    #: whether the configured player's program exists
     runs: bool = True
     #: the player that an automatic choice tries first, or None if there is none
     first: str | None = None
-    #: whether a server plays. Otherwise, the doctor's own engine does.
+    #: whether the server plays, or else the doctor's own engine
     by_server: bool = False
 
 
 @frozen
 class Devices:
-    """The devices that a player can use, by the player's own names."""
+    """The names of the devices that a player can use."""
 
-    #: the command that lists them
+    #: the command that lists the devices
     list_command: str
     names: tuple[str, ...] = ()
-    #: why they can't be listed, or None
+    #: why the devices can't be listed, or None if they can
     error: str | None = None
-    #: the configured device, or None for the player's default
+    #: the configured device, or None for the player's default device
     configured: str | None = None
-    #: package to install if the program that lists devices is missing, or None
+    #: the package to install if the listing program is missing, or None if it is installed
     package: str | None = None
 
 
 @frozen
 class SoundServer:
-    """What a client finds out about PulseAudio or PipeWire."""
+    """What is known about the sound server, PulseAudio or PipeWire."""
 
     #: name such as "PulseAudio (on PipeWire 0.3.65)", or None if no sound server answers
     name: str | None = None
-    #: the default sink, or None if unknown
+    #: name of the default sink, or None if unknown
     sink: str | None = None
-    #: whether clients of PulseAudio can connect. The player pulse is one.
+    #: whether PulseAudio clients can connect. The player `pulse` is such a client.
     accepts_pulse: bool = True
-    #: existing sockets of sound servers if none answers
+    #: the existing sockets of sound servers, if no server answers
     sockets: tuple[str, ...] = ()
-    #: why the client failed, or None if no client program is installed
+    #: why the client program failed, or None if none is installed
     error: str | None = None
     #: whether the sound server accepts connections but doesn't answer
     hangs: bool = False
-    #: PULSE_SERVER, or None if it isn't set
+    #: value of PULSE_SERVER, or None if it isn't set
     pulse_server: str | None = None
 
 
@@ -187,9 +187,9 @@ class MixerLevel:
 
 
 def find_session(server_pid: int | None) -> tuple[UserSession, Mapping[str, str]]:
-    """Return the session and environment of the server, because its player makes the sound.
+    """Return the session and environment of the process whose player makes the sound.
 
-    If there is no server, or its environment can't be read, return those of this process.
+    This is the server, or this process if there is no server or its environment can't be read.
     """
     environment = None if server_pid is None else _environment(server_pid)
     if environment is None:
@@ -214,7 +214,10 @@ def find_session(server_pid: int | None) -> tuple[UserSession, Mapping[str, str]
 
 
 def names_a_player(server_pid: int, env: Mapping[str, str]) -> bool:
-    """Return whether a server's command line or environment names a player. Such a server tries no other player."""
+    """Return whether the server's command line or environment names a player.
+
+    If it does, the server tries no other player.
+    """
     return bool(env.get("TALK_PLAYER") or re.search(r"\0--player[=\0]", _read_text(f"/proc/{server_pid}/cmdline")))
 
 
@@ -232,13 +235,13 @@ def _environment(pid: int) -> dict[str, str] | None:
     """Return the environment of another process, or None if it belongs to another user."""
     data = read_proc_file(f"/proc/{pid}/environ", -1)
     if data is None or file_owner(f"/proc/{pid}") != os.getuid():
-        return None  # root can read it, but may not use another user's sound server
+        return None  # root could read it, but can't use another user's sound server
     pairs = (each.partition("=") for each in os.fsdecode(data).split("\0") if "=" in each)
     return {name: value for name, _, value in pairs}
 
 
 def _name(look_up: Callable[[int], tuple[Any, ...]], number: int) -> str:
-    """Return the name of a user or a group, or its number if it has no name."""
+    """Return the name of a user or group, or the number if there is no name."""
     try:
         return str(look_up(number)[0])
     except KeyError:
@@ -246,7 +249,7 @@ def _name(look_up: Callable[[int], tuple[Any, ...]], number: int) -> str:
 
 
 def _group_ids(pid: int) -> tuple[int, ...]:
-    """Return the group ids of a process. Without /proc, return those of this process."""
+    """Return the group ids of a process, or those of this process if /proc can't be read."""
     status = _read_text(f"/proc/{pid}/status")
     found = re.search(r"^Gid:\s+\d+\s+(\d+).*?^Groups:([\d \t]*)$", status, re.MULTILINE | re.DOTALL)
     groups = map(int, " ".join(found.groups()).split()) if found else (os.getegid(), *os.getgroups())
@@ -254,12 +257,13 @@ def _group_ids(pid: int) -> tuple[int, ...]:
 
 
 def _origins(environment: Mapping[str, str], pid: int) -> Iterable[str]:
-    """Yield what started a process, the most specific first."""
+    """Yield descriptions of what started a process, with the most specific one first."""
     if environment.get("container") or any(map(os.path.exists, _CONTAINER_FILES)):
         yield _CONTAINER
     unit = re.search(r"system\.slice/(?:[^\n]*/)?([^/\n]+)\.service", _read_text(f"/proc/{pid}/cgroup"))
     service = unit[1] if unit else ""
-    programs = {service, *(str(command_name(each)).lower() for each in parents(pid))}  # Debian's cron also runs as CRON
+    # The names are compared in lower case, because Debian's cron is also called CRON.
+    programs = {service, *(str(command_name(each)).lower() for each in parents(pid))}
     if not _CRON_PROGRAMS.isdisjoint(programs):
         yield _CRON_JOB
     elif service and service not in _SSH_PROGRAMS and environment.get("INVOCATION_ID"):
@@ -269,8 +273,8 @@ def _origins(environment: Mapping[str, str], pid: int) -> Iterable[str]:
 
 
 def find_cards(session: UserSession, kernel: str = "/proc/asound", nodes: str = "/dev/snd") -> Cards:
-    """Return the kernel's sound cards, and which of them the user may open."""
-    # Each card has two lines. The first is " 0 [Device         ]: USB-Audio - USB Audio Device".
+    """Return the sound cards that the kernel has found, and which of them the user may open."""
+    # Each card takes two lines, such as " 0 [Device         ]: USB-Audio - USB Audio Device" and a longer description.
     names = re.findall(r"^\s*\d+ \[[^\]]*\]:.*? - (.*)$", _read_text(f"{kernel}/cards"), re.MULTILINE)
     playing = playback_devices(nodes)
     group, forbidden = _AUDIO_GROUP, []
@@ -297,8 +301,8 @@ def _may_open(found: os.stat_result, entries: list[tuple[int, int, int]], sessio
     """Return whether the user may read and write a file.
 
     Args:
-        found: mode and owner of the file.
-        entries: its access control list, as from `_access_list`.
+        found: the file's mode and owner.
+        entries: the file's access control list, as returned by `_access_list`.
         session: the user.
     """
     if session.uid == 0:
@@ -313,10 +317,13 @@ def _may_open(found: os.stat_result, entries: list[tuple[int, int, int]], sessio
 
 
 def _access_list(path: str) -> list[tuple[int, int, int]]:
-    """Return the entries of a file's access control list as tuples of tag, permission bits and user or group id."""
+    """Return the entries of a file's access control list.
+
+    Each entry has a tag, permission bits, and a user or group id.
+    """
     with contextlib.suppress(OSError):
         data = os.getxattr(path, "system.posix_acl_access")
-        return list(struct.iter_unpack("<HHI", data[4:]))  # after a version number of four bytes
+        return list(struct.iter_unpack("<HHI", data[4:]))  # the first four bytes are a version number
     return []
 
 
@@ -326,11 +333,14 @@ def _read_text(path: str) -> str:
 
 
 def run_program(program: str, *arguments: str, env: Mapping[str, str], limit: float | None = None) -> ProgramOutput:
-    """Run a program in the C locale until it ends, or until `limit` seconds have passed (default: PROGRAM_LIMIT_S)."""
+    """Run a program in the C locale, and return its output. Kill it after `limit` seconds.
+
+    The default limit is PROGRAM_LIMIT_S.
+    """
     limit = PROGRAM_LIMIT_S if limit is None else limit
     if not on_path(program, env):
         return ProgramOutput(f"{program} is not there")
-    # Files, because a process that the program leaves running would keep a pipe open.
+    # Use files instead of pipes, because a background process of the program would keep a pipe open.
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         try:
             process = subprocess.Popen(
@@ -347,8 +357,8 @@ def run_program(program: str, *arguments: str, env: Mapping[str, str], limit: fl
             process.wait(limit)
         code = process.returncode
         if code is None:
-            kill([-process.pid])  # its own group, whose id is not reused before the process is reaped
-            with contextlib.suppress(subprocess.TimeoutExpired):  # stuck in a driver: init will reap it
+            kill([-process.pid])  # the process group, whose id can't be reused before the process is reaped
+            with contextlib.suppress(subprocess.TimeoutExpired):  # it hangs in a driver, so init will reap it
                 process.wait(1)
         stdout, stderr = (os.pread(each.fileno(), _MAX_OUTPUT_BYTES, 0).decode(errors="replace") for each in (out, err))
     if code is None:
@@ -360,7 +370,7 @@ def run_program(program: str, *arguments: str, env: Mapping[str, str], limit: fl
 
 
 def is_custom(player: str | None) -> bool:
-    """Return whether a player is a command of the user's own. Nothing is known about what it needs."""
+    """Return whether a player is a command that the user wrote, not one of the known players."""
     program = _program_of(player) if player and not is_silent(player) else None
     return program is not None and program.rpartition("/")[2] not in PLAYERS
 
@@ -376,7 +386,7 @@ def _program_of(command: str) -> str | None:
 def find_players(
     env: Mapping[str, str], configured: str | None, first: str | None = None, *, by_server: bool = False
 ) -> Players:
-    """Return which players are installed. The other arguments are fields of the result."""
+    """Find out which players are installed. The other arguments are stored in the result."""
     found = tuple(each for each in PACKAGES if on_path(each, env))
     program = _program_of(configured or "")
     runs = program == "pulse" or bool(program and on_path(program, env))
@@ -384,7 +394,7 @@ def find_players(
 
 
 def find_devices(env: Mapping[str, str], player: str | None, configured: str | None) -> Devices | None:
-    """Return the devices of a player, or None if no program lists them."""
+    """Return the devices of a player, or None if there is no program to list them."""
     if player not in _DEVICE_LISTS:
         return None
     command, parse, package = _DEVICE_LISTS[player]
@@ -396,25 +406,28 @@ def find_devices(env: Mapping[str, str], player: str | None, configured: str | N
 
 
 def _parse_alsa(output: ProgramOutput) -> list[str]:
-    """Return the devices in a list by aplay. The lines below each device are indented."""
+    """Parse the list of devices printed by `aplay -L`, in which descriptions are indented."""
     return [each for each in output.stdout.splitlines() if each and not each[0].isspace() and each not in _NOT_DEVICES]
 
 
 def _parse_sinks(output: ProgramOutput) -> dict[str, str]:
-    """Return the states of the sinks by name. A line has number, name, module, format and state, separated by tabs."""
+    """Parse the list of sinks printed by pactl, and return the state of each sink by name.
+
+    A line has the sink's number, name, module, format and state, separated by tabs.
+    """
     lines = [] if output.error else [each.split("\t") for each in output.stdout.splitlines()]
     return {each[1]: each[-1].strip() for each in lines if len(each) > 2}
 
 
 def _parse_nodes(output: ProgramOutput) -> list[str]:
-    """Return the sinks in a list of PipeWire's nodes."""
+    """Parse the list of nodes printed by `pw-cli ls Node`, and return the names of the sinks."""
     nodes = re.split(r"^\s*id \d+,", output.stdout, flags=re.MULTILINE)
     found = [re.search(r'node\.name = "([^"]*)"', each) for each in nodes if '"Audio/Sink"' in each]
     return [each[1] for each in found if each]
 
 
 _LIST_SINKS = "pactl list short sinks"
-#: For each player, the command that lists its devices, the parser of its output, and the package of the command.
+#: For each player: the command that lists its devices, the parser for the command's output, and the command's package.
 _DEVICE_LISTS: dict[str | None, tuple[str, Callable[[ProgramOutput], Iterable[str]], str]] = {
     "aplay": ("aplay -L", _parse_alsa, PACKAGES["aplay"]),
     "pulse": (_LIST_SINKS, _parse_sinks, PACKAGES["pacat"]),
@@ -424,26 +437,26 @@ _DEVICE_LISTS: dict[str | None, tuple[str, Callable[[ProgramOutput], Iterable[st
 
 
 def add_pactl_package(finding: Finding, env: Mapping[str, str]) -> Finding:
-    """Add the package of pactl to the next step, if the step needs pactl and it isn't installed."""
+    """Add a hint on how to install pactl to a finding, if the next step needs pactl and it is missing."""
     if finding.next is None or "pactl " not in finding.next or on_path("pactl", env):
         return finding
     return replace(finding, next=f"{finding.next} (for pactl: sudo apt-get install -y {PACKAGES['pacat']})")
 
 
 def suspended_sinks(env: Mapping[str, str]) -> tuple[str, ...]:
-    """Return the sinks that take no data, including sinks that sleep because nothing plays."""
+    """Return the names of suspended sinks, including sinks that are only suspended because nothing is playing."""
     sinks = _parse_sinks(run_program(*_LIST_SINKS.split(), env=env))
     return tuple(name for name, state in sinks.items() if state == "SUSPENDED")
 
 
 def find_sound_server(env: Mapping[str, str], session: UserSession) -> SoundServer:
-    """Return the sound server that a player in this session connects to."""
+    """Return the sound server to which players in this session connect."""
     pulse = run_program("pactl", "info", env=env)
     if pulse.error is None:
         fields = dict(re.findall(r"^\s*([\w ]+): (.*\S)", pulse.stdout, re.MULTILINE))
         return SoundServer(fields.get("Server Name", "PulseAudio"), fields.get("Default Sink"))
     pipewire = pulse if pulse.timed_out else run_program("pw-cli", "info", "0", env=env)
-    # Without pactl, only the socket shows whether clients of PulseAudio can connect.
+    # If pactl isn't installed, connecting to the socket is the only way to test whether PulseAudio clients can connect.
     native = None if on_path("pactl", env) else _pulse_address(env)
     if pipewire.error is None:
         name = "PipeWire" if native else "PipeWire, without its PulseAudio part"
@@ -458,9 +471,9 @@ def find_sound_server(env: Mapping[str, str], session: UserSession) -> SoundServ
 
 
 def _pulse_address(env: Mapping[str, str]) -> str | None:
-    """Return the address of a server that accepts clients of PulseAudio, or None if there is none.
+    """Return the address of a server that accepts PulseAudio clients, or None if there is none.
 
-    An address on another machine is returned without a test. The sentence will show whether it works.
+    An address on another machine isn't tested. The sentence will show whether it works.
     """
     named = env.get("PULSE_SERVER", "").removeprefix("unix:")
     if named and not named.startswith("/"):
@@ -474,7 +487,7 @@ def _pulse_address(env: Mapping[str, str]) -> str | None:
 
 
 def find_levels(env: Mapping[str, str], server: SoundServer, cards: Cards) -> Iterable[MixerLevel]:
-    """Yield the volume of the default sink, or of the sound cards' controls if there is no sound server."""
+    """Yield the volume of the default sink, or of the sound cards if there is no sound server."""
     if server.hangs:
         return
     if server.name is not None:
@@ -495,7 +508,7 @@ def find_levels(env: Mapping[str, str], server: SoundServer, cards: Cards) -> It
 
 
 def parse_level(name: str, text: str, unmute_command: str, louder_command: str) -> MixerLevel:
-    """Return the volume in a mixer program's output, which is that of the loudest channel.
+    """Parse the output of a mixer program, and return the volume of the loudest channel.
 
     The formats are "Mute: no" and "40%" for pactl, "Volume: 0.40 [MUTED]" for wpctl, and "[40%] [on]" for amixer. In
     amixer's output, the sound is muted if every channel is off.
@@ -508,14 +521,14 @@ def parse_level(name: str, text: str, unmute_command: str, louder_command: str) 
 
 
 def judge_session(session: UserSession) -> Finding:
-    """Judge whether players can find the sound server of the user."""
+    """Return the finding about the session, which shows whether players can find the user's sound server."""
     who = "" if session.server_pid is None else "the server's: "
     who += f"user {session.user} (uid {session.uid})"
     who += "" if session.sudo_uid is None else f" by sudo from uid {session.sudo_uid}"
     who += f", in {' and '.join(session.origins)}" if session.origins else ""
     if session.runtime_dir is None:
         if session.usual_runtime_dir is None:
-            # Robots often have no logind, which makes this directory. Then nothing is wrong.
+            # This is normal on robots without logind, which would create the directory.
             return ok("session", f"{who}; no XDG_RUNTIME_DIR, as there is no session of this user")
         again = "" if session.server_pid is None else " where the server is started, and start it again"
         return warning(
@@ -544,7 +557,7 @@ def judge_silent_player(player: str | None, *, by_server: bool) -> Finding:
 def judge_sound(
     players: Players, devices: Devices | None, cards: Cards, server: SoundServer, session: UserSession
 ) -> list[Finding]:
-    """Judge everything between the engine and the loudspeaker, except the volume."""
+    """Return the findings about everything between the engine and the loudspeaker, except the volume."""
     return [
         _judge_player(players),
         *([] if devices is None else [_judge_device(devices)]),
@@ -555,7 +568,7 @@ def judge_sound(
 
 
 def _set_by(by_server: bool) -> str:
-    """Return what configured the player, for people."""
+    """Return a description of what configured the player."""
     return "the server's" if by_server else "TALK_PLAYER"
 
 
@@ -590,7 +603,7 @@ def _judge_device(devices: Devices) -> Finding:
     if not names:
         step = "plug in a loudspeaker; in a container, hand the device in"
         return warning("device", f"{command} lists none", step)
-    # ALSA accepts plughw:1,0 for any card without listing it. The sentence will show whether it works.
+    # A device such as plughw:1,0 may work even if ALSA doesn't list it. The sentence will show whether it does.
     if configured is None or configured in names or ":" in configured:
         return ok("device", f"{used}; {command} lists {join_names(names)}")
     words = f"{configured} is not among those that {command} lists: {join_names(names)}"
@@ -649,7 +662,7 @@ def _judge_sound_server(server: SoundServer, cards: Cards, session: UserSession)
 
 
 def _judge_unreachable(server: SoundServer, session: UserSession, words: str) -> Finding:
-    """Return a warning about a sound server that can't be reached, with the most likely cause."""
+    """Return a warning that the sound server can't be reached, with the most likely cause."""
     hint, step = "", "systemctl --user restart pipewire pipewire-pulse (or: pulseaudio --start)"
     if server.pulse_server is not None:
         step = "unset PULSE_SERVER, or start the sound server that it names"
@@ -668,10 +681,10 @@ def _judge_unreachable(server: SoundServer, session: UserSession, words: str) ->
 
 
 def judge_levels(levels: tuple[MixerLevel, ...], *, is_used: bool) -> list[Finding]:
-    """Judge the volume.
+    """Return the findings about the volume.
 
     Args:
-        levels: the mixer's outputs.
+        levels: the outputs' volumes.
         is_used: whether speech is known to go to these outputs.
     """
     broken = failure if is_used else warning

@@ -1,7 +1,7 @@
-"""The voice: Python, pyttsx3, libespeak-ng with its data and voices, and neural voices.
+"""The checks of the voices: Python, pyttsx3, libespeak-ng, and neural voices.
 
-Most facts come from an engine process that the doctor starts for itself. A faulty library or voice can only crash that
-process. The doctor itself never loads any of them.
+Most facts come from an engine process that the doctor starts. The doctor itself loads neither libraries nor voices, so
+that a faulty one can't crash it.
 
 Neural voices are only examined if one is installed or in use. Only the voice in use is loaded and timed, because
 loading takes memory and some seconds.
@@ -32,15 +32,16 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from typing import Any
 
-#: The sentence that the doctor speaks, and its rate in words per minute.
+#: The sentence that the doctor speaks, and its speed in words per minute.
 SENTENCE_TEXT, SENTENCE_RATE_WPM = "If you hear this, talk works.", 200
-#: The engine states of a server whose engine works.
+#: The states in which a server's engine works.
 WORKING_STATES = ("ready", "starting")
-#: Next steps if something is missing.
+#: The commands to show if a package is missing.
 INSTALL_LIBRARY = install.espeak_library()
 _INSTALL_PYTTSX3 = install.command("pyttsx3")
 _INSTALL_NEURAL = install.neural()
-#: The next step for a library that can't be used. The key is a text in the engine's message, or else the reason.
+#: The next step if libespeak-ng can't be used. The key is a part of the engine's message, or the reason for the
+#: failure.
 _LIBRARY_ADVICE = {
     "espeak-ng data": "sudo apt-get install -y espeak-ng-data",
     "libespeak-ng": INSTALL_LIBRARY,
@@ -49,15 +50,15 @@ _LIBRARY_ADVICE = {
     Reason.ENGINE_HUNG: "restart the sound server if that hangs (see below): libespeak-ng waits for it at its start",
 }
 _PACKAGES_CHECK, _FILES_CHECK, _NEURAL_CHECK = "neural", "voice files", "neural voice"
-#: A neural voice has to be this many times faster than speech. Otherwise other programs on the machine cause gaps.
+#: How much faster than real time a neural voice must be. If it is slower, other programs can cause gaps in the speech.
 _MIN_REAL_TIME_FACTOR = 1.3
-#: A program that imports a package, but not from the current directory, and prints an error in one line. It runs as
-#: a process of its own, because onnxruntime can crash on an old processor.
+#: A program that tries to import a package. It runs in a separate process, because onnxruntime can crash on an old
+#: processor. It ignores the current directory, and prints only the last line of a traceback.
 _IMPORT_PROGRAM = "import sys; sys.tracebacklimit = 0; sys.path[:] = filter(None, sys.path); import "
-#: Time limit for an import. Reading a package from an SD card is slow.
+#: Time limit for an import, which is slow from an SD card.
 _IMPORT_LIMIT_S = 10.0
 _IMPORT_TIMED_OUT = f"it takes more than {_IMPORT_LIMIT_S:g} s"
-#: The next step for a package that can't be imported. The key is a text in the message; "" is the default.
+#: The next step if a package can't be imported. The key is a part of the error message, and "" is the default.
 _IMPORT_ADVICE = {
     _IMPORT_TIMED_OUT: "run talk doctor again when this machine is less busy",
     "SIGILL": "this processor is too old for that version: install an older one, or use an espeak voice",
@@ -68,15 +69,15 @@ _CHOOSE_ESPEAK = "choose one of espeak's: talk set --voice en, or talk serve --v
 
 @frozen
 class EngineOptions:
-    """Options of an engine process that the doctor starts."""
+    """Options for starting an engine process."""
 
     player: str | None = None
     device: str | None = None
     voice: str | None = None
     driver: str | None = None
-    #: the player to try first if none is given
+    #: the player to try first, if `player` is None
     first_player: str | None = None
-    #: environment of the process, or None for a copy of this one's
+    #: environment of the engine process, or None for this process's environment
     env: Mapping[str, str] | None = None
     #: descriptors that interrupt any wait, as in `wait_ready`
     interrupt: Mapping[int, int] | None = None
@@ -91,46 +92,46 @@ class EngineReport:
     synthesizer: str | None = None
     #: number of voices, or None if the engine did not list them
     voice_count: int | None = None
-    #: number of neural voices among them
+    #: number of neural voices
     neural_count: int = 0
-    #: the player that the engine would try first, or None
+    #: the player that the engine would try first, or None if there is none
     player: str | None = None
-    #: id of the configured voice if it is a neural one, or None
+    #: id of the configured voice, or None if it is not a neural voice
     neural_voice: str | None = None
-    #: why the engine did not start: a word for programs and a message, or None if it did
+    #: the machine-readable reason why the engine did not start, or None if it did
     reason: str | None = None
     message: str = ""
 
 
 @frozen
 class VoiceTrial:
-    """The result of speaking with the neural voice in use."""
+    """The result of trying a neural voice."""
 
-    #: seconds that loading took, or None if the voice was not loaded
+    #: loading time in seconds, or None if the voice was not loaded
     load_s: float | None = None
     #: seconds of speech synthesized per second, or None if the voice failed
     speed: float | None = None
-    #: memory of the engine process afterwards, or None if unknown
+    #: memory used by the engine process after speaking, or None if unknown
     memory_bytes: int | None = None
-    #: why the voice failed, and the next step
+    #: why the voice failed, and what the user should do next
     fault: tuple[str, str] = ("", "")
 
 
 @frozen
 class NeuralVoices:
-    """Facts about neural voices and the packages that they need."""
+    """What is known about neural voices and their packages."""
 
-    #: message and next step if a package is missing or can't be imported, or None
+    #: error message and next step if a package can't be imported, or None if all can
     package_fault: tuple[str, str] | None = None
     #: installed packages with their versions, such as "onnxruntime 1.23.2"
     installed: tuple[str, ...] = ()
-    #: ids of the voices whose files look valid
+    #: ids of the voices with valid files
     valid: tuple[str, ...] = ()
-    #: id, fault and next step of all other voices
+    #: id, fault and next step of each voice with invalid files
     invalid: tuple[tuple[str, str, str], ...] = ()
-    #: the neural voice in use, as the user wrote it, or None
+    #: the neural voice in use, as the user wrote it, or None if no neural voice is in use
     used: str | None = None
-    #: result of speaking with that voice, or None if it was not tried
+    #: result of trying the voice in use, or None if it was not tried
     trial: VoiceTrial | None = None
 
 
@@ -145,9 +146,10 @@ def start_engine(options: EngineOptions, limit: float = math.inf, output: int | 
     """Start an engine process, and return it.
 
     Args:
-        options: its options.
-        limit: seconds after which any wait for the process ends with a TimeoutError.
-        output: descriptor that gets the sound as a WAV file, instead of a player. Such an engine lists no voices.
+        options: the options of the engine.
+        limit: seconds after which waiting for the process raises TimeoutError.
+        output: descriptor to which the sound is written as a WAV file instead of being played. The engine then lists no
+            voices.
     """
     given = options.driver, options.player, options.device, options.voice
     configure = protocol.Configure(
@@ -158,7 +160,7 @@ def start_engine(options: EngineOptions, limit: float = math.inf, output: int | 
 
 
 def find_engine(options: EngineOptions) -> EngineReport:
-    """Start an engine process, and return what it reports."""
+    """Start an engine process, and return its report."""
     report = EngineReport()
     try:
         with start_engine(options) as engine:
@@ -170,11 +172,14 @@ def find_engine(options: EngineOptions) -> EngineReport:
         if report.driver is None or error.reason == Reason.ENGINE_CRASHED:
             reason, message = explain_failure(error)
             return EngineReport(reason=reason, message=message)
-    return report  # the engine was ready but listed no voices
+    return report  # the engine started, but didn't list its voices
 
 
 def explain_failure(error: EngineFailed) -> tuple[str, str]:
-    """Return the reason and the message of an engine's failure. A silent engine counts as `engine_hung`."""
+    """Return the reason and the message of an engine's failure.
+
+    The reason is `engine_hung` if the engine stopped responding.
+    """
     if error.silent_s is not None:
         return Reason.ENGINE_HUNG, f"the engine process said nothing for {error.silent_s:g} s"
     return error.reason, str(error)
@@ -186,13 +191,13 @@ def judge_python() -> Finding:
 
 
 def judge_engine(pyttsx3: str | None, engine: EngineReport, *, server: str | None) -> list[Finding]:
-    """Judge pyttsx3, libespeak-ng and the voices.
+    """Return the findings about pyttsx3, libespeak-ng and the voices.
 
     Args:
         pyttsx3: version of pyttsx3, or None if it is not installed.
         engine: the report of the doctor's engine process.
-        server: the engine state that a server reports, or None. If the server's engine works, faults of the doctor's
-            engine are only warnings.
+        server: the state of the server's engine, or None if there is no server. If that engine works, faults of the
+            doctor's own engine are only warnings.
     """
     broken = warning if server in WORKING_STATES else failure
     if server not in {None, *WORKING_STATES} and engine.reason is None:
@@ -200,7 +205,7 @@ def judge_engine(pyttsx3: str | None, engine: EngineReport, *, server: str | Non
     if engine.reason is None:
         words = f"{pyttsx3 or 'of an unknown version'}, driver {engine.driver}"
         return [ok("pyttsx3", words), *_judge_library(engine)]
-    # The finding shows the next step separately.
+    # Remove the next step, which the finding shows separately.
     message = engine.message.removesuffix(f": {_INSTALL_PYTTSX3}").removesuffix(f": {INSTALL_LIBRARY}")
     if "pyttsx3 is missing" in message or pyttsx3 is None:
         return [broken("pyttsx3", message or "pyttsx3 is missing", _INSTALL_PYTTSX3)]
@@ -231,9 +236,9 @@ def find_neural(used: str | None, options: EngineOptions, limit: float) -> Neura
     """Check the files of all neural voices, and try the voice in use.
 
     Args:
-        used: that voice as the user wrote it, or None if no neural voice is in use.
-        options: environment and interrupt of the processes that are started.
-        limit: time in seconds for the trial.
+        used: the voice in use, as the user wrote it, or None if no neural voice is in use.
+        options: options for the engine process.
+        limit: time limit for trying the voice, in seconds.
     """
     fault = _find_package_fault(os.environ if options.env is None else options.env)
     valid, invalid = [], []
@@ -250,12 +255,12 @@ def find_neural(used: str | None, options: EngineOptions, limit: float) -> Neura
 
 
 def _find_package_fault(env: Mapping[str, str]) -> tuple[str, str] | None:
-    """Return a message about the first package that is missing or can't be imported, and the next step."""
+    """Find a package that is missing or can't be imported. Return an error message and the next step, or None."""
     missing = models.missing_package()
     if missing is not None:
         return _split_step(missing)
     env = {**env, **models.NO_TELEMETRY}
-    for package in reversed(install.NEURAL_PACKAGES):  # onnxruntime imports numpy, so numpy is first
+    for package in reversed(install.NEURAL_PACKAGES):  # numpy is first, because onnxruntime imports it
         output = run_program(sys.executable, "-c", _IMPORT_PROGRAM + package, env=env, limit=_IMPORT_LIMIT_S)
         if output.error is not None:
             message = f"{_with_version(package)} cannot be imported: "
@@ -270,17 +275,20 @@ def _with_version(package: str) -> str:
 
 
 def _split_step(message: str) -> tuple[str, str]:
-    """Split a message into the fault and the next step after its last colon. The default step is another voice."""
+    """Split an error message into the fault and the next step, which follows the last colon.
+
+    The default step is to choose another voice.
+    """
     what, colon, step = message.rpartition(": ")
     return (what, step) if colon else (message, _CHOOSE_ESPEAK)
 
 
 def _try_voice(used: str, options: EngineOptions, limit: float) -> VoiceTrial:
-    """Load the voice and time a sentence. Nothing is played."""
+    """Load a voice, and measure how fast it speaks a sentence. Nothing is played."""
     try:
         with open(os.devnull, "wb") as output, start_engine(options, limit, output.fileno()) as engine:
             engine.wait_for(protocol.Ready)
-            ended, load_s = _speak(engine, used, "a")  # speaking a first text also loads the voice
+            ended, load_s = _speak(engine, used, "a")  # speaking for the first time also loads the voice
             began = time.monotonic()
             if ended.outcome == protocol.OUTCOME_COMPLETED:
                 ended, _ = _speak(engine, used, SENTENCE_TEXT)
@@ -295,9 +303,12 @@ def _try_voice(used: str, options: EngineOptions, limit: float) -> VoiceTrial:
 
 
 def _speak(engine: PrivateEngine, voice: str, text: str) -> tuple[protocol.Ended, float | None]:
-    """Speak a text, and return how it ended and the seconds that loading the voice took, or None."""
+    """Speak a text. Return how it ended, and the seconds it took to load the voice.
+
+    The loading time is None if the voice was not loaded during this call.
+    """
     load_s = None
-    # `voice_only`, so that espeak doesn't speak instead.
+    # Set `voice_only`, because otherwise espeak would speak if the voice isn't loaded.
     engine.speak(protocol.Speak(text, text, SENTENCE_RATE_WPM, 1.0, voice, 50, voice_only=True))
     while True:
         event = next(engine.events)
@@ -309,12 +320,15 @@ def _speak(engine: PrivateEngine, voice: str, text: str) -> tuple[protocol.Ended
 
 def _memory_of(pid: int) -> int | None:
     """Return the resident memory of a process in bytes, or None if it is unknown."""
-    statm = read_proc_file(f"/proc/{pid}/statm")  # the first two numbers are the total and the resident pages
+    statm = read_proc_file(f"/proc/{pid}/statm")  # the second number is the count of resident pages
     return int(statm.split()[1]) * os.sysconf("SC_PAGE_SIZE") if statm else None
 
 
 def judge_server_voices(voices: dict[str, Any]) -> list[Finding]:
-    """Judge the neural voices of a server whose files can't be examined, from its own `neural_voices`."""
+    """Return the findings about the neural voices of a server whose files can't be examined.
+
+    `voices` is the server's description of its neural voices.
+    """
     failed = _failed_voices(voices)
     loaded = tuple(each for each in voices if each not in failed)
     for voice, why in failed.items():
@@ -324,17 +338,17 @@ def judge_server_voices(voices: dict[str, Any]) -> list[Finding]:
 
 
 def _failed_voices(voices: dict[str, Any]) -> dict[str, str]:
-    """Return the voices that a server could not load, and why."""
+    """Return the voices that the server could not load, with the reason for each."""
     return {voice: str(each.get("why")) for voice, each in voices.items() if each.get("state") == "failed"}
 
 
 def judge_neural(neural: NeuralVoices, *, has_server: bool, server_voices: dict[str, Any]) -> list[Finding]:
-    """Judge the packages and files of neural voices, and the voice in use.
+    """Return the findings about the packages and files of neural voices, and about the voice in use.
 
     Args:
-        neural: the facts.
+        neural: the facts about neural voices.
         has_server: whether a server runs. It speaks with espeak if a neural voice fails.
-        server_voices: the server's own `neural_voices`, or empty.
+        server_voices: the server's description of its neural voices, which is empty if there is no server.
     """
     trial = neural.trial
     broken = warning if has_server or neural.used is None else failure
@@ -352,7 +366,7 @@ def judge_neural(neural: NeuralVoices, *, has_server: bool, server_voices: dict[
     if trial is None:
         return found
     if trial.speed is not None and _failed_voices(server_voices):
-        return [*found, *judge_server_voices(server_voices)]  # the voice works here, but the server could not load it
+        return [*found, *judge_server_voices(server_voices)]  # only the server failed to load the voice
     if trial.speed is None:
         message, step = trial.fault
         return [*found, broken(_NEURAL_CHECK, f"{neural.used} is in use: {message}", step)]
@@ -360,7 +374,7 @@ def judge_neural(neural: NeuralVoices, *, has_server: bool, server_voices: dict[
 
 
 def _judge_speed(words: str, trial: VoiceTrial, speed: float) -> Finding:
-    """Judge whether a voice that works is fast enough for this machine."""
+    """Return the finding about the speed of a voice on this machine."""
     facts = [] if trial.load_s is None else [f"loaded in {trial.load_s:.1f} s"]
     facts.append(f"makes a sentence {speed:.1f} times as fast as it is heard")
     facts += [] if trial.memory_bytes is None else [f"takes {trial.memory_bytes / 1e6:.0f} MB with its engine"]

@@ -1,4 +1,4 @@
-"""The messages between client and server: lines of bytes, requests, events and replies.
+"""The messages that clients and servers exchange: requests, replies and events.
 
 This package only defines the form of messages. It decides nothing, opens nothing and waits for nothing. It may import
 `goals` and the flat modules of `talkcli`. A new request is a class with a row for each of its fields. A new event or

@@ -1,4 +1,4 @@
-"""The messages of a server and their JSON form: the greeting, replies with their lists, and events.
+"""The messages that a server sends, and their JSON form.
 
 Rules for this file: it only defines the form of messages, without I/O. `to_json` returns the object for the wire, and
 the commands print the same object. A field means the same in each event. Fields may be added, but never renamed or
@@ -26,13 +26,13 @@ PROTOCOL = 1
 class ServerStatus:
     """The state of a server and its goals."""
 
-    #: the server's description of itself, which the wire's document lists under `server`
+    #: the server's description of itself
     server: JsonObject
     #: the goal that is ACTIVE or PREEMPTING
     active: Goal | None
-    #: in the order in which they will be spoken
+    #: the pending goals, in the order in which they will be spoken
     pending: tuple[Goal, ...]
-    #: the goals that ended last, oldest first
+    #: the most recently ended goals, oldest first
     recent: tuple[Goal, ...]
 
     def to_json(self) -> JsonObject:
@@ -45,7 +45,7 @@ class ServerStatus:
 
     @classmethod
     def from_json(cls, message: JsonObject) -> ServerStatus:
-        """Return the status in an object. Raises Unreadable if one of its goals is malformed."""
+        """Read a status from its JSON object. Raises Unreadable if one of the goals is malformed."""
         server, pending, recent = message.get("server"), message.get("pending"), message.get("recent")
         return cls(
             server if isinstance(server, dict) else {},
@@ -56,43 +56,43 @@ class ServerStatus:
 
     @classmethod
     def from_reply(cls, reply: JsonObject, items: list[JsonObject]) -> ServerStatus:
-        """Return the status in a reply and in the lines of the list before it."""
+        """Read a status from a reply and from the list items that preceded the reply."""
         lists = {name: [each[name] for each in items if name in each] for name in ("pending", "recent")}
         return cls.from_json({**reply, **lists})
 
 
 def unfinished(status: ServerStatus) -> list[Goal]:
-    """Return the goals of a status that have not ended: the active goal, then the pending goals in their order."""
+    """Return the active goal, followed by the pending goals in their order."""
     return [*([status.active] if status.active else []), *status.pending]
 
 
 @frozen
 class Canceled:
-    """The effect of a cancel."""
+    """The result of a cancel request."""
 
-    #: the goals that the cancel ended
+    #: the goals that were cancelled
     canceled: tuple[Goal, ...]
-    #: goals that the request named, but that had ended before
+    #: goals that were named in the request, but had already ended
     ended: tuple[Goal, ...]
 
     @classmethod
     def from_items(cls, items: list[JsonObject]) -> Canceled:
-        """Return the effect that the lines of a cancel's list describe."""
+        """Read the result from the list items of the server's answer."""
         return cls(tuple(goals(items, "canceled")), tuple(goals(items, "ended")))
 
 
 @frozen
 class StateChanged:
-    """A change of a goal's state."""
+    """Event sent when a goal's state changes."""
 
     id: str
     state: State
     #: the time of the event, in seconds since 1970 UTC
     at: float | None = None
-    #: the number of the event. Missing numbers belong to events for other clients, or to words that were dropped
+    #: the number of the event. A number is skipped if its event was for another client, or if a word was dropped
     #: because this client reads slowly.
     n: int | None = None
-    #: the whole goal, for clients that watch all goals. It comes with the first and the last state.
+    #: the whole goal. Only clients that watch all goals receive it, with the goal's first and last state.
     goal: Goal | None = None
 
     def to_json(self) -> JsonObject:
@@ -102,16 +102,16 @@ class StateChanged:
 
 @frozen
 class WordHeard:
-    """The beginning of a word that is being heard."""
+    """Event sent when a word begins to be heard."""
 
     id: str
     word: str
-    #: position of the word in the goal's text, in characters: the word is `text[start:end]`
+    #: position of the word in the goal's text: the word is `text[start:end]`
     start: int
     end: int
-    #: 1 for the first word of the goal that was heard
+    #: the word's number: 1 for the goal's first word that is heard
     number: int
-    #: seconds since the goal's sound began
+    #: seconds since the beginning of the goal's sound
     time: float
     at: float | None = None
     n: int | None = None
@@ -122,12 +122,12 @@ class WordHeard:
 
 @frozen
 class PausedChanged:
-    """The beginning or the end of a pause of all speech."""
+    """Event sent when all speech is paused or resumed."""
 
     paused: bool
-    #: the goal that is paused or goes on, or None if nothing was being spoken
+    #: id of the paused or resumed goal, or None if nothing was being spoken
     id: str | None = None
-    #: the client that asked for the change
+    #: the client that paused or resumed speech
     by: By | None = None
     at: float | None = None
     n: int | None = None
@@ -138,7 +138,7 @@ class PausedChanged:
 
 @frozen
 class Result:
-    """The end of a goal."""
+    """Event sent when a goal has ended."""
 
     goal: Goal
 
@@ -148,7 +148,7 @@ class Result:
 
 @frozen
 class Snapshot:
-    """The state of the server and its goals at the moment when a client starts to watch."""
+    """Event sent when a client starts to watch. It has the state of the server and of all goals."""
 
     status: ServerStatus
 
@@ -158,13 +158,18 @@ class Snapshot:
 
 Event = StateChanged | WordHeard | PausedChanged | Result | Snapshot
 
-#: The events that have the same fields as their messages. The message of a snapshot has the fields of its status.
+#: Event classes whose fields are also the fields of their messages. Snapshot is missing, because its message has the
+#: fields of the status instead.
 _EVENTS_BY_KIND: dict[str, type[Event]]
 _EVENTS_BY_KIND = {"state": StateChanged, "word": WordHeard, "paused": PausedChanged, "result": Result}
 
 
 def from_json(message: JsonObject) -> Event | None:
-    """Return the event in a message, or None if its kind is unknown. Raises Unreadable if a field is malformed."""
+    """Read an event from its message. Return None if the kind of event is unknown.
+
+    Raises:
+        Unreadable: a field is malformed.
+    """
     kind = str(message.get("event"))
     if kind == "snapshot":
         return Snapshot(ServerStatus.from_json(message))
@@ -174,7 +179,7 @@ def from_json(message: JsonObject) -> Event | None:
     found = read_fields(event, message)
     for name, annotation in event.__annotations__.items():
         value = message.get(name)
-        # A time that no calendar can show counts as missing, as in a goal. The rest of the event is still valid.
+        # A time that is out of a calendar's range is treated as missing. The rest of the event is still valid.
         missing = value is None or (annotation.startswith("float") and type(value) in (int, float))
         if name not in found and not (missing and annotation.endswith(" | None")):
             raise Unreadable(f"the {name!r} of a {kind!a} event is {value!a}")
@@ -182,28 +187,28 @@ def from_json(message: JsonObject) -> Event | None:
 
 
 def _numbered(kind: str, event: StateChanged | WordHeard | PausedChanged) -> JsonObject:
-    """Return an event as an object without its goal: the kind first, the number and the time last."""
+    """Return an event's JSON object, without its goal."""
     own = {name: value for name, value in fields(event).items() if name not in {"at", "n", "goal"}}
     return {"event": kind, **own, "n": event.n, "at": event.at}
 
 
 def goals(items: list[JsonObject], name: str) -> Iterator[Goal]:
-    """Yield the goals with this name in the lines of a list. Raises Unreadable if a goal is malformed."""
+    """Yield the goals that list items contain in the field `name`. Raises Unreadable if a goal is malformed."""
     return (Goal.from_json(each[name]) for each in items if name in each)
 
 
 def goal_in(reply: JsonObject, name: str = "goal") -> Goal | None:
-    """Return the goal in a reply, or None if it is null. Raises Unreadable if the goal is malformed."""
+    """Read a goal from a reply, or return None if the field is null. Raises Unreadable if the goal is malformed."""
     return None if reply.get(name) is None else Goal.from_json(reply[name])
 
 
 def greeting(version: str, pid: int, boot: str) -> JsonObject:
-    """Return the first message of a server."""
+    """Return the greeting, which is the first message that a server sends."""
     return {"talk": PROTOCOL, "version": version, "pid": pid, "boot": boot, "features": []}
 
 
 def busy_greeting(message: str | None = None) -> JsonObject:
-    """Return the greeting of a server that has too many clients.
+    """Return the greeting that refuses a client, because the server has too many clients.
 
     `message` gives the reason and the next step. It is None if the server has reached `--max-clients`.
     """
@@ -211,7 +216,7 @@ def busy_greeting(message: str | None = None) -> JsonObject:
 
 
 def check_greeting(message: JsonObject, version: str) -> None:
-    """Raise ProtocolMismatch or Busy if a client of this version can't go on after a greeting."""
+    """Raise ProtocolMismatch or Busy if a greeting shows that this client can't use the server."""
     theirs = message.get("talk")
     if theirs != PROTOCOL or isinstance(theirs, bool):
         server = ascii(message.get("version", "unknown"))
@@ -223,13 +228,13 @@ def check_greeting(message: JsonObject, version: str) -> None:
         )
     if message.get("error") == "busy":
         words = message.get("message")
-        if not (isinstance(words, str) and words and words.isprintable()):  # unsafe on a terminal
+        if not (isinstance(words, str) and words and words.isprintable()):  # not safe to show on a terminal
             words = "the server has as many clients as it takes (`talk serve --max-clients`)"
         raise Busy(words, "busy")
 
 
 def item(seq: int | None, **fields: object) -> JsonObject:
-    """Return a line of a list, which comes before the reply."""
+    """Return the message for one item of a list. The items are sent before the reply."""
     return fields if seq is None else {"seq": seq, **fields}
 
 
@@ -244,7 +249,7 @@ def failure(seq: int | None, code: str, message: str) -> JsonObject:
 
 
 def take_seq(message: JsonObject) -> int | None:
-    """Remove the number from a request, and return it or None. Raises BadRequest if it isn't an integer."""
+    """Remove the `seq` number from a request, and return it. Raises BadRequest if it isn't an integer."""
     seq = message.pop("seq", None)
     if seq is not None and (isinstance(seq, bool) or not isinstance(seq, int)):
         raise BadRequest('"seq" must be an integer', "bad_field")

@@ -1,4 +1,4 @@
-"""Lines of JSON in UTF-8, one object per line: how a stream is split into lines, and how a line is read and written.
+"""Read and write JSON lines, which have one object per line.
 
 Rules for this file: no I/O. It knows lines and their limits, but not what a request means. Any received bytes become an
 object or a BadRequest. The functions that need `json` or the errors import them, for two reasons: a client writes its
@@ -18,21 +18,21 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
     from talkcli.protocol.requests import Request
 
-#: Length limit for a request, including its newline. The longest text has 40,000 bytes of UTF-8. A text of 10,000
-#: characters also fits if all of them are escaped as \uXXXX.
+#: Maximum length of a request, including its newline. The longest text has 10,000 characters, which take 40,000 bytes
+#: of UTF-8, or 60,000 bytes if all of them are escaped as \uXXXX.
 MAX_LINE_BYTES = 64 * 1024
 
 #: The number of the first request on a connection.
 FIRST_NUMBER = 1
 
-#: Length limit for a JSON integer. No count or time is longer, and converting thousands of digits takes quadratic time.
+#: Maximum number of digits in a JSON integer. Converting thousands of digits would take quadratic time.
 MAX_DIGITS = 20
 
 
 class TruncatedLine(bytes):
     """The beginning of a line that is longer than the limit of its `LineSplitter`."""
 
-    #: length of the whole line in bytes
+    #: length of the complete line in bytes
     size: int
 
 
@@ -48,7 +48,10 @@ class LineSplitter:
         self.size = 0
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Return the lines that are complete now, without their newlines. Lines that are too long are truncated."""
+        """Add received bytes, and return the lines that are now complete, without their newlines.
+
+        A line that is too long is truncated.
+        """
         *lines, rest = data.split(b"\n")
         for place, line in enumerate(lines):
             if self.size or len(line) > self._max_bytes:
@@ -58,7 +61,7 @@ class LineSplitter:
         return lines
 
     def take_rest(self) -> bytes:
-        """Return the incomplete line as if it ended here, or b"" if there is none."""
+        """Remove and return the incomplete line, or return b"" if there is none."""
         line = bytes(self._rest)
         if self.size > self._max_bytes:
             line = TruncatedLine(line)
@@ -73,7 +76,7 @@ class LineSplitter:
 
 
 def write_request(request: Request) -> JsonObject:
-    """Return a request as an object for the wire, without the fields that have their default value."""
+    """Return a request's JSON object, without the fields that have their default value."""
     message: JsonObject = {"request": request.kind}
     for option in request.options:
         value = getattr(request, option.name)
@@ -83,7 +86,7 @@ def write_request(request: Request) -> JsonObject:
 
 
 def request_line(message: JsonObject) -> bytes:
-    """Return an object as a line, like `encode`, but without importing `json` if all values are plain."""
+    """Encode an object as a line of JSON, without importing `json` if all values are simple."""
     try:
         shown = ", ".join(f'"{name}": {_plain(value)}' for name, value in message.items())
         return f"{{{shown}}}\n".encode()
@@ -92,11 +95,11 @@ def request_line(message: JsonObject) -> bytes:
 
 
 def _plain(value: object) -> str:
-    """Return a value as JSON. Raises TypeError if only `json` can write it."""
+    """Encode a simple value as JSON. Raises TypeError if the value needs the `json` module."""
     if isinstance(value, str):
         if value.isprintable() and '"' not in value and "\\" not in value:
             return f'"{value}"'
-        from _json import encode_basestring  # a shared library, which most texts don't need
+        from _json import encode_basestring  # slow to load, and most texts don't need it
 
         return encode_basestring(value)
     if isinstance(value, bool):
@@ -111,7 +114,7 @@ def _plain(value: object) -> str:
 
 
 def encode(message: JsonObject) -> bytes:
-    """Return an object as a line. Raises ValueError or TypeError if it has no JSON form.
+    """Encode an object as a line of JSON. Raises ValueError or TypeError if that is impossible.
 
     Text is written as UTF-8. Only lone surrogates, which UTF-8 can't hold, are escaped.
     """
@@ -123,7 +126,7 @@ def encode(message: JsonObject) -> bytes:
 
 
 def decode(line: bytes) -> JsonObject:
-    """Return the object in a line. Raises BadRequest if there is none. Its code gives the reason."""
+    """Decode the JSON object in a line. Raises BadRequest if the line is malformed."""
     from talkcli.errors import BadRequest, LineTooLong
 
     if isinstance(line, TruncatedLine):
@@ -141,13 +144,13 @@ def decode(line: bytes) -> JsonObject:
     return value
 
 
-#: Functions that write and read JSON. If `json.dumps` and `json.loads` have options, they make new functions for each
-#: line. This takes half as long as writing the line of an event.
+#: Functions that encode and decode JSON. They are created once, because `json.dumps` and `json.loads` create new ones
+#: for every call that has options, which is slow.
 _json_functions: dict[str, Callable[[Any], Any]] = {}
 
 
 def _json(name: str) -> Callable[[Any], Any]:
-    """Return the function with this name: `decode`, `encode` or `escape`. The first call makes all three."""
+    """Return the JSON function called `decode`, `encode` or `escape`. The first call creates all three."""
     if not _json_functions:
         import json
 
@@ -184,5 +187,5 @@ def _number(digits: str) -> float:
 
 
 def _finite(number: float) -> bool:
-    """Return whether a number is neither NaN nor infinite."""
+    """Return whether a number is finite."""
     return number - number == 0

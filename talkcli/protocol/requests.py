@@ -1,4 +1,4 @@
-"""The requests of a client as frozen values, and how they are read from JSON.
+"""The requests that a client can send, and how they are read from JSON.
 
 Rules for this file: it only defines the form of requests. The scheduler decides whether a goal is admitted. A request
 is a class with a row for each of its fields. The classes of `say`, `cancel` and `set` are in `goals.options`. Fields
@@ -64,7 +64,7 @@ class Hello:
 
 @frozen
 class Wait:
-    """A request for the results of goals, whoever sent them."""
+    """A request for the results of goals, which other clients may have sent."""
 
     kind: ClassVar[str] = "wait"
     meaning: ClassVar[str] = "Send the results of these goals, whoever sent them"
@@ -143,7 +143,11 @@ _OPTIONS_BY_KIND = {kind: {each.name: each for each in request.options} for kind
 
 
 def read_request(message: JsonObject) -> Request:
-    """Return the request in a decoded line without its `seq`. Raises BadRequest, with a code, if it is malformed."""
+    """Read a request from its JSON object, from which `seq` has been removed.
+
+    Raises:
+        BadRequest: the request is malformed.
+    """
     fields = dict(message)
     kind = fields.pop("request", None)
     if not isinstance(kind, str):
