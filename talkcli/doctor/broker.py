@@ -52,7 +52,7 @@ _ECHO_PAYLOAD = b"doctor"
 #: A warning is shown if the certificate expires within this time.
 _RENEWAL_LIMIT_S = 14 * 86400
 _NO_ANSWER = "no answer"
-#: The next step for each reason why the broker can't be reached.
+#: What to suggest to the user for each reason why the broker can't be reached.
 _UNREACHABLE_STEPS = {
     "connection refused": "on {host}: systemctl status mosquitto; others than {host} reach it where its mosquitto.conf "
     "has a line 'listener {port}'",
@@ -424,7 +424,7 @@ def judge_unknown(robot: str, known: tuple[str, ...], name: str, *, privileged: 
         robot: the robot's name.
         known: the names of the robots that the broker knows.
         name: the user's name.
-        privileged: whether the user has all other rights.
+        privileged: whether the user has all other access rights.
     """
     words = f"the broker knows no robot '{robot}'"
     by_lower = {each.lower(): each for each in known}

@@ -28,7 +28,7 @@ PASSWORD_FILE = "TALK_MQTT_PASSWORD_FILE"
 CA = "TALK_MQTT_CA"
 CERT = "TALK_MQTT_CERT"
 KEY = "TALK_MQTT_KEY"
-#: Whether the connection uses TLS, and the default port, by URL scheme.
+#: For each URL scheme, whether it uses TLS, and its default port.
 _SCHEMES = {"mqtt": (False, 1883), "mqtts": (True, 8883)}
 #: Maximum length of a password in MQTT.
 _MAX_PASSWORD_BYTES = 65_535
@@ -36,7 +36,7 @@ _MAX_PASSWORD_BYTES = 65_535
 
 @frozen
 class Broker:
-    """A broker's address and the login for it."""
+    """The address of a broker, and the credentials for logging in."""
 
     host: str
     port: int
@@ -44,7 +44,7 @@ class Broker:
     #: the user name; None for an anonymous login, or if the certificate contains the user name
     user: str | None = None
     password: str | None = None
-    #: path of the CA certificate that verifies the broker; None for the system's CAs
+    #: path of the CA certificate for checking the broker; None to use the system's CAs
     ca: str | None = None
     #: path of the client's certificate
     cert: str | None = None
@@ -58,10 +58,10 @@ class Broker:
         return f"{'mqtts' if self.tls else 'mqtt'}://{host}:{self.port}"
 
     def ssl_context(self) -> ssl.SSLContext | None:
-        """Return the TLS settings, or None if the connection doesn't use TLS.
+        """Create an SSL context, or return None if the connection doesn't use TLS.
 
         Raises:
-            UsageError: the file of a certificate or key is unusable.
+            UsageError: a certificate or key file is unusable.
         """
         if not self.tls:
             return None
@@ -78,7 +78,7 @@ class Broker:
 
 
 def from_environment(environment: Mapping[str, str], *, insecure: bool = False) -> Broker:
-    """Return the broker described by environment variables.
+    """Read the broker's address and credentials from environment variables.
 
     Args:
         environment: the variables.
@@ -115,10 +115,12 @@ def require_paho() -> None:
 
 
 def client_user(broker: Broker) -> str:
-    """Return the user name for topics: the user name of the login, or else the name of the local user.
+    """Return the user name to use in topics.
+
+    This is the user name of the login, or the name of the local user if the login has none.
 
     Raises:
-        UsageError: the name can't be a level of a topic.
+        UsageError: the name isn't allowed in a topic.
     """
     name = broker.user
     if name is None:
@@ -133,7 +135,7 @@ def client_user(broker: Broker) -> str:
 
 
 def _parse_url(url: str) -> tuple[str, int, bool]:
-    """Return the host, the port, and whether to use TLS.
+    """Split a broker's URL into the host, the port, and whether to use TLS.
 
     Error messages don't show the whole URL, because it may contain a password.
 
@@ -142,7 +144,7 @@ def _parse_url(url: str) -> tuple[str, int, bool]:
     """
     try:
         parts = urlsplit(url)
-    except ValueError:  # the original message contains the URL, so it isn't shown
+    except ValueError:  # the original message shows the URL, which may contain a password
         raise UsageError(f"{URL} is no URL: write mqtts://HOST or mqtt://HOST") from None
     if parts.scheme not in _SCHEMES:
         raise UsageError(
@@ -179,7 +181,7 @@ def _read_password(path: str) -> str:
 
 
 def is_local(host: str) -> bool:
-    """Return whether a host is this machine, so that nobody else can read the traffic."""
+    """Return whether a host name or address refers to this machine."""
     if host == "localhost":
         return True
     try:
@@ -193,7 +195,7 @@ def _no_passphrase() -> str:
 
 
 def _file_error(path: str | None, error: Exception) -> str:
-    """Return an error message about a file that can't be used."""
+    """Return a message that explains why a file can't be used."""
     if isinstance(error, ssl.SSLError):
         return f"{printable(str(path))} is not what it should be: {error.reason or error}"
     words = error.strerror if isinstance(error, OSError) else str(error)

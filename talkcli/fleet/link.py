@@ -1,8 +1,8 @@
-"""A connection to the broker through paho-mqtt, without an event loop or thread.
+"""A connection to the broker, based on paho-mqtt, that needs no event loop and no thread.
 
 The owner polls the connection's descriptor, and calls `read`, `write` and `tick`. A link is never reconnected, because
-paho would resend unacknowledged messages, and one of them may be an outdated sentence. Create a new link instead. This
-module doesn't interpret payloads.
+paho would resend unacknowledged messages, and the robot might speak an outdated sentence. Create a new link instead.
+This module doesn't interpret payloads.
 """
 
 from __future__ import annotations
@@ -36,40 +36,43 @@ if TYPE_CHECKING:
 
     from talkcli.fleet.broker import Broker
 
-    #: Called with the reason code of a PUBACK.
+    #: Callback that receives the reason code of a PUBACK packet.
     OnAcknowledged = Callable[[int], None]
 
-#: MQTT's keepalive interval. The broker closes a connection after one and a half intervals without data.
+#: MQTT keepalive interval. The broker closes a connection if it receives nothing for one and a half intervals.
 KEEPALIVE_S = 10
-#: Time allowed for the broker to answer the login.
+#: Time allowed for the broker to respond to a login.
 LOGIN_LIMIT_S = 5.0
-#: Interval between calls of `tick`.
+#: How often `tick` should be called.
 TICK_EVERY_S = 5.0
-#: Largest packet to send, including the header.
+#: Maximum size of a sent packet, including its header.
 MAX_PACKET_BYTES = 256 * 1024
-#: Space in a packet for everything except the payload, such as topics and properties.
+#: Space that is reserved in each packet for the topic and the properties.
 MAX_HEADER_BYTES = 1024
-#: Maximum number of unacknowledged QoS 1 messages. paho queues further messages, but ignores the limit that a broker
-#: announces. HiveMQ's cloud accepts 10, and other brokers accept more.
+#: Maximum number of unacknowledged QoS 1 messages. The broker announces its own limit, but paho ignores it. The lowest
+#: one is 10, on HiveMQ Cloud. paho queues further messages.
 _MAX_UNACKNOWLEDGED_MESSAGES = 10
-#: Highest receive maximum in MQTT, for a client that receives messages from all robots. By default, mosquitto sends 20
-#: unacknowledged messages and queues 1,000. It silently drops further messages, even retained ones.
+#: The highest receive maximum that MQTT allows. A client that receives messages from all robots needs it. By default,
+#: mosquitto queues only 1,000 messages for a client, and silently drops the rest, even retained messages.
 MAX_RECEIVE_COUNT = 65_535
-# MQTT 5 reason codes. REASON_FAILURE is the lowest code of a failure.
+# MQTT 5 reason codes. All codes from REASON_FAILURE upwards are failures.
 _REASONS_DENIED = (0x86, 0x87, 0x8A, 0x8C)
 _REASON_UNSUPPORTED_PROTOCOL = 0x84
 REASON_FAILURE, REASON_NOT_AUTHORIZED = 0x80, 0x87
-#: Values of SO_LINGER. Closing usually discards unsent data, so that a delayed sentence can't arrive minutes later.
+#: Values for SO_LINGER. A closed link usually discards unsent data, so that a sentence can't arrive minutes late.
 _LINGER_DISCARD, _LINGER_DELIVER = struct.pack("ii", 1, 0), struct.pack("ii", 0, 0)
 
 
 def boottime() -> float:
-    """Return the seconds since the machine started. On Linux, this includes the time in suspend."""
+    """Return the seconds since the machine booted. On Linux, this includes time spent suspended."""
     return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
 
 class Link:
-    """A connection to the broker. Any thread may use it. The thread that calls `read` runs the callbacks."""
+    """A connection to the broker.
+
+    Any thread may use it. Callbacks run in the thread that calls `read`.
+    """
 
     def __init__(
         self,
@@ -80,39 +83,39 @@ class Link:
         max_packet_bytes: int = MAX_PACKET_BYTES,
         receive_maximum: int | None = None,
     ) -> None:
-        """Prepare a connection without opening it.
+        """Create a link that isn't connected yet.
 
         Args:
             broker: the broker's address and login.
-            client_id: unique name of this connection.
+            client_id: the MQTT client id, which must be unique.
             on_message: called with each received message.
             will: retained message that the broker publishes if the connection breaks.
             max_packet_bytes: largest packet that the broker may send.
             receive_maximum: how many unacknowledged QoS 1 messages the broker may send; None for the broker's default.
 
         Raises:
-            UsageError: the file of a certificate or key is unusable.
+            UsageError: a certificate or key file is unusable.
         """
         self._broker = broker
         self._deliver = on_message
         self._max_packet_bytes = max_packet_bytes
         self._receive_maximum = receive_maximum
-        #: why the connection has ended; None until then
+        #: why the connection has ended; None if it hasn't
         self.ended: str | None = None
         #: total size of the unsent and unacknowledged messages
         self.outstanding_bytes = 0
-        #: largest payload that the broker accepts
+        #: size of the largest payload that the broker accepts
         self.max_payload_bytes = MAX_PACKET_BYTES - MAX_HEADER_BYTES
         #: size and callback of each unacknowledged message, by message id
         self._unacknowledged: dict[int, tuple[int, OnAcknowledged | None]] = {}
-        #: the broker's answer to the login
+        #: the broker's response to the login; None until it arrives
         self._answer: ReasonCode | None = None
-        #: the TLS alert that the broker sent during the login
+        #: the TLS alert that the broker sent during the login; "" if it sent none
         self._alert = ""
-        #: held during calls of paho, because TLS can't be read and written at the same time
+        #: held while paho runs, because a TLS connection can't be read and written at the same time
         self._lock = threading.RLock()
-        #: whether paho is reading and may call `_on_message`. If a callback wrote to a broken connection, paho would
-        #: wait for itself.
+        #: whether paho is reading. Nothing is written then, because paho would deadlock if a callback wrote to a broken
+        #: connection.
         self._delivering = False
         self._socket: socket.socket | None = None
         self._paho = paho.Client(
@@ -133,7 +136,7 @@ class Link:
         self._paho.on_log = self._on_log
 
     def open(self) -> None:
-        """Connect, log in, and wait for the broker's answer.
+        """Connect to the broker and log in.
 
         Raises:
             ServerUnavailable: no broker answers.
@@ -156,18 +159,18 @@ class Link:
             raise AccessDenied(f"{words}; TALK_MQTT_CA names the file of the CA that it is of") from error
         except ssl.SSLError as error:
             raise ServerUnavailable(f"no TLS with the broker at {url}: {error.reason or error}") from error
-        except (OSError, ValueError) as error:  # ValueError: an invalid host name
+        except (OSError, ValueError) as error:  # ValueError means that the host name is invalid
             why = error.strerror if isinstance(error, OSError) else None
             raise ServerUnavailable(f"no broker at {url}: {why or error}") from error
         found = self._paho.socket()
-        if isinstance(found, socket.socket):  # otherwise the broker has already closed the connection
+        if isinstance(found, socket.socket):  # there is no socket if the broker has already closed the connection
             self._socket = found
             try:
-                # Without this, Nagle's algorithm delays messages by 40 ms.
+                # Nagle's algorithm would delay messages by 40 ms.
                 found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 found.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER_DISCARD)
             except OSError:
-                pass  # macOS: the broker has reset the connection, and the first read will report that
+                pass  # on macOS, this fails if the broker has reset the connection (the first read reports it)
         end = time.monotonic() + LOGIN_LIMIT_S
         while self._answer is None and self.ended is None and (left := end - time.monotonic()) > 0:
             events = select.POLLIN | (select.POLLOUT if self.wants_write else 0)
@@ -178,16 +181,16 @@ class Link:
             raise login_error
 
     def fileno(self) -> int:
-        """Return the descriptor to poll, or -1 after the end of the connection."""
+        """Return the file descriptor to poll, or -1 if the connection has ended."""
         return -1 if self._socket is None else self._socket.fileno()
 
     @property
     def wants_write(self) -> bool:
-        """Whether unsent data is waiting for the descriptor to become writable."""
+        """Whether there is data to send once the descriptor becomes writable."""
         return self.ended is None and bool(self._paho.want_write())
 
     def read(self) -> None:
-        """Read available data without waiting, and pass each message to `on_message`."""
+        """Read all available data without blocking, and call `on_message` with each message."""
         with self._lock:
             while self.ended is None:
                 self._delivering = True
@@ -196,20 +199,24 @@ class Link:
                 finally:
                     self._delivering = False
                 if self.ended is None and self._socket is not None and hasattr(socket, "TCP_QUICKACK"):
-                    # Linux delays TCP acknowledgements by 40 ms, and Nagle's algorithm in the broker waits for them.
+                    # Linux would delay the TCP acknowledgement by 40 ms, and the broker might wait for it before it
+                    # sends more.
                     self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
                 if not self._tls_pending():
                     break
             self.write()
 
     def write(self) -> None:
-        """Send as much unsent data as possible without waiting. During `on_message`, leave this to `read`."""
+        """Send as much data as possible without blocking.
+
+        During `on_message`, this does nothing. `read` sends the data afterwards.
+        """
         with self._lock:
             if self.wants_write and not self._delivering:
                 self._paho.loop_write()
 
     def tick(self) -> None:
-        """Send and check keepalive messages. Call this every `TICK_EVERY_S`."""
+        """Send keepalive messages, and check that the broker answers them. Call this every `TICK_EVERY_S` seconds."""
         with self._lock:
             if self.ended is None:
                 self._paho.loop_misc()
@@ -226,7 +233,7 @@ class Link:
         correlation: bytes | None = None,
         acknowledged: OnAcknowledged | None = None,
     ) -> bool:
-        """Publish a message. Return False if the connection has ended, otherwise True.
+        """Publish a message, and return whether the connection was still open.
 
         Args:
             topic: the topic, without wildcards.
@@ -253,7 +260,7 @@ class Link:
         return True
 
     def size_error(self, line: bytes, kind: str) -> RequestRefused | None:
-        """Return an error if a request of this kind is longer than the broker accepts, or None if it fits."""
+        """Return an error if a request is too long for the broker, or None if it fits."""
         if len(line) <= self.max_payload_bytes:
             return None
         words = f"{kind} has {len(line):,} bytes, and the broker takes {self.max_payload_bytes:,}: nothing was sent"
@@ -264,7 +271,7 @@ class Link:
 
         Args:
             topics: the topics, which may contain wildcards.
-            retained: whether to receive the messages that the broker has retained before.
+            retained: whether to receive messages that the broker has already retained.
         """
         handling = SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE if retained else SubscribeOptions.RETAIN_DO_NOT_SEND
         options = SubscribeOptions(qos=1, retainAsPublished=True, retainHandling=handling)
@@ -274,7 +281,10 @@ class Link:
                 self.write()
 
     def close(self) -> None:
-        """Close the connection. If any message is unacknowledged, discard unsent data and don't send a DISCONNECT."""
+        """Close the connection.
+
+        If any message is unacknowledged, unsent data is discarded, and no DISCONNECT packet is sent.
+        """
         with self._lock:
             logged_in = self._answer is not None and not self._answer.is_failure
             if self.ended is None and self._socket is not None and logged_in and not self._unacknowledged:
@@ -287,18 +297,18 @@ class Link:
                 self._socket = None
 
     def drop(self) -> None:
-        """Close the descriptor in a forked child. The parent's connection stays open."""
+        """Close a forked child's copy of the descriptor. The parent process stays connected."""
         if self._socket is not None:
             os.close(self._socket.detach())
 
     # -- internals
 
     def _tls_pending(self) -> bool:
-        """Return whether TLS holds decrypted data, which polling the descriptor doesn't show."""
+        """Return whether the TLS layer holds decrypted data, which polling can't detect."""
         return isinstance(self._socket, ssl.SSLSocket) and self._socket.pending() > 0
 
     def _login_error(self) -> TalkError | None:
-        """Return an error if the login has failed, or None if the broker has accepted it."""
+        """Return an error if the login failed, or None if it succeeded."""
         url, answer = self._broker.url, self._answer
         if answer is None and self._broker.tls and (self._alert or self.ended):
             # With TLS 1.3, the client finishes its handshake before the broker checks the client's certificate. If the
@@ -324,7 +334,7 @@ class Link:
         self, _client: paho.Client, _data: object, _flags: object, code: ReasonCode, properties: Properties | None
     ) -> None:
         self._answer = code
-        # paho's log is needed only if the login fails. It would take a tenth of the processor time for each packet.
+        # Turn off paho's log, which is only needed to explain a failed login. It would use a tenth of the CPU time.
         self._paho.on_log = None
         limit = getattr(properties, "MaximumPacketSize", MAX_PACKET_BYTES)
         self.max_payload_bytes = max(0, min(MAX_PACKET_BYTES, limit) - MAX_HEADER_BYTES)
@@ -346,14 +356,14 @@ class Link:
             acknowledged(code.value)
 
     def _on_log(self, _client: paho.Client, _data: object, _level: int, words: str) -> None:
-        # With TLS 1.3, the alert for a missing client certificate arrives in the first read. paho only logs it.
+        # With TLS 1.3, the broker's alert about a missing certificate arrives in the first read, and paho only logs it.
         if "ALERT" in words and self._answer is None:
             self._alert = words.rpartition("] ")[2].partition(" (")[0]
 
 
 @lru_cache(maxsize=32)
 def _properties(expiry: float | None, response: str | None, correlation: bytes | None) -> Properties:
-    """Return the MQTT properties of a message. Cached, because paho creates them slowly."""
+    """Return the MQTT properties for a message. They are cached, because creating them is slow."""
     properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
     if expiry is not None:
         properties.MessageExpiryInterval = max(1, math.ceil(min(expiry, 2**31)))
@@ -368,7 +378,10 @@ class LinkOpener:
     """Opens a link in a thread, because `Link.open` blocks and can't be interrupted."""
 
     def __init__(self, link: Link, on_done: Callable[[], object]) -> None:
-        """Start opening the link. The thread calls `on_done` when it has finished, unless `cancel` was called."""
+        """Start to open the link in a new thread.
+
+        The thread calls `on_done` when it has finished, unless `cancel` was called before.
+        """
         self.link = link
         self.error: TalkError | None = None
         self.done = False
@@ -378,7 +391,7 @@ class LinkOpener:
         threading.Thread(target=self._open, name="talk: connecting", daemon=True).start()
 
     def cancel(self) -> None:
-        """Close the link now if it is open, or else as soon as it opens."""
+        """Close the link at once, or as soon as it has opened."""
         with self._lock:
             self._canceled = True
             if self.done:

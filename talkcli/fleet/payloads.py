@@ -1,4 +1,4 @@
-"""The messages of a fleet: presence, status, and the description of a robot for Home Assistant.
+"""The messages of a fleet: presence, status, and robots' descriptions for Home Assistant.
 
 Rules for this file: no I/O. Any client of the broker may have written a received payload, so invalid fields are treated
 as missing.
@@ -26,15 +26,15 @@ if TYPE_CHECKING:
 
 @frozen
 class Message:
-    """A message from the broker."""
+    """An MQTT message."""
 
     topic: str
     payload: bytes
     #: whether the publisher asked the broker to retain the message
     retained: bool = False
-    #: the topic for answers, if the sender named one
+    #: topic for the reply; None if the sender named none
     response: str | None = None
-    #: data that answers repeat, if the sender gave any
+    #: data that the reply must repeat; None if the sender gave none
     correlation: bytes | None = None
     #: seconds until the message expires; None if it never does
     expiry: int | None = None
@@ -42,27 +42,27 @@ class Message:
 
 @frozen
 class Presence:
-    """Whether a robot is online, and what its bridge last published about it."""
+    """A robot's presence: whether it is online, and details of its bridge and server."""
 
     name: str
     online: bool
     #: random id of the bridge process; "" if unknown
     session: str = ""
-    #: start time of the bridge, in seconds since 1970 UTC by the robot's clock; None if the robot is offline
+    #: when the bridge started, as a Unix timestamp by the robot's clock; None if the robot is offline
     since: float | None = None
     groups: tuple[str, ...] = ()
-    #: kinds of requests that the robot accepts over the broker
+    #: requests that remote clients may send to the robot, such as `say`
     allow: tuple[str, ...] = ()
-    #: boot id, pid and version of the robot's server; None if no server runs
+    #: boot id, pid and version of the robot's server; None if the server isn't running
     server: JsonObject | None = None
     #: version of the bridge; "" if the robot is offline
     version: str = ""
 
     @classmethod
     def read(cls, name: str, payload: bytes) -> Presence | None:
-        """Return the presence in a message, or None if the robot's name or the payload is invalid.
+        """Parse a presence message, or return None if the robot's name or the payload is invalid.
 
-        An empty payload, which clears a retained presence, is invalid, too.
+        An empty payload, which clears a retained presence, also counts as invalid.
         """
         said = _object(payload)
         if said is None or topics.name_fault(name):
@@ -87,7 +87,7 @@ class Presence:
 
 
 def bridge_rank(presence: Presence | None) -> tuple[float, str] | None:
-    """Return the rank of a bridge among bridges of the same robot, or None if the bridge is offline.
+    """Return a bridge's rank among the bridges with the same robot name, or None if it is offline.
 
     The bridge with the lowest rank keeps the robot's name. The others exit.
     """
@@ -105,13 +105,13 @@ class LastGoal:
     reason: str | None = None
     #: the goal's text; None if the robot keeps texts private
     text: str | None = None
-    #: end of the goal, in seconds since 1970 UTC by the robot's clock
+    #: when the goal ended, as a Unix timestamp by the robot's clock
     at: float | None = None
 
 
 @frozen
 class RobotStatus:
-    """A robot's active goal, its number of pending goals, and the goal that ended last."""
+    """A robot's active goal, the number of pending goals, and the goal that ended last."""
 
     #: id of the active goal; None if there is none
     active: str | None = None
@@ -124,7 +124,7 @@ class RobotStatus:
 
     @classmethod
     def read(cls, payload: bytes) -> RobotStatus | None:
-        """Return the status in a message, or None if the payload is empty or malformed."""
+        """Parse a status message, or return None if the payload is empty or malformed."""
         said = _object(payload)
         if said is None:
             return None
@@ -139,7 +139,7 @@ class RobotStatus:
         )
 
     def events(self) -> list[StateChanged]:
-        """Return the events that led to this status: the end of the last goal and the start of the active goal."""
+        """Convert the status to events: the end of the last goal, and the start of the active goal."""
         last, found = self.last, []
         if last:
             ended = Goal(last.id, last.state, last.text, last.reason, ended_at=last.at)
@@ -160,7 +160,7 @@ class RobotInfo:
     """A robot's presence and its latest status."""
 
     presence: Presence
-    #: the latest known status, which is kept while the robot is offline; None if unknown
+    #: the latest status, even if the robot is offline now; None if unknown
     status: RobotStatus | None
 
     def to_json(self) -> JsonObject:
@@ -170,7 +170,7 @@ class RobotInfo:
 
 
 def _object(payload: bytes) -> JsonObject | None:
-    """Return the JSON object in a payload, or None if the payload is anything else."""
+    """Decode a payload that contains a JSON object, or return None if it contains anything else."""
     try:
         return decode(payload.strip())
     except BadRequest:
@@ -190,9 +190,9 @@ def _texts(value: object) -> tuple[str, ...]:
 #: Payload that Home Assistant publishes on its status topic when it starts.
 HOMEASSISTANT_ONLINE = b"online"
 
-#: Template for the presence payload: whether the robot can speak now.
+#: Template that derives from the presence payload whether the robot can speak.
 _AVAILABLE = "{{ 'online' if value_json.online and value_json.server else 'offline' }}"
-# Templates for the status payload. Home Assistant shows the state `None` as unknown.
+# These templates extract values from the status payload. Home Assistant shows `None` as unknown.
 _STATE_TEMPLATE = "{{ 'paused' if value_json.paused else 'speaking' if value_json.active else 'idle' }}"
 _SPEAKING_TEMPLATE = "{{ 'ON' if value_json.active and not value_json.paused else 'OFF' }}"
 _PENDING_TEMPLATE = "{{ value_json.pending }}"
@@ -201,12 +201,12 @@ _LAST_ATTRIBUTES_TEMPLATE = "{{ (value_json.last or {}) | tojson }}"
 
 
 def homeassistant_device(name: str, allow: Collection[str], version: str) -> tuple[str, bytes]:
-    """Return the topic and the payload of the message that adds a robot to Home Assistant as a device.
+    """Create the message that adds a robot to Home Assistant, and return its topic and payload.
 
     Args:
         name: the robot's name.
-        allow: kinds of requests that the robot accepts. Components for other requests are sent without content, so that
-            Home Assistant removes them if they exist.
+        allow: requests that the robot accepts. The components for other requests are sent empty, so that Home Assistant
+            removes them.
         version: the bridge's version.
     """
     identifier = f"{topics.PREFIX}-{name}"
@@ -239,7 +239,7 @@ def homeassistant_device(name: str, allow: Collection[str], version: str) -> tup
 
 
 def _command(name: str, kind: str, platform: str, shown: str | None, *, allowed: bool) -> JsonObject:
-    """Return a component that sends a request to the robot, without content if the request isn't allowed."""
+    """Return a Home Assistant component that sends a request, or an empty one if the request isn't allowed."""
     if not allowed:
         return {"platform": platform}
     topic = topics.robot(name, kind, topics.HOMEASSISTANT)
@@ -247,6 +247,6 @@ def _command(name: str, kind: str, platform: str, shown: str | None, *, allowed:
 
 
 def _sensor(name: str, shown: str, template: str, platform: str = "sensor", **more: object) -> JsonObject:
-    """Return a component that shows part of the robot's status."""
+    """Return a Home Assistant component that shows part of the robot's status."""
     topic = topics.robot(name, topics.STATUS)
     return {"platform": platform, "name": shown, "state_topic": topic, "value_template": template, "qos": 1, **more}

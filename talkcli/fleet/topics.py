@@ -16,45 +16,45 @@ PREFIX = "talk"
 ROBOT_LEVEL, _GROUP, _REPLY = "robot", "group", "reply"
 #: The group that every robot belongs to.
 ALL_ROBOTS = "all"
-#: Wildcard for one level of a topic in a subscription.
+#: Wildcard that matches any single level of a topic in a subscription.
 ANY = "+"
-#: Placeholder for a robot's name in the topic that a desk publishes to itself. It is not a valid robot name.
+#: Placeholder for the robot's name in a topic on which a desk sends messages to itself. It isn't a valid robot name.
 MARKER = "_"
-#: Prefix of a remote client's name at the server, followed by the client's user name.
+#: The server knows a remote client by this prefix and the client's user name.
 REMOTE_PREFIX = "mqtt:"
-#: Maximum length of the name of a robot, a group or a user.
+#: Maximum length of a robot, group or user name.
 MAX_NAME_CHARS = MAX_SENDER_NAME_CHARS - len(REMOTE_PREFIX)
 _NAME_PATTERN = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{MAX_NAME_CHARS - 1}}}")
 
-# The levels below a robot's name. Clients publish requests on the first three.
+# Topic levels below a robot's name. Clients publish requests to the first three.
 REQUEST_LEVELS = REQUEST, PLAIN_SAY, PLAIN_CANCEL = "request", "say", "cancel"
 PRESENCE, STATUS, EVENT, ECHO = "presence", "status", "event", "echo"
 
-#: Home Assistant's user name at the broker, and the prefix of its own topics.
+#: Home Assistant's user name at the broker, and also the prefix of its topics.
 HOMEASSISTANT = "homeassistant"
 #: Topic on which Home Assistant publishes whether it is running.
 HOMEASSISTANT_STATUS = f"{HOMEASSISTANT}/status"
 
 
 def name_fault(name: str) -> str | None:
-    """Return why a name is invalid for a robot, a group or a user, or None if it is valid."""
+    """Return the reason why a robot, group or user name is invalid, or None if it is valid."""
     if _NAME_PATTERN.fullmatch(name):
         return None
     return f"must be 1 to {MAX_NAME_CHARS} of A-Z a-z 0-9 . _ -, the first of them a letter or a digit"
 
 
 def robot(name: str, *levels: str) -> str:
-    """Return the topic with these levels below a robot's name."""
+    """Build a topic from a robot's name and the levels below it."""
     return "/".join((PREFIX, ROBOT_LEVEL, name, *levels))
 
 
 def group(name: str, *levels: str) -> str:
-    """Return the topic with these levels below a group's name."""
+    """Build a topic from a group's name and the levels below it."""
     return "/".join((PREFIX, _GROUP, name, *levels))
 
 
 def reply(user: str, session: str, *robot_name: str) -> str:
-    """Return the topic on which a robot answers a user's session.
+    """Return the topic on which a robot replies to one session of a user.
 
     Without a robot's name, return the response topic for a request to a group.
     """
@@ -62,7 +62,7 @@ def reply(user: str, session: str, *robot_name: str) -> str:
 
 
 def homeassistant_device(name: str) -> str:
-    """Return the topic on which Home Assistant expects the description of a robot.
+    """Return the topic of a robot's device description for Home Assistant.
 
     The robot's name is a whole level, because a pattern in access rules can match a login only against a whole level.
     Home Assistant allows no dots in this level, so a name with a dot is escaped and put below a different level.
@@ -75,7 +75,7 @@ def homeassistant_device(name: str) -> str:
 
 @frozen
 class RequestTopic:
-    """The parts of a topic on which a client sends requests to a robot."""
+    """The parsed topic of a client's request."""
 
     #: REQUEST, PLAIN_SAY or PLAIN_CANCEL
     kind: str
@@ -84,7 +84,7 @@ class RequestTopic:
 
 
 def parse_request(topic: str) -> RequestTopic | None:
-    """Return the parts of a request topic, or None if it is another kind of topic."""
+    """Parse a request topic, or return None for any other topic."""
     levels = topic.split("/")
     if len(levels) != 5 or levels[0] != PREFIX or name_fault(levels[4]):
         return None
@@ -94,9 +94,9 @@ def parse_request(topic: str) -> RequestTopic | None:
 
 
 def checked_reply(response: str, user: str, robot_name: str) -> str | None:
-    """Return the topic on which a robot answers a user, or None if the response topic isn't the user's own.
+    """Return the topic for a robot's reply, or None if the client may not use its response topic.
 
-    This prevents users from making a robot publish to other users or on another robot's topic.
+    This prevents users from making a robot publish to other users or to another robot's topic.
     """
     levels = response.split("/")
     if levels[:3] != [PREFIX, _REPLY, user] or len(levels) not in (4, 5) or name_fault(levels[3]):

@@ -1,11 +1,11 @@
 """The bridge's connections to the robot's server.
 
-They are shells around the client core, and run in the event loop. They pass lines on without decoding them.
+They wrap the client core, run in the event loop, and return lines without decoding them.
 """
 
 from __future__ import annotations
 
-import _socket  # the type of the sockets that `connect.reach` returns
+import _socket  # `connect.reach` returns sockets of this module's type
 import asyncio
 import contextlib
 import random
@@ -27,12 +27,12 @@ _CHUNK_BYTES = 64 * 1024
 class LocalConnection(ClientCore):
     """A connection to the robot's server. Only one task at a time may read from it.
 
-    It doesn't use an asyncio transport, because creating one takes more than half as long as everything else that a new
-    connection needs. This matters when an operator cancels everything on a thousand robots.
+    It doesn't use an asyncio transport, because that would make a new connection take half as long again. This
+    matters when an operator cancels everything on a thousand robots.
     """
 
     def __init__(self, socket: _socket.socket, path: str) -> None:
-        """Use a non-blocking socket that is connected to the server at `path`."""
+        """Wrap a non-blocking socket that is already connected to the server at `path`."""
         self._loop = asyncio.get_running_loop()
         super().__init__(connect.ANSWER_LIMIT_S, self._loop.time())
         self.path = path
@@ -41,7 +41,7 @@ class LocalConnection(ClientCore):
         self._lines: list[bytes] = []
 
     async def greet(self, hello: JsonObject) -> None:
-        """Send a hello line, and wait for the server's greeting. If that fails, close the connection.
+        """Send `hello`, and wait for the server's greeting. Close the connection if this fails.
 
         Raises:
             ServerUnavailable, AccessDenied, ProtocolMismatch, Busy: the server can't be used.
@@ -66,7 +66,10 @@ class LocalConnection(ClientCore):
         self.connected(*identity(greeting), self._loop.time())
 
     async def read(self) -> list[bytes]:
-        """Wait for lines and return them without newlines, or return an empty list if the connection has ended."""
+        """Wait for lines, and return them without their newlines.
+
+        If the connection has ended, return an empty list.
+        """
         while not self._lines:
             await asyncio.sleep(0)  # let other tasks run even if data is always available
             try:
@@ -80,7 +83,7 @@ class LocalConnection(ClientCore):
         return lines
 
     def send(self, exchange: Exchange) -> bool:
-        """Send a request as soon as the server can receive it, or return False if it is too long."""
+        """Send a request. Return False if it is too long, otherwise True."""
         self.register(exchange, self._loop.time())
         line = self.line(exchange)
         if len(line) > MAX_LINE_BYTES:
@@ -88,12 +91,12 @@ class LocalConnection(ClientCore):
             return False
         with contextlib.suppress(ServerUnavailable):  # `read` will report the end of the connection
             self.queue(line, exchange)
-        if len(line) == self.unsent_bytes:  # otherwise the loop is already waiting to send
+        if len(line) == self.unsent_bytes:  # otherwise, the event loop is already waiting to send earlier lines
             self._flush()
         return True
 
     def close(self) -> None:
-        """Close the connection. A waiting `read` must be cancelled or ended with `abort` before.
+        """Close the connection. Before this, cancel a waiting `read`, or end it with `abort`.
 
         The server cancels the requests that it has not answered, if possible.
         """
@@ -103,12 +106,12 @@ class LocalConnection(ClientCore):
             self._socket.close()
 
     def abort(self) -> None:
-        """Shut the connection down, so that a waiting `read` returns. Its caller must then call `close`."""
+        """Shut down the connection, so that a waiting `read` returns. The reader must then call `close`."""
         with contextlib.suppress(OSError):
             self._socket.shutdown(_socket.SHUT_RDWR)
 
     def _flush(self) -> None:
-        """Send as much as possible without waiting. Send the rest when the socket becomes writable."""
+        """Send as much as possible without blocking. Send the rest when the socket becomes writable."""
         if self._socket.fileno() < 0:
             return
         try:
@@ -116,7 +119,7 @@ class LocalConnection(ClientCore):
         except BlockingIOError:
             pass
         except OSError as error:
-            # Nothing may follow, because part of a line may have been sent. `read` will report the end.
+            # Send nothing more, because the server may have received half a line. `read` will report the error.
             self.stop_sending("the server went away", str(error))
             self.abort()
         if self.outgoing():
@@ -153,7 +156,7 @@ async def dial(
 
 
 def _discard(dialing: asyncio.Task[LocalConnection]) -> None:
-    """Close the connection that was made after its `dial` had been cancelled."""
+    """Close a connection that was opened after `dial` had been cancelled."""
     if not dialing.cancelled() and not dialing.exception():
         dialing.result().close()
 

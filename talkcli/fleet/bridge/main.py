@@ -33,29 +33,30 @@ if TYPE_CHECKING:
     from talkcli.fleet.broker import Broker
     from talkcli.goals.goal import JsonObject
 
-#: How long the broker keeps a robot's presence, and the interval at which the bridge renews it.
+#: How long the broker keeps a robot's presence, and how often the bridge renews it.
 PRESENCE_EXPIRY_S, PRESENCE_EVERY_S = 150, 60.0
-#: Time allowed for another bridge of the same robot to answer.
+#: Time allowed for another bridge with the same robot name to answer.
 _RIVAL_LIMIT_S = 1.0
-#: Upper limit of the random pause before the first attempt to reconnect to the broker, and before later attempts.
-#: Without randomness, a thousand robots would reconnect at the same time.
+#: Longest pause before the first and before later attempts to reconnect to the broker. The pauses are random, so that
+#: a thousand robots don't reconnect at the same moment.
 _FIRST_BROKER_RETRY_S, _LAST_BROKER_RETRY_S = 0.5, 10.0
-#: Time without a returned echo after which the connection is closed.
+#: The connection is closed if no echo has returned for this long.
 _ECHO_TIMEOUT_S = 15.0
-#: Minimum time since the last echo before a refused stale message triggers an extra one.
+#: After refusing a stale message, the bridge sends an extra echo if the last one is at least this old.
 _ECHO_PAUSE_S = 1.0
-#: Amount of unacknowledged data above which events are dropped and nothing is read from the server.
+#: If more data than this is unacknowledged, the bridge drops events and stops reading from the server.
 SLOW_BROKER_BYTES = 256 * 1024
-#: Amount of unacknowledged data above which the connection is closed.
+#: If more data than this is unacknowledged, the bridge closes the connection.
 STUCK_BROKER_BYTES = 4 * 1024 * 1024
-#: Largest packet that the broker may send. Requests that are slightly too long fit, so that they can be answered with
-#: an error. A larger limit would be risky, because paho needs several seconds to parse 250 kB of MQTT properties.
+#: Largest packet that the broker may send. A request that is slightly too long still fits, so that the bridge can
+#: answer it with an error. The limit isn't higher, because paho takes several seconds to parse 250 kB of MQTT
+#: properties.
 _MAX_INCOMING_BYTES = MAX_LINE_BYTES + 8 * 1024
-#: Upper limit of the random delay before a robot describes itself to a Home Assistant that has just started.
+#: When Home Assistant starts, each bridge waits for a random time up to this limit before it describes its robot.
 _DEVICE_DELAY_S = 3.0
 #: Time allowed for the broker to acknowledge the bridge's last message.
 _OFFLINE_LIMIT_S = 1.0
-#: Prefix of the message on the echo topic that asks whether another bridge uses this robot's name.
+#: Prefix of an echo message that asks whether another bridge uses the robot's name.
 _RIVAL_QUESTION = b"? "
 _RIGHTS = "may its user do there what 'talk bridge --print-acl' has for these options?"
 
@@ -67,13 +68,13 @@ class BridgeSettings:
     #: the robot's name
     name: str
     broker: Broker
-    #: kinds of requests that remote clients may send
+    #: requests that remote clients may send, such as `say`
     allow: tuple[str, ...]
-    #: the robot's groups, not including the group of all robots
+    #: the robot's groups, except the group of all robots
     groups: tuple[str, ...] = ()
-    #: path of the server's socket; None for the default locations
+    #: path of the server's socket; None to try the default locations
     socket: str | None = None
-    #: whether events and statuses contain the texts of goals
+    #: whether to publish the texts of goals
     with_text: bool = True
     #: whether to add the robot to Home Assistant as a device
     homeassistant: bool = False
@@ -87,7 +88,7 @@ def run_bridge(settings: BridgeSettings, read_broker: Callable[[], Broker]) -> i
         read_broker: called before each reconnection to read the broker's settings, because a password may have changed.
 
     Raises:
-        UsageError: the file of a certificate or key is unusable.
+        UsageError: a certificate or key file is unusable.
         AddressInUse: an older bridge has the same robot name.
     """
     asyncio.run(_run(settings, read_broker))
@@ -102,7 +103,7 @@ async def _run(settings: BridgeSettings, read_broker: Callable[[], Broker]) -> N
         bridge.end()
 
     loop.set_exception_handler(log.handle_loop_error)
-    # Leave SIGINT ignored if it is. A shell without job control starts background programs that way.
+    # Don't handle SIGINT if it is ignored. A shell without job control starts background programs like that.
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
         loop.add_signal_handler(signal.SIGINT, on_signal, signal.SIGINT)
     loop.add_signal_handler(signal.SIGTERM, on_signal, signal.SIGTERM)
@@ -114,7 +115,10 @@ class Bridge:
     """Connects one robot to the broker. All methods run in the event loop's thread."""
 
     def __init__(self, settings: BridgeSettings, read_broker: Callable[[], Broker]) -> None:
-        """Start offline. The arguments are those of `run_bridge`."""
+        """Create a bridge that isn't connected yet.
+
+        The arguments are those of `run_bridge`.
+        """
         self._settings = settings
         self._echo_topic = topics.robot(settings.name, topics.ECHO)
         self._presence_topic = topics.robot(settings.name, topics.PRESENCE)
@@ -132,25 +136,25 @@ class Bridge:
             self._sessions, self._publish_to_all, self._server_changed, with_text=settings.with_text
         )
         self._link: Link | None = None
-        #: the link's descriptor in the event loop, or -1
+        #: the link's descriptor while the event loop watches it, otherwise -1
         self._descriptor = -1
         self._disconnected = asyncio.Event()
-        #: upper limit of the next pause before reconnecting
+        #: longest possible pause before the next attempt to reconnect
         self._retry_s = _FIRST_BROKER_RETRY_S
         #: whether this bridge has claimed the robot's name and accepts requests
         self._online = False
-        #: when the last echo was sent (loop clock)
+        #: when the last echo was sent, by the event loop's clock
         self._echo_at = 0.0
-        #: when the presence was last published (loop clock)
+        #: when the presence was last published, by the event loop's clock
         self._presence_at = 0.0
-        #: timer that describes the robot to a Home Assistant that has just started
+        #: timer that calls `_publish_device` after Home Assistant has started
         self._device_timer: asyncio.TimerHandle | None = None
         self._ending = asyncio.Event()
         self._error: BaseException | None = None
 
     async def run(self) -> None:
         """Keep the robot connected until `end` is called."""
-        self._broker.ssl_context()  # raise UsageError before starting anything
+        self._broker.ssl_context()  # check the certificate files before anything is started
         log.write(f"robot {self._settings.name}, by the broker at {self._settings.broker.url}")
         self._systemd.notify_ready()
         tasks = [asyncio.create_task(each) for each in (self._stay_connected(), self._publisher.run())]
@@ -170,7 +174,7 @@ class Bridge:
             raise self._error
 
     def end(self, error: BaseException | None = None) -> None:
-        """Stop `run`, which takes the robot offline and then raises the error, if any."""
+        """Take the robot offline, and make `run` return or raise the given error."""
         self._error = self._error or error
         self._ending.set()
 
@@ -230,15 +234,15 @@ class Bridge:
             raise opener.error
 
     def _on_connect(self, link: Link) -> None:
-        """Start to use a new connection. Before going online, check for another bridge with the robot's name."""
+        """Start using a new connection, and ask whether another bridge already has the robot's name."""
         self._disconnected.clear()
         self._link, self._descriptor = link, link.fileno()
         #: whether the broker has retained the presence of another bridge
         self._rival_seen = False
-        #: timer that claims the name unless another bridge answers first; None until this bridge's question returns
+        #: timer for going online unless another bridge answers; None until the broker returns this bridge's question
         self._rival_timer: asyncio.TimerHandle | None = None
         self._echoes = EchoTracker(boottime())
-        #: when the first echo after the last returned one was sent (loop clock); None if no echo is outstanding
+        #: since when the bridge has been waiting for an echo, by the event loop's clock; None if it isn't waiting
         self._unanswered_since: float | None = None
         self._loop.add_reader(self._descriptor, self._on_ready, Link.read)
         link.subscribe(self._presence_topic, retained=True)
@@ -266,7 +270,7 @@ class Bridge:
         log.write(f"online, at {self._settings.broker.url}")
 
     def _disconnect(self, link: Link) -> None:
-        """Close a connection and end all sessions, unless that has already been done."""
+        """Close a connection, and end all sessions that use it."""
         if self._link is link:
             self._link, self._online = None, False
             self._forget_descriptor()
@@ -286,14 +290,14 @@ class Bridge:
             self._descriptor = -1
 
     def _on_ready(self, action: Callable[[Link], None]) -> None:
-        """Read from the link or write to it, because its descriptor is ready."""
+        """Read from the link, or write to it, when its descriptor is ready."""
         link = self._link
         if link:
             action(link)
             self._check_link(link)
 
     def _check_link(self, link: Link) -> None:
-        """React to the end of a link, and to the amount of unsent data. Call this after each use of a link."""
+        """Check whether the link has ended and whether the broker is slow. Call this after each use of the link."""
         if link is not self._link or self._descriptor < 0:
             return
         if link.ended is None and link.outstanding_bytes > STUCK_BROKER_BYTES:
@@ -303,8 +307,8 @@ class Bridge:
             )
             link.close()
         if link.ended is not None:
-            # Forget the descriptor now, because another file may get its number. Disconnect later, because the caller
-            # may still be working with the sessions.
+            # Stop watching the descriptor now, because its number may be reused. Disconnect later, because the caller
+            # may still be using the sessions.
             self._forget_descriptor()
             self._loop.call_soon(self._disconnect, link)
             return
@@ -322,7 +326,7 @@ class Bridge:
         link = self._link
         if link is None:
             return
-        if len(payload) > link.max_payload_bytes:  # the broker would end the connection
+        if len(payload) > link.max_payload_bytes:  # otherwise, the broker would close the connection
             words = f"{len(payload):,} bytes for {topic} are not published"
             log.write_limited("long", f"{words}: the broker takes {link.max_payload_bytes:,}")
             return
@@ -335,13 +339,16 @@ class Bridge:
         self._publish(topic, payload, qos, correlation=correlation, acknowledged=acknowledged)
 
     def _publish_to_all(self, topic: str, payload: bytes, expiry: float | None) -> None:
-        """Publish an event that expires, or a retained message. Drop events if the broker is slow."""
+        """Publish an event, or a retained message if `expiry` is None.
+
+        Events are dropped if the broker is slow.
+        """
         retain = expiry is None
         if self._online and self._link and (retain or self._link.outstanding_bytes <= SLOW_BROKER_BYTES):
             self._publish(topic, payload, retain=retain, expiry=expiry)
 
     def _log_denial(self, reason: int) -> None:
-        """Log a warning if the reason code of an acknowledgement means that a message was denied."""
+        """Log a warning if the broker's reason code means that a message was not authorized."""
         if reason == REASON_NOT_AUTHORIZED:
             log.write_limited("rights", f"the broker doesn't let this robot publish all that it says: {_RIGHTS}")
 
@@ -353,7 +360,7 @@ class Bridge:
     def _on_message(self, message: Message) -> None:
         try:
             self._handle(message)
-        except Exception as error:  # noqa: BLE001 - no message may end the robot
+        except Exception as error:  # noqa: BLE001 - no message may crash the bridge
             log.write_bug("what came from the broker", error)
 
     def _handle(self, message: Message) -> None:
@@ -388,7 +395,7 @@ class Bridge:
             self._send_echo()
 
     def _handle_echo(self, payload: bytes) -> None:
-        """Process an echo, or the question of a new bridge whether the robot's name is in use."""
+        """Process a message on the echo topic: an echo, or a bridge's question about the robot's name."""
         if payload.startswith(_RIVAL_QUESTION):
             if payload != _RIVAL_QUESTION + self._session.encode():
                 if self._online:
@@ -402,7 +409,10 @@ class Bridge:
             self._unanswered_since = None
 
     def _handle_presence(self, payload: bytes) -> None:
-        """Process a message on the robot's presence topic, from this bridge, an earlier one, or a rival."""
+        """Process a message on the robot's presence topic.
+
+        It may come from this bridge, an earlier one, or another one with the same robot name.
+        """
         presence = Presence.read(self._settings.name, payload)
         rank = bridge_rank(presence)
         if payload and (presence is None or (presence.online and rank is None)):
@@ -411,10 +421,10 @@ class Bridge:
         if rank and rank[1] == self._session:
             return
         if not self._rival_timer:
-            self._rival_seen = rank is not None  # it may be from a bridge that has ended
+            self._rival_seen = rank is not None  # this may come from a bridge that has already ended
         elif rank is None:
             if self._online:
-                self._publish_presence()  # replace a late will or an ignored message
+                self._publish_presence()  # replace an invalid message, or a will that arrived late
         elif rank < (self._since, self._session):
             words = f"another bridge is '{self._settings.name}' already: session {log.sanitize(rank[1])}"
             self.end(AddressInUse(f"{words}; each robot has a name of its own, give another --name"))
@@ -462,7 +472,7 @@ class Bridge:
         self._publish(self._echo_topic, f"{self._session} {number}".encode())
 
     def _tick(self) -> None:
-        """Do the periodic work."""
+        """Send an echo, check for timeouts, and renew the presence if it is due."""
         now, due = self._loop.time(), self._tick_timer.when()
         self._tick_timer = self._loop.call_later(ECHO_EVERY_S, self._tick)
         self._sessions.tick()
@@ -473,7 +483,7 @@ class Bridge:
         link.tick()
         self._check_link(link)
         if self._unanswered_since is not None:
-            # Don't count the time while this process was stopped, because returned echoes are still unread.
+            # Don't count time during which this process was stopped. Echoes that have returned since are still unread.
             self._unanswered_since += now - due
             if now - self._unanswered_since > _ECHO_TIMEOUT_S:
                 log.write_limited("echo", f"nothing that this robot sends itself comes back: {_RIGHTS}")
@@ -484,18 +494,18 @@ class Bridge:
             self._publish_presence()
 
     async def _go_offline(self) -> None:
-        """Disconnect. If the robot was online and no other bridge has its name, publish that it is offline."""
+        """Disconnect from the broker. Publish that the robot is offline, unless another bridge has its name."""
         link = self._link
         if link is None:
             return
         taken = asyncio.Event()
         was_online = self._online and not isinstance(self._error, AddressInUse)
-        self._online = False  # otherwise the bridge would correct its own offline message
+        self._online = False  # otherwise, the bridge would overwrite its own offline message
         if was_online:
             topic, payload = self._presence_topic, self._offline_presence()
         else:
-            # Wait for the acknowledgement of any message, because the link is closed with a DISCONNECT only if all
-            # messages are acknowledged. Otherwise, the broker would publish the will, and the robot would seem to be
+            # Publish a message that has no effect, and wait until everything is acknowledged. Otherwise, `Link.close`
+            # would not send a DISCONNECT packet, and the broker would publish the will. The robot would seem to be
             # offline although another bridge is online.
             topic, payload = self._echo_topic, f"{self._session} 0".encode()
         self._publish(topic, payload, retain=was_online, acknowledged=lambda _: taken.set())

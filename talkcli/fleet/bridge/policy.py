@@ -29,20 +29,21 @@ if TYPE_CHECKING:
 STALE_CODE = "stale"
 #: Requests that are always allowed. They reveal nothing that the bridge doesn't publish anyway.
 ALWAYS_ALLOWED = ("hello", "watch")
-#: Requests that the option `--allow` can contain.
+#: Requests that can be allowed with the option `--allow`.
 ALLOWABLE_REQUESTS = tuple(each for each in REQUEST_TYPES if each not in ALWAYS_ALLOWED)
 
-#: Interval at which the bridge sends an echo to itself.
+#: How often the bridge sends an echo to itself.
 ECHO_EVERY_S = 5.0
-#: Messages are stale if the newest returned echo is older than one interval and a second for its transmission.
+#: A message is stale if the newest returned echo is older than this. The extra second is for transmission.
 STALE_AFTER_S = ECHO_EVERY_S + 1.0
-#: Maximum number of outstanding echoes, enough for one per second during half a minute.
+#: Maximum number of echoes that have not returned. This is enough for one per second over half a minute.
 _MAX_ECHOES = 32
-#: Maximum number of pending goals from remote clients. The rest of the queue, usually 100, is for local clients.
+#: Maximum number of pending goals from remote clients. The server's queue usually holds 100 goals, and the rest of it
+#: is left to local clients.
 MAX_REMOTE_GOALS = 20
-#: Maximum number of remembered goal ids. They prevent goals that the server has forgotten from being spoken twice.
+#: How many goal ids to remember, so that no goal is spoken twice, even if the server has forgotten it.
 MAX_REMEMBERED_IDS = 1_000
-#: Maximum size of correlation data, which the header of each answer repeats.
+#: Maximum size of the correlation data, which is repeated in the header of each answer.
 MAX_CORRELATION_BYTES = 256
 #: TTL of a goal whose message expired while the goal was waiting for room. Zero would mean no limit.
 _EXPIRED_TTL_S = 0.001
@@ -58,17 +59,17 @@ class RemoteRequest:
     seq: int | None
     request: Request
     correlation: bytes | None = None
-    #: size of the payload, which is counted while the request is waiting
+    #: size of the payload, which counts towards the limit for waiting requests
     size_bytes: int = 0
-    #: latest time at which the goal may start, by the clock of `Policy.decide`; None for no limit
+    #: latest time at which the goal may start, by the `boottime` clock; None for no limit
     start_by: float | None = None
 
     def say(self, goal_id: str, now: float) -> Say:
-        """Return the `say` for the server, with an id, and with a TTL that ends before the message expires.
+        """Return the `say` request for the server, with an id and with a TTL limited by the message's expiry.
 
         Args:
             goal_id: the goal's id.
-            now: the current time by the clock of `Policy.decide`.
+            now: the current time, by the `boottime` clock.
         """
         assert isinstance(self.request, Say)
         ttl = self.request.ttl
@@ -80,7 +81,7 @@ class RemoteRequest:
 
 @frozen
 class Refusal:
-    """A refused request, with the error for its client."""
+    """A refused request, and the error to send to its client."""
 
     reply_topic: str | None
     seq: int | None
@@ -90,7 +91,7 @@ class Refusal:
 
 @frozen
 class Goodbye:
-    """A message by which a client ends its session."""
+    """A message that ends a client's session."""
 
     user: str
     reply_topic: str
@@ -100,16 +101,21 @@ class Goodbye:
 class Ignored:
     """A message that is logged but not answered."""
 
-    #: key for the log's rate limit
+    #: key for limiting how often similar messages are logged
     kind: str
     words: str
 
 
 class Policy:
-    """The rules for messages to one robot."""
+    """Decides which messages to a robot are accepted."""
 
     def __init__(self, name: str, allow: Collection[str]) -> None:
-        """Set up the rules for a robot with this name, which accepts these kinds of requests."""
+        """Create the policy of one robot.
+
+        Args:
+            name: the robot's name.
+            allow: requests that the robot accepts, in addition to `ALWAYS_ALLOWED`.
+        """
         self._name = name
         self._allow = {*allow, *ALWAYS_ALLOWED}
 
@@ -121,7 +127,7 @@ class Policy:
         Args:
             message: a message on a request topic of the robot or one of its groups.
             topic: the parts of the message's topic.
-            now: the time by a clock that includes the time in suspend.
+            now: the current time, by the `boottime` clock.
             stale: whether the message may be outdated.
         """
         if message.retained:
@@ -158,7 +164,7 @@ class Policy:
 
 
 def _request_fields(kind: str, payload: bytes) -> JsonObject:
-    """Return the fields of the request in a payload.
+    """Parse a payload, and return the fields of the request.
 
     Raises:
         BadRequest: the payload is malformed.
@@ -178,21 +184,21 @@ def _request_fields(kind: str, payload: bytes) -> JsonObject:
 
 
 class EchoTracker:
-    """Detects outdated messages by means of echoes, which are messages that the bridge sends to itself.
+    """Detects messages that may be outdated, using echoes that the bridge sends to itself.
 
-    The broker forwards messages in order. A message that arrives after an echo was forwarded after that echo had been
-    sent. Therefore, the age of the newest returned echo limits the delay of the next message. The clocks of different
-    machines needn't be compared.
+    The broker forwards messages in order. A message that arrives after an echo must have been forwarded after the echo
+    was sent. Therefore, the age of the newest returned echo limits the delay of the next message. There is no need to
+    compare the clocks of different machines.
     """
 
     def __init__(self, now: float) -> None:
-        """Start to track a connection that was opened at the time `now`."""
+        """Start tracking a connection that was opened at the time `now`."""
         self._newest_at = now
         self._sent: dict[int, float] = {}
         self._number = 0
 
     def add(self, now: float) -> int:
-        """Record an echo that is sent now, and return its number."""
+        """Record that an echo is being sent, and return its number."""
         self._number += 1
         self._sent[self._number] = now
         while len(self._sent) > _MAX_ECHOES:
@@ -200,7 +206,7 @@ class EchoTracker:
         return self._number
 
     def returned(self, number_text: bytes) -> bool:
-        """Record a returned echo, and return whether it was outstanding."""
+        """Record that an echo has returned. Return False if the echo is unknown."""
         number = int(number_text) if number_text.isdigit() and len(number_text) <= MAX_DIGITS else 0
         sent = self._sent.get(number)
         if sent is None:
@@ -215,10 +221,13 @@ class EchoTracker:
 
 
 class SentIds:
-    """The ids of recent goals, each with the boot id of the server that received the goal."""
+    """The ids of recent goals, and the server that each goal was sent to.
+
+    A server is identified by its boot id.
+    """
 
     def __init__(self) -> None:
-        #: the server's boot id, and whether the goal counts towards the limit of remote goals, by goal id
+        #: maps each goal id to the server's boot id, and to whether the goal counts towards the limit
         self._sent: dict[str, tuple[str, bool]] = {}
 
     def boot_of(self, goal_id: str) -> str | None:
@@ -226,30 +235,30 @@ class SentIds:
         return self._sent.get(goal_id, (None, False))[0]
 
     def is_counted(self, goal_id: str, boot: str) -> bool:
-        """Return whether a goal was sent to the server with this boot id and counts towards the limit."""
+        """Return whether a goal was sent to this server and counts towards the limit for remote goals."""
         return self._sent.get(goal_id) == (boot, True)
 
     def add(self, goal_id: str, boot: str, *, counted: bool = True) -> None:
-        """Record a goal that is sent to the server with this boot id."""
+        """Record that a goal was sent to the server with this boot id."""
         self._sent.pop(goal_id, None)
         self._sent[goal_id] = boot, counted
         if len(self._sent) > MAX_REMEMBERED_IDS:
             del self._sent[next(iter(self._sent))]
 
     def discard(self, goal_id: str) -> None:
-        """Forget a goal that can't have been spoken, because the server didn't accept it."""
+        """Forget a goal that the server didn't accept."""
         self._sent.pop(goal_id, None)
 
 
 class RemoteGoals:
-    """The goals of remote clients that are pending at the server or on their way to it.
+    """Keeps track of remote clients' goals that are pending at the server or on their way there.
 
-    Goals with `preempt` or `flush` don't count. A goal's reply and its events arrive on different connections, in any
-    order.
+    Goals with `preempt` or `flush` aren't counted. A goal's reply and its events arrive on different connections, in
+    any order.
     """
 
     def __init__(self) -> None:
-        #: the goal's key, and whether the server has confirmed that the goal is pending, by goal id
+        #: maps each goal id to the goal's key, and to whether the server has confirmed that the goal is pending
         self._goals: dict[str, tuple[str | None, bool]] = {}
 
     def __len__(self) -> int:
@@ -262,20 +271,25 @@ class RemoteGoals:
 
     @staticmethod
     def counts(say: Say) -> bool:
-        """Return whether a goal counts towards the limit."""
+        """Return whether a goal counts towards the limit for remote goals."""
         return not (say.preempt or say.flush)
 
     def has_room(self, say: Say) -> bool:
-        """Return whether a goal may be sent now. There is always room for a goal that replaces another by its key."""
+        """Return whether a goal may be sent to the server now.
+
+        There is always room for a goal that replaces another goal with the same key.
+        """
         replaces = say.key is not None and any(key == say.key for key, _ in self._goals.values())
         return len(self) < MAX_REMOTE_GOALS or not self.counts(say) or replaces
 
     def add(self, goal_id: str, key: str | None) -> None:
-        """Count a goal that is on its way to the server."""
+        """Add a goal that is being sent to the server."""
         self._goals.setdefault(goal_id, (key, False))
 
     def answered(self, goal_id: str, *, pending: bool) -> None:
-        """Record the server's reply to a goal, unless an event has already confirmed the goal as pending.
+        """Record from the server's reply whether a goal is pending.
+
+        The reply is ignored if an event has already confirmed that the goal is pending.
 
         Args:
             goal_id: the goal's id.
@@ -288,15 +302,18 @@ class RemoteGoals:
             del self._goals[goal_id]
 
     def queued(self, goal_id: str, key: str | None) -> None:
-        """Record an event that reports a goal as pending."""
+        """Record that a goal is pending, as an event has reported."""
         self._goals[goal_id] = key, True
 
     def dequeued(self, goal_id: str) -> bool:
-        """Record an event that reports a goal as no longer pending, and return whether the goal was counted."""
+        """Remove a goal that is no longer pending, and return whether it was counted."""
         return self._goals.pop(goal_id, None) is not None
 
     def reset(self, pending: Iterable[tuple[str, str | None]]) -> None:
-        """Replace the pending goals by these ids and keys. Goals on their way to the server still count."""
+        """Replace all pending goals with the given ids and keys.
+
+        Goals that are still on their way to the server are kept.
+        """
         self._goals = {each: found for each, found in self._goals.items() if not found[1]}
         self._goals |= {goal_id: (key, True) for goal_id, key in pending}
 
@@ -304,7 +321,7 @@ class RemoteGoals:
 def end_unsent(
     request: RemoteRequest, goal_id: str, state: State, reason: str, words: str, at: float, by: By | None = None
 ) -> tuple[Goal, list[JsonObject]]:
-    """End a goal that was not sent to the server, and return it with the lines for its client.
+    """End a goal that was never sent to the server. Return the goal and the lines for its client.
 
     The server would send the same lines.
 
@@ -338,7 +355,7 @@ def end_unsent(
 
 
 def without_texts(message: JsonObject) -> JsonObject:
-    """Return a message without the texts of its goals, to shorten a line that is too long for the broker."""
+    """Return a shorter copy of a message, without the texts of its goals."""
     nothing = {"text": None, "spoken": None}
     return {
         name: {**each, **nothing} if isinstance(each, dict) and "text" in each else each
@@ -347,7 +364,10 @@ def without_texts(message: JsonObject) -> JsonObject:
 
 
 def sender_name(user: str, name: str | None = None) -> str:
-    """Return a remote client's name at the server: its user name, and the name that it gave itself, if any."""
+    """Return the name under which the server knows a remote client.
+
+    It consists of the client's user name and the name that the client gave itself, if any.
+    """
     return f"{topics.REMOTE_PREFIX}{user} {name}"[:MAX_SENDER_NAME_CHARS] if name else f"{topics.REMOTE_PREFIX}{user}"
 
 

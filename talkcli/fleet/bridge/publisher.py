@@ -1,4 +1,4 @@
-"""Publishes a robot's status and the events of its goals for all subscribers.
+"""Publishes a robot's status and goal events to all subscribers.
 
 The publisher watches the robot's server as long as the bridge runs. If the broker is too slow, events are dropped. If a
 payload is too long for the broker, it is published without texts.
@@ -31,48 +31,49 @@ if TYPE_CHECKING:
     from talkcli.fleet.bridge.session import RemoteSessions
     from talkcli.goals.goal import Goal, JsonObject
 
-    #: Publishes a message for all subscribers: topic, payload, expiry in seconds. Without an expiry, it is retained.
+    #: Publishes a message to all subscribers, given its topic, its payload, and its expiry in seconds. A message
+    #: without an expiry is retained.
     PublishToAll = Callable[[str, bytes, float | None], None]
 
 #: How long the broker keeps an undelivered event.
 EVENT_EXPIRY_S = 60
 #: Minimum time between two status messages.
 _STATUS_EVERY_S = 1.0
-#: Delay between a change and the status that shows it. A canceled goal is PREEMPTING for some milliseconds before it
-#: ends. Without the delay, the status would show that state for a second.
+#: Delay between a change and the status message about it. A canceled goal takes a few milliseconds to end. Without the
+#: delay, the status would show the goal as active for another second.
 _STATUS_AFTER_CHANGE_S = 0.1
-#: Maximum length of a text in the status. This part of the text of each pending goal is kept in memory.
+#: Maximum length of a goal's text in the status. Longer texts are cut off.
 _MAX_STATUS_TEXT_CHARS = 1_000
-#: Time without data after which the server counts as hung. A server sends a sign of life every 5 s.
+#: The server counts as hung if it sends nothing for this long. A working server sends a sign of life every 5 s.
 _SERVER_SILENCE_LIMIT_S = 15.0
-#: Upper limit of the random pause before the first attempt to reconnect to the server, and before later attempts.
+#: Longest pause before the first and before later attempts to reconnect to the server. The pauses are random.
 _FIRST_SERVER_RETRY_S, _LAST_SERVER_RETRY_S = 0.2, 5.0
 
 
 class Publisher:
-    """Watches the server, and publishes its status and events."""
+    """Watches the robot's server, and publishes its status and events."""
 
     def __init__(
         self, sessions: RemoteSessions, publish: PublishToAll, on_server_change: Callable[[], None], *, with_text: bool
     ) -> None:
-        """Start without a server.
+        """Create a publisher that isn't connected to the server yet.
 
         Args:
             sessions: the remote sessions, which receive all changes of goals.
-            publish: publishes a message for all subscribers.
-            on_server_change: called after the connection to the server has been made or has ended.
+            publish: publishes a message to all subscribers.
+            on_server_change: called after connecting to the server and after disconnecting from it.
             with_text: whether to publish the texts of goals.
         """
         self._sessions = sessions
         self._publish = publish
         self._on_server_change = on_server_change
         self._with_text = with_text
-        #: boot id, pid and version of the server; None while there is no connection to it
+        #: boot id, pid and version of the server; None if the bridge isn't connected to it
         self.server: JsonObject | None = None
         self._connection: LocalConnection | None = None
-        #: when data was last received from the server (loop clock)
+        #: when the server last sent data, by the event loop's clock
         self._heard_at = 0.0
-        #: texts of the goals that have not ended, by goal id
+        #: texts of unfinished goals, by goal id
         self._texts: dict[str, str | None] = {}
         #: id of the active goal
         self._active: str | None = None
@@ -81,7 +82,7 @@ class Publisher:
         self._paused = False
         #: timer for the next status
         self._timer: asyncio.TimerHandle | None = None
-        #: when the last status was published (loop clock)
+        #: when the last status was published, by the event loop's clock
         self._published_at = 0.0
         self._loop = asyncio.get_running_loop()
 
@@ -103,10 +104,10 @@ class Publisher:
             self._retry_s = min(_LAST_SERVER_RETRY_S, self._retry_s * 2)
 
     async def _follow(self, server: LocalConnection) -> None:
-        """Receive the server's events until the connection ends."""
+        """Process the server's lines until the connection ends."""
         self._heard_at = self._loop.time()
         watch = partial(self._watch, server)
-        # Request the log before watching, to learn about the goals of an earlier bridge.
+        # Request the log first, because it contains the goals that an earlier bridge has sent.
         server.send(Exchange(Log(MAX_LOG_GOALS), watch, lambda _: watch({}, [])))
         while lines := await server.read():
             self._receive(server, lines)
@@ -119,7 +120,7 @@ class Publisher:
             self._timer = self._loop.call_at(due, self._publish_status)
 
     def tick(self) -> None:
-        """End the connection if the server counts as hung. Call this every few seconds."""
+        """Disconnect from the server if it hangs. Call this every few seconds."""
         server = self._connection
         if server and self._loop.time() - self._heard_at > _SERVER_SILENCE_LIMIT_S:
             log.write_limited(
@@ -142,7 +143,7 @@ class Publisher:
                 log.write_limited("line", f"what the server says can't be read: {log.sanitize(str(error))}")
 
     def _watch(self, server: LocalConnection, _reply: JsonObject, ended: list[JsonObject]) -> None:
-        """Remember the goals in the reply to `log`, and send a `watch`."""
+        """Remember the goals in the server's log, and start watching the server."""
 
         def refuse(error: TalkError) -> None:
             raise ServerUnavailable(f"the server at {server.path} can't be watched: {error}")
@@ -152,7 +153,7 @@ class Publisher:
         server.send(Exchange(Watch(), partial(self._on_watching, server), refuse))
 
     def _on_watching(self, server: LocalConnection, reply: JsonObject, items: list[JsonObject]) -> None:
-        """Store the server's state, from the reply to `watch`."""
+        """Store the server's state from its reply to `watch`."""
         status = ServerStatus.from_reply(reply, items)
         self._retry_s = _FIRST_SERVER_RETRY_S
         for each in unfinished(status):
@@ -168,7 +169,7 @@ class Publisher:
         self.schedule_status()
 
     def _on_disconnect(self) -> None:
-        """Forget the server's state after the end of the connection."""
+        """Forget the server's state, because the connection has ended."""
         self._active = None
         self._texts.clear()
         self._paused = False
@@ -225,7 +226,7 @@ class Publisher:
 
 
 def _shown_text(goal: Goal | None) -> str | None:
-    """Return the part of a goal's text that the status shows."""
+    """Return the beginning of a goal's text, as shown in the status."""
     return goal.text[:_MAX_STATUS_TEXT_CHARS] if goal and goal.text else None
 
 

@@ -1,7 +1,8 @@
 """Sessions of remote clients. Each session is one client's connection to the robot's server.
 
 A session sends its client's requests to the server and publishes the server's lines in their order. `policy` has
-already accepted the requests. If too many goals are pending, further goals wait here for room or are rejected.
+already accepted the requests. If too many goals are pending, a patient goal waits here for room, and other goals are
+rejected.
 """
 
 from __future__ import annotations
@@ -35,31 +36,31 @@ if TYPE_CHECKING:
     from talkcli.protocol.events import StateChanged
     from talkcli.protocol.requests import Request
 
-    #: Publishes lines for a client: topic, payload, QoS, correlation data.
+    #: Publishes lines for a client, given the topic, the payload, the QoS, and the correlation data.
     Publish = Callable[[str, bytes, int, bytes | None], None]
 
 #: Maximum number of sessions. Each has a connection to the server, which accepts 256 connections by default.
 MAX_SESSIONS = 32
-#: Maximum number of one client's requests that are waiting for the connection, for room, or for answers.
+#: Maximum number of unanswered requests per client.
 MAX_WAITING_REQUESTS = 64
-#: Maximum total size of all clients' waiting requests. Cancel and status requests are allowed twice as much.
+#: Maximum total size of all clients' unanswered requests. For `cancel` and `status`, the limit is twice as high.
 MAX_WAITING_BYTES = 4 * 1024 * 1024
-#: Time without a message after which a client's session ends, because MQTT doesn't report that a client has left.
-#: Waiting clients say hello every 30 s, and two of these messages may get lost.
+#: A client's session ends if the client sends nothing for this long, because MQTT doesn't report when a client leaves.
+#: Waiting clients send `hello` every 30 s, so that two of these messages may get lost.
 CLIENT_SILENCE_LIMIT_S = 90.0
 #: Time allowed for the server to answer the requests of a client that has said goodbye.
 _GOODBYE_LIMIT_S = 5.0
-#: Maximum length of the robot's name in a generated goal id, which has at most 64 characters in total.
+#: A generated goal id begins with the robot's name, which is cut to this length. An id has at most 64 characters.
 _MAX_ID_PREFIX_CHARS = 48
-#: The last message to a client after its connection to the server has ended.
+#: Message to a client after the server has closed the client's connection.
 _SERVER_GONE = "the robot's talk server ended the connection"
 _ALIVE = b'{"event": "alive"}\n'
-#: Beginnings of lines that may get lost, because they are published with QoS 0.
+#: Lines with these beginnings are published with QoS 0, because losing one does no harm.
 _UNRELIABLE = (b'{"event": "word"', b'{"event": "alive"')
 
 
 class RemoteSessions:
-    """The sessions of all remote clients, and the limits that they share."""
+    """Manages the sessions of all remote clients, and the limits that they share."""
 
     def __init__(
         self,
@@ -69,7 +70,7 @@ class RemoteSessions:
         max_payload: Callable[[], int],
         on_change: Callable[[], None],
     ) -> None:
-        """Start without sessions.
+        """Start with no sessions.
 
         Args:
             name: the robot's name.
@@ -81,24 +82,24 @@ class RemoteSessions:
         self.name, self.socket = name, socket
         self.publish, self.max_payload = publish, max_payload
         self.ids, self.goals = policy.SentIds(), policy.RemoteGoals()
-        #: limits how many connections wait for the server's greeting at the same time
+        #: limits the number of connections that are waiting for the server's greeting
         self.dialing = asyncio.Semaphore(MAX_SESSIONS)
         #: cleared while the broker is slow, so that sessions stop reading from the server
         self.may_read = asyncio.Event()
         self.may_read.set()
-        #: goals waiting for room, oldest first
+        #: goals that are waiting for room in the server's queue, oldest first
         self.waiting: list[tuple[RemoteRequest, Say, RemoteSession]] = []
         self._on_change = on_change
         self._loop = asyncio.get_running_loop()
         self._sessions: dict[tuple[str, str | None], RemoteSession] = {}
         self._release_handle: asyncio.Handle | None = None
-        #: the client that canceled pending goals since the last release
+        #: the client that canceled pending goals since waiting goals were last sent; None if no client did
         self._canceled_by: By | None = None
 
     # -- from the broker
 
     def submit(self, request: RemoteRequest) -> None:
-        """Carry out a request in its client's session."""
+        """Pass a request to its client's session, which is created if necessary."""
         session = self._sessions.get((request.user, request.reply_topic)) or self._new_session(request)
         if session:
             session.submit(request)
@@ -107,13 +108,13 @@ class RemoteSessions:
             self.refuse(policy.Refusal(request.reply_topic, request.seq, request.correlation, error))
 
     def refuse(self, refusal: policy.Refusal) -> None:
-        """Publish the error for a refused request, if its client wants answers."""
+        """Send the error for a refused request to its client, if the client wants answers."""
         if refusal.reply_topic is not None:
             line = encode(failure(refusal.seq, refusal.error.code, refusal.error.message))
             self.publish(refusal.reply_topic, line, 1, refusal.correlation)
 
     def say_goodbye(self, user: str, reply_topic: str) -> None:
-        """End a client's session after the server has answered the client's requests."""
+        """End a client's session once the server has answered its requests."""
         session = self._sessions.get((user, reply_topic))
         if session:
             session.say_goodbye()
@@ -135,9 +136,9 @@ class RemoteSessions:
                 session.send_alive()
 
     def _new_session(self, request: RemoteRequest) -> RemoteSession | None:
-        """Return a new session, or None if there is no place for it.
+        """Create a session, or return None if there are too many already.
 
-        If all places are taken, an idle session is ended. For a cancel or status request, any session may be ended.
+        An idle session is ended to make room. For a `cancel` or `status` request, any session may be ended.
         """
         if len(self._sessions) >= MAX_SESSIONS:
             sessions = list(self._sessions.values())
@@ -158,12 +159,12 @@ class RemoteSessions:
         self._sessions = {key: each for key, each in self._sessions.items() if each is not session}
 
     def waiting_bytes(self) -> int:
-        """Return the total size of the waiting requests of all clients."""
+        """Return the total size of all clients' unanswered requests."""
         in_sessions = sum(each.waiting_bytes for each in self._sessions.values())
         return in_sessions + sum(request.size_bytes for request, _, _ in self.waiting)
 
     def cancel_waiting(self, selection: Cancel, by: By | None) -> list[Goal]:
-        """End the waiting goals that a `cancel` selects, and return them."""
+        """Cancel the waiting goals that match a `cancel` request, and return them."""
         selected = [self.waiting[each] for each in selection.select_waiting([say for _, say, _ in self.waiting])]
         self.waiting = [each for each in self.waiting if not any(each is other for other in selected)]
         words = "canceled before it was spoken"
@@ -173,7 +174,7 @@ class RemoteSessions:
         ]
 
     def schedule_release(self) -> None:
-        """Schedule the release of waiting goals for which there is room.
+        """Schedule `_release`, which sends waiting goals to the server.
 
         Call this whenever the number of pending goals may have changed. Events that were received together are all
         processed before goals are released.
@@ -187,7 +188,7 @@ class RemoteSessions:
         self._release_handle = None
         canceled_by, self._canceled_by = self._canceled_by, None
         if canceled_by and not self.goals.pending_count:
-            # A client canceled all pending goals, so cancel the goals that were waiting for their places, too.
+            # A client has canceled every pending goal, so cancel the waiting goals, too.
             self.cancel_waiting(Cancel(), canceled_by)
         while self.waiting and self.goals.has_room(self.waiting[0][1]):
             request, say, session = self.waiting.pop(0)
@@ -196,7 +197,7 @@ class RemoteSessions:
     # -- from the watch of the server
 
     def goal_changed(self, event: StateChanged, boot: str) -> None:
-        """Process a goal's change of state, reported by the server with this boot id."""
+        """Process a state change that was reported by the server with this boot id."""
         goal = event.goal
         if event.state is not State.PENDING:
             counted = self.goals.dequeued(event.id)
@@ -207,7 +208,7 @@ class RemoteSessions:
         self.schedule_release()
 
     def remember(self, goal: Goal, boot: str) -> None:
-        """Remember the id of a remote goal that an earlier bridge may have sent.
+        """Remember the id of a goal that an earlier bridge process may have sent.
 
         The goal counts towards the limit even if it was sent with `preempt`, because the server doesn't report that.
         """
@@ -215,22 +216,22 @@ class RemoteSessions:
             self.ids.add(goal.id, boot)
 
     def reset_pending(self, pending: tuple[Goal, ...], boot: str) -> None:
-        """Replace the pending goals by those of the server with this boot id."""
+        """Replace the pending goals with those that the server has just reported."""
         self.goals.reset((each.id, each.key) for each in pending if self.ids.is_counted(each.id, boot))
         self.schedule_release()
 
 
 class _RemoteExchange(Exchange):
-    """A remote client's request to the server, and the answer."""
+    """A remote client's request that was sent to the server."""
 
     __slots__ = ("canceled", "is_new", "remote")
 
     def __init__(self, remote: RemoteRequest, request: Request, *, is_new: bool = False) -> None:
         super().__init__(request)
         self.remote = remote
-        #: whether the goal is sent for the first time, if the request is a `say`
+        #: whether a `say` request sends its goal for the first time
         self.is_new = is_new
-        #: the waiting goals that were canceled here, if the request is a `cancel`
+        #: waiting goals that a `cancel` request has ended before the server received them
         self.canceled: list[Goal] = []
 
     @property
@@ -243,14 +244,14 @@ class RemoteSession:
     """One remote client's connection to the server. All methods run in the event loop's thread."""
 
     def __init__(self, sessions: RemoteSessions, user: str, reply_topic: str | None) -> None:
-        """Start without a connection.
+        """Create a session that isn't connected to the server yet.
 
         Args:
             sessions: all sessions, to which this one belongs.
             user: the client's user name at the broker.
             reply_topic: the topic for answers, or None if the client wants none.
         """
-        #: when the client sent its last request (loop clock)
+        #: when the client sent its last request, by the event loop's clock
         self.used_at = 0.0
         self._sessions = sessions
         self._user, self._reply_topic = user, reply_topic
@@ -258,7 +259,7 @@ class RemoteSession:
         self._loop = asyncio.get_running_loop()
         self._server: LocalConnection | None = None
         self._task: asyncio.Task[None] | None = None
-        #: requests waiting for the connection to the server
+        #: requests to send as soon as the server is connected
         self._queue: deque[RemoteRequest] = deque()
         #: ids of the goals whose results the client is waiting for
         self._awaited: set[str] = set()
@@ -275,11 +276,11 @@ class RemoteSession:
 
     @property
     def waiting_bytes(self) -> int:
-        """Total size of the requests waiting for the connection or for answers."""
+        """Total size of the unanswered requests, not including waiting goals."""
         return sum(each.size_bytes for each in self._unanswered)
 
     def submit(self, request: RemoteRequest) -> None:
-        """Carry out a request after the earlier ones, or refuse it if too many are waiting."""
+        """Send or queue a request, or refuse it if too many requests are unanswered."""
         self.used_at = self._loop.time()
         if self._goodbye_timer:  # the client has returned
             self._goodbye_timer.cancel()
@@ -298,7 +299,11 @@ class RemoteSession:
                 self._task = asyncio.create_task(self._run(urgent=urgent))
 
     def say_goodbye(self) -> None:
-        """Stop answering, drop waiting goals, and end once the server has answered requests with a lasting effect."""
+        """End the session soon, because its client has said goodbye.
+
+        The client gets no more answers, and its waiting goals are dropped. The session stays open until the server has
+        answered requests with a lasting effect.
+        """
         self._reply_topic = None
         self._drop_waiting()
         self._queue = deque(each for each in self._queue if _has_lasting_effect(each))
@@ -306,7 +311,7 @@ class RemoteSession:
         self._end_if_done()
 
     def end(self, why: str | None = None) -> None:
-        """End the session. The server cancels everything that can still be canceled.
+        """End the session. The server cancels unfinished requests, if possible.
 
         Args:
             why: a message for the client, which is sent only if the client is waiting for something.
@@ -321,31 +326,31 @@ class RemoteSession:
         self._clean_up()
 
     def send_alive(self) -> None:
-        """Publish a sign of life if a goal is waiting for room, because the server doesn't know about the goal."""
+        """Send a sign of life to the client if one of its goals is waiting for room in the queue."""
         if self._waiting_for_room():
             self._publish([(_ALIVE, None)])
 
     @property
     def _exchanges(self) -> list[_RemoteExchange]:
-        """The requests that were sent to the server and have not been answered."""
+        """The requests that the server has not answered yet."""
         exchanges = self._server.exchanges.values() if self._server else ()
         return [each for each in exchanges if isinstance(each, _RemoteExchange)]
 
     @property
     def _unanswered(self) -> list[RemoteRequest]:
-        """The requests waiting for the connection or for answers."""
+        """The client's unanswered requests, not including waiting goals."""
         return [*self._queue, *(each.remote for each in self._exchanges)]
 
     def _waiting_for_room(self) -> list[RemoteRequest]:
-        """Return this session's goals that are waiting for room."""
+        """Return the client's goals that are waiting for room in the server's queue."""
         return [request for request, _, session in self._sessions.waiting if session is self]
 
     def _drop_waiting(self) -> None:
-        """Remove this session's goals from the goals waiting for room."""
+        """Drop the client's waiting goals."""
         self._sessions.waiting = [each for each in self._sessions.waiting if each[2] is not self]
 
     def _end_if_done(self) -> None:
-        """End the session after a goodbye, unless a request with a lasting effect is still unanswered."""
+        """End the session if the client has said goodbye and its important requests have been answered."""
         if self._goodbye_timer and not any(map(_has_lasting_effect, self._unanswered)):
             self.end()
 
@@ -365,12 +370,12 @@ class RemoteSession:
             self._send(_RemoteExchange(remote, request))
 
     def send_say(self, remote: RemoteRequest, say: Say, *, has_room: bool = False) -> None:
-        """Send a goal to the server, keep it until there is room, or refuse it.
+        """Send a goal to the server, or reject it if too many goals are pending. Patient goals wait for room.
 
         Args:
             remote: the client's request.
             say: the goal in it.
-            has_room: whether the goal has waited and there is room now.
+            has_room: whether the goal was waiting, and there is room for it now.
         """
         shared, server = self._sessions, self._server
         assert server
@@ -391,7 +396,10 @@ class RemoteSession:
             self.end_goal(remote, None, State.REJECTED, "queue_full", words, None)
 
     def _send_cancel(self, remote: RemoteRequest, cancel: Cancel) -> None:
-        """Cancel goals waiting for room, then goals at the server. The server doesn't know about the waiting goals."""
+        """Cancel waiting goals, and then send the `cancel` request to the server.
+
+        The server doesn't know about waiting goals.
+        """
         goals = self._sessions.cancel_waiting(cancel, By(client=Sender(name=self._name)))
         canceled = {each.id for each in goals}
         if cancel.ids is not None:
@@ -403,7 +411,7 @@ class RemoteSession:
         self._send(exchange)
 
     def _send(self, exchange: _RemoteExchange) -> bool:
-        """Send a request to the server, or refuse it and return False if it is too long."""
+        """Send a request to the server. If it is too long, refuse it and return False."""
         assert self._server
         if not self._server.send(exchange):
             self._refuse(exchange.remote, "line_too_long", f"a request has at most {MAX_LINE_BYTES} bytes")
@@ -411,7 +419,7 @@ class RemoteSession:
         return True
 
     def _new_id(self) -> str:
-        """Return a new id for a goal that has none. Goals are counted by their ids."""
+        """Generate an id for a goal that has none."""
         return f"{self._sessions.name[:_MAX_ID_PREFIX_CHARS]}-x{random.getrandbits(48):012x}"
 
     # -- from the server
@@ -439,7 +447,7 @@ class RemoteSession:
         self._clean_up()
 
     def _receive(self, lines: list[bytes]) -> None:
-        """Publish the server's lines for the client."""
+        """Process lines from the server, and publish them for the client."""
         answers: list[tuple[bytes, bytes | None]] = []
         for line in lines:
             try:
@@ -457,7 +465,7 @@ class RemoteSession:
         self._end_if_done()
 
     def _translate(self, message: JsonObject) -> list[tuple[bytes, bytes | None]]:
-        """Return the lines for the client that correspond to a line of the server's answer to a request."""
+        """Convert one line of the server's answer to lines for the client."""
         assert self._server
         exchange = self._server.match(message)
         if not isinstance(exchange, _RemoteExchange):
@@ -486,7 +494,7 @@ class RemoteSession:
             self._awaited.add(str(goal.get("id")))
 
     def _count_goal(self, exchange: _RemoteExchange, reply: JsonObject) -> None:
-        """Update the count of pending goals after the server's reply to a `say`."""
+        """Update the number of pending goals after the server has answered a `say` request."""
         if exchange.goal_id is None:
             return
         goal = reply.get("goal")
@@ -504,7 +512,7 @@ class RemoteSession:
     def end_goal(
         self, request: RemoteRequest, goal_id: str | None, state: State, reason: str, words: str, by: By | None
     ) -> Goal:
-        """End a goal that was not sent to the server. The arguments are those of `policy.end_unsent`."""
+        """End a goal that was never sent to the server. The arguments are those of `policy.end_unsent`."""
         goal, lines = policy.end_unsent(request, goal_id or self._new_id(), state, reason, words, time.time(), by)
         answer, *events = (encode(each) for each in lines)
         self._publish([(answer, request.correlation), *((each, None) for each in events)])
@@ -515,7 +523,10 @@ class RemoteSession:
         self._publish([(encode({"event": "gone", "message": why}), None)])
 
     def _publish(self, lines: list[tuple[bytes, bytes | None]]) -> None:
-        """Publish lines, each given with its correlation data. Lines with the same data share a payload if they fit."""
+        """Publish lines for the client. Each line comes with its correlation data.
+
+        Consecutive lines with the same correlation data are published in one message if they fit.
+        """
         if self._reply_topic is None:
             return
         limit = self._sessions.max_payload()
@@ -531,7 +542,11 @@ class RemoteSession:
             self._sessions.publish(self._reply_topic, payload, int(reliable), current)
 
     def _shortened(self, line: bytes, limit: int) -> bytes:
-        """Return the line without texts, an error, or nothing, because the line is too long for the broker."""
+        """Shorten a line that is too long for the broker.
+
+        Return the line without texts if that is short enough. Otherwise, return an error in place of a reply, and an
+        empty line in place of an event.
+        """
         message = decode(line)
         shorter = encode(policy.without_texts(message))
         if len(shorter) <= limit:
@@ -544,7 +559,7 @@ class RemoteSession:
         return b""
 
     def _clean_up(self) -> None:
-        """Close the connection and forget unanswered requests."""
+        """Close the connection to the server, and forget unanswered requests."""
         shared = self._sessions
         self._drop_waiting()
         for exchange in self._exchanges:
@@ -558,6 +573,9 @@ class RemoteSession:
 
 
 def _has_lasting_effect(remote: RemoteRequest) -> bool:
-    """Return whether a request has a lasting effect, even after a goodbye. A `patient` goal doesn't."""
+    """Return whether to carry out a request even if the client has said goodbye.
+
+    A `patient` goal is dropped in that case.
+    """
     request = remote.request
     return not request.patient if isinstance(request, Say) else isinstance(request, Cancel | Set | Pause | Resume)
