@@ -1,4 +1,4 @@
-"""The client library: connect to a server, send requests, and follow goals.
+"""The client library, which connects to a server, sends requests and follows goals.
 
 `client` has the requests, and `goal` the operations on a single goal. `core` implements the client's side of the
 protocol without I/O. `connection` has the blocking transports, and `connect` finds the server's socket. A new blocking

@@ -1,4 +1,4 @@
-"""The library's main class: send, follow and cancel goals from Python.
+"""The library's main class, which sends, follows and cancels goals.
 
     with Client(name="patrol") as talk:
         goal = talk.say("battery low")
@@ -38,17 +38,17 @@ if TYPE_CHECKING:
 
 __all__ = ["Client", "GoalHandle"]
 
-#: The part of a request's line that is reserved for everything except the list of ids.
+#: The number of bytes in a request that are reserved for everything except the list of ids.
 _REST_OF_LINE_BYTES = 4096
-#: The maximum size of an ASCII character in JSON (a quote with its backslash), and of any character (an escaped
-#: surrogate pair).
+#: The maximum sizes of a character in JSON: two bytes for an escaped ASCII character, such as a quote, and twelve bytes
+#: for any other character, which may be an escaped surrogate pair.
 _MAX_ASCII_BYTES, _MAX_CHARACTER_BYTES = 2, 12
-#: A `seq` with more digits than any request will have.
+#: A `seq` with more digits than that of any real request.
 _LONG_SEQ = 10**15
 
 
 class Client:
-    """A connection to a talk server. The server is looked for in the same places as by the command `talk`.
+    """A connection to a talk server, which is found in the same places as by the command `talk`.
 
     If the connection breaks, for example because the server was restarted, the next call reconnects. If the server is
     still the same process, its goals are followed again. Otherwise they are LOST.
@@ -79,14 +79,14 @@ class Client:
 
     @classmethod
     def over(cls, connection: Connection) -> Client:
-        """Return a client that uses an existing connection. This method is not part of the library's interface."""
+        """Return a client that uses an existing connection. This method is private to `talk`."""
         client = cls.__new__(cls)
         client._use(connection)
         return client
 
     def _use(self, connection: Connection) -> None:
         self._connection = connection
-        #: the boot id of the first server, which completes ids that are bare numbers
+        #: the boot id of the first server, which is put before ids that are only numbers
         self._first_boot = connection.boot
 
     @property
@@ -96,7 +96,7 @@ class Client:
 
     @property
     def server_pid(self) -> int | None:
-        """The process id that the server reports."""
+        """The server's process id."""
         return self._connection.pid
 
     def close(self) -> None:
@@ -133,7 +133,7 @@ class Client:
         patient: bool = False,
         block: bool = True,
     ) -> GoalHandle:
-        """Send a goal, and return its handle once the server has accepted or REJECTED the goal.
+        """Send a goal, and return its handle after the server has accepted or REJECTED the goal.
 
         Args:
             text: the text to speak, up to 10,000 characters.
@@ -237,7 +237,7 @@ class Client:
         before: str | None = None,
         key: str | None = None,
     ) -> Canceled:
-        """Cancel the selected goals, and return once they are silent. Without arguments, cancel all goals.
+        """Cancel goals, and return when they are silent. Without arguments, cancel all goals.
 
         A goal is cancelled if any of the arguments selects it.
 
@@ -284,7 +284,7 @@ class Client:
         return Goal.from_json(reply.get("goal"))
 
     def log(self, count: int = 20) -> list[Goal]:
-        """Return the goals that ended last, including REJECTED ones, with the oldest first.
+        """Return the most recently ended goals, including REJECTED ones, with the oldest first.
 
         Args:
             count: the maximum number of goals, 1 to 2,200. The server keeps no more than 2,200.
@@ -307,7 +307,7 @@ class Client:
         return [each["voice"] for each in items if isinstance(each.get("voice"), dict)]  # type: ignore[misc]
 
     def settings(self) -> JsonObject:
-        """Return the server's settings, which apply to goals without such options of their own.
+        """Return the server's settings, which are the defaults for goals.
 
         The object has `rate`, `volume`, `voice`, `pitch`, `preempt` and `ttl`, in the units of `say`. A voice of None
         is the default voice of the driver. A ttl of None means no limit.
@@ -323,7 +323,7 @@ class Client:
         preempt: bool | None = None,
         ttl: float | None = None,
     ) -> JsonObject:
-        """Change the server's settings, and return all of them as `settings` does.
+        """Change the server's settings, and return all of them in the same form as `settings`.
 
         The new settings apply to goals that have not begun to be spoken. They last until the server ends. The units are
         those of `say`.
@@ -347,21 +347,21 @@ class Client:
         return settings if isinstance(settings, dict) else {}
 
     def pause(self) -> Goal | None:
-        """Pause all speech, and return the paused goal once it is silent. Return None if no goal was being spoken.
+        """Pause all speech, and return the paused goal when it is silent, or None if no goal was being spoken.
 
         Nothing is spoken until any client calls `resume`. Pausing twice is no error.
         """
         return goal_in(self._connection.request(Pause())[0])
 
     def resume(self) -> Goal | None:
-        """Resume speech, and return the goal that continues. Return None if no goal was paused.
+        """Resume speech, and return the resumed goal, or None if no goal was paused.
 
         Resuming twice is no error.
         """
         return goal_in(self._connection.request(Resume())[0])
 
     def events(self, *, reconnect: bool = False) -> Iterator[Event]:
-        """Iterate over the events of all goals from now on.
+        """Iterate over the events of all goals, starting now.
 
         The first event is a Snapshot. It is followed by StateChanged, WordHeard and PausedChanged events. The first and
         the last StateChanged of a goal contain the whole goal. The iteration can be stopped at any time.
@@ -387,7 +387,7 @@ class Client:
     # -- internal
 
     def _handle(self, request: Say) -> tuple[GoalHandle, OnReply]:
-        """Return a handle for a new goal, and the function that processes the reply to its request.
+        """Create a handle for a new goal, and the function that processes the server's reply.
 
         If the text is too long for a request, the goal is already REJECTED.
 
@@ -405,14 +405,14 @@ class Client:
         return handle, accepted
 
     def _full_id(self, goal_id: str) -> str:
-        """Complete an id that is a bare number, and check it. The errors are those of `check_id`."""
+        """Check an id. If it is only a number, put the boot id before it. Raises the same errors as `check_id`."""
         if goal_id.isascii() and goal_id.isdecimal():
             goal_id = f"{self._first_boot}-{goal_id}"
         check_id(goal_id)
         return goal_id
 
     def _take_all(self, buffer: EventBuffer) -> Iterator[Event]:
-        """Iterate over the events in a buffer, and raise Lost when the buffer or the connection is closed."""
+        """Iterate over the events in a buffer. Raises Lost when the buffer or the connection is closed."""
         for event in taken(self._connection, lambda: buffer.take() or buffer.closed, None):
             if event is None or isinstance(event, str):
                 break
@@ -435,7 +435,7 @@ def check_id(goal_id: str) -> None:
 
 
 def batches(ids: Iterable[str]) -> list[tuple[str, ...]]:
-    """Split ids into groups that each fit into the line of a request. Keep the order, and drop duplicates."""
+    """Split ids into groups, each of which fits into one request. Duplicates are removed."""
     groups: list[list[str]] = []
     room = 0
     for each in dict.fromkeys(ids):
@@ -450,7 +450,7 @@ def batches(ids: Iterable[str]) -> list[tuple[str, ...]]:
 
 
 def check(request: Say | Set) -> None:
-    """Check the types and ranges of a request's options, as the server does.
+    """Check the types and ranges of a request's options in the same way as the server.
 
     Raises:
         UsageError: an option is not valid.
@@ -458,7 +458,7 @@ def check(request: Say | Set) -> None:
     for option in request.options:
         try:
             fault = option.type_error(getattr(request, option.name))
-        except (TypeError, ValueError) as error:  # `data` contains a value without a JSON form
+        except (TypeError, ValueError) as error:  # `data` contains a value that JSON can't represent
             fault = f"is no JSON: {error}"
         if fault:
             raise UsageError(f"{option.name!r} {fault}")
@@ -467,7 +467,7 @@ def check(request: Say | Set) -> None:
 
 
 def too_long(request: Say) -> Goal | None:
-    """Return a REJECTED goal if a text doesn't fit into a request, or None if the text fits.
+    """Return a REJECTED goal if the text is too long for a request, or None if it isn't.
 
     Raises:
         UsageError: `data` has no JSON form.

@@ -1,4 +1,4 @@
-"""Connect a client: find the server's socket, send the first request early, and explain failures.
+"""Connect a client to the server, and explain why if that fails.
 
 Connecting has two stages. In the first stage, `reach` opens a connection. A caller that already knows its request sends
 it with `send_early`, so that the server works on it while the rest of the client is imported. This stage imports next
@@ -25,25 +25,25 @@ if TYPE_CHECKING:
     from talkcli.errors import AccessDenied, TalkError
     from talkcli.goals.goal import JsonObject
 
-#: The beginning of a server's greeting in this protocol. A test compares it with the result of `protocol.lines`.
+#: The beginning of the greeting of a server with the same protocol. A test compares it with a real greeting.
 GREETING_START = b'{"talk": 1, "version": '
-#: Time in which an idle server sends its greeting. A longer wait must be interruptible.
+#: An idle server sends its greeting within this time. Longer waits must be interruptible.
 GREETING_WAIT_S = 0.2
-#: The longest time for which `yield_processor` waits.
+#: Maximum wait of `yield_processor`.
 _LONGEST_YIELD_S = 0.2
-#: Parts of an answer which show that the goal will not be spoken.
+#: If an answer contains one of these, the goal will not be spoken.
 _REFUSALS = (b'"ok": false', b'"state": "REJECTED"')
-#: Time in which a server must send its greeting, and must answer each request.
+#: Time limit for a server's greeting, and for each answer.
 ANSWER_LIMIT_S = 5.0
-#: How long to keep trying to connect to a server that has reached its client limit or has a full backlog.
+#: How long to keep trying if a server has too many clients or a full backlog.
 BUSY_LIMIT_S = 5.0
-#: The minimum and the maximum pause between two of these attempts. The pause is random, so that many clients that were
-#: refused at the same time don't all return at the same time.
+#: The minimum and maximum pause before trying again if a server is busy. The pause is random, so that refused clients
+#: don't all try again at the same moment.
 BUSY_PAUSE_S = (0.02, 0.2)
-#: The first and the longest pause between two attempts to reach a server that has not started yet. Each pause is twice
-#: as long as the one before.
+#: The first and longest pause before trying again if a server has not started yet. The pause doubles after each
+#: attempt.
 _FIRST_RETRY_PAUSE_S, _LONGEST_RETRY_PAUSE_S = 0.02, 0.25
-#: What the user can do if there is no server, or if the server refuses this user.
+#: Next steps for users who can't connect to a server.
 _START_STEP = "start one with: talk serve"
 _LET_IN_STEP = "have its owner let you in, with `talk serve --socket-mode 0660` and the socket's group"
 _START_OWN_STEP = "or start your own with: talk serve"
@@ -51,35 +51,35 @@ _START_OWN_STEP = "or start your own with: talk serve"
 
 @frozen
 class ConnectionAttempt:
-    """The progress of connecting to a server."""
+    """The state of an attempt to connect to a server."""
 
-    #: a non-blocking socket; None if no connection was accepted
+    #: the non-blocking socket, or None if no connection was accepted
     socket: _socket.socket | None
     #: path of the server's socket
     path: str = ""
-    #: the paths that were tried without success, each with its error
+    #: the paths that could not be used, with the error for each
     failures: tuple[tuple[str, Exception], ...] = ()
-    #: whether `hello` was sent
+    #: whether the hello message was sent
     hello_sent: bool = False
-    #: received bytes that have not been processed, starting with the greeting until `connect` has read it
+    #: received bytes that have not been processed yet
     received: bytes = b""
     #: the part of the first request that has been sent
     request_sent: bytes = b""
-    #: the server's boot id, which is the first half of the goal ids that it gives; empty until the greeting is read
+    #: the server's boot id, with which its goal ids begin, or "" if the greeting has not been read yet
     boot: str = ""
-    #: the process id that the server reports; None until the greeting is read
+    #: the server's process id, or None if the greeting has not been read yet
     pid: int | None = None
 
     @property
     def backlog_full(self) -> bool:
-        """Whether the last path has a server that accepts no connection now, because its backlog is full."""
+        """Whether the server can't accept a connection now, because its backlog is full."""
         return self.socket is None and bool(self.failures) and isinstance(self.failures[-1][1], BlockingIOError)
 
 
 def reach(
     named: str | None, failures: tuple[tuple[str, Exception], ...] = (), only: str | None = None
 ) -> ConnectionAttempt:
-    """Open a connection to the first place that accepts one, without sending anything.
+    """Connect to the first usable socket, without sending anything.
 
     Args:
         named: path of the only socket to try, as the user named it; None for the usual places.
@@ -88,7 +88,7 @@ def reach(
     """
     for path in [only] if only else paths.client_sockets(named)[len(failures) :]:
         connected = _socket.socket(_socket.AF_UNIX, _socket.SOCK_STREAM)
-        # If this call could block, a stopped server with a full backlog would block the client for ever.
+        # Don't block, because a stopped server with a full backlog would block the client for ever.
         connected.setblocking(False)
         error: Exception | None
         try:
@@ -100,13 +100,13 @@ def reach(
             return ConnectionAttempt(connected, path, failures)
         connected.close()
         failures = (*failures, (path, error))
-        if isinstance(error, BlockingIOError):  # the right server is there, but its backlog is full
+        if isinstance(error, BlockingIOError):  # this is the right server, but its backlog is full
             break
     return ConnectionAttempt(None, failures=failures)
 
 
 def _foreign(connected: _socket.socket) -> AccessDenied | None:
-    """Return an error if the server belongs to another user, who could then read everything that is sent."""
+    """Return an error if the server belongs to another user, who could read all requests."""
     from talkcli import peers
 
     _, uid = peers.credentials(connected)
@@ -120,7 +120,7 @@ def _foreign(connected: _socket.socket) -> AccessDenied | None:
 def send_early(
     attempt: ConnectionAttempt, hello: JsonObject, request: JsonObject, before: Callable[[], None]
 ) -> ConnectionAttempt | None:
-    """Send hello, and the first request as soon as the server's greeting is received.
+    """Send hello, wait briefly for the server's greeting, and then send the first request.
 
     The request is not sent if the greeting is late or unexpected.
 
@@ -146,7 +146,7 @@ def send_early(
             before()
             sent = line[: connected.send(line)]
     except TimeoutError:
-        pass  # the server may be busy, and `connect` waits for it
+        pass  # the server may be busy, so `connect` waits longer
     except OSError:
         connected.close()
         return None
@@ -155,7 +155,9 @@ def send_early(
 
 
 def yield_processor(attempt: ConnectionAttempt, timeout: float | None) -> ConnectionAttempt:
-    """Leave the processor to the server for a moment, and return the connection with the bytes received meanwhile.
+    """Sleep for a moment, so that the server has the processor for itself.
+
+    Return the connection, with the bytes that were received during the wait.
 
     A client that only waits for the end of its goal calls this before its other imports. The server, the engine, the
     player and the sound server need the processor until the first sound. Together they use about as much processor time
@@ -177,21 +179,21 @@ def yield_processor(attempt: ConnectionAttempt, timeout: float | None) -> Connec
             received += data
             if not data or any(each in data for each in _REFUSALS):
                 break
-    except OSError:  # the time is over, or the connection broke, in which case the next read fails, too
+    except OSError:  # the time is over or the connection broke, which the next read will notice
         pass
     connected.setblocking(False)
     return replace(attempt, received=received)
 
 
 def sender_name(name: str | None) -> str | None:
-    """Return the sender's name, which is the given name or else TALK_NAME. Return None if there is neither."""
-    # Even if the variable is not valid UTF-8, a cancel must not fail.
+    """Return the given name, or else the value of TALK_NAME, or None if it isn't set."""
+    # Cancelling must work even if the variable is not valid UTF-8.
     variable = os.environ.get("TALK_NAME", "").encode(errors="surrogateescape").decode(errors="replace")
     return name or variable or None
 
 
 def hello(name: str | None, *, urgent: bool) -> JsonObject:
-    """Return the first message of a client, as an object for the wire.
+    """Return the JSON object of a client's hello message.
 
     This function doesn't use `requests.Hello`, because importing it takes long. A test compares the results.
 
@@ -211,7 +213,7 @@ def connect(
     keep_trying: float = 0.0,
     end: float | None = None,
 ) -> ConnectionAttempt:
-    """Connect to the first server that accepts this client, and read its greeting.
+    """Connect to the first usable server, and read its greeting.
 
     Args:
         named: path of the only socket to try; None for the usual places.
@@ -267,7 +269,7 @@ def connect(
 
 
 def _may_start(attempt: ConnectionAttempt) -> bool:
-    """Return whether a server may soon start at one of the failed places."""
+    """Return whether a server could still be starting at one of the failed places."""
     found = (paths.describe_place(path, error) for path, error in attempt.failures if isinstance(error, OSError))
     return any(each in {paths.PLACE_ABSENT, paths.PLACE_STALE} for each in found)
 
@@ -279,7 +281,9 @@ def _greet(
     end: float,
     interrupt: Mapping[int, int] | None,
 ) -> ConnectionAttempt:
-    """Send hello unless that was done, and read the greeting by `end` (monotonic). Close the connection on any error.
+    """Send hello if it has not been sent yet, and read the server's greeting.
+
+    The connection is closed if the greeting has not arrived by `end` (monotonic), and after any other error.
 
     Raises:
         ConnectionError: the server closed the connection before it sent a greeting.
@@ -299,7 +303,7 @@ def _greet(
             try:
                 connected.send(request_line(hello))
             except (BrokenPipeError, ConnectionResetError):
-                pass  # the server has closed the connection, but the reason can still be read
+                pass  # the server has closed the connection, but its error message can still be read
         while b"\n" not in received:
             if not wait_ready({connected.fileno(): POLLIN}, end - time.monotonic(), interrupt):
                 listener, _ = peers.credentials(connected)
@@ -318,14 +322,14 @@ def _greet(
 
 
 def unreachable(attempt: ConnectionAttempt, named: str | None) -> TalkError:
-    """Return an error that lists the failed places, and tells the user what to do next."""
+    """Return an error that lists the failed places and the next step."""
     from talkcli.errors import AccessDenied, ServerUnavailable
 
     if attempt.backlog_full:
         path = attempt.failures[-1][0]
         return ServerUnavailable(f"the server at {path} does not take up connections: restart it if it hangs")
     tried = ""
-    found = ""  # what is at the last place; there is only one place if the user named it
+    found = ""  # description of the last place
     denied = False
     for path, error in attempt.failures:
         words = str(error)
@@ -347,7 +351,7 @@ def unreachable(attempt: ConnectionAttempt, named: str | None) -> TalkError:
 
 
 def _named_step(named: str, found: str, *, denied: bool) -> str:
-    """Return what the user can do next if the socket was named by an option or a variable.
+    """Return the next step for a user who named a socket by an option or a variable.
 
     Args:
         named: the path as the user named it.
@@ -372,5 +376,5 @@ def _named_step(named: str, found: str, *, denied: bool) -> str:
 
 
 def _inside(directory: str) -> str:
-    """Return the path of a socket with the usual name in a directory."""
+    """Return the path of the socket in a directory."""
     return f"{directory.rstrip('/')}/{paths.SOCKET_NAME}"

@@ -1,4 +1,4 @@
-"""Blocking connections to a server: shells around the client core, for any number of threads.
+"""Blocking, thread-safe connections to a server, built on `ClientCore`.
 
 `Connection` is the interface that the rest of the library uses, and the base class of all blocking transports.
 `SocketConnection` uses a Unix socket. `ReconnectingConnection` also uses a Unix socket, and reconnects after a break.
@@ -33,18 +33,19 @@ if TYPE_CHECKING:
 
     _T = TypeVar("_T")
 
-#: How many bytes are received at once.
+#: Maximum number of bytes to receive at once.
 _RECEIVE_BYTES = 256 * 1024
-#: The first and the longest pause between two attempts to reconnect. Each pause is twice as long as the one before.
+#: The first and longest pause between attempts to reconnect. The pause doubles after each attempt.
 _FIRST_RECONNECT_PAUSE_S, _LONGEST_RECONNECT_PAUSE_S = 0.02, 0.5
-#: How many times to read before a request is sent. Some events may have to be read before the end of the connection.
+#: How many times to read before sending a request, to find out whether the connection has ended. Events may have to be
+#: read before its end is noticed.
 _MAX_READS = 4
-#: How long a thread waits without a socket before it checks whether another thread has reconnected.
+#: How often a thread without a socket checks whether another thread has reconnected.
 _RECONNECT_CHECK_S = 0.1
 
 
 def taken(connection: Connection, take: Callable[[], _T], end: float | None) -> Iterator[_T]:
-    """Iterate over the results of `take`, and wait for the server while the result is empty.
+    """Call `take` repeatedly and yield its results, waiting for the server while there are none.
 
     An empty result is yielded if `end` has passed or the connection has ended. Nothing more is received after `end`, so
     that a loop over the results ends even if the server keeps sending events.
@@ -74,7 +75,7 @@ def taken(connection: Connection, take: Callable[[], _T], end: float | None) -> 
 
 
 class Connection(ClientCore):
-    """A connection to one server, for any number of threads. One of the waiting threads reads for all of them.
+    """Base class for thread-safe connections to a server.
 
     The server carries out each request at most once, in the order of sending. A request that could have an effect is
     never sent twice. The exception is a `say` with an id, because the server speaks it only once.
@@ -87,15 +88,15 @@ class Connection(ClientCore):
     ServerUnavailable. Events that were received before can still be read.
     """
 
-    #: the process that listens at the socket, according to the kernel; None if the server is on another machine
+    #: id of the process that listens at the socket, or None if the server is on another machine
     listener: int | None = None
-    #: the class of the exchanges that `begin` creates
+    #: the class that `begin` uses for exchanges
     exchange_type = Exchange
 
     def __init__(self, patience: float) -> None:
-        """Create the state of a connection. The server must answer each request within `patience` seconds."""
+        """Initialize a connection. The server must answer each request within `patience` seconds."""
         super().__init__(patience, time.monotonic())
-        #: the lock for all state; it is notified after messages have been processed
+        #: the condition that locks all state, and that is notified after messages have been processed
         self.changed = threading.Condition()
         self._process = os.getpid()
         self._reading = False
@@ -115,14 +116,14 @@ class Connection(ClientCore):
             self.end("the connection was closed")
             self._closing = True
             self._hang_up()
-            # If a thread is reading, that thread closes the descriptor. Otherwise the thread might poll the descriptor
-            # after its number was given to another file.
+            # If a thread is reading, let that thread close the descriptor. If it were closed here, its number could be
+            # reused while the thread is still polling it.
             if not self._reading:
                 self._drop()
             self.changed.notify_all()
 
     def request(self, request: Request, on_reply: OnReply | None = None) -> tuple[JsonObject, list[JsonObject]]:
-        """Send a request, and return its reply and the lines of the reply's list.
+        """Send a request, wait for the reply, and return it with its list items.
 
         Args:
             request: the request.
@@ -136,13 +137,13 @@ class Connection(ClientCore):
             Interrupted: as in `wait_until`.
         """
         exchange = self.begin(request, on_reply)
-        # The wait for the reply to a `say` can't be interrupted, because the caller needs the goal's id to cancel it. A
-        # patient `say` can be interrupted, because a goal that is waiting for room is cancelled with the connection.
+        # A normal `say` can't be interrupted, because the caller needs the goal's id to cancel the goal. A patient
+        # `say` can be interrupted, because closing the connection cancels a goal that is waiting for room in the queue.
         interruptible = exchange.slow or not isinstance(request, Say)
         try:
             deadline = self.answer_by(exchange)
             while not self.wait_until(lambda: exchange.over, deadline, interruptible=interruptible):
-                # Each line of the answer moves the deadline.
+                # Each received line extends the deadline.
                 earlier, deadline = deadline, self.answer_by(exchange)
                 if deadline == earlier:
                     break
@@ -171,7 +172,7 @@ class Connection(ClientCore):
         return exchange
 
     def submit(self, request: Request, on_reply: OnReply, on_failure: OnFailure) -> None:
-        """Send a request without waiting. Bytes that the server doesn't accept now are sent by later calls.
+        """Send a request without blocking. Later calls send the bytes that the server doesn't accept now.
 
         One of the two functions is called during this call or a later one, while the lock `changed` is held.
 
@@ -190,7 +191,7 @@ class Connection(ClientCore):
             self.begin(request, on_reply, on_failure)
 
     def post(self, request: Request) -> None:
-        """Send a request without waiting, and ignore the answer.
+        """Send a request without blocking, and ignore the answer.
 
         Raises:
             ServerUnavailable: the request can't be sent.
@@ -208,7 +209,9 @@ class Connection(ClientCore):
         since: float | None = None,
         interruptible: bool = True,
     ) -> bool:
-        """Read and process messages until `done()` is true. A server that is silent for too long is treated as gone.
+        """Read and process messages until `done()` is true, or until the connection has ended.
+
+        If the server is silent for too long, the connection ends.
 
         Args:
             done: called while the lock `changed` is held, and never again after it has returned True.
@@ -241,7 +244,8 @@ class Connection(ClientCore):
                         return False
                     self.break_off(why, now)
                     continue
-                # Read once more at the deadline, without waiting, because messages that have arrived count.
+                # At the deadline, read once more without waiting, because messages that have already arrived must be
+                # processed.
                 last = now >= end
                 wait_s = max(0.0, min(end, self.next_expiry()) - now)
                 if self._reading:
@@ -258,7 +262,7 @@ class Connection(ClientCore):
                     self.changed.notify_all()
 
     def _read_available(self) -> None:
-        """Process the messages that have arrived, without waiting. This also finds the end of the connection."""
+        """Process the messages that have already arrived, and notice if the connection has ended."""
         for _ in range(_MAX_READS):
             heard = self._heard
             self.wait_until(lambda: False, time.monotonic(), interruptible=False)
@@ -276,7 +280,7 @@ class Connection(ClientCore):
         raise NotImplementedError
 
     def _step(self, timeout: float, interruptible: bool) -> None:
-        """Wait up to `timeout` seconds for messages, and process them. Only one thread at a time calls this.
+        """Wait up to `timeout` seconds for messages, and process them. Only one thread may call this at a time.
 
         Raises:
             Interrupted: the wait is `interruptible`, and one of the interrupting descriptors is ready.
@@ -284,19 +288,19 @@ class Connection(ClientCore):
         raise NotImplementedError
 
     def _hang_up(self) -> None:
-        """Disconnect, and wake the reading thread."""
+        """Disconnect, which also wakes the reading thread."""
         raise NotImplementedError
 
     def _drop(self) -> None:
-        """Close this process's descriptors. Those of a parent process stay open."""
+        """Close this process's descriptors, but not those of the parent process."""
         raise NotImplementedError
 
     def _cut_off(self) -> None:
-        """Disconnect, because only a part of a line could be sent."""
+        """Disconnect, because a line could only be sent in part."""
 
 
 class SocketConnection(Connection):
-    """A connection over a Unix socket, without a thread of its own."""
+    """A connection over a Unix socket."""
 
     def __init__(
         self,
@@ -341,12 +345,12 @@ class SocketConnection(Connection):
         self._socket: _socket.socket | None = attempt.socket
         self.path, self.boot, self.pid = attempt.path, attempt.boot, attempt.pid
         self._sent_early = attempt.request_sent
-        #: bytes that were received after the greeting; they are processed once the early request is registered
+        #: bytes that were received after the greeting, and are processed after the early request is registered
         self._received_early = attempt.received
 
     @property
     def listener(self) -> int | None:  # type: ignore[override]
-        """The id of the process that listens at the socket, according to the kernel. None while disconnected."""
+        """The id of the process that listens at the socket, or None while disconnected."""
         return None if self._socket is None else peers.credentials(self._socket)[0]
 
     def _send(self, exchange: Exchange) -> None:
@@ -363,13 +367,13 @@ class SocketConnection(Connection):
         self._flush()
 
     def _flush(self) -> None:
-        """Send as many of the outgoing bytes as the server accepts now. The caller holds the lock `changed`."""
+        """Send as many bytes as the server accepts now. The caller must hold the lock `changed`."""
         try:
             while self._socket is not None and (data := self.outgoing()):
                 self.mark_sent(self._socket.send(data))
         except BlockingIOError:
             pass
-        except OSError as error:  # the server's last messages can still be read before the end of the connection
+        except OSError as error:  # keep the connection, because the server's last messages can still be read
             if self.greeted:
                 self.stop_sending("the server went away", f"the server at {self.path} went away: {error.strerror}")
 
@@ -392,10 +396,10 @@ class SocketConnection(Connection):
                 return
             data = connected.recv(_RECEIVE_BYTES)
         except BlockingIOError:
-            return  # the socket has only become writable
-        except ConnectionResetError:  # the server closed it without reading everything
+            return  # the socket is writable, but not readable
+        except ConnectionResetError:  # the server closed the connection without reading all requests
             pass
-        except (OSError, ValueError) as error:  # ValueError: another thread has closed it
+        except (OSError, ValueError) as error:  # ValueError: another thread has closed the socket
             why = f"the connection broke: {error}"
         with self.changed:
             if connected is not self._socket:
@@ -408,7 +412,7 @@ class SocketConnection(Connection):
                 self.break_off(why, now)
 
     def _hang_up(self) -> None:
-        self._shut(SHUT_RDWR)  # unlike closing the socket, this wakes the reading thread
+        self._shut(SHUT_RDWR)  # closing the socket would not wake the reading thread
 
     def _drop(self) -> None:
         if self._socket is not None:
@@ -423,28 +427,28 @@ class SocketConnection(Connection):
             if self._socket is not None:
                 self._socket.shutdown(direction)
         except OSError:
-            pass  # the server has closed it
+            pass  # the server has closed the connection
 
 
 class ReconnectingConnection(SocketConnection):
-    """A connection over a Unix socket that reconnects after a break. Only `close` ends it.
+    """A connection over a Unix socket that reconnects after it has been interrupted.
 
-    It has no thread of its own. It reconnects during later calls.
+    It has no thread of its own, so it reconnects during later calls. Only `close` ends it for good.
     """
 
     def __init__(self, socket: str | None = None, *, name: str | None = None, patience: float = ANSWER_LIMIT_S) -> None:
         """Connect to a server. The arguments are those of `SocketConnection`."""
         super().__init__(socket, name=name, patience=patience)
-        #: former sockets that only the reading thread may close, because it may still be polling them
+        #: former sockets, which only the reading thread may close, because it may still be polling them
         self._given_up: list[_socket.socket] = []
-        #: when the next attempt to connect is due; during an attempt, when the greeting is due (monotonic)
+        #: monotonic time of the next attempt to connect. During an attempt, this is the time limit for the greeting.
         self._due = 0.0
-        #: the pause after the next failed attempt
+        #: the pause to make after the next failed attempt
         self._pause_s = _FIRST_RECONNECT_PAUSE_S
 
     def begin(self, request: Request, on_reply: OnReply | None = None, on_failure: OnFailure | None = None) -> Exchange:
         if on_failure is None:
-            self._read_available()  # finds a break since the last call
+            self._read_available()  # notices if the connection has broken
         with self.changed:
             if self.ended is None:
                 self._connect_again(time.monotonic(), at_once=isinstance(request, Cancel))
@@ -483,18 +487,18 @@ class ReconnectingConnection(SocketConnection):
     def post(self, request: Request) -> None:
         failures: list[TalkError] = []
         self.submit(request, lambda *_: None, failures.append)
-        if failures and self.unsent_bytes:  # the buffer is full; if the connection had broken, it would be empty
+        if failures and self.unsent_bytes:  # the buffer is full, because it would be empty if the connection had broken
             raise failures[0]
 
     def receive(self, data: bytes, now: float) -> None:
         try:
             super().receive(data, now)
-        except TalkError as error:  # according to the greeting, the server can't be used
+        except TalkError as error:  # the greeting shows that the server can't be used
             self._give_up_socket()
             self._not_connected(error, now)
 
     def _connect_again(self, now: float, *, at_once: bool = False) -> None:
-        """Try to connect if there is no socket and the pause is over. With `at_once`, ignore the pause."""
+        """Reconnect if the connection is broken and the pause is over. `at_once` ignores the pause."""
         if self._socket is not None or (now < self._due and not at_once):
             return
         found = reach(self._named, only=self.path)
@@ -506,12 +510,15 @@ class ReconnectingConnection(SocketConnection):
         self._flush()
 
     def _not_connected(self, error: TalkError, now: float) -> None:
-        """Record that an attempt has failed, and schedule the next one."""
+        """Record a failed attempt to connect, and schedule the next one."""
         self._due, self._pause_s = now + self._pause_s, min(2 * self._pause_s, _LONGEST_RECONNECT_PAUSE_S)
         self.not_connected(error)
 
     def _give_up_socket(self) -> None:
-        """Disconnect. If a thread is reading, it closes the socket later. The caller holds the lock `changed`."""
+        """Disconnect. If a thread is reading, that thread closes the socket later.
+
+        The caller must hold the lock `changed`.
+        """
         self._hang_up()
         if self._socket is not None and self._reading:
             self._given_up.append(self._socket)

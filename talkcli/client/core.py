@@ -1,6 +1,7 @@
-"""The client's side of the protocol, without I/O: requests become bytes, received bytes become replies and events.
+"""The client's side of the protocol, without I/O.
 
-A transport is a shell around `ClientCore`. The shell connects, and it owns the lock or the event loop. Its duties are:
+`ClientCore` turns requests into bytes, and received bytes into replies and events. A transport is a shell around it,
+which connects, and has the lock or the event loop. Its duties are:
 
 - Send the bytes that `outgoing()` returns, and report with `mark_sent()` how many were accepted.
 - Pass received bytes to `receive()`.
@@ -35,30 +36,31 @@ if TYPE_CHECKING:
     from talkcli.protocol.events import Event
     from talkcli.protocol.requests import Request
 
-#: A function that receives the reply to a request and the lines of the reply's list.
+#: A callback for the reply to a request, and for the list items that preceded the reply.
 OnReply = Callable[["JsonObject", "list[JsonObject]"], None]
-#: A function that receives the error if a request was refused, was not sent, or will not be answered.
+#: A callback for the error if a request was refused, not sent, or not answered.
 OnFailure = Callable[["TalkError"], None]
-#: A function that receives the events of a goal. After a break of the connection, it also receives the current goal.
+#: A callback for the events of a goal. After reconnecting, it is also called with the goal's current state.
 Listener = Callable[["Event | Goal | GoalLost"], None]
 
-#: A server that sends nothing for this time is treated as gone. It sends a sign of life every 5 s to waiting clients.
+#: If the server sends nothing for this time, the connection is treated as broken. A working server sends waiting
+#: clients a message at least every 5 s.
 SILENCE_LIMIT_S = 15.0
-#: Size limit of the send buffer for requests that are sent without waiting.
+#: Maximum size of the requests that are waiting to be sent.
 MAX_UNSENT_BYTES = 256 * 1024
-#: The minimum ttl in a request, because 0 would mean no limit.
+#: The minimum TTL in a request, because 0 would mean no limit.
 _MIN_TTL_S = 0.01
-#: How many words and pauses are kept for a slow reader. If there are more, the oldest are dropped. The longest text has
-#: 10,000 characters and thus at most 5,000 words, so no word of a single goal is dropped.
+#: Maximum number of buffered words and pauses. If there are more, the oldest are dropped. This is enough for the
+#: longest text, which has 10,000 characters and thus at most 5,000 words.
 MAX_FEEDBACK_EVENTS = 5_000
-#: How many state changes are kept for a slow reader of all goals. They are enough for about 3,000 goals. If there are
-#: more, the reader's stream ends.
+#: Maximum number of buffered state changes, which is enough for about 3,000 goals. If there are more, the reader's
+#: stream ends.
 MAX_STATE_EVENTS = 10_000
 
 
 @frozen
 class GoalLost:
-    """A message to a goal's listeners that the goal is lost, and that no more events will follow."""
+    """Tells a goal's listeners that the goal is lost, so that no more events will follow."""
 
     #: a human-readable reason
     why: str
@@ -68,18 +70,18 @@ class EventBuffer:
     """A bounded queue of events for one reader."""
 
     def __init__(self, *, reconnects: bool = False) -> None:
-        # There are two queues of numbered events, so that dropping the oldest feedback takes constant time.
+        # Two queues of numbered events make it fast to drop the oldest feedback.
         self._states: deque[tuple[int, Event]] = deque()
         self._feedback: deque[tuple[int, Event]] = deque(maxlen=MAX_FEEDBACK_EVENTS)
         self._count = 0
         self._last_number: int | None = None
-        #: the reason why no more events are added; None while the buffer is open
+        #: why the buffer was closed, or None while it is open
         self.closed: str | None = None
-        #: whether the buffer stays in use after the connection has broken
+        #: whether the buffer is still used after the client has reconnected
         self.reconnects = reconnects
 
     def add(self, event: Event) -> None:
-        """Add an event, unless it is the same as the last one or the buffer is closed.
+        """Add an event, unless it is a duplicate or the buffer is closed.
 
         A connection that waits for a goal and also watches all goals receives each state twice.
         """
@@ -103,33 +105,33 @@ class EventBuffer:
         return len(self._states) + len(self._feedback)
 
     def take(self) -> Event | None:
-        """Remove and return the oldest event. Return None if the buffer is empty."""
+        """Remove and return the oldest event, or return None if the buffer is empty."""
         queues = [each for each in (self._states, self._feedback) if each]
         return min(queues, key=lambda each: each[0][0]).popleft()[1] if queues else None
 
 
 class EventListeners:
-    """The listeners for single goals, and the buffers of readers that watch all goals."""
+    """The listeners of single goals, and the event buffers of readers that watch all goals."""
 
     def __init__(self) -> None:
-        #: for each goal id, the listeners, and whether each of them also wants the goal's words
+        #: the listeners of each goal, by id, and whether each listener also receives words
         self._goals: dict[str, dict[Listener, bool]] = {}
-        #: weak references, because watching ends when the reader drops its iterator
+        #: weak references, because a reader stops watching by dropping its iterator
         self._watches: WeakSet[EventBuffer] = WeakSet()
 
     def add(self, goal_id: str, listener: Listener, *, feedback: bool = False) -> None:
-        """Pass a goal's events and all pauses to a listener, until the goal's Result or GoalLost.
+        """Add a listener for a goal's events and for all pauses. It is removed when the goal has ended or is lost.
 
         Args:
             goal_id: the goal's id.
             listener: the function to call. Adding the same listener again has no effect, except for `feedback`.
-            feedback: also pass each word.
+            feedback: whether the listener also receives words.
         """
         listeners = self._goals.setdefault(goal_id, {})
         listeners[listener] = feedback or listeners.get(listener, False)
 
     def watch(self, buffer: EventBuffer) -> None:
-        """Add all events to this buffer, as long as its reader keeps a reference to it."""
+        """Add all events to this buffer until its reader drops it."""
         self._watches.add(buffer)
 
     @property
@@ -139,11 +141,11 @@ class EventListeners:
 
     @property
     def goals(self) -> dict[str, bool]:
-        """The ids of all goals with listeners, and whether any listener wants the goal's words."""
+        """The ids of all goals with listeners, and whether any of a goal's listeners receives words."""
         return {goal_id: any(listeners.values()) for goal_id, listeners in self._goals.items()}
 
     def lose(self, goal_id: str, why: str) -> None:
-        """Tell a goal's listeners that the goal is lost, and remove them. `why` is the human-readable reason."""
+        """Tell a goal's listeners that the goal is lost, and remove them. `why` is a human-readable reason."""
         for listener in self._goals.pop(goal_id, {}):
             listener(GoalLost(why))
 
@@ -157,7 +159,7 @@ class EventListeners:
 
         Args:
             why: a human-readable reason.
-            include_reconnecting: also close the buffers that would stay in use after a break.
+            include_reconnecting: whether to also close buffers that are still used after reconnecting.
         """
         for buffer in list(self._watches):
             if include_reconnecting or not buffer.reconnects:
@@ -165,7 +167,7 @@ class EventListeners:
                 self._watches.discard(buffer)
 
     def publish(self, event: Event | None) -> None:
-        """Pass an event to the listeners for its goal and to the readers that watch all goals. Ignore None."""
+        """Pass an event to the goal's listeners and to the readers that watch all goals. None is ignored."""
         if isinstance(event, Result):
             for listener in self._goals.pop(event.goal.id, {}):
                 listener(event)
@@ -176,7 +178,7 @@ class EventListeners:
                     listener(event)
             state = event.state if isinstance(event, StateChanged) and not event.goal else None
             if state is State.PENDING or (state and state.terminal):
-                return  # the server sends this event again, with the whole goal, to clients that watch all goals
+                return  # the server sends watching clients this event again, with the whole goal
         elif not isinstance(event, Snapshot):
             return
         for buffer in self._watches:
@@ -184,29 +186,29 @@ class EventListeners:
 
 
 class TrackedGoal:
-    """A client's knowledge of one goal, with a buffer of its events."""
+    """What a client knows about a goal, and a buffer for the goal's events."""
 
     def __init__(self, goal: Goal) -> None:
-        #: the goal as last described by the server
+        #: the goal's last known state
         self.goal = goal
-        #: whether a goal with this id had been sent before, so that the text is not spoken again
+        #: whether a goal with this id had already been sent, so that the text isn't spoken twice
         self.attached = False
-        #: whether the server has paused all speech, as far as is known
+        #: whether all speech is paused, as far as the client knows
         self.speech_paused = False
-        #: when the server started to send the goal's events to this connection (monotonic); None before that
+        #: monotonic time since when the server has sent the goal's events to this connection, or None if it doesn't
         self._followed_at: float | None = None
-        #: whether words and pauses are buffered, too
+        #: whether to buffer words and pauses, too
         self._with_feedback = False
         self._buffer = EventBuffer()
 
     def _expect(self, request: Say, now: float) -> None:
-        """Copy the id and text of a `say` request that has not been answered yet."""
+        """Copy the id and text from a `say` request, until the server has answered it."""
         self.goal = replace(self.goal, id=request.id or "", text=request.text)
         if request.wait:
             self._followed_at = now
 
     def _accept(self, reply: JsonObject) -> None:
-        """Update the goal from the reply to its `say`."""
+        """Update the goal from the server's reply to `say`."""
         self.goal = Goal.from_json(reply.get("goal"))
         self.attached = reply.get("attached") is True
         self.speech_paused = reply.get("paused") is True
@@ -220,7 +222,7 @@ class TrackedGoal:
             listeners.add(self.goal.id, self._hear, feedback=feedback)
 
     def _fail(self, error: TalkError) -> None:
-        """End the goal because its `say` failed. It is LOST if it may be spoken, and otherwise REJECTED."""
+        """End the goal because `say` failed: as LOST if the goal may be spoken, and otherwise as REJECTED."""
         from talkcli.goals.reasons import Reason  # rarely needed, and slow to import
 
         if isinstance(error, Lost):
@@ -231,7 +233,7 @@ class TrackedGoal:
             self._update(replace(self.goal, state=State.REJECTED, reason=reason, message=message))
 
     def _update(self, goal: Goal) -> None:
-        """Replace the goal with a newer description of it, unless it has already ended."""
+        """Replace the goal with its newer state, unless it has already ended."""
         if not self.goal.state.terminal:
             self.goal = goal
 
@@ -248,7 +250,7 @@ class TrackedGoal:
         elif isinstance(event, Result):
             self.goal = event.goal
         elif isinstance(event, StateChanged):
-            # After a terminal state, the Result follows. Only the Result has the details.
+            # A terminal state is followed by the Result, which has more details.
             if not event.state.terminal:
                 self.goal = replace(self.goal, state=event.state)
             self._buffer.add(event)
@@ -265,19 +267,19 @@ class TrackedGoal:
         return self.goal.state.terminal or bool(self._buffer)
 
     def _take(self) -> Event | None:
-        """Remove and return the oldest event. After the last event of an ended goal, always return its Result."""
+        """Remove and return the oldest event. If there is none, return the Result of an ended goal."""
         return self._buffer.take() or (Result(self.goal) if self.goal.state.terminal else None)
 
 
 def lost(goal: Goal, why: str) -> Goal:
-    """Return a copy of a goal that has ended as LOST. `why` is the human-readable reason."""
+    """Return a copy of a goal in the state LOST. `why` is a human-readable reason."""
     from talkcli.goals.reasons import Reason  # rarely needed, and slow to import
 
     return replace(goal, state=State.LOST, reason=Reason.LOST.value, message=f"Talk lost: {why}")
 
 
 def read_greeting(line: bytes, path: str, version: str) -> JsonObject:
-    """Return a server's greeting, after checking that this client can use the server.
+    """Read a server's greeting, and check that this client can use the server.
 
     Args:
         line: the server's first line, without its newline.
@@ -285,7 +287,7 @@ def read_greeting(line: bytes, path: str, version: str) -> JsonObject:
         version: this client's version, for error messages.
 
     Raises:
-        ServerUnavailable: the line is no greeting.
+        ServerUnavailable: the line is not a greeting.
         ProtocolMismatch, Busy, AccessDenied: the server can't be used.
     """
     try:
@@ -303,16 +305,16 @@ def read_greeting(line: bytes, path: str, version: str) -> JsonObject:
 
 
 def identity(server: JsonObject) -> tuple[str, int | None]:
-    """Return the boot id and the process id from a greeting or another description of a server."""
+    """Return a server's boot id and process id, from its greeting or its status."""
     boot, pid = server.get("boot"), server.get("pid")
     return boot if isinstance(boot, str) else "", pid if isinstance(pid, int) else None
 
 
 class Exchange:
-    """A request and its answer: a reply, which may follow the lines of a list."""
+    """A request and its answer, which consists of list items and a reply."""
 
     def __init__(self, request: Request, on_reply: OnReply | None = None, on_failure: OnFailure | None = None) -> None:
-        """Create an exchange. It must be registered before its request is sent.
+        """Create an exchange, which must be registered before the request is sent.
 
         Args:
             request: the request.
@@ -322,21 +324,21 @@ class Exchange:
         """
         self.request = request
         self.on_reply, self.on_failure = on_reply, on_failure
-        #: the `seq` of the request and of all lines of its answer; 0 until the exchange is registered
+        #: the `seq` of the request and of its answer, or 0 if the exchange is not registered yet
         self.number = 0
-        #: whether the whole line was sent, so that the server may carry out the request
+        #: whether the whole request was sent, so that the server may carry it out
         self.sent = False
-        #: the lines of the list that have been received
+        #: the list items that have been received
         self.items: list[JsonObject] = []
         self.reply: JsonObject | None = None
-        #: the error, if there will be no reply; None otherwise
+        #: the error if there will be no reply, or None
         self.error: TalkError | None = None
-        #: when the last line of the answer was received, or else when the exchange began (monotonic)
+        #: monotonic time of the last received line, or of the beginning of the exchange
         self.heard_at = 0.0
 
     @property
     def slow(self) -> bool:
-        """Whether the answer may take any time."""
+        """Whether there is no time limit for the answer."""
         return isinstance(self.request, Pause) or (isinstance(self.request, Say) and self.request.patient)
 
     @property
@@ -346,13 +348,13 @@ class Exchange:
 
 
 class ClientCore:
-    """The protocol state of one client's connection to a server."""
+    """The protocol state of a client's connection to a server."""
 
-    #: the requests that may have a lasting effect even if no answer is received
+    #: the kinds of requests that may have an effect even if no answer is received
     lasting: tuple[type[Request], ...] = (Say,)
 
     def __init__(self, patience: float, now: float) -> None:
-        """Create the state of a connection that is already established.
+        """Initialize the state for a connection that is already open.
 
         Args:
             patience: seconds in which the server must answer.
@@ -360,57 +362,58 @@ class ClientCore:
         """
         #: the server's socket or address, for error messages
         self.path = ""
-        #: the server's boot id, which is the first half of the goal ids that the server gives
+        #: the server's boot id, with which its goal ids begin
         self.boot = ""
-        #: the process id that the server reports
+        #: the server's process id
         self.pid: int | None = None
         self.listeners = EventListeners()
-        #: the reason why the connection has ended for good; None until then
+        #: why the connection has ended for good, or None if it hasn't
         self.ended: str | None = None
-        #: the open exchanges by their numbers
+        #: the unanswered exchanges, by number
         self.exchanges: dict[int, Exchange] = {}
-        #: whether the server has sent its greeting, so that requests may be sent
+        #: whether the server has sent its greeting. Requests may only be sent after that.
         self.greeted = True
-        #: since when there has been no connection (monotonic); None while there is one
+        #: monotonic time at which the connection broke, or None while there is a connection
         self.absent_since: float | None = None
-        #: the reason of the last break of the connection
+        #: why the connection last broke
         self.absence = ""
-        #: the error of the last attempt to reconnect; None after a success
+        #: the error of the last attempt to reconnect, or None if it succeeded
         self.connect_error: TalkError | None = None
         self._patience = patience
         self._numbers: Iterator[int] = itertools.count(FIRST_NUMBER)
         self._splitter = LineSplitter()
-        #: when the last bytes were received (monotonic)
+        #: monotonic time at which bytes were last received
         self._heard = now
-        #: lines that are waiting to be sent, each with its exchange
+        #: the lines that are waiting to be sent, with their exchanges
         self._unsent: deque[tuple[bytes, Exchange]] = deque()
-        #: how many bytes of the first of these lines have been sent
+        #: number of bytes of the first waiting line that have already been sent
         self._first_sent_bytes = 0
-        #: the unsent part of the hello line, which is sent before the server's greeting is received
+        #: the unsent part of the hello line, which need not wait for the server's greeting
         self._hello = b""
-        #: this client's version, for error messages about a greeting
+        #: this client's version, for error messages
         self._version = ""
-        #: the part of the first request that was sent before this object was created
+        #: the bytes of the first request that were sent before this object was created
         self._sent_early = b""
-        #: the reason why nothing more can be sent, although answers may still be received; None otherwise
+        #: why requests can no longer be sent, although answers may still be received, or None if they can be sent
         self._sending_ended: str | None = None
-        #: the last error that answered no request; if the server then closes the connection, this is the reason
+        #: the last error message that answered no request. If the server then closes the connection, this is the
+        #: reason.
         self._last_error: str | None = None
 
     # -- requests
 
     def register(self, exchange: Exchange, now: float) -> None:
-        """Start expecting the answer to a request, and number the exchange unless it has a number already."""
+        """Number an exchange if it has no number yet, and expect its answer."""
         exchange.number = exchange.number or next(self._numbers)
         exchange.heard_at = now
         self.exchanges[exchange.number] = exchange
 
     def line(self, exchange: Exchange) -> bytes:
-        """Return the request line of a registered exchange."""
+        """Return the line that sends the request of a registered exchange."""
         return request_line({"seq": exchange.number, **write_request(exchange.request)})
 
     def queue(self, line: bytes, exchange: Exchange) -> None:
-        """Append the line of an exchange to the outgoing bytes.
+        """Append the line of an exchange to the bytes that are waiting to be sent.
 
         Raises:
             ServerUnavailable: nothing more can be sent.
@@ -431,13 +434,13 @@ class ClientCore:
         return sum(len(line) for line, _ in self._unsent) - self._first_sent_bytes
 
     def outgoing(self) -> bytes:
-        """Return the bytes to be sent now. Requests are held back until the server has sent its greeting."""
+        """Return the bytes that can be sent now. Requests wait for the server's greeting."""
         if self._hello or not self.greeted:
             return self._hello
         return b"".join(line for line, _ in self._unsent)[self._first_sent_bytes :]
 
     def mark_sent(self, count: int) -> None:
-        """Record that the transport has accepted this number of outgoing bytes."""
+        """Remove this number of bytes from the waiting bytes, because they have been sent."""
         if self._hello:
             self._hello = self._hello[count:]
             return
@@ -449,7 +452,7 @@ class ClientCore:
         self._first_sent_bytes = count
 
     def forget(self, exchange: Exchange) -> bool:
-        """Stop expecting an answer. If the request has not been sent, don't send it.
+        """Stop waiting for an answer. A request that has not been sent is removed.
 
         Returns:
             False if a part of the line has been sent. The connection must then be closed before the newline is sent,
@@ -465,7 +468,7 @@ class ClientCore:
         return True
 
     def stop_sending(self, why: str, message: str) -> None:
-        """Fail the requests that have not been sent, and all later ones. Answers can still be received.
+        """Fail all unsent and later requests. Answers to earlier requests can still be received.
 
         Args:
             why: the reason, which becomes a part of the error messages of later requests.
@@ -478,7 +481,7 @@ class ClientCore:
             self.fail(exchange, ServerUnavailable(message))
 
     def answer(self, exchange: Exchange) -> tuple[JsonObject, list[JsonObject]]:
-        """Return the reply to a request, and the lines of its list.
+        """Return the reply to a request, and its list items.
 
         Raises:
             RequestRefused: the server refused the request.
@@ -494,7 +497,7 @@ class ClientCore:
         return exchange.reply, exchange.items
 
     def unanswered(self, exchange: Exchange) -> TalkError:
-        """Return the error for a request without an answer."""
+        """Return the error for an unanswered request."""
         request = exchange.request
         why = self.ended or (self.absence if self.absent_since is not None else "")
         if not exchange.sent:
@@ -510,7 +513,7 @@ class ClientCore:
         return Lost(words) if isinstance(request, self.lasting) else ServerUnavailable(words)
 
     def refusal(self, reply: JsonObject, items: list[JsonObject]) -> TalkError:
-        """Return the error for a reply that is not ok. The lines of the list become the error's `items`."""
+        """Return the error for a reply that refuses a request. The list items become the error's `items`."""
         from talkcli.terminal.text import printable  # rarely needed, and slow to import
 
         error = reply.get("error")
@@ -520,14 +523,14 @@ class ClientCore:
     # -- limits
 
     def answer_by(self, exchange: Exchange) -> float:
-        """Return the time limit for sending a request, or if it was already sent, for the next line of its answer."""
+        """Return the time by which a request must be sent, or by which the next line of its answer must arrive."""
         if exchange.sent:
             return float("inf") if exchange.slow else exchange.heard_at + self._patience
         ttl = exchange.request.ttl if isinstance(exchange.request, Say) else None
         return exchange.heard_at + min(self._patience, ttl or self._patience)
 
     def silent_by(self, began: float) -> tuple[float, str]:
-        """Return when a silent server is treated as gone, and the reason to report then.
+        """Return when a silent server will be given up, and the reason to report at that time.
 
         Args:
             began: when the caller started to wait (monotonic). Earlier silence doesn't count.
@@ -537,18 +540,20 @@ class ClientCore:
         return max(began, self._heard) + SILENCE_LIMIT_S, f"it has said nothing for {SILENCE_LIMIT_S:g} s"
 
     def goals_lost_at(self) -> float:
-        """Return when the followed goals become LOST unless there is a new connection."""
+        """Return when the followed goals become LOST if the client doesn't reconnect before."""
         return float("inf") if self.absent_since is None else self.absent_since + self._patience
 
     def next_expiry(self) -> float:
-        """Return the latest time for the next call of `expire`."""
+        """Return the time by which `expire` must be called."""
         times = [self.answer_by(each) for each in self.exchanges.values() if each.on_failure]
         if self.listeners.goals:
             times.append(self.goals_lost_at())
         return min(times, default=float("inf"))
 
     def expire(self, now: float) -> bool:
-        """Fail exchanges with an `on_failure` that have reached their time limit, and lose goals after a long absence.
+        """Fail exchanges that have reached their time limit, and lose goals after a long disconnection.
+
+        Exchanges without an `on_failure` are not affected, because their callers wait for the answer.
 
         Returns:
             False if the connection must be closed, because a part of a line has been sent (see `forget`).
@@ -564,7 +569,7 @@ class ClientCore:
     # -- receiving
 
     def split(self, data: bytes, now: float) -> list[bytes]:
-        """Return the lines that are complete after receiving these bytes.
+        """Split received bytes into lines, and return the complete ones.
 
         Shells that pass lines on undecoded use this method instead of `receive`.
         """
@@ -572,7 +577,7 @@ class ClientCore:
         return self._splitter.feed(data)
 
     def begin_stream(self) -> None:
-        """Discard an incomplete line, because the next bytes are the beginning of a new stream."""
+        """Discard an incomplete line, because a new stream begins."""
         self._splitter = LineSplitter()
 
     def receive(self, data: bytes, now: float) -> None:
@@ -584,7 +589,7 @@ class ClientCore:
         splitter = self._splitter
         for line in self.split(data, now):
             if self.ended is not None or self._splitter is not splitter:
-                return  # the previous line has broken the connection
+                return  # processing the previous line has ended the connection
             if not self.greeted:
                 self.connected(*identity(read_greeting(line, self.path, self._version)), now)
                 continue
@@ -594,7 +599,7 @@ class ClientCore:
                 self.break_off(f"it sent what is no message: {error}", now)
 
     def match(self, message: JsonObject) -> Exchange | None:
-        """Return the open exchange that a message belongs to, or None if the message belongs to none."""
+        """Return the exchange to which a message belongs, or None if there is none."""
         number = message.get("seq")
         return self.exchanges.get(number) if isinstance(number, int) else None
 
@@ -636,7 +641,7 @@ class ClientCore:
             try:
                 exchange.on_reply(reply, exchange.items)
             except Unreadable as error:
-                # A request with a lasting effect may have taken effect, so `unanswered` makes its error instead.
+                # This request may have taken effect, so `unanswered` creates its error instead.
                 if not isinstance(exchange.request, self.lasting):
                     exchange.error = error
                 if exchange.on_failure:
@@ -647,11 +652,11 @@ class ClientCore:
     # -- disconnecting and reconnecting
 
     def break_off(self, why: str, now: float) -> None:  # noqa: ARG002 - for subclasses that reconnect
-        """Abandon the connection. By default, this ends it for good. A subclass may reconnect instead."""
+        """Break the connection. This ends it for good, unless a subclass reconnects."""
         self.end(why)
 
     def end(self, why: str) -> None:
-        """End the connection for good. Events that were received before can still be read."""
+        """End the connection for good. Events that have already been received can still be read."""
         if self.ended is not None:
             return
         self.ended = self._last_error or why
@@ -660,7 +665,7 @@ class ClientCore:
             self.fail(exchange, self.unanswered(exchange))
 
     def disconnected(self, why: str, now: float) -> None:
-        """Record a break of the connection, after which the shell will reconnect. All open exchanges fail."""
+        """Record that the connection has broken and the shell is going to reconnect. All unanswered requests fail."""
         self.absence = self._last_error or why
         self.absent_since, self._last_error, self._sending_ended = now, None, None
         self.greeted = False
@@ -672,7 +677,7 @@ class ClientCore:
         self.listeners.end_watches(why, include_reconnecting=False)
 
     def connecting(self, hello: bytes, version: str) -> None:
-        """Start a new connection. Requests are held back until the server has sent its greeting.
+        """Prepare for a new connection. Requests wait until the server has sent its greeting.
 
         Args:
             hello: the line to be sent first.
@@ -682,7 +687,10 @@ class ClientCore:
         self.begin_stream()
 
     def not_connected(self, error: TalkError) -> None:
-        """Record that an attempt to reconnect has failed. Exchanges without an `on_failure` fail, too."""
+        """Record that an attempt to reconnect has failed.
+
+        Exchanges without an `on_failure` fail, too.
+        """
         self.connect_error = error
         for exchange in [each for each in self.exchanges.values() if not each.on_failure]:
             self.forget(exchange)
@@ -712,7 +720,7 @@ class ClientCore:
             self.queue(self._line_now(exchange, now), exchange)
 
     def _line_now(self, exchange: Exchange, now: float) -> bytes:
-        """Return the line of a request that has waited for the connection, with its ttl reduced by the time waited."""
+        """Return the line of a request whose TTL is reduced by the time that it has waited."""
         request = exchange.request
         if isinstance(request, Say) and request.ttl:
             exchange.request = replace(request, ttl=max(_MIN_TTL_S, request.ttl - (now - exchange.heard_at)))
@@ -720,21 +728,21 @@ class ClientCore:
         return self.line(exchange)
 
     def _follow_again(self, goal_id: str, *, feedback: bool, now: float) -> None:
-        """Ask the server to send a goal's events on the new connection."""
+        """Follow a goal again after reconnecting."""
 
         def on_reply(_: JsonObject, items: list[JsonObject]) -> None:
             for goal in goals(items, "goal"):
-                if not goal.state.terminal:  # an ended goal's result follows
+                if not goal.state.terminal:  # an ended goal's Result is sent next
                     self.listeners.update(goal)
 
         def on_failure(error: TalkError) -> None:
-            if self.absent_since is None:  # after another break, the goal is followed again on the next connection
+            if self.absent_since is None:  # if the connection has broken again, the next one follows the goal
                 self.listeners.lose(goal_id, f"{error.message}; it may have been spoken")
 
         self._begin(Exchange(Wait((goal_id,), feedback), on_reply, on_failure), now)
 
     def _watch_again(self, now: float) -> None:
-        """Ask the server to send the events of all goals on the new connection."""
+        """Watch all goals again after reconnecting."""
 
         def on_reply(reply: JsonObject, items: list[JsonObject]) -> None:
             self.listeners.publish(Snapshot(ServerStatus.from_reply(reply, items)))
@@ -746,7 +754,7 @@ class ClientCore:
         self._begin(Exchange(Watch(), on_reply, on_failure), now)
 
     def _begin(self, exchange: Exchange, now: float) -> None:
-        """Register an exchange and queue its request."""
+        """Register an exchange, and queue its request to be sent."""
         self.register(exchange, now)
         self.queue(self.line(exchange), exchange)
 
@@ -760,7 +768,7 @@ class ClientCore:
             exchange.on_failure(error)
 
     def _lose_goals(self) -> None:
-        """End all followed goals as LOST, because the connection to their server has broken."""
+        """End all followed goals as LOST."""
         for goal_id in self.listeners.goals:
             self.listeners.lose(goal_id, f"{self.absence}; it may still be spoken")
 

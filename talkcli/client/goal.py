@@ -1,4 +1,4 @@
-"""Handles of goals, and the merged events of several goals.
+"""Goal handles, and the merged events of several goals.
 
 A handle needs a connection, but no client. The connection delivers the events of all handles while any thread waits for
 one of them. A handle changes only while the connection's lock is held, and never after its goal has ended.
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class GoalHandle(TrackedGoal):
-    """A goal that this client has sent or follows. Any number of threads may use it.
+    """A handle for a goal that this client has sent or follows. Any number of threads may use it.
 
     Events are buffered until they are read. If there are more than 5,000 words and pauses, the oldest are dropped.
     `events`, `feedback` and `poll` read from the same buffer, so each event is returned only once. A new loop continues
@@ -37,12 +37,12 @@ class GoalHandle(TrackedGoal):
     def __init__(self, connection: Connection, goal: Goal) -> None:
         super().__init__(goal)
         self._connection = connection
-        #: whether the Result has been returned
+        #: whether the Result has been returned to the caller
         self._result_taken = False
 
     @property
     def id(self) -> str:
-        """The goal's id. It is empty if the goal was REJECTED before it was given an id."""
+        """The goal's id, which is empty if the goal was REJECTED before it got an id."""
         return self.goal.id
 
     @property
@@ -101,9 +101,9 @@ class GoalHandle(TrackedGoal):
         return (each for each in self._events(end, timeout) if isinstance(each, WordHeard))
 
     def poll(self) -> Event | None:
-        """Return the goal's next event without waiting, or None if there is no new event. The last event is the Result.
+        """Return the goal's next event, or None if there is no new event. The last event is the Result.
 
-        This is for loops that must not wait. Call it regularly, because each call also receives the events of other
+        This method never blocks. Call it regularly, because each call also receives the events of other
         goals, and sends the rest of earlier requests.
 
         Raises:
@@ -122,7 +122,9 @@ class GoalHandle(TrackedGoal):
         return event
 
     def request_cancel(self) -> None:
-        """Ask the server to cancel the goal, without waiting. Use `wait` or `poll` to learn how the goal ends.
+        """Ask the server to cancel the goal, without waiting for the answer.
+
+        Use `wait` or `poll` to find out how the goal ends.
 
         Raises:
             ServerUnavailable: the client is closed, or 256 KiB of requests are waiting to be sent.
@@ -149,7 +151,7 @@ class GoalHandle(TrackedGoal):
     # -- internal
 
     def _listen(self, *, feedback: bool) -> None:
-        """Start listening for the goal's events. The caller holds the connection's lock."""
+        """Start listening for the goal's events. The caller must hold the connection's lock."""
         self._listen_to(self._connection.listeners, feedback=feedback, now=time.monotonic())
 
     def _events(self, end: float | None, timeout: float | None) -> Iterator[Event]:
@@ -164,7 +166,7 @@ class GoalHandle(TrackedGoal):
                 yield event
 
     def _follow(self, *, feedback: bool) -> None:
-        """Ask the server to send the goal's events to this connection, unless it already does."""
+        """Ask the server to send the goal's events, unless it already does."""
         if self.state.terminal or (self._followed_at is not None and (self._with_feedback or not feedback)):
             return
 
@@ -175,12 +177,12 @@ class GoalHandle(TrackedGoal):
         self._connection.request(Wait((self.id,), feedback), accepted)
 
     def _give_up(self, timeout: float | None) -> None:
-        """End the goal as LOST if the connection has ended. Raise TimeoutError if it hasn't."""
+        """End the goal as LOST if the connection has ended, or else raise TimeoutError."""
         if not self._lose():
             raise TimeoutError(f"{self.id} has not ended after {0 if timeout is None else round(timeout, 1):g} s")
 
     def _lose(self) -> bool:
-        """End the goal as LOST if the connection has ended, and return whether it has."""
+        """End the goal as LOST if the connection has ended. Return whether the connection has ended."""
         ended = self._connection.ended
         if ended is not None:
             with self._connection.changed:
@@ -189,7 +191,7 @@ class GoalHandle(TrackedGoal):
 
 
 def merged(handles: Sequence[GoalHandle], timeout: float | None = None) -> Iterator[tuple[GoalHandle, Event]]:
-    """Iterate over the events of several goals as they happen, until all goals have ended.
+    """Iterate over the events of several goals until all of them have ended.
 
     The last event of each goal is its Result. A pause of all speech is yielded only once. If the connection ends, the
     remaining goals end as LOST.
@@ -220,15 +222,15 @@ class _EventStream:
     """The merged events of several goals, in the server's order."""
 
     def __init__(self, handles: Sequence[GoalHandle]) -> None:
-        #: the goals that have not ended, without duplicates
+        #: the unfinished goals, without duplicates
         self.unfinished = list({each.id: each for each in handles}.values())
-        #: the number of the last event of each goal, by which the goal's Result is sorted
+        #: the number of each goal's last event, which is also used to sort the goal's Result
         self._last_numbers: dict[str, int] = {}
-        #: the number of the last pause, which each goal receives
+        #: the number of the last pause, which every goal receives, but which is yielded once
         self._pause_number: int | None = None
 
     def take(self) -> list[tuple[GoalHandle, Event]]:
-        """Remove and return the events of all goals. The caller holds the connection's lock."""
+        """Remove and return the new events of all goals. The caller must hold the connection's lock."""
         found = []
         for handle in self.unfinished:
             event: Event | None = None
@@ -242,10 +244,11 @@ class _EventStream:
                     self._last_numbers[handle.id] = number
                 found.append((self._last_numbers.get(handle.id, 0), handle, event))
         self.unfinished = [each for each in self.unfinished if not each.state.terminal]
-        # A Result has the number of its goal's last event. It stays behind this event, because the sort is stable.
+        # A Result is sorted by the number of its goal's last event. It stays behind this event, because sorting is
+        # stable.
         return [(handle, event) for _, handle, event in sorted(found, key=lambda each: each[0])]
 
 
 def _end(timeout: float | None) -> float | None:
-    """Return the monotonic time at which a timeout ends, or None if there is no timeout."""
+    """Return the monotonic time at which a timeout expires, or None if there is no timeout."""
     return None if timeout is None else time.monotonic() + timeout
