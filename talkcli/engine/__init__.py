@@ -1,4 +1,4 @@
-"""The engine, which speaks the goals one at a time.
+"""The speech engine, which speaks one goal at a time.
 
 `parent` runs in the server. It starts the engine process, sends goals to it and monitors it. `child` runs in the engine
 process and contains the driver, the synthesizers and the players. The two exchange the messages in `protocol` and never

@@ -1,4 +1,4 @@
-"""The players that users can name, the command lines of player programs, and the machine's playback devices.
+"""The known players, the command lines of player programs, and the machine's playback devices.
 
 This module neither starts a program nor opens a device, so the server, doctor and the command line may use it. The
 classes that play sound are in `talkcli.engine.child.players`.
@@ -18,27 +18,26 @@ if TYPE_CHECKING:
 #: The size of a sample in bytes (signed 16 bit, one channel).
 SAMPLE_BYTES = 2
 
-#: Seconds of sound that a player is offered at a time. With short pieces, little sound is still played after a stop.
+#: Seconds of sound to offer to a player at a time. The pieces are short, so that little sound is played after a stop.
 PIECE_S = 0.02
 
-#: Milliseconds of sound that a player may buffer. More would delay words, and would lose more sound if the player
-#: stalls. Less than three periods of 20 ms would cause gaps on a busy machine.
+#: Milliseconds of sound that a player may buffer. A larger buffer would delay words, and would lose more sound if the
+#: player stalls. A smaller buffer than three periods of 20 ms would cause gaps on a busy machine.
 BUFFER_MS = 60
 
 #: Milliseconds of sound to queue for aplay while it starts. It starts playing once its buffer is full, and it reads
 #: whole periods of 15 ms. If it had to wait for each piece of 20 ms, it would start 2 ms later (measured on a PC).
 APLAY_START_MS = 80
 
-#: Bytes that a program may read before it opens its device (one block of standard input). Reading more than that proves
-#: that the program is playing.
+#: Bytes that a program may read before it opens its device (one block of standard input). If it reads more, it must be
+#: playing.
 READ_AHEAD_BYTES = 4096
 
 #: The prefix of a player that writes to a file, as in "file:PATH".
 FILE_PREFIX = "file:"
 
 #: The name of the sink that PulseAudio and PipeWire create if there is no other. PipeWire describes it as "Dummy
-#: Output". Nobody can hear it, whereas every other virtual sink (echo canceller, remap, tunnel, effect) leads to a real
-#: device.
+#: Output". Nobody can hear it. Every other virtual sink (echo canceller, remap, tunnel, effect) leads to a real device.
 DUMMY_SINK = "auto_null"
 #: Environment variables that select a sound server or a custom configuration.
 _SOUND_VARIABLES = ("PULSE_SERVER", "PULSE_CLIENTCONFIG", "PIPEWIRE_REMOTE", "ALSA_CONFIG_PATH")
@@ -68,12 +67,13 @@ class KnownPlayer:
     description: str
     #: the Debian package that contains the player
     package: str = ""
-    #: the function that builds a program's command line from the sample rate and the device, or None for a class
+    #: the function that builds the program's command line from the sample rate and the device, or None if the player is
+    #: a class
     command: Callable[[int, str | None], PlayerCommand] | None = None
-    #: the location of a class as "module:Class", or "" for a program. The class is called with the sample rate, the
-    #: device, and whether a muted output is an error.
+    #: the player's class as "module:Class", or "" if the player is a program. The class is called with the sample rate,
+    #: the device, and whether a muted output is an error.
     class_path: str = ""
-    #: whether the automatic choice includes this player. If the user names only a device, it includes only programs.
+    #: whether this player may be chosen automatically. If the user names only a device, only programs are chosen.
     automatic: bool = False
     #: whether this player makes no sound and therefore needs no device
     silent: bool = False
@@ -91,7 +91,7 @@ def _pacat(rate: int, device: str | None) -> PlayerCommand:
     argv = ["pacat", "--playback", "--raw", "--format=s16le", "--channels=1", f"--rate={rate}"]
     argv += [f"--latency-msec={BUFFER_MS}", "--process-time-msec=20", "--client-name=talk", "--stream-name=talk"]
     argv += ["-d", device] if device else []
-    # pacat reads once while it is still connecting, and gets at most one piece.
+    # While pacat is still connecting, it reads once and gets at most one piece.
     return PlayerCommand("pacat", tuple(argv), read_ahead=int(PIECE_S * rate) * SAMPLE_BYTES)
 
 
@@ -112,9 +112,9 @@ def _au_header(rate: int) -> bytes:
     return b"dns." + struct.pack("<5I", 24, unknown_length, pcm16, rate, 1)
 
 
-#: The players by name. The automatic choice tries classes before programs, and otherwise keeps this order. The sound
-#: server comes first because it starts at once and reports more than any program does. aplay comes before the other
-#: programs because robots without a desktop have it, and because it loses no samples if it can't open the device.
+#: The players by name. Unless the user names a player, classes are tried before programs, and otherwise in this order.
+#: The sound server comes first because it starts at once and reports more than any program does. aplay comes before the
+#: other programs because robots without a desktop have it, and because it loses no samples if it can't open the device.
 PLAYERS = {
     "aplay": KnownPlayer("ALSA", "alsa-utils", _aplay, automatic=True),
     "pacat": KnownPlayer("PulseAudio", "pulseaudio-utils", _pacat, automatic=True),
@@ -132,7 +132,7 @@ NO_PLAYER = f"no player found: install {', '.join(_OTHERS)} or {_LAST}"
 
 
 class PlayerMissing(Exception):
-    """A player program is not installed, or its command line can't be parsed; the text is an error message."""
+    """A player program is not installed, or its command line can't be parsed."""
 
 
 def is_silent(player: str | None) -> bool:
@@ -156,11 +156,11 @@ def player_commands(player: str | None, device: str | None, rate: int, last: str
     """Return the command lines to try, best first.
 
     Args:
-        player: The name of a known program, a custom command line, or None for all installed programs that the
-            automatic choice includes.
+        player: The name of a known program, a custom command line, or None for all installed programs that may be
+            chosen automatically.
         device: The device to play to, or None for the program's default.
         rate: Samples per second.
-        last: The name of the program that last worked. The automatic choice tries it first.
+        last: The name of the program that worked last time. If `player` is None, it is tried first.
 
     Raises:
         PlayerMissing: No suitable program is installed.
@@ -219,10 +219,10 @@ def sound_server_sockets(env: Mapping[str, str], *uids: int) -> list[str]:
 
 
 def has_no_output(env: Mapping[str, str], nodes: str = "/dev/snd", etc: str = "/etc") -> bool:
-    """Return whether this process certainly has no output to play sound to.
+    """Return whether it is certain that this process can't play any sound.
 
-    The function only looks at file names, so it wakes up no device. Any custom configuration counts as an output,
-    because it may lead anywhere.
+    This only looks at file names, so that no sleeping device wakes up. Any custom configuration counts as an output,
+    because it may lead to any device.
     """
     if playback_devices(nodes) or any(map(env.get, _SOUND_VARIABLES)) or sound_server_sockets(env, os.getuid()):
         return False
@@ -238,7 +238,7 @@ def _config_home(env: Mapping[str, str]) -> str:
 
 
 def _has_default_server(path: str) -> bool:
-    """Return whether a configuration file of PulseAudio's clients names a server; Debian's default file doesn't."""
+    """Return whether PulseAudio's client configuration names a server. Debian's default file doesn't."""
     with contextlib.suppress(OSError), open(path, "rb") as file:
         return any(line.lstrip().startswith(b"default-server") for line in file)
     return False

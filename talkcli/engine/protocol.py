@@ -30,32 +30,33 @@ if TYPE_CHECKING:
 
     _M = TypeVar("_M")
 
-#: Maximum interval between two messages of an engine process that is speaking or loading a voice. It is far below
-#: `HANG_LIMIT_S`, so that a late message isn't mistaken for a hang. An idle process sends nothing, so that the robot
-#: can sleep.
+#: Maximum time between two messages from an engine process that is speaking or loading a voice. This is far below
+#: `HANG_LIMIT_S`, so that a late message isn't mistaken for a hang. An idle process sends nothing, which lets the robot
+#: sleep.
 ALIVE_INTERVAL_S = 0.5
 
-#: Environment variable with the file descriptor of the liveness pipe's write end. The player must inherit this
-#: descriptor. Once the process and the player have exited, the pipe is closed, which the server detects.
+#: Environment variable that holds the descriptor number of the liveness pipe's write end. The player must inherit this
+#: descriptor. The pipe closes only after both the process and the player have exited, so the server knows when they are
+#: gone.
 LIVENESS_VARIABLE = "TALK_LIVENESS_FD"
 
-#: Name that error messages use for the player that writes to `Configure.output_fd`.
+#: Name of the player that writes to `Configure.output_fd`, for error messages.
 OUTPUT_STREAM_NAME = "the output"
 
 # Time limits for the engine process, shared by the server, `say -o` and `talk doctor`.
 
 #: Time allowed for a new process to become ready. A cold start from an SD card takes two to three seconds.
 START_LIMIT_S = 10.0
-#: Time without a message after which a process that is speaking or loading a voice counts as hung.
+#: A process that is speaking or loading a voice counts as hung if it sends no message for this long.
 HANG_LIMIT_S = 3.0
-#: Time allowed for loading a neural voice, which takes three seconds on a small machine.
+#: Time allowed for loading a neural voice. A small machine needs three seconds.
 LOAD_LIMIT_S = 60.0
 #: Time allowed for confirming a stop. After that, the process is killed.
 STOP_LIMIT_S = 0.15
 #: Time allowed for a killed process and its player to exit.
 KILL_LIMIT_S = 2.0
-#: Time allowed for confirming a hold. After that, the process is killed. This limit is twice the time that a client
-#: waits for a pause, because a third-party driver may finish a word or more first.
+#: Time allowed for confirming a pause. After that, the process is killed. This is twice as long as a client waits for a
+#: pause, because a third-party driver may first finish a word or more.
 HOLD_LIMIT_S = 4.0
 
 # Outcomes of a `Speak`.
@@ -74,7 +75,7 @@ class Configure:
     driver: str | None
     #: "aplay", "pacat", "pw-cat", "null", "file:PATH" or a command line; None to try the installed players
     player: str | None
-    #: output device in the player's own notation; None for the player's default
+    #: output device, named the way the player expects; None for the player's default
     device: str | None
     #: ID, name or language of a voice to check at startup; None for the driver's default
     voice: str | None
@@ -86,13 +87,13 @@ class Configure:
     output_fd: int | None = None
     #: whether a sentence fails if the output is muted; `Speak.audible` takes precedence
     audible: bool = False
-    #: player that last worked, which is tried first if `player` is None; None for the default order
+    #: player that worked last time, tried first if `player` is None; None for the default order
     last_player: str | None = None
 
 
 @frozen
 class Speak:
-    """Speak a text. Rate, volume and pitch are absolute values."""
+    """Speak a text. Rate, volume and pitch are absolute values, not changes."""
 
     id: str
     text: str
@@ -101,67 +102,67 @@ class Speak:
     voice: str | None  # ID, name or language; None for the driver's default
     pitch: int  # 0 to 100; 50 is the voice's natural pitch
     next_waits: bool = False  # whether another goal is waiting in the queue
-    next_is_neural: bool = False  # whether the waiting goal has a neural voice
-    lead_in: int | None = None  # milliseconds of silence to play first, on any device; None to use `Configure.lead_in`
+    next_is_neural: bool = False  # whether the next goal in the queue uses a neural voice
+    lead_in: int | None = None  # milliseconds of silence to play before the text; None to use `Configure.lead_in`
     audible: bool | None = None  # whether to fail if the output is muted; None to use `Configure.audible`
-    voice_only: bool = False  # whether to wait for the neural voice to load, and to fail without it
+    voice_only: bool = False  # whether to wait for the neural voice to load, and fail if it can't be loaded
 
 
 @frozen
 class Stop:
-    """Stop speaking at once. Ignored if this goal is not being spoken, because it may have just ended."""
+    """Stop speaking this goal at once. Ignored if the goal has already ended."""
 
     id: str
 
 
 @frozen
 class Hold:
-    """Hold the sentence, and send `Held` once it is silent. Ignored if this goal is not being spoken."""
+    """Pause this goal, and send `Held` once it is silent. Ignored if the goal has already ended."""
 
     id: str
-    number: int  # number of this hold within the goal, starting at 1
+    number: int  # number of this pause within the goal, starting at 1
 
 
 @frozen
 class Continue:
-    """Continue a held sentence. Ignored if the sentence is not held."""
+    """Resume a paused goal. Ignored if the goal is not paused."""
 
     id: str
 
 
 @frozen
 class NextGoal:
-    """Update `next_waits` and `next_is_neural` of the current goal."""
+    """Update `next_waits` and `next_is_neural` for the current goal."""
 
     id: str  # ID of the current goal
     next_waits: bool  # whether another goal is waiting in the queue
-    next_is_neural: bool = False  # whether the waiting goal has a neural voice
+    next_is_neural: bool = False  # whether the next goal in the queue uses a neural voice
 
 
 @frozen
 class LoadVoice:
-    """Load a neural voice in the background. Answered by one `VoiceLoaded`."""
+    """Load a neural voice in the background. The reply is one `VoiceLoaded`."""
 
     voice: str  # voice ID without a speaker
 
 
 @frozen
 class DropVoice:
-    """Unload a neural voice, but not before a sentence that uses it has ended. Answered by `VoiceMemory`."""
+    """Unload a neural voice as soon as no sentence is using it. The reply is `VoiceMemory`."""
 
     voice: str  # voice ID without a speaker
 
 
 @frozen
 class Voice:
-    """A voice of the driver."""
+    """A voice that the driver offers."""
 
     id: str
     language: str | None
     name: str
     quality: str | None = None  # quality level of a neural voice, such as "medium"
-    #: speakers of a neural voice, ordered by number; None in messages, because pyttsx3's list of voices has no field
-    #: for them
+    #: speakers of a neural voice, in the order of their numbers. In messages, this is None, because pyttsx3's list of
+    #: voices has no field for speakers.
     speakers: tuple[str, ...] | None = None
 
 
@@ -181,13 +182,13 @@ class StartFailed:
 
     reason: Reason  # ENGINE_FAILED or UNKNOWN_VOICE
     message: str  # human-readable error, including what to install
-    permanent: bool = True  # whether each new start will also fail until the user fixes something
+    permanent: bool = True  # whether every further start will fail until the user fixes something
     usage_error: bool = False  # whether an option names something that doesn't exist
 
 
 @frozen
 class VoiceList:
-    """All voices of the driver. Sent once, right after `Ready`, if `Configure.list_voices` is true."""
+    """All voices that the driver offers. Sent once, right after `Ready`, if `Configure.list_voices` is true."""
 
     voices: tuple[Voice, ...]
 
@@ -197,7 +198,7 @@ class VoiceLoaded:
     """A neural voice was loaded, or loading failed."""
 
     voice: str  # voice ID without a speaker
-    seconds: float  # time that the loading took
+    seconds: float  # how long loading took
     error: str | None = None  # human-readable error; None if the voice was loaded
 
 
@@ -212,13 +213,13 @@ class VoiceUnloaded:
 class VoiceMemory:
     """The memory used by neural voices. Sent before `VoiceLoaded`, and after a sentence or a `DropVoice`."""
 
-    voice: str  # ID (without a speaker) of the voice that was loaded or has spoken; empty after `DropVoice`
-    memory: int  # bytes by which the process has grown since before its first neural voice
+    voice: str  # ID of the voice that was loaded or used, without a speaker; empty after `DropVoice`
+    memory: int  # memory growth in bytes, measured from before the first neural voice was loaded
 
 
 @frozen
 class Started:
-    """The engine process has started to process the goal."""
+    """The engine process has begun working on the goal."""
 
     id: str
 
@@ -227,7 +228,7 @@ class Started:
 class Alive:
     """A heartbeat from a process that is busy but has sent nothing else for `ALIVE_INTERVAL_S`."""
 
-    id: str  # ID of the current goal; empty if a voice is loading without a goal
+    id: str  # ID of the current goal; empty if only a voice is loading
 
 
 @frozen
@@ -246,7 +247,7 @@ class OutputChanged:
     """The device, volume and mute state of the current output. Sent when they become known or change."""
 
     id: str
-    output: JsonObject | None  # a goal's `output` as JSON; None if the player can't determine it
+    output: JsonObject | None  # the goal's `output` field as JSON; None if the player can't determine it
 
 
 @frozen
@@ -260,19 +261,19 @@ class VoiceChosen:
 
 @frozen
 class Held:
-    """The sentence is held, and stays silent until `Continue` or `Stop`."""
+    """The goal is paused, and stays silent until `Continue` or `Stop`."""
 
     id: str
-    number: int  # number of the confirmed `Hold`
+    number: int  # number of the `Hold` that this message confirms
 
 
 @frozen
 class Ended:
-    """The goal has ended and is silent. Its player has exited, or the player's stream is closed."""
+    """The goal has ended, and nothing more of it will be heard."""
 
     id: str
     outcome: str  # OUTCOME_COMPLETED, OUTCOME_STOPPED or OUTCOME_FAILED
-    reason: Reason | None = None  # reason for the failure, if any
+    reason: Reason | None = None  # reason for the failure, if the goal failed
     message: str | None = None  # error message of the player or the engine, if the goal failed
     duration: float | None = None  # length of the audio in seconds; None unless the goal was completed
     gaps: int = 0  # number of silent gaps caused by audio that was synthesized too late
@@ -280,19 +281,19 @@ class Ended:
     player: str | None = None  # name of the player, if it was chosen automatically
 
 
-#: Commands that start a goal, one for each kind of goal.
+#: Commands that start a goal. There is one for each kind of goal.
 GoalCommand = Speak
 Command = Configure | GoalCommand | Stop | Hold | Continue | NextGoal | LoadVoice | DropVoice
 #: Events about the goal with the given `id`.
 GoalEvent = Started | Alive | Word | OutputChanged | VoiceChosen | Held | Ended
 Event = Ready | StartFailed | VoiceList | VoiceLoaded | VoiceUnloaded | VoiceMemory | GoalEvent
 
-#: Message classes of each direction by name. A line contains the name as its "kind".
+#: Message classes for each direction, by name. Each line contains the name of its class as "kind".
 COMMAND_CLASSES: dict[str, type[Command]] = {each.__name__: each for each in Command.__args__}
 EVENT_CLASSES: dict[str, type[Event]] = {each.__name__: each for each in Event.__args__}
 
-# Reused for speed. `json.dumps` with a `default` would create an encoder for each line, and `json.loads` would detect
-# the encoding of each line. Together they would be a third of the cost of a message.
+# The encoder and the decoder are reused for speed. `json.dumps` with a `default` would create an encoder for each line,
+# and `json.loads` would detect the encoding of each line. Together, this would take a third of the time for a message.
 _JSON_ENCODER = json.JSONEncoder(default=fields)
 _JSON_DECODER = json.JSONDecoder()
 

@@ -1,6 +1,7 @@
-"""Interface to pyttsx3: starting an engine, setting its properties for each goal, and `talk`'s own driver.
+"""Speech through pyttsx3, including `talk`'s own driver for it.
 
-`talk`'s own driver makes a synthesizer and the players available through pyttsx3's interface.
+This module starts pyttsx3's engine and sets the engine's properties for each goal. `talk`'s own driver makes a
+synthesizer and the players available through pyttsx3's interface.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from talkcli.engine.child.synthesizers.combined import CombinedSynthesizer
     from talkcli.engine.child.words import TimedWord
 
-#: Drivers for macOS that speak in Apple's run loop, so this process has to run that loop.
+#: macOS drivers that speak only while this process runs Apple's run loop.
 _RUN_LOOP_DRIVERS = ("nsss", "avspeech")
 
 
@@ -42,7 +43,7 @@ class CannotStart(Exception):
     """
 
     def __init__(self, message: str, reason: Reason = Reason.ENGINE_FAILED, **more: bool) -> None:
-        """Build the message for the server. `more` contains further fields of `StartFailed`."""
+        """Create the error and its `StartFailed` message. `more` contains further fields of the message."""
         super().__init__(message)
         self.failure = protocol.StartFailed(reason, message, **more)
 
@@ -75,7 +76,7 @@ def start(configure: protocol.Configure, runner: GoalRunner) -> protocol.Ready:
 
 
 def _register_own(synthesizer_name: str, driver_name: str, runner: GoalRunner) -> CombinedSynthesizer:
-    """Create a synthesizer and register a driver for it."""
+    """Create one of `talk`'s synthesizers, and register a driver for it."""
     module, _, function = SYNTHESIZERS[synthesizer_name].partition(":")
     try:
         imported = import_module(f"talkcli.engine.child.synthesizers.{module}")
@@ -114,7 +115,7 @@ def _start_engine(pyttsx3: Any, name: str, *, named: bool) -> Any:
         raise CannotStart(_start_error(name, error), permanent=False) from error
     try:
         engine.startLoop(False)
-        engine.iterate()  # drivers that fail here would hang at the first goal
+        engine.iterate()  # a driver that fails here would otherwise hang at the first goal
     except TypeError as error:
         message = f'the driver "{name}" cannot be stepped (its iterate() is no generator): leave --driver out'
         raise CannotStart(message, usage_error=True) from error
@@ -134,7 +135,7 @@ def _driver_names(pyttsx3: Any) -> list[str]:
 
 
 def _run_loop_step(driver_name: str) -> Callable[[], None]:
-    """Return a function that gives a third-party driver time to work between two steps."""
+    """Return a function that runs the event loop of a third-party driver, if it needs one."""
     if sys.platform != "darwin" or driver_name not in _RUN_LOOP_DRIVERS:
         return lambda: None
     from Foundation import NSDate, NSRunLoop  # type: ignore[import-not-found,unused-ignore]
@@ -152,7 +153,7 @@ class DriverProperties:
     def __init__(self, engine: Any, driver: str) -> None:
         self._engine = engine
         self._driver = driver
-        self._values = fields(SpeechSettings())  # the initial values of pyttsx3's drivers
+        self._values = fields(SpeechSettings())  # pyttsx3's drivers start with these values
         self._default_voice: Any = None
         self._voices: tuple[protocol.Voice, ...] = ()
         self._voice: str | None = None
@@ -214,8 +215,8 @@ class DriverProperties:
         """
         found = voices.find_voice(wanted, self._voices)
         if found is not None and is_neural(found.id) and without_speaker(wanted) != without_speaker(found.id):
-            found = None  # not an exact match, and a new voice may match better
-        if found is None:  # listing takes some milliseconds, so it is only done for unknown voices
+            found = None  # not an exact match, and a voice installed since then may match better
+        if found is None:  # listing the voices takes some milliseconds, so it is only done if necessary
             self._voices = voices.list_voices(self._engine)
             found = voices.find_voice(wanted, self._voices)
         if found is None:
@@ -224,7 +225,9 @@ class DriverProperties:
         return found.id
 
     def _set(self, name: str, value: Any, shown: str) -> None:
-        """Set a property. pyttsx3 reports an error through a notification instead of an exception.
+        """Set a property of the engine.
+
+        pyttsx3 reports errors through notifications. This method raises them as exceptions.
 
         Args:
             name: name of the property.
@@ -268,10 +271,10 @@ class Driver:
         self._playback: Playback | None = None
 
     def iterate(self) -> Iterator[None]:
-        """Yield endlessly. Before each yield, speak the stored text, if there is one."""
+        """Speak each stored text, and yield whenever there is none. Never return."""
         while True:
             if self._text is None:
-                self._proxy.setBusy(False)  # a busy driver gets no text from pyttsx3, and each driver starts as busy
+                self._proxy.setBusy(False)  # each driver is busy at first, and gets no text while it is busy
             if self._text is None:
                 yield
                 continue
@@ -279,7 +282,7 @@ class Driver:
             self._speak(text)
 
     def say(self, text: str) -> None:
-        """Store a text, which the next step of `iterate` speaks."""
+        """Store a text. The next step of `iterate` speaks it."""
         self._proxy.setBusy(True)
         self._text = text
 
@@ -289,7 +292,7 @@ class Driver:
         if self._playback is not None:
             self._playback.stop()
 
-    #: Called by pyttsx3 when the proxy is deleted.
+    #: pyttsx3 calls this method when it deletes the proxy.
     destroy = stop
 
     def getProperty(self, name: str) -> Any:  # noqa: N802 - pyttsx3's name
@@ -319,7 +322,7 @@ class Driver:
             self._sound = replace(self._sound, **{name: kind(value)})
 
     def _speak(self, text: str) -> None:
-        """Speak a text. Notify pyttsx3 exactly once that the text is finished."""
+        """Speak a text, and then notify pyttsx3 exactly once that it is finished."""
         runner = self._runner
         self._proxy.notify("started-utterance")
         self._playback = playback = Playback(runner, self._report_word)

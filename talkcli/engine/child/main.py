@@ -1,8 +1,8 @@
-"""Entry point of the engine process, which the server starts in its own session to speak through pyttsx3.
+"""Entry point of the engine process, which speaks through pyttsx3.
 
-The standard input of the process is the socket to the server. The process both reads and writes it. The server may kill
-the process at any time, because the process has no state worth keeping. If the server exits, the process and its player
-must exit too.
+The server starts the process in a session of its own. The standard input of the process is the socket to the server,
+which the process both reads and writes. The server may kill the process at any time, because the process has no state
+worth keeping. If the server exits, the process and its player must exit too.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ from talkcli.engine import protocol
 
 #: Minimum value of the memory limit, for small machines. With a voice of 63 MB, the process uses 0.4 GB.
 _MIN_MEMORY_BYTES = 1 << 30
-#: Linux's number of the prctl operation that sets a signal for the death of the parent thread.
+#: Linux's number for the prctl operation that has the kernel send a signal when the parent thread exits.
 _PR_SET_PDEATHSIG = 1
 
 
 def main() -> None:
-    """Run the engine process until the server disconnects or the engine can't continue."""
+    """Run the engine process until the server disconnects or an error makes it exit."""
     _die_with_parent()
     _limit_core_dump()
     _limit_memory()
-    # The server handles Ctrl-C and the closing of its terminal. A failed write, instead of SIGPIPE, shows that the
-    # server or the player has stopped reading.
+    # Only the server reacts to Ctrl-C and to the closing of its terminal. SIGPIPE is ignored, so that writing raises an
+    # error if the server or the player has stopped reading.
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGPIPE):
         signal.signal(number, signal.SIG_IGN)
-    # If SIGCHLD was inherited as ignored, the exit status of a player could not be read.
+    # The parent may have ignored SIGCHLD. In that case, the exit status of a player could not be read.
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-    # These imports take time. By now, the kernel kills this process if the server exits in the meantime.
+    # These imports take time. They come after `_die_with_parent`, because the server may exit in the meantime.
     from talkcli.engine.child.driver import CannotStart, start
     from talkcli.engine.child.players.base import CannotEnd
     from talkcli.engine.child.players.chooser import PlayerChooser
@@ -99,5 +99,5 @@ def _inherited_descriptors() -> list[int]:
     if value is None:
         return []
     descriptor = int(value)
-    os.set_inheritable(descriptor, False)  # if it isn't open, this fails now instead of at every sentence
+    os.set_inheritable(descriptor, False)  # if the descriptor isn't open, fail now instead of at every sentence
     return [descriptor]

@@ -1,6 +1,6 @@
-"""Playback of one sentence: sending samples to a player, holding the sentence, and checking that all of it was heard.
+"""Playback of one sentence, including pauses and a check that all of it was heard.
 
-`Playback` waits only in `GoalRunner.wait`, so that a stop or a hold can arrive at any time. `SentenceSamples` and
+`Playback` waits only in `GoalRunner.wait`, so that a `Stop` or a `Hold` can arrive at any time. `SentenceSamples` and
 `PlayerFeed` never wait. Nothing here depends on how the samples are synthesized or which kind of player plays them.
 """
 
@@ -26,58 +26,58 @@ if TYPE_CHECKING:
 #: null sink that isn't being recorded needs up to two.
 FIRST_SOUND_LIMIT_S = 5.0
 
-#: Time after which a player that accepts no samples counts as stalled. Normally, a player accepts samples within 0.04 s
-#: on a busy machine. A null sink that isn't being recorded may take 2 s.
+#: A player counts as stalled if it accepts no samples for this long. Normally, a player accepts samples within 0.04 s,
+#: even on a busy machine. A null sink that isn't being recorded may take 2 s.
 STALL_LIMIT_S = 3.0
 
-#: Interval for checking how much a player has consumed. It is also the precision with which a stall is detected.
+#: How often to check how much a player has consumed. Stalls are detected with the same precision.
 PROGRESS_CHECK_INTERVAL_S = 0.1
 
 #: Time allowed for a player to exit after the end of the audio. It covers the same delays as `STALL_LIMIT_S`.
 DRAIN_LIMIT_S = 3.0
 
-#: Maximum time by which a player may end before the calculated end of its audio. Sound cards have inexact clocks, and
-#: players cut off silence at the end. A sentence ends with a longer silence, so nothing audible is missing.
+#: How much earlier than calculated a player may finish. Sound cards have inexact clocks, and players cut off silence at
+#: the end. The silence at the end of a sentence is longer than this, so nothing audible is missing.
 EARLY_END_LIMIT_S = 0.25
 
-#: Time for which opening a busy device is retried, because another program, such as `talk doctor --silent`, may use the
-#: device only briefly.
+#: How long to keep trying to open a busy device. Another program, such as `talk doctor --silent`, may be using it only
+#: briefly.
 DEVICE_BUSY_LIMIT_S = 1.0
 DEVICE_RETRY_INTERVAL_S = 0.05
 
-#: Maximum length of the zero samples that may be skipped at the beginning of a sentence. libespeak-ng produces 0 to
-#: 11 ms. More silence is intended, for example at volume 0.
+#: Maximum length of the zero samples to skip at the beginning of a sentence. libespeak-ng produces 0 to 11 ms of zeros.
+#: Longer silence is intentional, for example at volume 0.
 LEADING_ZEROS_LIMIT_S = 0.1
 
 #: Time allowed for a killed player to exit. It usually takes 1 ms, unless the player hangs in a device driver.
 PLAYER_KILL_LIMIT_S = 1.0
 
-#: Time allowed for a held sentence to become silent. Players usually have 42 to 98 ms of sound buffered. A player that
-#: has more or is stalled is killed, and the sentence later continues with a new player.
+#: Time allowed for a paused sentence to become silent. Players usually have 42 to 98 ms of sound buffered. A player
+#: that has buffered more or has stalled is killed, and a new player continues the sentence later.
 HOLD_SILENCE_LIMIT_S = 0.15
 
-#: Maximum time by which the word clock may be ahead of the sound. Measurements show 4 to 8 ms.
+#: How far the word clock may be ahead of the sound. It was measured to be 4 to 8 ms ahead.
 CLOCK_ERROR_S = 0.01
 
-#: Maximum length of a silence caused by late samples that doesn't count as a gap. Such a silence is inaudible, and the
-#: clock can't measure it precisely.
+#: If samples are late, the resulting silence counts as a gap only if it is longer than this. A shorter silence is
+#: inaudible, and the clock can't measure it precisely.
 INAUDIBLE_GAP_S = 0.05
 
-#: Length of the sound that is repeated after a player was killed with sound in its buffer. It compensates for the
-#: limited precision of the clock, so that no sound is lost.
+#: How much sound to repeat after a player was killed with sound in its buffer. The clock isn't exact, so some sound
+#: could otherwise be lost.
 REPEATED_SOUND_S = 0.03
 
-#: Length of a hold after which the player is released. After a shorter hold, the sentence can continue immediately.
-#: During a longer one, other programs can use the device, and the device can sleep.
+#: The player is released if a pause lasts longer than this, so that other programs can use the device and the device
+#: can sleep. After a shorter pause, the sentence continues immediately.
 RELEASE_DELAY_S = 10.0
 
-#: Minimum amount of sound in a player's buffer. With a configured buffer of 60 ms, measurements show 42 to 78 ms
-#: for aplay and 25 to 60 ms for pacat.
+#: Minimum amount of sound in a player's buffer while it plays. With a buffer of 60 ms, aplay was measured to hold 42 to
+#: 78 ms, and pacat 25 to 60 ms.
 MIN_PLAYER_BUFFER_S = 0.02
 
-#: Maximum absolute value of a sample that counts as silence. It is 66 dB below the loudest sample (32,768).
-#: libespeak-ng ends a sentence with 235 to 275 ms of zeros. With a voice that has an echo ("f3"), about the last 100 ms
-#: aren't zero but quiet.
+#: Samples up to this absolute value count as silence. It is 66 dB below the loudest possible sample (32,768).
+#: libespeak-ng ends a sentence with 235 to 275 ms of zeros. If the voice has an echo ("f3"), about 100 ms of the
+#: silence are quiet sound instead of zeros.
 MAX_QUIET_LEVEL = 16
 
 
@@ -90,7 +90,7 @@ class SentenceSamples:
 
     def __init__(self) -> None:
         self._kept = bytearray()
-        #: whether the sentence has had any sound or any word
+        #: whether any sound or word was added so far
         self.audible = False
         #: offset of the first sample in the buffer
         self.begin = 0
@@ -129,7 +129,7 @@ class SentenceSamples:
 
 
 class PlayerFeed:
-    """The stream of samples to one player. It counts the bytes written and consumed, and adjusts the word clock."""
+    """Sends samples to one player, and adjusts the word clock to the player's progress."""
 
     def __init__(self, player: Player, rate: int, clock: WordClock, begin: float, lead_in: float) -> None:
         """Start a stream, and reset the clock for it.
@@ -148,14 +148,14 @@ class PlayerFeed:
         self.consumed = 0
         #: number of bytes written to the player, including silence
         self.written = 0
-        #: time at which the player last accepted samples or had consumed everything; the start of a possible stall
+        #: time at which the player last accepted samples or had consumed everything
         self.progress_at = time.monotonic()
         self._rate = rate
         self._clock = clock
         self._first_write_at = 0.0
         #: time at which everything written will have been heard
         self._heard_at = 0.0
-        #: number of bytes of silence that remain to be written before the first sample
+        #: number of bytes of silence still to be written before the first sample
         self.lead_in = int(lead_in * rate) * SAMPLE_BYTES if player.real_time else 0
         clock.reset(begin)
 
@@ -185,10 +185,10 @@ class PlayerFeed:
         return taken
 
     def update(self, now: float, *, complete: bool) -> None:
-        """Adjust the clock to the player's progress. `complete` says that nothing more will be written."""
+        """Adjust the clock to the player's progress. Set `complete` if nothing more will be written."""
         consumed = self.player.consumed()
         if consumed > self.consumed:
-            if self.consumed == 0:  # the device is open now; until then, samples wait in the player's pipe
+            if self.consumed == 0:  # the device has been opened; until then, samples wait in the player's pipe
                 self._clock.start(now)
             self.consumed = consumed
             if consumed >= self.written:  # consuming a few bytes now and then doesn't count as progress
@@ -200,21 +200,21 @@ class PlayerFeed:
             self._clock.limit_elapsed(now, max(0.0, self._seconds(consumed) - MIN_PLAYER_BUFFER_S))
 
     def buffered(self, now: float) -> float:
-        """Return the length in seconds of the sound that was written but not heard yet."""
+        """Return how many seconds of sound were written but not heard yet."""
         return max(0.0, self.time_left(self.written, now))
 
     def time_left(self, written: int, now: float) -> float:
-        """Return the seconds until this byte of the stream is heard, or a negative number if it was already heard."""
+        """Return the seconds until a byte of the stream is heard. The result is negative if it was already heard."""
         return self._seconds(written) - self._clock.elapsed(now)
 
     def silent_for(self, now: float) -> float:
-        """Return the number of seconds for which the player has had nothing to play."""
+        """Return for how many seconds the player has had nothing to play."""
         if self.written == 0 or self.time_left(self.written, now) > MIN_PLAYER_BUFFER_S:
             return 0.0
         return max(0.0, now - self._heard_at)
 
     def missing_seconds(self, now: float) -> float:
-        """Return the length in seconds of the audio that would be missing if the player ended now."""
+        """Return how many seconds of audio would be lost if the player ended now."""
         return self._first_write_at + self._seconds(self.written) - now
 
     def _seconds(self, length: int) -> float:
@@ -222,11 +222,11 @@ class PlayerFeed:
 
 
 class _PlayerReleased(Exception):
-    """The player was released because the sentence is held. The current step is later repeated with a new player."""
+    """The player was released during a pause. The current step is repeated with a new player after the pause."""
 
 
 class Playback:
-    """Plays one sentence. The synthesizer writes the samples to it.
+    """Plays one sentence, using the samples that a synthesizer writes to it.
 
     All public methods except `stop` and `silence` may raise Stopped or CannotSpeak.
     """
@@ -242,12 +242,12 @@ class Playback:
         self._players = runner.players
         self._on_word = on_word
         self._rate = 0
-        #: functions that open the players that have not been tried yet, best first; None to try all players
+        #: functions that open the remaining players, best first; None to try all players
         self._untried: Iterator[Callable[[], Player]] | None = None
         self._feed: PlayerFeed | None = None
         self._first_error: CannotSpeak | None = None
         self._clock = WordClock()
-        #: all samples until the player is known to work, and from then on the samples not heard yet
+        #: all samples of the sentence; once the player has proved to work, only those not heard yet
         self._samples = SentenceSamples()
         self._complete = False  # whether all samples were written
         self._begin = 0  # offset of the current player's first sample
@@ -257,13 +257,13 @@ class Playback:
         self._start_known = False
         #: number of bytes of zero samples skipped at the beginning
         self._skipped = 0
-        #: monotonic time until which opening a busy device is retried; 0 until a device is found to be busy
+        #: monotonic time at which to stop retrying a busy device; 0 if no device was busy
         self._busy_until = 0.0
         #: whether the samples are synthesized in another thread, and may be late
         self._in_background = False
-        #: length in seconds of each gap that late samples have caused
+        #: lengths in seconds of the gaps caused by late samples
         self.gaps: list[float] = []
-        #: time at which the player of a held sentence started to play silence
+        #: time at which the player began to play silence during a pause
         self._silent_at: float | None = None
 
     # -- methods for the synthesizer
@@ -279,7 +279,7 @@ class Playback:
             fallback_reason: human-readable reason for a fallback voice, or None for the requested voice.
         """
         if self._feed is not None and rate != self._rate:
-            self._release_player(self._feed, 0)  # the player was started with another rate
+            self._release_player(self._feed, 0)  # the player was started with a different sample rate
         self._rate = rate
         self._runner.report_voice(voice, fallback_reason)
         if self._players.takes_time and not self._runner.hold_number:
@@ -300,14 +300,17 @@ class Playback:
         self._clock.add(TimedWord(start, length, position))
 
     def write(self, samples: bytes) -> None:
-        """Play samples. Return when the player has accepted them, or at once while everything so far is silent."""
+        """Play samples, and return once the player has accepted them.
+
+        If all samples so far are silent, they are stored until the first sound follows.
+        """
         self._samples.add(samples)
         self._wait((), 0.0)  # checks for a stop, because writing to a file never waits
         if self._samples.audible and self._find_start():
             self._with_player(self._send_all)
 
     def wait(self, descriptor: int) -> None:
-        """Wait for the descriptor while another thread synthesizes more samples. Meanwhile, keep playing.
+        """Keep playing until the descriptor is ready, while another thread synthesizes more samples.
 
         This method may return early. If the player runs out of samples in the meantime, it doesn't count as stalled.
         """
@@ -338,13 +341,13 @@ class Playback:
         return self._seconds(self._sent - self._skipped)
 
     def stop(self) -> None:
-        """Stop the sound at once. The running method raises Stopped."""
+        """Stop playing at once. The method that is currently running raises Stopped."""
         self._stopped = True
         if self._feed is not None:
             self._feed.player.kill()
 
     def silence(self) -> None:
-        """End the player, and return when it is certainly silent.
+        """Kill the player, and wait until it is certainly silent.
 
         Raises:
             CannotEnd: the player has not exited in time.
@@ -376,7 +379,7 @@ class Playback:
             try:
                 if self._feed is None:
                     self._await_continue()
-                    if 0 < self._begin == self._samples.end:  # the sentence was held at its very end
+                    if 0 < self._begin == self._samples.end:  # the sentence was paused at its very end
                         return
                     self._feed = self._open()
                 step(self._feed)
@@ -395,16 +398,16 @@ class Playback:
         return PlayerFeed(player, self._rate, self._clock, self._seconds(self._begin), lead_in)
 
     def _next_player(self, error: CannotSpeak) -> None:
-        """Release a player that has failed. If another one can't replace it, raise an error.
+        """Release a player that has failed, or raise an error if no other player can replace it.
 
         There is no replacement if some of the sound may have been heard, or if no other player is left.
         """
         feed = self._feed
         if feed is not None and feed.player.real_time and self._runner.hold_number:
-            self._rewind(feed)  # after the hold, the sentence continues with another player
+            self._rewind(feed)  # another player continues the sentence after the pause
             return
         first = self._first_error
-        if first is None or first.reason == Reason.NO_PLAYER:  # a failed player's error is more useful
+        if first is None or first.reason == Reason.NO_PLAYER:  # any other error is more useful
             first = self._first_error = error
         lost = error.final or error.reason == Reason.AUDIO_STALLED or (feed is not None and feed.player.proven)
         others = list(self._untried or ())
@@ -418,7 +421,7 @@ class Playback:
             self._wait((), time.monotonic() + DEVICE_RETRY_INTERVAL_S)
 
     def _is_busy(self, error: CannotSpeak) -> bool:
-        """Return whether the error is a busy device that should be tried again."""
+        """Return whether the device is busy and should be tried again."""
         if error.reason != Reason.AUDIO_DEVICE or "busy" not in str(error).lower():
             return False
         self._busy_until = self._busy_until or time.monotonic() + DEVICE_BUSY_LIMIT_S
@@ -428,12 +431,12 @@ class Playback:
         """Release the player. The next player continues at the offset `begin`."""
         self._begin = self._sent = begin
         if feed.player.proven:
-            self._players.last_player = feed.player.name  # will be tried first
+            self._players.last_player = feed.player.name  # the next sentence tries this player first
         self._untried = self._first_error = None
         self.silence()
 
     def _rewind(self, feed: PlayerFeed) -> None:
-        """Release a player although it still has sound in its buffer. The next player repeats the unheard sound."""
+        """Release a player that still has sound in its buffer. The next player repeats the unheard sound."""
         feed.update(time.monotonic(), complete=False)
         self._release_player(feed, self._unheard_begin() if feed.player.proven else self._begin)
 
@@ -447,23 +450,23 @@ class Playback:
             if self._runner.hold_number:
                 self._keep_silent(feed)
             if self._sent == self._audible_end(feed):
-                self._update(feed)  # the next samples may take long to arrive
+                self._update(feed)  # the next samples may not arrive for a long time
                 return
             taken = self._offer(feed)
             self._update(feed)
             if taken:
                 continue
             limit = FIRST_SOUND_LIMIT_S if feed.consumed == 0 else STALL_LIMIT_S
-            due = feed.progress_at + limit if feed.player.real_time else None  # a pipe's reader may be slow
+            due = feed.progress_at + limit if feed.player.real_time else None  # the reader of a pipe may be slow
             self._wait_for(feed, due)
             if due and time.monotonic() >= due and not self._runner.hold_number and not self._offer(feed):
                 raise CannotSpeak(Reason.AUDIO_STALLED, f"{feed.player.name} took no sound for {limit:g} s")
 
     def _await_samples(self, feed: PlayerFeed, more: Interest) -> None:
-        """Wait once for more samples. Meanwhile, keep playing."""
+        """Keep playing while waiting for more samples."""
         if self._runner.hold_number:
             self._keep_silent(feed)
-        feed.player.ended()  # raises an error if the player has failed, because the wait below would not notice
+        feed.player.ended()  # raises an error if the player has failed, because waiting doesn't report that
         self._wait_for(feed, None, more)
         self._update(feed)
         feed.progress_at = time.monotonic()  # until now, the player had nothing to play
@@ -478,7 +481,7 @@ class Playback:
         while not player.ended():
             self._update(feed)
             now = time.monotonic()
-            # If less sound is left, the player ends before a hold could silence it.
+            # If less sound is left, it isn't worth killing the player, because it will finish anyway.
             if self._runner.hold_number and feed.buffered(now) > HOLD_SILENCE_LIMIT_S:
                 self._rewind(feed)
                 raise _PlayerReleased
@@ -494,7 +497,7 @@ class Playback:
     # -- samples
 
     def _find_start(self) -> bool:
-        """Decide how many zero samples to skip at the beginning, and return whether a decision was possible.
+        """Decide how many zero samples to skip at the beginning. Return False if it is too early to decide.
 
         Zeros before the first sound are skipped, so that it is heard earlier. They are kept in a file. They are also
         kept after another sentence, because they are part of the silence between the two sentences.
@@ -513,7 +516,7 @@ class Playback:
         return True
 
     def _offer(self, feed: PlayerFeed) -> int:
-        """Offer part of the lead-in or of the samples to the player, and return the number of bytes accepted."""
+        """Offer the next silence or samples to the player, and return the number of bytes accepted."""
         if feed.lead_in:
             taken = feed.offer_silence(self._seconds(self._begin), feed.lead_in)
             feed.lead_in -= taken
@@ -527,7 +530,7 @@ class Playback:
         return taken
 
     def _audible_end(self, feed: PlayerFeed) -> int:
-        """Return the offset up to which to play now.
+        """Return the offset at which to stop playing for now.
 
         Silence at the end is held back, because it is shortened if another goal is waiting.
         """
@@ -567,10 +570,10 @@ class Playback:
     # -- holding
 
     def _keep_silent(self, feed: PlayerFeed) -> None:
-        """Play silence while the sentence is held.
+        """Play silence while the sentence is paused.
 
         Raises:
-            _PlayerReleased: the player failed, or the hold is longer than `RELEASE_DELAY_S`.
+            _PlayerReleased: the player failed, or the pause is longer than `RELEASE_DELAY_S`.
         """
         if not feed.player.real_time:
             self._await_continue()
@@ -584,10 +587,10 @@ class Playback:
             try:
                 taken = self._offer_silence(feed)
             except CannotSpeak:
-                release_at = 0.0  # a player that fails during a hold is replaced
+                release_at = 0.0  # a player that fails during a pause is replaced
             due = min(release_at, feed.progress_at + STALL_LIMIT_S)
             if time.monotonic() >= due:
-                self._release_player(feed, self._sent)  # everything sent so far was heard
+                self._release_player(feed, self._sent)  # everything sent so far has been heard
                 raise _PlayerReleased
             if not taken:
                 self._wait_for(feed, due)
@@ -610,7 +613,10 @@ class Playback:
             now = time.monotonic()
 
     def _offer_silence(self, feed: PlayerFeed) -> int:
-        """Offer silence, unless the player has enough. Without this limit, some players would accept it endlessly."""
+        """Offer silence to the player, unless it already has enough.
+
+        Without this limit, some players would accept silence endlessly.
+        """
         feed.player.ended()  # raises an error if the player has failed
         taken = 0 if self._has_enough_silence(feed) else feed.offer_silence(self._seconds(self._sent))
         self._update(feed)
@@ -622,13 +628,13 @@ class Playback:
     # -- waiting
 
     def _await_continue(self) -> None:
-        """Wait for the end of a hold, without a player."""
+        """Wait without a player until the sentence continues."""
         while self._runner.hold_number:
             self._runner.confirm_hold()
             self._wait((), None)
 
     def _wait_for(self, feed: PlayerFeed, until: float | None, more: Interest | None = None) -> None:
-        """Wait for the player or a monotonic time.
+        """Wait until the player needs attention or a time is reached.
 
         Args:
             feed: the stream of the player.
@@ -639,15 +645,15 @@ class Playback:
         idle = more is not None or self._has_enough_silence(feed)
         moments = [until, now + PIECE_S if idle else player.wake_at()]
         moments.append(self._clock.next_word_at() if player.proven else None)
-        if feed.consumed < feed.written:  # poll doesn't report each time that a player consumes samples
+        if feed.consumed < feed.written:  # poll doesn't always report that a player has consumed samples
             moments.append(now + PROGRESS_CHECK_INTERVAL_S)
-        # Without samples to write, a writable player would end the wait at once.
+        # If there are no samples to write, don't wait for a writable player, because that would end the wait at once.
         interests = [each for each in player.interests() if not (idle and each[1] == select.POLLOUT)]
         interests += [] if more is None else [more]
         self._wait(interests, min((moment for moment in moments if moment is not None), default=None))
 
     def _wait(self, interests: Sequence[Interest], until: float | None) -> None:
-        """Wait in the runner. If the sentence was stopped in the meantime, raise Stopped."""
+        """Wait in the runner. If the sentence is stopped during the wait, raise Stopped."""
         self._runner.wait(interests, until)
         self._check_stopped()
 

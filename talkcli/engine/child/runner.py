@@ -1,8 +1,8 @@
 """The main loop of the engine process, which speaks goals through pyttsx3 and executes commands.
 
 The loop runs in one thread. While `talk`'s own driver speaks, it waits in `GoalRunner.wait`, which executes a `Stop` or
-`Hold` at once. Third-party drivers can't hold a sentence. For them, a hold stops the sentence, and the rest of the text
-is later spoken as a new sentence.
+`Hold` at once. Third-party drivers can't pause a sentence. They are stopped instead, and later speak the rest of the
+text as a new sentence.
 
 Each goal must end with an `Ended`. pyttsx3 makes this harder because it drops exceptions raised by its callbacks,
 ignores blank text and reports errors as notifications.
@@ -34,25 +34,26 @@ if TYPE_CHECKING:
     from talkcli.engine.child.synthesizers.combined import CombinedSynthesizer
     from talkcli.goals.goal import Output
 
-#: Interval between two steps of a third-party driver while it speaks. The driver can't wake this process.
+#: Time between two steps of a third-party driver while it speaks. The driver is polled because it can't wake this
+#: process.
 DRIVER_STEP_S = 0.05
 
-#: Time allowed for a third-party driver to finish the text after its last word, in addition to the estimated time for
-#: the remaining words. The driver doesn't show whether it is still speaking.
+#: Time allowed for a third-party driver to finish the text, in addition to the estimated time for the remaining words.
+#: The driver doesn't report whether it is still speaking.
 DRIVER_LIMIT_S = 10.0
-#: Number of words to allow for each remaining character. "€" is spoken as one word. An emoji is spoken as up to five,
-#: but other characters are usually between emojis.
+#: Number of words to allow for each remaining character. "€" is spoken as one word. An emoji is spoken as up to five
+#: words, but a text rarely consists of emojis only.
 MAX_WORDS_PER_CHARACTER = 3
 
 
 class Channel:
-    """The engine process's end of the socket to its server."""
+    """The engine process's connection to the server."""
 
     #: standard input, which is the socket
     descriptor = 0
 
     def __init__(self) -> None:
-        #: whether the server has closed its end
+        #: whether the server has closed the connection
         self.closed = False
         #: monotonic time at which the last event was sent
         self.sent_at = time.monotonic()
@@ -87,17 +88,17 @@ class ActiveGoal:
         self.id = command.id
         self.command = command
         self.words = WordFinder(command.text)
-        #: time at which the goal started, plus the duration of its holds
+        #: time at which the goal started, plus the length of all its pauses
         self.began_at = now
         #: time at which the driver last received text or reported a word
         self.progress_at = now
-        #: whether the driver is speaking the text; False while the goal is held with a third-party driver
+        #: whether the driver is speaking the text; False while a third-party driver is paused
         self.with_driver = False
-        #: whether a third-party driver was stopped in order to hold the goal
+        #: whether a third-party driver was stopped in order to pause the goal
         self.interrupted = False
         #: time at which a stopped third-party driver reported that it is silent
         self.silent_at: float | None = None
-        #: offset in the text of the part that the driver received
+        #: offset in the text at which the driver began
         self.offset = 0
         #: offset in the text of the last word heard
         self.last_word = 0
@@ -107,11 +108,11 @@ class ActiveGoal:
         self.reported_voice = ""
         #: human-readable reason for a fallback voice; None for the requested voice
         self.fallback_reason: str | None = None
-        #: number of the last hold confirmed to the server
+        #: number of the last pause that was confirmed to the server
         self.confirmed_hold = 0
         #: the first error that the driver reported
         self.error: Exception | None = None
-        #: whether it was logged that the driver takes too long
+        #: whether a log message has reported that the driver takes too long
         self.overdue_logged = False
 
 
@@ -134,14 +135,14 @@ class GoalRunner:
         self._set_properties: Any = None
         self._pump: Callable[[], None] | None = None
         self._synthesizer: CombinedSynthesizer | None = None
-        #: number of the active hold, or 0; read by the playback, because pyttsx3 has no method for a hold
+        #: number of the current pause, or 0; read by the playback, because pyttsx3 has no method for pausing
         self.hold_number = 0
         # Only `talk`'s own driver sets these attributes. pyttsx3's notifications have no fields for them.
         #: position in the audio of the word being reported, in seconds; None with a third-party driver
         self.position: float | None = None
         #: length of the last sentence in seconds; None if it wasn't heard completely
         self.duration: float | None = None
-        #: length in seconds of each gap in the last sentence
+        #: lengths in seconds of the gaps in the last sentence
         self.gaps: list[float] = []
 
     def attach_engine(
@@ -177,7 +178,7 @@ class GoalRunner:
         if send_voices:
             try:
                 voices = list_voices(self._engine)
-            except Exception:  # noqa: BLE001 - a third-party driver may raise any error, and yet be able to speak
+            except Exception:  # noqa: BLE001 - a third-party driver may fail here and still be able to speak
                 traceback.print_exc()
                 voices = ()
             self._channel.send(protocol.VoiceList(voices))
@@ -186,13 +187,13 @@ class GoalRunner:
                 self.wait((), None)
                 continue
             command = self._backlog.popleft()
-            if isinstance(command, protocol.GoalCommand):  # other commands are for goals that have ended
+            if isinstance(command, protocol.GoalCommand):  # all other commands are for goals that have already ended
                 self._speak(command)
 
     def wait(self, interests: Sequence[Interest], until: float | None) -> None:
-        """Wait for a descriptor, a command or a monotonic time, and execute the commands. It may return early.
+        """Wait for a descriptor, a command or a time, and execute the commands.
 
-        A command may have stopped or held the sentence when this method returns.
+        This method may return early. By then, a command may have stopped or paused the sentence.
 
         Args:
             interests: the descriptors, with the poll events to wait for.
@@ -224,7 +225,7 @@ class GoalRunner:
             self._channel.send(protocol.Alive(self._goal.id if self._goal else ""))
 
     def _execute(self, command: protocol.Command) -> None:
-        """Execute a command for the current goal or for a voice. Put others into the backlog."""
+        """Execute a command for the current goal or for a voice. Add any other command to the backlog."""
         goal = self._goal
         if isinstance(command, protocol.LoadVoice | protocol.DropVoice):
             if self._synthesizer is not None:
@@ -251,7 +252,7 @@ class GoalRunner:
             self._goal.stop_requested = True
             if self._goal.with_driver:
                 self._engine.stop()
-            else:  # the goal is held or hasn't started, so the driver would not report its end
+            else:  # the goal is paused or hasn't started, so the driver would not report its end
                 self._end(protocol.OUTCOME_STOPPED)
 
     def _send_voice_events(self) -> None:
@@ -260,14 +261,14 @@ class GoalRunner:
             self._channel.send(event)
 
     def report_voice(self, voice: str, fallback_reason: str | None) -> None:
-        """Report the voice that speaks the goal, unless it was already reported. The playback calls this method."""
+        """Tell the server which voice speaks the goal, unless the server already knows."""
         goal = self._goal
         if goal is not None and voice != goal.reported_voice:
             goal.reported_voice = voice
             self._channel.send(protocol.VoiceChosen(goal.id, voice, fallback_reason or goal.fallback_reason))
 
     def confirm_hold(self) -> None:
-        """Confirm that the held goal is silent. If a hold was already confirmed, do nothing."""
+        """Confirm to the server that the paused goal is silent. Each pause is confirmed only once."""
         goal = self._goal
         if goal is not None and not goal.stop_requested and goal.confirmed_hold != self.hold_number:
             goal.confirmed_hold = self.hold_number
@@ -287,7 +288,7 @@ class GoalRunner:
         self.hold_number, self.duration, self.gaps = 0, None, []
         self.players.begin(command)
         self._channel.send(protocol.Started(command.id))
-        # Commands for this goal may have been received together with it.
+        # Some commands for this goal may have arrived together with it.
         backlog, self._backlog = self._backlog, deque()
         for each in backlog:
             self._execute(each)
@@ -309,7 +310,7 @@ class GoalRunner:
                 self._send_to_driver(goal)
 
     def _send_to_driver(self, goal: ActiveGoal) -> None:
-        """Have the driver speak the text, beginning with the last word heard."""
+        """Have the driver speak the text, starting at the last word heard."""
         goal.progress_at = time.monotonic()
         if goal.silent_at is not None:
             goal.began_at += goal.progress_at - goal.silent_at
@@ -319,7 +320,7 @@ class GoalRunner:
             self._fail(Reason.NOTHING_TO_SAY, "nothing in the text can be spoken")
 
     def _step_driver(self, goal: ActiveGoal) -> None:
-        """Run the driver for one step.
+        """Run one step of the driver.
 
         `talk`'s own driver speaks the whole text in one step. A third-party driver needs many steps.
         """
@@ -371,7 +372,7 @@ class GoalRunner:
         elif error is None:
             self._fail(Reason.ENGINE_FAILED, "the driver did not complete the sentence")
         else:
-            traceback.print_exception(error)  # for the server's log
+            traceback.print_exception(error)  # this goes to the server's log
             self._fail(Reason.ENGINE_FAILED, f"{type(error).__name__}: {error}")
 
     def _fail(self, reason: Reason, message: str) -> None:
@@ -393,7 +394,7 @@ class GoalRunner:
         return self._channel.sent_at + protocol.ALIVE_INTERVAL_S
 
     def _is_overdue(self, goal: ActiveGoal) -> bool:
-        """Return whether a third-party driver takes longer than the text can possibly need.
+        """Return whether a third-party driver has taken longer than the text can possibly need.
 
         The process then sends no `Alive`, so that the server kills it. There may be no other way to stop the driver.
         """
@@ -409,7 +410,7 @@ class GoalRunner:
 
 
 def _with_traceback(callback: Callable[..., None]) -> Callable[..., None]:
-    """Wrap a callback to print the traceback of an exception, because pyttsx3 drops exceptions."""
+    """Wrap a callback so that it prints the traceback of any exception. pyttsx3 would drop the exception."""
 
     def call(**values: Any) -> None:
         try:

@@ -1,4 +1,4 @@
-"""The words of a sentence: where they are in the text, and when each of them is heard.
+"""Finds the words of a sentence in the text, and determines when each of them is heard.
 
 Nothing here reads the clock. All times are arguments, in monotonic seconds.
 """
@@ -11,7 +11,7 @@ from collections import deque
 
 from talkcli.frozen import frozen, replace
 
-#: The rest of a word after its first part, because synthesizers report only "it" of "it's" or "well" of "well-known".
+#: The rest of a word after its first part. Synthesizers report only "it" for "it's", and "well" for "well-known".
 _WORD_REST = re.compile(r"(?:['’-][^\W\d_]\w*|\.[^\W\d_](?!\w))+")
 _LETTER = re.compile(r"[^\W\d_]")
 #: The rest of a number after a comma or a dot, such as the "000" of "1,000".
@@ -21,7 +21,7 @@ _END_MARKS = ".,;:!?…"
 
 
 def count_letters(text: str, start: int) -> int:
-    """Return the number of consecutive letters and digits that begin at `start`, including combining accents.
+    """Count the letters and digits from `start` to the next other character, including combining accents.
 
     It is used as the length of a word if libespeak-ng reports a length of 0. libespeak-ng does so if the next character
     isn't ASCII (as in "«hello»"), and also if there is no word at all.
@@ -33,7 +33,7 @@ def count_letters(text: str, start: int) -> int:
 
 
 class WordFinder:
-    """Finds the whole words of a text from the locations that a synthesizer reports.
+    """Finds whole words in a text, given the locations that a synthesizer reports.
 
     Synthesizers repeat locations, go back, report blanks, return lengths that extend into the next word, and report
     only the first part of "it's". `find` returns each word at most once, in the order of the text. If two words are
@@ -46,7 +46,7 @@ class WordFinder:
         self._count = 0
 
     def find(self, location: int, length: int) -> tuple[int, int, int] | None:
-        """Return the start, the end and the number of the word at a reported location, or None if it isn't a new word.
+        """Return the start, end and number of the word at a reported location, or None if no new word starts there.
 
         The first word has number 1.
         """
@@ -88,11 +88,11 @@ class TimedWord:
 
 
 class WordClock:
-    """A clock for a player's stream, which computes how much audio was heard and which words have started.
+    """Keeps track of how much audio has been heard, and of which words have started.
 
-    The clock is started when the player accepts the first samples. It is set back if the player falls behind, so that
-    no word is reported before it is heard. If the output has its own clock, this clock follows it. Silence in the
-    stream delays the words after it.
+    The clock measures the stream to one player. It starts when the player accepts the first samples. It is set back if
+    the player falls behind, so that no word is reported before it is heard. If the output has its own clock, this clock
+    follows it. Silence in the stream delays the words after it.
     """
 
     def __init__(self) -> None:
@@ -101,15 +101,15 @@ class WordClock:
         self._started_at: float | None = None
         #: position in the audio at which the stream begins, in seconds
         self._begin = 0.0
-        #: silence in the stream, as pairs of the position in the audio that follows and the length in seconds
+        #: silences in the stream: each one's position in the audio, and its length in seconds
         self._silences: list[tuple[float, float]] = []
 
     def add(self, word: TimedWord) -> None:
-        """Add a word. Its position must not be less than that of the previous word."""
+        """Add a word. Words must be added in the order of their positions."""
         self._waiting.append(word)
 
     def skip_until(self, position: float) -> None:
-        """Move earlier words to this position, because the audio before it is skipped."""
+        """Skip the audio before this position, and move the words in it to this position."""
         self._waiting = deque(replace(each, position=max(position, each.position)) for each in self._waiting)
 
     def reset(self, position: float) -> None:
@@ -129,11 +129,11 @@ class WordClock:
         self._silences.append((position, seconds))
 
     def set_elapsed(self, now: float, elapsed: float) -> None:
-        """Set the number of seconds heard, as reported by the output. If it is 0, the clock is stopped."""
+        """Set the number of seconds heard, as reported by the output. 0 stops the clock."""
         self._started_at = now - elapsed if elapsed > 0 else None
 
     def limit_elapsed(self, now: float, elapsed: float) -> None:
-        """Set the clock back if it shows more than this number of seconds heard."""
+        """Set the clock back to this number of seconds if it shows more."""
         if self._started_at is not None and now - self._started_at > elapsed:
             self._started_at = now - elapsed
 
@@ -142,7 +142,7 @@ class WordClock:
         return 0.0 if self._started_at is None else now - self._started_at
 
     def heard_position(self, now: float) -> float:
-        """Return the position up to which the audio was heard."""
+        """Return the position up to which the audio has been heard."""
         position = self._begin + self.elapsed(now)
         for before, seconds in self._silences:
             if position <= before:

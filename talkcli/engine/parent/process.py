@@ -1,4 +1,4 @@
-"""The parent's side of an engine process: starting it, exchanging messages with it and killing it.
+"""Starts an engine process, exchanges messages with it, and kills it.
 
 `EngineProcess` never blocks for long and makes no decisions, so that the supervisor can use it in an event loop.
 `PrivateEngine` is for callers that have only a few texts and can block until each of them is spoken.
@@ -35,10 +35,10 @@ if TYPE_CHECKING:
 
 #: Environment variables that systemd sets only for the server itself.
 _SERVER_VARIABLES = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID", "LISTEN_FDS", "LISTEN_PID", "LISTEN_FDNAMES")
-#: Size of the socket's send buffer. Even with escapes, the longest text fits several times.
+#: Size of the socket's send buffer. The longest text fits into it several times, even if many characters are escaped.
 _SEND_BUFFER_BYTES = 512 * 1024
-#: Time allowed for a process to exit on its own after it closed its connection. Killing it earlier would hide its exit
-#: status.
+#: Time allowed for a process to exit on its own after it has closed its connection. Killing it earlier would hide its
+#: exit status.
 _EXIT_WAIT_S = 0.2
 #: Maximum length of a line from standard error. The rest of a longer line is discarded.
 MAX_STDERR_LINE_BYTES = 1000
@@ -51,7 +51,7 @@ def engine_command() -> list[str]:
 
 
 class EngineProcess:
-    """A running engine process, with the descriptors to watch."""
+    """A running engine process, as seen by the process that started it."""
 
     def __init__(
         self,
@@ -77,7 +77,8 @@ class EngineProcess:
         self.start_failure: protocol.StartFailed | None = None
         #: monotonic time by which the process must have exited after a kill; set by the supervisor
         self.exit_deadline = float("inf")
-        # Held while sending. Otherwise, another thread could close the descriptor and its number could be reused.
+        # This lock is held while sending. Otherwise, another thread could close the descriptor, and its number could be
+        # reused.
         self._sending = threading.Lock()
         self._lines = LineSplitter()
         self._stderr_lines = LineSplitter(MAX_STDERR_LINE_BYTES)
@@ -121,7 +122,7 @@ class EngineProcess:
     def receive(self) -> Iterator[protocol.Event | None]:
         """Read once without blocking, and yield the received events.
 
-        The last one is None if the process has closed the connection or sent a malformed message.
+        The last event is None if the process has closed the connection or sent a malformed message.
         """
         try:
             data = self.socket.recv(65536)
@@ -162,26 +163,26 @@ class EngineProcess:
         """
         if self._process.returncode is None:
             kill([-self.pid])
-            # A player dies with the engine process. If it is a pipeline, its programs are in a process group of their
-            # own and would survive.
+            # A player dies with the engine process, but the programs of a pipeline have a process group of their own
+            # and would survive.
             kill(pid for pid in processes() if peers.process_stat(pid)[3:4] == [b"%d" % self.pid])
             kill_holders(self.liveness)
 
     def describe_exit(self) -> str:
         """Return a human-readable description of how the process exited. Kill it if it is still running."""
         end = time.monotonic() + _EXIT_WAIT_S
-        # Before Python 3.13, macOS has no waitid. There, the exit status may result from the kill below.
+        # macOS has no waitid before Python 3.13. The exit status may then be that of the kill below.
         while hasattr(os, "waitid") and time.monotonic() < end:
             if os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is not None:
                 break
             time.sleep(0.001)
-        self.kill()  # before reaping the process, because its group ID may be reused afterwards
+        self.kill()  # must come before reaping, because the group ID may be reused afterwards
         try:
             status = self._process.wait(_EXIT_WAIT_S)
         except subprocess.TimeoutExpired:
             return "it closed its connection"
         self.read_stderr()
-        self._report_stderr(b"\n")  # ends an incomplete last line
+        self._report_stderr(b"\n")  # completes the last line
         how = f"it was killed by {signal_name(-status)}" if status < 0 else f"it exited with status {status}"
         return f"{how} ({self._last_stderr_line})" if self._last_stderr_line else how
 
@@ -203,7 +204,7 @@ class EngineFailed(Exception):
 
     Attributes:
         reason: machine-readable reason, as in a goal. For ENGINE_CRASHED, the message describes how the process exited.
-        silent_s: the exceeded time limit for a message, in seconds; None for any other failure.
+        silent_s: the time limit in seconds, if the process sent no message within it; otherwise None.
     """
 
     def __init__(self, reason: Reason, message: str, silent_s: float | None = None) -> None:
@@ -213,7 +214,7 @@ class EngineFailed(Exception):
 
 
 class PrivateEngine:
-    """An engine process for a single caller, as a context manager.
+    """A context manager that runs an engine process for a single caller.
 
     It speaks one text at a time, blocks the caller's thread while waiting, and enforces the time limits in `protocol`.
     Leaving the context kills the process and its player. `say -o` and `talk doctor` use this class.
@@ -245,7 +246,7 @@ class PrivateEngine:
         self._deadline = deadline
         self._interrupt = interrupt
         self._last_event_at = time.monotonic()
-        #: endless iterator over the events of the process, with the same errors as `wait_for`
+        #: endless iterator over the events of the process, which raises the same errors as `wait_for`
         self.events = self._receive_events()
 
     def __enter__(self) -> PrivateEngine:
@@ -258,12 +259,12 @@ class PrivateEngine:
         self._process.close()
 
     def speak(self, command: protocol.GoalCommand) -> None:
-        """Start to speak a text. The process must be ready, and the previous text must have ended."""
+        """Start speaking a text. The process must be ready, and the previous text must have ended."""
         self._last_event_at = time.monotonic()
         self._process.send(command)  # if this fails, `wait_for` raises an error
 
     def wait_for(self, event_class: type[_E]) -> _E:
-        """Wait for the next event of a class, and return the event.
+        """Wait for the next event of the given class, and return it.
 
         Raises:
             EngineFailed: the process failed, or exceeded a time limit.
@@ -281,8 +282,8 @@ class PrivateEngine:
             ready = wait_ready(watched, due - time.monotonic(), self._interrupt)
             if process.stderr in ready and not process.read_stderr():
                 del watched[process.stderr]
-            # Read before checking the limits. If this process was suspended (Ctrl-Z), the limits may have passed even
-            # though the events arrived in time.
+            # Read the events before checking the time limits. If this process was suspended (Ctrl-Z), the limits may
+            # have passed even though the events arrived in time.
             for event in process.receive() if process.socket.fileno() in ready else ():
                 self._last_event_at = time.monotonic()
                 if event is None:

@@ -1,4 +1,4 @@
-"""Rendering of a text into a WAV file, for `say -o`.
+"""Rendering text to a WAV file, for `say -o`.
 
 A rendering uses its own engine process and needs no server. It is not a goal: it isn't queued, other clients don't see
 it, and the text may have any length.
@@ -29,16 +29,17 @@ from talkcli.polling import wait_ready
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-#: Failures that have the exit code of a rejected goal. All other failures have the exit code of an aborted goal.
+#: Failures that exit with the code of a rejected goal. All other failures exit with the code of an aborted goal.
 _REJECTED_REASONS = frozenset({Reason.INVALID_TEXT, Reason.UNKNOWN_VOICE, Reason.BAD_OPTION})
-#: Failures of the player. Here, the player writes the file, so they mean that the file can't be written.
+#: Failures of the player. During a rendering, the player writes the file, so these mean that the file can't be written.
 _FILE_REASONS = frozenset({Reason.AUDIO_DEVICE, Reason.AUDIO_LOST})
-#: Paths that refer to standard output. They are not opened, because the shell has already opened standard output.
+#: Paths that refer to standard output. They don't need to be opened, because the shell has already opened standard
+#: output.
 STANDARD_OUTPUT = frozenset({"-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"})
-#: Interval for checking whether a named pipe has a reader, because no event signals this.
+#: How often to check whether a named pipe has a reader. There is no event for this.
 _READER_CHECK_INTERVAL_S = 0.05
-#: Maximum length of the text in one `Speak`, which is the same as for a goal. The engine sends no messages while it
-#: prepares a text, so a longer text could be mistaken for a hang.
+#: Maximum length of the text in one `Speak`, the same as for a goal. The engine sends no messages while it prepares a
+#: text, so a longer text could be mistaken for a hang.
 MAX_PIECE_CHARS = MAX_TEXT_CHARS
 #: The end of a sentence or a line. Cutting a text there doesn't change how it sounds.
 _SENTENCE_END = re.compile(r"""[.!?…]["')\]»”’]*\s+|[。！？।]|\n\s*""")
@@ -74,7 +75,7 @@ def render(
     timeout: float | None = None,
     interrupt: Mapping[int, int] | None = None,
 ) -> float:
-    """Render a text into a WAV file, and return the length of the audio in seconds.
+    """Render a text to a WAV file, and return the length of the audio in seconds.
 
     Args:
         text: the text, of any length.
@@ -98,7 +99,7 @@ def render(
     fault = bad_text(text, None)
     if fault is not None:
         raise RenderFailed(*fault)
-    # A rendering can wait until its voice is loaded. A file with another voice would be useless.
+    # A rendering can wait for its voice to load. A file with a different voice would be useless.
     commands = (
         protocol.Speak(f"{number}", piece, rate, volume, voice, pitch, voice_only=True)
         for number, piece in enumerate(pieces(text), 1)
@@ -160,7 +161,7 @@ def _speak_all(engine: PrivateEngine, commands: Iterator[protocol.Speak], engine
             raise _engine_failure(error, command.voice) from error
         if ended.outcome == protocol.OUTCOME_COMPLETED and ended.duration is not None:
             seconds += ended.duration
-        elif ended.reason == Reason.NOTHING_TO_SAY:  # a piece of a long text may consist of dots only
+        elif ended.reason == Reason.NOTHING_TO_SAY:  # a piece of a long text may contain nothing but dots
             silent_end = ended
         else:
             raise _goal_failure(ended, engine_path, path)
@@ -241,13 +242,13 @@ def _open_without_blocking(path: str, deadline: float, interrupt: Mapping[int, i
 
 @contextlib.contextmanager
 def _hidden_file(path: str) -> Iterator[str]:
-    """Create a hidden file, yield its path, and finally rename it to `path`. Remove it after an error."""
+    """Create a hidden file, yield its path, and finally rename the file to `path`. After an error, remove it."""
     target = _resolve_target(path)
     # The hidden name isn't derived from the target's name, because a longer name may exceed the file system's limit.
     hidden = os.path.join(os.path.dirname(target), f".talk-{os.urandom(8).hex()}.wav")
     try:
         try:
-            open(hidden, "xb").close()  # gets its mode from the umask
+            open(hidden, "xb").close()  # the umask determines the file's mode
         except OSError as error:
             directory = os.path.dirname(hidden)
             if not os.path.isdir(directory):
@@ -256,12 +257,13 @@ def _hidden_file(path: str) -> Iterator[str]:
         yield hidden
         try:
             with open(hidden, "rb") as file:
-                os.fsync(file)  # protects against power cuts, and makes some file systems report a full disk
+                os.fsync(file)  # protects the file against power cuts, and makes some file systems report a full disk
             os.replace(hidden, target)
         except OSError as error:
             raise _write_failure(path, error) from error
     finally:
-        # The file may have been renamed or never created. If removing it fails, the original error is more useful.
+        # The hidden file may have been renamed or never created. If it can't be removed, the original error is more
+        # useful.
         with contextlib.suppress(OSError):
             os.unlink(hidden)
 
@@ -293,7 +295,7 @@ def _resolve_target(path: str) -> str:
 
 
 def _is_own_output(found: os.stat_result) -> bool:
-    """Return whether the file is this process's standard output or standard error, so that it can't be replaced."""
+    """Return whether the file is this process's own standard output or standard error."""
     for descriptor in (1, 2):
         with contextlib.suppress(OSError):  # the descriptor is closed
             if os.path.samestat(found, os.fstat(descriptor)):

@@ -1,7 +1,7 @@
 """The engine thread, which owns the engine process, gives it one goal at a time, and enforces time limits.
 
 Another thread submits the goals. Whatever the engine process does, the engine thread posts exactly one `Ended` for each
-goal, unless the goal was given up. It reports everything through the callback `post` and holds no lock while it waits.
+goal, unless the goal was abandoned. It reports everything through the callback `post` and holds no lock while it waits.
 It knows nothing about clients or the queue.
 """
 
@@ -25,15 +25,15 @@ from talkcli.goals.reasons import Reason
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-#: Delay before the next start, by the number of consecutive processes that failed to start or ended too soon.
+#: Delays before the next start. The delay grows with each consecutive process that fails to start or exits too soon.
 RESTART_DELAYS_S = (0.0, 0.1, 0.5, 2.0, 10.0)
-#: Maximum number of lines from standard error that are logged per period. It is enough for a traceback. A third-party
-#: driver may write a line for each word.
+#: Maximum number of lines from standard error to log per period. This is enough for a traceback. The limit is needed
+#: because a third-party driver may write a line for each word.
 MAX_STDERR_LINES = 20
 STDERR_PERIOD_S = 60.0
-#: Minimum lifetime of a process. If it ends earlier and had no goal, the next start may be delayed.
+#: If a process exits within this time and had no goal, the next start may be delayed.
 MIN_LIFETIME_S = 1.0
-#: Time without a ready process after which each failed start also fails a goal. Otherwise, goals would wait forever.
+#: If no process has been ready for this long, each failed start also fails a goal. Otherwise, goals would wait forever.
 ENGINE_WAIT_LIMIT_S = 10.0
 NEVER = float("inf")
 
@@ -47,7 +47,7 @@ class EngineDied:
 
 @frozen
 class EngineMissing:
-    """Another start has failed after a long time without a ready process. The next goal fails with this message."""
+    """The engine has failed to start for a long time. The next goal fails with this message."""
 
     message: str
 
@@ -61,7 +61,7 @@ class EngineSaid:
 
 @frozen
 class ThreadDied:
-    """The engine thread was ended by a bug. No more goals can be spoken."""
+    """A bug has ended the engine thread. No more goals can be spoken."""
 
     message: str
 
@@ -70,7 +70,7 @@ Report = protocol.Event | EngineDied | EngineMissing | EngineSaid | ThreadDied
 
 
 class ActionQueue:
-    """A queue of actions that other threads submit to a thread that waits for descriptors.
+    """Runs actions from other threads in a thread that waits for descriptors.
 
     `call` may be used from any thread. Only the waiting thread may use the other methods.
     """
@@ -85,7 +85,7 @@ class ActionQueue:
         self.selector = selectors.DefaultSelector()
         self._actions: deque[Callable[[], None]] = deque()
         self._closed = False
-        #: held by `call`, because otherwise the descriptor could be closed and its number reused before the write
+        #: lock that prevents the descriptor from being closed while `call` uses it
         self._calling = threading.Lock()
         #: monotonic time at which the thread wakes up on its own; 0 while it is awake or being woken
         self._sleeps_until = 0.0
@@ -97,7 +97,7 @@ class ActionQueue:
         self.selector.register(self._reader, selectors.EVENT_READ)
 
     def call(self, action: Callable[[], None], by: float = 0.0) -> None:
-        """Have the waiting thread run an action, or do nothing if the queue is closed.
+        """Run an action in the waiting thread. If the queue is closed, do nothing.
 
         Args:
             action: the function to call.
@@ -108,14 +108,14 @@ class ActionQueue:
             if self._closed:
                 return
             self._actions.append(action)
-            # `wait` sets `_sleeps_until` before it checks for actions. Because of this order, either this method finds
-            # the thread asleep, or `wait` finds the action.
+            # `wait` sets `_sleeps_until` before it checks for actions. Therefore, either this method finds the thread
+            # asleep, or `wait` finds the action.
             if self._sleeps_until > by:
                 self._sleeps_until = 0.0
                 os.write(self._writer, b"\0")
 
     def wait(self, until: float) -> list[selectors.SelectorKey]:
-        """Wait for a registered descriptor, an action or a monotonic time, and run the actions.
+        """Wait for a registered descriptor, an action or a time, and run the actions.
 
         Returns:
             The keys of the ready descriptors.
@@ -149,7 +149,7 @@ class ActionQueue:
 
 
 class RestartPolicy:
-    """A policy for when to start the next engine process, and whether goals wait for it.
+    """Decides when to start the next engine process, and whether goals wait for it.
 
     Goals wait while the cause may be temporary, such as a lack of memory or descriptors. A permanent cause, such as a
     missing library or an unknown driver, fails each goal at once, until a process does become ready.
@@ -165,7 +165,10 @@ class RestartPolicy:
         self._missing_since = now
 
     def process_died(self, now: float, *, age_s: float, had_goal: bool) -> None:
-        """Schedule the next start after a ready process has ended. There is a delay only if it ended too soon."""
+        """Schedule the next start after a ready process has exited.
+
+        The start is delayed only if the process exited too soon.
+        """
         self._missing_since = now
         if had_goal or age_s > MIN_LIFETIME_S:
             self._failures = 0
@@ -174,7 +177,7 @@ class RestartPolicy:
             self._back_off(now)
 
     def start_failed(self, now: float, started_at: float, permanent_error: str | None) -> bool:
-        """Schedule the next start after a failed one, and return whether a goal must fail because of the long wait.
+        """Schedule the next start after a failed one. Return whether goals have waited too long.
 
         Args:
             now: the current time.
@@ -203,9 +206,9 @@ class SupervisedGoal:
     retried: bool = False
     #: time at which a `Stop` was sent
     stop_sent_at: float | None = None
-    #: number of the active hold; None if the goal is not held
+    #: number of the current pause; None if the goal is not paused
     hold_number: int | None = None
-    #: time at which a `Hold` was sent; None once it is confirmed
+    #: time at which a `Hold` was sent; None after it was confirmed
     hold_sent_at: float | None = None
     #: the event to post once `lost_process` has exited
     end: protocol.Ended | None = None
@@ -214,7 +217,7 @@ class SupervisedGoal:
 
 
 class Supervisor:
-    """The owner of the engine thread and the engine process."""
+    """Runs the engine thread, which starts engine processes and sends goals to them."""
 
     def __init__(self, configure: protocol.Configure, post: Callable[[Report], None]) -> None:
         """Create the thread without starting it.
@@ -223,8 +226,8 @@ class Supervisor:
             configure: settings for each engine process.
             post: called in the engine thread with each report, including one `Ended` for each goal.
         """
-        # Thread is not the base class, because its private names differ between versions of Python.
-        #: the engine thread. The owner starts it, and joins it after `close`. It starts the engine process.
+        # This class doesn't inherit from Thread, because Thread's private names differ between Python versions.
+        #: the engine thread, which starts the engine process. The owner starts this thread, and joins it after `close`.
         self.thread = threading.Thread(target=self._run, name="engine", daemon=True)
         self._configure = configure
         self._post = post
@@ -263,11 +266,11 @@ class Supervisor:
         self._actions.call(lambda: self._stop_goal(goal_id))
 
     def pause(self, goal_id: str, number: int) -> None:
-        """Hold the goal. `Held` is posted once the goal is silent, unless the goal is being stopped."""
+        """Pause the goal. `Held` is posted once the goal is silent, unless the goal is being stopped."""
         self._actions.call(lambda: self._hold_goal(goal_id, number))
 
     def resume(self, goal_id: str) -> None:
-        """Continue a held goal."""
+        """Resume a paused goal."""
         self._actions.call(lambda: self._hold_goal(goal_id, None))
 
     def announce_next(self, goal_id: str, next_waits: bool, next_is_neural: bool) -> None:
@@ -281,11 +284,11 @@ class Supervisor:
             process.send(protocol.NextGoal(goal_id, next_waits, next_is_neural))
 
     def load(self, voice: str) -> None:
-        """Have the process load a neural voice. `VoiceLoaded` is posted when loading has finished."""
+        """Load a neural voice. `VoiceLoaded` is posted when loading has finished or failed."""
         self._actions.call(lambda: self._send_voice_command(protocol.LoadVoice(voice)))
 
     def drop(self, voice: str) -> None:
-        """Have the process unload a neural voice."""
+        """Unload a neural voice."""
         self._actions.call(lambda: self._send_voice_command(protocol.DropVoice(voice)))
 
     def give_up(self, goal_id: str) -> None:
@@ -294,18 +297,18 @@ class Supervisor:
         self._actions.call(lambda: self._give_up_goal(goal_id))
 
     def close(self) -> None:
-        """Have the thread kill the process and exit."""
+        """Kill the process and end the thread."""
         self._closing = True
         self._actions.call(lambda: None)
 
     # -- the loop
 
     def _run(self) -> None:
-        """Run until `close` is called. Report an unexpected exception, because otherwise goals would wait forever."""
+        """Run the engine thread until `close` is called. Report bugs, because otherwise goals would wait forever."""
         try:
             while not self._closing:
-                # The time is taken before reading. After the machine was suspended, a deadline may have passed although
-                # a message has arrived. In this way, the message is read before the deadline is checked.
+                # The time is taken before waiting. If the machine is suspended during the wait, messages that have
+                # arrived are then read before any deadline counts as missed.
                 now = time.monotonic()
                 for key in self._actions.wait(self._next_deadline()):
                     self._handle_ready(key)
@@ -324,7 +327,7 @@ class Supervisor:
         return min([*deadlines, NEVER if self._process else self._restarts.next_start_at])
 
     def _deadlines(self) -> Iterator[tuple[float, str]]:
-        """Yield each deadline of the process, with the error message for missing it."""
+        """Yield the current deadlines, each with the error message to report if it is missed."""
         goal, no_sign = self._goal, f"the engine gave no sign of life for {HANG_LIMIT_S:g} s"
         if self._process and not self._process.ready:
             yield self._started_at + START_LIMIT_S, f"the engine was not ready after {START_LIMIT_S:g} s"
@@ -347,15 +350,15 @@ class Supervisor:
         for process in self._dying:
             if now < process.exit_deadline:
                 continue
-            process.exit_deadline = NEVER  # checked only once; the process is still reaped when it exits
-            process.kill()  # the first kill may have missed processes for lack of a free descriptor
+            process.exit_deadline = NEVER  # do this only once; the process is still reaped when it exits
+            process.kill()  # the first kill may have missed processes because no descriptor was free
             if self._goal and self._goal.lost_process is process:
                 message = f"the player could not be ended within {KILL_LIMIT_S:g} s"
                 self._fail_goal(self._goal, Reason.NOT_SILENT, message)
 
     def _handle_ready(self, key: selectors.SelectorKey) -> None:
         if key.fd not in self._selector.get_map():
-            return  # the descriptor was closed while an earlier one was handled
+            return  # the descriptor was closed while another one was handled
         process: EngineProcess = key.data
         if key.fd == process.liveness:
             if process is self._process:
@@ -377,7 +380,7 @@ class Supervisor:
         return self._goal if self._goal and self._goal.command.id == goal_id else None
 
     def _begin_goal(self, command: protocol.GoalCommand, sent_to: EngineProcess | None, at: float) -> None:
-        """Make this the current goal, and send it to the process unless `speak` has sent it.
+        """Make this the current goal, and send it to the process unless `speak` has already sent it.
 
         Args:
             command: the goal.
@@ -402,7 +405,7 @@ class Supervisor:
                 self._requeue_goal(goal.command.id, process)
 
     def _requeue_goal(self, goal_id: str, process: EngineProcess) -> None:
-        """Keep a goal that could not be sent, so that the next process gets it."""
+        """Keep a goal that could not be sent, and replace the process."""
         if process is self._process:
             goal = self._current(goal_id)
             if goal:
@@ -410,7 +413,7 @@ class Supervisor:
             self._replace_unresponsive(process)
 
     def _send_voice_command(self, command: protocol.LoadVoice | protocol.DropVoice) -> None:
-        """Send a command for a voice if a process is ready. Otherwise, drop it.
+        """Send a voice command to the process. If no process is ready, drop the command.
 
         The server sends such commands again whenever a new process becomes ready.
         """
@@ -422,13 +425,13 @@ class Supervisor:
                 self._replace_unresponsive(process)
 
     def _replace_unresponsive(self, process: EngineProcess) -> None:
-        """Replace a process that accepts no commands."""
+        """Replace a process that no longer accepts commands."""
         self._receive(process)  # if the process is dead, this reports a crash instead
         if process is self._process:
             self._lose_process("the engine takes no commands", Reason.ENGINE_HUNG)
 
     def _hold_goal(self, goal_id: str, number: int | None) -> None:
-        """Hold the goal, or continue it if `number` is None."""
+        """Pause the goal, or resume it if `number` is None."""
         goal = self._current(goal_id)
         if goal is None or goal.stop_sent_at is not None or goal.end or goal.hold_number == number:
             return
@@ -439,7 +442,7 @@ class Supervisor:
             if self._process and not self._process.send(command):
                 self._replace_unresponsive(self._process)
         elif number is not None:
-            self._post(protocol.Held(goal_id, number))  # the goal is silent, because no process has it
+            self._post(protocol.Held(goal_id, number))  # the goal is already silent, because no process is speaking it
         else:
             self._send_goal()
 
@@ -496,7 +499,7 @@ class Supervisor:
     def _receive(self, process: EngineProcess) -> None:
         """Handle the messages that have arrived from the process."""
         for event in process.receive():
-            self._actions.run()  # the goal of this event may still be in the queue of actions
+            self._actions.run()  # the event's goal may still be waiting in the queue of actions
             if process is not self._process:
                 return
             if event is None:
@@ -510,7 +513,7 @@ class Supervisor:
     def _handle_event(self, process: EngineProcess, event: protocol.Event) -> None:
         self._last_sign_at = time.monotonic()
         if isinstance(event, protocol.GoalEvent):
-            if self._goal and self._goal.sent and event.id == self._goal.command.id:  # otherwise, ignore it
+            if self._goal and self._goal.sent and event.id == self._goal.command.id:  # ignore other goals
                 process.had_goal = True
                 self._handle_goal_event(self._goal, event)
             return
@@ -523,7 +526,7 @@ class Supervisor:
         elif isinstance(event, protocol.VoiceLoaded) and event.voice == self._loading:
             self._loading = None
         elif isinstance(event, protocol.VoiceList):
-            self._configure = replace(self._configure, list_voices=False)  # later processes needn't list them
+            self._configure = replace(self._configure, list_voices=False)  # sending the list once is enough
         self._post(event)
         self._send_goal()
 
@@ -584,7 +587,7 @@ class Supervisor:
         goal.sent, goal.stop_sent_at, goal.hold_sent_at = False, None, None
 
     def _handle_failed_start(self, message: str, *, permanent: bool = False) -> None:
-        """Schedule another start, and fail the waiting goal if it should wait no longer."""
+        """Schedule another start. Fail the waiting goal if the error is permanent or the goal has waited too long."""
         ends_goal = self._restarts.start_failed(time.monotonic(), self._started_at, message if permanent else None)
         waiting = self._goal if self._goal and not self._goal.end else None
         if waiting and (ends_goal or permanent):
@@ -593,7 +596,7 @@ class Supervisor:
             self._post(EngineMissing(message))
 
     def _release_process(self, process: EngineProcess) -> None:
-        """Close the descriptors of a process that has exited with its player, and end its goal, which is silent now."""
+        """Clean up after a process that has exited, and end its goal."""
         self._selector.unregister(process.liveness)
         if process.stderr in self._selector.get_map():
             process.read_stderr()

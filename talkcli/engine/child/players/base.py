@@ -21,12 +21,12 @@ Interest = tuple[int, int]
 
 
 class CannotSpeak(Exception):
-    """The sentence or the rest of it can't be spoken.
+    """All or part of the sentence can't be spoken.
 
     Args:
         reason: The machine-readable reason, such as "audio_lost".
         message: The error message.
-        final: Whether to try no other player, because it wouldn't be heard either.
+        final: Whether no other player should be tried, because it wouldn't be heard either.
     """
 
     def __init__(self, reason: Reason, message: str, *, final: bool = False) -> None:
@@ -40,7 +40,7 @@ class Stopped(Exception):
 
 
 class CannotEnd(Exception):
-    """A player couldn't be killed, so the engine process can't guarantee silence any more and has to exit."""
+    """A player couldn't be killed. The engine process must exit, because it can't guarantee silence any more."""
 
 
 class Player(Protocol):
@@ -61,14 +61,14 @@ class Player(Protocol):
     of the program, such as an unplugged device or a full disk. Any other exception is a bug in the player.
     """
 
-    #: the player's name, which is displayed and identifies the player that last worked; it never changes
+    #: the name that is shown to users, and that identifies the player that worked last; it never changes
     name: str
-    #: whether playing takes as long as the sound lasts, so that a player that accepts no samples has stalled. A player
-    #: that writes to a file isn't real-time, and nobody hears it. The value never changes.
+    #: whether playing takes as long as the sound lasts. If so, a player that accepts no samples has stalled. A player
+    #: that writes to a file isn't real-time. The value never changes.
     real_time: bool
-    #: whether sound has certainly reached the output. The sentence may have been heard then, so no other player repeats
-    #: it if this one fails. The value is up to date after each call of `consumed`, and never becomes False again. A
-    #: player that stores everything it is offered may start with True.
+    #: whether sound has certainly reached the output. If the player fails after that, no other player repeats the
+    #: sentence, because it may have been heard. The value is up to date after each call of `consumed`, and never goes
+    #: back to False. A player that stores all samples may start with True.
     proven: bool
 
     @property
@@ -126,13 +126,16 @@ class Player(Protocol):
         """
 
     def wake_at(self) -> float | None:
-        """Return the monotonic time at which to check the player again, or None to rely on poll alone."""
+        """Return the monotonic time at which to check the player again, or None if poll is enough."""
 
     def kill(self) -> None:
-        """Stop playing at once, and start to release all resources; never raises, and may be called again."""
+        """Stop playing at once, and start to release all resources.
+
+        This method never raises an exception, and may be called again.
+        """
 
     def gone(self) -> bool:
         """Return whether the player is certainly silent and has released its descriptors, processes and threads.
 
-        It is called every 20 ms after `kill`. After one second, the engine process exits.
+        It is called every 20 ms after `kill`. If it still returns False after one second, the engine process exits.
         """

@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
     from talkcli.engine.child.players.base import Interest
 
-#: Seconds of sound that the null player accepts ahead of its clock: as much as a real player buffers, and 1 ms for
+#: Seconds of sound that the null player accepts in advance. This is as much as a real player buffers, plus 1 ms for
 #: rounding.
 NULL_AHEAD_S = 0.061
 
 _WAV_HEADER = struct.Struct("<4sI4s4sIHHIIHH4sI")
-#: The number of header bytes that the length after "RIFF" counts.
+#: The number of header bytes that are included in the length after "RIFF".
 _RIFF_HEADER_BYTES = _WAV_HEADER.size - 8
-#: The length in the header of a stream. Both lengths in a header have 32 bits.
+#: The value of both length fields in the header of a stream. Each field has 32 bits.
 _UNKNOWN_BYTES = 0xFFFFFFFF
 _MAX_WAV_BYTES = _UNKNOWN_BYTES - _WAV_HEADER.size
 
@@ -93,7 +93,7 @@ class NullPlayer(BuiltInPlayer):
         return self._closed and self._clock() >= self._end_time
 
     def wake_at(self) -> float | None:
-        # A third of the buffer is free then, so this player wakes up no more often than a real one.
+        # At this time, a third of the buffer is free, so this player wakes up no more often than a real one.
         return self._end_time if self._closed else self._end_time - NULL_AHEAD_S * 2 / 3
 
 
@@ -144,10 +144,10 @@ class WavPlayer(BuiltInPlayer):
             try:
                 self._write_header()
             finally:
-                os.close(self._file)  # some network file systems and quotas report a full disk only here
+                os.close(self._file)  # some network file systems report a full disk or an exceeded quota only here
 
     def kill(self) -> None:
-        with contextlib.suppress(CannotSpeak):  # the sentence has already ended with a stop or another error
+        with contextlib.suppress(CannotSpeak):  # the sentence was stopped, or has already failed with another error
             self.close()
 
     def _write_header(self) -> None:
@@ -167,7 +167,7 @@ class WavStreamPlayer(BuiltInPlayer):
     name = OUTPUT_STREAM_NAME
 
     def __init__(self, output: int, rate: int, *, first: bool) -> None:
-        """Open the player on a descriptor, and write the header before the `first` sentence."""
+        """Open the player for a descriptor. If this is the `first` sentence, write a header before it."""
         super().__init__()
         self._output = output
         self._header = _WAV_HEADER.pack(*_header_fields(rate, _UNKNOWN_BYTES, _UNKNOWN_BYTES)) if first else b""
@@ -197,7 +197,7 @@ class WavStreamPlayer(BuiltInPlayer):
 
 @contextlib.contextmanager
 def _os_errors(reason: Reason, subject: str) -> Iterator[None]:
-    """Raise CannotSpeak instead of an OSError."""
+    """Convert an OSError to CannotSpeak."""
     try:
         yield
     except OSError as error:
@@ -215,7 +215,7 @@ def _open_regular(path: str) -> int:
 
 
 def _header_fields(rate: int, riff_bytes: int, sample_bytes: int) -> tuple[bytes | int, ...]:
-    """Return the fields of a WAV header with the lengths of the RIFF chunk and of the samples."""
+    """Return the fields of a WAV header, given the lengths of the RIFF chunk and the samples."""
     audio_format = (1, 1, rate, rate * SAMPLE_BYTES, SAMPLE_BYTES, 8 * SAMPLE_BYTES)  # PCM, one channel
     return b"RIFF", riff_bytes, b"WAVE", b"fmt ", 16, *audio_format, b"data", sample_bytes
 

@@ -1,6 +1,6 @@
-"""The choice of a player for each sentence, according to `--player` and `--device`.
+"""Chooses a player for each sentence, according to `--player` and `--device`.
 
-Every sentence opens a player of its own. If a player fails, the playback decides whether to try the next one.
+Every sentence gets its own player. If a player fails, the playback decides whether to try the next one.
 """
 
 from __future__ import annotations
@@ -25,29 +25,29 @@ if TYPE_CHECKING:
     from talkcli.engine.protocol import Configure, Speak
     from talkcli.goals.goal import Output
 
-#: The players of the automatic choice that run in this process. They are tried before any program.
+#: The players that may be chosen automatically and run in this process. They are tried before any program.
 _AUTOMATIC_CLASSES = [name for name, each in PLAYERS.items() if each.automatic and each.class_path]
 
-#: Seconds without sound after which a device counts as idle. The next sentence then starts with the lead-in. Sound
-#: cards with power saving (snd_hda_intel) sleep after 1 s, and sound servers suspend a device after 5 s. Silence that
-#: is played counts as no sound, because some loudspeakers switch off when they receive only silence.
+#: A device counts as idle after this many seconds without sound. The next sentence then starts with the lead-in. Sound
+#: cards with power saving (snd_hda_intel) sleep after 1 s, and sound servers suspend a device after 5 s. Playing
+#: silence doesn't count as sound, because some loudspeakers switch off when they receive only silence.
 IDLE_AFTER_S = 1.0
 
-#: The number of handovers to remember for each player. Their median predicts the next handover, because it ignores a
-#: late one on a busy machine.
+#: The number of handovers to remember for each player. Their median predicts the next handover. The median ignores a
+#: single slow one on a busy machine.
 MAX_HANDOVERS = 5
 
-#: Maximum seconds of silence to cut. This is half of the pause after a sentence. The other half stays to separate
-#: sentences.
+#: Maximum seconds of silence to cut. This is half of the pause after a sentence. The other half is kept, so that the
+#: sentences stay separate.
 MAX_CUT_S = 0.12
 
-#: Maximum seconds of a handover. A longer one isn't counted, because the waiting goal was canceled or held, and another
-#: goal came later.
+#: Maximum seconds of a handover. If it takes longer, it isn't counted, because the waiting goal was canceled or paused
+#: and another goal followed later.
 MAX_HANDOVER_S = 0.5
 
 
 class HandoverTimes:
-    """Measures the pauses between sentences, and determines how much silence to cut in return.
+    """Measures the delays between sentences, and decides how much silence to cut to make up for them.
 
     A handover is the time between the last sample of one sentence and the first sample of the next. During a handover,
     the player drains and exits, the server gets the result, and the next sentence starts. This would lengthen the pause
@@ -60,29 +60,28 @@ class HandoverTimes:
     """
 
     def __init__(self) -> None:
-        #: whether another goal is waiting, and whether that goal needs a neural voice
+        #: whether another goal is waiting, and whether it needs a neural voice
         self.next_waits = self.next_is_neural = False
         self._measured: dict[tuple[str, bool], deque[float]] = {}
-        #: the player of the previous sentence and the time of its last sample, or None if no goal was waiting at its
-        #: end
+        #: the player of the previous sentence and the time of its last sample, or None if no other goal was waiting
         self._previous: tuple[str, float] | None = None
 
     @property
     def follows(self) -> bool:
-        """Whether the starting sentence directly follows another one."""
+        """Whether the new sentence directly follows another one."""
         return self._previous is not None
 
     def silence_to_cut(self, player: str) -> float:
-        """Return the seconds of silence to cut from the end of a sentence that this player plays."""
+        """Return how many seconds of silence to cut from the end of a sentence with this player."""
         measured = sorted(self._measured.get((player, self.next_is_neural), ()))
         return min(MAX_CUT_S, measured[len(measured) // 2]) if measured else 0.0
 
     def sentence_ended(self, player: str, last_sample_at: float) -> None:
-        """Record the time of the last sample after a sentence was played completely."""
+        """Record when the last sample of a completed sentence is heard."""
         self._previous = (player, last_sample_at) if self.next_waits else None
 
     def sentence_started(self, player: str, at: float, *, neural: bool = False) -> None:
-        """Record the time at which the player of a new sentence accepted the first sample."""
+        """Record when the first sample of a new sentence was played."""
         previous, self._previous = self._previous, None
         if previous is not None and previous[0] == player and 0 < at - previous[1] < MAX_HANDOVER_S:
             self._measured.setdefault((player, neural), deque(maxlen=MAX_HANDOVERS)).append(at - previous[1])
@@ -99,9 +98,9 @@ class PlayerChooser:
     def __init__(self, configure: Configure, inherited: Sequence[int] = ()) -> None:
         self._configure = configure
         self._inherited = inherited
-        #: whether playing takes as long as the sound lasts, which is only False for files
+        #: whether playing takes as long as the sound lasts; False only for files
         self.takes_time = configure.output_fd is None and not (configure.player or "").startswith(FILE_PREFIX)
-        #: the names of the players in this process that are tried first
+        #: the names of the players that run in this process and are tried first
         self._in_process: Sequence[str] = ()
         if configure.player is configure.device is None:
             self._in_process = _AUTOMATIC_CLASSES
@@ -117,7 +116,7 @@ class PlayerChooser:
         self._audible = configure.audible
         #: the player that last played a sentence completely
         self.last_player = configure.last_player
-        #: the player of the current sentence, if the choice is automatic
+        #: the player of the current sentence, if it was chosen automatically
         self.chosen: str | None = None
         self._last_used_at: float | None = None
 
@@ -148,7 +147,7 @@ class PlayerChooser:
         self.handovers.next_waits, self.handovers.next_is_neural = command.next_waits, command.next_is_neural
 
     def update_output(self, player: Player) -> None:
-        """Record the output of the current sentence; once the output was muted, the sentence counts as muted."""
+        """Record the output of the current sentence. If it is ever muted, the whole sentence counts as muted."""
         if player.proven and self._configure.player is None:
             self.chosen = player.name
         output, before = player.output, self.output
@@ -157,18 +156,18 @@ class PlayerChooser:
         elif output is not None:
             self.output = replace(output, muted=output.muted or before.muted)
         elif player.proven and before.player != player.name and not before.muted:
-            self.output = None  # this player doesn't know its output
+            self.output = None  # the new player doesn't know its output
 
     def device_released(self, silent_since: float | None = None) -> None:
-        """Record that the device was released now, or that it has played only silence since `silent_since`."""
+        """Record that the device was released, and has been silent since `silent_since` or since now."""
         self._last_used_at = time.monotonic() if silent_since is None else silent_since
 
     def lead_in_seconds(self, begins: bool = True) -> float:
-        """Return the seconds of silence that a newly opened player has to play first.
+        """Return how many seconds of silence a newly opened player has to play first.
 
         Args:
-            begins: Whether the player plays the beginning of the sentence. Otherwise it continues the sentence after a
-                long pause, and a lead-in of the sentence's own is only needed if the device is idle.
+            begins: Whether the player plays the beginning of the sentence. Otherwise, it continues the sentence after a
+                long pause, and a lead-in is needed only if the device is idle.
         """
         idle = self._last_used_at is None or time.monotonic() - self._last_used_at >= IDLE_AFTER_S
         own = self._own_lead_in
@@ -198,7 +197,7 @@ class PlayerChooser:
 
 
 def _open(name: str, rate: int, device: str | None = None, audible: bool = False) -> Player:
-    """Open a player in this process by its name in PLAYERS."""
+    """Open a player that runs in this process, given its name in PLAYERS."""
     module, _, member = PLAYERS[name].class_path.partition(":")
     player_class = getattr(import_module(f"talkcli.engine.child.players.{module}"), member)
     player: Player = player_class(rate, device, audible)

@@ -1,4 +1,4 @@
-"""Bindings of libpulse's functions and structures that a player needs, and a main loop that never blocks.
+"""Bindings for the parts of libpulse that a player needs, and a main loop that never blocks.
 
 An iteration of libpulse's main loop consists of prepare, poll and dispatch. A program can replace the poll function.
 Ours stores the descriptors and the timeout that libpulse wants to wait for, and polls without waiting. The loop is
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _LIBPULSE = "libpulse.so.0"
 
-#: The value for an invalid index, and for a size that the server chooses: (uint32_t) -1.
+#: An invalid index, or a size that the server should choose. This is -1 as a uint32_t.
 NO_INDEX = 0xFFFFFFFF
 #: The value for a volume of 100 %.
 NORMAL_VOLUME = 0x10000
@@ -40,7 +40,7 @@ FLAT_VOLUME = 0x40
 MASK_SINK, MASK_SINK_INPUT = 0x1, 0x4
 FACILITY_MASK, EVENT_SINK, EVENT_SINK_INPUT = 0xF, 0, 2
 NO_ENTITY, CONNECTION_REFUSED, INVALID_SERVER = 5, 6, 13
-#: The value of a size that reports an error: (size_t) -1.
+#: The value that a function returns instead of a size if it fails. This is -1 as a size_t.
 SIZE_ERROR = c_size_t(-1).value
 
 
@@ -75,7 +75,7 @@ class BufferSizes(Structure):
 
 
 class SinkInfo(Structure):
-    """The first fields of the C structure `pa_sink_info`; later versions of libpulse only append fields."""
+    """The first fields of the C structure `pa_sink_info`. Later versions of libpulse only append fields."""
 
     _fields_ = [
         ("name", c_char_p),
@@ -114,17 +114,17 @@ class SinkInputInfo(Structure):
     ]
 
 
-# Types of callbacks. A callback must not raise an exception: ctypes would print it and return garbage.
+# Types of callbacks. A callback must not raise an exception, because ctypes would print it and return garbage.
 PollCallback = CFUNCTYPE(c_int, POINTER(PollDescriptor), ctypes.c_ulong, c_int, c_void_p)
 StreamCallback = CFUNCTYPE(None, c_void_p, c_void_p)
-#: (stream or context, success, data)
+#: The parameters are a stream or context, success and data.
 SuccessCallback = CFUNCTYPE(None, c_void_p, c_int, c_void_p)
-#: (context, facility and type of the change, index of the changed object, data)
+#: The parameters are a context, the facility and type of the change, the index of the changed object, and data.
 ChangeCallback = CFUNCTYPE(None, c_void_p, c_int, c_uint32, c_void_p)
 SinkCallback = CFUNCTYPE(None, c_void_p, POINTER(SinkInfo), c_int, c_void_p)
 SinkInputCallback = CFUNCTYPE(None, c_void_p, POINTER(SinkInputInfo), c_int, c_void_p)
 
-#: The functions that the player uses without the prefix "pa_", with the types of their results and arguments.
+#: The libpulse functions that the player uses, without the prefix "pa_", and the types of their results and arguments.
 _SIGNATURES: tuple[tuple[str, Any, list[Any]], ...] = (
     ("mainloop_new", c_void_p, []),
     ("mainloop_free context_disconnect context_unref operation_unref stream_unref", None, [c_void_p]),
@@ -174,7 +174,7 @@ def load() -> Any:
 
 
 class MainLoop:
-    """A main loop of libpulse that never waits."""
+    """A libpulse main loop that never blocks."""
 
     def __init__(self, library: Any) -> None:
         self._library = library
@@ -195,7 +195,7 @@ class MainLoop:
         """Run one iteration without waiting, and return whether it did any work."""
         if self.freed or self._library.mainloop_prepare(self._pointer, -1) < 0:
             return False
-        self._library.mainloop_poll(self._pointer)  # without it, dispatch would abort the process
+        self._library.mainloop_poll(self._pointer)  # without this call, dispatch would abort the process
         return bool(self._library.mainloop_dispatch(self._pointer) > 0)
 
     def free(self) -> None:

@@ -42,24 +42,26 @@ if TYPE_CHECKING:
     from talkcli.engine.child.players.base import Interest
     from talkcli.engine.players import PlayerCommand
 
-#: The capacity of the program's input pipe in bytes, if the system allows a choice. If the pipe has only one page, poll
-#: reports room only after the program has read everything.
+#: The capacity of the program's input pipe in bytes, if the system lets a process set it. If the pipe has only one
+#: page, poll reports room only after the program has read everything.
 PIPE_BYTES = 4096
 
-#: Seconds for which a program may report an error and exit after it has closed its input. After that, it is killed.
+#: Seconds that a program has to report an error and exit after it closes its input. After that, it is killed.
 ERROR_GRACE_S = 0.5
 
-#: Seconds for which `kill` waits until the program has exited, which takes 1 ms. If the program hangs in the kernel,
-#: `gone` continues to check.
+#: Maximum seconds for which `kill` waits for the program to exit, which usually takes 1 ms. If the program hangs in the
+#: kernel, `gone` keeps checking.
 REAP_WAIT_S = 0.02
 
-#: Seconds between checks of a program if the system has no descriptor that reports its exit (macOS, Linux before 5.3).
+#: Seconds between checks for a program's exit, on systems without a descriptor that reports it (macOS, Linux before
+#: 5.3).
 EXIT_CHECK_S = 0.01
 
-#: The maximum length of a stored line from standard error. Errors are shorter, and the message has to stay readable.
+#: The maximum length of a stored line from standard error. Errors are usually shorter, and longer messages would be
+#: hard to read.
 MAX_ERROR_LINE_BYTES = 300
 
-#: Bytes to read from standard error at a time. Many messages then don't delay the samples.
+#: Maximum bytes to read from standard error at a time, so that many messages don't delay the samples.
 STDERR_READ_BYTES = 65536
 
 #: Lines that aren't errors or don't help users, such as messages of libraries, underruns and hints.
@@ -73,12 +75,12 @@ _ERROR = (
 #: The source location in "aplay: main:831: text", which doesn't help users.
 _SOURCE_LOCATION = r"^(?P<program>[^\s:]+): \w+:\d+: "
 
-#: Signals that Python ignores. A program has to start with their default actions.
+#: Signals that Python ignores. Programs are started with the default actions for these signals.
 _RESET_SIGNALS = [getattr(signal, name) for name in ("SIGPIPE", "SIGXFSZ") if hasattr(signal, name)]
 
 
 class PlayerProcess:
-    """A running program, in a process group of its own."""
+    """A running player program in its own process group."""
 
     def __init__(self, argv: tuple[str, ...], inherited: Sequence[int] = ()) -> None:
         """Start the program.
@@ -106,7 +108,7 @@ class PlayerProcess:
         #: our non-blocking ends of the program's standard input and standard error, or None once they are closed
         self.stdin: int | None = our_stdin
         self.stderr: int | None = our_stderr
-        #: readable after the program has exited; None if the system has no such descriptor (macOS, Linux before 5.3)
+        #: a descriptor that becomes readable when the program exits; None on macOS and on Linux before 5.3
         self.exit = _exit_descriptor(self.pid)
         self._leash: int | None = leash
         self._status: int | None = None
@@ -127,18 +129,22 @@ class PlayerProcess:
                 self._status = os.waitstatus_to_exitcode(status)
         if self._status is None or self._leash is None:
             return self._status
-        # Processes of other users can't be killed. They don't count, because the server reports them.
+        # Processes of other users can't be killed, so they are ignored here. The server reports them.
         return None if kill_holders(self._leash) and is_held(self._leash) else self._status
 
     def kill(self) -> None:
         """Kill the program and its process group."""
-        if self._status is None:  # after the program is reaped, its process id may be used again
+        if self._status is None:  # after the program is reaped, its process ID may be reused
             kill([-self.pid])
 
     def await_end(self, seconds: float) -> None:
-        """Block until the program exits or the time is over; return at once if the system can't report the exit."""
+        """Block until the program exits or the time is over.
+
+        If the system can't report the exit, return at once.
+        """
         if self.exit is not None and self._status is None:
-            # `wait_ready` can't be used, because this may run while the interpreter exits and nothing can be imported.
+            # Don't use `wait_ready` here. This may run while the interpreter exits, when modules can't be imported any
+            # more.
             wait = select.poll()
             wait.register(self.exit, select.POLLIN)
             wait.poll(seconds * 1000)
@@ -156,7 +162,7 @@ class PlayerProcess:
             self.stderr = None
 
     def release(self) -> None:
-        """Close all descriptors after the program was reaped; may be called again."""
+        """Close all descriptors of a program that has been reaped. May be called again."""
         self.close_stdin()
         self.close_stderr()
         close(*(each for each in (self.exit, self._leash) if each is not None))
@@ -164,7 +170,10 @@ class PlayerProcess:
 
 
 def _spawn(argv: tuple[str, ...], stdin: int, stderr: int, inherited: Sequence[int]) -> int:
-    """Start the program and return its process id; `inherited` descriptors are inheritable only during the call."""
+    """Start the program and return its process ID.
+
+    The `inherited` descriptors are inheritable only during the call.
+    """
     actions = [
         (os.POSIX_SPAWN_DUP2, stdin, 0),
         (os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0),
@@ -183,14 +192,14 @@ def _attach_leash(leash: int, group: int) -> None:
     """Make the kernel kill a process group when the other end of its leash is closed."""
     if not hasattr(fcntl, "F_SETSIG"):
         return
-    with contextlib.suppress(OSError):  # if a sandbox forbids this, the program exits when its input is closed
+    with contextlib.suppress(OSError):  # if a sandbox forbids this, the program still exits when its input is closed
         fcntl.fcntl(leash, fcntl.F_SETOWN, -group)
         fcntl.fcntl(leash, fcntl.F_SETSIG, signal.SIGKILL)
         fcntl.fcntl(leash, fcntl.F_SETFL, fcntl.fcntl(leash, fcntl.F_GETFL) | os.O_ASYNC)
 
 
 def _exit_descriptor(pid: int) -> int | None:
-    """Return a descriptor that becomes readable when the process exits, or None if the system has none."""
+    """Return a descriptor that becomes readable when the process exits, or None if the system doesn't support this."""
     try:
         return os.pidfd_open(pid)
     except (AttributeError, OSError):  # the system or the kernel is too old, or a sandbox forbids it
@@ -232,7 +241,7 @@ class ErrorOutput:
 
 
 class ProgramPlayer(Player):
-    """Plays a sentence through an external program, by writing the samples to its standard input."""
+    """Plays a sentence by writing its samples to the standard input of an external program."""
 
     real_time = True
 
@@ -268,7 +277,7 @@ class ProgramPlayer(Player):
             return 0
         # Only one piece is kept in the pipe, because sound in the pipe is still played after a pause begins.
         waiting = _unread_bytes(self._process.stdin)
-        # If nobody holds the read end, the program has closed its input. The write reports that.
+        # If no process has the read end open, the program has closed its input, and the write fails.
         if waiting == 0 or not is_held(self._process.stdin):
             return self._write(data)
         # If the program has read nothing yet, it gets as much as it needs to start.
@@ -339,7 +348,7 @@ class ProgramPlayer(Player):
         return written
 
     def _failure(self, status: int) -> CannotSpeak:
-        """Return the error for a program that exited too early or with an error."""
+        """Return the error for a program that exited too early or with an error status."""
         self.consumed()
         line = self._errors.line()
         if status < 0:

@@ -22,23 +22,23 @@ if TYPE_CHECKING:
 
     from talkcli.engine.child.players.base import Interest
 
-#: Milliseconds of room in the buffer at which the server wakes the player.
+#: The server wakes the player when the buffer has room for this many milliseconds of sound.
 REQUEST_MS = 15
 
-#: Seconds for which a stream volume of 0 is ignored. PipeWire creates every stream with this volume, and sets the real
-#: one a millisecond later.
+#: Seconds for which a volume of 0 is ignored after a stream is created. PipeWire creates every stream with this volume,
+#: and sets the real volume a millisecond later.
 VOLUME_SETTLES_S = 0.1
 
-#: Seconds within which the server has to create the stream, which usually takes 1 to 20 ms. If the server hangs, the
-#: sentence can move to another player, because this one has no samples yet.
+#: Seconds that the server has to create the stream. It usually takes 1 to 20 ms. If the server hangs, another player
+#: can play the sentence, because this player hasn't accepted any samples yet.
 READY_LIMIT_S = 2.0
 
-#: Seconds for which the sink may stay suspended while a stream plays. A sink that was asleep wakes up before the stream
-#: starts.
+#: Seconds for which the sink may be suspended while a stream plays. A sleeping sink wakes up before the stream starts.
 SUSPENDED_LIMIT_S = 0.5
 
-#: Seconds between an answer and the next request for the time, until sound is heard. The requests are frequent because
-#: the first word begins at that moment. It takes 1 to 10 ms with local devices and 200 ms over Bluetooth.
+#: Until the first sound is heard, the player asks the server for the playback time this many seconds after each answer.
+#: It asks so often because the first word must be reported as soon as it is heard. The first sound takes 1 to 10 ms on
+#: local devices and 200 ms over Bluetooth.
 TIME_REQUEST_S = 0.002
 
 
@@ -46,10 +46,10 @@ TIME_REQUEST_S = 0.002
 class Level:
     """The volume and mute state of a sink or a stream."""
 
-    volume: float  # of the loudest channel; 1.0 is 100 %, and higher values are possible
+    volume: float  # volume of the loudest channel; 1.0 is 100 %, and higher values are possible
     muted: bool
-    #: whether the volumes of streams are absolute, so that the sink's volume is just the loudest of them; only for
-    #: sinks
+    #: whether the volumes of the sink's streams are absolute, so that the sink's own volume doesn't reduce them any
+    #: further
     flat: bool = False
 
 
@@ -82,7 +82,7 @@ class PulsePlayer(Player):
         self._clock_report: tuple[float, float] | None = None
         #: the number of bytes written when the server last ran out of samples, or None while it plays
         self._dry_at: int | None = None
-        #: when to request the time until the server has reported one; None while a request is pending
+        #: when to send the next request for the playback time; None while a request is pending
         self._time_request_at: float | None = 0.0
         self._closed = self._draining = self._drained = False
         self._error: CannotSpeak | None = None
@@ -96,7 +96,7 @@ class PulsePlayer(Player):
         self._pending_levels = 0
         self._sink_level: Level | None = None
         self._stream_level: Level | None = None
-        #: whether the output was ever muted during the sentence, and whether the server refused to report a level
+        #: whether the output was ever muted during the sentence, and whether the server refused to report a volume
         self._muted = self._level_refused = False
         try:
             self._lib = libpulse.load()
@@ -114,7 +114,7 @@ class PulsePlayer(Player):
         if self._context is None:
             self._loop.free()
             raise CannotSpeak(Reason.NO_PLAYER, "libpulse makes no connection: is there enough memory?")
-        # a failure appears in the state of the context
+        # if this fails, the state of the context shows it
         self._lib.context_connect(self._context, None, libpulse.NO_AUTOSPAWN, None)
         self._run()
         if self._error is not None:
@@ -161,9 +161,10 @@ class PulsePlayer(Player):
         return self._loop.interests
 
     def wake_at(self) -> float | None:
-        """Return the time at which libpulse has work to do or the next time limit ends.
+        """Return the time at which libpulse has work to do or a time limit ends.
 
-        This is now if there is room. It is also now after each report of the server's time, because words may be due.
+        The result is 0, which means now, if the server has room for samples. It is also 0 after each report of the
+        playback time, because words may be due.
         """
         report = self._clock_report
         self._run()
@@ -221,7 +222,7 @@ class PulsePlayer(Player):
             pass
 
     def _advance(self) -> bool:
-        """Check the state and take the next step, and return whether libpulse may have work because of it."""
+        """Check the stream's state and take the next step. Return whether libpulse may have more work now."""
         if self._error is not None or self._drained:
             return False
         state = self._lib.context_get_state(self._context)
@@ -266,7 +267,7 @@ class PulsePlayer(Player):
         return True
 
     def _check_sink(self) -> bool:
-        """Check which sink the stream plays to and whether it is suspended; return whether requests were sent."""
+        """Check the stream's sink, and whether it is suspended. Return whether any requests were sent."""
         index = int(self._lib.stream_get_device_index(self._stream))
         changed = index != self._sink_index
         if changed:
@@ -295,7 +296,7 @@ class PulsePlayer(Player):
         return changed
 
     def _request_time(self) -> bool:
-        """Request the time if that is due, and return whether a request was sent."""
+        """Request the playback time if a request is due. Return whether it was sent."""
         due = self._time_request_at
         if not self.proven or self._clock_report or due is None or time.monotonic() < due:
             return False
@@ -313,7 +314,7 @@ class PulsePlayer(Player):
         self._release(self._lib.context_get_sink_input_info(self._context, index, self._stream_callback, None))
 
     def _release(self, operation: int | None) -> None:
-        """Release the handle of an operation, which keeps running; None means that the context has failed."""
+        """Release the handle of an operation, if there is one. The operation keeps running."""
         if operation is not None:
             self._lib.operation_unref(operation)
 
@@ -322,7 +323,7 @@ class PulsePlayer(Player):
         if self._sink_index == libpulse.NO_INDEX or self._closed or self._error is not None:
             return 0
         if self._audible and not (self._level_refused or self.output):
-            return 0  # the server reports the levels within 1 ms
+            return 0  # wait for the volumes, which the server reports within 1 ms
         room = self._lib.stream_writable_size(self._stream)
         return 0 if room == libpulse.SIZE_ERROR else room // SAMPLE_BYTES * SAMPLE_BYTES
 
@@ -334,7 +335,7 @@ class PulsePlayer(Player):
         return self._pending_levels > 0 or time.monotonic() < self._volume_settled_at
 
     def _check_mute(self) -> None:
-        """Check the levels, and mark the whole sentence as muted if the output is muted now."""
+        """Mark the whole sentence as muted if the output is muted now."""
         levels = [each for each in (self._sink_level, self._stream_level) if each is not None]
         if self._drained or self._is_volume_pending() or not any(each.muted or each.volume == 0 for each in levels):
             return
@@ -343,11 +344,11 @@ class PulsePlayer(Player):
             self._error = CannotSpeak(Reason.MUTED, f"the output is muted: {self.device}", final=True)
 
     def _restart_clock(self) -> None:
-        """Request the time again after the stream has started, run out of samples or been suspended."""
+        """Forget the reported playback time, and request it again."""
         self._clock_report, self._time_request_at = None, 0.0
 
     def _fail(self, reason: Reason) -> None:
-        """Record the failure of the stream, with a message for libpulse's error number."""
+        """Record that the stream has failed, with a message for libpulse's error number."""
         if self._error is not None:
             return
         number = self._lib.context_errno(self._context)
@@ -357,7 +358,7 @@ class PulsePlayer(Player):
             reason, message = Reason.NO_PLAYER, f"no sound server answers: {words}"
         elif self._stream is None:
             message = f"the sound server lets nobody in: {words}"
-        # the error number may belong to a request for a sink that was removed
+        # Here, the error number may belong to a request for a sink that was removed.
         elif self._sink_index != libpulse.NO_INDEX:
             message = "the sound server ended the stream"
         elif number == libpulse.NO_ENTITY and self._wanted_device is not None:
@@ -378,7 +379,7 @@ class PulsePlayer(Player):
     def _on_time(self, *_: Any) -> None:
         heard, now = c_uint64(), time.monotonic()
         self._time_request_at = now + TIME_REQUEST_S
-        # Before the stream has started, the time only contains the delay of the answer.
+        # Before the stream has started, the reported time is only the delay of the answer.
         if self.proven and self._lib.stream_get_time(self._stream, byref(heard)) == 0 and heard.value:
             self._clock_report = heard.value / 1_000_000, now
 
@@ -392,7 +393,7 @@ class PulsePlayer(Player):
         self._drained = self.proven = self._error is None
 
     def _on_change(self, _context: int, event: int, index: int, _data: object) -> None:
-        """Request a level that may have changed."""
+        """Request a volume that may have changed."""
         facility = event & libpulse.FACILITY_MASK
         if facility == libpulse.EVENT_SINK and index == self._sink_index:
             self._request_sink_level()
@@ -400,7 +401,7 @@ class PulsePlayer(Player):
             self._request_stream_level()
 
     def _on_sink(self, _context: int, found: Any, end: int, _data: object) -> None:
-        if end == 0 and found[0].index == self._sink_index:  # otherwise the stream was moved to another sink
+        if end == 0 and found[0].index == self._sink_index:  # otherwise, the stream was moved to another sink
             flat = bool(found[0].flags & libpulse.FLAT_VOLUME)
             self._sink_level = Level(libpulse.loudest(found[0].volume), bool(found[0].mute), flat)
             self._check_mute()
