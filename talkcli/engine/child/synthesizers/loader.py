@@ -1,8 +1,8 @@
-"""The loading of neural voices in the background, one at a time.
+"""Classes that load neural voices in the background.
 
-The server decides which voices are loaded and dropped. Loading takes seconds and runs in a thread. All other calls come
-from a single other thread. The result of each load is reported to the server once, as an event. Voices are identified
-by their ids without a speaker.
+The server decides which voices to load and unload. Loading a voice takes seconds and runs in its own thread. All calls
+must come from one other thread. The result of each load is reported to the server once, as an event. Voices are
+identified by their ids without a speaker.
 """
 
 from __future__ import annotations
@@ -26,37 +26,37 @@ from talkcli.paths import cache_directory
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    #: the inode, the size and the time of the last change of each file
+    #: for each file, its inode, its size and the time of its last change
     _Fingerprints = tuple[tuple[int, int, int], ...]
 
-#: The growth of the process in bytes that triggers a new measurement and the return of freed memory to the system.
-#: Smaller amounts aren't returned, because the next sentence would need them again.
+#: After a sentence, freed memory is returned to the system only if the process has grown by at least this number of
+#: bytes. The next sentence would need smaller amounts again.
 GROWTH_BYTES = 16_000_000
 
 _T = TypeVar("_T")
 
 
 class BackgroundIterator(threading.Thread, Generic[_T]):
-    """A thread that runs an iterator some items ahead of its consumer."""
+    """A thread that reads items from an iterator before they are needed."""
 
     def __init__(self, items: Iterator[_T], max_ahead: int) -> None:
-        """Start the thread; it pauses while `max_ahead` items have not been taken."""
-        # A daemon thread could still be inside a C library when the process exits, which would abort the process.
+        """Start the thread. It pauses while `max_ahead` items are waiting to be taken."""
+        # A daemon thread could still be running C code when the process exits, which would crash the process.
         super().__init__(daemon=False)
         self._items = items
         self._room = threading.Semaphore(max_ahead)
-        #: the items that were not taken yet, as pairs (item, None). The last pair is (None, error), or (None, None) if
-        #: the iterator ended without an error.
+        #: the waiting items, as pairs (item, None). The last pair is (None, error) if the iterator raised an error, and
+        #: otherwise (None, None).
         self._made: deque[tuple[_T | None, BaseException | None]] = deque()
-        #: held while the thread writes to its descriptor, so that `close` can't free the descriptor's number meanwhile
+        #: a lock that prevents `close` from closing the pipe while the thread writes to it
         self._lock = threading.Lock()
         self._closed = False
-        #: readable if an item can be taken or the iterator has ended
+        #: a file descriptor that becomes readable when an item is ready or the iterator has ended
         self.descriptor, self._write_end = os.pipe()
         self.start()
 
     def run(self) -> None:
-        """Run the iterator until it ends or raises an exception."""
+        """Read items until the iterator ends or raises an exception."""
         try:
             for item in self._items:
                 self._room.acquire()
@@ -69,15 +69,15 @@ class BackgroundIterator(threading.Thread, Generic[_T]):
 
     @property
     def ready(self) -> bool:
-        """Whether `take` returns at once."""
+        """Whether `take` would return without waiting."""
         return bool(self._made)
 
     def take(self, wait: Callable[[int], None] | None = None) -> _T | None:
-        """Return the next item, or None at the end.
+        """Return the next item, or None if the iterator has ended.
 
         Args:
-            wait: A function that waits for the descriptor. It may return early. If it raises an exception, the
-                exception passes through and no item is lost. It isn't needed if `ready` is True.
+            wait: A function that waits until the descriptor is readable, or for a shorter time. If it raises an
+                exception, no item is lost. It isn't needed if `ready` is True.
 
         Raises:
             BaseException: The iterator raised this exception.
@@ -95,7 +95,7 @@ class BackgroundIterator(threading.Thread, Generic[_T]):
         return item
 
     def close(self) -> None:
-        """Make the thread end after its current item, which is discarded, and return at once."""
+        """Tell the thread to discard its current item and end. Return without waiting for it."""
         with self._lock:
             if not self._closed:
                 self._closed = True
@@ -111,45 +111,45 @@ class BackgroundIterator(threading.Thread, Generic[_T]):
 
 
 class ModelLoader:
-    """Keeps the loaded models, and loads queued voices one after the other."""
+    """Loads neural voices one after another, and stores their models."""
 
     def __init__(self) -> None:
-        #: the models by their voices, with the fingerprints of their files from before the load
+        #: the loaded models by voice, with the fingerprints that their files had before they were loaded
         self._models: dict[str, tuple[Model, _Fingerprints]] = {}
         self._waiting: deque[str] = deque()
         self._load: BackgroundIterator[tuple[Model, _Fingerprints]] | None = None
-        #: the voice that is being loaded, and the monotonic time when its load started
+        #: the voice that is being loaded, and when its load started (monotonic time)
         self._voice = ""
         self._started_at = 0.0
-        #: the loaded voices that failed to speak
+        #: the loaded voices that have failed to speak a sentence
         self._suspect: set[str] = set()
-        #: the error message of each voice's last load, if the load failed
+        #: error messages by voice, for voices that couldn't be loaded
         self._errors: dict[str, str] = {}
         self._events: list[VoiceLoaded | VoiceUnloaded | VoiceMemory] = []
-        #: the private memory of the process before the first load, and the growth in the last report
+        #: the private memory of the process before the first load, and how much it had grown at the last report
         self._initial_bytes: int | None = None
         self._reported_growth = 0
-        #: the voice that spoke since the last measurement, "" if a voice was dropped, or None if neither happened
+        #: why to measure the memory again: the id of a voice that has spoken, "" if a voice was unloaded, or None
         self._unmeasured: str | None = None
 
     @property
     def descriptor(self) -> int | None:
-        """A descriptor that is readable after the load has finished, or None if no voice is being loaded."""
+        """A file descriptor that becomes readable when the load has finished, or None if no voice is being loaded."""
         return self._load.descriptor if self._load else None
 
     @property
     def deadline(self) -> float:
-        """The monotonic time at which the current load fails."""
+        """The time limit for the current load (monotonic time)."""
         return self._started_at + LOAD_LIMIT_S
 
     def drop(self, voice: str) -> None:
-        """Release the model of a voice; a sentence that is being spoken keeps using it."""
+        """Unload a voice. If it is speaking a sentence, its memory is freed after the sentence."""
         if self._models.pop(voice, None):
             self._unmeasured = ""
         self._suspect.discard(voice)
 
     def start(self, voice: str) -> None:
-        """Load a voice in the background unless it is loaded or queued, and discard its earlier error."""
+        """Load a voice in the background, unless it is already loaded or queued."""
         if voice in self._models:
             self._events.append(VoiceLoaded(voice, 0.0))
         elif voice not in self._waiting and not (self._load and voice == self._voice):
@@ -168,22 +168,22 @@ class ModelLoader:
         return model
 
     def error(self, voice: str) -> str | None:
-        """Return the error message of a voice's last load, or None if the load didn't fail."""
+        """Return the error message if a voice couldn't be loaded, otherwise None."""
         return self._errors.get(voice)
 
     def mark_suspect(self, voice: str) -> None:
-        """Record that a loaded voice failed to speak. It is dropped after its files have changed."""
+        """Record that a loaded voice has failed to speak. It is unloaded once its files have changed."""
         self._suspect.add(voice)
 
     def mark_spoken(self, voice: str) -> None:
-        """Record that a voice has spoken, because its first sentences allocate memory that is kept."""
+        """Measure the memory again later, because the first sentences of a voice allocate memory permanently."""
         if voice not in self._models:
-            self._unmeasured = ""  # the voice was dropped during the sentence, so its memory is only released now
+            self._unmeasured = ""  # The voice was unloaded during the sentence, and its memory has been freed just now.
         elif self._unmeasured is None:
             self._unmeasured = voice
 
     def events(self) -> list[VoiceLoaded | VoiceUnloaded | VoiceMemory]:
-        """Return the events since the last call."""
+        """Return the events that have happened since the last call."""
         self._check_load()
         if self._unmeasured is not None:
             self._measure(self._unmeasured, min_growth=GROWTH_BYTES)
@@ -191,7 +191,7 @@ class ModelLoader:
         return events
 
     def _check_load(self) -> None:
-        """Store the model if the load has finished, or record a failure if it takes too long."""
+        """Store the model if the load has finished. Record a failure if the load takes too long."""
         load, voice = self._load, self._voice
         if load is None:
             return
@@ -199,13 +199,13 @@ class ModelLoader:
             if not load.ready:
                 if time.monotonic() < self.deadline:
                     return
-                # The thread may hang forever, for example reading a file from a dead server.
+                # The thread may hang forever, for example while it reads a file from a dead network drive.
                 raise VoiceFileError(f"{voice} was not loaded within {LOAD_LIMIT_S:g} s: are its files on a slow disk?")
             loaded = load.take()
             assert loaded is not None
         except VoiceFileError as error:
             self._record_failure(str(error))
-        except Exception as error:  # noqa: BLE001 - a faulty voice must not cost the engine process
+        except Exception as error:  # noqa: BLE001 - a faulty voice must not stop the engine process
             traceback.print_exception(error)
             self._record_failure(f"{voice} cannot be loaded: {type(error).__name__}: {error}")
         else:
@@ -217,7 +217,10 @@ class ModelLoader:
         self._start_next()
 
     def _measure(self, voice: str, min_growth: float = -math.inf) -> None:
-        """Report the growth of the process's memory, unless a voice that spoke added less than `min_growth` bytes."""
+        """Report how much the process's memory has grown since before the first load.
+
+        If the growth since the last report is below `min_growth` bytes, report nothing unless a voice was unloaded.
+        """
         self._unmeasured = None
         before, now = self._initial_bytes, _private_bytes()
         if before is None or now is None or (voice and now - before - self._reported_growth < min_growth):
@@ -234,7 +237,10 @@ class ModelLoader:
         self._events.append(VoiceLoaded(self._voice, self._elapsed(), why))
 
     def _start_next(self) -> None:
-        """Start the next load. Only one runs at a time because it needs a processor and twice the model's memory."""
+        """Start loading the next voice if no other is being loaded.
+
+        A load keeps one processor busy, and temporarily needs twice the memory of the model.
+        """
         while self._load is None and self._waiting:
             self._voice, self._started_at = self._waiting.popleft(), time.monotonic()
             try:
@@ -263,7 +269,7 @@ def _model_path(voice: str) -> str:
 
 
 def _fingerprints(path: str) -> _Fingerprints:
-    """Return values that change whenever a voice's files change, or () if a file can't be examined."""
+    """Return values that change whenever the files of a voice change, or () if a file can't be found."""
     try:
         found = [os.stat(each) for each in (path, path + models.JSON_SUFFIX)]
     except OSError:
@@ -272,13 +278,13 @@ def _fingerprints(path: str) -> _Fingerprints:
 
 
 def _load(path: str) -> Iterator[tuple[Model, _Fingerprints]]:
-    """Yield the model at a path.
+    """Load the model at a path, and yield it with the fingerprints of its files.
 
     Raises:
         VoiceFileError: The model can't be loaded.
     """
     try:
-        load_libraries(path)  # comes first, so that the libraries are certainly imported if a load hangs later
+        load_libraries(path)  # comes first, because reading the files may hang
         fingerprints = _fingerprints(path)
         yield Model(path, models.read_description(path), _open_cache()), fingerprints
     except OSError as error:
@@ -288,7 +294,7 @@ def _load(path: str) -> Iterator[tuple[Model, _Fingerprints]]:
 
 
 def _open_cache() -> ModelCache | None:
-    """Return the cache, or None if it can't be used. The reason is logged."""
+    """Open the cache. If it can't be used, log the reason and return None."""
     try:
         return ModelCache(cache_directory())
     except OSError:
@@ -297,7 +303,7 @@ def _open_cache() -> ModelCache | None:
 
 
 def _private_bytes() -> int | None:
-    """Return this process's private memory, including swapped pages, or None if it is unknown (in a sandbox)."""
+    """Return how much private memory this process uses, including swap. Return None if a sandbox hides it."""
     try:
         with open("/proc/self/status", "rb") as file:
             fields = dict(line.split(b":", 1) for line in file)
@@ -307,7 +313,10 @@ def _private_bytes() -> int | None:
 
 
 def _trim_heap() -> None:
-    """Return freed memory to the system, because glibc would keep most of a dropped model; takes 1 to 13 ms."""
+    """Return freed memory to the system, which takes 1 to 13 ms.
+
+    Otherwise, glibc would keep most of the memory of an unloaded model.
+    """
     import ctypes
 
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)

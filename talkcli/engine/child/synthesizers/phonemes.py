@@ -1,8 +1,8 @@
-"""The split of a text into parts for a neural voice, with phonemes from libespeak-ng and the positions of words.
+"""Functions that split a text into sentences for a neural voice, and convert them to phonemes.
 
 libespeak-ng returns the phonemes of each clause with blanks between words. When it speaks the clause, it reports the
-positions of the words in the text. These two lists have to be aligned, because some words are joined in the phonemes
-("in the") and others are split ("1,000"). This module doesn't use the library itself, but a `Phonemizer`.
+positions of the words in the text. These two lists have to be aligned, because the phonemes of some words are joined
+("in the"), while a number such as "1,000" has several words. Access to the library is through a `Phonemizer`.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ if TYPE_CHECKING:
 else:
     Protocol = object
 
-#: The maximum number of phonemes in a part. The time and memory that a model needs grow with their square. On a PC, 250
-#: phonemes take 0.25 s and 60 MB, and 800 phonemes take 2 s and 450 MB.
+#: The maximum number of phonemes that a model speaks at once. The time and memory that it needs grow with the square of
+#: this number. On a PC, 250 phonemes take 0.25 s and 60 MB, and 800 phonemes take 2 s and 450 MB.
 MAX_PART_PHONEMES = 250
-#: The maximum number of phonemes in a part without the pause mark at its end.
+#: The maximum number of phonemes in a part, not counting the punctuation mark at its end.
 _MAX_SECTION_PHONEMES = MAX_PART_PHONEMES - 1
-#: The number of phonemes after which a part may also end at a comma.
+#: A longer part ends at the next comma instead of at the end of the sentence.
 _LONG_PART_PHONEMES = 150
-#: The maximum number of comparisons for aligning two strings, which take up to 50 ms. This is enough for a clause of
-#: 1,000 phonemes, and libespeak-ng ends every clause after 800 bytes. Only a number of 800 digits has ten times as many
-#: phonemes, and nobody can tell where a word begins in it.
+#: The maximum number of comparisons to align two strings of phonemes, which takes up to 50 ms. This is enough for a
+#: clause of 1,000 phonemes. libespeak-ng ends every clause after 800 bytes, so only very long numbers exceed the limit.
+#: In such a number, the exact positions of words don't matter.
 _MAX_COMPARISONS = 1 << 20
-#: The marks between clauses that Piper's voices know. The last three end a sentence.
+#: The punctuation marks for which Piper's voices make a pause. The last three end a sentence.
 PAUSE_MARKS = ",;:.!?"
-#: The pause mark for each punctuation character in a text.
+#: For each punctuation character in a text, the mark to pass to Piper's voices.
 _PUNCTUATION = {
     **{each: each for each in PAUSE_MARKS},
     **dict.fromkeys("，、،", ","),
@@ -45,48 +45,48 @@ _PUNCTUATION = {
 }
 _SENTENCE_ENDS = ".!?"
 _LAST_PUNCTUATION = re.compile(rf"[{re.escape(''.join(_PUNCTUATION))}](?=[^\w]*\Z)")
-#: A change of language in phonemes: "(en)hello(de)".
+#: Matches a change of language between phonemes, such as "(en)" in "(en)hello(de)".
 _LANGUAGE_MARK = re.compile(r"\([^()]*\)")
 
 
 class Phonemizer(Protocol):
-    """Returns the phonemes of a language, as libespeak-ng does with one of its voices.
+    """Converts text to phonemes in one language.
 
-    Positions are characters from 0.
+    Positions are counted in characters from 0.
     """
 
     def clauses(self, text: str) -> list[tuple[str, str]]:
-        """Return the clauses of a text, each with its phonemes in IPA; joined, the clauses are the text."""
+        """Split a text into clauses, and return each clause with its phonemes in IPA."""
 
     def word_positions(self, clause: str) -> list[tuple[int, int]]:
-        """Return the start and the length (at least 1) of each word in a clause."""
+        """Return the start and the length of each word in a clause. The length is at least 1."""
 
     def ends_with_abbreviation(self, clause: str) -> bool:
-        """Return whether the dot at the end of a clause belongs to its last word, as in "Mr."."""
+        """Return whether a clause ends with an abbreviation such as "Mr."."""
 
 
 @frozen
 class SpeechPart:
-    """A sentence, or a part of a long sentence, that a model speaks in one run."""
+    """The phonemes of a sentence or of a part of a long sentence, which a model speaks at once."""
 
-    #: characters of IPA, blanks and pause marks; never empty
+    #: IPA characters, blanks and punctuation marks; never empty
     phonemes: tuple[str, ...]
-    #: the index of each word's first phoneme (never decreasing), with the word's start and length in the text
+    #: for each word, the index of its first phoneme, its start in the text and its length. The indexes never decrease.
     words: tuple[tuple[int, int, int], ...]
-    #: whether the part ends a sentence, so that a pause follows
+    #: whether this is the end of a sentence, after which the voice makes a pause
     ends_sentence: bool
 
 
 def split_text(phonemizer: Phonemizer, text: str) -> Iterator[SpeechPart]:
-    """Yield the parts of a text. A text without any speech has no parts.
+    """Split a text into parts that a model can speak at once.
 
-    The phonemizer is only used when the next part is requested.
+    A text without any speech has no parts. The phonemizer is used only while a part is being requested.
     """
     phonemes: list[str] = []
     words: list[tuple[int, int, int]] = []
 
     def finish(*, ends_sentence: bool) -> SpeechPart:
-        """Return the collected part, and start a new one."""
+        """Return the current part, and start a new one."""
         part = SpeechPart(tuple(phonemes), tuple(words), ends_sentence)
         phonemes.clear()
         words.clear()
@@ -120,29 +120,32 @@ def split_text(phonemizer: Phonemizer, text: str) -> Iterator[SpeechPart]:
 
 
 def _sections(groups: Sequence[str]) -> Iterator[str]:
-    """Yield the groups of phonemes, and those that are too long for a part in several sections."""
+    """Yield the groups of phonemes, but split those that are too long for a part."""
     for group in groups:
         for begin in range(0, len(group), _MAX_SECTION_PHONEMES):
             yield group[begin : begin + _MAX_SECTION_PHONEMES]
 
 
 def _phoneme_groups(ipa: str) -> list[str]:
-    """Return the groups of phonemes between blanks; each character of a group is a phoneme."""
+    """Split phonemes at the blanks. Each character of the result is a phoneme."""
     return [unicodedata.normalize("NFD", each) for each in _LANGUAGE_MARK.sub(" ", ipa).split()]
 
 
 def _locate_words(phonemizer: Phonemizer, clause: str, groups: Sequence[str]) -> list[tuple[int, int, int]]:
-    """Return the index of the first phoneme, the start and the length of each word in a clause."""
+    """Return the first phoneme of each word in a clause, with the word's start and length in the text.
+
+    The phonemes are counted across all groups.
+    """
     positions = phonemizer.word_positions(clause)
     group_starts = [0, *itertools.accumulate(map(len, groups))]
     if len(positions) == len(groups):
         return [(start, *position) for start, position in zip(group_starts, positions, strict=False)]
-    if not positions:  # there are phonemes, but their words are unknown
+    if not positions:  # The library has reported no words for these phonemes.
         return []
-    # A spelled word is reported once per letter, always with the position of the word.
+    # If a word is spelled out, the library reports the same position for each letter.
     positions = _increasing(positions)
     next_starts = [*(start for start, _ in positions[1:]), len(clause)]
-    # Each word is converted alone. The result is aligned with the phonemes of the whole clause.
+    # Convert each word on its own, and align the results with the phonemes of the whole clause.
     limits = zip(positions, next_starts, strict=True)
     words = [clause[start : min(start + length, next_start)] for (start, length), next_start in limits]
     alone = ["".join(itertools.chain(*(_phoneme_groups(ipa) for _, ipa in phonemizer.clauses(word)))) for word in words]
@@ -153,7 +156,7 @@ def _locate_words(phonemizer: Phonemizer, clause: str, groups: Sequence[str]) ->
 
 
 def _increasing(positions: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return only the positions that come after all previous ones."""
+    """Return the positions in ascending order. Omit those that don't come after all earlier ones."""
     found: list[tuple[int, int]] = []
     for position in positions:
         if not found or position[0] > found[-1][0]:
@@ -162,7 +165,7 @@ def _increasing(positions: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def _align(first: str, second: str, places: Sequence[int]) -> list[int]:
-    """Return the places in the second string that correspond to `places` in the similar first string."""
+    """Return the indexes in the second string that correspond to `places` in the first string, which is similar."""
     if len(first) * len(second) > _MAX_COMPARISONS:
         return [place * len(second) // len(first) for place in places]
     import difflib

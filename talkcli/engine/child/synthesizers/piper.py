@@ -1,8 +1,8 @@
-"""Piper's neural voices as a synthesizer, with phonemes from libespeak-ng.
+"""A synthesizer for Piper's neural voices, which gets its phonemes from libespeak-ng.
 
-Models are loaded and run in background threads. Meanwhile, the calling thread waits in its sink, so playback, stops,
-pauses and signs of life continue. The thread that runs a model also gets the phonemes from libespeak-ng, which no other
-thread uses during that time.
+Models are loaded and run in background threads. Meanwhile, the calling thread waits in its sink, so a sentence can
+still be played, paused and stopped. The thread that runs a model also calls libespeak-ng, which no other thread uses
+during that time.
 """
 
 from __future__ import annotations
@@ -32,50 +32,50 @@ if TYPE_CHECKING:
     from talkcli.engine.child.synthesizers.phonemes import SpeechPart
     from talkcli.engine.protocol import Voice
 
-    #: the start and length of each word in the text, and its time in seconds from the first sample of a part
+    #: for each word, its start and length in the text, and its time in seconds from the start of the part
     WordTimes = tuple[tuple[int, int, float], ...]
 
-#: The initial and the maximum number of frames to decode at a time. The first 0.23 s of sound are ready soon. Later
-#: parts have up to 0.93 s, because extra frames have to be decoded on both sides of each part
-#: (`inference.CONTEXT_FRAMES`).
+#: How many frames to decode at a time, at first and at most. A small first part of 0.23 s is ready quickly. Later parts
+#: have up to 0.93 s, because extra frames have to be decoded before and after each part (`inference.CONTEXT_FRAMES`).
 _MIN_DECODED_FRAMES, _MAX_DECODED_FRAMES = 20, 80
-#: The maximum number of decoded parts to keep ready. With up to seven seconds of sound, a slow moment of the machine
-#: isn't heard.
+#: The maximum number of decoded parts that wait to be played. They have up to seven seconds of sound, so playback
+#: continues if the computer is busy for a while.
 _MAX_PARTS_AHEAD = 8
-#: Seconds between the last audible sound of a sentence and its end, and the level (of full scale) below which sound is
-#: inaudible here. libespeak-ng makes pauses of 0.24 to 0.28 s, and a player may end 0.25 s early. Models make 0.07 to
-#: 0.2 s of sound below this level.
+#: The length of the pause after a sentence, and the level below which sound counts as silence there (1.0 is full
+#: scale). A model's own pause has 0.07 to 0.2 s, which is too short if a player stops 0.25 s early. libespeak-ng makes
+#: pauses of 0.24 to 0.28 s.
 _PAUSE_S, _PAUSE_LEVEL = 0.26, 0.01
-#: The level (of full scale) below which sound before a sentence is cut, and the seconds of it that are kept. This sound
-#: lasts 26 to 60 ms, and would delay every sentence.
+#: The level below which sound counts as silence at the start of a sentence (1.0 is full scale), and how much of this
+#: silence is kept. Models make 26 to 60 ms of it, which would delay every sentence.
 _LEADING_LEVEL, _LEADING_S = 0.0015, 0.005
-#: Seconds of silence between two words that count as a pause. If the silence is shorter, the second word begins where
-#: the first one ends, because the blank and its padding already sound like the second word.
+#: The minimum length of a pause between two words. If the silence is shorter, the second word is taken to begin where
+#: the first one ends, because the blank between them already sounds like the second word.
 _WORD_GAP_S = 0.15
-#: The level (of full scale) below which a part counts as silent.
+#: A part whose sound is always below this level counts as silent (1.0 is full scale).
 _SPEECH_LEVEL = 0.001
-#: Seconds of sound to write at a time.
+#: How much sound to write to the sink at a time.
 _WRITE_S = 0.1
 _FULL_SCALE = 32767
 _DEFAULT_PITCH = 50
-#: The rate of libespeak-ng that matches a voice's natural pace, and the share of the time that the pace doesn't change
-#: because durations are rounded up to whole frames. Both values were fitted to five sentences of libespeak-ng 1.51
-#: (gmw/en-US) at 80 to 450 words per minute, and of en_US-joe-medium at scales of 0.2 to 2.2. The durations agree
-#: within 5 % from 120 to 400 words per minute. At 80 and 450, the model is 11 and 13 % slower.
+#: The rate of libespeak-ng at which it is as fast as Piper's voices at their natural pace, and the share of the
+#: speaking time that doesn't depend on the rate, because durations are rounded up to whole frames. Both values were
+#: fitted to five sentences, spoken by libespeak-ng 1.51 (gmw/en-US) at 80 to 450 words per minute, and by
+#: en_US-joe-medium at scales of 0.2 to 2.2. From 120 to 400 words per minute, the durations agree within 5 %. At 80 and
+#: 450, the model is 11 and 13 % slower.
 _NATURAL_WPM, _CONSTANT_SHARE = 195, 0.30
 _MIN_SCALE = 0.1
 
 
 @frozen
 class SpokenPart:
-    """Some samples, and the words that begin in them or later."""
+    """A piece of sound, with the words that begin in it or later."""
 
     samples: bytes
     words: WordTimes = ()
 
 
 class Piper:
-    """A synthesizer for all neural voices, which uses libespeak-ng only while it speaks."""
+    """A synthesizer for Piper's neural voices. It uses libespeak-ng only while it speaks."""
 
     version: str | None = None
 
@@ -83,7 +83,7 @@ class Piper:
         self._espeak = espeak
         self.loader = ModelLoader()
         self.voice = ""
-        #: the id of the current voice without its speaker, the speaker, and the path of the model
+        #: the id of the current voice without the speaker, the speaker, and the path of the model
         self._model_id, self._speaker, self._path = "", "", ""
 
     @property
@@ -93,12 +93,15 @@ class Piper:
 
     @property
     def error(self) -> str | None:
-        """The error message of the current voice's last load, or None if the load didn't fail."""
+        """The error message if the current voice couldn't be loaded, otherwise None."""
         return self.loader.error(self._model_id)
 
     @property
     def language(self) -> str:
-        """The language of the current voice for libespeak-ng, from the voice's description or else from its name."""
+        """The libespeak-ng voice or language to use in place of the current voice.
+
+        It comes from the description of the voice, or from its name if the description can't be read.
+        """
         try:
             return models.read_description(self._path).espeak_voice
         except VoiceFileError:
@@ -108,7 +111,10 @@ class Piper:
         return models.installed_voices()
 
     def load(self, voice: str) -> None:
-        """Choose a voice, with or without a speaker. Faults of its files are reported by `speak`."""
+        """Choose a voice by its id, which may end with "#" and a speaker.
+
+        If a file of the voice is faulty, `speak` reports the error later.
+        """
         missing = models.missing_package()
         if missing is not None:
             raise UnknownVoice(missing)
@@ -122,9 +128,9 @@ class Piper:
         self.voice, self._model_id, self._speaker, self._path = voice, model, speaker, path
 
     def speak(self, text: str, settings: SpeechSettings, sink: SampleSink) -> None:
-        """Speak as `Synthesizer` describes, after waiting until the voice is loaded.
+        """Wait until the voice is loaded, and synthesize a sentence.
 
-        The samples vary between calls unless the voice's noise is 0.
+        The samples vary from call to call, unless the description of the voice sets its noise to 0.
         """
         if settings.pitch != _DEFAULT_PITCH:
             words = f"the voice {self.voice} has no pitch but its own: leave --pitch out, or choose one of espeak's"
@@ -151,7 +157,7 @@ class Piper:
     def _wait_for_model(self, voice: str, sink: SampleSink) -> Model:
         loader = self.loader
         if loader.model(voice) is None:
-            loader.start(voice)  # the files may have been repaired after an earlier error
+            loader.start(voice)  # Try again even after an error, because the files may have been repaired.
         while (model := loader.model(voice)) is None:
             why = loader.error(voice)
             if why is not None:
@@ -163,7 +169,7 @@ class Piper:
     def _write(
         self, model: Model, speaker: int, parts: Iterator[SpeechPart], settings: SpeechSettings, sink: SampleSink
     ) -> None:
-        """Write the sound of a text's parts, which a background thread makes."""
+        """Synthesize parts of a text in a background thread, and write their sound to the sink."""
         run = ModelRun()
         rate = model.description.rate
         write_bytes = int(_WRITE_S * rate) * SAMPLE_BYTES
@@ -185,7 +191,7 @@ class Piper:
 def _speak_parts(
     model: Model, parts: Iterator[SpeechPart], speaker: int, settings: SpeechSettings, run: ModelRun
 ) -> Iterator[SpokenPart]:
-    """Yield the sound of a text's parts.
+    """Synthesize the parts of a text, and yield the sound in small pieces.
 
     Raises:
         VoiceFileError: The model is faulty, or doesn't know any of the phonemes.
@@ -201,13 +207,13 @@ def _speak_parts(
         any_known = True
         frames = model.encode(ids, speaker, _duration_scale(settings.rate), run)
         begins = [0, *frames.ends]
-        # A word without known phonemes gets the time of the next phoneme, which may be early. Times must not decrease.
+        # If a word has no known phonemes, it gets the time of the next phoneme. `max` keeps the times from decreasing.
         times = itertools.accumulate((_word_time(model, part, places, begins, at) for at, _, _ in part.words), max)
         words = tuple((start, length, time) for (_, start, length), time in zip(part.words, times, strict=True))
         loudest = 0.0
-        quiet = 0  # the number of silent samples at the end so far
+        quiet = 0  # how many silent samples come after the last sound
         begin, count = 0, _MIN_DECODED_FRAMES
-        # these parts are held back until there is sound, because another voice can speak a silent part
+        # Hold back silence until there is sound. If the whole part is silent, another voice can speak it instead.
         silent: list[SpokenPart] = []
         while begin < frames.count:
             end = min(frames.count, begin + count)
@@ -235,14 +241,15 @@ def _speak_parts(
 def _word_time(model: Model, part: SpeechPart, places: Sequence[int], begins: Sequence[int], at: int) -> float:
     """Return the time at which a word is heard, in seconds from the start of its part.
 
-    In the median, the result is at most 9 ms early. The start of the word's first phoneme would be 41 to 93 ms late.
-    This was measured with a speech recognizer's alignment of 300 words at 120, 200 and 300 words per minute.
+    Usually, this is when the word before it ends. The start of the word's first phoneme would be 41 to 93 ms too late.
+    Compared with a speech recognizer, the result is at most 9 ms too early. These are medians for 300 words at 120, 200
+    and 300 words per minute.
 
     Args:
         model: The model that speaks the part.
         part: The part of the text.
-        places: The index of the first id of each phoneme.
-        begins: The frame at which each id begins.
+        places: For each phoneme, the index of its first id.
+        begins: For each id, the frame at which it begins.
         at: The index of the word's first phoneme.
     """
     own = begins[places[at]]
@@ -254,7 +261,7 @@ def _word_time(model: Model, part: SpeechPart, places: Sequence[int], begins: Se
 
 
 def _cut_leading_silence(samples: Any, levels: Any, words: WordTimes, rate: int) -> tuple[Any, WordTimes]:
-    """Return the samples without the inaudible beginning of the sentence, and the words with their new times."""
+    """Remove the silence at the start of a sentence, and adjust the times of its words."""
     audible = (levels > _LEADING_LEVEL).nonzero()[0]
     cut = max(0, int(audible[0]) - int(_LEADING_S * rate)) if len(audible) else 0
     return samples[cut:], tuple((start, length, max(0.0, time - cut / rate)) for start, length, time in words)
@@ -266,9 +273,9 @@ def _to_bytes(samples: Any, volume: float) -> bytes:
 
 
 def _phoneme_ids(phonemes: Sequence[str], ids: Mapping[str, tuple[int, ...]]) -> tuple[list[int], list[int]]:
-    """Return the model's ids for some phonemes, and the index of each phoneme's first id.
+    """Convert phonemes to the model's ids. Also return the index of each phoneme's first id.
 
-    A phoneme that the model doesn't know gets the index of the next known phoneme, or of the end. If the model knows
+    If the model doesn't know a phoneme, it gets the index of the next known phoneme, or of the end. If the model knows
     none of them, the list of indexes is empty.
     """
     result = [*ids[BEGIN_SYMBOL], *ids[PAD_SYMBOL]]
@@ -282,9 +289,9 @@ def _phoneme_ids(phonemes: Sequence[str], ids: Mapping[str, tuple[int, ...]]) ->
 
 
 def _duration_scale(rate: int) -> float:
-    """Return the factor by which all durations are multiplied for a rate in words per minute.
+    """Convert a rate in words per minute to a factor for the durations of all phonemes.
 
-    With this factor, a sentence takes as long as with libespeak-ng. Above 400 words per minute, the model is slower,
-    because no phoneme is shorter than a frame.
+    The factor makes a sentence take as long as with libespeak-ng. Above 400 words per minute, the model is slower,
+    because no phoneme can be shorter than a frame.
     """
     return max(_MIN_SCALE, (_NATURAL_WPM / rate - _CONSTANT_SHARE) / (1 - _CONSTANT_SHARE))

@@ -1,12 +1,14 @@
-"""The split of a Piper voice's model (VITS, in ONNX) into an encoder and a decoder.
+"""Functions to split the model of a Piper voice (VITS, in ONNX format) into an encoder and a decoder.
 
-The encoder turns phoneme ids into frames, and the decoder turns frames into samples. Each sample depends only on some
-frames around it, so the decoder can run on a part at a time. The encoder also outputs the number of frames of each
-phoneme id, from which the time of each word is known. The whole model doesn't output this.
+The encoder turns phoneme ids into frames, and the decoder turns frames into samples. Each sample depends only on nearby
+frames, so the decoder can process a few frames at a time. The encoder also outputs how many frames each phoneme id
+takes, which is used to calculate the times of words. The whole model doesn't output this.
 
-The module is pure. It reads only as much of ONNX's encoding (protobuf) as it needs, with the field numbers of
-`onnx.proto`. Models come from strangers, and a C library reads them. Therefore a model is rejected if it isn't
-understood or refers to anything outside of its file, and the halves contain only fields that were examined.
+Models come from strangers, and onnxruntime reads them with C++ code. A model is therefore rejected if this module
+doesn't understand it, or if it refers to other files. The halves contain only fields that have been checked.
+
+The module is pure. It reads only the fields that it needs from the file, which is encoded as a protobuf message. The
+field numbers are those of `onnx.proto`.
 """
 
 from __future__ import annotations
@@ -17,11 +19,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     Buffer = bytes | memoryview
-    #: a field of a message: its number, its wire type (one of the four below), and its value (encoded if an integer)
+    #: a field of a message: its number, its wire type (one of the four below), and its value. Integers stay encoded.
     Field = tuple[int, int, Buffer]
 
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
-#: Field numbers of a model, an operator set, a graph, a node, an attribute and a tensor.
+#: The field numbers of a model, an operator set, a graph, a node, an attribute and a tensor.
 _IR_VERSION, _GRAPH, _OPERATOR_SETS, _MODEL_FUNCTIONS = 1, 7, 8, 25
 _DOMAIN = 1
 _NODE, _GRAPH_NAME, _INITIALIZER, _INPUT, _OUTPUT, _SPARSE_INITIALIZER = 1, 2, 5, 11, 12, 15
@@ -29,41 +31,43 @@ _NODE_INPUT, _NODE_OUTPUT, _OPERATOR, _ATTRIBUTE, _NODE_DOMAIN = 1, 2, 4, 5, 7
 _TENSOR, _SUBGRAPH, _TENSORS, _SUBGRAPHS, _SPARSE_TENSOR, _SPARSE_TENSORS = 5, 6, 10, 11, 22, 23
 _TENSOR_NAME, _EXTERNAL_DATA, _DATA_LOCATION = 8, 13, 14
 
-#: The domains of ONNX's own operators. Operators of other domains are foreign code.
+#: The domains of the standard ONNX operators. Operators from other domains are rejected, because they could run foreign
+#: code.
 _STANDARD_DOMAINS = ("", "ai.onnx")
-#: The name of the weights of the decoder's first layer in all of Piper's models.
+#: The weights of the decoder's first layer have this name in all of Piper's models.
 _DECODER_WEIGHTS = "dec.conv_pre.weight"
-#: The operator that rounds durations up to whole frames. The encoder contains it once.
+#: The operator that rounds durations up to whole frames. It occurs exactly once in an encoder.
 _ROUNDING_OPERATOR = "Ceil"
-#: The prefix of operators whose results vary even if they have no inputs.
+#: The names of random operators begin with this prefix. Their results are not constant.
 _RANDOM_PREFIX = "Random"
-#: The encoded type of a value: floats, in any shape.
+#: The encoded type of a tensor of floats with any shape.
 _FLOAT_TYPE = b"\x12\x04\x0a\x02\x08\x01"
-#: The maximum depth of nested graphs. Piper's models have none, and PyTorch writes one for a condition.
+#: How deeply graphs may be nested. Piper's models have no nested graphs, but PyTorch writes one for a condition.
 _MAX_NESTED_GRAPHS = 4
-#: The maximum number of fields in a model. Reading a field takes 300 bytes and 1 to 3 microseconds. Piper's models have
-#: 30,000 fields.
+#: The maximum number of fields in a model. Each field takes 300 bytes of memory, and 1 to 3 microseconds to read.
+#: Piper's models have 30,000 fields.
 _MAX_FIELDS = 300_000
-#: The maximum length of a name. The longest in Piper's models has 52 characters.
+#: The maximum length of a name. The longest name in Piper's models has 52 characters.
 _MAX_NAME_BYTES = 1000
 _MAX_INTEGER_BITS = 64
 
 
 class NotSplit(Exception):
-    """The model is unsafe or not one of Piper's. The text is the reason, worded to follow the file's name."""
+    """Raised if a model is unsafe or isn't one of Piper's. The message gives the reason without the file's name."""
 
 
 @frozen
 class ModelHalves:
-    """The encoder and the decoder, each a complete model in parts that have to be joined.
+    """The two halves of a model: the encoder and the decoder.
 
-    The parts with the weights, which make up nearly all bytes, are not copied.
+    Each half is a complete ONNX file, stored as a sequence of buffers. The weights, which make up nearly all of it, are
+    not copied.
     """
 
-    #: the half with the whole model's inputs. Its outputs are the inputs of the decoder, followed by the number of
+    #: the encoder, which has the inputs of the whole model. It outputs the decoder's inputs, and then the number of
     #: frames of each phoneme id.
     encoder: tuple[Buffer, ...]
-    #: the half with the whole model's output. Its inputs are the outputs of the encoder except the last one.
+    #: the decoder, which has the output of the whole model. Its inputs are all but the last of the encoder's outputs.
     decoder: tuple[Buffer, ...]
 
 
@@ -104,7 +108,7 @@ def split_model(model: Buffer) -> ModelHalves:
 
 
 class _Reader:
-    """Reads the messages of one model, and limits the number of their fields."""
+    """Reads the protobuf messages of one model. It limits the total number of fields."""
 
     def __init__(self) -> None:
         self._fields_left = _MAX_FIELDS
@@ -135,7 +139,7 @@ class _Reader:
 
 
 class _Node:
-    """An operation, whose inputs include those of the graphs inside it."""
+    """An operation in a graph. Its inputs include those of the graphs nested in it."""
 
     def __init__(self, reader: _Reader, raw: Buffer, depth: int) -> None:
         fields = reader.fields(raw)
@@ -157,7 +161,7 @@ class _Node:
 
 
 class _Graph:
-    """The nodes of a graph in the order in which they run, and their weights."""
+    """A graph of operations, with its nodes in execution order and its weights."""
 
     def __init__(self, reader: _Reader, raw: Buffer, depth: int = 0) -> None:
         if depth > _MAX_NESTED_GRAPHS:
@@ -181,7 +185,7 @@ class _Graph:
         return found
 
     def nodes_for(self, wanted: Iterable[str]) -> list[_Node]:
-        """Return the nodes that are needed to compute some values."""
+        """Return the nodes that are needed to compute these values."""
         names = {*wanted}
         found = []
         for node in reversed(self.nodes):
@@ -191,7 +195,7 @@ class _Graph:
         return found[::-1]
 
     def constants(self) -> set[str]:
-        """Return the names of constant values, which both halves may compute."""
+        """Return the names of the values that don't depend on the inputs and aren't random."""
         names = {*self._weights, ""}
         for node in self.nodes:
             if names.issuperset(node.inputs) and not node.operator.startswith(_RANDOM_PREFIX):
@@ -199,14 +203,20 @@ class _Graph:
         return names
 
     def fields_of(self, nodes: list[_Node]) -> list[Field]:
-        """Return the fields of a graph with some nodes and their weights, without inputs and outputs."""
+        """Return the fields of a graph that has only these nodes and their weights.
+
+        Fields for its inputs and outputs have to be added.
+        """
         names = {name for each in nodes for name in each.inputs}
         weights = [(_INITIALIZER, _BYTES, each) for name, each in self._weights.items() if name in names]
         return [*((_NODE, _BYTES, each.raw) for each in nodes), (_GRAPH_NAME, _BYTES, b"half"), *weights]
 
 
 def _is_shared(reader: _Reader, field: Field) -> bool:
-    """Return whether both halves get a field of the model: its version, or a set of standard operators."""
+    """Return whether to copy a field of the model into both halves.
+
+    These fields are the version of the format, and the sets of standard operators.
+    """
     number, kind, value = field
     if (number, kind) == (_OPERATOR_SETS, _BYTES):
         return "".join(_names(reader.fields(value), _DOMAIN)) in _STANDARD_DOMAINS
@@ -214,10 +224,10 @@ def _is_shared(reader: _Reader, field: Field) -> bool:
 
 
 def _tensor_name(reader: _Reader, raw: Buffer) -> str:
-    """Return the name of a tensor.
+    """Return the name of a tensor, after checking that its data is in the same file.
 
     Raises:
-        NotSplit: The tensor's data is in another file.
+        NotSplit: The data is in another file.
     """
     fields = reader.fields(raw)
     locations = (value for number, _, value in fields if number in {_EXTERNAL_DATA, _DATA_LOCATION})
@@ -227,12 +237,12 @@ def _tensor_name(reader: _Reader, raw: Buffer) -> str:
 
 
 def _messages(fields: Iterable[Field], wanted: int) -> list[Buffer]:
-    """Return the messages in the fields with a given number."""
+    """Return the content of all fields that have this number."""
     return [value for number, kind, value in fields if (number, kind) == (wanted, _BYTES)]
 
 
 def _names(fields: Iterable[Field], wanted: int) -> list[str]:
-    """Return the names in the fields with a given number."""
+    """Return the content of all fields that have this number, as strings."""
     found = _messages(fields, wanted)
     if any(len(value) > _MAX_NAME_BYTES for value in found):
         raise NotSplit("is none of Piper's models: it has names that are too long")
@@ -243,7 +253,7 @@ def _names(fields: Iterable[Field], wanted: int) -> list[str]:
 
 
 def _parse_integer(raw: Buffer, at: int) -> tuple[int, int]:
-    """Return the integer that begins at an index, and the index after it."""
+    """Decode the integer at an index. Return it with the index of the byte after it."""
     result = shift = 0
     while at < len(raw) and shift < _MAX_INTEGER_BITS:
         byte = raw[at]
@@ -264,7 +274,7 @@ def _encode_integer(value: int) -> bytes:
 
 
 def _encode_model(head: list[Field], graph: list[Field]) -> tuple[Buffer, ...]:
-    """Return the parts of a model with these fields and this graph."""
+    """Encode a model with these fields and this graph, as a sequence of buffers."""
     parts = list(_encode_fields(graph))
     key = _encode_integer(_GRAPH << 3 | _BYTES) + _encode_integer(sum(map(len, parts)))
     return (*_encode_fields(head), key, *parts)
@@ -279,5 +289,5 @@ def _encode_fields(fields: Iterable[Field]) -> Iterator[Buffer]:
 
 
 def _float_value(name: str) -> bytes:
-    """Return the encoded description of an input or output of floats."""
+    """Encode the description of an input or output that is a tensor of floats."""
     return b"".join(_encode_fields([(1, _BYTES, name.encode())])) + _FLOAT_TYPE
