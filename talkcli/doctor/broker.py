@@ -360,7 +360,7 @@ def judge_certificate(broker: Broker, connection: BrokerConnection, now: float, 
 
 
 def _trust_step(broker: Broker, connection: BrokerConnection, now: float) -> str:
-    """Return the next step after a TLS error."""
+    """Return a suggestion for fixing a TLS error."""
     if connection.certificate_code in _DATE_CODES:
         clock = time.strftime("%Y-%m-%d %H:%M", time.gmtime(now))
         return f"renew the certificate of {broker.host}; or set this machine's clock: it says {clock} UTC"

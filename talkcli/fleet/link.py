@@ -1,4 +1,4 @@
-"""A connection to the broker, based on paho-mqtt, that needs no event loop and no thread.
+"""Connects to the broker through paho-mqtt, without an event loop or a thread.
 
 The owner polls the connection's descriptor, and calls `read`, `write` and `tick`. A link is never reconnected, because
 paho would resend unacknowledged messages, and the robot might speak an outdated sentence. Create a new link instead.
@@ -49,8 +49,8 @@ TICK_EVERY_S = 5.0
 MAX_PACKET_BYTES = 256 * 1024
 #: Space that is reserved in each packet for the topic and the properties.
 MAX_HEADER_BYTES = 1024
-#: Maximum number of unacknowledged QoS 1 messages. The broker announces its own limit, but paho ignores it. The lowest
-#: one is 10, on HiveMQ Cloud. paho queues further messages.
+#: Maximum number of unacknowledged QoS 1 messages. paho queues further messages. A broker announces its own limit, but
+#: paho ignores that. HiveMQ Cloud accepts 10 messages, and other brokers accept more.
 _MAX_UNACKNOWLEDGED_MESSAGES = 10
 #: The highest receive maximum that MQTT allows. A client that receives messages from all robots needs it. By default,
 #: mosquitto queues only 1,000 messages for a client, and silently drops the rest, even retained messages.
@@ -59,7 +59,7 @@ MAX_RECEIVE_COUNT = 65_535
 _REASONS_DENIED = (0x86, 0x87, 0x8A, 0x8C)
 _REASON_UNSUPPORTED_PROTOCOL = 0x84
 REASON_FAILURE, REASON_NOT_AUTHORIZED = 0x80, 0x87
-#: Values for SO_LINGER. A closed link usually discards unsent data, so that a sentence can't arrive minutes late.
+#: Values for SO_LINGER. A closed link usually discards unsent data, so that no sentence arrives minutes too late.
 _LINGER_DISCARD, _LINGER_DELIVER = struct.pack("ii", 1, 0), struct.pack("ii", 0, 0)
 
 
@@ -114,8 +114,8 @@ class Link:
         self._alert = ""
         #: held while paho runs, because a TLS connection can't be read and written at the same time
         self._lock = threading.RLock()
-        #: whether paho is reading. Nothing is written then, because paho would deadlock if a callback wrote to a broken
-        #: connection.
+        #: whether paho is reading. Nothing may be written during that time, because paho deadlocks if a callback
+        #: writes to a broken connection.
         self._delivering = False
         self._socket: socket.socket | None = None
         self._paho = paho.Client(

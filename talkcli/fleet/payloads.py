@@ -32,7 +32,7 @@ class Message:
     payload: bytes
     #: whether the publisher asked the broker to retain the message
     retained: bool = False
-    #: topic for the reply; None if the sender named none
+    #: topic for the reply; None if the sender doesn't want one
     response: str | None = None
     #: data that the reply must repeat; None if the sender gave none
     correlation: bytes | None = None
@@ -48,7 +48,7 @@ class Presence:
     online: bool
     #: random id of the bridge process; "" if unknown
     session: str = ""
-    #: when the bridge started, as a Unix timestamp by the robot's clock; None if the robot is offline
+    #: Unix timestamp of the bridge's start, by the robot's clock; None if the robot is offline
     since: float | None = None
     groups: tuple[str, ...] = ()
     #: requests that remote clients may send to the robot, such as `say`
@@ -105,7 +105,7 @@ class LastGoal:
     reason: str | None = None
     #: the goal's text; None if the robot keeps texts private
     text: str | None = None
-    #: when the goal ended, as a Unix timestamp by the robot's clock
+    #: Unix timestamp of the goal's end, by the robot's clock
     at: float | None = None
 
 
@@ -170,7 +170,7 @@ class RobotInfo:
 
 
 def _object(payload: bytes) -> JsonObject | None:
-    """Decode a payload that contains a JSON object, or return None if it contains anything else."""
+    """Decode a JSON object, or return None if the payload contains anything else."""
     try:
         return decode(payload.strip())
     except BadRequest:
@@ -190,7 +190,7 @@ def _texts(value: object) -> tuple[str, ...]:
 #: Payload that Home Assistant publishes on its status topic when it starts.
 HOMEASSISTANT_ONLINE = b"online"
 
-#: Template that derives from the presence payload whether the robot can speak.
+#: Template that shows whether the robot can speak, based on the presence payload.
 _AVAILABLE = "{{ 'online' if value_json.online and value_json.server else 'offline' }}"
 # These templates extract values from the status payload. Home Assistant shows `None` as unknown.
 _STATE_TEMPLATE = "{{ 'paused' if value_json.paused else 'speaking' if value_json.active else 'idle' }}"

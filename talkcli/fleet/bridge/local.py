@@ -5,7 +5,7 @@ They wrap the client core, run in the event loop, and return lines without decod
 
 from __future__ import annotations
 
-import _socket  # `connect.reach` returns sockets of this module's type
+import _socket  # `connect.reach` returns sockets of the type `_socket.socket`
 import asyncio
 import contextlib
 import random
@@ -91,12 +91,12 @@ class LocalConnection(ClientCore):
             return False
         with contextlib.suppress(ServerUnavailable):  # `read` will report the end of the connection
             self.queue(line, exchange)
-        if len(line) == self.unsent_bytes:  # otherwise, the event loop is already waiting to send earlier lines
+        if len(line) == self.unsent_bytes:  # if earlier lines are unsent, the event loop will send them all
             self._flush()
         return True
 
     def close(self) -> None:
-        """Close the connection. Before this, cancel a waiting `read`, or end it with `abort`.
+        """Close the connection. If a `read` is waiting, first cancel it or end it with `abort`.
 
         The server cancels the requests that it has not answered, if possible.
         """

@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 PRESENCE_EXPIRY_S, PRESENCE_EVERY_S = 150, 60.0
 #: Time allowed for another bridge with the same robot name to answer.
 _RIVAL_LIMIT_S = 1.0
-#: Longest pause before the first and before later attempts to reconnect to the broker. The pauses are random, so that
-#: a thousand robots don't reconnect at the same moment.
+#: Longest random pause before the first attempt to reconnect to the broker, and before later attempts. Without
+#: randomness, a thousand robots would reconnect at the same moment.
 _FIRST_BROKER_RETRY_S, _LAST_BROKER_RETRY_S = 0.5, 10.0
 #: The connection is closed if no echo has returned for this long.
 _ECHO_TIMEOUT_S = 15.0
@@ -103,7 +103,7 @@ async def _run(settings: BridgeSettings, read_broker: Callable[[], Broker]) -> N
         bridge.end()
 
     loop.set_exception_handler(log.handle_loop_error)
-    # Don't handle SIGINT if it is ignored. A shell without job control starts background programs like that.
+    # Don't handle SIGINT if it is ignored. A shell without job control starts background programs with SIGINT ignored.
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
         loop.add_signal_handler(signal.SIGINT, on_signal, signal.SIGINT)
     loop.add_signal_handler(signal.SIGTERM, on_signal, signal.SIGTERM)
@@ -239,16 +239,16 @@ class Bridge:
         self._link, self._descriptor = link, link.fileno()
         #: whether the broker has retained the presence of another bridge
         self._rival_seen = False
-        #: timer for going online unless another bridge answers; None until the broker returns this bridge's question
+        #: timer that takes the robot online unless another bridge answers; None until this bridge's question returns
         self._rival_timer: asyncio.TimerHandle | None = None
         self._echoes = EchoTracker(boottime())
-        #: since when the bridge has been waiting for an echo, by the event loop's clock; None if it isn't waiting
+        #: when the bridge began to wait for an echo, by the event loop's clock; None if it isn't waiting
         self._unanswered_since: float | None = None
         self._loop.add_reader(self._descriptor, self._on_ready, Link.read)
         link.subscribe(self._presence_topic, retained=True)
         link.subscribe(self._echo_topic, retained=False)
-        # The retained presence of another bridge arrives before this question returns. If the other bridge is still
-        # running, its answer arrives after the question.
+        # The broker sends the retained presence of another bridge before it returns this question. If that bridge is
+        # still running, its answer arrives afterwards.
         self._publish(self._echo_topic, _RIVAL_QUESTION + self._session.encode())
         self._send_echo()
 
@@ -284,7 +284,7 @@ class Bridge:
     def _forget_descriptor(self) -> None:
         if self._descriptor >= 0:
             for forget in (self._loop.remove_reader, self._loop.remove_writer):
-                # If paho has closed the socket, the loop removes the descriptor but raises an error.
+                # If paho has already closed the socket, the descriptor is removed, but an error is raised.
                 with contextlib.suppress(OSError):
                     forget(self._descriptor)
             self._descriptor = -1
@@ -483,7 +483,7 @@ class Bridge:
         link.tick()
         self._check_link(link)
         if self._unanswered_since is not None:
-            # Don't count time during which this process was stopped. Echoes that have returned since are still unread.
+            # Don't count time during which this process was stopped, because it couldn't read any echoes.
             self._unanswered_since += now - due
             if now - self._unanswered_since > _ECHO_TIMEOUT_S:
                 log.write_limited("echo", f"nothing that this robot sends itself comes back: {_RIGHTS}")

@@ -38,8 +38,8 @@ ECHO_EVERY_S = 5.0
 STALE_AFTER_S = ECHO_EVERY_S + 1.0
 #: Maximum number of echoes that have not returned. This is enough for one per second over half a minute.
 _MAX_ECHOES = 32
-#: Maximum number of pending goals from remote clients. The server's queue usually holds 100 goals, and the rest of it
-#: is left to local clients.
+#: Maximum number of pending goals from remote clients. The other places in the server's queue, which usually has 100,
+#: are left to local clients.
 MAX_REMOTE_GOALS = 20
 #: How many goal ids to remember, so that no goal is spoken twice, even if the server has forgotten it.
 MAX_REMEMBERED_IDS = 1_000
@@ -227,7 +227,7 @@ class SentIds:
     """
 
     def __init__(self) -> None:
-        #: maps each goal id to the server's boot id, and to whether the goal counts towards the limit
+        #: by goal id, the boot id of the goal's server, and whether the goal counts towards the limit
         self._sent: dict[str, tuple[str, bool]] = {}
 
     def boot_of(self, goal_id: str) -> str | None:
@@ -235,7 +235,7 @@ class SentIds:
         return self._sent.get(goal_id, (None, False))[0]
 
     def is_counted(self, goal_id: str, boot: str) -> bool:
-        """Return whether a goal was sent to this server and counts towards the limit for remote goals."""
+        """Return whether a goal was sent to the server with this boot id and counts towards the limit."""
         return self._sent.get(goal_id) == (boot, True)
 
     def add(self, goal_id: str, boot: str, *, counted: bool = True) -> None:
@@ -258,7 +258,7 @@ class RemoteGoals:
     """
 
     def __init__(self) -> None:
-        #: maps each goal id to the goal's key, and to whether the server has confirmed that the goal is pending
+        #: by goal id, the goal's key, and whether the server has confirmed that the goal is pending
         self._goals: dict[str, tuple[str | None, bool]] = {}
 
     def __len__(self) -> int:
@@ -287,7 +287,7 @@ class RemoteGoals:
         self._goals.setdefault(goal_id, (key, False))
 
     def answered(self, goal_id: str, *, pending: bool) -> None:
-        """Record from the server's reply whether a goal is pending.
+        """Process the server's reply to a request that sent a goal.
 
         The reply is ignored if an event has already confirmed that the goal is pending.
 
@@ -302,7 +302,7 @@ class RemoteGoals:
             del self._goals[goal_id]
 
     def queued(self, goal_id: str, key: str | None) -> None:
-        """Record that a goal is pending, as an event has reported."""
+        """Record that a goal is pending, as reported by an event."""
         self._goals[goal_id] = key, True
 
     def dequeued(self, goal_id: str) -> bool:
@@ -310,7 +310,7 @@ class RemoteGoals:
         return self._goals.pop(goal_id, None) is not None
 
     def reset(self, pending: Iterable[tuple[str, str | None]]) -> None:
-        """Replace all pending goals with the given ids and keys.
+        """Replace all pending goals. The new goals are given as pairs of id and key.
 
         Goals that are still on their way to the server are kept.
         """

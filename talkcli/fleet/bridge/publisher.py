@@ -46,7 +46,7 @@ _STATUS_AFTER_CHANGE_S = 0.1
 _MAX_STATUS_TEXT_CHARS = 1_000
 #: The server counts as hung if it sends nothing for this long. A working server sends a sign of life every 5 s.
 _SERVER_SILENCE_LIMIT_S = 15.0
-#: Longest pause before the first and before later attempts to reconnect to the server. The pauses are random.
+#: Longest random pause before the first attempt to reconnect to the server, and before later attempts.
 _FIRST_SERVER_RETRY_S, _LAST_SERVER_RETRY_S = 0.2, 5.0
 
 

@@ -55,7 +55,7 @@ _MAX_ID_PREFIX_CHARS = 48
 #: Message to a client after the server has closed the client's connection.
 _SERVER_GONE = "the robot's talk server ended the connection"
 _ALIVE = b'{"event": "alive"}\n'
-#: Lines with these beginnings are published with QoS 0, because losing one does no harm.
+#: Lines that start with one of these are published with QoS 0, because losing one does no harm.
 _UNRELIABLE = (b'{"event": "word"', b'{"event": "alive"')
 
 
@@ -70,7 +70,7 @@ class RemoteSessions:
         max_payload: Callable[[], int],
         on_change: Callable[[], None],
     ) -> None:
-        """Start with no sessions.
+        """Create an empty collection of sessions.
 
         Args:
             name: the robot's name.
@@ -93,7 +93,7 @@ class RemoteSessions:
         self._loop = asyncio.get_running_loop()
         self._sessions: dict[tuple[str, str | None], RemoteSession] = {}
         self._release_handle: asyncio.Handle | None = None
-        #: the client that canceled pending goals since waiting goals were last sent; None if no client did
+        #: the client that has canceled pending goals since `_release` last ran; None if none has
         self._canceled_by: By | None = None
 
     # -- from the broker
@@ -231,7 +231,7 @@ class _RemoteExchange(Exchange):
         self.remote = remote
         #: whether a `say` request sends its goal for the first time
         self.is_new = is_new
-        #: waiting goals that a `cancel` request has ended before the server received them
+        #: goals that a `cancel` request has ended before they were sent to the server
         self.canceled: list[Goal] = []
 
     @property
@@ -299,7 +299,7 @@ class RemoteSession:
                 self._task = asyncio.create_task(self._run(urgent=urgent))
 
     def say_goodbye(self) -> None:
-        """End the session soon, because its client has said goodbye.
+        """End the session after its client has said goodbye.
 
         The client gets no more answers, and its waiting goals are dropped. The session stays open until the server has
         answered requests with a lasting effect.
