@@ -209,7 +209,7 @@ class Link:
     def write(self) -> None:
         """Send as much data as possible without blocking.
 
-        During `on_message`, this does nothing. `read` sends the data afterwards.
+        Nothing is sent during `on_message`, because `read` sends the data afterwards.
         """
         with self._lock:
             if self.wants_write and not self._delivering:

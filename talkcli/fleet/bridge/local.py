@@ -27,7 +27,7 @@ _CHUNK_BYTES = 64 * 1024
 class LocalConnection(ClientCore):
     """A connection to the robot's server. Only one task at a time may read from it.
 
-    It doesn't use an asyncio transport, because that would make a new connection take half as long again. This
+    It doesn't use an asyncio transport, because connecting would then take about one and a half times as long. This
     matters when an operator cancels everything on a thousand robots.
     """
 

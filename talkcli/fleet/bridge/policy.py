@@ -227,7 +227,7 @@ class SentIds:
     """
 
     def __init__(self) -> None:
-        #: by goal id, the boot id of the goal's server, and whether the goal counts towards the limit
+        #: for each goal id: the boot id of the goal's server, and whether the goal counts towards the limit
         self._sent: dict[str, tuple[str, bool]] = {}
 
     def boot_of(self, goal_id: str) -> str | None:
@@ -258,7 +258,7 @@ class RemoteGoals:
     """
 
     def __init__(self) -> None:
-        #: by goal id, the goal's key, and whether the server has confirmed that the goal is pending
+        #: for each goal id: the goal's key, and whether the server has confirmed that the goal is pending
         self._goals: dict[str, tuple[str | None, bool]] = {}
 
     def __len__(self) -> int:
@@ -287,7 +287,7 @@ class RemoteGoals:
         self._goals.setdefault(goal_id, (key, False))
 
     def answered(self, goal_id: str, *, pending: bool) -> None:
-        """Process the server's reply to a request that sent a goal.
+        """Process the server's reply to a `say` request.
 
         The reply is ignored if an event has already confirmed that the goal is pending.
 
