@@ -1,12 +1,12 @@
-"""Speech for robots: goals can be followed and cancelled like robot actions, but no robot middleware is needed.
+"""A speech server for robots, and its Python client library.
 
-The library is `from talkcli import Client`, and the command `talk` is in `talkcli.cli`. A module is only imported when
-one of its names is used, because every start of the command has to wait for imports.
+Use the library with `from talkcli import Client`. The command `talk` is in `talkcli.cli`. Modules are imported when one
+of their names is first used, so that the command starts quickly.
 """
 
 from __future__ import annotations
 
-TYPE_CHECKING = False  # importing `typing` takes as long as a request
+TYPE_CHECKING = False  # importing `typing` would delay the start of the command
 if TYPE_CHECKING:
     from talkcli.client.client import Client
     from talkcli.client.goal import GoalHandle

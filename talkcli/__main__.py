@@ -1,4 +1,4 @@
-"""The command `talk`, run as `python -m talkcli`."""
+"""Entry point for `python -m talkcli`."""
 
 from talkcli.cli import main
 

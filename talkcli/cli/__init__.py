@@ -1,8 +1,10 @@
-"""The command line. Only this package uses click, and only this package prints or exits.
+"""The `talk` command line.
 
-Scripts often call `say`, `wait`, `cancel` and `status`, and importing click takes longer than a server takes to answer.
-So `plain` parses simple command lines of these commands, sends their requests, and imports the rest of the program only
-then. Click handles all other lines, all errors in command lines, and all help.
+Only this package uses click, prints to the terminal or exits the process.
+
+Scripts often call `say`, `wait`, `cancel` and `status`, and importing click takes longer than the server takes to
+answer. So `plain` parses simple command lines of these commands. It sends the request first, and imports the rest of
+the program afterwards. Click handles all other command lines, all errors and all help.
 """
 
 from __future__ import annotations
@@ -17,14 +19,14 @@ if TYPE_CHECKING:
 
 
 def main() -> NoReturn:
-    """Run the command line of this process, and exit."""
+    """Run the command line in `sys.argv`, and exit."""
     try:
         code = _run_plain(sys.argv[1:])
-    except KeyboardInterrupt:  # nothing has been started yet
+    except KeyboardInterrupt:  # no command has been started yet
         code = 128 + 2
     if code is None:
         sys.exit(_run_with_click(sys.argv[1:]))
-    # All output is written. The interpreter's own cleanup would take an eighth of the command's time.
+    # All output has been written. Skip the interpreter's cleanup, which would take an eighth of the command's run time.
     os._exit(code)
 
 
@@ -35,7 +37,7 @@ def run(arguments: list[str]) -> int:
 
 
 def _run_plain(arguments: list[str]) -> int | None:
-    """Run a plain command line, and return its exit code. Return None for any other."""
+    """Run a simple command line, and return its exit code, or None if click has to parse it."""
     _prepare_streams()
     if "_TALK_COMPLETE" in os.environ:
         return None
@@ -52,15 +54,16 @@ def _run_with_click(arguments: list[str]) -> int:
 
 
 def _prepare_streams() -> None:
-    """Open closed standard streams as /dev/null, and escape characters that the locale can't encode.
+    """Replace closed standard streams with /dev/null, and escape characters that the locale can't encode.
 
-    If 0, 1 or 2 stayed closed, a socket or a lock could get this descriptor, and notes would be written to it.
+    If file descriptor 0, 1 or 2 stayed closed, the next socket or lock file would get its number, and messages would be
+    written to it.
     """
     for descriptor in (0, 1, 2):
         try:
             os.fstat(descriptor)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # gets the lowest free descriptor, which is this one
+            os.open(os.devnull, os.O_RDWR)  # `open` returns the lowest free descriptor, which is this one
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")

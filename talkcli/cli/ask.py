@@ -1,7 +1,9 @@
-"""The commands that ask the server and show its answer: cancel, status, watch, log, voices, set, pause, resume, doctor.
+"""The commands that send a request to the server and show its answer.
 
-This module must not need click, because plain command lines are run without it. Modules that only one command needs are
-imported by that command.
+They are cancel, status, watch, log, voices, set, pause and resume. `talk doctor` is also here.
+
+This module must not import click, because simple command lines are run without it. Modules that only one command needs
+are imported by that command.
 """
 
 from __future__ import annotations
@@ -27,12 +29,12 @@ if TYPE_CHECKING:
     from talkcli.doctor import broker, examine
     from talkcli.goals.goal import Goal, JsonObject
 
-#: How many of the last characters that were heard are shown when a goal is paused.
+#: The number of characters of spoken text to show when a goal is paused.
 _PAUSED_TEXT_CHARS = 40
 
 
 def cancel(options: CommonOptions, ids: tuple[str, ...], current: bool, before: str | None, key: str | None) -> None:
-    """Cancel the selected goals, or all goals."""
+    """Cancel the selected goals, or all goals if none are selected."""
     with options.connect() as client:
         try:
             done = client.cancel(ids or None, current=current, before=before, key=key)
@@ -45,7 +47,7 @@ def cancel(options: CommonOptions, ids: tuple[str, ...], current: bool, before: 
 
 
 def status(options: CommonOptions, goal_id: str | None) -> None:
-    """Show the server's status, or one goal."""
+    """Show the status of the server or the details of a goal."""
     from talkcli.goals.goal import Goal
     from talkcli.terminal.goals import goal_lines, status_lines
 
@@ -60,14 +62,14 @@ def status(options: CommonOptions, goal_id: str | None) -> None:
 
 
 def watch(options: CommonOptions, words: bool) -> int:
-    """Show the events of all goals until the user interrupts the command, and return the exit code."""
+    """Show the events of all goals until interrupted, and return the exit code."""
     from talkcli.cli.interrupts import Interrupts, has_reader
     from talkcli.terminal.transcript import Transcript
 
     if not has_reader():
         return EXIT_SIGPIPE
     transcript = Transcript(full=screen().width is None, words=words)
-    # In `talk watch | head`, the command ends when `head` does, even if the next event is hours away.
+    # `talk watch | head` must end as soon as `head` does, even if the next event is hours away.
     with Interrupts(output=True) as interrupts, options.connect(interrupt=interrupts.watched) as client:
         for event in client.events():
             show_result(options, [event.to_json()], partial(transcript.lines, event, screen(), time.time()))
@@ -75,7 +77,7 @@ def watch(options: CommonOptions, words: bool) -> int:
 
 
 def log(options: CommonOptions, count: int) -> None:
-    """Show the last goals that have ended."""
+    """Show the goals that have ended most recently."""
     from talkcli.terminal.transcript import log_lines
 
     with options.connect() as client:
@@ -84,7 +86,7 @@ def log(options: CommonOptions, count: int) -> None:
 
 
 def voices(options: CommonOptions, language: str | None) -> None:
-    """Show all voices of the engine, or those of a language and of its variants."""
+    """List the engine's voices, or only the voices for a language and its variants."""
     from talkcli.terminal.goals import voice_lines
 
     with options.connect() as client:
@@ -102,7 +104,7 @@ def voices(options: CommonOptions, language: str | None) -> None:
 
 
 def change(options: CommonOptions, **settings: Any) -> None:
-    """Change the server's settings that aren't None. If all are None, show the settings."""
+    """Change the given settings of the server, or show all settings if none are given."""
     from talkcli.terminal.goals import setting_lines
 
     asked = {name: value for name, value in settings.items() if value is not None}
@@ -134,7 +136,7 @@ def resume(options: CommonOptions) -> None:
 
 
 def _show_paused(options: CommonOptions, goal: Goal | None, *, paused: bool, words: str) -> None:
-    """Show whether speech is paused, and the goal that is being spoken."""
+    """Report that speech has been paused or resumed."""
     if options.json:
         show_json({"paused": paused, "goal": None if goal is None else goal.to_json()})
     elif not options.quiet:
@@ -142,7 +144,7 @@ def _show_paused(options: CommonOptions, goal: Goal | None, *, paused: bool, wor
 
 
 def doctor(options: CommonOptions, silent: bool) -> int:
-    """Show the doctor's findings and the next step. Return the exit code."""
+    """Run the doctor's checks, show the findings and the next step, and return the exit code."""
     from talkcli.cli.interrupts import Interrupts
     from talkcli.doctor.report import format_conclusion, format_finding, has_passed
     from talkcli.goals.states import EXIT_CODES, State
@@ -159,14 +161,14 @@ def doctor(options: CommonOptions, silent: bool) -> int:
         return interrupts.exit_code
     if not options.json and not options.quiet:
         note(format_conclusion(findings, screen(), examination.question))
-    # If a sentence would not be heard, the exit code is that of an aborted goal.
+    # If speech can't be heard, exit with the same code as for an aborted goal.
     return 0 if has_passed(findings, examination.question) else EXIT_CODES[State.ABORTED]
 
 
 def _examination(
     options: CommonOptions, interrupt: Mapping[int, int], *, silent: bool
 ) -> examine.LocalExamination | broker.BrokerExamination:
-    """Return the examination of this machine, or of the way to a robot in a fleet."""
+    """Return the checks for this machine, or for the connection to a robot of a fleet."""
     robot = named_robot(options.robot, options.socket)
     if robot is None:
         from talkcli.doctor.examine import LocalExamination
@@ -192,26 +194,26 @@ def _show_canceled(done: Canceled, options: CommonOptions) -> None:
 
 
 def _suggest_key(key: str, client: Client) -> None:
-    """Suggest a similar key if an unfinished goal has one."""
+    """Suggest a similar key if an unfinished goal has such a key."""
     from talkcli.terminal.text import printable
 
     try:
         status = client.status()
     except TalkError:
-        return  # the cancel itself has succeeded, so this is no error
+        return  # the suggestion is optional, so this isn't an error
     near = nearest(key, {each.key for each in unfinished(status) if each.key})
     if near:
         note(f"no goal has the key '{printable(key)}': did you mean '{printable(near)}'?")
 
 
 def _no_voice(language: str, voices: Iterable[JsonObject]) -> str:
-    """Return the error for a language without a voice. It suggests a similar name or code of a language, if any."""
+    """Return the error message for a language that has no voice, with a suggestion."""
     from talkcli.goals.options import is_neural
     from talkcli.terminal.text import printable
 
     codes = {_language_code(each): _language_code(each) for each in voices}
-    # Names are such as "German" or "English_(America)". The first part of the code lists all voices of the language.
-    # The name of a neural voice isn't that of a language.
+    # Typical names are "German" and "English_(America)". The first part of a language code selects all voices of the
+    # language. Neural voices are left out because they aren't named after languages.
     names = {
         str(each.get("name") or "").partition(" ")[0]: _language_code(each).partition("-")[0]
         for each in voices

@@ -1,6 +1,8 @@
-"""The command line in click, made from the commands' rows. It handles help, completion, errors and complex lines.
+"""The click version of the command line, generated from the table of commands.
 
-The function of a command is imported when the command is run, so that no command needs the imports of another.
+It handles help, completion, errors and complex command lines.
+
+A command's function is only imported when the command is run, so that no command has to load the imports of another.
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ _EXAMPLES = """
     talk cancel                       silence, now
     talk doctor                       silent? what to do next
 """
-#: Names of commands in other programs, and the commands here that do the same. Names similar to ours are left out.
+#: Command names that users may know from other programs, with the equivalent commands of `talk`.
 _FOREIGN_NAMES = {
     "check": "doctor",
     "follow": "watch",
@@ -50,7 +52,10 @@ _FOREIGN_NAMES = {
 
 
 class _OptionType(click.FloatRange):
-    """The type of an option that `read_value` reads. It is a range so that help shows the limits of a number."""
+    """The click type of options that are parsed by `read_value`.
+
+    It is derived from a range type so that help shows the limits of numbers.
+    """
 
     def __init__(self, option: Option) -> None:
         self._option = option
@@ -61,7 +66,7 @@ class _OptionType(click.FloatRange):
             return read_value(self._option, str(value))
         except ValueError as error:
             if self._option.kind in (INTEGER, NUMBER, SECONDS):
-                source = None  # click's own message names the option
+                source = None  # click adds the option's name to the message
             elif ctx and ctx.get_parameter_source(self._option.name) is not ParameterSource.ENVIRONMENT:
                 source = spelling(self._option)
             else:
@@ -108,7 +113,7 @@ def _click_argument(argument: Option) -> click.Argument:
 
 
 def _completer(name: str) -> Callable[..., list[CompletionItem]] | None:
-    """Return a function for click that calls the completer of this name; None for an empty name."""
+    """Return a click callback for the named completer, or None if the name is empty."""
 
     def complete(context: click.Context, _: click.Parameter, incomplete: str) -> list[CompletionItem]:
         from talkcli.cli import completion
@@ -124,15 +129,18 @@ def _store_common(context: click.Context, parameter: click.Parameter, value: obj
 
 
 class _HelpfulCommand(click.Command):
-    """A command whose help has examples, its own options, the common options, and exit codes."""
+    """A click command whose help includes examples, common options and exit codes."""
 
     examples: str
     exit_codes: ExitCodes
-    #: the heading of the common options
+    #: the heading above the common options in help
     common_heading = "Options of every command"
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Return the completions, each with the first sentence of its help. A shell has no room for more."""
+        """Return the completions with shortened help texts.
+
+        Only the first sentence is kept, because a shell has no room for more.
+        """
         found = super().shell_complete(ctx, incomplete)
         for each in found:
             each.help = re.split(r"[.;](?:\s|$)", each.help or "", maxsplit=1)[0] + "."
@@ -161,7 +169,7 @@ class _HelpfulCommand(click.Command):
 
 
 class ClickCommand(_HelpfulCommand):
-    """A command made from its row."""
+    """A click command generated from its entry in the table of commands."""
 
     def __init__(self, row: Command) -> None:
         self.row = row
@@ -187,11 +195,11 @@ class ClickCommand(_HelpfulCommand):
         return self.row.run(options, given)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        ctx.allow_extra_args = True  # `rest` is reported below
+        ctx.allow_extra_args = True  # extra arguments are reported below
         try:
             rest = super().parse_args(ctx, args)
         except click.UsageError as error:
-            error.ctx = error.ctx or ctx  # the note below the error names this command's help
+            error.ctx = error.ctx or ctx  # the message below the error will refer to this command's help
             if isinstance(error, click.NoSuchOption) and self.row.unknown_option_hint:
                 words = _describe_error(error)
                 stop = "" if words.endswith("?") else "."
@@ -205,7 +213,7 @@ class ClickCommand(_HelpfulCommand):
 
 
 class _CommandGroup(_HelpfulCommand, click.Group):
-    """The group of all commands. It makes each command from its row when it is needed."""
+    """The group of all commands, which are created when they are first needed."""
 
     examples, exit_codes = _EXAMPLES, ALL_EXIT_CODES
     common_heading = "Options, before or after the command"
@@ -220,7 +228,7 @@ class _CommandGroup(_HelpfulCommand, click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         unknown = args[0] not in COMMANDS and args[0][:1] not in ("", "-")
-        if unknown and not ctx.resilient_parsing:  # completion shows no errors
+        if unknown and not ctx.resilient_parsing:  # errors aren't shown during completion
             raise click.UsageError(_unknown_command(args), ctx)
         return super().resolve_command(ctx, args)
 
@@ -245,7 +253,10 @@ def talk(context: click.Context) -> None:
 
 
 def _first_screen(context: click.Context) -> str:
-    """Return the text for `talk` without a command. With the next prompt, it fits on a terminal of 24 lines."""
+    """Return the text to print if `talk` is run without a command.
+
+    It leaves room for the next shell prompt on a terminal with 24 lines.
+    """
     formatter = context.make_formatter()
     formatter.write(f"{talk.help}\n")
     with formatter.indentation():
@@ -256,8 +267,8 @@ def _first_screen(context: click.Context) -> str:
 
 
 def run(arguments: list[str]) -> int:
-    """Run a command line, or complete it for a shell. Return the exit code."""
-    # The parent process may have set this signal to be ignored. Child processes would then have no exit status.
+    """Run a command line or print its completions, and return the exit code."""
+    # The parent process may have left SIGCHLD ignored. The exit statuses of child processes would then be lost.
     _signal.signal(_signal.SIGCHLD, _signal.SIG_DFL)
     options = CommonOptions()
     if "_TALK_COMPLETE" in os.environ:
@@ -269,17 +280,17 @@ def _run_group(arguments: list[str], options: CommonOptions) -> object:
     try:
         with talk.make_context("talk", [*arguments], obj=options) as context:
             return talk.invoke(context)
-    except click.exceptions.Exit as end:  # the help or the version was printed
+    except click.exceptions.Exit as end:  # click has printed the help or the version
         return end.exit_code
     except KeyboardInterrupt:
-        write_error_line()  # the terminal has shown ^C on the current line
+        write_error_line()  # start a new line after the ^C that the terminal has shown
         raise
     except click.ClickException as error:
         from talkcli.terminal.text import printable
 
-        # The error may have been found before --json was read.
+        # The error may have occurred before --json was parsed.
         json = options.json or "--json" in arguments
-        words = printable(_describe_error(error))  # the command line may contain text from another program
+        words = printable(_describe_error(error))  # arguments may contain control characters
         show_error(UsageError(words), json=json)
         if not json and "--help" not in words:
             found = getattr(error, "ctx", None)
@@ -288,11 +299,11 @@ def _run_group(arguments: list[str], options: CommonOptions) -> object:
 
 
 def _complete_for_shell(options: CommonOptions) -> int:
-    """Print the completions for a shell, and nothing else."""
-    from talkcli.cli import completion  # noqa: F401 - this tells click about our classes for the shells
+    """Print the completions for a shell."""
+    from talkcli.cli import completion  # noqa: F401 - importing it registers our completion classes with click
 
     try:
-        talk.main([], prog_name="talk", standalone_mode=False, obj=options)  # raises SystemExit after completing
+        talk.main([], prog_name="talk", standalone_mode=False, obj=options)  # raises SystemExit when it is done
     except Exception:
         if os.environ.get("TALK_DEBUG"):
             raise
@@ -300,13 +311,13 @@ def _complete_for_shell(options: CommonOptions) -> int:
 
 
 def _write_lines(text: str, formatter: click.HelpFormatter) -> None:
-    """Write lines unchanged, with the formatter's current indentation."""
+    """Write each line at the formatter's current indentation, without wrapping it."""
     for line in text.strip().splitlines():
         formatter.write(f"{'':{formatter.current_indent}}{line.strip()}\n")
 
 
 def _unknown_command(words: list[str]) -> str:
-    """Return the error for an unknown command. It suggests a command, or how to speak these words."""
+    """Return the error message for an unknown command, with a suggestion."""
     name = words[0]
     if name.lower() == "help":
         meant = next((each for each in words[1:] if each in COMMANDS), None)
@@ -318,16 +329,16 @@ def _unknown_command(words: list[str]) -> str:
 
 
 def _quote_for_shell(text: str) -> str:
-    """Return a text quoted for a shell, in double quotes if possible."""
+    """Quote a text for the shell, in double quotes if possible."""
     import shlex
 
     return shlex.quote(text) if any(each in text for each in '"$`\\!') else f'"{text}"'
 
 
 def _describe_error(error: click.ClickException) -> str:
-    """Return what is wrong with a command line, in our own style."""
+    """Return click's error message, reworded in the style of `talk`."""
     if isinstance(error, click.NoSuchOption):
-        # The dashes would make any two options similar.
+        # Leading dashes would make unrelated options look similar.
         near = nearest(error.option_name.lstrip("-"), [each.lstrip("-") for each in error.possibilities or ()])
         return f"no such option '{error.option_name}'" + (f": did you mean '--{near}'?" if near else "")
     if isinstance(error, click.MissingParameter) and error.param and isinstance(error.param.type, click.Choice):

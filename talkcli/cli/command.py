@@ -1,7 +1,9 @@
-"""The row that describes a command. Help, completion, the tables in documents and both parsers are made from it.
+"""The data class that describes a command.
 
-This module also reads the words of a command line: option values, and texts that may contain bytes that aren't UTF-8.
-The commands themselves are in `commands`. This module is pure. It is imported before anything is sent, without click.
+Help, completion, both parsers and the tables in the documentation are generated from these descriptions.
+
+This module also parses option values, and texts that may contain invalid UTF-8. The commands themselves are in
+`commands`. The module has no side effects and doesn't use click, because it is imported before a request is sent.
 """
 
 from __future__ import annotations
@@ -18,19 +20,19 @@ if TYPE_CHECKING:
     from talkcli.cli.show import CommonOptions
 
     ExitCodes = Mapping[int | str, str]
-    #: Returns what is wrong with a combination of options. It is called with the values of all options, by name, and
-    #: with the names of the options on the command line.
+    #: A function that returns an error message if the given options can't be combined. Its arguments are the values of
+    #: all options, by name, and the names of the options that were given on the command line.
     Rule = Callable[[Mapping[str, Any], frozenset[str]], str | None]
 
-#: The path of a file to be written.
+#: The path of an output file.
 OUTPUT_FILE = Kind("string", (str,), "must be a string")
-#: The permissions of a file, in octal.
+#: File permissions in octal.
 FILE_MODE = Kind("string", (str,), "must be a string", "MODE")
 
-#: Options of `say`, `wait` and others that can't be combined with several robots.
+#: Options that can't be used with several robots.
 _SINGLE_ROBOT_OPTIONS = ("lines", "ahead", "feedback", "output")
 
-#: The exit codes of every command that uses a server. A command can give other meanings to them.
+#: The exit codes shared by all commands that use a server. A command can override their descriptions.
 SERVER_EXIT_CODES: ExitCodes = {
     1: "anything not named here; a bug says so",
     2: "usage: what is wrong stands on standard error",
@@ -40,12 +42,12 @@ SERVER_EXIT_CODES: ExitCodes = {
     10: "permission denied",
     12: "lost: it was sent, then nothing more was heard; it may have an effect all the same",
 }
-#: The exit codes of every command that can be sent to several robots.
+#: The exit codes shared by all commands that can be sent to several robots.
 FLEET_EXIT_CODES: ExitCodes = {
     **SERVER_EXIT_CODES,
     13: "robots differ: those that did not do it failed in more than one way",
 }
-#: All exit codes, for the general help and the README. The help of each command has its own meanings.
+#: All exit codes, for `talk --help` and the README. Each command's own help is more specific.
 ALL_EXIT_CODES: ExitCodes = {
     **FLEET_EXIT_CODES,
     0: "accepted; with --wait succeeded: all of it was played",
@@ -66,37 +68,37 @@ ALL_EXIT_CODES: ExitCodes = {
 
 @frozen
 class Command:
-    """A row that describes a command."""
+    """The description of a command: its options, help texts, exit codes and functions."""
 
     name: str
-    #: one line for the list of commands
+    #: a one-line summary for the list of commands
     summary: str
     #: the description in the command's help
     description: str
-    #: the function that runs the command, as "module:name"; it is called with `CommonOptions` and the given values
+    #: the function that runs the command, as "module:name"; its arguments are the common options and the command's own
     function: str
-    #: example command lines, one on each line
+    #: example command lines, one per line
     examples: str
     exit_codes: ExitCodes
     options: tuple[Option, ...] = ()
-    #: the positional argument; it takes any number of words if its metavar ends with dots
+    #: the positional argument; it accepts any number of words if its metavar ends with "..."
     argument: Option | None = None
-    #: whether it may connect to a server that has reached its client limit
+    #: whether the command may connect even if the server has reached its client limit
     urgent: bool = False
-    #: added to the error for an unknown option
+    #: a hint to add to the error message for an unknown option
     unknown_option_hint: str = ""
-    #: whether the lightweight parser in `plain` may read it, without click
+    #: whether the lightweight parser in `plain` may parse the command
     plain: bool = True
-    #: whether it uses a server; this can be the server of a robot in a fleet
+    #: whether the command uses a server, on this machine or on a robot of a fleet
     uses_server: bool = True
-    #: whether it connects to a single server, for which --connect-timeout can wait
+    #: whether --connect-timeout can be used with the command
     connects: bool = True
-    #: the function that sends the command to several robots, in the form of `function`; empty if there is none
+    #: the function that sends the command to several robots, as "module:name", or an empty string
     fleet_function: str = ""
     rule: Rule | None = None
 
     def usage_fault(self, given: Mapping[str, Any], typed: frozenset[str], common: Mapping[str, Any]) -> str | None:
-        """Return what is wrong with a command line whose values are each valid, or None.
+        """Return an error message if the options can't be combined, otherwise None.
 
         Args:
             given: the values of the command's own options and of its argument, by name.
@@ -114,13 +116,13 @@ class Command:
         return self.rule(given, typed) if self.rule else None
 
     def _is_local(self, given: Mapping[str, Any]) -> bool:
-        """Return whether the command runs without a server, such as `talk say --output`."""
+        """Return whether the command runs without a server, as `talk say --output` does."""
         return not self.uses_server or given.get("output") is not None
 
     def _connection_fault(
         self, given: Mapping[str, Any], robot: str | None, connect_timeout: float | None
     ) -> str | None:
-        """Return what is wrong with naming a robot or waiting for a server, or None."""
+        """Return an error message if --robot or --connect-timeout can't be used here, otherwise None."""
         local_name = f"{self.name}{' --output' * (given.get('output') is not None)}"
         is_several = False
         if robot is not None:
@@ -144,12 +146,12 @@ class Command:
         return "--connect-timeout waits for one robot: name it, or leave out --connect-timeout" if is_several else None
 
     def run(self, options: CommonOptions, given: Mapping[str, Any]) -> int | None:
-        """Run the command with the given values, and return its exit code, or None for 0."""
+        """Run the command with these option values. Return its exit code, or None for success."""
         options.urgent = self.urgent
         function = self.function
         robot = None if self._is_local(given) else named_robot(options.robot, options.socket)
         if robot:
-            # The robot can also come from the environment, so it is checked again.
+            # Check the robot again, because its name may come from an environment variable.
             if fault := self._connection_fault(given, robot, options.connect_timeout):
                 raise UsageError(fault)
             from talkcli.fleet.desk.request import selects_several
@@ -163,12 +165,19 @@ class Command:
 
 
 def option(flags: str, kind: Kind, words: str, **more: Any) -> Option:
-    """Return an option of a command, named after its long flag. `words` is its help, and `more` has further fields."""
+    """Create an option that is named after its long flag.
+
+    Args:
+        flags: the option's flags, as click expects them.
+        kind: the type of its values.
+        words: its help text.
+        more: further fields of `Option`.
+    """
     name = flags.rpartition("--")[2].replace("-", "_")
     return Option(name, kind, flags=flags, help=words, **{"default": False if kind is FLAG else None, **more})
 
 
-#: The options of every command. They can be written before or after its name.
+#: The options that every command accepts, before or after the command's name.
 COMMON_OPTIONS = (
     option(
         "--socket",
@@ -198,13 +207,16 @@ COMMON_OPTIONS = (
 
 
 def spelling(option: Option, value: object = None) -> str:
-    """Return the long flag of an option. If the flag has two forms, the value chooses one."""
+    """Return the long flag of an option.
+
+    If the option has a positive and a negative flag, `value` selects one of them.
+    """
     forms = option.flags.split("/")
     return (forms[-1] if value is False else forms[0]).split(", ")[-1]
 
 
 def read_value(option: Option, text: str) -> Any:
-    """Return the value of an option from its text.
+    """Parse the value of an option.
 
     Raises:
         ValueError: the text isn't a valid value. The message says why.
@@ -219,13 +231,13 @@ def read_value(option: Option, text: str) -> Any:
         bad = next(filter(_is_bad_byte, text), None)
         if bad:
             raise ValueError(f"the byte {_format_byte(bad)} in it is not UTF-8")
-    if not text and kind in (WORD, ID, PATH):  # an empty name would select nothing
+    if not text and kind in (WORD, ID, PATH):  # usually caused by an unset shell variable
         raise ValueError("empty; is the variable set that it comes from?")
     return text
 
 
 def range_help(option: Option) -> str:
-    """Return the limits of a number for help; empty if it has none."""
+    """Return the range of a numeric option for help, or an empty string if it has no limits."""
     return f"from {option.range}" if option.limits[1] is not None else option.range
 
 
@@ -237,7 +249,7 @@ def _read_number(option: Option, text: str) -> float:
         value = int(text) if whole else float(text)
     except ValueError:
         raise ValueError(f"'{text}' is not {wanted}") from None
-    if value != value:  # only true for NaN
+    if value != value:  # NaN is the only value that differs from itself
         raise ValueError(f"{value!r} is not a number")
     if option.kind is SECONDS and value == float("inf"):
         raise ValueError("no limit is 0")
@@ -247,7 +259,10 @@ def _read_number(option: Option, text: str) -> float:
 
 
 def _read_mode(text: str) -> int:
-    """Return the mode of a socket. Its owner must be able to use it, and nobody may execute it."""
+    """Parse the file mode of a socket.
+
+    The owner must be able to read and write, and nobody may have execute permission.
+    """
     digits = 3 <= len(text) <= 4 and set(text) <= set("01234567")
     mode = int(text, 8) if digits else 0
     if mode & ~0o666 or mode & 0o600 != 0o600:
@@ -256,12 +271,12 @@ def _read_mode(text: str) -> int:
 
 
 def _as_utf8(text: str) -> str:
-    """Return a text from the command line, decoded as UTF-8 even if Python has used another encoding."""
+    """Decode a command-line argument as UTF-8, even if Python has used another encoding."""
     return text.encode(errors="surrogateescape").decode(errors="surrogateescape")
 
 
 def _is_bad_byte(character: str) -> bool:
-    """Return whether a character stands for a byte that isn't UTF-8. Python decodes such bytes to surrogates."""
+    """Return whether a character is a surrogate that represents an invalid byte."""
     return "\udc80" <= character <= "\udcff"
 
 
@@ -270,10 +285,14 @@ def _format_byte(character: str) -> str:
 
 
 def replace_bad_bytes(text: str, line: int = 1) -> tuple[str, str | None]:
-    """Replace each byte that isn't UTF-8 by U+FFFD. `line` is the number of the text's first line.
+    """Replace bytes that aren't valid UTF-8 with U+FFFD.
+
+    Args:
+        text: the text, with invalid bytes decoded to surrogates.
+        line: the number of the text's first line.
 
     Returns:
-        The text, and a note about the bytes, or None if there are none.
+        The text, and a message about the replaced bytes, or None if there were none.
     """
     if text.isascii():
         return text, None
@@ -292,7 +311,7 @@ def replace_bad_bytes(text: str, line: int = 1) -> tuple[str, str | None]:
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:
-    """Return the known word that was most likely meant, or None if none is similar."""
+    """Return the known word that is most similar to this one, or None if there is no close match."""
     import difflib
 
     by_name = {each.lower(): each for each in known}

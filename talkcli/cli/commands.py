@@ -1,7 +1,7 @@
-"""The commands. Each has a row with its purpose, its options, its exit codes, and the function that runs it.
+"""The table of all commands, with their help texts, options and exit codes.
 
-This module is imported before anything is sent, so it must import nothing heavy, and it must not run anything. The
-options of goals and servers are in `goals.options`. The functions here say which options can't be combined.
+This module is imported before a request is sent, so it must not have slow imports or side effects. The options of goals
+and servers are in `goals.options`. The functions here check combinations of options.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from typing import Any
 
-#: The largest value of --max-queue, and so of --ahead.
+#: The maximum for --max-queue and for --ahead.
 MAX_QUEUED_GOALS = 10_000
 #: The systemd units that `talk serve` and `talk bridge` can print.
 SERVE_UNITS = ("user", "system", "user-socket", "system-socket")
 BRIDGE_UNITS = ("user", "system")
-#: The shells that have a completion script.
+#: The shells that `talk completion` supports.
 SHELLS = ("bash", "zsh", "fish")
 
 
 def _timeout_option(words: str) -> Option:
-    """Return the option --timeout. `words` is its help."""
+    """Return a --timeout option with this help text."""
     return option("-t, --timeout", NUMBER, words, limits=(0, None), excludes_minimum=True, metavar="SEC")
 
 
@@ -52,7 +52,7 @@ def _print_unit_option(names: tuple[str, ...]) -> Option:
 
 
 def _say_options() -> Iterator[Option]:
-    """Yield the options of `say` in the order of the help: those of a goal, and those of the command itself."""
+    """Yield the options of `say` in the order in which help lists them."""
     for each in OPTIONS:
         if each.flags:
             yield replace(each, env="", help=f"{each.help}  [env var, with -o: {each.env}]") if each.env else each
@@ -69,9 +69,9 @@ def _say_options() -> Iterator[Option]:
 
 
 _SAY_OPTIONS = tuple(_say_options())
-#: Options of `say` that also work without a server.
+#: Options of `say` that can be combined with --output.
 _SERVERLESS_OPTIONS = {"timeout", "output", *(each.name for each in SOUND_OPTIONS)}
-#: File extensions of other audio formats than WAV.
+#: File extensions of audio formats other than WAV.
 _OTHER_EXTENSIONS = (".aac", ".aiff", ".au", ".flac", ".m4a", ".mp3", ".mp4", ".oga", ".ogg", ".opus", ".webm", ".wma")
 
 
@@ -101,11 +101,11 @@ def _say_rule(given: Mapping[str, Any], typed: frozenset[str]) -> str | None:
 
 _SERVE_OPTIONS = (
     *(each.for_serve() for each in SETTINGS),
-    # At two seconds a sentence, 100 goals are more than three minutes of speech. Going through the longest queue takes
-    # about a millisecond.
+    # At two seconds per sentence, 100 goals are more than three minutes of speech. Searching a queue of the maximum
+    # length takes about a millisecond.
     option("--max-queue", INTEGER, "Goals that may wait.", default=100, limits=(1, MAX_QUEUED_GOALS)),
     option("--max-text", INTEGER, "Characters of one text.", default=MAX_TEXT_CHARS, limits=(1, MAX_TEXT_CHARS)),
-    # Each client takes one of the 1,024 file descriptors that a process usually has.
+    # Each client uses a file descriptor, and a process can usually open 1,024 of them.
     option("--max-clients", INTEGER, "Clients at once.", default=256, limits=(1, None)),
     option(
         "--player",
@@ -184,7 +184,7 @@ def _bridge_rule(given: Mapping[str, Any], _: frozenset[str]) -> str | None:
 
 _GOAL_IDS = Option("ids", IDS, metavar=IDS.metavar, completion="goal_ids")
 
-#: The commands in the order of the help. Those that a new user needs first come first.
+#: All commands, in the order in which help lists them. The most important ones for new users come first.
 _ROWS = (
     Command(
         name="serve",

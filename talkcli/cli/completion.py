@@ -1,15 +1,15 @@
-"""Completion: the values that a shell offers for a word, and the exchange with bash, zsh and fish.
+"""Shell completion for bash, zsh and fish.
 
-The values come from the server that the command would use. If it doesn't answer quickly, nothing is offered. Completion
-never prints an error.
+The values come from the server that the command would use. If the server doesn't answer quickly, no values are offered.
+Completion never prints an error.
 
-The scripts and their output format are our own, on top of click's classes. click's scripts pass on the words that the
-shell has split. bash also splits at `:` and `=`, which ids may contain, and values with a space, a comma, a quote or a
-`*` don't survive the way back. Here the shell sends the line up to the cursor as it was typed, and gets back quoted
-values that start where it inserts them. The scripts are files in this directory, which `talk completion` prints.
+We use click's classes, but not its scripts. click's scripts pass on the words that the shell has split. But bash also
+splits at `:` and `=`, which ids may contain, and values with a space, a comma, a quote or a `*` are garbled when they
+are passed back. Our scripts send the line up to the cursor as it was typed, and get back quoted values that they can
+insert unchanged. The scripts are files in this directory, which `talk completion` prints.
 
-An option or an argument names its completer in its row. A completer is a function of this module that takes the common
-options and the incomplete word, and returns the values to choose from, each with its help.
+An option or an argument is completed by the function of this module that is named in its `completion` field. This
+function takes the common options and the incomplete word, and returns the possible values, each with a help text.
 """
 
 from __future__ import annotations
@@ -36,34 +36,34 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import Goal, JsonObject
     from talkcli.protocol.events import ServerStatus
 
-    #: Values that a shell may offer, each with its help.
+    #: Completion values, each with its help text.
     Offers = list[tuple[str, str]]
 
-#: How long the server may take to answer, because a person has pressed a key and is waiting.
+#: The time limit for the server's answer. It is short because the user is waiting for completions.
 COMPLETION_TIMEOUT_S = 0.5
-#: How many ended goals are offered at most.
+#: The maximum number of ended goals to offer.
 _MAX_ENDED_GOALS = 100
-#: The length at which the text of a goal, or a name, is cut in the help of a value.
+#: The maximum length of a goal's text, or of a name, in the help text of a value.
 _HELP_TEXT_CHARS = 60
-#: Characters that bash needs escaped. Letters and digits of all scripts can stay as they are.
+#: Matches a character that must be escaped in bash.
 _BASH_SPECIAL = re.compile(r"[^\w@%+=:,./-]")
 
 
 class _LineCompletion(ShellComplete):
-    """Completion for a shell that sends the line up to the cursor in COMP_WORDS."""
+    """Base class for our completion scripts, which pass the line up to the cursor in COMP_WORDS."""
 
-    #: the name of the script's file
+    #: the file name of the completion script
     script: ClassVar[str]
 
     def source(self) -> str:
-        """Return the script that sets up completion."""
+        """Return the completion script for this shell."""
         with open(os.path.join(os.path.dirname(__file__), self.script), encoding="utf-8") as file:
             return file.read()
 
     def get_completion_args(self) -> tuple[list[str], str]:
         line = os.environ["COMP_WORDS"]
         words = split_arg_string(line)
-        # If one more character would begin a new word, the word to complete is still empty.
+        # If the next character would start a new word, the word to complete is empty.
         if len(split_arg_string(f"{line}x")) > len(words):
             words.append("")
         return words[1:-1], words[-1]
@@ -72,13 +72,16 @@ class _LineCompletion(ShellComplete):
         return "file" if item.type == "file" else self.line(item.value, item.help)
 
     def line(self, value: str, words: str | None) -> str:  # noqa: ARG002
-        """Return the line that tells the shell to offer a value. `words` is the value's help."""
+        """Format a value and its help text (`words`) as a line for the completion script."""
         return f"plain,{value}"
 
 
 @add_completion_class
 class BashCompletion(_LineCompletion):
-    """Completion for bash, which replaces the text in COMP_CWORD and doesn't quote."""
+    """Completion for bash, which inserts values without quoting them.
+
+    bash replaces the text in COMP_CWORD, which may be only the last part of the word.
+    """
 
     name = "bash"
     script = "talk.bash"
@@ -87,7 +90,7 @@ class BashCompletion(_LineCompletion):
         typed, quote = _last_word(os.environ["COMP_WORDS"])
         replaced = os.environ["COMP_CWORD"]
         if replaced in {":", "="}:
-            replaced = ""  # bash-completion, which is used after sudo, passes the separator if nothing follows it
+            replaced = ""  # after sudo, the separator is passed if no text follows it
         stays = typed.removesuffix(replaced) if replaced else typed
         kept = "".join(split_arg_string(stays))
         return f"plain,{_quote_for_bash(_with_flag(value, typed).removeprefix(kept), quote)}"
@@ -95,7 +98,7 @@ class BashCompletion(_LineCompletion):
 
 @add_completion_class
 class ZshCompletion(_LineCompletion):
-    """Completion for zsh, which quotes by itself and takes help after a colon."""
+    """Completion for zsh, which quotes values itself and expects the help text after a colon."""
 
     name = "zsh"
     script = "_talk"
@@ -110,7 +113,7 @@ class ZshCompletion(_LineCompletion):
 
 @add_completion_class
 class FishCompletion(_LineCompletion):
-    """Completion for fish, which quotes by itself and takes help after a tab."""
+    """Completion for fish, which quotes values itself and expects the help text after a tab."""
 
     name = "fish"
     script = "talk.fish"
@@ -121,7 +124,7 @@ class FishCompletion(_LineCompletion):
 
 
 def completion(_: CommonOptions, shell: str) -> None:
-    """Print the completion script of a shell."""
+    """Print the completion script for a shell."""
     shell_class = click.shell_completion.get_completion_class(shell)
     assert shell_class
     talk = click.get_current_context().find_root().command
@@ -129,7 +132,7 @@ def completion(_: CommonOptions, shell: str) -> None:
 
 
 def _last_word(line: str) -> tuple[str, str]:
-    """Return the last word of a line as it was typed, and the quote that is still open in it."""
+    """Return the last word of a line as typed, and its unclosed quotation mark, if any."""
     word, quote, escaped = "", "", False
     for character in line:
         if escaped:
@@ -148,14 +151,14 @@ def _last_word(line: str) -> tuple[str, str]:
 
 
 def _with_flag(value: str, typed: str) -> str:
-    """Return a value, with the flag in front of it if the user is typing --option=VALUE."""
+    """Prefix a value with its flag if the user is typing --option=VALUE."""
     word = "".join(split_arg_string(typed))
     option, equals, _ = word.partition("=")
     return f"{option}={value}" if equals and option.startswith("-") else value
 
 
 def _quote_for_bash(value: str, quote: str) -> str:
-    """Return a value quoted for bash. `quote` is the quotation mark that is still open; empty if there is none."""
+    """Escape a value for bash. `quote` is an unclosed quotation mark before it, or an empty string."""
     if quote == "'":
         return value.replace("'", "'\\''")
     if quote:
@@ -164,15 +167,15 @@ def _quote_for_bash(value: str, quote: str) -> str:
 
 
 def complete(completer: str, options: CommonOptions, incomplete: str) -> list[CompletionItem[str]]:
-    """Return the completions of an incomplete word.
+    """Return the completions for a partially typed word.
 
     Args:
-        completer: the name of the completer; "files" lets the shell complete a file.
+        completer: the name of the completer, or "files" to let the shell complete file names.
         options: the common options that were typed before the word.
-        incomplete: the beginning of the word.
+        incomplete: the part of the word that has been typed.
 
     Returns:
-        The matching values, each once. After an error, for example without a server, there are none.
+        The matching values, without duplicates. The list is empty after an error, for example if there is no server.
     """
     if completer == "files":
         return [CompletionItem(incomplete, type="file")]
@@ -189,7 +192,7 @@ def complete(completer: str, options: CommonOptions, incomplete: str) -> list[Co
 
 
 def _matches(value: str, incomplete: str) -> bool:
-    # A value with invisible characters couldn't be recognised, and would reach the terminal unescaped.
+    # Leave out values with invisible characters, because the shell would write them to the terminal unescaped.
     return bool(value) and value.startswith(incomplete) and value.isprintable()
 
 
@@ -200,7 +203,7 @@ def goal_ids(options: CommonOptions, incomplete: str) -> Offers:
 
 
 def known_ids(options: CommonOptions, incomplete: str) -> Offers:
-    """Offer the ids of all goals: first those of unfinished goals, then the newest."""
+    """Offer the ids of unfinished goals, followed by those of the latest ended goals."""
     with options.connect(COMPLETION_TIMEOUT_S) as client:
         status, ended = client.status(), client.log(_MAX_ENDED_GOALS)
     return _offer_ids([*unfinished(status), *reversed(ended)], status, incomplete)
@@ -218,9 +221,9 @@ def unfinished_keys(options: CommonOptions, _: str) -> Offers:
 
 
 def voices(options: CommonOptions, incomplete: str) -> Offers:
-    """Offer the languages of the voices. If none of them matches, offer the ids, or else the names.
+    """Offer the languages of the voices. If no language matches, offer voice ids or names.
 
-    Neural voices are few and are called by their ids, so these ids are offered together with the languages.
+    Neural voices are always offered by id, because there are few of them and users select them by id.
     """
     with options.connect(COMPLETION_TIMEOUT_S) as client:
         found = client.voices()
@@ -234,7 +237,7 @@ def voices(options: CommonOptions, incomplete: str) -> Offers:
 
 
 def robots(options: CommonOptions, _: str) -> Offers:
-    """Offer the robots of the fleet that are online, and their groups."""
+    """Offer the names and groups of the robots that are online."""
     broker = options.broker()
     from talkcli.fleet import topics
     from talkcli.fleet.desk.watch import read_robots
@@ -261,7 +264,7 @@ def _status(options: CommonOptions) -> ServerStatus:
 
 
 def _offer_ids(goals: Iterable[Goal], status: ServerStatus, incomplete: str) -> Offers:
-    """Offer the ids of goals. If digits were typed, also offer the bare numbers of this server's goals."""
+    """Offer goal ids. If the user has typed digits, also offer short ids such as 12."""
     own = f"{status.server.get('boot')}-" if incomplete.isascii() and incomplete.isdecimal() else ""
     return [(name, _goal_help(each)) for each in goals for name in dict.fromkeys((each.id.removeprefix(own), each.id))]
 

@@ -1,6 +1,6 @@
-"""The displays of `--feedback`: JSON objects, lines, or the sentence with the current word highlighted.
+"""The displays for `--feedback`: JSON, plain lines, or a sentence with the current word highlighted.
 
-These classes only show the events that they are given. They never wait, and don't know which client owns a goal.
+These classes only display events. They never wait, and they don't know which client owns a goal.
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import Goal
     from talkcli.protocol.events import Event
 
-#: The goal's id and state are left out if they would leave fewer columns than this for the text.
+#: The minimum width of the text. If it doesn't fit beside the goal's id and state, they are left out.
 _MIN_SENTENCE_COLUMNS = 20
-#: Terminal codes for the current word, for the text after it, and for normal text.
+#: Terminal codes that style the current word, the text after it, and normal text.
 _WORD_STYLE, _UNHEARD_STYLE, _NORMAL_STYLE = "\x1b[1;7m", "\x1b[2m", "\x1b[0m"
-#: Moves to the start of the line and clears it.
+#: Terminal code that clears the current line and moves the cursor to its start.
 _CLEAR_LINE = "\r\x1b[2K"
 
 
 def make_feedback(options: CommonOptions) -> Feedback:
-    """Return the kind of feedback that fits the options and standard output."""
+    """Create the display that suits the options and standard output."""
     if options.json:
         return _JsonFeedback()
-    # With another encoding, characters may not have the width that is expected.
+    # With other encodings, the displayed width of characters is unknown.
     utf_8 = sys.stdout is not None and sys.stdout.encoding.lower().replace("-", "") == "utf8"
     return _TerminalFeedback() if utf_8 and has_colour() else _LineFeedback()
 
 
 class _JsonFeedback(Feedback):
-    """Feedback with a JSON object for each event."""
+    """Prints each event as a JSON object."""
 
     shows_events = True
 
@@ -53,12 +53,15 @@ class _JsonFeedback(Feedback):
 
 
 class _LineFeedback(Feedback):
-    """Feedback with a line for each event. Spaces separate the fields, so only the last field can contain spaces."""
+    """Prints each event as a line.
+
+    Fields are separated by spaces, so only the last field can contain spaces.
+    """
 
     shows_events = True
 
     def __init__(self) -> None:
-        #: the last state that was shown, by the id of an unfinished goal
+        #: the last state shown for each unfinished goal, by goal id
         self._shown: dict[str, State] = {}
 
     def show(self, goal: Goal, event: Event) -> None:  # noqa: ARG002
@@ -74,16 +77,16 @@ class _LineFeedback(Feedback):
             self._shown.pop(event.goal.id, None)
 
     def _show_state(self, goal_id: str, state: State) -> None:
-        # The end of a goal is a state and a result. If the goal had ended before or was lost, it is only a result.
+        # The end of a goal is usually reported twice, as a new state and as a result. Print it only once.
         if self._shown.get(goal_id) is not state:
             self._shown[goal_id] = state
             show(f"{printable(goal_id)} {state.name}")
 
 
 class _TerminalFeedback(Feedback):
-    """Feedback that shows the sentence on one line of a terminal and highlights each word as it is heard.
+    """Shows the sentence on one line of a terminal and highlights each word as it is spoken.
 
-    The line is rewritten in place and is never wider than the terminal, so only a part of a long text is shown. When
+    The line is rewritten in place and is never wider than the terminal, so only part of a long text is visible. When
     the goal ends, the whole sentence is written.
     """
 
@@ -91,7 +94,7 @@ class _TerminalFeedback(Feedback):
 
     def __init__(self) -> None:
         self._line: _GoalLine | None = None
-        #: held while anything is written, because resizing also repaints the line, in a thread of its own
+        #: held during output, because another thread repaints the line when the terminal is resized
         self._writing = threading.Lock()
         self._resizes = _ResizeWatcher(self._paint)
 
@@ -106,7 +109,7 @@ class _TerminalFeedback(Feedback):
         line = self._line
         if isinstance(event, Result):
             self._end(event.goal)
-        elif isinstance(event, PausedChanged):  # a pause concerns all speech
+        elif isinstance(event, PausedChanged):  # pausing affects all goals
             if line:
                 line.paused = event.paused
         elif line is None or (line.goal.id != goal.id and _is_spoken(event)):
@@ -114,7 +117,7 @@ class _TerminalFeedback(Feedback):
             self._line.update(event)
         elif line.goal.id == goal.id:
             line.update(event)
-        else:  # another goal keeps the line until this one is spoken
+        else:  # the line shows another goal until this one is spoken
             return
         self._paint()
 
@@ -126,7 +129,7 @@ class _TerminalFeedback(Feedback):
         self._paint()
 
     def close(self) -> None:
-        """Write the whole sentence of the current line, and end it."""
+        """Write the current goal's whole sentence, and end the line."""
         self._resizes.close()
         if self._line:
             self._write_whole(self._line)
@@ -141,7 +144,7 @@ class _TerminalFeedback(Feedback):
         self._write_whole(ended)
 
     def _write_whole(self, line: _GoalLine) -> None:
-        """Write a goal's state and its whole sentence, on as many lines as it takes."""
+        """Write a goal's state and its whole sentence, which may take several lines."""
         ended = line.state is State.SUCCEEDED
         heard, unheard = (line.text.whole, "") if ended else line.text.split(line.word[1])
         with self._writing:
@@ -152,7 +155,7 @@ class _TerminalFeedback(Feedback):
 
     def _paint(self) -> None:
         with self._writing:
-            line = self._line  # another thread may remove it
+            line = self._line  # another thread may set `_line` to None
             if line:
                 _write(line.painted())
 
@@ -160,8 +163,8 @@ class _TerminalFeedback(Feedback):
 class _ResizeWatcher(threading.Thread):
     """A thread that calls a function when the terminal is resized.
 
-    It waits for the signal, because a signal handler would end the wait for goals (see `interrupts`). macOS
-    discards a signal without a handler, so there the next event shows the new size.
+    It uses `sigwait`, because a signal handler would interrupt the wait for goals (see `interrupts`). macOS discards
+    signals without a handler, so on macOS the line only adapts to the new width at the next event.
     """
 
     def __init__(self, on_resize: Callable[[], None]) -> None:
@@ -171,7 +174,7 @@ class _ResizeWatcher(threading.Thread):
         self._blocked = {signal.SIGWINCH} - signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGWINCH})
         try:
             self.start()
-        except RuntimeError:  # the limit of threads is reached, so the next event shows the new size
+        except RuntimeError:  # no more threads can be started, so the line only adapts at the next event
             self._closed = True
 
     def run(self) -> None:
@@ -189,7 +192,7 @@ class _ResizeWatcher(threading.Thread):
 
 
 class _GoalLine:
-    """The content of the line: a goal, its state, and the current word."""
+    """The goal, the state and the current word that a line shows."""
 
     def __init__(self, goal: Goal) -> None:
         self.goal = goal
@@ -197,20 +200,20 @@ class _GoalLine:
         self.state = State.PENDING if goal.state.terminal else goal.state
         self.text = MeasuredText(TEXT_NOT_KEPT if goal.text is None else goal.text)
         heard = len(goal.spoken or "")
-        #: the indices in the text at which the current word begins and ends
+        #: the start and end of the current word, as indices into the text
         self.word = (heard, heard)
 
     def update(self, event: Event) -> None:
-        """Update the word or the state from an event of the goal."""
+        """Update the current word or the state after an event."""
         if isinstance(event, WordHeard):
             self.word = (event.start, event.end)
         elif isinstance(event, StateChanged) and event.state is not State.PENDING:
-            # PENDING may be reported late, after the goal was read in a later state.
+            # A PENDING event may arrive late, when the goal is already in a later state.
             self.state = event.state
 
     def painted(self) -> str:
-        """Return the line with its colours and its position on the terminal."""
-        # The last column stays free, because some terminals move to the next line as soon as it is written.
+        """Return the line as text with terminal codes."""
+        # Leave the last column free, because some terminals start a new line as soon as it is filled.
         columns = (terminal_columns(sys.stdout) or DEFAULT_COLUMNS) - 1
         state = "PAUSED" if self.paused and self.state is State.ACTIVE else self.state.name
         head = f"{printable(self.goal.id)}  {Screen(colour=True).coloured(f'{state:<9}', self.state)}  "
@@ -226,7 +229,7 @@ def _is_spoken(event: Event) -> bool:
 
 
 def _write(text: str) -> None:
-    """Write to the terminal without Python's buffer. If the terminal is busy, wait for it."""
+    """Write to the terminal without buffering, and wait if the terminal isn't ready."""
     data = text.encode(errors="backslashreplace")
     fd = sys.stdout.fileno()
     while data:

@@ -1,4 +1,4 @@
-"""The commands for fleets: `talk bridge` connects a robot to a broker, and `talk fleet` shows all robots."""
+"""The commands `talk bridge`, which connects a robot to a broker, and `talk fleet`, which shows all robots."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 def bridge(options: CommonOptions, print_unit: str | None, print_acl: bool, **given: Any) -> int:
-    """Run the bridge, or print its systemd unit or the access rules for the broker. Return the exit code."""
+    """Run the bridge, or print its systemd unit or the broker's access rules. Return the exit code."""
     _check_names("--name", [] if given["name"] is None else [given["name"]])
     if print_acl:
         show(topics.access_rules(homeassistant=given["homeassistant"], name=given["name"]))
@@ -72,7 +72,10 @@ def _check_names(option: str, names: Sequence[str]) -> None:
 
 
 def fleet(options: CommonOptions, what: str) -> int | None:
-    """Show the state of each robot, or watch all robots. Return the exit code, or None for 0."""
+    """Show the state of each robot, or watch the robots until interrupted.
+
+    Return the exit code, or None for success.
+    """
     broker = options.broker()
     text = paths.named_robot(options.robot, options.socket)
     selection = None if text is None else Selection(text)
@@ -90,7 +93,7 @@ def fleet(options: CommonOptions, what: str) -> int | None:
 
 
 def _no_robot_error(broker: Broker, selection: Selection | None) -> ServerUnavailable:
-    """Return the error for a selection that matches no robot."""
+    """Return the error to raise if no robot matches the selection."""
     if selection is None:
         return ServerUnavailable(f"no robot is known at {broker.url}; on each robot: talk bridge --name NAME")
     if selection.group is not None:
@@ -107,7 +110,7 @@ def _watch(options: CommonOptions, broker: Broker, selection: Selection | None) 
     if not has_reader():
         return EXIT_SIGPIPE
     transcript = FleetTranscript(full=screen().width is None)
-    # If the output were not watched, a closed pipe would be noticed only at the next event.
+    # Watch the output, too. Otherwise, a closed pipe would only be noticed at the next event.
     with Interrupts(output=True) as interrupts:
         for event in FleetWatch(broker, selection).events(interrupts.watched):
             _show_event(options, broker, transcript, event)
@@ -115,7 +118,7 @@ def _watch(options: CommonOptions, broker: Broker, selection: Selection | None) 
 
 
 def _show_event(options: CommonOptions, broker: Broker, transcript: FleetTranscript, event: FleetEvent) -> None:
-    """Show an event on standard output. A lost or recovered broker is reported on standard error."""
+    """Print an event. Messages about a lost or recovered broker go to standard error."""
     from talkcli.fleet.desk.watch import BrokerAway, EventsMissed, FleetSnapshot, RobotChanged, RobotEvent
 
     now = time.time()
