@@ -1,6 +1,6 @@
-"""Signals and closed output, which end a command's wait.
+"""Handling of signals and closed output while a command waits.
 
-A signal makes a descriptor readable, so it never interrupts a read or a write halfway. Standard output is polled
+A signal makes a file descriptor readable, so it never interrupts a read or a write halfway. Standard output is polled
 together with this descriptor. If a goal was sent early, `plain` blocks signals until `Interrupts` is entered.
 """
 
@@ -24,40 +24,43 @@ _HANDLED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def discard_unread_output() -> None:
-    """Discard all output if it has no reader. Commands call this before they write anything."""
+    """Discard all output if nothing reads it.
+
+    Commands call this before they write anything.
+    """
     if not has_reader():
         discard_output()
 
 
 def has_reader() -> bool:
-    """Return whether standard output is open and something reads it."""
-    # POLLNVAL doesn't count, because macOS reports it for a terminal.
+    """Return whether standard output is open and has a reader."""
+    # POLLNVAL is ignored, because macOS reports it for terminals.
     return sys.stdout is not None and not _poll_output() & (select.POLLERR | select.POLLHUP)
 
 
 def _poll_output() -> int:
-    """Return the poll events of standard output. A file never has any."""
+    """Poll standard output, and return its events."""
     poll = select.poll()
     poll.register(STDOUT_FD, 0)
     return next((events for _, events in poll.poll(0)), 0)
 
 
 class Interrupts:
-    """A context in which SIGINT, SIGTERM, SIGHUP or closed output ends a wait.
+    """A context manager that ends a wait on SIGINT, SIGTERM, SIGHUP or closed output.
 
-    Pass `watched` to `wait_ready` as `interrupt`. The context suppresses the Interrupted that is raised then, and
-    `exit_code` is the exit code of the command. A second signal ends the process at once. A second SIGHUP is ignored,
-    because the shell and the system both send one when a terminal is closed.
+    Pass `watched` to `wait_ready` as `interrupt`. The context manager suppresses the Interrupted exception that ends
+    the wait, and provides the command's `exit_code`. A second signal ends the process at once. A second SIGHUP is
+    ignored, because the shell and the system both send one when a terminal is closed.
     """
 
     def __init__(self, blocked: Iterable[int] = (), *, output: bool = False) -> None:
-        """Prepare the context.
+        """Initialize the context manager.
 
         Args:
             blocked: signals that were blocked earlier and can be handled now.
-            output: whether the wait ends if the reader of standard output goes away.
+            output: whether to end the wait if the reader of standard output goes away.
         """
-        #: the signal that was received, or None
+        #: the first signal that was received, or None
         self.signal_number: int | None = None
         #: whether the reader of standard output has gone away
         self.reader_gone = False
@@ -66,20 +69,20 @@ class Interrupts:
 
     @property
     def exit_code(self) -> int:
-        """The exit code for the signal or the missing reader that has ended the wait."""
+        """The command's exit code after a signal or closed output has ended the wait."""
         return EXIT_SIGPIPE if self.signal_number is None else EXIT_SIGNAL + self.signal_number
 
     def __enter__(self) -> Interrupts:
         self._descriptor, self._write = os.pipe()
         os.set_blocking(self._write, False)
-        #: the poll events to wait for, by descriptor; callers may add descriptors of their own
+        #: the poll events to wait for, by file descriptor; callers may add other descriptors
         self.watched = {self._descriptor: select.POLLIN}
-        if self._output and not _poll_output() & select.POLLNVAL:  # POLLNVAL would end every wait at once
+        if self._output and not _poll_output() & select.POLLNVAL:  # with POLLNVAL, every wait would end at once
             self.watched[STDOUT_FD] = 0
-        # Python runs handlers later, in the main thread, so a handler couldn't end a wait that is just starting. The
-        # wakeup descriptor is written at once.
+        # Python runs signal handlers with a delay, so a handler couldn't end a wait that is just starting. The wakeup
+        # descriptor is written immediately.
         self._old_wakeup_fd = signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
-        # A shell starts background commands with SIGINT ignored. Ignored signals stay ignored.
+        # Keep ignored signals ignored. For example, shells start background commands with SIGINT ignored.
         self._old_handlers = {
             each: signal.signal(each, self._handle_signal)
             for each in _HANDLED_SIGNALS
@@ -106,9 +109,9 @@ class Interrupts:
         self.reader_gone = self.reader_gone or (STDOUT_FD in self.watched and not has_reader())
 
     def record(self, error: Interrupted | OSError) -> None:
-        """Record why the wait has ended, and discard all output if its reader is gone.
+        """Record what ended the wait, and discard all output if its reader is gone.
 
-        Any error other than an interrupt, a timeout or a missing reader is raised again.
+        Errors other than an interrupt, a timeout or a missing reader are raised again.
         """
         if isinstance(error, OSError) and not isinstance(error, TimeoutError):
             if not reader_is_gone(error):
@@ -119,9 +122,12 @@ class Interrupts:
             discard_output()
 
     def reset(self) -> None:
-        """Stop watching everything but the first signal, so that the command can clean up."""
+        """Let the command clean up after its wait was interrupted.
+
+        During the cleanup, only a signal can end a wait.
+        """
         if self.signal_number is not None:
-            signal.set_wakeup_fd(-1)  # so that a second SIGHUP does nothing
+            signal.set_wakeup_fd(-1)  # a second SIGHUP must not interrupt the cleanup
         self.check_reader()
         self.watched.pop(STDOUT_FD, None)
         os.set_blocking(self._descriptor, False)

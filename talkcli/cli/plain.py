@@ -1,11 +1,11 @@
-"""A lightweight parser for plain command lines, which need no help text and no error message.
+"""A lightweight parser for simple command lines, which doesn't need click.
 
-It uses the same rows as click's parser, and the same function to read values. It leaves any doubtful line to click:
-unknown options, several flags in one word, invalid values, and options that contradict each other.
+It uses the same table of commands as the click version, and the same function to parse option values. Click handles all
+other command lines, such as those with unknown options, combined short flags, invalid values or conflicting options.
 
-For some commands the request is sent before the rest of the program is imported. This is only done if the request can't
-be wrong, so that no error is found after it was sent. It is the same request that the client library would send (a test
-compares them), and `SocketConnection` then continues with it.
+Some commands send their request before the rest of the program is imported. They only do this if the request is known
+to be valid, so that no error is found after it was sent. It is the same request that the client library would send (a
+test compares them), and `SocketConnection` then handles the server's answer.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
     from talkcli.goals.options import Option
 
-    #: The option of each flag, with the value that the flag stands for if it takes none.
+    #: Maps each flag to its option, and to the option's value if the flag takes no argument.
     Flags = dict[str, tuple[Option, bool]]
 
 _COMMON_NAMES = {each.name for each in COMMON_OPTIONS}
-#: The commands whose request may be sent before the rest of the program is imported.
+#: Commands that may send their request before the rest of the program is imported.
 _EARLY_COMMANDS = ("say", "cancel", "status", "pause", "resume")
 
 
@@ -42,7 +42,7 @@ class PlainCommand:
     """A parsed command line."""
 
     command: Command
-    #: the values of the command's own options and of its argument, by name
+    #: the values of the command's own options and its argument, by name
     given: dict[str, Any]
     #: the values of the common options on the command line, by name
     common: dict[str, Any]
@@ -51,7 +51,7 @@ class PlainCommand:
 
 
 def read(arguments: list[str], environment: Mapping[str, str]) -> PlainCommand | None:
-    """Parse a command line; None if click has to parse it."""
+    """Parse a command line, or return None if click has to parse it."""
     try:
         return _parse(arguments, environment)
     except (ValueError, StopIteration):  # an option's value is invalid or missing
@@ -89,7 +89,7 @@ def _flag_table(options: Iterable[Option]) -> Flags:
 
 
 def _read_option(flags: Flags, word: str, rest: Iterator[str], given: dict[str, Any]) -> bool:
-    """Read an option and its value into `given`. Return False if click has to read it."""
+    """Parse an option into `given`. Return False if click has to parse it."""
     name, equals, text = word.partition("=")
     if name not in flags or (equals and name[:2] != "--"):
         return False
@@ -103,7 +103,7 @@ def _read_option(flags: Flags, word: str, rest: Iterator[str], given: dict[str, 
 def _add_defaults(
     command: Command, given: dict[str, Any], words: list[str], environment: Mapping[str, str]
 ) -> PlainCommand | None:
-    """Add the argument and the values that were not given; None if click has to report an error."""
+    """Add the argument and default values. Return None if click has to report an error."""
     common = {name: given.pop(name) for name in _COMMON_NAMES & given.keys()}
     typed = frozenset(given)
     for option in command.options:
@@ -122,13 +122,13 @@ def _add_defaults(
 
 
 def run(plain: PlainCommand) -> int:
-    """Run a plain command, and return its exit code."""
+    """Run a parsed command, and return its exit code."""
     started_at = time.monotonic()
     command, given = plain.command.name, plain.given
     blocked: set[int] = set()
 
     def block_signals() -> None:
-        # A signal must cancel a goal that was sent, so it has to wait until the command can do that.
+        # A signal must cancel the goal, so block signals until the command is able to do that.
         wanted = {_signal.SIGINT, _signal.SIGTERM, _signal.SIGHUP} if command == "say" else set()
         blocked.update(wanted - _signal.pthread_sigmask(_signal.SIG_BLOCK, wanted))
 
@@ -137,7 +137,7 @@ def run(plain: PlainCommand) -> int:
         if early and early.request_sent and given.get("wait") and not given.get("feedback"):
             early = yield_processor(early, given["timeout"])
     except KeyboardInterrupt:
-        return 128 + int(_signal.SIGINT)  # nothing was sent
+        return 128 + int(_signal.SIGINT)  # no request has been sent
     from talkcli.cli.show import CommonOptions, run_command
 
     options = CommonOptions(
@@ -147,9 +147,9 @@ def run(plain: PlainCommand) -> int:
 
 
 def may_send_early(plain: PlainCommand) -> bool:
-    """Return whether the request of a command may be sent early.
+    """Return whether the request may be sent before the rest of the program is imported.
 
-    The command must use the local server, and must not read standard input first, because that can take any time.
+    The command must use the local server, and must not need standard input, which may take any time to arrive.
     """
     if named_robot(plain.common.get("robot"), plain.common.get("socket")):
         return False
@@ -157,7 +157,7 @@ def may_send_early(plain: PlainCommand) -> bool:
 
 
 def _connect_early(plain: PlainCommand, before_sending: Callable[[], None]) -> ConnectionAttempt | None:
-    """Connect to the server and send the request, but don't wait for a slow server.
+    """Connect to the server and send the request, without waiting for a slow server.
 
     Returns:
         The connection and its progress, or None if the connection broke before anything was sent.
@@ -165,13 +165,13 @@ def _connect_early(plain: PlainCommand, before_sending: Callable[[], None]) -> C
     early = reach(named_socket(plain.common.get("socket")))
     if early.socket is None:
         return early
-    # The messages are made after connecting, because the server sends its greeting in the meantime.
+    # Connect before creating the messages, so that the server can send its greeting in the meantime.
     messages = early_messages(plain)
     return send_early(early, *messages, before_sending) if messages else early
 
 
 def early_messages(plain: PlainCommand) -> tuple[JsonObject, JsonObject] | None:
-    """Return the hello and the request of a command; None if the request may be refused or needs the library."""
+    """Return a command's hello and request messages, or None if the client library has to send them."""
     command, name = plain.command, sender_name(plain.given.get("name"))
     request = _early_request(command.name, plain.given)
     if request is None or len(name or "") > MAX_SENDER_NAME_CHARS:
@@ -187,7 +187,7 @@ def _early_request(command: str, given: dict[str, Any]) -> JsonObject | None:
         return write_request(say) if say else None
     if command == "cancel":
         ids, before, key = given["ids"], given["before"], given["key"]
-        # Several ids may contain duplicates, or be too many for one request.
+        # Leave several ids to the library. They may contain duplicates or be too many for one request.
         if len(ids) > 1 or not all(map(_is_full_id, [*ids, before or "-"])) or (key and key_error(key)):
             return None
         return write_request(Cancel(ids or None, given["current"], before, key))
@@ -198,17 +198,20 @@ def _early_request(command: str, given: dict[str, Any]) -> JsonObject | None:
 
 
 def _is_full_id(goal_id: str) -> bool:
-    """Return whether an id can be sent as it is. A bare number can't, because the library adds the server's boot id."""
+    """Return whether a goal id is complete.
+
+    A number such as 12 isn't complete, because the library has to add the server's boot id.
+    """
     return 0 < len(goal_id) <= MAX_ID_CHARS and not goal_id.isdecimal()
 
 
 def _say_request(given: dict[str, Any]) -> Say | None:
-    """Return the request to say a text; None if the text must be changed or may be too long for a request."""
+    """Return the request to say a text, or None if the text contains invalid UTF-8 or may be too long."""
     options = {each.name: given[each.name] for each in Say.options if each.name in given}
     say = Say(**{**options, "text": " ".join(given["text"]), "wait": given["wait"] or given["feedback"]})
     try:
         say.text.encode()
     except UnicodeEncodeError:
         return None
-    # A text of this length fits into a request even if each of its characters has to be escaped.
+    # A text of this length fits into one request even if every character has to be escaped.
     return None if len(say.text) + len(say.voice or "") > MAX_TEXT_CHARS else say

@@ -1,7 +1,7 @@
-"""`talk say`: send a sentence and report how it ends, or write it into a file with `-o`.
+"""The command `talk say`, which speaks a text or writes the speech to a file.
 
-`stdin` has the options that read standard input. This module must not need click, because plain command lines are run
-without it. Only `-o` imports the engine, because it needs no server.
+`stdin` reads standard input. This module must not import click, because simple command lines are run without it. Only
+`-o` imports the engine, because it works without a server.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def say(
     output: str | None,
     **goal_options: Any,
 ) -> int:
-    """Speak a text or each line of standard input, or write the text into a file. Return the exit code.
+    """Speak a text or the lines of standard input, or write the speech to a file. Return the exit code.
 
     Args:
         options: the options of every command.
@@ -70,7 +70,7 @@ def say(
             reporter = GoalReporter(options, feedback=feedback)
             return retry_without_output(reporter.report_refused, rejected_goal(str(error)))
         if isinstance(read, int):
-            return read  # nothing was sent
+            return read  # a signal or closed output has ended the reading
         sentence = read
     if output is not None:
         return _write_file(output, sentence, goal_options, timeout, options)
@@ -92,7 +92,7 @@ def _say_text(
         try:
             with options.connect(timeout, name=name, interrupt=interrupts.watched) as client:
                 if interrupts.signal_number is not None and not (options.early and options.early.request_sent):
-                    raise Interrupted  # a goal that was sent early is cancelled below, when its id is known
+                    raise Interrupted  # a goal that was sent early is cancelled below, once its id is known
                 goal = client.say(text, follow=wait, feedback=feedback, **goal_options)
                 reporter = GoalReporter(options, feedback=feedback)
                 if wait and goal.state is not State.REJECTED:
@@ -108,7 +108,7 @@ def _say_text(
 
 
 def _without_bad_bytes(text: str, options: CommonOptions) -> str:
-    """Return a text without bytes that aren't UTF-8, and print a note about them."""
+    """Replace bytes that aren't valid UTF-8, and print a message about them."""
     text, problem = replace_bad_bytes(text)
     if problem and not options.quiet:
         note(problem)
@@ -116,7 +116,7 @@ def _without_bad_bytes(text: str, options: CommonOptions) -> str:
 
 
 def _report_sent(goal: GoalHandle, options: CommonOptions, reporter: GoalReporter) -> int:
-    """Report a goal for which the command doesn't wait, and return the exit code."""
+    """Report whether a goal was accepted or rejected, and return the exit code."""
     if goal.state is State.REJECTED:
         code = reporter.report_refused(goal.goal)
         if goal.goal.reason == "text_too_long" and not options.quiet:
@@ -130,10 +130,10 @@ def _report_sent(goal: GoalHandle, options: CommonOptions, reporter: GoalReporte
 def _wait_for_goal(
     goal: GoalHandle, interrupts: Interrupts, timeout: float | None, options: CommonOptions, reporter: GoalReporter
 ) -> int:
-    """Wait for a goal, report its end, and return the exit code.
+    """Wait until a goal has ended, report how it ended, and return the exit code.
 
-    The goal belongs to this command, so it is cancelled if the wait ends first. A goal that an earlier command has sent
-    with the same id isn't cancelled.
+    The goal is cancelled if the wait is interrupted or times out. However, if an earlier command has already sent a
+    goal with the same id, that goal isn't cancelled.
     """
     try:
         reporter.show_accepted(goal)
@@ -156,7 +156,7 @@ def _wait_for_goal(
 def _write_file(
     path: str, text: str, goal_options: Mapping[str, Any], timeout: float | None, options: CommonOptions
 ) -> int:
-    """Write the speech into a file, or to standard output for "-", and return the exit code."""
+    """Write the speech to a file, or to standard output if the path is "-". Return the exit code."""
     from talkcli.engine.parent.render import STANDARD_OUTPUT, render
 
     settings, seconds_at_most = _sound_settings(goal_options), seconds_left(options.deadline(timeout))
@@ -172,12 +172,12 @@ def _write_file(
             return interrupts.exit_code
     if options.json:
         result = {"output": path, "seconds": seconds, "text": text, **settings}
-        retry_without_output(show_if_possible, show_json, result)  # the file has been written in any case
+        retry_without_output(show_if_possible, show_json, result)  # the file has been written, even if this fails
     return EXIT_OK
 
 
 def _sound_settings(goal_options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings for the engine. Like a server, take missing ones from the environment."""
+    """Return the engine's settings from the options or from environment variables."""
     found = {}
     for option in SOUND_OPTIONS:
         value, text = goal_options[option.name], os.environ.get(option.env) if option.env else None

@@ -1,4 +1,7 @@
-"""`talk serve`: run the server, or print a systemd unit for it. No other command imports the server."""
+"""The command `talk serve`, which runs the server or prints a systemd unit for it.
+
+No other command imports the server.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ if TYPE_CHECKING:
 
     from talkcli.cli.show import CommonOptions
 
-#: The warning at the start if there is no sound device.
+#: The warning that is printed at startup if there is no sound device.
 _NO_DEVICE = (
     "no sound device is here, and no PulseAudio or PipeWire: plug in a loudspeaker, or hand it to the container ('talk "
     "doctor' says more); it is looked for with each sentence, which ends ABORTED until it is there; to speak without "
@@ -25,7 +28,10 @@ _NO_DEVICE = (
 
 
 def serve(options: CommonOptions, print_unit: str | None, **given: Any) -> int:
-    """Run the server, or print a systemd unit for it. Return the exit code. `given` are the other options, by name."""
+    """Run the server or print a systemd unit for it, and return the exit code.
+
+    `given` contains all other options, by name.
+    """
     if print_unit:
         units.print_server_unit(options, print_unit, given)
         return 0
@@ -39,12 +45,12 @@ def serve(options: CommonOptions, print_unit: str | None, **given: Any) -> int:
 
 
 def _warn_about_sound(player: str, driver: str | None) -> None:
-    """Warn if no sentence could be heard, because there is no sound device or no such player."""
+    """Warn if speech can't be heard because the sound device or the player is missing."""
     from talkcli.engine.players import PACKAGES, has_no_output, is_silent
     from talkcli.engine.voices import is_own_driver
 
     if is_silent(player) or not is_own_driver(driver):
-        return  # other drivers play by themselves, and the server says so
+        return  # other drivers play sound themselves, and the server reports this
     if (not player or player in PACKAGES) and has_no_output(os.environ):
         note(_NO_DEVICE)
     if player:
@@ -52,11 +58,11 @@ def _warn_about_sound(player: str, driver: str | None) -> None:
 
 
 def _warn_about_player(player: str) -> None:
-    """Warn about a player that was mistyped or is not installed."""
+    """Warn if the player's name is misspelled or the player isn't installed."""
     from talkcli.engine.players import PACKAGES, PLAYERS, PlayerMissing, player_commands
 
     if player in PLAYERS and player not in PACKAGES:
-        return  # this player isn't a program, so it can't be missing
+        return  # this player isn't an external program, so it can't be missing
     try:
         player_commands(player, None, 0)
     except PlayerMissing as error:

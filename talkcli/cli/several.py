@@ -1,6 +1,8 @@
-"""The commands that `--robot` can send to several robots: say, wait, cancel, status, set, pause and resume.
+"""The commands that can be sent to several robots with `--robot`.
 
-Each outcome is shown as a line `ROBOT ID STATE CODE` as soon as it arrives. The last line counts the robots that have
+They are say, wait, cancel, status, set, pause and resume.
+
+Each outcome is printed as a line `ROBOT ID STATE CODE` as soon as it arrives. The last line says how many robots have
 carried out the request. The same commands for a single server are in `say`, `wait` and `ask`.
 """
 
@@ -30,7 +32,7 @@ if TYPE_CHECKING:
     from talkcli.fleet.desk.request import Outcome
     from talkcli.fleet.desk.several import FleetRequest
 
-#: Limits for the notes about failures: names per note, and notes. Standard output has all failures.
+#: The maximum number of names in a message about failures, and of such messages. Standard output lists all failures.
 _MAX_NAMES, _MAX_NOTES = 5, 10
 
 
@@ -42,7 +44,10 @@ def say(
     name: str | None,
     **chosen: Any,
 ) -> int:
-    """Speak a text on each robot, and return the exit code. The arguments are those of `say.say`."""
+    """Speak a text on each robot, and return the exit code.
+
+    The arguments are explained in `say.say`.
+    """
     discard_unread_output()
     sentence = " ".join(text)
     if text == ("-",):
@@ -53,7 +58,7 @@ def say(
         except InputTooLong as error:
             raise UsageError(str(error)) from error
         if isinstance(read, int):
-            return read  # nothing was sent
+            return read  # a signal or closed output has ended the reading
         sentence = read
     sentence, unreadable = replace_bad_bytes(sentence)
     if unreadable and not options.quiet:
@@ -62,7 +67,7 @@ def say(
 
 
 def wait(options: CommonOptions, ids: tuple[str, ...], timeout: float | None) -> int:
-    """Wait until these goals, or all goals, have ended on each robot. Return the exit code."""
+    """Wait on each robot until the given goals, or all goals, have ended. Return the exit code."""
     discard_unread_output()
     return _ask(options, Wait(ids or None), timeout)
 
@@ -73,12 +78,12 @@ def cancel(options: CommonOptions, ids: tuple[str, ...], current: bool, before: 
 
 
 def status(options: CommonOptions, goal_id: str | None) -> int:
-    """Show the state of each robot, or of one goal on each robot. Return the exit code."""
+    """Show the status of each robot, or the state of one goal on each robot. Return the exit code."""
     return _ask(options, Status(goal_id))
 
 
 def change(options: CommonOptions, **settings: Any) -> int:
-    """Change the given settings on each robot, or show all settings if none is given. Return the exit code."""
+    """Change the given settings on each robot, or show all settings if none are given. Return the exit code."""
     return _ask(options, Set(**settings))
 
 
@@ -131,7 +136,7 @@ def _ask(options: CommonOptions, request: Request, timeout: float | None = None,
 
 
 def _cancel(fleet_request: FleetRequest, interrupts: Interrupts, printer: _OutcomePrinter) -> None:
-    """Cancel the goals that haven't ended, and wait briefly for silence."""
+    """Cancel all unfinished goals, and wait briefly until the robots are silent."""
     interrupts.reset()
     try:
         if fleet_request.unfinished_robots:
@@ -144,17 +149,21 @@ def _cancel(fleet_request: FleetRequest, interrupts: Interrupts, printer: _Outco
 
 
 class _OutcomePrinter:
-    """Shows outcomes as they arrive, and a summary at the end."""
+    """Prints each robot's outcome as it arrives, and a summary at the end."""
 
     def __init__(self, options: CommonOptions, request: Request) -> None:
         self._options, self._request = options, request
-        #: each robot's first failure, or its last outcome if nothing has failed. `last` is that of its last outcome.
+        #: each robot's first failure, or its latest outcome if nothing has failed; `last` always comes from the latest
+        #: outcome
         self._outcomes: dict[str, Outcome] = {}
         shows_count = not options.quiet and sys.stderr is not None and sys.stderr.isatty()
         self._terminal = sys.stderr if shows_count else None
 
     def show_outcomes(self, fleet_request: FleetRequest, timeout: float | None) -> None:
-        """Show all outcomes as they arrive. Raises the same errors as `FleetRequest.results`."""
+        """Print all outcomes as they arrive.
+
+        This raises the same errors as `FleetRequest.results`.
+        """
         try:
             self._show_count(fleet_request)
             for each in fleet_request.results(timeout):
@@ -167,17 +176,17 @@ class _OutcomePrinter:
 
     def _add(self, outcome: Outcome) -> None:
         before = self._outcomes.get(outcome.robot)
-        # A failure that was the last outcome is replaced, because the robot only seemed to be absent.
+        # If a robot answers after a failure that seemed final, it only appeared to be absent. Replace the failure.
         if before is not None and before.exit_code and not before.last:
             outcome = replace(before, last=outcome.last)
         self._outcomes[outcome.robot] = outcome
 
     def summarize(self, fleet_request: FleetRequest, unknown: str = "not done") -> int:
-        """Show how many robots carried out the request, and why others failed. Return the exit code.
+        """Print how many robots carried out the request and why others failed. Return the exit code.
 
         Args:
             fleet_request: the request.
-            unknown: how to describe the robots whose last outcome hasn't arrived.
+            unknown: the description of robots whose last outcome hasn't arrived.
         """
         failures = [each for each in self._outcomes.values() if each.exit_code]
         done = sum(each.last and not each.exit_code for each in self._outcomes.values())
@@ -203,7 +212,7 @@ class _OutcomePrinter:
             show_if_possible(show, f"{outcome.robot} {goal} {outcome.state} {outcome.exit_code}")
 
     def _show_count(self, fleet_request: FleetRequest) -> None:
-        """Show how many robots have finished, if standard error is a terminal."""
+        """Show the number of finished robots if standard error is a terminal."""
         if self._terminal:
             finished = sum(each.last for each in self._outcomes.values())
             self._terminal.write(f"\r{finished} of {len(fleet_request)}")
@@ -216,7 +225,7 @@ class _OutcomePrinter:
 
 
 def _failure_notes(failures: list[Outcome]) -> list[str]:
-    """Return a note for each kind of failure, with the robots' names and the first robot's reason."""
+    """Return one message for each kind of failure, with the robots' names and the first robot's reason."""
     alike: dict[tuple[str, int], list[Outcome]] = {}
     for each in failures:
         alike.setdefault((each.state, each.exit_code), []).append(each)
@@ -227,7 +236,7 @@ def _failure_notes(failures: list[Outcome]) -> list[str]:
 
 
 def _join_names(names: list[str]) -> str:
-    """Return the first few names, and the number of the remaining ones, as text."""
+    """Join the first few names, and append the number of remaining names."""
     more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
     return ", ".join(names[:_MAX_NAMES]) + more
 
@@ -235,5 +244,5 @@ def _join_names(names: list[str]) -> str:
 def _describe_failure(outcome: Outcome) -> str:
     """Return a human-readable reason for a failure."""
     if outcome.error is not None:
-        return outcome.error.message.removeprefix(f"{outcome.robot}: ")  # the note already names the robot
+        return outcome.error.message.removeprefix(f"{outcome.robot}: ")  # the message already contains the robot's name
     return describe_end(outcome.goal) if outcome.goal else outcome.state

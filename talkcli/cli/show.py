@@ -1,6 +1,6 @@
-"""Code shared by all commands: the common options, the connection to the server, output, notes and exit codes.
+"""Code shared by all commands: common options, connections, output and exit codes.
 
-Every error that ends a command becomes a message on standard error and an exit code.
+If an error ends a command, the error is reported on standard error and determines the exit code.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ if TYPE_CHECKING:
 
 #: The file descriptor of standard output.
 STDOUT_FD = 1
-#: Errors of writing to a full or broken disk.
+#: Error numbers for a full or broken disk.
 _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
-#: Whether output was lost because of such an error. The command goes on, but its exit code is not 0.
+#: Whether output was lost because of a disk error. The command continues, but its exit code isn't 0.
 _output_lost = False
-#: The width of a terminal that doesn't report one.
+#: The width to assume if a terminal doesn't report its width.
 DEFAULT_COLUMNS = 80
-#: Replaces a space at which a line must not be broken.
+#: Temporarily replaces a space at which a line must not be broken.
 _NO_BREAK_SPACE = "\0"
 
 
 class CommonOptions:
-    """The options that every command has, together with the connection that was made early."""
+    """The options of every command, and the connection that `plain` may have opened."""
 
     socket: str | None = None
     robot: str | None = None
@@ -50,33 +50,35 @@ class CommonOptions:
     json = False
     quiet = False
     connect_timeout: float | None = None
-    #: the connection that `plain` has made early; its request may have been sent
+    #: the connection that `plain` has opened, or None; the request may already have been sent
     early: ConnectionAttempt | None = None
     #: signals that stay blocked until the command can handle them
     blocked_signals: Iterable[int] = ()
-    #: the names of the options on the command line
+    #: the names of the options that were given on the command line
     typed: frozenset[str] = frozenset()
-    #: whether the command may connect to a server that has reached its client limit
+    #: whether the command may connect even if the server has reached its client limit
     urgent = False
 
     def __init__(self, **given: Any) -> None:
-        #: the start of the command (monotonic)
+        #: the monotonic time at which the command was started
         self.started_at = time.monotonic()
         vars(self).update(given)
 
     def deadline(self, timeout: float | None) -> float | None:
-        """Return the monotonic time at which a timeout ends. It is counted from the start of the command."""
+        """Return the monotonic time at which a timeout expires, counted from the start of the command."""
         return None if timeout is None else self.started_at + timeout
 
     def connect(self, timeout: float | None = None, **options: Any) -> Client:
-        """Connect to the server. The first call keeps trying for `connect_timeout` seconds.
+        """Connect to the server.
+
+        The first call keeps trying for `connect_timeout` seconds.
 
         Args:
-            timeout: seconds that the whole command may take. This also limits the wait for each answer.
+            timeout: time limit in seconds for the whole command, and for each answer from the server.
             options: further arguments of `SocketConnection`.
 
         Raises:
-            TimeoutError: `timeout` ended before a server was found. Only raised with `connect_timeout`.
+            TimeoutError: no server was found in time. This is only raised if `connect_timeout` is set.
         """
         from talkcli.client.client import Client
         from talkcli.client.connect import ANSWER_LIMIT_S
@@ -91,7 +93,7 @@ class CommonOptions:
             return Client.over(self._connection(keep_trying=seconds, **options))
         except ServerUnavailable as error:
             now = time.monotonic()
-            if connect_timeout is None or now < began + seconds:  # trying this server again is of no use
+            if connect_timeout is None or now < began + seconds:  # retrying wasn't requested or can't help
                 raise
             words = f"waited for {round(seconds, 1):g} s: {error.message}"
             if end is not None and now >= end:
@@ -99,7 +101,11 @@ class CommonOptions:
             raise ServerUnavailable(words) from None
 
     def broker(self) -> Broker:
-        """Return the address and login of the broker; UsageError if a setting or paho-mqtt is missing."""
+        """Return the broker's address and login.
+
+        Raises:
+            UsageError: a setting or paho-mqtt is missing.
+        """
         from talkcli.fleet.broker import from_environment, require_paho
 
         require_paho()
@@ -118,9 +124,9 @@ class CommonOptions:
 
 
 def run_command(command: Callable[[], object], options: CommonOptions) -> int:
-    """Run a command, and return its exit code. Errors are reported on standard error.
+    """Run a command, report its errors on standard error, and return its exit code.
 
-    If the command returns a number, that is its exit code. Any other value stands for 0.
+    If the command returns a number, that is its exit code. Any other value means success.
     """
     try:
         code = command()
@@ -148,7 +154,7 @@ def run_command(command: Callable[[], object], options: CommonOptions) -> int:
 
 
 def discard_output() -> None:
-    """Send all further output to /dev/null."""
+    """Redirect standard output to /dev/null."""
     _redirect_to_null(STDOUT_FD)
     if sys.stdout is None:
         # This file stays open as long as the process runs.
@@ -163,18 +169,20 @@ def _redirect_to_null(descriptor: int) -> None:
 
 def reader_is_gone(error: OSError) -> bool:
     """Return whether this error means that the reader of standard output is gone."""
-    if error.errno == errno.EIO:  # a closed terminal, or a broken disk
+    if error.errno == errno.EIO:  # EIO means a closed terminal or a broken disk
         return stat.S_ISCHR(os.fstat(STDOUT_FD).st_mode)
     return isinstance(error, BrokenPipeError)
 
 
 def handle_output_error(error: Exception) -> int | None:
-    """Discard all further output if it can't be written. A full or broken disk is reported.
+    """Discard further output if this error means that it can't be written.
+
+    A full or broken disk is reported.
 
     Returns:
-        The exit code for this error, or None if it has nothing to do with standard output.
+        The exit code for the error, or None if the error doesn't concern standard output.
     """
-    global _output_lost  # noqa: PLW0603 - the process has one standard output
+    global _output_lost  # noqa: PLW0603 - standard output is global, too
     if not isinstance(error, OSError):
         return None
     if reader_is_gone(error) or _is_read_only(error):
@@ -189,7 +197,7 @@ def handle_output_error(error: Exception) -> int | None:
 
 
 def _is_read_only(error: OSError) -> bool:
-    """Return whether this error means that standard output is open for reading only."""
+    """Return whether this error means that standard output is read-only."""
     if error.errno != errno.EBADF:
         return False
     import fcntl
@@ -198,7 +206,11 @@ def _is_read_only(error: OSError) -> bool:
 
 
 def show_if_possible(put: Callable[..., None], *what: object) -> None:
-    """Call a function that writes output. A full disk is reported and ignored; OSError if the reader is gone."""
+    """Call a function that writes output, but only report an error if the disk is full or broken.
+
+    Raises:
+        OSError: the reader of the output is gone.
+    """
     try:
         put(*what)
     except OSError as error:
@@ -207,7 +219,7 @@ def show_if_possible(put: Callable[..., None], *what: object) -> None:
 
 
 def retry_without_output(act: Callable[..., _T], *given: Any) -> _T:
-    """Call a function. If the reader of its output is gone, discard all output and call it again."""
+    """Call a function that writes output. If the reader is gone, discard all output and call it again."""
     try:
         return act(*given)
     except OSError as error:
@@ -218,29 +230,40 @@ def retry_without_output(act: Callable[..., _T], *given: Any) -> _T:
 
 
 def standard_output() -> TextIO:
-    """Return standard output; BrokenPipeError if it is closed."""
+    """Return `sys.stdout`.
+
+    Raises:
+        BrokenPipeError: standard output is closed.
+    """
     if sys.stdout is None:
         raise BrokenPipeError("standard output is closed")
     return sys.stdout
 
 
 def show(line: str) -> None:
-    """Write a line to standard output; BrokenPipeError if it is closed."""
+    """Write a line to standard output.
+
+    Raises:
+        BrokenPipeError: standard output is closed.
+    """
     stream = standard_output()
     stream.write(f"{line}\n")
     stream.flush()
 
 
 def show_json(message: JsonObject) -> None:
-    """Write an object as a line of JSON to standard output; BrokenPipeError if it is closed.
+    """Write an object to standard output as one line of JSON.
 
-    JSON is always in UTF-8, whatever the locale is. On a terminal invisible characters are escaped.
+    The encoding is always UTF-8, regardless of the locale. On a terminal, invisible characters are escaped.
+
+    Raises:
+        BrokenPipeError: standard output is closed.
     """
     _write_json(standard_output(), message)
 
 
 def show_result(options: CommonOptions, items: Iterable[JsonObject], lines: Callable[[], Iterable[str]]) -> None:
-    """Show a result: the JSON objects with --json, else the lines."""
+    """Print a result as JSON objects with --json, otherwise as lines of text."""
     if options.json:
         for item in items:
             show_json(item)
@@ -250,7 +273,7 @@ def show_result(options: CommonOptions, items: Iterable[JsonObject], lines: Call
 
 
 def _write_json(stream: TextIO, message: JsonObject) -> None:
-    from talkcli.protocol.lines import encode  # help and completion need no JSON
+    from talkcli.protocol.lines import encode  # imported here because help and completion don't use it
 
     line = encode(message)
     if stream.isatty():
@@ -263,7 +286,7 @@ def _write_json(stream: TextIO, message: JsonObject) -> None:
 
 
 def note(words: str) -> None:
-    """Write a message to standard error. On a terminal, its lines are wrapped."""
+    """Write a message to standard error, wrapped to the width of the terminal."""
     lines = f"talk: {words}"
     if sys.stderr is not None and sys.stderr.isatty():
         lines = _wrap(lines)
@@ -273,7 +296,7 @@ def note(words: str) -> None:
 def write_error_line(line: str = "") -> None:
     """Write a line to standard error if it is open."""
     if sys.stderr is not None:
-        # If the reader is gone, the command still does its work.
+        # The command must continue even if nothing reads its messages.
         try:
             sys.stderr.write(f"{line}\n")
             sys.stderr.flush()
@@ -282,7 +305,7 @@ def write_error_line(line: str = "") -> None:
 
 
 def terminal_columns(stream: TextIO) -> int:
-    """Return the width of a terminal, or 0 if the stream isn't a terminal or its width is unknown."""
+    """Return the width of a terminal, or 0 if it is unknown or the stream isn't a terminal."""
     try:
         return os.get_terminal_size(stream.fileno()).columns
     except OSError:
@@ -290,7 +313,7 @@ def terminal_columns(stream: TextIO) -> int:
 
 
 def _wrap(text: str) -> str:
-    """Return the text in lines that fit the terminal."""
+    """Wrap the text to the width of the terminal."""
     columns = terminal_columns(sys.stderr) or DEFAULT_COLUMNS
     if all(len(line) <= columns for line in text.split("\n")):
         return text
@@ -302,7 +325,7 @@ def _wrap(text: str) -> str:
     wrapper = textwrap.TextWrapper(
         max(columns, MIN_COLUMNS), subsequent_indent="      ", break_long_words=False, break_on_hyphens=False
     )
-    # A command stays on one line, so that it can be copied from the terminal.
+    # Don't break commands, so that they can be copied from the terminal.
     kept = re.sub(r"'[^'\n]*'|: (?:talk|sudo) .*", lambda found: found[0].replace(" ", _NO_BREAK_SPACE), text)
     return "\n".join(map(wrapper.fill, kept.split("\n"))).replace(_NO_BREAK_SPACE, " ")
 
@@ -316,17 +339,17 @@ def show_error(error: TalkError, *, json: bool) -> None:
         try:
             _write_json(sys.stderr, {"error": fields})
         except OSError:
-            _redirect_to_null(2)  # as in `write_error_line`
+            _redirect_to_null(2)  # continue without messages, as in `write_error_line`
 
 
 class Feedback:
-    """A display for the events of goals. This base class shows nothing, unlike those in `feedback`."""
+    """Base class for the displays in `feedback`. It shows no events itself."""
 
-    #: whether events are shown; the command itself then doesn't print ids and results
+    #: whether the display shows events; if so, the command itself doesn't print ids and results
     shows_events = False
 
     def begin(self, goals: Sequence[Goal]) -> None:
-        """Show the current state of these goals, before their first event."""
+        """Show the initial state of these goals."""
 
     def show(self, goal: Goal, event: Event) -> None:
         """Show an event of this goal."""
@@ -336,21 +359,21 @@ class Feedback:
         note(words)
 
     def close(self) -> None:
-        """End the display, so that other output can follow."""
+        """Finish the display before other output is written."""
 
 
 def has_colour() -> bool:
-    """Return whether standard output is a terminal that may show colours."""
+    """Return whether colours may be used on standard output."""
     return sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
 
 
 def screen() -> Screen:
-    """Return the current width and the colours of standard output."""
+    """Return the current width and the colour support of standard output."""
     from talkcli.terminal.text import Screen
 
     if sys.stdout is None or not sys.stdout.isatty():
         return Screen()
-    # COLUMNS comes second, because an exported value doesn't change when the window is resized.
+    # COLUMNS is only a fallback, because it may be outdated after the window has been resized.
     width = terminal_columns(sys.stdout)
     if not width:
         columns = os.environ.get("COLUMNS", "")
