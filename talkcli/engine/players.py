@@ -22,11 +22,11 @@ SAMPLE_BYTES = 2
 PIECE_S = 0.02
 
 #: Milliseconds of sound that a player may buffer. A larger buffer would delay words, and would lose more sound if the
-#: player stalls. A smaller buffer than three periods of 20 ms would cause gaps on a busy machine.
+#: player stalls. A buffer of less than three periods of 20 ms would cause gaps on a busy machine.
 BUFFER_MS = 60
 
-#: Milliseconds of sound to queue for aplay while it starts. It starts playing once its buffer is full, and it reads
-#: whole periods of 15 ms. If it had to wait for each piece of 20 ms, it would start 2 ms later (measured on a PC).
+#: Milliseconds of sound to queue for aplay while it starts. aplay starts playing once its buffer is full, and reads
+#: whole periods of 15 ms. If it received one piece of 20 ms at a time, it would start 2 ms later (measured on a PC).
 APLAY_START_MS = 80
 
 #: Bytes that a program may read before it opens its device (one block of standard input). If it reads more, it must be
@@ -112,9 +112,10 @@ def _au_header(rate: int) -> bytes:
     return b"dns." + struct.pack("<5I", 24, unknown_length, pcm16, rate, 1)
 
 
-#: The players by name. Unless the user names a player, classes are tried before programs, and otherwise in this order.
-#: The sound server comes first because it starts at once and reports more than any program does. aplay comes before the
-#: other programs because robots without a desktop have it, and because it loses no samples if it can't open the device.
+#: The players by name. If the user names no player, they are tried in this order, except that classes come before
+#: programs. The sound server comes first because it starts at once and reports more than any program does. aplay comes
+#: before the other programs because robots without a desktop have it, and because it loses no samples if it can't open
+#: the device.
 PLAYERS = {
     "aplay": KnownPlayer("ALSA", "alsa-utils", _aplay, automatic=True),
     "pacat": KnownPlayer("PulseAudio", "pulseaudio-utils", _pacat, automatic=True),

@@ -56,7 +56,7 @@ STOP_LIMIT_S = 0.15
 #: Time allowed for a killed process and its player to exit.
 KILL_LIMIT_S = 2.0
 #: Time allowed for confirming a pause. After that, the process is killed. This is twice as long as a client waits for a
-#: pause, because a third-party driver may first finish a word or more.
+#: pause, because a third-party driver may finish some words first.
 HOLD_LIMIT_S = 4.0
 
 # Outcomes of a `Speak`.
@@ -143,14 +143,14 @@ class NextGoal:
 class LoadVoice:
     """Load a neural voice in the background. The reply is one `VoiceLoaded`."""
 
-    voice: str  # voice ID without a speaker
+    voice: str  # ID of the voice, without a speaker
 
 
 @frozen
 class DropVoice:
     """Unload a neural voice as soon as no sentence is using it. The reply is `VoiceMemory`."""
 
-    voice: str  # voice ID without a speaker
+    voice: str  # ID of the voice, without a speaker
 
 
 @frozen
@@ -181,9 +181,9 @@ class StartFailed:
     """The engine can't start. The process exits after sending this message."""
 
     reason: Reason  # ENGINE_FAILED or UNKNOWN_VOICE
-    message: str  # human-readable error, including what to install
-    permanent: bool = True  # whether every further start will fail until the user fixes something
-    usage_error: bool = False  # whether an option names something that doesn't exist
+    message: str  # human-readable error, which says what to install
+    permanent: bool = True  # whether the engine can't start until the user has fixed something
+    usage_error: bool = False  # whether a command-line option names something that doesn't exist
 
 
 @frozen
@@ -197,7 +197,7 @@ class VoiceList:
 class VoiceLoaded:
     """A neural voice was loaded, or loading failed."""
 
-    voice: str  # voice ID without a speaker
+    voice: str  # ID of the voice, without a speaker
     seconds: float  # how long loading took
     error: str | None = None  # human-readable error; None if the voice was loaded
 
@@ -206,7 +206,7 @@ class VoiceLoaded:
 class VoiceUnloaded:
     """A neural voice was unloaded because its files have changed."""
 
-    voice: str  # voice ID without a speaker
+    voice: str  # ID of the voice, without a speaker
 
 
 @frozen
@@ -288,12 +288,13 @@ Command = Configure | GoalCommand | Stop | Hold | Continue | NextGoal | LoadVoic
 GoalEvent = Started | Alive | Word | OutputChanged | VoiceChosen | Held | Ended
 Event = Ready | StartFailed | VoiceList | VoiceLoaded | VoiceUnloaded | VoiceMemory | GoalEvent
 
-#: Message classes for each direction, by name. Each line contains the name of its class as "kind".
+#: Message classes for each direction, by class name. Each message contains its class name as "kind".
 COMMAND_CLASSES: dict[str, type[Command]] = {each.__name__: each for each in Command.__args__}
 EVENT_CLASSES: dict[str, type[Event]] = {each.__name__: each for each in Event.__args__}
 
 # The encoder and the decoder are reused for speed. `json.dumps` with a `default` would create an encoder for each line,
-# and `json.loads` would detect the encoding of each line. Together, this would take a third of the time for a message.
+# and `json.loads` would detect the encoding of each line. Together, they would take a third of the time for each
+# message.
 _JSON_ENCODER = json.JSONEncoder(default=fields)
 _JSON_DECODER = json.JSONDecoder()
 

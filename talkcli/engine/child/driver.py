@@ -97,7 +97,7 @@ def register(name: str, synthesizer: Synthesizer, runner: GoalRunner) -> None:
 
 
 def _start_engine(pyttsx3: Any, name: str, *, named: bool) -> Any:
-    """Return pyttsx3's engine for a driver, with its loop started.
+    """Start pyttsx3's engine with a driver, and return the engine.
 
     Args:
         pyttsx3: the imported module.
@@ -252,7 +252,7 @@ class DriverProperties:
 
 
 class Driver:
-    """`talk`'s own driver for pyttsx3, which connects a synthesizer with a playback.
+    """`talk`'s own pyttsx3 driver, which plays the sound that a synthesizer produces.
 
     pyttsx3's DriverProxy calls the methods. One step of `iterate` speaks a whole sentence: the synthesizer writes to
     the playback, which waits for the player. An exception must not leave this step, because pyttsx3 would drop the

@@ -14,9 +14,9 @@ import sys
 
 from talkcli.engine import protocol
 
-#: Minimum value of the memory limit, for small machines. With a voice of 63 MB, the process uses 0.4 GB.
+#: Lower bound of the memory limit, for small machines. With a voice of 63 MB, the process uses 0.4 GB.
 _MIN_MEMORY_BYTES = 1 << 30
-#: Linux's number for the prctl operation that has the kernel send a signal when the parent thread exits.
+#: Number of Linux's prctl operation that requests a signal when the parent thread exits.
 _PR_SET_PDEATHSIG = 1
 
 

@@ -56,7 +56,7 @@ PLAYER_KILL_LIMIT_S = 1.0
 #: that has buffered more or has stalled is killed, and a new player continues the sentence later.
 HOLD_SILENCE_LIMIT_S = 0.15
 
-#: How far the word clock may be ahead of the sound. It was measured to be 4 to 8 ms ahead.
+#: How far the word clock may run ahead of the sound. Measurements show 4 to 8 ms.
 CLOCK_ERROR_S = 0.01
 
 #: If samples are late, the resulting silence counts as a gap only if it is longer than this. A shorter silence is
@@ -76,8 +76,8 @@ RELEASE_DELAY_S = 10.0
 MIN_PLAYER_BUFFER_S = 0.02
 
 #: Samples up to this absolute value count as silence. It is 66 dB below the loudest possible sample (32,768).
-#: libespeak-ng ends a sentence with 235 to 275 ms of zeros. If the voice has an echo ("f3"), about 100 ms of the
-#: silence are quiet sound instead of zeros.
+#: libespeak-ng ends a sentence with 235 to 275 ms of zeros. If the voice has an echo ("f3"), the last 100 ms or so are
+#: quiet, but not zero.
 MAX_QUIET_LEVEL = 16
 
 
@@ -99,7 +99,7 @@ class SentenceSamples:
 
     @property
     def end(self) -> int:
-        """Offset after the last sample added so far."""
+        """Offset just after the last sample."""
         return self.begin + len(self._kept)
 
     def add(self, samples: bytes) -> None:
@@ -208,7 +208,7 @@ class PlayerFeed:
         return self._seconds(written) - self._clock.elapsed(now)
 
     def silent_for(self, now: float) -> float:
-        """Return for how many seconds the player has had nothing to play."""
+        """Return how long the player has had nothing to play, in seconds."""
         if self.written == 0 or self.time_left(self.written, now) > MIN_PLAYER_BUFFER_S:
             return 0.0
         return max(0.0, now - self._heard_at)
@@ -247,7 +247,7 @@ class Playback:
         self._feed: PlayerFeed | None = None
         self._first_error: CannotSpeak | None = None
         self._clock = WordClock()
-        #: all samples of the sentence; once the player has proved to work, only those not heard yet
+        #: all samples so far; once the player is known to work, only those not heard yet
         self._samples = SentenceSamples()
         self._complete = False  # whether all samples were written
         self._begin = 0  # offset of the current player's first sample
@@ -305,7 +305,7 @@ class Playback:
         If all samples so far are silent, they are stored until the first sound follows.
         """
         self._samples.add(samples)
-        self._wait((), 0.0)  # checks for a stop, because writing to a file never waits
+        self._wait((), 0.0)  # check for a stop here, because writing to a file never waits
         if self._samples.audible and self._find_start():
             self._with_player(self._send_all)
 
@@ -372,7 +372,7 @@ class Playback:
     def _with_player(self, step: Callable[[PlayerFeed], None]) -> None:
         """Call `step` with the current player, and repeat it with the next player if necessary.
 
-        It is repeated if the player fails before any sound was heard, or if the player was released during a hold.
+        It is repeated if the player fails before any sound was heard, or if the player was released during a pause.
         """
         while True:
             self._check_stopped()

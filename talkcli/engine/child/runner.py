@@ -41,8 +41,8 @@ DRIVER_STEP_S = 0.05
 #: Time allowed for a third-party driver to finish the text, in addition to the estimated time for the remaining words.
 #: The driver doesn't report whether it is still speaking.
 DRIVER_LIMIT_S = 10.0
-#: Number of words to allow for each remaining character. "€" is spoken as one word. An emoji is spoken as up to five
-#: words, but a text rarely consists of emojis only.
+#: Maximum number of words expected for each remaining character. "€" is spoken as one word. An emoji is spoken as up to
+#: five words, but a text rarely consists of emojis only.
 MAX_WORDS_PER_CHARACTER = 3
 
 
@@ -60,7 +60,7 @@ class Channel:
         self._lines = LineSplitter()
 
     def send(self, event: protocol.Event) -> None:
-        """Send an event. Block until all of it is written."""
+        """Send an event, blocking until all of it is written."""
         data = memoryview(protocol.encode(event))
         self.sent_at = time.monotonic()
         try:
@@ -70,7 +70,7 @@ class Channel:
             self.closed = True
 
     def receive(self) -> list[protocol.Command]:
-        """Wait for data, read once, and return the complete commands."""
+        """Wait for data, and return the commands that have arrived completely."""
         try:
             data = os.read(self.descriptor, 65536)
         except ConnectionResetError:
@@ -98,7 +98,7 @@ class ActiveGoal:
         self.interrupted = False
         #: time at which a stopped third-party driver reported that it is silent
         self.silent_at: float | None = None
-        #: offset in the text at which the driver began
+        #: offset in the text at which the driver started speaking
         self.offset = 0
         #: offset in the text of the last word heard
         self.last_word = 0
@@ -410,7 +410,7 @@ class GoalRunner:
 
 
 def _with_traceback(callback: Callable[..., None]) -> Callable[..., None]:
-    """Wrap a callback so that it prints the traceback of any exception. pyttsx3 would drop the exception."""
+    """Wrap a callback so that an exception prints its traceback. pyttsx3 drops exceptions silently."""
 
     def call(**values: Any) -> None:
         try:

@@ -21,7 +21,7 @@ _END_MARKS = ".,;:!?…"
 
 
 def count_letters(text: str, start: int) -> int:
-    """Count the letters and digits from `start` to the next other character, including combining accents.
+    """Count the letters, digits and combining accents from `start` to the first other character.
 
     It is used as the length of a word if libespeak-ng reports a length of 0. libespeak-ng does so if the next character
     isn't ASCII (as in "«hello»"), and also if there is no word at all.
@@ -84,7 +84,7 @@ class TimedWord:
 
     location: int  # offset of the first character in the text
     length: int  # number of characters
-    position: float  # start in the audio, in seconds
+    position: float  # position at which the word starts in the audio, in seconds
 
 
 class WordClock:
@@ -101,7 +101,7 @@ class WordClock:
         self._started_at: float | None = None
         #: position in the audio at which the stream begins, in seconds
         self._begin = 0.0
-        #: silences in the stream: each one's position in the audio, and its length in seconds
+        #: position in the audio and length in seconds of each silence in the stream
         self._silences: list[tuple[float, float]] = []
 
     def add(self, word: TimedWord) -> None:
@@ -109,7 +109,7 @@ class WordClock:
         self._waiting.append(word)
 
     def skip_until(self, position: float) -> None:
-        """Skip the audio before this position, and move the words in it to this position."""
+        """Skip the audio before this position. Any words in it now start at this position."""
         self._waiting = deque(replace(each, position=max(position, each.position)) for each in self._waiting)
 
     def reset(self, position: float) -> None:
@@ -133,7 +133,7 @@ class WordClock:
         self._started_at = now - elapsed if elapsed > 0 else None
 
     def limit_elapsed(self, now: float, elapsed: float) -> None:
-        """Set the clock back to this number of seconds if it shows more."""
+        """Set the clock back if it shows more than this number of seconds."""
         if self._started_at is not None and now - self._started_at > elapsed:
             self._started_at = now - elapsed
 

@@ -120,7 +120,7 @@ class EngineProcess:
                 return False
 
     def receive(self) -> Iterator[protocol.Event | None]:
-        """Read once without blocking, and yield the received events.
+        """Yield the events that have arrived, without blocking.
 
         The last event is None if the process has closed the connection or sent a malformed message.
         """
@@ -140,7 +140,7 @@ class EngineProcess:
                 return
 
     def read_stderr(self) -> bool:
-        """Read standard error of the process once, and return whether it is still open."""
+        """Read from the standard error of the process, and return whether it is still open."""
         try:
             data = os.read(self.stderr, 65536)
         except BlockingIOError:
@@ -176,13 +176,13 @@ class EngineProcess:
             if os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is not None:
                 break
             time.sleep(0.001)
-        self.kill()  # must come before reaping, because the group ID may be reused afterwards
+        self.kill()  # must happen before the process is reaped, because its group ID may be reused afterwards
         try:
             status = self._process.wait(_EXIT_WAIT_S)
         except subprocess.TimeoutExpired:
             return "it closed its connection"
         self.read_stderr()
-        self._report_stderr(b"\n")  # completes the last line
+        self._report_stderr(b"\n")  # ends the last line, which may be incomplete
         how = f"it was killed by {signal_name(-status)}" if status < 0 else f"it exited with status {status}"
         return f"{how} ({self._last_stderr_line})" if self._last_stderr_line else how
 

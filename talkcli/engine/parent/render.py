@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 
 #: Failures that exit with the code of a rejected goal. All other failures exit with the code of an aborted goal.
 _REJECTED_REASONS = frozenset({Reason.INVALID_TEXT, Reason.UNKNOWN_VOICE, Reason.BAD_OPTION})
-#: Failures of the player. During a rendering, the player writes the file, so these mean that the file can't be written.
+#: Failures of the player. When a text is rendered, the player writes the file, so these failures mean that the file
+#: can't be written.
 _FILE_REASONS = frozenset({Reason.AUDIO_DEVICE, Reason.AUDIO_LOST})
 #: Paths that refer to standard output. They don't need to be opened, because the shell has already opened standard
 #: output.

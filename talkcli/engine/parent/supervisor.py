@@ -31,7 +31,7 @@ RESTART_DELAYS_S = (0.0, 0.1, 0.5, 2.0, 10.0)
 #: because a third-party driver may write a line for each word.
 MAX_STDERR_LINES = 20
 STDERR_PERIOD_S = 60.0
-#: If a process exits within this time and had no goal, the next start may be delayed.
+#: If a process exits sooner than this without having had a goal, the next start may be delayed.
 MIN_LIFETIME_S = 1.0
 #: If no process has been ready for this long, each failed start also fails a goal. Otherwise, goals would wait forever.
 ENGINE_WAIT_LIMIT_S = 10.0
@@ -210,7 +210,7 @@ class SupervisedGoal:
     hold_number: int | None = None
     #: time at which a `Hold` was sent; None after it was confirmed
     hold_sent_at: float | None = None
-    #: the event to post once `lost_process` has exited
+    #: event that will be posted once `lost_process` has exited
     end: protocol.Ended | None = None
     #: the killed process that was speaking the goal
     lost_process: EngineProcess | None = None
@@ -362,7 +362,7 @@ class Supervisor:
         process: EngineProcess = key.data
         if key.fd == process.liveness:
             if process is self._process:
-                self._receive(process)  # read its last messages before handling its death
+                self._receive(process)  # read the last messages of the process before handling its death
             if process is self._process:
                 self._handle_crash(process)
             if process.is_gone():
@@ -513,7 +513,7 @@ class Supervisor:
     def _handle_event(self, process: EngineProcess, event: protocol.Event) -> None:
         self._last_sign_at = time.monotonic()
         if isinstance(event, protocol.GoalEvent):
-            if self._goal and self._goal.sent and event.id == self._goal.command.id:  # ignore other goals
+            if self._goal and self._goal.sent and event.id == self._goal.command.id:  # ignore events about other goals
                 process.had_goal = True
                 self._handle_goal_event(self._goal, event)
             return

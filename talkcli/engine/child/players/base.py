@@ -1,7 +1,7 @@
 """The interface of a player, and the exceptions that end a sentence.
 
 Samples are signed 16 bit, little-endian, one channel. Lengths are in bytes. `tests/engine/test_player_contract.py`
-tests that every player keeps the promises of `Player`.
+tests that every player behaves as `Player` promises.
 """
 
 from __future__ import annotations

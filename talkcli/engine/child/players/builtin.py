@@ -175,7 +175,7 @@ class WavStreamPlayer(BuiltInPlayer):
         self._poll.register(output, select.POLLOUT)
 
     def offer(self, data: memoryview) -> int:
-        if not self._poll.poll(0):  # a writable pipe has room for at least a header and a piece
+        if not self._poll.poll(0):  # a writable pipe has room for at least a header and a piece of samples
             return 0
         try:
             written = os.write(self._output, self._header + data if self._header else data)

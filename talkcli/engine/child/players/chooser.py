@@ -33,16 +33,16 @@ _AUTOMATIC_CLASSES = [name for name, each in PLAYERS.items() if each.automatic a
 #: silence doesn't count as sound, because some loudspeakers switch off when they receive only silence.
 IDLE_AFTER_S = 1.0
 
-#: The number of handovers to remember for each player. Their median predicts the next handover. The median ignores a
-#: single slow one on a busy machine.
+#: The number of handovers to remember for each player. Their median, which a single slow handover doesn't affect,
+#: predicts the next one.
 MAX_HANDOVERS = 5
 
 #: Maximum seconds of silence to cut. This is half of the pause after a sentence. The other half is kept, so that the
 #: sentences stay separate.
 MAX_CUT_S = 0.12
 
-#: Maximum seconds of a handover. If it takes longer, it isn't counted, because the waiting goal was canceled or paused
-#: and another goal followed later.
+#: Handovers that take more than this many seconds aren't counted. In these cases, the waiting goal was canceled or
+#: paused, and another goal followed later.
 MAX_HANDOVER_S = 0.5
 
 
@@ -159,7 +159,7 @@ class PlayerChooser:
             self.output = None  # the new player doesn't know its output
 
     def device_released(self, silent_since: float | None = None) -> None:
-        """Record that the device was released, and has been silent since `silent_since` or since now."""
+        """Record that the device was released. If `silent_since` is given, it has been silent since that time."""
         self._last_used_at = time.monotonic() if silent_since is None else silent_since
 
     def lead_in_seconds(self, begins: bool = True) -> float:

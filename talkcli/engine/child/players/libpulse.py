@@ -117,9 +117,10 @@ class SinkInputInfo(Structure):
 # Types of callbacks. A callback must not raise an exception, because ctypes would print it and return garbage.
 PollCallback = CFUNCTYPE(c_int, POINTER(PollDescriptor), ctypes.c_ulong, c_int, c_void_p)
 StreamCallback = CFUNCTYPE(None, c_void_p, c_void_p)
-#: The parameters are a stream or context, success and data.
+#: A callback that receives a stream or context, whether an operation succeeded, and user data.
 SuccessCallback = CFUNCTYPE(None, c_void_p, c_int, c_void_p)
-#: The parameters are a context, the facility and type of the change, the index of the changed object, and data.
+#: A callback that receives a context, the facility and type of a change, the index of the changed object, and user
+#: data.
 ChangeCallback = CFUNCTYPE(None, c_void_p, c_int, c_uint32, c_void_p)
 SinkCallback = CFUNCTYPE(None, c_void_p, POINTER(SinkInfo), c_int, c_void_p)
 SinkInputCallback = CFUNCTYPE(None, c_void_p, POINTER(SinkInputInfo), c_int, c_void_p)

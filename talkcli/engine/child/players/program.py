@@ -138,7 +138,7 @@ class PlayerProcess:
             kill([-self.pid])
 
     def await_end(self, seconds: float) -> None:
-        """Block until the program exits or the time is over.
+        """Block until the program exits or the time is up.
 
         If the system can't report the exit, return at once.
         """
@@ -189,7 +189,7 @@ def _spawn(argv: tuple[str, ...], stdin: int, stderr: int, inherited: Sequence[i
 
 
 def _attach_leash(leash: int, group: int) -> None:
-    """Make the kernel kill a process group when the other end of its leash is closed."""
+    """Make the kernel kill a process group when the other end of its leash pipe is closed."""
     if not hasattr(fcntl, "F_SETSIG"):
         return
     with contextlib.suppress(OSError):  # if a sandbox forbids this, the program still exits when its input is closed

@@ -296,7 +296,7 @@ class PulsePlayer(Player):
         return changed
 
     def _request_time(self) -> bool:
-        """Request the playback time if a request is due. Return whether it was sent."""
+        """Send a request for the playback time if one is due, and return whether it was sent."""
         due = self._time_request_at
         if not self.proven or self._clock_report or due is None or time.monotonic() < due:
             return False
