@@ -1,4 +1,4 @@
-"""The library's interface to a fleet: list its robots, connect to one, or send a request to several at once.
+"""The Python interface to a fleet of robots.
 
 from talkcli import Fleet
 
@@ -28,14 +28,14 @@ if TYPE_CHECKING:
 
 
 class Fleet:
-    """A fleet: all robots that are connected to one broker.
+    """All robots that are connected to the same broker.
 
-    The argument `to` of most methods selects robots. It is a robot's name, a glob that matches names (`wh-*`), or a
-    group (`@warehouse`). The group `@all` contains every robot.
+    Most methods have an argument `to` that selects robots. It is the name of a robot, a glob that matches names
+    (`wh-*`), or a group (`@warehouse`). The group `@all` contains every robot.
 
-    These methods return a FleetRequest. Iterating over it yields the outcomes as they arrive: one for each robot, or
-    one for each goal if the request affects several goals. The outcome of an offline robot has exit code 3. The robot
-    doesn't receive the request later.
+    These methods return a FleetRequest. Iterate over it to receive the outcomes as they arrive. There is one for each
+    robot, or one for each goal if the request affects several goals. If a robot is offline, its outcome has exit code
+    3, and the robot doesn't receive the request later.
 
     Each request opens its own connection to the broker, and closes it after the last outcome. To close it earlier, use
     the FleetRequest in a `with` block or call its `close`. Always exhaust or close the FleetRequest, or the request may
@@ -45,13 +45,13 @@ class Fleet:
     """
 
     def __init__(self, broker: str | None = None, *, name: str | None = None, insecure: bool = False) -> None:
-        """Read the settings, without connecting to the broker.
+        """Prepare to use a fleet. Each request connects to the broker later.
 
         The login and the certificates come from the environment variables TALK_MQTT_*.
 
         Args:
-            broker: URL of the broker, mqtts://HOST or mqtt://HOST; default TALK_BROKER.
-            name: the sender's name; default TALK_NAME.
+            broker: the URL of the broker, mqtts://HOST or mqtt://HOST. The default is TALK_BROKER.
+            name: the name of the sender. The default is TALK_NAME.
             insecure: whether a password may be sent to another machine without TLS.
 
         Raises:
@@ -63,7 +63,7 @@ class Fleet:
         self._name = name
 
     def robots(self) -> list[Presence]:
-        """Return all robots that the broker knows, including offline ones, sorted by name.
+        """List all robots of the fleet by name, including those that are offline.
 
         Raises:
             ServerUnavailable: The broker can't be reached.
@@ -74,7 +74,7 @@ class Fleet:
         return [each.presence for each in read_robots(self._broker, ANSWER_LIMIT_S, with_status=False)]
 
     def robot(self, name: str) -> Client:
-        """Return a client that is connected to one robot's server. It works like a client of a local server.
+        """Connect to one robot. The returned client works like the client of a local server.
 
         Raises:
             ServerUnavailable: The broker can't be reached, or the robot is unknown, offline or without a server.
@@ -85,17 +85,17 @@ class Fleet:
         return Client.over(connect_robot(name, self._broker, name=self._name))
 
     def say(self, to: str, text: str, *, wait: bool = True, ttl: float | None = None, **options: Any) -> FleetRequest:
-        """Speak a text on each robot. The goals of all robots have the same id.
+        """Speak a text on each robot.
 
-        To cancel the goals, call `cancel` on the returned FleetRequest. After its last outcome, call `Fleet.cancel`
-        with the id instead.
+        The goal has the same id on all robots. To cancel it, call `cancel` on the returned FleetRequest. After the last
+        outcome, call `Fleet.cancel` with the id instead.
 
         Args:
             to: the name of a robot, a glob or a group.
-            text: the text.
+            text: the text to speak.
             wait: whether to wait until each goal has ended. Otherwise, wait only until each robot has accepted it.
-            ttl: seconds within which each robot must start speaking; 0 for no limit, default 10.
-            options: further options of `Client.say`, except `follow`.
+            ttl: the time in seconds within which each robot must start speaking, or 0 for no limit. The default is 10.
+            options: other options of `Client.say`, except `follow`.
         """
         return self._ask(to, Say(text, wait=wait, ttl=ttl, **options))
 
@@ -108,18 +108,18 @@ class Fleet:
         before: str | None = None,
         key: str | None = None,
     ) -> FleetRequest:
-        """Cancel goals on each robot. The arguments are those of `Client.cancel`; by default, cancel all goals.
+        """Cancel goals on each robot, by default all of them.
 
-        A robot's outcome arrives once the robot is silent.
+        The other arguments are those of `Client.cancel`. The outcome of a robot arrives when the robot is silent.
         """
         return self._ask(to, Cancel(None if ids is None else tuple(ids), current, before, key))
 
     def wait(self, to: str, ids: Iterable[str] | None = None) -> FleetRequest:
-        """Wait until these goals have ended. By default, wait for all goals that each robot currently has."""
+        """Wait for goals on each robot to end, by default all current goals."""
         return self._ask(to, Wait(None if ids is None else tuple(ids)))
 
     def status(self, to: str) -> FleetRequest:
-        """Request the status of each robot's server. The field `said["status"]` of an outcome has the details."""
+        """Get the status of each robot's server. The details are in the `said["status"]` field of each outcome."""
         return self._ask(to, Status())
 
     def pause(self, to: str) -> FleetRequest:
@@ -131,7 +131,10 @@ class Fleet:
         return self._ask(to, Resume())
 
     def set(self, to: str, **settings: Any) -> FleetRequest:
-        """Change settings, as in `Client.set`, on each robot whose bridge allows it."""
+        """Change the settings of each robot's server. The robot's bridge must allow it.
+
+        The arguments are those of `Client.set`.
+        """
         return self._ask(to, Set(**settings))
 
     def _ask(self, to: str, request: Request) -> FleetRequest:

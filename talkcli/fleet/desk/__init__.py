@@ -1,1 +1,1 @@
-"""The operator's side of a fleet: sends requests to robots, watches them, and formats their state as text."""
+"""The operator's side of a fleet, which sends requests to robots and shows their state."""

@@ -1,6 +1,6 @@
-"""An operator's connection to the broker. It reconnects after every break.
+"""An operator's connection to the broker, which reconnects when it is lost.
 
-A handler subscribes to topics and processes messages. Requests are not queued while the broker is unreachable.
+A handler subscribes to topics and processes the messages. While the broker is unreachable, nothing is sent or queued.
 """
 
 from __future__ import annotations
@@ -35,84 +35,84 @@ if TYPE_CHECKING:
     from talkcli.fleet.payloads import Message
     from talkcli.protocol.requests import Request
 
-#: Longest absence of a broker or a robot. After it, open requests count as lost. A bridge reconnects within 15 s after
+#: How long a broker or a robot may be absent before open requests count as lost. A bridge reconnects within 15 s after
 #: its broker is back, and systemd restarts a bridge after 2 s.
 ABSENCE_LIMIT_S = 30.0
-#: The broker discards any request except a sentence after this time, because nobody waits for a later answer.
+#: The broker discards undelivered requests after this time. Sentences have a time limit of their own.
 _REQUEST_EXPIRY_S = 5
-#: How long to wait for more retained messages after the marker message. Some brokers send a few of them late.
+#: How long to keep waiting for retained messages after the marker message. Some brokers send a few of them late.
 RETAINED_GRACE_S = 0.3
-#: Upper limit of the random pause before reconnecting. It starts at the first value, and doubles after each failed
-#: attempt up to the second value.
+#: The pause before reconnecting is random. Its upper limit starts at the first value, and doubles after each failed
+#: attempt until it reaches the second value.
 _FIRST_BROKER_PAUSE_S, _MAX_BROKER_PAUSE_S = 0.5, 10.0
 
 
 class DeskHandler(Protocol):
-    """Interface of an object that processes the messages of a DeskLink. `DeskLink.poll` calls its methods."""
+    """Interface for an object that processes the messages of a DeskLink. `DeskLink.poll` calls its methods."""
 
     def on_connected(self, link: Link) -> None:
-        """Subscribe to topics on a new connection."""
+        """Called when the link has connected to the broker. This method has to subscribe to topics."""
 
     def on_disconnected(self, why: str) -> None:
-        """Handle a broken connection, or a failed attempt to connect."""
+        """Called when the connection is lost, and when an attempt to connect fails."""
 
     def on_message(self, message: Message) -> None:
-        """Process a message from the broker."""
+        """Called for each message from the broker."""
 
 
 class DeskLink:
-    """A connection to the broker that reconnects after every break.
+    """A connection to the broker that reconnects when it is lost.
 
     Only one thread at a time may call `poll`. Any thread may call the other methods.
     """
 
-    #: processes all messages; must be set before the first `poll`
+    #: the object that processes all messages; must be set before `poll` is first called
     handler: DeskHandler
 
     def __init__(self, broker: Broker) -> None:
-        """Prepare the connection. The first call of `poll` opens it.
+        """Prepare a connection. The first call of `poll` opens it.
 
         Raises:
             UsageError: The user name can't be part of a topic.
         """
         self.broker, self.user = broker, client_user(broker)
-        #: random part of the reply topics, which distinguishes this connection from the user's other ones
+        #: a random part of the reply topics, so that each connection of a user has its own
         self.session = os.urandom(8).hex()
-        #: the current MQTT connection; None while disconnected
+        #: the current MQTT connection, or None if there is none
         self.link: Link | None = None
-        #: error of the last failed attempt to connect, or the broker's refusal of the marker message
+        #: the last error, if connecting failed or the broker rejected the marker message
         self.failure: TalkError | None = None
-        #: when the marker message came back, which follows the retained messages (monotonic); None until then
+        #: when the marker message came back (monotonic time), or None until then. It follows the retained messages.
         self.marker_at: float | None = None
         self._inbox: deque[Message] = deque()
-        #: callbacks of refused requests, with their errors. `poll` calls them later, when the link is not locked.
+        #: callbacks for rejected requests, with the errors to pass. `poll` calls them when the link isn't locked.
         self._refusals: deque[tuple[Callable[[TalkError], None], TalkError]] = deque()
         self._opening: LinkOpener | None = None
         self._failed_attempts = 0
         self._next_attempt_at = self._polled_at = time.monotonic()
-        # Unlike a pipe, sockets are closed by the garbage collector if nobody calls `close`.
+        # If nobody calls `close`, the garbage collector closes sockets, but not pipes.
         self._wake_reader, self._wake_writer = socket.socketpair()
         for each in (self._wake_reader, self._wake_writer):
             each.setblocking(False)
 
     @property
     def retained_received(self) -> bool:
-        """Whether all retained messages should have been received by now."""
+        """Whether all retained messages have probably arrived."""
         return self.marker_at is not None and time.monotonic() > self.marker_at + RETAINED_GRACE_S
 
     def reply_topic(self, robot: str) -> str:
-        """Return the topic for a robot's replies to this desk."""
+        """Return the topic on which a robot replies to this connection."""
         return topics.reply(self.user, self.session, robot)
 
     def poll(self, timeout: float, interrupt: Mapping[int, int] | None = None) -> bool:
         """Wait for messages, and pass them to the handler. Connect or reconnect if necessary.
 
         Args:
-            timeout: seconds to wait at most.
-            interrupt: descriptors that interrupt the wait, as in `wait_ready`.
+            timeout: the maximum time to wait in seconds.
+            interrupt: file descriptors that interrupt the wait, as in `wait_ready`.
 
         Returns:
-            Whether the connection was ready. More data may be waiting then, even if no message was complete.
+            True if data was read. More data may be waiting, even if no message was complete.
         """
         link = self.link
         now = time.monotonic()
@@ -123,7 +123,7 @@ class DeskLink:
         wake = self._wake_reader.fileno()
         watched = {wake: select.POLLIN}
         descriptor = -1 if link is None else link.fileno()
-        if link is not None and descriptor >= 0:  # the descriptor is -1 if another thread has closed the link
+        if link is not None and descriptor >= 0:  # It is -1 if another thread has closed the link.
             watched[descriptor] = select.POLLIN | (select.POLLOUT if link.wants_write else 0)
         ready = wait_ready(watched, min(timeout, due), interrupt)
         if wake in ready:
@@ -148,10 +148,10 @@ class DeskLink:
         """Wait until the broker has sent its retained messages.
 
         Args:
-            timeout: seconds to wait at most.
-            is_enough: function that returns whether to stop as soon as the marker has arrived, without waiting for late
-                messages.
-            interrupt: as in `poll`.
+            timeout: the maximum time to wait in seconds.
+            is_enough: a function that is called after the marker has arrived. If it returns True, the wait ends without
+                allowing time for late messages.
+            interrupt: file descriptors that interrupt the wait, as in `poll`.
 
         Raises:
             ServerUnavailable: The broker can't be reached, or doesn't answer in time.
@@ -169,14 +169,14 @@ class DeskLink:
     def send(
         self, request: Request, number: int, to: str, on_refused: Callable[[TalkError], None], *, is_group: bool = False
     ) -> bool:
-        """Send a request. Return whether it was sent.
+        """Send a request to a robot or a group. Return whether it was sent.
 
         Args:
             request: the request.
-            number: the request's number, which its answers repeat.
-            to: the name of a robot, or of a group.
-            on_refused: called with the error. A request that is too long is refused at once, and the broker may refuse
-                any request later.
+            number: the number of the request, which is repeated in the answers.
+            to: the name of the robot or the group.
+            on_refused: a function that is called with the error if the request is too long, or if the broker rejects
+                it later.
             is_group: whether `to` is a group.
         """
         if self.link is None:
@@ -196,32 +196,36 @@ class DeskLink:
         return self.link.publish(topic, line, expiry=expiry, response=response, acknowledged=on_acknowledged)
 
     def end_session(self, to: str, *, is_group: bool = False) -> None:
-        """End this desk's session with the bridge of a robot, or with all bridges of a group."""
+        """Tell the bridge of a robot, or all bridges of a group, that no more requests will follow."""
         if self.link is not None:
             topic, response = self._topics(to, is_group=is_group)
             self.link.publish(topic, b"", 0, response=response)
 
     def _topics(self, to: str, *, is_group: bool) -> tuple[str, str]:
-        """Return the topic for requests to a robot or a group, and the topic for the replies."""
+        """Return the topics for requests to a robot or a group, and for their replies."""
         topic = topics.group if is_group else topics.robot
         response = topics.reply(self.user, self.session) if is_group else self.reply_topic(to)
         return topic(to, topics.REQUEST, self.user), response
 
     def wake(self) -> None:
-        """Wake the thread that waits in `poll`."""
+        """Make `poll` return soon if another thread is waiting in it."""
         try:
             self._wake_writer.send(b"\0")
         except OSError:
-            pass  # another wake-up is pending, or the sockets are closed
+            pass  # The buffer is full because `poll` has already been woken, or the link is closed.
 
     def flush(self, timeout: float) -> None:
-        """Wait, up to the timeout, until the broker has acknowledged all messages."""
+        """Wait until the broker has acknowledged all messages, but at most `timeout` seconds."""
         end = time.monotonic() + timeout
         while self.link is not None and self.link.outstanding_bytes and (left := end - time.monotonic()) > 0:
             self.poll(left)
 
     def close(self, *, forked: bool = False) -> None:
-        """Close the connection permanently. In a forked child, close only the child's copies of the descriptors."""
+        """Close the connection for good.
+
+        Args:
+            forked: whether this is a forked child process. Then only its copies of the file descriptors are closed.
+        """
         if self._opening is not None and not forked:
             self._opening.cancel()
         if self.link is not None:
@@ -230,18 +234,18 @@ class DeskLink:
         self._wake_writer.close()
 
     def publish_error(self, code: int, action: str) -> TalkError:
-        """Return the error for a message that the broker has refused.
+        """Return the error to raise if the broker has rejected a message.
 
         Args:
-            code: the reason code of the broker's acknowledgement.
-            action: the forbidden action, as it appears in the message.
+            code: the reason code from the broker.
+            action: words for the error message that say what the user isn't allowed to do.
         """
         if code == REASON_NOT_AUTHORIZED:
             return self._access_error(action)
         return ServerUnavailable(f"nothing was sent: the broker at {self.broker.url} refuses it, reason 0x{code:02x}")
 
     def no_answer_error(self, timeout: float) -> TalkError:
-        """Return the error for a broker that has sent no retained messages within `timeout` seconds."""
+        """Return the error to raise if the broker hasn't sent its retained messages within `timeout` seconds."""
         if self.link is None or self.marker_at is not None:
             return ServerUnavailable(f"the broker at {self.broker.url} does not answer within {timeout:g} s")
         return self._access_error(f"read {topics.reply(self.user, '+', '+')}")
@@ -251,7 +255,7 @@ class DeskLink:
         return AccessDenied(f"{words}: its ACL needs the lines of an operator, see 'talk bridge --print-acl'")
 
     def _maintain(self, link: Link | None, now: float) -> float:
-        """Connect, or keep the connection alive. Return the seconds until the next call is due."""
+        """Connect, or keep the connection alive. Return how many seconds the next call may be delayed."""
         if link is not None:
             link.tick()
             if self.marker_at is None or self.retained_received:
@@ -261,14 +265,14 @@ class DeskLink:
             self._end_attempt(self._opening)
             return 0.0
         if self._opening is None and now >= self._next_attempt_at:
-            # If a thousand robots answered at the same time, a broker would drop messages beyond its default limit.
+            # When a thousand robots answer at once, a broker with default settings would drop some of the messages.
             name = f"talk-desk-{self.user}-{self.session}"
             new = Link(self.broker, name, self._inbox.append, receive_maximum=MAX_RECEIVE_COUNT)
             self._opening = LinkOpener(new, self.wake)
         return TICK_EVERY_S if self._opening else max(0.0, self._next_attempt_at - now)
 
     def _end_attempt(self, opening: LinkOpener) -> None:
-        """Use the new connection, or schedule the next attempt if this one has failed."""
+        """Start using a new connection. If connecting has failed, schedule the next attempt."""
         self._opening = None
         if opening.error is not None:
             self._failed_attempts += 1
@@ -282,7 +286,7 @@ class DeskLink:
         self._inbox.clear()
         link.subscribe(self.reply_topic(topics.MARKER), retained=False)
         self.handler.on_connected(link)
-        # The broker sends this marker message back after the retained messages.
+        # The broker sends this message back after the retained messages, so it marks their end.
         link.publish(self.reply_topic(topics.MARKER), b"\n", acknowledged=self._on_marker_acknowledged)
 
     def _on_marker_acknowledged(self, code: int) -> None:

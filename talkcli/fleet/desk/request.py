@@ -1,4 +1,7 @@
-"""The selection of robots for a request, and the outcome on each robot. Pure."""
+"""Classes for the robots that a request is for, and for its outcome on each robot.
+
+The module is pure.
+"""
 
 from __future__ import annotations
 
@@ -18,22 +21,22 @@ if TYPE_CHECKING:
     from talkcli.fleet.payloads import Presence
 
 _GROUP_PREFIX, _WILDCARDS = "@", "*?["
-#: Globs that consist of valid characters. Other globs can't match a robot's name.
+#: Matches a glob in which all characters are valid. No other glob can match the name of a robot.
 _GLOB = re.compile(r"[A-Za-z0-9._*?\[\]!-]+")
 
 
 def selects_several(text: str) -> bool:
-    """Return whether a value of `--robot` is a glob or a group."""
+    """Return whether a value of `--robot` is a glob or a group, and not the name of a single robot."""
     return text.startswith(_GROUP_PREFIX) or any(each in text for each in _WILDCARDS)
 
 
 class Selection:
-    """The robots that a value of `--robot` selects.
+    """The robots selected by a value of `--robot`.
 
     Attributes:
         text: the value of `--robot`: a name, a glob (`*`, `?` and `[abc]`, as in a shell), or `@GROUP`.
-        group: the group's name; None if the value is not a group. Every robot belongs to the group `all`.
-        name: the robot's name; None if the value may select several robots.
+        group: the name of the group, or None if the value is not a group. Every robot belongs to the group `all`.
+        name: the name of the robot, or None if the value may select several robots.
     """
 
     def __init__(self, text: str) -> None:
@@ -43,41 +46,41 @@ class Selection:
 
     @property
     def fault(self) -> str | None:
-        """The reason why the selection can't match any robot, or None if it can."""
+        """An error message if no robot can ever match, otherwise None."""
         for kind, name in (("group", self.group), ("robot", self.name)):
             if name is not None:
                 fault = topics.name_fault(name)
                 return fault and f"no {kind} can be called '{name}': a name {fault}"
-        # An unclosed bracket matches only a literal bracket, and no robot's name has one.
+        # If a bracket isn't closed, it only matches a bracket, which can't occur in a robot's name.
         if not _GLOB.fullmatch(self.text) or "[" in re.sub(r"\[!?[^]]+\]", "", self.text):
             return f"the glob '{self.text}' matches no robot's name: it has A-Z a-z 0-9 . _ - with *, ? and [ ] alone"
         return None
 
     def includes(self, presence: Presence) -> bool:
-        """Return whether a robot is selected, online or not."""
+        """Return whether a robot is selected. It doesn't have to be online."""
         if self.group is not None:
             return self.group == topics.ALL_ROBOTS or self.group in presence.groups
         return fnmatchcase(presence.name, self.text)
 
 
 class NoServer(ServerUnavailable):
-    """The robot is online, but its server is not running."""
+    """Raised if a robot is online, but its server is not running."""
 
 
 @frozen
 class Outcome:
     """The outcome of a request on one robot.
 
-    A robot has one outcome for each goal of the request, or a single outcome if the request affects no goals.
+    If the request affects several goals, the robot has one outcome for each of them.
 
     Attributes:
-        robot: the robot's name.
+        robot: the name of the robot.
         state: the name of the goal's state. Without a goal, one of IDLE, PAUSED, RESUMED and SET, or the reason for a
             failure: OFFLINE, NO_SERVER, UNREACHABLE, UNKNOWN (no such goal), REFUSED or LOST.
         exit_code: 0 if the robot carried out the request, otherwise the exit code of `talk` for the failure.
-        goal: the goal; None if the outcome concerns no goal.
+        goal: the goal, or None if the outcome isn't about a goal.
         error: the error if the request failed, otherwise None.
-        said: the `status`, `settings` or `paused` field of the server's reply; None if the reply has none of them.
+        said: the `status`, `settings` or `paused` field of the server's reply, or None if there is no such field.
         last: whether this is the robot's last outcome.
     """
 
@@ -98,20 +101,23 @@ class Outcome:
 
 
 def failure_outcome(robot: str, error: TalkError, state: str | None = None) -> Outcome:
-    """Return the outcome of a failed request. By default, the error's class determines the state."""
+    """Return the outcome of a failed request.
+
+    By default, its state depends on the class of the error.
+    """
     states = {UnknownGoal: "UNKNOWN", Lost: State.LOST.name, NoServer: "NO_SERVER", ServerUnavailable: "UNREACHABLE"}
     default = next((name for kind, name in states.items() if isinstance(error, kind)), "REFUSED")
     return Outcome(robot, state or default, error.exit_code, error=error)
 
 
 def reply_outcomes(robot: str, request: Request, reply: JsonObject, items: list[JsonObject]) -> list[Outcome]:
-    """Return the outcomes that a reply contains.
+    """Return the outcomes of a request from the server's reply.
 
     Args:
-        robot: the robot's name.
-        request: the request. If it waits for goals, they have ended.
-        reply: the server's reply.
-        items: the lines of the list that came before the reply.
+        robot: the name of the robot.
+        request: the request. If it waits for goals, they must have ended.
+        reply: the reply.
+        items: the list items that the server sent before the reply.
     """
     if isinstance(request, Cancel):
         return cancel_outcomes(robot, items) or [Outcome(robot, "IDLE")]
@@ -127,18 +133,18 @@ def reply_outcomes(robot: str, request: Request, reply: JsonObject, items: list[
         state = "PAUSED" if status.server.get("paused") is True else goal.state.name if goal else "IDLE"
         return [Outcome(robot, state, goal=goal, said={"status": status.to_json()})]
     if isinstance(request, Status):
-        goal = Goal.from_json(reply.get("goal"))  # raises Unreadable if there is no goal
+        goal = Goal.from_json(reply.get("goal"))  # This raises Unreadable if there is no goal.
     if goal is None:
         return [Outcome(robot, "IDLE")]
     return [Outcome(robot, goal.state.name, (isinstance(request, Say) and goal.exit_code) or EXIT_OK, goal)]
 
 
 def cancel_outcomes(robot: str, items: list[JsonObject], *, last: bool = True) -> list[Outcome]:
-    """Return the outcome of each goal in the answer to a cancel.
+    """Return the outcomes of a cancel request, one for each goal.
 
     Args:
-        robot: the robot's name.
-        items: the lines of the list that came before the reply.
+        robot: the name of the robot.
+        items: the list items that the server sent before its reply.
         last: whether these are the robot's last outcomes.
     """
     done = Canceled.from_items(items)

@@ -1,8 +1,9 @@
 """A connection to one robot's server, through the broker and the robot's bridge.
 
-The robot keeps speaking while its bridge or the broker is away, and this connection survives such an absence. When the
-robot is back, open requests are sent again, except those that could take effect twice. A goal is first looked up by its
-id, and sent again only if the robot doesn't know it. A goal's listeners receive its current state.
+The robot keeps speaking while its bridge or the broker is away, and the connection survives such an absence. When the
+robot is back, open requests are sent again, except those that could take effect twice. For each goal, the robot is
+first asked whether it knows the id. The goal is sent again only if it doesn't. The goal's listeners receive its current
+state.
 """
 
 from __future__ import annotations
@@ -36,29 +37,32 @@ if TYPE_CHECKING:
     from talkcli.fleet.payloads import Message
     from talkcli.goals.goal import JsonObject
 
-#: Interval of the messages that keep the bridge's session alive, which ends after 90 s of silence.
+#: How often to send a message that keeps the bridge's session alive. The bridge ends a session after 90 s of silence.
 _KEEP_ALIVE_INTERVAL_S = 30.0
-#: Maximum number of times a request is sent again. The request itself may be the reason why the connection breaks.
+#: How many times a request may be sent again. The limit matters if the request itself breaks the connection.
 _MAX_RESENDS = 5
-#: Pause between two attempts to connect with `keep_trying`.
+#: The pause between two attempts to connect, if `keep_trying` is set.
 _CONNECT_PAUSE_S = 0.25
-#: Maximum length of the user name at the start of a new goal id. An id has 64 characters at most.
+#: A new goal id begins with this many characters of the user name. An id has at most 64 characters.
 _ID_USER_CHARS = 48
-#: Limit for simultaneous lookups of goals after an absence. A bridge accepts 64 open requests from each client.
+#: How many goals to look up at the same time after an absence. A bridge accepts 64 open requests from each client.
 _MAX_OPEN_LOOKUPS = 32
 
 
 class RobotExchange(Exchange):
-    """A request to a robot and its answer. It stays open while the robot is absent."""
+    """A request to a robot, and the robot's answer. The request stays open while the robot is absent."""
 
-    #: how many times the request was sent again
+    #: how many times the request has been sent again
     resends = 0
-    #: time after which a sentence is no longer sent (`boottime`); None for no limit
+    #: when to stop sending the sentence (in `boottime`), or None for no limit
     latest: float | None = None
 
 
 class RobotConnection(Connection):
-    """A connection to a robot's server through the broker. It uses a thread only to connect to the broker."""
+    """A connection to a robot's server through the broker.
+
+    A thread is used only while connecting to the broker.
+    """
 
     lasting = (Say, Cancel, Set, Pause, Resume)
     exchange_type = RobotExchange
@@ -74,19 +78,19 @@ class RobotConnection(Connection):
         end: float | None = None,
         numbers: Iterator[int] | None = None,
     ) -> None:
-        """Prepare the connection. Requests are held until the robot is known to be online.
+        """Prepare a connection. Requests are queued until the robot is online.
 
         Args:
-            robot: the robot's name.
-            desk: the connection to the broker; its handler passes the robot's messages to `on_message`.
-            name: the sender's name; default TALK_NAME.
-            interrupt: descriptors that interrupt any wait, as in `wait_ready`.
-            patience: seconds in which the server must answer.
-            end: time limit for all answers (monotonic), even if the robot is absent; None for no limit.
-            numbers: source of request numbers that several connections share; default one of its own.
+            robot: the name of the robot.
+            desk: the connection to the broker. Its handler must pass the robot's messages to `on_message`.
+            name: the name of the sender. The default is TALK_NAME.
+            interrupt: file descriptors that interrupt any wait, as in `wait_ready`.
+            patience: the time in seconds within which the server must answer.
+            end: the time limit for all answers (monotonic time), even if the robot is absent, or None for no limit.
+            numbers: an iterator of request numbers, if several connections share one.
 
         Raises:
-            UsageError: The robot's or the sender's name is not allowed.
+            UsageError: The name of the robot or the sender is not allowed.
         """
         super().__init__(patience)
         fault = topics.name_fault(robot)
@@ -102,15 +106,15 @@ class RobotConnection(Connection):
         self.path = f"{robot} ({desk.broker.url})"
         self._interrupt, self._end = interrupt, end
         self._published_at = time.monotonic()
-        #: the robot's presence as received on the current connection to the broker; empty if unknown
+        #: the robot's presence, or empty if it hasn't arrived since the broker was last connected
         self._presence: JsonObject = {}
-        #: session id of the bridge that has received the open requests; None if there is none
+        #: the session id of the bridge that received the open requests, or None if there is no such bridge
         self._bridge_session: object = None
-        #: when the robot became absent (monotonic); None while requests can be sent
+        #: when the robot became absent (monotonic time), or None if requests can be sent
         self.absent_since = self._published_at
-        #: ids of the goals to cancel again after each absence
+        #: the ids of canceled goals, which are canceled again after each absence
         self._canceled: set[str] = set()
-        #: lookups to send when earlier ones have been answered
+        #: requests to look up goals, which wait until earlier ones have been answered
         self._lookups: deque[Exchange] = deque()
 
     # -- requests
@@ -121,20 +125,20 @@ class RobotConnection(Connection):
             exchange.request = replace(request, id=request.id or new_goal_id(self._desk))
             exchange.latest = boottime() + request.ttl if request.ttl else None
         if not self._publish(exchange):
-            self._desk.wake()  # the request will be sent when the robot is back
+            self._desk.wake()  # The request will be sent when the robot is back.
 
     def expect_reply(self, exchange: RobotExchange) -> None:
-        """Register a request that was sent to the robot's group, so that its answer is processed."""
+        """Expect an answer to a request that was sent to the robot's group."""
         exchange.sent = True
         self._published_at = time.monotonic()
         self.register(exchange, self._published_at)
 
     def cancel_permanently(self, goal_id: str, *, is_sent: bool) -> None:
-        """Cancel a goal now and after each absence, and never send it again.
+        """Cancel a goal now, and again after each absence of the robot.
 
         Args:
-            goal_id: the goal's id.
-            is_sent: whether the first cancel has already been sent to the robot's group.
+            goal_id: the id of the goal.
+            is_sent: whether the cancel request has already been sent to the robot's group. Then it isn't sent now.
         """
         with self.changed:
             self._canceled.add(goal_id)
@@ -142,13 +146,13 @@ class RobotConnection(Connection):
                 self._post(Cancel((goal_id,)))
 
     def _post(self, request: Request) -> bool:
-        """Send a request if possible, and ignore its answer. Return whether it was sent."""
+        """Send a request whose answer is ignored. Return whether it could be sent."""
         exchange = RobotExchange(request)
         exchange.number = next(self._numbers)
         return self._publish(exchange)
 
     def _publish(self, exchange: Exchange) -> bool:
-        """Send a request to the robot if possible. Return whether it was sent."""
+        """Send a request to the robot. Return whether it could be sent."""
 
         def on_refused(error: TalkError) -> None:
             with self.changed:
@@ -164,7 +168,7 @@ class RobotConnection(Connection):
 
     def answer_by(self, exchange: Exchange) -> float:
         if not isinstance(exchange, RobotExchange):
-            return float("inf")  # a lookup needs no limit, because it is repeated after each absence
+            return float("inf")  # This is a lookup, which is repeated after each absence.
         if self.absent_since is None:
             by = super().answer_by(exchange)
         else:
@@ -172,7 +176,7 @@ class RobotConnection(Connection):
         return by if self._end is None else min(by, max(self._end, exchange.heard_at))
 
     def goals_lost_at(self) -> float:
-        return float("inf")  # the connection ends before goals are lost, see `silent_by`
+        return float("inf")  # `silent_by` ends the connection before goals count as lost.
 
     def silent_by(self, began: float) -> tuple[float, str]:
         if self.absent_since is None:
@@ -192,7 +196,7 @@ class RobotConnection(Connection):
         self._desk.poll(timeout, self._interrupt if interruptible else None)
 
     def keep_alive(self) -> None:
-        """Keep the bridge's session alive if nothing has been sent for a while."""
+        """Send a message if nothing has been sent for a while, so that the bridge doesn't end the session."""
         if time.monotonic() - self._published_at > _KEEP_ALIVE_INTERVAL_S:
             self._post(Hello(self._sender))
 
@@ -202,7 +206,7 @@ class RobotConnection(Connection):
         link.subscribe(topics.robot(self.robot, topics.PRESENCE), retained=True)
 
     def on_disconnected(self, why: str) -> None:
-        """Treat the robot as absent until its presence is received again."""
+        """Treat the robot as absent until its presence arrives again."""
         with self.changed:
             self.begin_stream()
             self._presence, self._bridge_session = {}, None
@@ -222,11 +226,14 @@ class RobotConnection(Connection):
             self.absent_since = time.monotonic()
 
     def _update_presence(self, payload: bytes) -> None:
-        """Process the presence that the robot's bridge has published, or left as its will."""
+        """Process the robot's presence.
+
+        It comes from the robot's bridge, or from the broker if the bridge has lost its connection.
+        """
         try:
             presence = decode(payload.strip())
         except BadRequest:
-            return  # the retained message was cleared
+            return  # The retained message has been deleted.
         self._presence = presence
         server = presence.get("server")
         if presence.get("online") is not True:
@@ -242,9 +249,9 @@ class RobotConnection(Connection):
     # -- connecting
 
     def wait_online(self, give_up: float) -> None:
-        """Wait for the robot's presence. If the robot is offline, wait for it until `give_up` (monotonic).
+        """Wait until the robot is online.
 
-        Raises the same errors as `connect_robot`.
+        If it is offline, wait until `give_up` (monotonic time). Raises the same errors as `connect_robot`.
         """
         left = self._patience if self._end is None else max(0.0, self._end - time.monotonic())
         self._desk.wait_for_retained(min(self._patience, left), lambda: bool(self._presence), self._interrupt)
@@ -257,7 +264,7 @@ class RobotConnection(Connection):
         self.check_online()
 
     def check_online(self) -> None:
-        """Raise ServerUnavailable or ProtocolMismatch if the robot can't receive requests now."""
+        """Raise ServerUnavailable or ProtocolMismatch if the robot can't receive requests at the moment."""
         check_greeting(self._presence, __version__)
         if self.absent_since is not None:
             raise ServerUnavailable(f"{self.absence}: nothing was sent")
@@ -265,7 +272,7 @@ class RobotConnection(Connection):
     # -- after an absence
 
     def _resend_all(self) -> None:
-        """Send open requests again, and look up the goals that the robot may already have."""
+        """Send open requests again, but first look up goals that the robot may already have."""
         now = time.monotonic()
         if self._sender:
             self._post(Hello(self._sender))
@@ -279,7 +286,7 @@ class RobotConnection(Connection):
             if exchange.sent and isinstance(exchange.request, Say):
                 self._look_up(exchange, exchange.request, now)
             elif exchange.sent and isinstance(exchange.request, self.lasting):
-                # If the request were sent again, it could affect newer goals.
+                # The robot may have carried out this request. If it were sent again, it could affect newer goals.
                 self.fail(exchange, self._lost_error(exchange, self.absence))
             else:
                 self._resend(exchange)
@@ -287,9 +294,9 @@ class RobotConnection(Connection):
             self._watch_again(now)
 
     def _resend(self, exchange: RobotExchange) -> None:
-        """Send a request again. Fail it if its ttl has expired, or if it was sent too many times."""
+        """Send a request again. It fails if its ttl has expired, or if it has been sent too many times."""
         if exchange.number not in self.exchanges:
-            return  # nobody waits for the answer any more
+            return  # The caller has stopped waiting for the answer.
         request = exchange.request
         left = 0.0 if exchange.latest is None else exchange.latest - boottime()
         exchange.resends += 1
@@ -310,7 +317,7 @@ class RobotConnection(Connection):
         return Lost(f"{words}; it may have been carried out")
 
     def _look_up(self, exchange: RobotExchange, request: Say, now: float) -> None:
-        """Look up a goal that may have been accepted. If the robot doesn't know the goal, send it again."""
+        """Ask the robot whether it has accepted a goal. If it doesn't know the goal, send the goal again."""
 
         def on_reply(_: JsonObject, items: list[JsonObject]) -> None:
             for each in items:
@@ -332,7 +339,7 @@ class RobotConnection(Connection):
         self._send_lookups(now)
 
     def _send_lookups(self, now: float) -> None:
-        """Send waiting lookups until the limit for open ones is reached."""
+        """Send waiting lookups, as long as not too many are open."""
         open_count = sum(not isinstance(each, RobotExchange) for each in self.exchanges.values())
         for _ in range(min(len(self._lookups), _MAX_OPEN_LOOKUPS - open_count)):
             exchange = self._lookups.popleft()
@@ -351,7 +358,7 @@ class RobotConnection(Connection):
     # -- closing
 
     def end_session(self) -> None:
-        """End this desk's session with the robot's bridge."""
+        """Tell the robot's bridge that no more requests will follow."""
         if self._bridge_session is not None:
             self._desk.end_session(self.robot)
 
@@ -364,18 +371,18 @@ class RobotConnection(Connection):
 
 
 def connect_robot(robot: str, broker: Broker, *, keep_trying: float = 0.0, **options: Any) -> RobotConnection:
-    """Connect to a robot's server.
+    """Connect to a robot's server through the broker.
 
     Args:
-        robot: the robot's name.
+        robot: the name of the robot.
         broker: the broker that the robot's bridge uses.
-        keep_trying: seconds for which to retry if the broker can't be reached, and to wait for an offline robot.
-        options: further arguments of `RobotConnection`.
+        keep_trying: how long to keep trying in seconds if the broker can't be reached or the robot is offline.
+        options: other arguments of `RobotConnection`.
 
     Raises:
         ServerUnavailable: The broker can't be reached, or the robot is unknown, offline or without a server.
         AccessDenied: The broker rejected the login, or its certificate is not trusted.
-        UsageError: The robot's or the sender's name is not allowed.
+        UsageError: The name of the robot or the sender is not allowed.
     """
     give_up = time.monotonic() + keep_trying
     while True:
@@ -393,5 +400,5 @@ def connect_robot(robot: str, broker: Broker, *, keep_trying: float = 0.0, **opt
 
 
 def new_goal_id(desk: DeskLink) -> str:
-    """Return a new goal id. It contains a colon, unlike the ids that servers assign."""
+    """Create a goal id. It contains a colon, which the ids from servers don't."""
     return f"{desk.user[:_ID_USER_CHARS]}:{os.urandom(5).hex()}"

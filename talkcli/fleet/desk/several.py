@@ -1,8 +1,8 @@
-"""A request to several robots at once, and its outcome on each robot.
+"""Classes for a request to several robots at once.
 
-If a glob selects the robots, each robot is sent its own request. If the robots are a group, a single message is sent,
-which the broker delivers to all members. A member is recognized by its presence or by its answer. A request counts as
-successful only if the robot itself has confirmed it.
+If the robots are selected by a glob, each of them is sent its own request. If they are selected by a group, a single
+message is sent, which the broker delivers to all members. The members are known from their presence and their answers.
+A request counts as successful only if the robot itself has confirmed it.
 """
 
 from __future__ import annotations
@@ -35,21 +35,22 @@ if TYPE_CHECKING:
 
     from talkcli.fleet.broker import Broker
 
-#: Default ttl of a sentence, so that no robot says something that was true a minute ago.
+#: The default ttl of a sentence. It prevents a robot from saying something that was only true a minute ago.
 DEFAULT_TTL_S = 10.0
-#: Interval of the checks for robots that haven't answered in time.
+#: How often to check for robots that haven't answered in time.
 _CHECK_INTERVAL_S = 0.25
-#: Maximum number of messages to process before such a check. Many may have arrived while this process was suspended.
+#: The maximum number of messages to process before a check for late robots. There may be many messages if this process
+#: was suspended.
 _MAX_MESSAGES_PER_CHECK = 5000
 #: How long `close` waits until the broker has acknowledged the request.
 _FLUSH_LIMIT_S = 1.0
 
 
 class FleetRequest:
-    """A request to several robots. Iterating over it yields the robots' outcomes as they arrive.
+    """A request to several robots. Iterate over it to receive the outcomes as they arrive.
 
-    The connection to the broker is closed after the last outcome, by `close`, or at the end of a `with` block. Closing
-    it doesn't cancel the request. Only one thread may use this object.
+    The connection to the broker is closed after the last outcome, by `close`, or at the end of a `with` block. This
+    doesn't cancel the request. Only one thread may use this object.
     """
 
     def __init__(
@@ -67,14 +68,14 @@ class FleetRequest:
         Args:
             broker: the broker of the fleet.
             selection: the robots.
-            request: the request. It must name goals by their ids, because a goal's number differs from robot to robot.
-            name: the sender's name; default TALK_NAME.
-            interrupt: descriptors that interrupt any wait, as in `wait_ready`.
-            patience: seconds in which the broker and each robot must answer.
+            request: the request. It must refer to goals by their ids, because their numbers differ between robots.
+            name: the name of the sender. The default is TALK_NAME.
+            interrupt: file descriptors that interrupt any wait, as in `wait_ready`.
+            patience: the time in seconds within which the broker and each robot must answer.
 
         Raises:
             UsageError: The selection or the request is not valid.
-            UnknownGoal: The request has an id that no goal can have.
+            UnknownGoal: The request contains an invalid goal id.
             ServerUnavailable: The broker can't be reached.
             AccessDenied: The broker rejected the login, or its access rules don't allow the request.
         """
@@ -82,22 +83,22 @@ class FleetRequest:
             raise UsageError(selection.fault)
         _check_request(request)
         self._selection, self._name, self._interrupt, self._patience = selection, name, interrupt, patience
-        #: the known robots by name, including those that came online too late for the request
+        #: all known robots by name, including those that came online too late to receive the request
         self._robots: dict[str, RobotRequest] = {}
-        #: names of the robots that the request includes, and of those among them whose last outcome hasn't arrived
+        #: the names of the robots that the request is for, and of those that have more outcomes to come
         self._included, self._unfinished = set[str](), set[str]()
         self._outcomes: deque[Outcome] = deque()
         self._numbers = itertools.count(FIRST_NUMBER)
-        #: the number of the request, if it goes to a group
+        #: the number of the message to the group, if the robots are a group
         self._number = next(self._numbers)
-        #: the error if the broker has refused the message to the group
+        #: the error if the broker has rejected the message to the group
         self._refused: TalkError | None = None
-        #: whether the request was sent and is not closed yet
+        #: whether sending the request has begun and `close` hasn't been called yet
         self._began = False
-        #: whether all robots are known, so that later ones are ignored
+        #: whether all robots are known. Robots that appear later are ignored.
         self._complete = False
         self._closed = False
-        #: the id of the goal to cancel on each robot; None if `cancel` was not called
+        #: the id of the goal that `cancel` has canceled, or None if `cancel` hasn't been called
         self._canceled_id: str | None = None
         self._desk = DeskLink(broker)
         self._desk.handler = self
@@ -106,10 +107,10 @@ class FleetRequest:
                 ttl = DEFAULT_TTL_S if request.ttl is None else request.ttl
                 request = replace(request, id=request.id or new_goal_id(self._desk), ttl=ttl)
             self.request = request
-            #: the rejected goal, if the text is too long for any server; such a request is not sent
+            #: the rejected goal, if the text is too long for any server. The request isn't sent then.
             self._rejected = too_long(request) if isinstance(request, Say) else None
             self._desk.wait_for_retained(patience, interrupt=interrupt)
-            #: time after which the sentence is no longer sent (`boottime`); None for no limit
+            #: when to stop sending the sentence (in `boottime`), or None for no limit
             self._latest = boottime() + request.ttl if isinstance(request, Say) and request.ttl else None
             self._began = True
             self._send_to_known_robots()
@@ -127,29 +128,31 @@ class FleetRequest:
         return self.results()
 
     def __len__(self) -> int:
-        """Return the number of selected robots that are known so far, including offline ones."""
+        """Return how many selected robots have been found so far, including those that are offline."""
         return len(self._included)
 
     @property
     def unfinished_robots(self) -> list[str]:
-        """The names of the robots whose last outcome hasn't arrived, sorted."""
+        """The names of the robots that have more outcomes to come, sorted."""
         return sorted(self._unfinished)
 
     @property
     def why_disconnected(self) -> str | None:
-        """The reason why nothing can be sent now, or None if the broker is connected."""
+        """A message if the connection to the broker is lost, otherwise None."""
         return None if self._desk.link else f"the broker at {self._desk.broker.url} went away"
 
     def results(self, timeout: float | None = None) -> Iterator[Outcome]:
-        """Yield outcomes as they arrive. After a TimeoutError or Interrupted, call this again for the remaining ones.
+        """Yield the outcomes as they arrive.
+
+        After a TimeoutError or Interrupted, call this again to receive the remaining outcomes.
 
         Args:
-            timeout: seconds for all outcomes; None for no limit.
+            timeout: the time limit for all outcomes in seconds, or None for no limit.
 
         Raises:
-            TimeoutError: Not all robots have answered in time.
+            TimeoutError: Not all outcomes have arrived in time.
             Interrupted: One of the `interrupt` descriptors is ready.
-            ServerUnavailable: No robot is selected.
+            ServerUnavailable: No robot matches the selection.
             AccessDenied: The broker's access rules don't allow requests to the group.
         """
         end = None if timeout is None else time.monotonic() + timeout
@@ -178,9 +181,10 @@ class FleetRequest:
             raise self._no_robot_error()
 
     def cancel(self) -> None:
-        """Cancel the sentence on each robot that hasn't finished it. Absent robots cancel it when they are back.
+        """Cancel the sentence on all robots that haven't finished it.
 
-        Further outcomes report how the goals ended. This has no effect on requests other than sentences.
+        If a robot is absent, it cancels the sentence when it is back. Later outcomes report how the goals have ended.
+        If the request isn't a sentence, this method has no effect.
 
         Raises:
             UsageError: All outcomes have been returned. Cancel the goal by its id instead.
@@ -194,13 +198,13 @@ class FleetRequest:
         if group is not None:
             self._desk.send(Cancel((goal_id,)), next(self._numbers), group, self._on_refused, is_group=True)
         for name in list(self._unfinished):
-            # A robot that has left the group doesn't receive the message to the group.
+            # If a robot has left the group, it doesn't receive the message to the group.
             robot = self._robots[name]
             is_sent = group is not None and robot.presence is not None and self._selection.includes(robot.presence)
             robot.connection.cancel_permanently(goal_id, is_sent=is_sent)
 
     def close(self) -> None:
-        """Close the connection to the broker. The robots still carry out the request."""
+        """Close the connection to the broker. This doesn't cancel the request."""
         began, self._began, self._closed = self._began, False, True
         if began:
             self._desk.flush(_FLUSH_LIMIT_S)
@@ -213,7 +217,7 @@ class FleetRequest:
         self._desk.close()
 
     def _send_to_known_robots(self) -> None:
-        """Send the request to the group, or to each robot whose presence has arrived."""
+        """Send the request to the group, or to each selected robot that is known."""
         group = self._selection.group
         if group is not None and self._rejected is None:
             self._desk.send(self.request, self._number, group, self._on_refused, is_group=True)
@@ -227,7 +231,7 @@ class FleetRequest:
         self._refused = error
 
     def _check_all(self) -> None:
-        """Process all messages that have arrived. Then record a failure for each robot that is too late."""
+        """Process all waiting messages. Then record a failure for each robot that hasn't answered in time."""
         for _ in range(_MAX_MESSAGES_PER_CHECK):
             if not self._desk.poll(0.0, self._interrupt):
                 break
@@ -235,7 +239,7 @@ class FleetRequest:
             self._update(name, check_time=True)
 
     def _no_robot_error(self) -> TalkError:
-        """Return the error for a selection that matches no robot."""
+        """Return the error to raise if no robot matches the selection."""
         selection, url = self._selection, self._desk.broker.url
         if selection.group is not None and self.why_disconnected:
             words = f"{self.request.kind} was sent to the group '{selection.group}', but {self.why_disconnected}"
@@ -247,13 +251,13 @@ class FleetRequest:
     # -- messages from the broker
 
     def on_connected(self, link: Link) -> None:
-        """Subscribe to all replies to this desk, and to the presence of all robots."""
+        """Subscribe to all replies to this connection, and to the presence of all robots."""
         link.subscribe(topics.reply(self._desk.user, self._desk.session, topics.ANY), retained=False)
         link.subscribe(topics.robot(topics.ANY, topics.PRESENCE), retained=True)
 
     def on_disconnected(self, why: str) -> None:
         """Treat all robots as absent."""
-        # Later robots are not included, because the broker may be back too late to report them.
+        # Ignore robots that appear after this, because the broker may be back too late.
         self._complete = self._complete or self._began
         for each in self._robots.values():
             each.connection.on_disconnected(why)
@@ -266,7 +270,7 @@ class FleetRequest:
             return
         presence = Presence.read(name, message.payload)
         if presence is None:
-            return  # cleared or malformed
+            return  # The retained message has been deleted, or it is malformed.
         if name in self._robots or self._selection.includes(presence):
             robot = self._robot(name)
             robot.presence = presence
@@ -275,11 +279,11 @@ class FleetRequest:
                 self._on_presence(robot, presence)
 
     def _on_presence(self, robot: RobotRequest, presence: Presence) -> None:
-        """Include a robot in the request when its presence first arrives, and send the request if possible.
+        """Include a robot in the request when its presence first arrives. Send the request if possible.
 
-        After all retained messages have arrived, further robots are ignored, because they came online too late. Before
-        that, every member of a group is expected to answer, even if it came online after the request was sent. Such a
-        member can't be distinguished from the others, because some brokers send retained messages late.
+        After all retained messages have arrived, new robots are ignored, because they came online too late. Until then,
+        every member of a group is expected to answer. Some members may have come online after the request was sent, but
+        they can't be recognized, because some brokers send retained messages late.
         """
         name = presence.name
         if name in self._included:
@@ -301,7 +305,10 @@ class FleetRequest:
             robot.send()
 
     def _on_reply(self, name: str, message: Message) -> None:
-        """Process a robot's lines. A robot that answers the group's request is a member, even if it seemed absent."""
+        """Process lines from a robot's server.
+
+        If a robot answers a request to a group, it is a member of the group, even if it seemed to be absent.
+        """
         if topics.name_fault(name) or not self._began:
             return
         robot = self._robot(name)
@@ -314,7 +321,7 @@ class FleetRequest:
         self._update(name)
 
     def _robot(self, name: str) -> RobotRequest:
-        """Return the RobotRequest of a robot. Create it if there is none."""
+        """Return the RobotRequest for a robot. Create it if necessary."""
         if name not in self._robots:
             connection = RobotConnection(
                 name, self._desk, name=self._name, patience=self._patience, numbers=self._numbers
@@ -323,12 +330,12 @@ class FleetRequest:
         return self._robots[name]
 
     def _include(self, name: str) -> None:
-        """Include a robot in the request."""
+        """Add a robot to the robots that the request is for."""
         self._included.add(name)
         self._unfinished.add(name)
 
     def _update(self, name: str, *, check_time: bool = False) -> None:
-        """Record the new outcomes of a robot, unless its last one has been recorded."""
+        """Record the new outcomes of a robot, unless it is already finished."""
         if name in self._unfinished:
             self._robots[name].update(check_time=check_time)
 
@@ -338,22 +345,22 @@ class FleetRequest:
 
 
 class RobotRequest:
-    """The part of a `FleetRequest` that is for one robot."""
+    """The request to one of the robots of a `FleetRequest`."""
 
     def __init__(self, connection: RobotConnection, request: Request, record: Callable[..., None]) -> None:
-        """Prepare the request. `record` is called with all outcomes."""
+        """Prepare a request. All outcomes are passed to `record`."""
         self.connection = connection
-        #: the robot's last presence; None if unknown
+        #: the latest presence of the robot, or None if unknown
         self.presence: Presence | None = None
-        #: whether the request was sent to this robot or to its group
+        #: whether the request has been sent to this robot or to its group
         self.was_asked = False
         self._name, self._request, self._record = connection.robot, request, record
-        #: the goals that haven't been reported as ended, and the start of the wait for them (monotonic)
+        #: the goals whose end hasn't been reported yet, and when the wait for them began (monotonic time)
         self._handles: deque[GoalHandle] = deque()
         self._since = time.monotonic()
 
     def send(self) -> None:
-        """Send the request to this robot alone."""
+        """Send the request to this robot only, not to its group."""
         try:
             self.connection.check_online()
             self.connection.begin(self._request, self._on_reply, self._on_failure)
@@ -362,11 +369,11 @@ class RobotRequest:
             self._on_failure(error)
 
     def expect_reply(self, number: int, latest: float | None) -> None:
-        """Register the request that was sent to the robot's group, so that its answer is processed.
+        """Expect an answer to the request, which was sent to the robot's group.
 
         Args:
-            number: the number of that request.
-            latest: time after which a sentence is no longer sent (`boottime`); None for no limit.
+            number: the number of the request.
+            latest: when to stop sending the sentence (in `boottime`), or None for no limit.
         """
         exchange = RobotExchange(self._request, self._on_reply, self._on_failure)
         exchange.number, exchange.latest = number, latest
@@ -377,7 +384,7 @@ class RobotRequest:
         """Record the outcomes of goals that have ended since the last call.
 
         Args:
-            check_time: whether to record a failure, too, if the robot hasn't answered in time.
+            check_time: whether to record a failure if the robot hasn't answered in time.
         """
         self.connection.keep_alive()
         if check_time:
@@ -388,17 +395,17 @@ class RobotRequest:
                 self.connection.end(why)
         while self._handles and (self._handles[0].state.terminal or self._handles[0]._lose()):
             handle = self._handles.popleft()
-            # A wait without ids succeeds even if the goals fail.
+            # Waiting for all goals succeeds even if the goals fail.
             any_end = isinstance(self._request, Wait) and self._request.ids is None and handle.state is not State.LOST
             code = EXIT_OK if any_end else handle.goal.exit_code or EXIT_OK
             self._record(Outcome(self._name, handle.state.name, code, handle.goal, last=not self._handles))
 
     def _on_reply(self, reply: JsonObject, items: list[JsonObject]) -> None:
-        """Follow the goals that the request waits for. If there are none, the reply has all outcomes."""
+        """Start waiting for the goals of the request. If there are none to wait for, record the outcomes."""
         request = self._request
         found: list[Goal] = []
         if isinstance(request, Say):
-            goal = Goal.from_json(reply.get("goal"))  # raises Unreadable if there is no goal
+            goal = Goal.from_json(reply.get("goal"))  # This raises Unreadable if there is no goal.
             found = [goal] if request.wait else []
         elif isinstance(request, Wait):
             found = list(goals(items, "goal"))
@@ -419,7 +426,7 @@ class RobotRequest:
 
 
 def _check_request(request: Request) -> None:
-    """Raise UsageError or UnknownGoal if this request can't be sent to several robots."""
+    """Raise UsageError or UnknownGoal if a request can't be sent to several robots."""
     ids = (request.ids if isinstance(request, Cancel | Wait) else None) or ()
     other = request.before if isinstance(request, Cancel) else request.id if isinstance(request, Status) else None
     for each in (*ids, *(() if other is None else (other,))):

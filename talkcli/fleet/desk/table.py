@@ -1,6 +1,6 @@
-"""Output about a fleet: a table of the robots, and lines about events. Pure.
+"""Functions to format the state of a fleet as a table, and its events as lines.
 
-The caller passes the time and the properties of the terminal.
+The module is pure. The caller passes the time and the properties of the terminal.
 """
 
 from __future__ import annotations
@@ -17,29 +17,29 @@ if TYPE_CHECKING:
 
     from talkcli.protocol.events import Event
 
-    #: The text of a cell, and the state whose colour is used; None for no colour.
+    #: The text of a cell, and the state that determines its colour. If the state is None, the cell has no colour.
     Cell = tuple[str, State | None]
 
 COLUMN_NAMES = ("ROBOT", "ONLINE", "SERVER", "SPEAKING", "QUEUE", "LAST", "SINCE")
-#: If the column SPEAKING would be narrower than the minimum, these columns are omitted in turn.
+#: If a terminal is too narrow, these columns are omitted one by one until the column SPEAKING has its minimum width.
 _OPTIONAL_COLUMNS = ("SINCE", "LAST", "SERVER", "QUEUE")
 _MIN_TEXT_CHARS = 12
-#: Width of the column SPEAKING if the output isn't a terminal. Longer texts are not cut.
+#: The width of the column SPEAKING if the output isn't a terminal. Longer texts are not cut off.
 _USUAL_TEXT_CHARS = 40
 _MAX_VERSION_CHARS = 12
-#: The cell for a value that is missing or unknown.
+#: The cell to show for an unknown value.
 _EMPTY_CELL: Cell = ("-", None)
 
 
 def robot_lines(robots: Sequence[RobotInfo], screen: Screen, now: float) -> list[str]:
-    """Return the lines of the table, with a heading.
+    """Format a table of robots. The first line is the heading.
 
-    If a terminal is too narrow, the texts of sentences are shortened first. Then columns are omitted.
+    If a terminal is too narrow, the texts of sentences are shortened, and then columns are omitted.
 
     Args:
         robots: the robots, one for each row.
         screen: the properties of the terminal.
-        now: the current time in seconds since 1970, to show ages.
+        now: the current time in seconds since 1970.
     """
     rows = [_cells(each, screen, now) for each in robots]
     widths = {name: max(map(width, (name, *(cells[name][0] for cells in rows)))) for name in COLUMN_NAMES}
@@ -49,7 +49,7 @@ def robot_lines(robots: Sequence[RobotInfo], screen: Screen, now: float) -> list
 
 
 def _cells(robot: RobotInfo, screen: Screen, now: float) -> dict[str, Cell]:
-    """Return the cells of a row, by column name."""
+    """Return the cells of a robot's row, by column name."""
     presence, status = robot.presence, robot.status or RobotStatus()
     cells = dict.fromkeys(COLUMN_NAMES, _EMPTY_CELL)
     cells["ROBOT"] = cut(printable(presence.name), max_id_columns(screen)), None
@@ -90,7 +90,10 @@ def _last_cell(goal: LastGoal, now: float) -> Cell:
 
 
 def _format_age(seconds: float) -> str:
-    """Return a duration in its largest unit. A negative one, from a robot whose clock is ahead, counts as 0."""
+    """Format a duration in its largest unit, such as "3 h".
+
+    A negative duration counts as 0. It occurs if the robot's clock is ahead.
+    """
     whole = max(0, int(seconds))
     for size, name in ((86400, "d"), (3600, "h"), (60, "min")):
         if whole >= size:
@@ -99,7 +102,7 @@ def _format_age(seconds: float) -> str:
 
 
 def _fit_columns(widths: dict[str, int], room: int | None) -> None:
-    """Narrow the column SPEAKING, and remove other columns, until a line fits into `room` characters."""
+    """Shrink the column SPEAKING and remove other columns until a line has at most `room` characters."""
     longest = widths["SPEAKING"]
     if room is None:
         widths["SPEAKING"] = min(longest, _USUAL_TEXT_CHARS)
@@ -125,18 +128,18 @@ def _format_row(cells: dict[str, Cell], widths: dict[str, int], screen: Screen) 
 
 
 class FleetTranscript:
-    """Formats events of robots as lines. Each line has the time, then the robot's name."""
+    """Formats events of robots as lines. Each line begins with the time and the robot's name."""
 
     def __init__(self, *, full: bool) -> None:
-        """Create a transcript. `full` has the same meaning as for `Transcript`."""
+        """Create a transcript. `full` is the option of `Transcript`."""
         self._full = full
         self._columns = ColumnWidths()
         self._transcripts: dict[str, Transcript] = {}
 
     def begin(self, robots: Sequence[Presence], broker: str, screen: Screen, now: float) -> list[str]:
-        """Return the first line, which has the number of robots and the broker's URL."""
+        """Return the first line, which shows the number of robots and the URL of the broker."""
         for each in robots:
-            self._columns.robot(each.name, screen)  # before the first line, so that all lines are aligned
+            self._columns.robot(each.name, screen)  # All names must be known first, so that all lines are aligned.
         offline = sum(not each.online for each in robots)
         serverless = sum(each.online and each.server is None for each in robots)
         parts = [f"{len(robots)} robot{'' if len(robots) == 1 else 's'}"]
@@ -145,16 +148,16 @@ class FleetTranscript:
         return [cut(f"{clock_time(now)}{COLUMN_GAP}{', '.join(parts)}; {printable(broker)}", screen.columns_left(0))]
 
     def lines(self, name: str, event: Event, screen: Screen, now: float) -> list[str]:
-        """Return the lines for an event of a robot, as `Transcript.lines` does."""
+        """Format an event of a robot, as `Transcript.lines` does."""
         if name not in self._transcripts:
             self._transcripts[name] = Transcript(full=self._full, words=False, robot=name, widths=self._columns)
         return self._transcripts[name].lines(event, screen, now)
 
     def change(self, before: Presence | None, robot: Presence, screen: Screen, now: float) -> list[str]:
-        """Return the line that reports a change of a robot or its server. The robot's earlier goals are forgotten.
+        """Return the line that reports a change of a robot or its server. This forgets the robot's earlier goals.
 
         Args:
-            before: the presence before the change; None if the robot was unknown.
+            before: the presence before the change, or None if the robot was unknown.
             robot: the presence after the change.
             screen: the properties of the terminal.
             now: the current time in seconds since 1970.

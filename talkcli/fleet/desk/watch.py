@@ -1,8 +1,8 @@
-"""The state of all robots of a fleet: `read_robots` reads it once, and FleetWatch watches it change.
+"""Functions to read the state of a fleet once, or to watch it.
 
-Nothing is sent to the robots. After a break of the connection to the broker, FleetWatch compares the retained messages
-with the state before the break. They contain each robot's presence, active goal and last ended goal. If several goals
-of a robot ended during the break, only the last one is reported.
+Nothing is sent to the robots. If the connection to the broker was lost for a while, FleetWatch compares the retained
+messages with the state before that. They contain each robot's presence, its active goal, and the goal that ended last.
+If several goals of a robot ended in the meantime, only the last one is reported.
 """
 
 from __future__ import annotations
@@ -29,22 +29,26 @@ if TYPE_CHECKING:
     from talkcli.fleet.link import Link
     from talkcli.goals.goal import JsonObject
 
-#: Time for bridges to reconnect after the broker is back. A robot that has no presence by then counts as gone.
+#: After the broker is back, bridges have this much time to reconnect. If a robot hasn't reported its presence by then,
+#: it counts as gone.
 BRIDGES_BACK_LIMIT_S = 15.0
-#: Interval of the checks for time limits that have passed.
+#: How often to check whether a time limit has passed.
 _LIMIT_CHECK_INTERVAL_S = 0.5
 
 
 @frozen
 class FleetSnapshot:
-    """The state of all robots when the watch starts, sorted by name."""
+    """The state of all robots when the watch starts. They are sorted by name."""
 
     robots: tuple[RobotInfo, ...]
 
 
 @frozen
 class RobotChanged:
-    """A robot or its server has come or gone. `before` or `now` is None if its presence is unknown."""
+    """Reports that a robot or its server has started or stopped.
+
+    `before` and `now` are the robot's presence before and after the change, or None if it is unknown.
+    """
 
     name: str
     before: Presence | None
@@ -53,7 +57,7 @@ class RobotChanged:
 
 @frozen
 class RobotEvent:
-    """An event of one robot, and the JSON message that it was read from."""
+    """An event of one robot, with the JSON message from which it was read."""
 
     name: str
     event: StateChanged | PausedChanged
@@ -62,7 +66,10 @@ class RobotEvent:
 
 @frozen
 class EventsMissed:
-    """The state of a robot whose events were missed for a while, with the events that can be derived from the state."""
+    """Reports that some events of a robot were missed.
+
+    It contains the robot's current state, and those of the missed events that can be derived from it.
+    """
 
     robot: RobotInfo
     events: tuple[StateChanged, ...]
@@ -70,7 +77,7 @@ class EventsMissed:
 
 @frozen
 class BrokerAway:
-    """The connection to the broker has broken. The watch fails if it is not back within `limit` seconds."""
+    """Reports that the connection to the broker was lost. The watch fails if it isn't back within `limit` seconds."""
 
     why: str
     limit: float
@@ -78,7 +85,7 @@ class BrokerAway:
 
 @frozen
 class BrokerBack:
-    """The broker is connected again. `after` is the length of the break in seconds."""
+    """Reports that the broker is connected again, after an absence of `after` seconds."""
 
     after: float
 
@@ -89,13 +96,13 @@ FleetEvent = FleetSnapshot | RobotChanged | RobotEvent | EventsMissed | BrokerAw
 def read_robots(
     broker: Broker, timeout: float, name: str | None = None, *, with_status: bool = True
 ) -> list[RobotInfo]:
-    """Return the robots that the broker knows, online or not, sorted by name.
+    """List the robots of a fleet by name, including those that are offline.
 
     Args:
         broker: the broker of the fleet.
-        timeout: seconds in which the broker must answer.
-        name: the only robot to return; None for all.
-        with_status: whether to read the robots' status as well.
+        timeout: the time in seconds within which the broker must answer.
+        name: the name of a robot, to return only this one.
+        with_status: whether to read the status of the robots, too.
 
     Raises:
         ServerUnavailable: The broker can't be reached, or doesn't answer in time.
@@ -113,7 +120,7 @@ def read_robots(
 
 
 class _RetainedReader:
-    """A desk handler that collects all messages on some topics."""
+    """Subscribes to some topics, and collects all messages."""
 
     def __init__(self, wanted: list[str]) -> None:
         self._wanted = wanted
@@ -123,14 +130,14 @@ class _RetainedReader:
         link.subscribe(*self._wanted, retained=True)
 
     def on_disconnected(self, why: str) -> None:
-        pass  # `wait_for_retained` raises the desk's failure
+        pass  # `wait_for_retained` raises the error.
 
     def on_message(self, message: Message) -> None:
         self.messages.append(message)
 
 
 def _robots_in(messages: list[Message]) -> list[RobotInfo]:
-    """Return the robots whose presence is among these messages, sorted by name."""
+    """Read the state of robots from these messages, sorted by name. Omit robots without a presence."""
     payloads: dict[str, dict[str, bytes]] = {}
     for message in messages:
         _, _, name, kind, *_ = message.topic.split("/")
@@ -144,10 +151,10 @@ def _robots_in(messages: list[Message]) -> list[RobotInfo]:
 
 
 class FleetWatch:
-    """Watches all robots of a fleet, or a selection of them. Only one thread may use it."""
+    """Watches all robots of a fleet, or some of them. Only one thread may use this object."""
 
     def __init__(self, broker: Broker, selection: Selection | None = None) -> None:
-        """Prepare the watch. `events` connects to the broker.
+        """Prepare to watch robots. `events` connects to the broker.
 
         Raises:
             UsageError: The user name can't be part of a topic.
@@ -157,27 +164,27 @@ class FleetWatch:
         self._desk.handler = self
         self._events: deque[FleetEvent] = deque()
         self._presences: dict[str, Presence] = {}
-        #: for each robot, the ids of the goals that were last reported as ended (key True) and as started (key False)
+        #: for each robot, the goal last reported as ended (key True) and the goal last reported as started (key False)
         self._reported: dict[str, dict[bool, str]] = {}
-        #: robots whose events may have been missed. Their next status shows what they have spoken.
+        #: the robots whose events may have been missed. Their next status message shows the goals that were missed.
         self._maybe_missed: set[str] = set()
-        #: the first messages on a new connection, until all retained ones have arrived; None after that
+        #: the messages on a new connection until all retained ones have arrived, otherwise None
         self._retained: list[Message] | None = None
         self._has_started = False
-        #: since when the broker has been disconnected (monotonic), and why; None while it is connected
+        #: when the connection to the broker was lost (monotonic time) and why, or None if the broker is connected
         self._away_since: float | None = time.monotonic()
         self._away_why = ""
-        #: robots that haven't come back with the broker, each with the time limit (monotonic)
+        #: the robots that haven't reconnected since the broker is back, with their time limits (monotonic time)
         self._missing: dict[str, float] = {}
 
     def events(self, interrupt: Mapping[int, int] | None = None) -> Iterator[FleetEvent]:
-        """Yield events, starting with a FleetSnapshot, until one of the `interrupt` descriptors is ready.
+        """Yield events until one of the `interrupt` descriptors is ready. The first event is a FleetSnapshot.
 
         Raises:
             Interrupted: One of the descriptors is ready, see `wait_ready`.
             ServerUnavailable: The broker can't be reached when the watch starts.
             AccessDenied: The broker rejected the login, or its access rules don't allow the request.
-            Lost: The broker was lost later, and was not back in time.
+            Lost: The connection to the broker was lost later, and the broker wasn't back in time.
         """
         try:
             while True:
@@ -192,14 +199,14 @@ class FleetWatch:
     # -- messages from the broker
 
     def on_connected(self, link: Link) -> None:
-        """Subscribe to presence, status and events."""
+        """Subscribe to the presence, the status and the events of the robots."""
         self._retained = []
         robot = (self._selection and self._selection.name) or topics.ANY
         link.subscribe(topics.robot(robot, topics.EVENT, topics.ANY), retained=False)
         link.subscribe(*(topics.robot(robot, each) for each in (topics.PRESENCE, topics.STATUS)), retained=True)
 
     def on_disconnected(self, why: str) -> None:
-        """Report that the broker is away, once for each absence."""
+        """Report that the broker is away, but only once per absence."""
         self._retained, self._away_why = None, why
         if self._away_since is None:
             self._away_since = time.monotonic()
@@ -213,11 +220,11 @@ class FleetWatch:
         _, _, name, kind, *_ = message.topic.split("/")
         if kind == topics.PRESENCE:
             presence = Presence.read(name, message.payload)
-            if presence or not message.payload:  # malformed messages are ignored
+            if presence or not message.payload:  # Otherwise, the message is malformed.
                 self._missing.pop(name, None)
                 self._set_presence(name, presence if presence and self._selects(presence) else None)
         elif kind == topics.STATUS:
-            if name in self._maybe_missed:  # otherwise its events were received, and they have more details
+            if name in self._maybe_missed:  # Otherwise, the robot's events have arrived, and they have more details.
                 self._report_missed(name, RobotStatus.read(message.payload))
         elif (event := _read_event(message)) is not None:
             self._report(event)
@@ -228,7 +235,7 @@ class FleetWatch:
     # -- time limits
 
     def _check_limits(self, now: float) -> None:
-        """Handle every time limit that has passed."""
+        """Check all time limits, and handle those that have passed."""
         if self._retained is not None and self._desk.retained_received:
             self._process_retained(self._retained, now)
         if not self._has_started and self._desk.failure:
@@ -246,7 +253,7 @@ class FleetWatch:
     # -- changes
 
     def _process_retained(self, messages: list[Message], now: float) -> None:
-        """Report the first snapshot, or the changes during a break of the connection."""
+        """Report the first snapshot, or the changes that happened while the connection was lost."""
         self._retained = None
         robots = {each.presence.name: each for each in _robots_in(messages) if self._selects(each.presence)}
         events = [event for each in messages if (event := _read_event(each))]
@@ -269,7 +276,7 @@ class FleetWatch:
             self._report(event)
 
     def _set_presence(self, name: str, now: Presence | None) -> None:
-        """Store a robot's presence, and report it if the robot or its server has changed."""
+        """Store a robot's presence. Report it if the robot or its server has started or stopped."""
         before = self._presences.pop(name, None)
         if now:
             self._presences[name] = now
@@ -279,12 +286,12 @@ class FleetWatch:
             self._events.append(RobotChanged(name, before, now))
 
     def _report_missed(self, name: str, status: RobotStatus | None, arrived: Container[str | None] = ()) -> None:
-        """Report the missed events that can be derived from a robot's status.
+        """Report those missed events of a robot that can be derived from its status.
 
         Args:
-            name: the robot's name.
-            status: the robot's status; None if unknown.
-            arrived: ids of goals whose events have arrived and will be reported next.
+            name: the name of the robot.
+            status: the status of the robot, or None if unknown.
+            arrived: the ids of goals whose events have already arrived and will be reported later.
         """
         if status is None:
             return
@@ -292,13 +299,13 @@ class FleetWatch:
         reported = self._reported.setdefault(name, {})
         missed = [each for each in events if reported.get(each.state.terminal) != each.id and each.id not in arrived]
         reported.update({each.state.terminal: each.id for each in events})
-        if events:  # a bridge that has just started may not know any goals yet
+        if events:  # If a bridge has just started, it may not know any goals yet.
             self._maybe_missed.discard(name)
         if is_known and missed and presence and presence.online:
             self._events.append(EventsMissed(RobotInfo(presence, status), tuple(missed)))
 
     def _report(self, robot_event: RobotEvent) -> None:
-        """Report a robot's event, unless the robot isn't selected."""
+        """Report an event of a robot if the robot is selected."""
         name, event = robot_event.name, robot_event.event
         if self._selection and name not in self._presences:
             return
@@ -308,7 +315,7 @@ class FleetWatch:
 
 
 def _read_event(message: Message) -> RobotEvent | None:
-    """Return the event in a message. Return None for any other message, and if the event is malformed or unknown."""
+    """Read an event from a message. Return None if the message contains no known event."""
     _, _, name, kind, *_ = message.topic.split("/")
     if kind != topics.EVENT or topics.name_fault(name):
         return None
@@ -321,7 +328,7 @@ def _read_event(message: Message) -> RobotEvent | None:
 
 
 def _identity(presence: Presence | None) -> tuple[object, ...]:
-    """Return a value that changes when the robot comes or goes, or when its bridge or server is replaced."""
+    """Return a value that changes when a robot, its bridge or its server starts or stops."""
     if presence is None or not presence.online:
         return (False,)
     return True, presence.session, presence.server and presence.server.get("boot")
