@@ -231,7 +231,7 @@ def read_value(option: Option, text: str) -> Any:
         bad = next(filter(_is_bad_byte, text), None)
         if bad:
             raise ValueError(f"the byte {_format_byte(bad)} in it is not UTF-8")
-    if not text and kind in (WORD, ID, PATH):  # usually caused by an unset shell variable
+    if not text and kind in (WORD, ID, PATH):  # an empty value usually comes from an unset variable
         raise ValueError("empty; is the variable set that it comes from?")
     return text
 

@@ -90,7 +90,7 @@ class BashCompletion(_LineCompletion):
         typed, quote = _last_word(os.environ["COMP_WORDS"])
         replaced = os.environ["COMP_CWORD"]
         if replaced in {":", "="}:
-            replaced = ""  # after sudo, the separator is passed if no text follows it
+            replaced = ""  # after `sudo`, bash passes the separator instead of an empty word
         stays = typed.removesuffix(replaced) if replaced else typed
         kept = "".join(split_arg_string(stays))
         return f"plain,{_quote_for_bash(_with_flag(value, typed).removeprefix(kept), quote)}"

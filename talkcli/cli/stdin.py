@@ -1,8 +1,9 @@
-"""`talk say` from standard input, as one text or line by line.
+"""Code that reads standard input for `talk say`, as one text or line by line.
 
-A text is read up to the length of the longest text allowed. With --lines each line becomes a goal, and all goals are
-sent over one connection. One thread reads lines into a `LineBuffer`, sends them while few of its goals are pending, and
-follows these goals. The input may never end, so a goal is forgotten once it has been reported.
+If the input is a single text, it is read up to the maximum length of a text. With --lines, each line becomes a goal,
+and all goals are sent over one connection. A single thread reads lines into a `LineBuffer`, sends them until the limit
+of pending goals is reached, and follows these goals. The input may never end, so a goal is forgotten once it has been
+reported.
 """
 
 from __future__ import annotations
@@ -38,39 +39,42 @@ if TYPE_CHECKING:
 
     _T = TypeVar("_T")
 
-#: The size of one read: the capacity of a pipe.
+#: The maximum size of one read, which is the capacity of a pipe.
 _STDIN_READ_BYTES = 65_536
-#: The size of the longest text and its line ending.
+#: The maximum size of a text with its line ending.
 _MAX_STDIN_TEXT_BYTES = MAX_TEXT_BYTES + len("\r\n")
-#: How much input with a ttl is read before it can be sent.
+#: The maximum size of buffered input if a ttl is set.
 _MAX_BUFFERED_BYTES = 1_000_000
-#: How many goals may be pending without --ahead.
+#: The default for --ahead, which limits the number of pending goals.
 _DEFAULT_PENDING_GOALS = 10
-#: How many goals that are no longer pending are kept until they have been reported.
+#: The maximum number of started or ended goals that haven't been reported.
 _MAX_UNREPORTED_GOALS = 1_000
-#: How many late lines are dropped before signals and the server are looked at again.
+#: The maximum number of expired lines to drop before signals and the server are checked again.
 _MAX_DROPPED_LINES = 1_000
-#: Stands for the end of an unlimited time.
+#: The deadline that is used if there is no time limit.
 _NO_LIMIT = float("inf")
-#: The shortest ttl that is sent, because 0 would mean no limit.
+#: The minimum ttl that is sent, because 0 would mean no limit.
 _MIN_TTL_S = 0.01
 
 
 class InputTooLong(Exception):
-    """Standard input is longer than the longest text allowed."""
+    """Raised if standard input exceeds the maximum length of a text."""
 
 
 def read_text(end: float | None, *, wait: bool = False, whole: bool = False) -> str | int:
-    """Read standard input as one text. If a signal or a missing reader ends the reading, return the exit code instead.
+    """Read standard input as one text.
 
     Args:
-        end: the monotonic time by which the whole text must have been read.
-        wait: end the reading, too, if the reader of standard output goes away.
-        whole: read a text of any length.
+        end: the monotonic time by which the input must have ended, or None for no limit.
+        wait: whether to stop if the reader of standard output goes away.
+        whole: whether to read a text of any length.
+
+    Returns:
+        The text, or the exit code if a signal or a missing reader has ended the reading.
 
     Raises:
-        TimedOut: `end` has come.
-        InputTooLong: the text is too long. The rest isn't read.
+        TimedOut: the input hasn't ended in time.
+        InputTooLong: the text is too long. The rest of the input isn't read.
     """
     data = bytearray()
     with Interrupts(output=wait) as interrupts:
@@ -86,12 +90,12 @@ def read_text(end: float | None, *, wait: bool = False, whole: bool = False) -> 
             "'talk say --lines' speaks it line by line"
         )
     if interrupts.signal_number == signal.SIGINT:
-        write_error_line()  # the terminal has shown ^C on the current line
+        write_error_line()  # start a new line after the ^C that the terminal has shown
     return interrupts.exit_code
 
 
 def rejected_goal(words: str) -> Goal:
-    """Return the goal that a server would have made of a text that is too long to be sent."""
+    """Return a rejected goal for a text that is too long to be sent."""
     return Goal("", State.REJECTED, reason="text_too_long", message=f"Talk rejected: {words}")
 
 
@@ -100,39 +104,43 @@ class InputLine:
     """A line of standard input."""
 
     number: int
-    #: without the end of the line; only the beginning of a line that is too long
+    #: the line without its line ending; truncated if the line is too long
     text: str
-    #: the size in bytes of a line that is too long to be spoken; 0 for any other line
+    #: the size of the line in bytes if it is too long to be spoken, otherwise 0
     oversize_bytes: int = 0
-    #: the monotonic time at which its ttl ends
+    #: the monotonic time at which the line expires
     end: float = _NO_LIMIT
 
 
 class LineBuffer:
-    """Lines that were read and have not been sent. The caller passes the time."""
+    """A buffer for lines that have been read but not sent."""
 
     def __init__(self, ttl: float | None = None) -> None:
-        """`ttl`: seconds from when a line was read; None for no limit."""
+        """Create an empty buffer.
+
+        Args:
+            ttl: seconds after which a line expires, or None for no limit.
+        """
         self._ttl = ttl
-        # One more byte than the longest text, because a line may end in CRLF.
+        # Allow one more byte than the longest text has, because a line may end in CRLF.
         self._splitter = LineSplitter(MAX_TEXT_BYTES + 1)
-        #: chunks that are not split yet, with the time at which each was read; many short lines would take more memory
+        #: chunks of input that haven't been split yet, to save memory, with the time when each was read
         self._chunks: deque[tuple[float, bytes]] = deque()
         self._lines: deque[InputLine] = deque()
         self._number = 0
-        #: the number of bytes that have not been split into lines
+        #: the number of bytes that haven't been split into lines yet
         self.size = 0
         self.ended = False
 
     def feed(self, data: bytes, now: float) -> None:
-        """Add a chunk of input. An empty chunk is the end of the input, and ends the last line."""
+        """Add a chunk of input. An empty chunk marks the end of the input."""
         self.ended = not data
         self.size += len(data)
         self._chunks.append((now, data))
 
     @property
     def first(self) -> InputLine | None:
-        """The oldest line that is not blank."""
+        """The oldest line that isn't blank, or None."""
         while not self._lines and self._chunks:
             now, data = self._chunks.popleft()
             self.size -= len(data)
@@ -145,32 +153,35 @@ class LineBuffer:
         return self._lines[0] if self._lines else None
 
     def take(self) -> InputLine:
-        """Remove the first line."""
+        """Remove and return the oldest line."""
         return self._lines.popleft()
 
     def take_late(self, now: float) -> Iterator[InputLine]:
-        """Remove the lines whose ttl is over."""
+        """Remove and yield all expired lines."""
         while (line := self.first) and line.end <= now:
             yield self.take()
 
 
 def _read_available(count: int) -> bytes | None:
-    """Return up to `count` bytes of standard input; b"" at its end, None if there are none at the moment."""
+    """Read up to `count` bytes of standard input.
+
+    Return no bytes at the end of the input, and None if no input is available at the moment.
+    """
     try:
         return os.read(0, count)
-    except BlockingIOError:  # another program has made it non-blocking
+    except BlockingIOError:  # another program has made standard input non-blocking
         return None
     except OSError as error:
         raise UsageError(f"standard input cannot be read: {error.strerror}") from error
 
 
 def _decode(data: bytes) -> str:
-    # Bytes that aren't UTF-8 stay recognisable, as in arguments. See `replace_bad_bytes`.
+    # Decode invalid bytes to surrogates, which `replace_bad_bytes` will find.
     return data.decode(errors="surrogateescape").rstrip("\r\n")
 
 
 class LineSpeaker:
-    """One run of `say --lines`, which sends the lines of standard input as goals and follows these goals."""
+    """Speaks the lines of standard input for `say --lines`, each line as a goal."""
 
     def __init__(
         self,
@@ -182,7 +193,7 @@ class LineSpeaker:
         timeout: float | None,
         ahead: int | None,
     ) -> None:
-        """Prepare the run.
+        """Initialize the speaker without connecting to the server.
 
         Args:
             options: the options of every command.
@@ -204,22 +215,22 @@ class LineSpeaker:
         self._ttl: float | None = goal_options["ttl"] or None
         self._buffer = LineBuffer(self._ttl)
         self._interrupts = Interrupts(output=wait)
-        #: the number of the line that is being sent, until it is accepted or refused
+        #: the number of the line that was sent but hasn't been accepted or rejected yet, or None
         self._sending: int | None = None
-        #: the goal that was sent and has not been answered yet, with its request
+        #: the goal and the request that the server hasn't answered yet, or None
         self._unanswered: tuple[GoalHandle, Exchange] | None = None
-        #: the goals that have not ended, with their line numbers, in the order of the lines; with --wait also the ended
-        #: goals that have not been reported
+        #: unfinished goals with their line numbers, in the order of the lines; with --wait, also ended goals that
+        #: haven't been reported yet
         self._goals: deque[tuple[int, GoalHandle]] = deque()
-        #: whether a note has already said that speech is paused
+        #: whether the user has been told that speech is paused
         self._pause_known = False
-        #: the error after which nothing more is read or sent
+        #: the error that has stopped reading and sending, or None
         self._error: TalkError | None = None
-        #: the number and the exit code of the first line that did not succeed
+        #: the line number and the exit code of the first failure, or None
         self._failure: tuple[int, int] | None = None
 
     def run(self) -> int:
-        """Send all lines, and return the exit code. With --wait, also wait until the goals have ended."""
+        """Send all lines and, with --wait, wait until their goals have ended. Return the exit code."""
         interrupts = self._interrupts
         try:
             with (
@@ -262,27 +273,30 @@ class LineSpeaker:
 
     @property
     def _done(self) -> bool:
-        """Whether nothing is left to send or, with --wait, to wait for."""
+        """Whether there is nothing left to send or to wait for."""
         if self._wait and self._goals:
             return False
         return self._error is not None or not (self._unanswered or self._has_lines)
 
     @property
     def _has_lines(self) -> bool:
-        """Whether there are lines to send, or there may be later."""
+        """Whether there are lines to send, or more input may follow."""
         return self._buffer.first is not None or not self._buffer.ended
 
     @property
     def _full(self) -> bool:
-        """Whether enough goals are pending, so that no line may be sent."""
+        """Whether the limit of pending or unreported goals has been reached."""
         pending = sum(each.state is State.PENDING for _, each in self._goals)
-        # A line with a key replaces the pending line of that key, so their number stays the same.
+        # A goal with a key replaces the pending goal with the same key, so the number of pending goals doesn't grow.
         enough = pending >= self._max_pending and self._goal_options["key"] is None
         return enough or len(self._goals) - pending >= _MAX_UNREPORTED_GOALS
 
     @property
     def _wants_input(self) -> bool:
-        """Whether to read more input. Without a ttl, input stays in the pipe until its first line can be sent."""
+        """Whether to read more input.
+
+        Without a ttl, input is only read when the next line can be sent.
+        """
         if self._buffer.ended or self._error is not None:
             return False
         if self._ttl:
@@ -290,7 +304,11 @@ class LineSpeaker:
         return not (self._buffer.first or self._unanswered or self._full)
 
     def _step(self) -> None:
-        """Send and drop lines as far as possible, then wait for more; TimeoutError if the timeout is over."""
+        """Send as many lines as possible, drop expired lines, and wait until there is more to do.
+
+        Raises:
+            TimeoutError: the time limit of the command is over.
+        """
         if self._error is None:
             for line in islice(self._buffer.take_late(time.monotonic()), _MAX_DROPPED_LINES):
                 self._report_expired(line)
@@ -307,7 +325,7 @@ class LineSpeaker:
             path = self._connection.path
             raise ServerUnavailable(f"nothing more can be sent to the server at {path}: {self._connection.ended}")
 
-    # -- sending
+    # Sending lines
 
     def _send(self, line: InputLine) -> None:
         if line.oversize_bytes:
@@ -321,7 +339,7 @@ class LineSpeaker:
         goal_options = self._goal_options
         if self._ttl:
             goal_options = {**goal_options, "ttl": max(_MIN_TTL_S, round(line.end - time.monotonic(), 2))}
-        # The goal is followed even without --wait, because its state shows when it is no longer pending.
+        # Follow the goal even without --wait, to find out when it is no longer pending.
         request = Say(text, wait=True, feedback=self._feedback.shows_events, patient=True, **goal_options)
         handle, accepted = self._client._handle(request)
         if handle.state is State.REJECTED:
@@ -330,7 +348,7 @@ class LineSpeaker:
         self._unanswered = handle, self._connection.begin(request, accepted)
 
     def _take_answer(self) -> None:
-        """Handle the server's answer to the last line if it has come or the connection has ended."""
+        """Process the server's answer to the last line, if it has arrived or the connection has ended."""
         if self._unanswered is None or not (self._unanswered[1].over or self._connection.ended):
             return
         (handle, exchange), number = self._unanswered, self._sending or 0
@@ -343,19 +361,19 @@ class LineSpeaker:
         self._sending = None
         self._show(self._reporter.show_accepted, handle, self._pause_known)
         self._pause_known = handle.speech_paused
-        if not self._wait:  # the goal in the handle may have ended since the reply
+        if not self._wait:  # report the state in the reply, because the goal may have ended since then
             self._show(self._reporter.report, Goal.from_json(reply.get("goal")))
         elif not self._goals:
             self._feedback.begin([handle.goal])
         self._goals.append((number, handle))
 
     def _report_refused(self, number: int, goal: Goal) -> None:
-        """Report a line that was rejected."""
+        """Report a rejected line."""
         self._sending = None
         self._count_failure(number, self._show(self._reporter.report_refused, goal, f"line {number}: "))
 
     def _report_expired(self, line: InputLine) -> None:
-        """Report a line that was not sent within its ttl."""
+        """Report a line that expired before it was sent."""
         words = f"line {line.number} was not sent: its ttl of {format_number(self._ttl)} s is over"
         goal = Goal("", State.RECALLED, text=line.text, reason="expired", message=words)
         code = self._show(self._reporter.report_refused, goal)
@@ -363,18 +381,18 @@ class LineSpeaker:
             self._count_failure(line.number, code)
 
     def _count_failure(self, number: int, code: int) -> None:
-        """Keep the exit code of the first line that did not succeed."""
+        """Record the exit code if this is the first line that has failed."""
         if code and (self._failure is None or number < self._failure[0]):
             self._failure = number, code
 
     def _show(self, act: Callable[..., _T], *given: object) -> _T:
-        """Call a function that shows something. Without --wait, go on if the reader of the output is gone."""
+        """Call a function that writes output. Without --wait, continue even if the reader is gone."""
         return act(*given) if self._wait else retry_without_output(act, *given)
 
-    # -- waiting
+    # Waiting for input and for the server
 
     def _wait_for_news(self) -> None:
-        """Wait for input, an answer, an event of a goal, or the end of a line's ttl or of the timeout."""
+        """Wait for input, an answer or an event, until a line expires or the command times out."""
         watched = self._interrupts.watched
         first = self._buffer.first
         end = min(first.end, self._end) if first and self._error is None else self._end
@@ -384,10 +402,11 @@ class LineSpeaker:
             if self._unanswered and self._unanswered[1].over:
                 return True
             if not self._wait and any(each.state.terminal for _, each in self._goals):
-                return True  # without a goal, the server sends no signs of life
+                return True  # if no goals are left, the server sends no more keep-alive messages
             return self._full != was_full or (self._wait and bool(self._goals) and self._goals[0][1]._has_event())
 
-        # While it has goals, the server sends signs of life. Without goals, its silence counts from the request.
+        # The server only sends keep-alive messages if it has goals. Otherwise, measure its silence from the last
+        # request.
         since = self._unanswered[1].heard_at if self._unanswered and not self._goals else 0.0
         wait = partial(self._connection.wait_until, has_news, since=since)
         if self._wants_input:
@@ -400,17 +419,17 @@ class LineSpeaker:
         except Interrupted:
             if watched.pop(0, None) is None:
                 raise
-            wait_ready({}, 0, watched)  # raises Interrupted again if there was more than input
+            wait_ready({}, 0, watched)  # raises Interrupted again if there was also a signal or closed output
             data = _read_available(_STDIN_READ_BYTES)
             if data is not None:
                 self._buffer.feed(data, time.monotonic())
-            if self._unanswered or self._goals:  # the server must be read even if the input never pauses
+            if self._unanswered or self._goals:  # read from the server even if there is always more input
                 wait(time.monotonic(), interruptible=False)
         finally:
             watched.pop(0, None)
 
     def _report_goals(self) -> None:
-        """Report the goals' events in the order of the lines, and forget the goals that have ended."""
+        """Report goal events in the order of the lines, and forget goals that have ended."""
         if not self._wait:
             self._goals = deque(each for each in self._goals if not each[1].state.terminal)
             return
@@ -425,13 +444,13 @@ class LineSpeaker:
             if self._goals:
                 self._feedback.begin([self._goals[0][1].goal])
 
-    # -- stopping before the end of the input
+    # Stopping before the end of the input
 
     def _stop(self) -> None:
         """Stop before the end of the input. With --wait, cancel all goals."""
         if self._wait:
-            # Closing the connection also takes back a line that waits for room in the queue. Otherwise it would be
-            # accepted when the goals are cancelled.
+            # Close the connection first. Otherwise, a line that is waiting for room in the queue would be accepted when
+            # the other goals are cancelled.
             self._client.close()
             self._interrupts.reset()
             self._cancel([each.id for _, each in self._goals if not each.state.terminal])
@@ -457,7 +476,7 @@ class LineSpeaker:
             note(f"{recalled} that waited: recalled")
 
     def _report_unsent(self) -> None:
-        """Write a note about the first line that was not accepted, if there is one."""
+        """Print a message about the first line that wasn't sent or accepted, if there is one."""
         if self._options.quiet:
             return
         if self._sending is not None:
@@ -467,15 +486,18 @@ class LineSpeaker:
 
 
 def _own_goals(client: Client) -> list[str]:
-    """Return the ids of all unfinished goals of this process; none if the server is on another machine."""
+    """Return the ids of this process's unfinished goals.
+
+    The list is empty if the server is on another machine.
+    """
     if client._connection.listener is None:
-        return []  # process ids of another machine mean nothing here
+        return []  # process ids can't be compared with those of another machine
     goals = unfinished(client.status())
     return [each.id for each in goals if each.client is not None and each.client.pid == os.getpid()]
 
 
 def _cancel_goals(client: Client, ids: list[str]) -> list[Goal]:
-    """Cancel these goals, and return them as they ended, in the order of their ids."""
+    """Cancel these goals, and return the ended goals in the order of `ids`."""
     try:
         done = client.cancel(ids)
     except UnknownGoal as error:

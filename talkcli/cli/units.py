@@ -1,8 +1,9 @@
-"""The systemd units that `talk serve` and `talk bridge` print, filled in with this program's path and options.
+"""Code that generates the systemd units for `talk serve` and `talk bridge`.
 
-The templates are the files in `systemd`, such as `serve-user` for `talk serve --print-unit user`. In a template, a name
-in braces stands for a value, and a line such as `@supervision.conf` includes that file. The printed units work
-unchanged. The system's units give the process access only to what it needs. This module doesn't install them.
+The templates are in the directory `systemd`. For example, `serve-user` is the template for `talk serve --print-unit
+user`. A name in braces is replaced by its value, and a line such as `@supervision.conf` includes that file. The printed
+units can be used unchanged. System units only give the process access to what it needs. This module doesn't install the
+units.
 """
 
 from __future__ import annotations
@@ -28,19 +29,19 @@ if TYPE_CHECKING:
     from talkcli.cli.show import CommonOptions
     from talkcli.goals.options import Option
 
-#: The group whose members may use the system's server. Its members may already use the sound card.
+#: The group whose members may use the system-wide server. They can already use the sound card.
 SOCKET_GROUP = "audio"
-#: The files with the broker's address and login.
+#: The environment files that contain the broker's address and login.
 _BRIDGE_ENVIRONMENTS = {"user": "%h/.config/talk/bridge.env", "system": "/etc/talk/bridge.env"}
 
-#: Characters that would end a line of a unit, and surrogates, which aren't UTF-8.
+#: Characters that must not occur in a unit: control characters, line separators and surrogates.
 _UNSAFE_CHARACTERS = "[\0-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]"
-#: Directories that ProtectHome= hides.
+#: Directories that are hidden by systemd's setting ProtectHome=.
 _HOME_DIRECTORIES = ("/home/", "/root/", "/run/user/")
 
 
 def print_server_unit(options: CommonOptions, name: str, given: Mapping[str, Any]) -> None:
-    """Print a unit for `talk serve`, with the options in `given`."""
+    """Print a systemd unit that runs `talk serve` with these options."""
     mode, words = given["socket_mode"], []
     if name.startswith("system") and "socket_mode" not in options.typed:
         mode = 0o660
@@ -49,7 +50,7 @@ def print_server_unit(options: CommonOptions, name: str, given: Mapping[str, Any
 
 
 def print_bridge_unit(options: CommonOptions, name: str, given: Mapping[str, Any]) -> None:
-    """Print a unit for `talk bridge`, with the options in `given`."""
+    """Print a systemd unit that runs `talk bridge` with these options."""
     words = ["--insecure"] if options.insecure else []
     _print_unit(options, "bridge", name, given, words, environment=_BRIDGE_ENVIRONMENTS[name])
 
@@ -57,14 +58,14 @@ def print_bridge_unit(options: CommonOptions, name: str, given: Mapping[str, Any
 def _print_unit(
     options: CommonOptions, command: str, name: str, given: Mapping[str, Any], words: Sequence[str], **values: str
 ) -> None:
-    """Print a unit, and a note if the system's own user could not run it.
+    """Print a systemd unit, and warn if the service's user can't access the program.
 
     Args:
-        options: the common options. The unit gets their socket and the options on the command line.
+        options: the common options, with the socket and the names of the options to copy into the unit.
         command: the command that the unit runs.
         name: the name of the unit for --print-unit.
         given: the values of the command's options, by name.
-        words: further words for the unit's command line.
+        words: further arguments for the unit's command line.
         values: further values for the template, by name.
     """
     row = COMMANDS[command]
@@ -74,7 +75,7 @@ def _print_unit(
     usual_socket = paths.SYSTEM_SOCKET if name.startswith("system") else f"%t/talk/{paths.SOCKET_NAME}"
     escape = _escape_path if name.endswith("-socket") else printable
     program = _program(sys.argv[0])
-    # The files of the program: its script, its interpreter and its package.
+    # The program's script, interpreter and package must all be accessible.
     files = (program[0], *map(os.path.realpath, (program[0], sys.executable, __file__)))
     unit = _template(f"{command}-{name}").format(
         command=" ".join(map(_quote, (*program, command, *words, *socket_option, *typed))),
@@ -95,27 +96,30 @@ def _print_unit(
 
 
 def _template(name: str) -> str:
-    """Return the text of a template, with the files that it includes."""
+    """Return the text of a template, including the files that it refers to."""
     with open(os.path.join(os.path.dirname(__file__), "systemd", name), encoding="utf-8") as file:
         return "".join(_template(line[1:].strip()) if line.startswith("@") else line for line in file)
 
 
 def _program(started_as: str) -> tuple[str, ...]:
-    """Return the command that starts the running `talk`: the installed script, or else the module."""
+    """Return the command that starts this program: the installed script or `python -m talkcli`."""
     script = os.path.join(os.path.dirname(sys.executable), "talk")
     found = shutil.which(started_as if os.path.basename(started_as) == "talk" else script)
     return (os.path.abspath(found),) if found else (sys.executable, "-m", "talkcli")
 
 
 def _assignment(option: Option, value: object) -> str:
-    """Return an option with its value as one word of a command line."""
+    """Format an option and its value as one command-line argument."""
     if value is True:
         return spelling(option)
     return f"{spelling(option)}={value:04o}" if option.kind is FILE_MODE else f"{spelling(option)}={value}"
 
 
 def _find_hidden(files: Sequence[str]) -> tuple[str, str] | None:
-    """Return the first file that other users can't reach, and the directory that prevents it; None if all can."""
+    """Find a file that other users can't access.
+
+    Return the file and the directory that blocks access, or None if all files can be accessed.
+    """
     for path in files:
         steps = path.split(os.sep)
         for count in range(2, len(steps)):
@@ -126,8 +130,8 @@ def _find_hidden(files: Sequence[str]) -> tuple[str, str] | None:
 
 
 def _quote(word: str) -> str:
-    """Return a word quoted for the command line in a unit."""
-    word = word.replace("%", "%%").replace("$", "$$")  # systemd expands specifiers and variables
+    """Quote an argument for the command line in a unit."""
+    word = word.replace("%", "%%").replace("$", "$$")  # systemd would expand specifiers and variables
     if word and all(each.isalnum() or each in "/._-+=:,@%{}" for each in word):
         return word
     escaped = word.replace("\\", "\\\\").replace('"', '\\"')
@@ -139,7 +143,11 @@ def _as_bytes(found: re.Match[str]) -> str:
 
 
 def _escape_path(path: str) -> str:
-    """Return a path as the value of a setting, which can't be quoted; UsageError if systemd would misread it."""
+    """Escape a path for use as a setting in a unit, where quotes aren't allowed.
+
+    Raises:
+        UsageError: systemd would misread the path.
+    """
     if re.search(_UNSAFE_CHARACTERS, path) or path.endswith(("\\", " ")):
         raise UsageError(f"a socket's unit can't name {printable(path)}: name a path without such signs")
-    return path.replace("%", "%%")  # systemd expands specifiers
+    return path.replace("%", "%%")  # systemd would expand specifiers

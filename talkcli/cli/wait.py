@@ -1,7 +1,7 @@
-"""The command `talk wait`, and how `say` and `wait` wait for goals and report their ends.
+"""The command `talk wait`, and code that it shares with `talk say`.
 
-Goals are handled in the same way whether or not standard output can be written. This module must not need click,
-because plain command lines are run without it.
+Goals are handled in the same way whether or not standard output can be written. This module must not import click,
+because simple command lines are run without it.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ if TYPE_CHECKING:
     from talkcli.client.client import GoalHandle
     from talkcli.goals.goal import Goal
 
-#: How long to wait for silence after a goal was cancelled.
+#: How long to wait for silence after cancelling a goal.
 CANCEL_TIMEOUT_S = 1.0
 
 
 def seconds_left(end: float | None) -> float | None:
-    """Return the seconds until a monotonic time, or None for no limit."""
+    """Return the number of seconds until a monotonic time, or None if there is no limit."""
     return None if end is None else max(0.0, end - time.monotonic())
 
 
 def timeout_error(timeout: float | None, words: str = "") -> TimedOut:
-    """Return the error of a command that --timeout has ended. `words` are added to its message."""
+    """Return the error to raise when --timeout has expired. `words` is added to its message."""
     return TimedOut(f"timed out after {format_number(timeout or 0)} s{words and f': {words}'}")
 
 
 class GoalReporter:
-    """The output of a command about its goals: ids, events and results, as the options demand."""
+    """Prints the ids, events and results of a command's goals, depending on the options."""
 
     def __init__(self, options: CommonOptions, *, feedback: bool) -> None:
-        """`feedback`: whether to show each event."""
+        """Initialize the reporter. With `feedback`, it shows each event."""
         self._options = options
         self.feedback = Feedback()
         if feedback:
@@ -51,7 +51,10 @@ class GoalReporter:
             self.feedback = make_feedback(options)
 
     def show_accepted(self, goal: GoalHandle, pause_known: bool = False) -> None:
-        """Show the id of an accepted goal, and a note if speech is paused and the user doesn't know it yet."""
+        """Print the id of an accepted goal, and tell the user if speech is paused.
+
+        `pause_known` means that the user has already been told.
+        """
         if self._options.quiet:
             return
         if not self._options.json and not self.feedback.shows_events:
@@ -63,7 +66,8 @@ class GoalReporter:
         """Wait until these goals have ended, and show their events.
 
         Raises:
-            TimeoutError, Interrupted: the wait ended earlier.
+            TimeoutError: the goals haven't ended in time.
+            Interrupted: the wait was interrupted.
         """
         from talkcli.client.goal import merged
 
@@ -72,13 +76,19 @@ class GoalReporter:
             show_if_possible(self.feedback.show, goal.goal, event)
 
     def report_refused(self, goal: Goal, prefix: str = "") -> int:
-        """Report a goal that no server has accepted, and return its exit code. A note starts with `prefix`."""
+        """Report a goal that wasn't accepted, and return its exit code.
+
+        A message starts with `prefix`.
+        """
         if self._options.json:
             show_if_possible(self.feedback.show, goal, Result(goal))
         return self.report(goal, prefix)
 
     def report(self, goal: Goal, prefix: str = "") -> int:
-        """Report a goal's end or its current state, and return its exit code. A note starts with `prefix`."""
+        """Report a goal's result or current state, and return its exit code.
+
+        A message starts with `prefix`.
+        """
         if self._options.json and not self.feedback.shows_events:
             show_if_possible(show_json, goal.to_json())
         muted = goal.output is not None and goal.output.muted
@@ -92,9 +102,10 @@ class GoalReporter:
         return EXIT_TIMEOUT if goal.exit_code is None else goal.exit_code
 
     def cancel(self, goal: GoalHandle, interrupts: Interrupts) -> None:
-        """Cancel a goal, wait a moment for silence, and report the goal's end.
+        """Cancel a goal, wait briefly for silence, and report how the goal ended.
 
-        Output may fail, because Ctrl-C may have ended its reader, too, and SIGHUP means that the terminal is gone.
+        Output may fail, because Ctrl-C may also have ended the program that reads it, and SIGHUP means that the
+        terminal is gone.
         """
         interrupts.reset()
         problem = "could not be cancelled"
@@ -114,7 +125,7 @@ class GoalReporter:
 
 
 def wait(options: CommonOptions, ids: tuple[str, ...], timeout: float | None, feedback: bool) -> int:
-    """Wait until these goals, or all active and pending ones, have ended. Return the exit code."""
+    """Wait until the given goals, or all unfinished goals, have ended. Return the exit code."""
     end = options.deadline(timeout)
     discard_unread_output()
     with Interrupts(output=True) as interrupts, options.connect(timeout, interrupt=interrupts.watched) as client:
@@ -126,7 +137,7 @@ def wait(options: CommonOptions, ids: tuple[str, ...], timeout: float | None, fe
             first_failure = EXIT_OK
             for goal in goals:
                 ended = goal.wait(seconds_left(end))
-                # Without ids, only the loss of the server is a failure.
+                # If no ids were given, only a lost server counts as a failure.
                 may_fail = bool(ids) or ended.state is State.LOST
                 code = reporter.report(ended) if may_fail or options.json else EXIT_OK
                 if may_fail:
@@ -139,11 +150,11 @@ def wait(options: CommonOptions, ids: tuple[str, ...], timeout: float | None, fe
 
 
 def _show_events(goals: list[GoalHandle], end: float | None, interrupts: Interrupts, reporter: GoalReporter) -> None:
-    """Show the events of these goals until all have ended."""
+    """Show the events of these goals until all of them have ended."""
     try:
         reporter.follow(goals, seconds_left(end))
     except Interrupted:
-        interrupts.check_reader()  # before `close` can change standard output
+        interrupts.check_reader()  # check this before `close` can redirect standard output
         raise
     finally:
         retry_without_output(reporter.feedback.close)

@@ -1,7 +1,7 @@
-"""Goals, server status, settings and voices as lines of text.
+"""Functions that format goals, server status, settings and voices as lines of text.
 
-The functions return lines and print nothing. The caller passes the width of the terminal and the time. `transcript` has
-the lines for events.
+The functions return lines and print nothing. The caller passes the width of the terminal and the time. Events are
+formatted in `transcript`.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import By, Goal, JsonObject, Output, Sender
     from talkcli.protocol.events import ServerStatus
 
-#: Longer texts are cut in a list of goals.
+#: The maximum length of a text in a list of goals.
 _LISTED_TEXT_CHARS = 200
-#: The width of the label in front of each line.
+#: The width of the label at the start of each line.
 _LABEL_COLUMNS = 9
-#: Longer command lines of senders are cut.
+#: The maximum length of a sender's command line.
 _SENDER_COMMAND_CHARS = 60
-#: Longer names and languages of voices are cut. Those of neural voices come from files of unknown origin.
+#: The maximum length of a voice's name or language. Voice files may contain longer ones.
 _VOICE_NAME_CHARS = 80
-#: Shown instead of a text that the server no longer keeps.
+#: Replaces a text that the server no longer keeps.
 TEXT_NOT_KEPT = "(text no longer kept)"
 
-#: The formats of a server's fields. A field without a format is shown with its name and its value.
+#: Formats for fields of the server status. Other fields are shown with their name and value.
 _FIELD_FORMATS = {
     "engine": "{}",
     "synthesizer": "{}",
@@ -52,12 +52,12 @@ _FIELD_FORMATS = {
     "ttl": "ttl {} s",
     "preempt": "preempts",
 }
-#: Fields of a server that are only shown if they have a value.
+#: Fields of the server status that are only shown if they have a value.
 _OPTIONAL_FIELDS = frozenset({"synthesizer", "device", "lead_in", "ttl", "preempt"})
 
 _UNKNOWN_SENDER = "nobody known"
-#: Programs that start another program or a script, by their names without a version. The values are the options that
-#: take a value, the options that replace the script, and the number of arguments before the script.
+#: Programs that run a script or another program, by name without version. Each value consists of the options that take
+#: a value, the options that replace the script, and the number of arguments before the script.
 _LAUNCHERS = {
     **dict.fromkeys(("sh", "bash", "dash", "ash", "zsh", "ksh", "fish"), ("o O rcfile init-file", "c s", 0)),
     **dict.fromkeys(("nohup", "setsid"), ("", "", 0)),
@@ -78,14 +78,14 @@ _LAUNCHERS = {
     "timeout": ("s k signal kill-after", "", 1),
     "xargs": ("n P I L s d a E max-args max-procs arg-file", "", 0),
 }
-#: An argument such as NAME=VALUE, which sets a variable for the started program.
+#: Matches an argument such as NAME=VALUE, which sets an environment variable.
 _ASSIGNMENT = re.compile(r"\w+=.*")
-#: The path of an open descriptor. It doesn't tell the name of the script.
+#: Matches the path of an open file descriptor, which says nothing about the name of the script.
 _DESCRIPTOR_PATH = re.compile(r"/dev/(fd/\d+|stdin)|/proc/(self|\d+)/fd/\d+")
 
 
 def describe_end(goal: Goal) -> str:
-    """Return one line that says how a goal ended."""
+    """Describe how a goal ended in one line."""
     words = printable(goal.message or goal.state.name)
     if goal.by:
         words += f" ({_describe_cause(goal.by)})"
@@ -93,7 +93,7 @@ def describe_end(goal: Goal) -> str:
 
 
 def goal_lines(goal: Goal, screen: Screen, now: float) -> list[str]:
-    """Return everything that is known about a goal, with one line for each field. `now` is in seconds since 1970."""
+    """Return all details of a goal, with one field per line. `now` is a Unix timestamp."""
     state = screen.coloured(goal.state.name, goal.state)
     rows = [
         ("id", printable(goal.id)),
@@ -118,13 +118,13 @@ def goal_lines(goal: Goal, screen: Screen, now: float) -> list[str]:
     lines = []
     for name, value in rows:
         if value:
-            # JSON isn't wrapped here, so that it stays valid when it is copied from the terminal.
+            # Don't wrap JSON, so that it stays valid when it is copied from the terminal.
             lines += wrap(value.split(" "), _label(name), Screen() if name == "data" else screen)
     return lines
 
 
 def status_lines(status: ServerStatus, screen: Screen, now: float) -> list[str]:
-    """Return the lines of `talk status`. `now` is in seconds since 1970."""
+    """Return the lines of `talk status`. `now` is a Unix timestamp."""
     server = status.server
     uptime = server.get("uptime")
     identity = [
@@ -153,12 +153,15 @@ def status_lines(status: ServerStatus, screen: Screen, now: float) -> list[str]:
 
 
 def _label(name: str) -> str:
-    """Return a label padded to the width of all labels."""
+    """Pad a label to the width of the label column."""
     return f"{name:<{_LABEL_COLUMNS}}"
 
 
 def setting_lines(settings: Mapping[str, object]) -> list[str]:
-    """Return one line for each setting: the name of its option, and a value that this option accepts."""
+    """Return one line for each setting, with its name and value.
+
+    The values are written in the form that the options of `talk set` accept.
+    """
     shown = {"voice": "default", "ttl": 0}
     rows = [(name, shown.get(name, "-") if value is None else value) for name, value in settings.items()]
     longest = max((len(name) for name, _ in rows), default=0)
@@ -166,7 +169,7 @@ def setting_lines(settings: Mapping[str, object]) -> list[str]:
 
 
 def voice_lines(voices: list[JsonObject]) -> list[str]:
-    """Return one line for each voice: id, language and name."""
+    """Return one line for each voice, with its id, language and name."""
     limits = {"id": None, "language": _VOICE_NAME_CHARS, "name": _VOICE_NAME_CHARS}
     rows = [[printable(str(each.get(name) or "-"), limit) for name, limit in limits.items()] for each in voices]
     widths = [max((width(row[place]) for row in rows), default=0) for place in (0, 1)]
@@ -174,7 +177,7 @@ def voice_lines(voices: list[JsonObject]) -> list[str]:
 
 
 def format_duration(seconds: float) -> str:
-    """Return a duration in its two largest units, such as "2 h 5 min"."""
+    """Format a duration in its two largest units, such as "2 h 5 min"."""
     whole = int(seconds)
     for size, name, smaller, small_name in ((86400, "d", 3600, "h"), (3600, "h", 60, "min"), (60, "min", 1, "s")):
         if whole >= size:
@@ -183,7 +186,7 @@ def format_duration(seconds: float) -> str:
 
 
 def _goal_table(label: str, goals: Sequence[Goal], id_columns: int, screen: Screen, now: float) -> list[str]:
-    """Return one line for each goal of a status, no wider than the terminal."""
+    """Return one line for each goal, cut to the width of the terminal."""
     heads = [
         _label("" if number else label) + _head_columns(goal, id_columns, screen) for number, goal in enumerate(goals)
     ]
@@ -197,22 +200,22 @@ def _goal_table(label: str, goals: Sequence[Goal], id_columns: int, screen: Scre
 
 
 def _head_columns(goal: Goal, id_columns: int, screen: Screen) -> str:
-    """Return the columns before a goal's text: the time of its end, its id and its state."""
+    """Return the columns before a goal's text: its end time, id and state."""
     goal_id = pad(cut(printable(goal.id), max_id_columns(screen)), id_columns)
     head = f"{goal_id}{COLUMN_GAP}{screen.coloured(pad(goal.state.name, 9), goal.state)}{COLUMN_GAP}"
     return f"{clock_time(goal.ended_at)}{COLUMN_GAP}{head}" if goal.state.terminal else head
 
 
 def _tail_forms(goal: Goal, now: float) -> list[str]:
-    """Return several wordings for the column after a goal's text, the longest first."""
+    """Return possible texts for the column after a goal's text, longest first."""
     if goal.state.terminal:
         return _muted_note(goal) if goal.state is State.SUCCEEDED else reason_forms(goal)
-    # The sender comes first, because a wording that doesn't fit is cut at its end.
+    # The sender comes first, because text that doesn't fit is cut off at the end.
     return [", ".join([f"from {each}", *_unfinished_details(goal, now)]) for each in sender_forms(goal.client)]
 
 
 def quoted_text(goal: Goal, limit: int | None = None) -> str:
-    """Return the text of a goal in quotes, cut after `limit` characters."""
+    """Return a goal's text in quotes, cut to `limit` characters."""
     return _quote(goal.text, limit) or TEXT_NOT_KEPT
 
 
@@ -221,7 +224,7 @@ def _quote(text: str | None, limit: int | None = None) -> str | None:
 
 
 def _unfinished_details(goal: Goal, now: float) -> list[str]:
-    """Return further details of a goal that has not ended, such as its priority and its key."""
+    """Return details of an unfinished goal, such as its priority and key."""
     held = "held, " if goal.paused else ""
     notes = [
         None if goal.started_at is None else f"{held}for {max(0.0, now - goal.started_at):.1f} s",
@@ -233,7 +236,7 @@ def _unfinished_details(goal: Goal, now: float) -> list[str]:
 
 
 def _time_left(goal: Goal, now: float) -> str | None:
-    """Return how long a pending goal may still wait, or None if it has no limit."""
+    """Return how much time a pending goal has left, or None if it has no ttl."""
     if goal.state is not State.PENDING or not goal.ttl or goal.queued_at is None:
         return None
     left = max(0.0, goal.queued_at + goal.ttl - now)
@@ -241,7 +244,7 @@ def _time_left(goal: Goal, now: float) -> str | None:
 
 
 def _describe_sender(sender: Sender | None) -> str:
-    """Return everything that is known about a sender: its command, its process, its user and its name."""
+    """Describe a sender with its command, process id, user id and name."""
     if sender is None:
         return _UNKNOWN_SENDER
     parts = [
@@ -254,9 +257,11 @@ def _describe_sender(sender: Sender | None) -> str:
 
 
 def sender_forms(sender: Sender | None) -> list[str]:
-    """Return several wordings that name a sender, the longest first. A column shows the first one that fits.
+    """Return several descriptions of a sender, longest first.
 
-    The name that the sender gave itself comes first. It is in quotes because nobody has checked it.
+    A column shows the first one that fits.
+
+    The name that the sender has chosen comes first. It is in quotes because it isn't verified.
     """
     if sender is None:
         return [_UNKNOWN_SENDER]
@@ -270,12 +275,12 @@ def sender_forms(sender: Sender | None) -> list[str]:
 
 
 def _describe_cause(by: By) -> str:
-    """Return the goal or the client that ended a goal."""
+    """Describe the goal or the client that caused another goal to end."""
     return f"by {_describe_sender(by.client) if by.goal is None else printable(by.goal)}"
 
 
 def reason_forms(goal: Goal) -> list[str]:
-    """Return several wordings that say why a goal ended and who ended it, the longest first."""
+    """Return several descriptions of why a goal ended and who ended it, longest first."""
     if goal.state is State.SUCCEEDED:
         return [", ".join([*([] if goal.duration is None else [f"{goal.duration:.1f} s"]), *_muted_note(goal)])]
     reason = printable(goal.reason or goal.state.name.lower())
@@ -284,17 +289,17 @@ def reason_forms(goal: Goal) -> list[str]:
         by = [printable(goal.by.goal)] if goal.by.goal is not None else sender_forms(goal.by.client)
     forms = [f"{reason} by {each}" for each in by] or [reason]
     words = _message_details(goal)
-    # The shortest wording only says who ended the goal, because the state hints at the reason.
+    # The shortest description only says who ended the goal, because the state suggests the reason.
     shortest = f"by {by[-1]}" if by else reason
     if not words:
         return [*forms, shortest]
     forms = [f"{each}: {words}" for each in forms]
-    # The details from an engine or a player are more useful than the reason alone, even if they are cut.
+    # Details from an engine or a player are more useful than the reason alone, even if they are cut.
     return forms if goal.state in {State.ABORTED, State.REJECTED} else [*forms, shortest]
 
 
 def _message_details(goal: Goal) -> str:
-    """Return the details in a goal's message; empty if its reason and `by` already say everything."""
+    """Return the part of a goal's message that adds to its reason, or an empty string."""
     if goal.state not in {State.ABORTED, State.REJECTED} and goal.by is not None:
         return ""
     head, colon, words = (goal.message or "").partition(": ")
@@ -307,7 +312,7 @@ def _describe_output(output: Output) -> str:
 
 
 def _muted_note(goal: Goal) -> list[str]:
-    """Return a note if the goal was played on a muted output."""
+    """Return "muted" in a list if the goal's output was muted, otherwise an empty list."""
     return ["muted"] if goal.output and goal.output.muted else []
 
 
@@ -316,7 +321,7 @@ def _sender_command(sender: Sender) -> str:
 
 
 def _script_name(sender: Sender) -> str:
-    """Return the name of the sender's script, without its directory, its arguments and its launchers."""
+    """Return the name of the sender's script, without its directory, interpreter and arguments."""
     words = (sender.parent or "").split()
     if not words:
         return _sender_command(sender)
@@ -326,7 +331,10 @@ def _script_name(sender: Sender) -> str:
 
 
 def _launched_command(words: list[str]) -> list[str]:
-    """Return the command that a launcher starts. It is empty for any other command, and for a script without a name."""
+    """Return the command line that a launcher runs.
+
+    The list is empty if the command isn't a launcher, or if the script has no name.
+    """
     name = _file_name(words[0]).rstrip("0123456789.")
     if name not in _LAUNCHERS:
         return []
@@ -340,7 +348,7 @@ def _launched_command(words: list[str]) -> list[str]:
                 if each in nameless.split():
                     return []
                 if each in valued.split():
-                    if number == len(options):  # otherwise the rest of this word is the value
+                    if number == len(options):  # otherwise, the value is part of the same word
                         next(rest, None)
                     break
         elif not _ASSIGNMENT.fullmatch(word):
@@ -366,7 +374,7 @@ def _format_value(value: object) -> str:
 
 
 def clock_time(seconds: float | None) -> str:
-    """Return the local time of day, or dashes for None."""
+    """Format a timestamp as the local time of day, or as dashes if it is None."""
     return "--:--:--" if seconds is None else time.strftime("%H:%M:%S", time.localtime(seconds))
 
 

@@ -1,7 +1,7 @@
-"""Text on a terminal: escaping, measuring, cutting, padding and colouring.
+"""Functions that escape, measure, cut, pad and colour text for a terminal.
 
-Text from other programs must go through `printable` first, so that it can't move the cursor, fake a line or change the
-reading direction. Everything here is pure: the caller says how wide the terminal is and whether it has colours.
+Text from other programs must be passed to `printable` first, so that it can't move the cursor, fake a line or change
+the reading direction. The caller says how wide the terminal is and whether it has colours.
 """
 
 from __future__ import annotations
@@ -18,29 +18,29 @@ if TYPE_CHECKING:
 
 #: The space between two columns of a table.
 COLUMN_GAP = "  "
-#: The widest column of ids. A client can choose an id of 64 characters, which would leave no room for the text.
+#: The maximum width of an id column. An id can have 64 characters, which would leave no room for the text.
 MAX_ID_COLUMNS = 20
-#: A narrower terminal is treated as this wide, because shorter lines would show nothing useful.
+#: The minimum width to assume for a terminal, because shorter lines would be useless.
 MIN_COLUMNS = 40
-#: Stands for text that was left out.
+#: Replaces text that was cut off.
 ELLIPSIS = "…"
 
-#: The East Asian width classes of characters that take two columns. They include most emoji.
+#: Unicode width classes of characters that are two columns wide. They include most emoji.
 _WIDE_CLASSES = frozenset({"W", "F"})
-#: The categories of marks that are drawn over the character before them.
+#: Unicode categories of marks that are drawn over the preceding character.
 _COMBINING_CATEGORIES = frozenset({"Mn", "Me"})
-#: This character turns the one before it into an emoji, which is two columns wide.
+#: Turns the preceding character into an emoji, which is two columns wide.
 _EMOJI_SELECTOR = "\ufe0f"
-#: The first and last of the letters that flags are made of. A terminal draws each of them in two columns.
+#: The first and last of the letters that flags are composed of. Each letter is two columns wide on a terminal.
 _FLAG_LETTERS = ("\U0001f1e6", "\U0001f1ff")
 
-#: The categories of characters that are shown escaped: controls, format characters (such as bidi marks and zero-width
-#: characters), line and paragraph separators, surrogates, private characters and unassigned ones.
+#: Unicode categories of characters that are escaped: controls, format characters (such as bidi marks and zero-width
+#: characters), line and paragraph separators, surrogates, private-use and unassigned characters.
 _HIDDEN_CATEGORIES = frozenset({"Cc", "Cf", "Zl", "Zp", "Cs", "Co", "Cn"})
 
-#: A terminal code that begins or ends a colour.
+#: Matches a terminal code that starts or ends a colour.
 _COLOUR_CODE = re.compile("\x1b\\[[0-9;]*m")
-#: The parameters of the terminal code for each state's colour.
+#: The terminal colour code for each goal state.
 _STATE_COLOURS = {
     State.PENDING: "36",
     State.ACTIVE: "1;32",
@@ -52,24 +52,24 @@ _STATE_COLOURS = {
 
 @frozen
 class Screen:
-    """The width and the colours of the place where lines are shown."""
+    """The width and the colour support of the output."""
 
-    #: columns, or None if it isn't a terminal and lines can have any length
+    #: the number of columns, or None if the output isn't a terminal and lines can have any length
     width: int | None = None
     colour: bool = False
 
     def columns_left(self, taken: int) -> int | None:
-        """Return the number of columns beside those already taken, or None for no limit."""
+        """Return how many columns remain if `taken` columns are used, or None for no limit."""
         return None if self.width is None else max(self.width, MIN_COLUMNS) - taken
 
     def coloured(self, text: str, state: State | None) -> str:
-        """Return the text in the colour of a state, or in bold for None."""
+        """Return the text in the colour of a state, or in bold if the state is None."""
         code = _STATE_COLOURS.get(state) if state is not None else "1"
         return f"\x1b[{code}m{text}\x1b[0m" if self.colour and code else text
 
 
 def printable(text: str, limit: int | None = None) -> str:
-    """Return the text with all invisible characters escaped. After `limit` characters it is cut."""
+    """Escape all invisible characters in a text, and cut it after `limit` characters."""
     kept = text[:limit]
     if not (kept.isascii() and kept.isprintable() and "\\" not in kept):
         kept = "".join(map(_escape, kept))
@@ -77,25 +77,28 @@ def printable(text: str, limit: int | None = None) -> str:
 
 
 def printable_json(line: str) -> str:
-    """Return a line of JSON with all invisible characters escaped. It still means the same."""
+    """Escape all invisible characters in a line of JSON without changing its meaning."""
     import json
 
-    # These characters can only stand inside a JSON string.
+    # Invisible characters can only occur inside JSON strings.
     return "".join(json.dumps(each)[1:-1] if _is_hidden(each) else each for each in line)
 
 
 def width(text: str) -> int:
-    """Return how many columns the text takes. Colour codes take none.
+    """Return the width of a text in columns, ignoring colour codes.
 
-    If a character's width is unclear, the larger one counts: a line that is too short looks odd, but a line that is too
-    long wraps.
+    If a character's width is ambiguous, the larger width is assumed. A line that is too short looks odd, but a line
+    that is too long wraps.
     """
     text = _COLOUR_CODE.sub("", text)
     return len(text) if text.isascii() else sum(map(_character_width, text))
 
 
 def cut(text: str, columns: int | None) -> str:
-    """Return the text, cut to this many columns and ended with an ellipsis. It must not contain colour codes."""
+    """Cut a text to this many columns, and end it with an ellipsis if it was cut.
+
+    The text must not contain colour codes.
+    """
     if columns is None or width(text) <= columns:
         return text
     kept = sum(end < columns for end in accumulate(map(_character_width, text)))
@@ -103,32 +106,36 @@ def cut(text: str, columns: int | None) -> str:
 
 
 def shorten(text: str, columns: int | None) -> str:
-    """Return the text, cut to this many columns. A quoted text keeps its closing quote."""
+    """Cut a text to this many columns, but keep the closing quote of a quoted text."""
     if columns is None or not (len(text) > 1 and text[0] == text[-1] == '"'):
         return cut(text, columns)
     return f'"{cut(text[1:-1], columns - 2)}"'
 
 
 def max_id_columns(screen: Screen) -> int | None:
-    """Return how many columns an id may take: a quarter of the line, or None for no limit."""
+    """Return the maximum width of an id on this screen, or None for no limit."""
     columns = screen.columns_left(0)
     return None if columns is None else max(MAX_ID_COLUMNS, columns // 4)
 
 
 def pad(text: str, columns: int) -> str:
-    """Return the text, padded with spaces to this many columns."""
+    """Pad a text with spaces to this many columns."""
     return text + " " * (columns - width(text))
 
 
 def longest_fitting(forms: Sequence[str], columns: int | None) -> str:
-    """Return the first of several wordings that fits, or else the last one, cut. The longest comes first."""
+    """Return the longest text that fits, or the shortest text cut to fit.
+
+    `forms` must be sorted from the longest text to the shortest.
+    """
     return next((each for each in forms if columns is None or width(each) <= columns), cut(forms[-1], columns))
 
 
 def share_columns(wanted: Sequence[int], weights: Sequence[int], columns: int) -> list[int]:
-    """Divide the columns of a line, and return the width of each part.
+    """Divide the columns of a line among several parts, and return the width of each part.
 
-    Each part gets the width that it wants, or else its share by weight of the columns that the other parts leave.
+    Each part gets the width that it wants if there is enough space. Otherwise, the remaining columns are divided by
+    weight.
     """
     given = [0] * len(wanted)
     left, weight_left = columns, sum(weights)
@@ -142,13 +149,13 @@ def share_columns(wanted: Sequence[int], weights: Sequence[int], columns: int) -
 def fit_columns(
     texts: Sequence[str], *others: Sequence[Sequence[str]], weights: Sequence[int], columns: int
 ) -> list[str]:
-    """Return the rows of a table: each text, with its cells in the other columns beside it.
+    """Format a table so that each row fits into this many columns.
 
     Args:
-        texts: the first column.
-        others: the other columns. Each cell has several wordings, the longest first.
-        weights: the share of each column. Space that the other columns don't need goes to the texts.
-        columns: the width of the whole line.
+        texts: the cells of the first column.
+        others: the other columns. Each cell is a list of possible texts, longest first.
+        weights: the share of each column. Space that the other columns don't need goes to the first column.
+        columns: the width of the whole table.
     """
     columns -= len(COLUMN_GAP) * len(others)
     longest = [max(map(width, texts)), *(max(width(forms[0]) for forms in column) for column in others)]
@@ -163,10 +170,10 @@ def fit_columns(
 
 
 def wrap(pieces: Sequence[str], first: str, screen: Screen) -> list[str]:
-    """Join the pieces with spaces and return them as lines that are broken between two pieces.
+    """Join pieces of text with spaces, and wrap them into lines that fit the screen.
 
-    `first` stands in front of the first line, and the other lines are indented by its width. A piece that is wider than
-    a line isn't broken.
+    The first line starts with `first`, and the other lines are indented by its width. Lines are only broken between
+    pieces.
     """
     columns = screen.columns_left(width(first))
     lines = [pieces[0]]
@@ -179,24 +186,24 @@ def wrap(pieces: Sequence[str], first: str, screen: Screen) -> list[str]:
 
 
 class MeasuredText:
-    """A text whose width is measured once, so that parts of it can be cut out quickly."""
+    """A text with precomputed character widths, so that parts can be cut out quickly."""
 
     def __init__(self, text: str) -> None:
         self._shown = [printable(each) for each in text]
-        #: the column at which each character begins, followed by the column at which the text ends
+        #: the column at which each character starts, followed by the column at which the text ends
         self._columns = [0, *accumulate(map(width, self._shown))]
 
     @property
     def whole(self) -> str:
-        """The whole text, escaped."""
+        """The whole text, with invisible characters escaped."""
         return "".join(self._shown)
 
     def split(self, heard: int) -> tuple[str, str]:
-        """Return the first `heard` characters and the rest, both escaped."""
+        """Split the escaped text after `heard` characters."""
         return self._slice(0, heard), self._slice(heard, len(self._shown))
 
     def view(self, start: int, end: int, columns: int) -> tuple[str, str, str]:
-        """Return the part of the text around a word that fits into this many columns.
+        """Return as much of the text around a word as fits into this many columns.
 
         Args:
             start: the index of the word's first character.
@@ -211,10 +218,10 @@ class MeasuredText:
         start = min(max(start, 0), last)
         end = min(max(end, start), last)
         excess = self._columns[last] - columns
-        if excess > 0 and columns < 3:  # no room for an ellipsis at both ends and a character between them
+        if excess > 0 and columns < 3:  # too narrow for two ellipses and a character between them
             return "", "", ""
         first = self._first_shown(min(self._columns[start] - columns // 3, excess), start)
-        # An ellipsis takes one column at each end that is cut.
+        # Reserve one column for an ellipsis at each end that is cut.
         room = columns - (first > 0)
         stop = self._count_fitting(self._columns[first] + room)
         if stop < last:
@@ -228,15 +235,18 @@ class MeasuredText:
         return "".join(self._shown[start:end])
 
     def _first_shown(self, column: int, start: int) -> int:
-        """Return the index of the first character to show if all columns before `column` are cut; at most `start`."""
+        """Return the index of the first visible character if all columns before `column` are cut.
+
+        The index is never greater than `start`.
+        """
         if column <= 0:
             return 0
-        # The ellipsis needs one more column. The first character must not be a mark drawn over the one before it.
+        # The ellipsis needs one more column. The first visible character must not be a combining mark.
         begins = (place for place in range(start) if column < self._columns[place] < self._columns[place + 1])
         return next(begins, start)
 
     def _count_fitting(self, columns: int) -> int:
-        """Return how many characters, from the first one on, fit into this many columns."""
+        """Return how many characters from the start of the text fit into this many columns."""
         return sum(each <= columns for each in self._columns) - 1
 
 

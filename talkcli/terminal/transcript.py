@@ -1,7 +1,7 @@
-"""Lines for people that show what happens to goals (`talk watch`) and how past goals ended (`talk log`).
+"""Code that formats the output of `talk watch` and `talk log`.
 
-Events and goals go in, and lines come out. Times are in the local time zone. The columns are always in the same order:
-time, robot (if there are several), state, id, text, sender, reason.
+Times are in the local time zone. The columns are always in the same order: time, robot (if there are several), state,
+id, text, sender, reason.
 """
 
 from __future__ import annotations
@@ -32,53 +32,59 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import Goal
     from talkcli.protocol.events import Event
 
-#: The least width of the text if lines can have any length. Most sentences are shorter, so the next columns line up.
+#: The minimum width of the text column if lines can have any length. Most texts fit, so the next columns line up.
 _TEXT_COLUMNS = 40
-#: A long reason is only shown beside the text if this many columns remain for the text.
+#: The minimum width of the text if a long reason is shown beside it.
 _MIN_TEXT_COLUMNS = 16
-#: The first width of the id column. It fits the ids of a server's first 999 goals.
+#: The initial width of the id column, which is enough for the ids of a server's first 999 goals.
 _FIRST_ID_COLUMNS = 8
-#: The first width of the column for robots.
+#: The initial width of the robot column.
 _FIRST_ROBOT_COLUMNS = 8
-#: The indent of a continued line: the width of the time.
+#: The indentation of continuation lines, which is the width of the time column.
 _INDENT_COLUMNS = 10
-#: How many unfinished goals are remembered. The oldest is forgotten first.
+#: The maximum number of unfinished goals to remember. The oldest goal is dropped first.
 _MAX_REMEMBERED_GOALS = 1000
 
 
 class ColumnWidths:
-    """The widths of columns that grow with their content. Transcripts that share them have aligned lines."""
+    """Column widths that grow with the content of the columns.
+
+    Transcripts can share them to align their lines.
+    """
 
     def __init__(self) -> None:
         self.ids = _FIRST_ID_COLUMNS
         self.robots = _FIRST_ROBOT_COLUMNS
 
     def robot(self, name: str, screen: Screen) -> str:
-        """Widen the column for a robot's name, and return the padded name. It takes a sixth of a terminal at most."""
+        """Pad a robot's name to the width of its column, which is widened if necessary.
+
+        The name takes up at most a sixth of the terminal.
+        """
         columns = screen.columns_left(0)
         shown = cut(printable(name), None if columns is None else max(_FIRST_ROBOT_COLUMNS, columns // 6))
         self.robots = max(self.robots, min(width(shown), MAX_ID_COLUMNS))
         return pad(shown, self.robots)
 
     def goal_id(self, goal_id: str, screen: Screen) -> str:
-        """Widen the column for an id, and return the padded id."""
+        """Pad a goal id to the width of its column, which is widened if necessary."""
         shown = cut(printable(goal_id), max_id_columns(screen))
         self.ids = max(self.ids, min(width(shown), MAX_ID_COLUMNS))
         return pad(shown, self.ids)
 
 
 class Transcript:
-    """The lines for the events of one server, one event after the other."""
+    """Formats the events of one server as lines of text."""
 
     def __init__(
         self, *, full: bool, words: bool, robot: str | None = None, widths: ColumnWidths | None = None
     ) -> None:
-        """Begin a transcript.
+        """Create an empty transcript.
 
         Args:
-            full: show every event. Otherwise two short-lived states are left out: PENDING if no other goal comes first,
-                and PREEMPTING.
-            words: show each word as it is heard, too.
+            full: whether to show every event. Otherwise, PREEMPTING is left out, and PENDING if the goal can start at
+                once.
+            words: whether to show each word as it is spoken.
             robot: the robot's name, if the events of several robots are shown.
             widths: column widths shared with other transcripts.
         """
@@ -90,7 +96,7 @@ class Transcript:
         self._widths = widths or ColumnWidths()
 
     def lines(self, event: Event, screen: Screen, now: float) -> list[str]:
-        """Return the lines for an event. `now` is the time of events that have none, in seconds since 1970."""
+        """Return the lines for an event. `now` is the time to show if the event has none."""
         if isinstance(event, Snapshot):
             return self._snapshot_lines(event, screen, now)
         if isinstance(event, StateChanged):
@@ -100,14 +106,14 @@ class Transcript:
         if isinstance(event, WordHeard) and self._with_words:
             word = f"{printable(event.word)}{COLUMN_GAP}{event.time:.2f} s"
             return [self._head_columns(event.at or now, "word", None, event.id, screen) + word]
-        return []  # a result, which only clients that wait for the goal receive
+        return []  # results and unwanted words aren't shown
 
     def _snapshot_lines(self, event: Snapshot, screen: Screen, now: float) -> list[str]:
         status = event.status
         goals = unfinished(status)
         for goal in goals:
             self._goals[goal.id] = goal
-            self._widths.goal_id(goal.id, screen)  # before the first line, so that all lines are aligned
+            self._widths.goal_id(goal.id, screen)  # widen the column now to align all lines
         self._paused = status.server.get("paused") is True
         place = f"server {printable(str(status.server.get('pid')))} on {printable(str(status.server.get('socket')))}"
         waiting = f", {len(status.pending)} waiting" if status.pending else ""
@@ -122,7 +128,7 @@ class Transcript:
     def _state_lines(self, event: StateChanged, screen: Screen, now: float) -> list[str]:
         if event.goal is not None:
             self._goals[event.id] = event.goal
-            if len(self._goals) > _MAX_REMEMBERED_GOALS:  # the end of the oldest goal was probably not received
+            if len(self._goals) > _MAX_REMEMBERED_GOALS:  # the event for the end of the oldest goal was probably missed
                 del self._goals[next(iter(self._goals))]
         starts_at_once = not self._paused and len(self._goals) == 1
         goal = self._goals.get(event.id)
@@ -148,13 +154,13 @@ class Transcript:
         head = self._head_columns(at, state.name, state, goal.id, screen)
         ended = state.terminal
         forms = reason_forms(goal) if ended else sender_forms(goal.client)
-        if state is State.REJECTED:  # no earlier line has named its sender
+        if state is State.REJECTED:  # no earlier line has shown the goal's sender
             forms = [f"{forms[0]}, from {each}" for each in sender_forms(goal.client)] + forms
         columns = screen.columns_left(width(head))
         if columns is None:
             return [(head + pad(quoted_text(goal), _TEXT_COLUMNS) + COLUMN_GAP + forms[0]).rstrip()]
         tail_columns = columns // 3
-        # The last wording lacks the reason. If no other wording fits, `_long_end_lines` gives them more room.
+        # The last description lacks the reason. If none of the others fit, `_long_end_lines` gives them more room.
         complete = forms[:-1] if ended and goal.by is not None and len(forms) > 1 else forms
         if ended and all(width(each) > tail_columns for each in complete):
             return self._long_end_lines(head, goal, complete, screen)
@@ -163,9 +169,9 @@ class Transcript:
         return [(head + pad(shorten(quoted_text(goal), text_columns), text_columns) + COLUMN_GAP + tail).rstrip()]
 
     def _long_end_lines(self, head: str, goal: Goal, forms: list[str], screen: Screen) -> list[str]:
-        """Return the lines for the end of a goal whose reason is too long for its column.
+        """Format the end of a goal whose reason is too long for its column.
 
-        The reason stands beside a shortened text if it fits there, otherwise below the text.
+        The reason is shown beside a shortened text if it fits there, otherwise below the text.
         """
         text = quoted_text(goal)
         columns = screen.columns_left(width(head)) or 0
@@ -183,7 +189,7 @@ class Transcript:
 
 
 def log_lines(goals: Sequence[Goal], screen: Screen, now: float) -> list[str]:
-    """Return one line for each goal that has ended. `now` is in seconds since 1970."""
+    """Return one line for each ended goal. `now` is a Unix timestamp."""
     today = time.localtime(now)[:3]
     heads = [
         (_log_time(goal.ended_at, today), goal.state.name, cut(printable(goal.id), max_id_columns(screen)))
@@ -195,7 +201,7 @@ def log_lines(goals: Sequence[Goal], screen: Screen, now: float) -> list[str]:
     reasons = [reason_forms(goal) for goal in goals]
     columns = screen.columns_left(sum(widths) + 3 * len(COLUMN_GAP))
     if columns is None:
-        # Most lines are aligned. In a line with longer text, nothing is cut and the last columns move to the right.
+        # Nothing is cut, so a long text moves the columns after it to the right.
         details = [
             COLUMN_GAP.join((pad(text, _TEXT_COLUMNS), pad(sender[0], _TEXT_COLUMNS), reason[0])).rstrip()
             for text, sender, reason in zip(texts, senders, reasons, strict=True)
