@@ -14,10 +14,10 @@ EXIT_OK = 0
 EXIT_ERROR = 1
 EXIT_USAGE = 2
 EXIT_DIFFER = 13
-EXIT_TIMEOUT = 124  # the same as timeout(1)
+EXIT_TIMEOUT = 124  # the same exit code as timeout(1)
 EXIT_SIGNAL = 128  # the signal's number is added, as in a shell
 EXIT_SIGINT = EXIT_SIGNAL + 2
-EXIT_SIGPIPE = EXIT_SIGNAL + 13  # standard output was closed
+EXIT_SIGPIPE = EXIT_SIGNAL + 13  # used if standard output is closed
 
 
 class TalkError(Exception):
@@ -149,10 +149,10 @@ def refusal(code: str, message: str, items: list[dict[str, object]] | None = Non
 
 
 def memory_limits() -> str:
-    """Return a hint for an out-of-memory message, such as this process's memory limit."""
+    """Return the part of an out-of-memory message that explains which limits apply to this process."""
     import resource  # rarely needed, and slow to import
 
-    # Each limit with its unit, and with the shell command and the systemd option that set it.
+    # Each memory limit, its unit, and the shell command and systemd option that change it.
     for number, what, where in (
         (resource.RLIMIT_DATA, "bytes of memory", "ulimit -d, LimitDATA="),
         (resource.RLIMIT_AS, "bytes of address space", "ulimit -v, LimitAS="),

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 else:
 
     def dataclass_transform(**_):
-        """Replace the real decorator, which only type checkers need."""
+        """Stand in for the real decorator, which only type checkers need."""
         return lambda decorator: decorator
 
 
@@ -91,7 +91,7 @@ class _Methods:
         return hash((type(self), *fields(self).values()))
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Make `copy` and `pickle` call the class, because they can't set the fields of an instance."""
+        """Make `copy` and `pickle` create instances by calling the class, because fields can't be set."""
         return type(self), tuple(fields(self).values())
 
     def __repr__(self) -> str:

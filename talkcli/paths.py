@@ -20,7 +20,7 @@ SOCKET_NAME = "talk.sock"
 #: Socket of the system-wide server. systemd creates the directory if the unit has `RuntimeDirectory=talk`.
 SYSTEM_SOCKET = f"/run/talk/{SOCKET_NAME}"
 
-#: Descriptions of what is at a path to which no client can connect.
+#: Descriptions of paths to which no client can connect.
 PLACE_ABSENT = "not there"
 PLACE_FILE = "a file, and no socket"
 PLACE_DIRECTORY = "a directory, and no socket"
@@ -42,7 +42,7 @@ def named_robot(option: str | None, socket: str | None) -> str | None:
 
 
 def client_sockets(named: str | None) -> list[str]:
-    """Return the socket paths that a client tries, in order. If a socket is named, it is the only one."""
+    """Return the socket paths that a client tries, in order. A named socket is the only one tried."""
     if named:
         return [named]
     directories = [os.environ.get("XDG_RUNTIME_DIR"), *_runtime_directories(os.getuid())]

@@ -13,8 +13,8 @@ from talkcli.frozen import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-#: How long to wait for a killed process to close its pipe. This usually takes 1 to 2 ms. After that time, other
-#: processes that hold the pipe open are searched for.
+#: How long to wait for a killed process to close its pipe, which usually takes 1 to 2 ms. If the pipe is still open
+#: after this time, other processes must be holding it open.
 _RELEASE_S = 0.01
 
 

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Client", "GoalHandle"]
 
-#: The number of bytes in a request that are reserved for everything except the list of ids.
+#: Number of bytes in a request that are reserved for everything except the list of ids.
 _REST_OF_LINE_BYTES = 4096
 #: The maximum sizes of a character in JSON: two bytes for an escaped ASCII character, such as a quote, and twelve bytes
 #: for any other character, which may be an escaped surrogate pair.
@@ -48,7 +48,9 @@ _LONG_SEQ = 10**15
 
 
 class Client:
-    """A connection to a talk server, which is found in the same places as by the command `talk`.
+    """A connection to a talk server.
+
+    The client looks for the server in the same places as the command `talk`.
 
     If the connection breaks, for example because the server was restarted, the next call reconnects. If the server is
     still the same process, its goals are followed again. Otherwise they are LOST.
@@ -79,14 +81,14 @@ class Client:
 
     @classmethod
     def over(cls, connection: Connection) -> Client:
-        """Return a client that uses an existing connection. This method is private to `talk`."""
+        """Return a client that uses an existing connection. This method is for internal use."""
         client = cls.__new__(cls)
         client._use(connection)
         return client
 
     def _use(self, connection: Connection) -> None:
         self._connection = connection
-        #: the boot id of the first server, which is put before ids that are only numbers
+        #: the first server's boot id, which is prepended to ids that are only numbers
         self._first_boot = connection.boot
 
     @property
@@ -207,7 +209,7 @@ class Client:
         return handle
 
     def follow(self, ids: Iterable[str] | None = None, *, feedback: bool = False) -> list[GoalHandle]:
-        """Follow goals of any sender, and return their handles.
+        """Follow goals that any client has sent, and return their handles.
 
         Args:
             ids: ids of goals; None for all goals that have not ended.
@@ -270,7 +272,7 @@ class Client:
         return Canceled.from_items(items)
 
     def status(self) -> ServerStatus:
-        """Return the server's description, and its active, pending and recent goals."""
+        """Return the state of the server, with its active, pending and recent goals."""
         return ServerStatus.from_reply(*self._connection.request(Status()))
 
     def goal(self, goal_id: str) -> Goal:
@@ -307,7 +309,7 @@ class Client:
         return [each["voice"] for each in items if isinstance(each.get("voice"), dict)]  # type: ignore[misc]
 
     def settings(self) -> JsonObject:
-        """Return the server's settings, which are the defaults for goals.
+        """Return the server's settings, which are the defaults for new goals.
 
         The object has `rate`, `volume`, `voice`, `pitch`, `preempt` and `ttl`, in the units of `say`. A voice of None
         is the default voice of the driver. A ttl of None means no limit.
@@ -323,7 +325,7 @@ class Client:
         preempt: bool | None = None,
         ttl: float | None = None,
     ) -> JsonObject:
-        """Change the server's settings, and return all of them in the same form as `settings`.
+        """Change the server's settings, and return all settings.
 
         The new settings apply to goals that have not begun to be spoken. They last until the server ends. The units are
         those of `say`.
@@ -405,7 +407,7 @@ class Client:
         return handle, accepted
 
     def _full_id(self, goal_id: str) -> str:
-        """Check an id. If it is only a number, put the boot id before it. Raises the same errors as `check_id`."""
+        """Check an id, after prepending the boot id if it is only a number. Raises the same errors as `check_id`."""
         if goal_id.isascii() and goal_id.isdecimal():
             goal_id = f"{self._first_boot}-{goal_id}"
         check_id(goal_id)

@@ -1,4 +1,4 @@
-"""Connect a client to the server, and explain why if that fails.
+"""Connect a client to the server, and explain failures.
 
 Connecting has two stages. In the first stage, `reach` opens a connection. A caller that already knows its request sends
 it with `send_early`, so that the server works on it while the rest of the client is imported. This stage imports next
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 GREETING_START = b'{"talk": 1, "version": '
 #: An idle server sends its greeting within this time. Longer waits must be interruptible.
 GREETING_WAIT_S = 0.2
-#: Maximum wait of `yield_processor`.
+#: Maximum time for which `yield_processor` waits.
 _LONGEST_YIELD_S = 0.2
 #: If an answer contains one of these, the goal will not be spoken.
 _REFUSALS = (b'"ok": false', b'"state": "REJECTED"')
@@ -43,7 +43,7 @@ BUSY_PAUSE_S = (0.02, 0.2)
 #: The first and longest pause before trying again if a server has not started yet. The pause doubles after each
 #: attempt.
 _FIRST_RETRY_PAUSE_S, _LONGEST_RETRY_PAUSE_S = 0.02, 0.25
-#: Next steps for users who can't connect to a server.
+#: Advice for users who can't connect to a server.
 _START_STEP = "start one with: talk serve"
 _LET_IN_STEP = "have its owner let you in, with `talk serve --socket-mode 0660` and the socket's group"
 _START_OWN_STEP = "or start your own with: talk serve"
@@ -179,7 +179,7 @@ def yield_processor(attempt: ConnectionAttempt, timeout: float | None) -> Connec
             received += data
             if not data or any(each in data for each in _REFUSALS):
                 break
-    except OSError:  # the time is over or the connection broke, which the next read will notice
+    except OSError:  # the time is over, or the connection broke, which the next read reports
         pass
     connected.setblocking(False)
     return replace(attempt, received=received)
@@ -322,7 +322,7 @@ def _greet(
 
 
 def unreachable(attempt: ConnectionAttempt, named: str | None) -> TalkError:
-    """Return an error that lists the failed places and the next step."""
+    """Return an error that lists the failed places and advises the user."""
     from talkcli.errors import AccessDenied, ServerUnavailable
 
     if attempt.backlog_full:
@@ -351,7 +351,7 @@ def unreachable(attempt: ConnectionAttempt, named: str | None) -> TalkError:
 
 
 def _named_step(named: str, found: str, *, denied: bool) -> str:
-    """Return the next step for a user who named a socket by an option or a variable.
+    """Return advice for a user who named a socket by an option or a variable.
 
     Args:
         named: the path as the user named it.

@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 _RECEIVE_BYTES = 256 * 1024
 #: The first and longest pause between attempts to reconnect. The pause doubles after each attempt.
 _FIRST_RECONNECT_PAUSE_S, _LONGEST_RECONNECT_PAUSE_S = 0.02, 0.5
-#: How many times to read before sending a request, to find out whether the connection has ended. Events may have to be
-#: read before its end is noticed.
+#: Maximum number of reads before sending a request, which show whether the connection has ended. Some events may have
+#: to be read first.
 _MAX_READS = 4
 #: How often a thread without a socket checks whether another thread has reconnected.
 _RECONNECT_CHECK_S = 0.1
@@ -80,9 +80,9 @@ class Connection(ClientCore):
     The server carries out each request at most once, in the order of sending. A request that could have an effect is
     never sent twice. The exception is a `say` with an id, because the server speaks it only once.
 
-    Messages are read only while a thread is in `request`, `submit` or `wait_until`. They are processed in the server's
-    order while the lock `changed` is held, so that a waiting thread sees a consistent state. No lock is held during a
-    wait. Callers of the core's methods must hold this lock.
+    Messages are read only while a thread is in `request`, `submit` or `wait_until`. One of these threads reads for all
+    of them. Messages are processed in the server's order while the lock `changed` is held, so that a waiting thread
+    sees a consistent state. No lock is held during a wait. Callers of the core's methods must hold this lock.
 
     When the connection has ended, `ended` is the reason. Waiting threads return then, and later requests raise
     ServerUnavailable. Events that were received before can still be read.

@@ -15,7 +15,7 @@ as arguments. The caller must make sure that only one thread at a time calls a m
 from __future__ import annotations
 
 import itertools
-from _weakrefset import WeakSet  # importing it from `weakref` takes longer
+from _weakrefset import WeakSet  # importing `weakref` takes longer
 from collections import deque
 from collections.abc import Callable
 
@@ -195,14 +195,14 @@ class TrackedGoal:
         self.attached = False
         #: whether all speech is paused, as far as the client knows
         self.speech_paused = False
-        #: monotonic time since when the server has sent the goal's events to this connection, or None if it doesn't
+        #: monotonic time at which the server began to send the goal's events to this connection, or None
         self._followed_at: float | None = None
         #: whether to buffer words and pauses, too
         self._with_feedback = False
         self._buffer = EventBuffer()
 
     def _expect(self, request: Say, now: float) -> None:
-        """Copy the id and text from a `say` request, until the server has answered it."""
+        """Copy the goal's id and text from a `say` request that has not been answered yet."""
         self.goal = replace(self.goal, id=request.id or "", text=request.text)
         if request.wait:
             self._followed_at = now
@@ -233,7 +233,7 @@ class TrackedGoal:
             self._update(replace(self.goal, state=State.REJECTED, reason=reason, message=message))
 
     def _update(self, goal: Goal) -> None:
-        """Replace the goal with its newer state, unless it has already ended."""
+        """Update the goal, unless it has already ended."""
         if not self.goal.state.terminal:
             self.goal = goal
 
@@ -331,7 +331,7 @@ class Exchange:
         #: the list items that have been received
         self.items: list[JsonObject] = []
         self.reply: JsonObject | None = None
-        #: the error if there will be no reply, or None
+        #: the error, if the request failed without a reply
         self.error: TalkError | None = None
         #: monotonic time of the last received line, or of the beginning of the exchange
         self.heard_at = 0.0
@@ -388,22 +388,21 @@ class ClientCore:
         self._unsent: deque[tuple[bytes, Exchange]] = deque()
         #: number of bytes of the first waiting line that have already been sent
         self._first_sent_bytes = 0
-        #: the unsent part of the hello line, which need not wait for the server's greeting
+        #: the unsent part of the hello line, which is sent before the server's greeting arrives
         self._hello = b""
         #: this client's version, for error messages
         self._version = ""
         #: the bytes of the first request that were sent before this object was created
         self._sent_early = b""
-        #: why requests can no longer be sent, although answers may still be received, or None if they can be sent
+        #: why requests can no longer be sent, or None if they can. Answers may still be received.
         self._sending_ended: str | None = None
-        #: the last error message that answered no request. If the server then closes the connection, this is the
-        #: reason.
+        #: the last error message that did not belong to a request. It explains why the server closes the connection.
         self._last_error: str | None = None
 
     # -- requests
 
     def register(self, exchange: Exchange, now: float) -> None:
-        """Number an exchange if it has no number yet, and expect its answer."""
+        """Give an exchange its number, and start waiting for the answer."""
         exchange.number = exchange.number or next(self._numbers)
         exchange.heard_at = now
         self.exchanges[exchange.number] = exchange
@@ -440,7 +439,7 @@ class ClientCore:
         return b"".join(line for line, _ in self._unsent)[self._first_sent_bytes :]
 
     def mark_sent(self, count: int) -> None:
-        """Remove this number of bytes from the waiting bytes, because they have been sent."""
+        """Record that this number of waiting bytes has been sent."""
         if self._hello:
             self._hello = self._hello[count:]
             return
@@ -530,7 +529,7 @@ class ClientCore:
         return exchange.heard_at + min(self._patience, ttl or self._patience)
 
     def silent_by(self, began: float) -> tuple[float, str]:
-        """Return when a silent server will be given up, and the reason to report at that time.
+        """Return the time at which to give up on a silent server, and the reason to report.
 
         Args:
             began: when the caller started to wait (monotonic). Earlier silence doesn't count.
@@ -540,7 +539,7 @@ class ClientCore:
         return max(began, self._heard) + SILENCE_LIMIT_S, f"it has said nothing for {SILENCE_LIMIT_S:g} s"
 
     def goals_lost_at(self) -> float:
-        """Return when the followed goals become LOST if the client doesn't reconnect before."""
+        """Return the time at which followed goals become LOST if the client hasn't reconnected."""
         return float("inf") if self.absent_since is None else self.absent_since + self._patience
 
     def next_expiry(self) -> float:
@@ -647,7 +646,7 @@ class ClientCore:
                 if exchange.on_failure:
                     exchange.on_failure(exchange.error or self.unanswered(exchange))
                 raise
-        exchange.reply = reply  # not reached if the reply is malformed
+        exchange.reply = reply  # a malformed reply raises an error before this line
 
     # -- disconnecting and reconnecting
 
@@ -720,7 +719,7 @@ class ClientCore:
             self.queue(self._line_now(exchange, now), exchange)
 
     def _line_now(self, exchange: Exchange, now: float) -> bytes:
-        """Return the line of a request whose TTL is reduced by the time that it has waited."""
+        """Return a waiting request's line, with its TTL reduced by the time waited."""
         request = exchange.request
         if isinstance(request, Say) and request.ttl:
             exchange.request = replace(request, ttl=max(_MIN_TTL_S, request.ttl - (now - exchange.heard_at)))

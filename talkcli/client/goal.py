@@ -226,7 +226,7 @@ class _EventStream:
         self.unfinished = list({each.id: each for each in handles}.values())
         #: the number of each goal's last event, which is also used to sort the goal's Result
         self._last_numbers: dict[str, int] = {}
-        #: the number of the last pause, which every goal receives, but which is yielded once
+        #: the number of the last pause, which is yielded only once although every goal receives it
         self._pause_number: int | None = None
 
     def take(self) -> list[tuple[GoalHandle, Event]]:

@@ -107,7 +107,7 @@ class ServiceManager:
         try:
             self._socket.sendto(data, self._address)
         except OSError as error:
-            if not isinstance(error, BlockingIOError):  # BlockingIOError: its queue is full
+            if not isinstance(error, BlockingIOError):  # BlockingIOError: the queue is full
                 log.write_limited(
                     "supervisor", f"the supervisor (NOTIFY_SOCKET) can't be told anything: {error.strerror}"
                 )
@@ -126,6 +126,6 @@ def _notify_address(name: str) -> str:
 def _watchdog_interval() -> float | None:
     """Return the seconds between two watchdog notifications, or None if there is no watchdog."""
     timeout, own_pid = os.environ.get("WATCHDOG_USEC", ""), str(os.getpid())
-    is_for_us = os.environ.get("WATCHDOG_PID", own_pid) == own_pid  # it may be meant for another process of the unit
+    is_for_us = os.environ.get("WATCHDOG_PID", own_pid) == own_pid  # another process may be watched instead
     timeout_us = int(timeout) if timeout.isdecimal() and is_for_us else 0
     return timeout_us / 1e6 / _NOTIFICATIONS_PER_TIMEOUT_COUNT or None

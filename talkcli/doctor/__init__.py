@@ -1,4 +1,4 @@
-"""The checks of `talk doctor`, which find out why a sentence would not be heard.
+"""The checks of `talk doctor`, which find out why speech can't be heard.
 
 - `voice`, `sound`, `server` and `sentence` have the checks of one subject each. A check gathers facts, and a pure
   `judge_…` function turns the facts into findings.

@@ -52,7 +52,7 @@ _ECHO_PAYLOAD = b"doctor"
 #: A warning is shown if the certificate expires within this time.
 _RENEWAL_LIMIT_S = 14 * 86400
 _NO_ANSWER = "no answer"
-#: What to suggest to the user for each reason why the broker can't be reached.
+#: Advice for each reason why the broker can't be reached.
 _UNREACHABLE_STEPS = {
     "connection refused": "on {host}: systemctl status mosquitto; others than {host} reach it where its mosquitto.conf "
     "has a line 'listener {port}'",
@@ -360,7 +360,7 @@ def judge_certificate(broker: Broker, connection: BrokerConnection, now: float, 
 
 
 def _trust_step(broker: Broker, connection: BrokerConnection, now: float) -> str:
-    """Return a suggestion for fixing a TLS error."""
+    """Return advice on how to fix a TLS error."""
     if connection.certificate_code in _DATE_CODES:
         clock = time.strftime("%Y-%m-%d %H:%M", time.gmtime(now))
         return f"renew the certificate of {broker.host}; or set this machine's clock: it says {clock} UTC"
@@ -392,7 +392,7 @@ def judge_login(broker: Broker, refusal: str | None) -> Finding:
 
 
 def judge_anonymous(refusal: str | None) -> Finding:
-    """Return the finding about a login without credentials. `refusal` is the reason for refusing it, or None."""
+    """Return the finding about logging in without credentials. `refusal` is the broker's reason, or None."""
     if refusal is not None:
         return ok("anonymous", "who has no credentials is not let in")
     words = "the broker lets in who has no credentials: anybody on the network can make the robots speak"

@@ -118,7 +118,7 @@ class LocalExamination:
         reported = self._server.get("neural_voices")
         server_voices = reported if isinstance(reported, dict) else {}
         if used and not is_neural(used):
-            # The engine resolves a short name of a voice, unless it failed because of the name.
+            # The engine reports the full name of a voice, unless it failed because of the name.
             used = used if engine.reason and find_voice(used, models.installed_names(env)) else engine.neural_voice
         needed = used or server_voices or engine.neural_count or env.get("TALK_VOICES")
         if not needed or not is_own_driver(self._setting("driver")):

@@ -1,4 +1,4 @@
-"""The doctor's findings and conclusion, and their output.
+"""The doctor's findings and conclusion, and how they are displayed.
 
 This module has no side effects.
 """
@@ -27,7 +27,7 @@ _STATE_WIDTH_CHARS, _CHECK_WIDTH_CHARS = 7, 12
 _MESSAGE_INDENT = " " * (_STATE_WIDTH_CHARS + _CHECK_WIDTH_CHARS + 2 * len(COLUMN_GAP))
 _ARROW = "-> "
 _FINAL_STEP_INDENT = "  "
-#: The goal state that has the same colour as a finding's state.
+#: For each state of a finding, the goal state whose colour is used to display it.
 _FINDING_COLOURS = {OK: State.SUCCEEDED, WARNING: State.PREEMPTED, FAILURE: State.ABORTED}
 
 
@@ -70,7 +70,7 @@ BRIDGE_QUESTION = Question(
 
 
 def ok(check: str, message: str) -> Finding:
-    """Return a finding that no fault was found."""
+    """Return the finding of a check that found no fault."""
     return Finding(check, OK, printable(message))
 
 
@@ -91,19 +91,22 @@ def join_names(names: tuple[str, ...]) -> str:
 
 
 def has_passed(findings: Sequence[Finding], question: Question = SENTENCE_QUESTION) -> bool:
-    """Return whether the question is answered with yes, because its check was made and no check failed."""
+    """Return whether the answer to the question is yes.
+
+    For this, the question's check must have been made, and no check may have failed.
+    """
     return any(each.check == question.check for each in findings) and all(each.state != FAILURE for each in findings)
 
 
 def next_step(findings: Sequence[Finding]) -> str | None:
-    """Return the next step for the first failure, or None if nothing failed."""
+    """Return the advice for the first failure, or None if nothing failed."""
     return next((each.next for each in findings if each.state == FAILURE), None)
 
 
 def format_finding(finding: Finding, screen: Screen) -> list[str]:
     """Format a finding as lines of text.
 
-    In a pipe, a finding is a single line. On a terminal, the next step has lines of its own.
+    In a pipe, a finding is a single line. On a terminal, the advice has lines of its own.
     """
     state = screen.coloured(pad(finding.state, _STATE_WIDTH_CHARS), _FINDING_COLOURS[finding.state])
     head = COLUMN_GAP.join((state, pad(finding.check, _CHECK_WIDTH_CHARS), ""))
@@ -117,7 +120,7 @@ def format_finding(finding: Finding, screen: Screen) -> list[str]:
 
 
 def format_conclusion(findings: Sequence[Finding], screen: Screen, question: Question = SENTENCE_QUESTION) -> str:
-    """Format the answer to the question, and the next step if a check failed."""
+    """Format the answer to the question, and the advice if a check failed."""
     if has_passed(findings, question):
         warned = sum(each.state == WARNING for each in findings)
         return question.yes + ("" if not warned else "; 1 warning" if warned == 1 else f"; {warned} warnings")

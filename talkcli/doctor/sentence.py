@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 #: The sentence that is played silently beside a running server. It is short and fast, because some devices accept only
 #: one player at a time, but long enough to show whether the player works.
 SILENT_TEXT, _SILENT_RATE_WPM = "talk works well", 450
-#: The next step for each reason why a goal can end. The reasons "late" and "paused" are only used by the doctor. A test
-#: checks that no reason for aborting a goal is missing.
+#: Advice for each reason why a goal can end. The reasons "late" and "paused" are only used by the doctor. A test checks
+#: that no reason for aborting a goal is missing.
 ADVICE: dict[str, str] = {
     Reason.NO_PLAYER: "sudo apt-get install -y alsa-utils",
     Reason.AUDIO_DEVICE: "plug in and switch on the loudspeaker, close what else plays, and try: aplay -l",
@@ -58,8 +58,7 @@ SENTENCE_ELSEWHERE = failure(
     "not played: the server runs on another machine or in a container, and so does its player",
     "run talk doctor --silent there; or here without --silent, so that the server plays",
 )
-#: The next step if the player of another user's server failed, because the doctor can't use the environment of that
-#: server.
+#: Advice if the player of another user's server failed. The doctor can't use that server's environment.
 RUN_AS_OWNER = "play as the server's own user, who may have another sound: sudo -u '#{}' talk doctor --silent"
 _BUSY_STEP = "another program holds the device: close it, or play through a sound server (PipeWire, PulseAudio)"
 _PLAYER_REASONS = {Reason.AUDIO_DEVICE, Reason.AUDIO_LOST, Reason.AUDIO_STALLED}
@@ -73,7 +72,7 @@ class SentenceResult:
     """How the doctor's sentence ended."""
 
     state: State
-    #: why the goal ended this way, or "late" or "paused" if the doctor cancelled the sentence
+    #: machine-readable reason why the goal ended, or "late" or "paused" if the doctor cancelled it
     reason: str | None = None
     message: str | None = None
     #: length of the sound in seconds
@@ -124,7 +123,7 @@ def _cancel_late(client: Client, goal: GoalHandle, limit: float) -> SentenceResu
 
 
 def _goal_result(goal: Goal) -> SentenceResult:
-    """Return the result of a goal that the server has ended."""
+    """Return the result of a goal that has ended."""
     return SentenceResult(goal.state, goal.reason, goal.message, goal.duration, by_server=True)
 
 
@@ -159,7 +158,7 @@ def speak_by_engine(text: str, options: EngineOptions, volume: float, limit: flo
 
 
 def find_playback_step(findings: Sequence[Finding], *, custom: bool = False) -> str | None:
-    """Return the next step for the most likely cause of a playback fault, or None if no cause was found.
+    """Return advice for the most likely cause of a playback fault, or None if no cause was found.
 
     Args:
         findings: the findings of all checks before the sentence.

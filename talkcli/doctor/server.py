@@ -1,4 +1,4 @@
-"""The checks of the server: its socket, state and settings, and the goals that failed recently.
+"""The server checks: socket, state, settings, and goals that failed recently.
 
 The doctor connects like any client, with time limits.
 """
@@ -45,13 +45,13 @@ PLACE_FOREIGN = "another user's server"
 PLACE_LISTENING = "something listens"
 PLACE_STOPPED = "a process listens that is stopped"
 PLACE_SERVER = "the server"
-#: The next step if the server refuses the client, by error code.
+#: Advice if the server refuses the client, by error code.
 _REFUSAL_ADVICE = {
     "protocol_mismatch": "install the same talk on both sides, and start the server again",
     "busy": "end some of its clients, or raise the limit that is named: talk serve --max-clients 512, or LimitNOFILE=",
     "permission_denied": "have its owner let you in: talk serve --socket-mode 0660, and join the socket's group",
 }
-#: The next step for each kind of place. If several kinds were found, the first one in this table counts.
+#: Advice for each kind of place. If several kinds were found, the first one in this table counts.
 _PLACE_ADVICE = {
     PLACE_FORBIDDEN: "have {whose} let you in: talk serve --socket-mode 0660, and join the socket's group; "
     "or start your own",
@@ -62,7 +62,7 @@ _PLACE_ADVICE = {
     PLACE_DIRECTORY: "remove {path}, and: talk serve",
     PLACE_STALE: "talk serve (it takes the place of what was left over)",
 }
-#: How to name a socket with the option or the variable, and how to undo that.
+#: How to name a socket with an option or a variable, and how to undo that.
 _NAMING = {"TALK_SOCKET": "TALK_SOCKET=", "--socket": "--socket "}
 _UNNAMING: dict[str | None, str] = {"TALK_SOCKET": "unset TALK_SOCKET", "--socket": "leave --socket out"}
 #: Speech may be inaudible if the volume setting is lower than this. The maximum is 1.
@@ -165,7 +165,7 @@ def describe_server(client: Client) -> tuple[JsonObject, list[Goal]]:
     end = time.monotonic() + _ENGINE_START_LIMIT_S
     server, log = client.status().server, client.log(_LOG_GOALS_COUNT)
     while server.get("engine") == "starting" and time.monotonic() < end:
-        time.sleep(_ENGINE_POLL_S)  # there is no event for this change
+        time.sleep(_ENGINE_POLL_S)  # there is no event that reports this
         server = client.status().server
     return server, log
 
@@ -206,12 +206,12 @@ def _format_place(place: SocketPlace) -> str:
 
 
 def _search_step(search: SocketSearch) -> str:
-    """Return the next step if no server was found."""
+    """Return advice for a user without a server."""
     named_by = search.named_by
     if search.usual_server is not None:
         return f"{_UNNAMING[named_by]}: a server is on {search.usual_server}"
     place = next((each for what in _PLACE_ADVICE for each in search.places if each.what == what), None)
-    if place is None:  # no place is blocked
+    if place is None:  # nothing blocks a new server
         if search.foreign_sockets:
             return f"talk serve; or use another user's server: talk --socket {search.foreign_sockets[0]} doctor"
         if named_by is None:
@@ -257,7 +257,7 @@ def _judge_state(server: JsonObject) -> Finding:
 
 
 def summarize_server(server: JsonObject) -> str:
-    """Summarize a server's description of itself in one line."""
+    """Return a one-line summary of a server's state."""
     up = format_span(server.get("uptime"))
     parts = [f"talk {server.get('version')}", f"up {up}", f"engine {server.get('engine')}"]
     parts += [f"{name} {server[name]}" for name in ("synthesizer", "player", "device") if server.get(name)]

@@ -1,4 +1,4 @@
-"""The checks of the sound: user session, sound cards, players, devices, sound servers and volume.
+"""The sound checks: user session, sound cards, players, devices, sound servers and volume.
 
 Facts come from the kernel's files and from programs such as pactl, which have a time limit. No device is opened,
 because that would wake it. Only a spoken sentence proves that there is sound, so most faults are warnings. A missing or
@@ -89,7 +89,7 @@ class UserSession:
     origins: tuple[str, ...] = ()
     #: XDG_RUNTIME_DIR, or None if it isn't set
     runtime_dir: str | None = None
-    #: owner of that directory, or None if it doesn't exist
+    #: user id of that directory's owner, or None if the directory doesn't exist
     runtime_owner: int | None = None
     #: the directory that XDG_RUNTIME_DIR usually names, or None if it doesn't exist
     usual_runtime_dir: str | None = None
@@ -108,7 +108,7 @@ class Cards:
     forbidden: tuple[str, ...] = ()
     #: group that owns the device files
     group: str = _AUDIO_GROUP
-    #: whether the user will be in that group after the next login
+    #: whether the user will belong to that group after the next login
     member_after_login: bool = False
 
 
@@ -132,9 +132,9 @@ class Players:
     configured: str | None
     #: whether the configured player's program exists
     runs: bool = True
-    #: the player that an automatic choice tries first, or None if there is none
+    #: the player that is tried first if none is configured, or None if there is none
     first: str | None = None
-    #: whether the server plays, or else the doctor's own engine
+    #: True if the server uses the player, False if the doctor's own engine does
     by_server: bool = False
 
 
@@ -311,7 +311,7 @@ def _may_open(found: os.stat_result, entries: list[tuple[int, int, int]], sessio
         granted = [found.st_mode >> 6]
     else:
         own = {(_ACL_USER, session.uid), *((_ACL_GROUP, each) for each in session.gids)}
-        granted = [bits for tag, bits, holder in entries if (tag, holder) in own]  # logind adds an entry for the user
+        granted = [bits for tag, bits, holder in entries if (tag, holder) in own]  # logind adds the user's entry
         granted.append(found.st_mode >> 3 if found.st_gid in session.gids else found.st_mode)
     return any(bits & _ACL_READ_WRITE == _ACL_READ_WRITE for bits in granted)
 
@@ -437,7 +437,7 @@ _DEVICE_LISTS: dict[str | None, tuple[str, Callable[[ProgramOutput], Iterable[st
 
 
 def add_pactl_package(finding: Finding, env: Mapping[str, str]) -> Finding:
-    """Add a hint on how to install pactl to a finding, if the next step needs pactl and it is missing."""
+    """Add advice on how to install pactl to a finding that mentions pactl, if pactl isn't installed."""
     if finding.next is None or "pactl " not in finding.next or on_path("pactl", env):
         return finding
     return replace(finding, next=f"{finding.next} (for pactl: sudo apt-get install -y {PACKAGES['pacat']})")

@@ -1,4 +1,4 @@
-"""The checks of the voices: Python, pyttsx3, libespeak-ng, and neural voices.
+"""The voice checks: Python, pyttsx3, libespeak-ng and neural voices.
 
 Most facts come from an engine process that the doctor starts. The doctor itself loads neither libraries nor voices, so
 that a faulty one can't crash it.
@@ -40,8 +40,7 @@ WORKING_STATES = ("ready", "starting")
 INSTALL_LIBRARY = install.espeak_library()
 _INSTALL_PYTTSX3 = install.command("pyttsx3")
 _INSTALL_NEURAL = install.neural()
-#: The next step if libespeak-ng can't be used. The key is a part of the engine's message, or the reason for the
-#: failure.
+#: Advice if libespeak-ng can't be used. The key is a part of the engine's message, or the reason for the failure.
 _LIBRARY_ADVICE = {
     "espeak-ng data": "sudo apt-get install -y espeak-ng-data",
     "libespeak-ng": INSTALL_LIBRARY,
@@ -58,7 +57,7 @@ _IMPORT_PROGRAM = "import sys; sys.tracebacklimit = 0; sys.path[:] = filter(None
 #: Time limit for an import, which is slow from an SD card.
 _IMPORT_LIMIT_S = 10.0
 _IMPORT_TIMED_OUT = f"it takes more than {_IMPORT_LIMIT_S:g} s"
-#: The next step if a package can't be imported. The key is a part of the error message, and "" is the default.
+#: Advice if a package can't be imported. The key is a part of the error message, and "" is the default.
 _IMPORT_ADVICE = {
     _IMPORT_TIMED_OUT: "run talk doctor again when this machine is less busy",
     "SIGILL": "this processor is too old for that version: install an older one, or use an espeak voice",
@@ -121,13 +120,13 @@ class VoiceTrial:
 class NeuralVoices:
     """What is known about neural voices and their packages."""
 
-    #: error message and next step if a package can't be imported, or None if all can
+    #: error message and advice if a package can't be imported, or None if all can
     package_fault: tuple[str, str] | None = None
     #: installed packages with their versions, such as "onnxruntime 1.23.2"
     installed: tuple[str, ...] = ()
     #: ids of the voices with valid files
     valid: tuple[str, ...] = ()
-    #: id, fault and next step of each voice with invalid files
+    #: id, fault and advice for each voice with invalid files
     invalid: tuple[tuple[str, str, str], ...] = ()
     #: the neural voice in use, as the user wrote it, or None if no neural voice is in use
     used: str | None = None
@@ -205,7 +204,7 @@ def judge_engine(pyttsx3: str | None, engine: EngineReport, *, server: str | Non
     if engine.reason is None:
         words = f"{pyttsx3 or 'of an unknown version'}, driver {engine.driver}"
         return [ok("pyttsx3", words), *_judge_library(engine)]
-    # Remove the next step, which the finding shows separately.
+    # Remove the advice, which the finding shows separately.
     message = engine.message.removesuffix(f": {_INSTALL_PYTTSX3}").removesuffix(f": {INSTALL_LIBRARY}")
     if "pyttsx3 is missing" in message or pyttsx3 is None:
         return [broken("pyttsx3", message or "pyttsx3 is missing", _INSTALL_PYTTSX3)]
@@ -255,7 +254,7 @@ def find_neural(used: str | None, options: EngineOptions, limit: float) -> Neura
 
 
 def _find_package_fault(env: Mapping[str, str]) -> tuple[str, str] | None:
-    """Find a package that is missing or can't be imported. Return an error message and the next step, or None."""
+    """Check the packages of neural voices. Return an error message and advice, or None if all of them work."""
     missing = models.missing_package()
     if missing is not None:
         return _split_step(missing)
@@ -275,9 +274,9 @@ def _with_version(package: str) -> str:
 
 
 def _split_step(message: str) -> tuple[str, str]:
-    """Split an error message into the fault and the next step, which follows the last colon.
+    """Split an error message into the fault and the advice, which follows the last colon.
 
-    The default step is to choose another voice.
+    The default advice is to choose another voice.
     """
     what, colon, step = message.rpartition(": ")
     return (what, step) if colon else (message, _CHOOSE_ESPEAK)

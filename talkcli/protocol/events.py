@@ -77,7 +77,7 @@ class Canceled:
 
     @classmethod
     def from_items(cls, items: list[JsonObject]) -> Canceled:
-        """Read the result from the list items of the server's answer."""
+        """Create the result from the list items that the server sent."""
         return cls(tuple(goals(items, "canceled")), tuple(goals(items, "ended")))
 
 
@@ -109,7 +109,7 @@ class WordHeard:
     #: position of the word in the goal's text: the word is `text[start:end]`
     start: int
     end: int
-    #: the word's number: 1 for the goal's first word that is heard
+    #: the word's number, which is 1 for the first word that is heard
     number: int
     #: seconds since the beginning of the goal's sound
     time: float
@@ -158,8 +158,7 @@ class Snapshot:
 
 Event = StateChanged | WordHeard | PausedChanged | Result | Snapshot
 
-#: Event classes whose fields are also the fields of their messages. Snapshot is missing, because its message has the
-#: fields of the status instead.
+#: Event classes by kind. Snapshot is missing, because its message has other fields than the class.
 _EVENTS_BY_KIND: dict[str, type[Event]]
 _EVENTS_BY_KIND = {"state": StateChanged, "word": WordHeard, "paused": PausedChanged, "result": Result}
 
@@ -179,7 +178,7 @@ def from_json(message: JsonObject) -> Event | None:
     found = read_fields(event, message)
     for name, annotation in event.__annotations__.items():
         value = message.get(name)
-        # A time that is out of a calendar's range is treated as missing. The rest of the event is still valid.
+        # A time outside the calendar's range is treated as missing, because the rest of the event is still valid.
         missing = value is None or (annotation.startswith("float") and type(value) in (int, float))
         if name not in found and not (missing and annotation.endswith(" | None")):
             raise Unreadable(f"the {name!r} of a {kind!a} event is {value!a}")
@@ -193,7 +192,7 @@ def _numbered(kind: str, event: StateChanged | WordHeard | PausedChanged) -> Jso
 
 
 def goals(items: list[JsonObject], name: str) -> Iterator[Goal]:
-    """Yield the goals that list items contain in the field `name`. Raises Unreadable if a goal is malformed."""
+    """Yield the goals in the field `name` of list items. Raises Unreadable if a goal is malformed."""
     return (Goal.from_json(each[name]) for each in items if name in each)
 
 

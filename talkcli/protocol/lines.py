@@ -1,4 +1,4 @@
-"""Read and write JSON lines, which have one object per line.
+"""Read and write lines of JSON, with one object per line.
 
 Rules for this file: no I/O. It knows lines and their limits, but not what a request means. Any received bytes become an
 object or a BadRequest. The functions that need `json` or the errors import them, for two reasons: a client writes its

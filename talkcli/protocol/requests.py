@@ -108,7 +108,7 @@ class Watch:
 
 @frozen
 class Log:
-    """A request for the last goals that ended, oldest first."""
+    """A request for the most recently ended goals, oldest first."""
 
     kind: ClassVar[str] = "log"
     meaning: ClassVar[str] = "The last goals that ended, REJECTED ones too, oldest first"
@@ -143,7 +143,7 @@ _OPTIONS_BY_KIND = {kind: {each.name: each for each in request.options} for kind
 
 
 def read_request(message: JsonObject) -> Request:
-    """Read a request from its JSON object, from which `seq` has been removed.
+    """Create a request from its JSON object, which must not contain `seq`.
 
     Raises:
         BadRequest: the request is malformed.
