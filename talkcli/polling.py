@@ -25,7 +25,7 @@ def wait_ready(
     Raises:
         Interrupted: one of the descriptors in `interrupt` is ready.
     """
-    # Imported here, because commands that never wait don't need them.
+    # Imported here, because commands that never wait don't need these modules.
     import math
     import select
 

@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 _RECEIVE_BYTES = 256 * 1024
 #: The first and longest pause between attempts to reconnect. The pause doubles after each attempt.
 _FIRST_RECONNECT_PAUSE_S, _LONGEST_RECONNECT_PAUSE_S = 0.02, 0.5
-#: Maximum number of reads before sending a request, which show whether the connection has ended. Some events may have
-#: to be read first.
+#: Maximum number of reads before sending a request. Reading shows whether the connection has ended, but some events may
+#: have to be read first.
 _MAX_READS = 4
 #: How often a thread without a socket checks whether another thread has reconnected.
 _RECONNECT_CHECK_S = 0.1
@@ -96,7 +96,7 @@ class Connection(ClientCore):
     def __init__(self, patience: float) -> None:
         """Initialize a connection. The server must answer each request within `patience` seconds."""
         super().__init__(patience, time.monotonic())
-        #: the condition that locks all state, and that is notified after messages have been processed
+        #: protects all state, and is notified after messages have been processed
         self.changed = threading.Condition()
         self._process = os.getpid()
         self._reading = False
@@ -269,7 +269,7 @@ class Connection(ClientCore):
             if heard == self._heard:
                 break
 
-    # -- to be implemented by each transport. Callers of `_send`, `_hang_up` and `_cut_off` hold the lock `changed`.
+    # -- methods that each transport implements. Callers of `_send`, `_hang_up` and `_cut_off` hold the lock `changed`.
 
     def _send(self, exchange: Exchange) -> None:
         """Send or queue the request of a registered exchange.
@@ -345,7 +345,7 @@ class SocketConnection(Connection):
         self._socket: _socket.socket | None = attempt.socket
         self.path, self.boot, self.pid = attempt.path, attempt.boot, attempt.pid
         self._sent_early = attempt.request_sent
-        #: bytes that were received after the greeting, and are processed after the early request is registered
+        #: bytes received after the greeting. They are processed after the early request is registered.
         self._received_early = attempt.received
 
     @property

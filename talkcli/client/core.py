@@ -114,7 +114,7 @@ class EventListeners:
     """The listeners of single goals, and the event buffers of readers that watch all goals."""
 
     def __init__(self) -> None:
-        #: the listeners of each goal, by id, and whether each listener also receives words
+        #: listeners by goal id, and whether each of them also receives words
         self._goals: dict[str, dict[Listener, bool]] = {}
         #: weak references, because a reader stops watching by dropping its iterator
         self._watches: WeakSet[EventBuffer] = WeakSet()
@@ -371,7 +371,7 @@ class ClientCore:
         self.ended: str | None = None
         #: the unanswered exchanges, by number
         self.exchanges: dict[int, Exchange] = {}
-        #: whether the server has sent its greeting. Requests may only be sent after that.
+        #: whether the server has sent its greeting, so that requests may be sent
         self.greeted = True
         #: monotonic time at which the connection broke, or None while there is a connection
         self.absent_since: float | None = None
@@ -439,7 +439,7 @@ class ClientCore:
         return b"".join(line for line, _ in self._unsent)[self._first_sent_bytes :]
 
     def mark_sent(self, count: int) -> None:
-        """Record that this number of waiting bytes has been sent."""
+        """Record that the transport has sent this number of bytes."""
         if self._hello:
             self._hello = self._hello[count:]
             return
@@ -519,7 +519,7 @@ class ClientCore:
         code, message = (error.get("code"), error.get("message")) if isinstance(error, dict) else (None, None)
         return refusal(str(code), printable(str(message or "refused: the server gives no reason")), items)
 
-    # -- limits
+    # -- time limits
 
     def answer_by(self, exchange: Exchange) -> float:
         """Return the time by which a request must be sent, or by which the next line of its answer must arrive."""
@@ -735,7 +735,7 @@ class ClientCore:
                     self.listeners.update(goal)
 
         def on_failure(error: TalkError) -> None:
-            if self.absent_since is None:  # if the connection has broken again, the next one follows the goal
+            if self.absent_since is None:  # if the connection broke again, the goal is followed on the next one
                 self.listeners.lose(goal_id, f"{error.message}; it may have been spoken")
 
         self._begin(Exchange(Wait((goal_id,), feedback), on_reply, on_failure), now)

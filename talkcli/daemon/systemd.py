@@ -119,13 +119,13 @@ class ServiceManager:
 def _notify_address(name: str) -> str:
     """Return the socket address in NOTIFY_SOCKET, or "" if it is unset or invalid."""
     if name.startswith("@"):
-        return "\0" + name[1:]  # a Linux abstract socket
+        return "\0" + name[1:]  # an abstract socket, which Linux names with @
     return name if os.path.isabs(name) else ""
 
 
 def _watchdog_interval() -> float | None:
     """Return the seconds between two watchdog notifications, or None if there is no watchdog."""
     timeout, own_pid = os.environ.get("WATCHDOG_USEC", ""), str(os.getpid())
-    is_for_us = os.environ.get("WATCHDOG_PID", own_pid) == own_pid  # another process may be watched instead
+    is_for_us = os.environ.get("WATCHDOG_PID", own_pid) == own_pid  # the watchdog may watch another process
     timeout_us = int(timeout) if timeout.isdecimal() and is_for_us else 0
     return timeout_us / 1e6 / _NOTIFICATIONS_PER_TIMEOUT_COUNT or None

@@ -231,7 +231,7 @@ class BrokerExamination:
         return AccessRights(presence, unwritable, () if is_back or echo in unwritable else (echo,), trouble)
 
     def _known_robots(self, broker: Broker) -> tuple[str, ...]:
-        """Return the names of all robots that the broker knows. The tuple is empty if they can't be read."""
+        """Return the names of all robots that the broker knows. If they can't be read, the result is empty."""
         try:
             found = self._wait_for(partial(read_robots, broker, LOGIN_LIMIT_S, with_status=False))
             return tuple(each.presence.name for each in found)

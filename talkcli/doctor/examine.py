@@ -168,8 +168,8 @@ class LocalExamination:
         custom = sound.is_custom(player)
         step = sentence.find_playback_step(self._findings, custom=custom)
         if self._silent and self._server_pid is not None and self._session.server_pid is None:
-            # The server belongs to another user, so its environment can't be read. If /proc is mounted with hidepid,
-            # its owner is hidden, too.
+            # The server belongs to another user, so its environment can't be read. If /proc is mounted with the option
+            # hidepid, the server's owner can't be found out either.
             owner = sound.file_owner(f"/proc/{self._server_pid}")
             step = step if owner is None else sentence.RUN_AS_OWNER.format(owner)
         if result.reason == Reason.AUDIO_STALLED and not (self._hangs or custom):

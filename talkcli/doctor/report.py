@@ -63,7 +63,7 @@ SENTENCE_QUESTION = Question(
     SENTENCE_CHECK, "a sentence is heard, unless the loudspeaker itself is off", "a sentence would not be heard"
 )
 ROBOT_QUESTION = Question("bridge", "the robot answers", "the robot would not answer")
-#: The question that is answered if a robot checks its own access to the broker.
+#: The question for a robot that checks its own access to the broker.
 BRIDGE_QUESTION = Question(
     "rights", "the broker takes what this robot's bridge says", "this robot's bridge would not be heard"
 )

@@ -39,8 +39,8 @@ _LOG_GOALS_COUNT = 100
 _RECENT_CHECK = "recent goals"
 #: How long to wait for a starting engine, and how often to ask for its state.
 _ENGINE_START_LIMIT_S, _ENGINE_POLL_S = 1.0, 0.05
-#: Descriptions of what is at a path to which a client can connect. The kernel accepts connections even if the process
-#: never answers. `paths` has the descriptions for failed connections.
+#: Descriptions of paths to which a client can connect. The kernel accepts connections even if the process never
+#: answers. `paths` describes failed connections.
 PLACE_FOREIGN = "another user's server"
 PLACE_LISTENING = "something listens"
 PLACE_STOPPED = "a process listens that is stopped"
@@ -62,7 +62,7 @@ _PLACE_ADVICE = {
     PLACE_DIRECTORY: "remove {path}, and: talk serve",
     PLACE_STALE: "talk serve (it takes the place of what was left over)",
 }
-#: How to name a socket with an option or a variable, and how to undo that.
+#: How to set and unset the option or variable that names a socket.
 _NAMING = {"TALK_SOCKET": "TALK_SOCKET=", "--socket": "--socket "}
 _UNNAMING: dict[str | None, str] = {"TALK_SOCKET": "unset TALK_SOCKET", "--socket": "leave --socket out"}
 #: Speech may be inaudible if the volume setting is lower than this. The maximum is 1.
@@ -88,7 +88,7 @@ class SocketSearch:
 
     #: the places that were tried. If a server was found, its place is the last one.
     places: tuple[SocketPlace, ...]
-    #: "--socket" or "TALK_SOCKET" if one of them named the only place, or None if the usual places were tried
+    #: the option or variable that named the only place to try, or None if the usual places were tried
     named_by: str | None = None
     #: why the server refused the client, or None if no server was found
     message: str | None = None

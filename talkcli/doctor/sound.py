@@ -155,7 +155,7 @@ class Devices:
 
 @frozen
 class SoundServer:
-    """What is known about the sound server, PulseAudio or PipeWire."""
+    """Facts about the sound server, which is PulseAudio or PipeWire."""
 
     #: name such as "PulseAudio (on PipeWire 0.3.65)", or None if no sound server answers
     name: str | None = None
@@ -274,7 +274,7 @@ def _origins(environment: Mapping[str, str], pid: int) -> Iterable[str]:
 
 def find_cards(session: UserSession, kernel: str = "/proc/asound", nodes: str = "/dev/snd") -> Cards:
     """Return the sound cards that the kernel has found, and which of them the user may open."""
-    # Each card takes two lines, such as " 0 [Device         ]: USB-Audio - USB Audio Device" and a longer description.
+    # The first of a card's two lines looks like " 0 [Device         ]: USB-Audio - USB Audio Device".
     names = re.findall(r"^\s*\d+ \[[^\]]*\]:.*? - (.*)$", _read_text(f"{kernel}/cards"), re.MULTILINE)
     playing = playback_devices(nodes)
     group, forbidden = _AUDIO_GROUP, []
@@ -386,7 +386,10 @@ def _program_of(command: str) -> str | None:
 def find_players(
     env: Mapping[str, str], configured: str | None, first: str | None = None, *, by_server: bool = False
 ) -> Players:
-    """Find out which players are installed. The other arguments are stored in the result."""
+    """Find out which players are installed.
+
+    The other arguments are only stored in the result.
+    """
     found = tuple(each for each in PACKAGES if on_path(each, env))
     program = _program_of(configured or "")
     runs = program == "pulse" or bool(program and on_path(program, env))

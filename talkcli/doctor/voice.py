@@ -49,7 +49,8 @@ _LIBRARY_ADVICE = {
     Reason.ENGINE_HUNG: "restart the sound server if that hangs (see below): libespeak-ng waits for it at its start",
 }
 _PACKAGES_CHECK, _FILES_CHECK, _NEURAL_CHECK = "neural", "voice files", "neural voice"
-#: How much faster than real time a neural voice must be. If it is slower, other programs can cause gaps in the speech.
+#: The minimum speed of a neural voice, as a multiple of real time. If a voice is slower, other programs on the machine
+#: can cause gaps in its speech.
 _MIN_REAL_TIME_FACTOR = 1.3
 #: A program that tries to import a package. It runs in a separate process, because onnxruntime can crash on an old
 #: processor. It ignores the current directory, and prints only the last line of a traceback.
@@ -118,7 +119,7 @@ class VoiceTrial:
 
 @frozen
 class NeuralVoices:
-    """What is known about neural voices and their packages."""
+    """Facts about neural voices and their packages."""
 
     #: error message and advice if a package can't be imported, or None if all can
     package_fault: tuple[str, str] | None = None
@@ -365,7 +366,7 @@ def judge_neural(neural: NeuralVoices, *, has_server: bool, server_voices: dict[
     if trial is None:
         return found
     if trial.speed is not None and _failed_voices(server_voices):
-        return [*found, *judge_server_voices(server_voices)]  # only the server failed to load the voice
+        return [*found, *judge_server_voices(server_voices)]  # the doctor could load the voice, but the server couldn't
     if trial.speed is None:
         message, step = trial.fault
         return [*found, broken(_NEURAL_CHECK, f"{neural.used} is in use: {message}", step)]

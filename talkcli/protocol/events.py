@@ -158,7 +158,7 @@ class Snapshot:
 
 Event = StateChanged | WordHeard | PausedChanged | Result | Snapshot
 
-#: Event classes by kind. Snapshot is missing, because its message has other fields than the class.
+#: Event classes by kind. Snapshot is missing, because its fields differ from those of its message.
 _EVENTS_BY_KIND: dict[str, type[Event]]
 _EVENTS_BY_KIND = {"state": StateChanged, "word": WordHeard, "paused": PausedChanged, "result": Result}
 

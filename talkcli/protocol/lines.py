@@ -99,7 +99,7 @@ def _plain(value: object) -> str:
     if isinstance(value, str):
         if value.isprintable() and '"' not in value and "\\" not in value:
             return f'"{value}"'
-        from _json import encode_basestring  # slow to load, and most texts don't need it
+        from _json import encode_basestring  # slow to import, and not needed for most texts
 
         return encode_basestring(value)
     if isinstance(value, bool):
