@@ -181,7 +181,7 @@ def player_commands(player: str | None, device: str | None, rate: int, last: str
 
 
 def _custom_command(player: str, device: str | None, rate: int) -> PlayerCommand:
-    """Return the command line for a custom player command with its placeholders filled in."""
+    """Return a custom player command with its placeholders filled in."""
     import shlex
 
     try:

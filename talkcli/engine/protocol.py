@@ -93,7 +93,7 @@ class Configure:
 
 @frozen
 class Speak:
-    """Speak a text. Rate, volume and pitch are absolute values, not changes."""
+    """Speak a text. Rate, volume and pitch are absolute values, not relative changes."""
 
     id: str
     text: str
@@ -198,7 +198,7 @@ class VoiceLoaded:
     """A neural voice was loaded, or loading failed."""
 
     voice: str  # ID of the voice, without a speaker
-    seconds: float  # how long loading took
+    seconds: float  # number of seconds that loading took
     error: str | None = None  # human-readable error; None if the voice was loaded
 
 
@@ -277,7 +277,7 @@ class Ended:
     message: str | None = None  # error message of the player or the engine, if the goal failed
     duration: float | None = None  # length of the audio in seconds; None unless the goal was completed
     gaps: int = 0  # number of silent gaps caused by audio that was synthesized too late
-    gap_seconds: float = 0.0  # total length of these gaps
+    gap_seconds: float = 0.0  # total length of the silent gaps, in seconds
     player: str | None = None  # name of the player, if it was chosen automatically
 
 

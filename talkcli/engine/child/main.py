@@ -16,7 +16,7 @@ from talkcli.engine import protocol
 
 #: Lower bound of the memory limit, for small machines. With a voice of 63 MB, the process uses 0.4 GB.
 _MIN_MEMORY_BYTES = 1 << 30
-#: Number of Linux's prctl operation that requests a signal when the parent thread exits.
+#: The prctl operation that requests a signal when the parent thread exits (Linux only).
 _PR_SET_PDEATHSIG = 1
 
 

@@ -90,7 +90,7 @@ class SentenceSamples:
 
     def __init__(self) -> None:
         self._kept = bytearray()
-        #: whether any sound or word was added so far
+        #: whether any sound or word has been added so far
         self.audible = False
         #: offset of the first sample in the buffer
         self.begin = 0
@@ -407,7 +407,7 @@ class Playback:
             self._rewind(feed)  # another player continues the sentence after the pause
             return
         first = self._first_error
-        if first is None or first.reason == Reason.NO_PLAYER:  # any other error is more useful
+        if first is None or first.reason == Reason.NO_PLAYER:  # prefer any other error to NO_PLAYER
             first = self._first_error = error
         lost = error.final or error.reason == Reason.AUDIO_STALLED or (feed is not None and feed.player.proven)
         others = list(self._untried or ())
@@ -466,7 +466,7 @@ class Playback:
         """Keep playing while waiting for more samples."""
         if self._runner.hold_number:
             self._keep_silent(feed)
-        feed.player.ended()  # raises an error if the player has failed, because waiting doesn't report that
+        feed.player.ended()  # check for a failure here, because the wait below doesn't report it
         self._wait_for(feed, None, more)
         self._update(feed)
         feed.progress_at = time.monotonic()  # until now, the player had nothing to play
@@ -516,7 +516,7 @@ class Playback:
         return True
 
     def _offer(self, feed: PlayerFeed) -> int:
-        """Offer the next silence or samples to the player, and return the number of bytes accepted."""
+        """Offer the next samples or silence to the player, and return the number of bytes accepted."""
         if feed.lead_in:
             taken = feed.offer_silence(self._seconds(self._begin), feed.lead_in)
             feed.lead_in -= taken
@@ -634,7 +634,7 @@ class Playback:
             self._wait((), None)
 
     def _wait_for(self, feed: PlayerFeed, until: float | None, more: Interest | None = None) -> None:
-        """Wait until the player needs attention or a time is reached.
+        """Wait until the player needs attention or a time limit is reached.
 
         Args:
             feed: the stream of the player.

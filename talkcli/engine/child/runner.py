@@ -191,7 +191,7 @@ class GoalRunner:
                 self._speak(command)
 
     def wait(self, interests: Sequence[Interest], until: float | None) -> None:
-        """Wait for a descriptor, a command or a time, and execute the commands.
+        """Wait for a descriptor, a command or a time limit, and execute any commands that arrive.
 
         This method may return early. By then, a command may have stopped or paused the sentence.
 

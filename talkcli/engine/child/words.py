@@ -129,7 +129,7 @@ class WordClock:
         self._silences.append((position, seconds))
 
     def set_elapsed(self, now: float, elapsed: float) -> None:
-        """Set the number of seconds heard, as reported by the output. 0 stops the clock."""
+        """Set the number of seconds heard, as reported by the output. A value of 0 stops the clock."""
         self._started_at = now - elapsed if elapsed > 0 else None
 
     def limit_elapsed(self, now: float, elapsed: float) -> None:

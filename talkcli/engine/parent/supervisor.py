@@ -115,7 +115,7 @@ class ActionQueue:
                 os.write(self._writer, b"\0")
 
     def wait(self, until: float) -> list[selectors.SelectorKey]:
-        """Wait for a registered descriptor, an action or a time, and run the actions.
+        """Wait for a registered descriptor, an action or a time limit, and run any waiting actions.
 
         Returns:
             The keys of the ready descriptors.
@@ -351,14 +351,14 @@ class Supervisor:
             if now < process.exit_deadline:
                 continue
             process.exit_deadline = NEVER  # do this only once; the process is still reaped when it exits
-            process.kill()  # the first kill may have missed processes because no descriptor was free
+            process.kill()  # the first kill may have left processes alive if no descriptor was free
             if self._goal and self._goal.lost_process is process:
                 message = f"the player could not be ended within {KILL_LIMIT_S:g} s"
                 self._fail_goal(self._goal, Reason.NOT_SILENT, message)
 
     def _handle_ready(self, key: selectors.SelectorKey) -> None:
         if key.fd not in self._selector.get_map():
-            return  # the descriptor was closed while another one was handled
+            return  # handling another descriptor has closed this one
         process: EngineProcess = key.data
         if key.fd == process.liveness:
             if process is self._process:

@@ -61,7 +61,7 @@ class Player(Protocol):
     of the program, such as an unplugged device or a full disk. Any other exception is a bug in the player.
     """
 
-    #: the name that is shown to users, and that identifies the player that worked last; it never changes
+    #: the name shown to users, which never changes. It also identifies the player that worked last.
     name: str
     #: whether playing takes as long as the sound lasts. If so, a player that accepts no samples has stalled. A player
     #: that writes to a file isn't real-time. The value never changes.
@@ -120,7 +120,7 @@ class Player(Protocol):
         """
 
     def interests(self) -> Sequence[Interest]:
-        """Return the open descriptors to poll for room, failure or the end of the player.
+        """Return the open descriptors that report room for samples, a failure or the end of the player.
 
         The playback ignores descriptors that only wait for POLLOUT while it has no samples to offer.
         """

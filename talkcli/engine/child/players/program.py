@@ -120,7 +120,7 @@ class PlayerProcess:
         until all processes that it has started have exited.
         """
         if self._status is None:
-            if hasattr(os, "waitid"):  # not on macOS before Python 3.13
+            if hasattr(os, "waitid"):  # missing on macOS before Python 3.13
                 if os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is None:
                     return None
                 self.kill()

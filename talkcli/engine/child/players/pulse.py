@@ -92,7 +92,7 @@ class PulsePlayer(Player):
         self._volume_settled_at = 0.0
         self._ready_by = time.monotonic() + READY_LIMIT_S
         self._suspended_at: float | None = None
-        #: the number of pending requests for the stream's level
+        #: the number of pending requests for the stream's volume
         self._pending_levels = 0
         self._sink_level: Level | None = None
         self._stream_level: Level | None = None
@@ -114,7 +114,7 @@ class PulsePlayer(Player):
         if self._context is None:
             self._loop.free()
             raise CannotSpeak(Reason.NO_PLAYER, "libpulse makes no connection: is there enough memory?")
-        # if this fails, the state of the context shows it
+        # errors show up in the state of the context
         self._lib.context_connect(self._context, None, libpulse.NO_AUTOSPAWN, None)
         self._run()
         if self._error is not None:
@@ -319,7 +319,7 @@ class PulsePlayer(Player):
             self._lib.operation_unref(operation)
 
     def _room(self) -> int:
-        """Return the number of bytes that the server has room for, in whole samples."""
+        """Return how many bytes of whole samples the server has room for."""
         if self._sink_index == libpulse.NO_INDEX or self._closed or self._error is not None:
             return 0
         if self._audible and not (self._level_refused or self.output):
@@ -401,7 +401,7 @@ class PulsePlayer(Player):
             self._request_stream_level()
 
     def _on_sink(self, _context: int, found: Any, end: int, _data: object) -> None:
-        if end == 0 and found[0].index == self._sink_index:  # otherwise, the stream was moved to another sink
+        if end == 0 and found[0].index == self._sink_index:  # ignore a sink that the stream has left
             flat = bool(found[0].flags & libpulse.FLAT_VOLUME)
             self._sink_level = Level(libpulse.loudest(found[0].volume), bool(found[0].mute), flat)
             self._check_mute()
