@@ -194,7 +194,7 @@ def _show_canceled(done: Canceled, options: CommonOptions) -> None:
 
 
 def _suggest_key(key: str, client: Client) -> None:
-    """Suggest a similar key if an unfinished goal has such a key."""
+    """Suggest a similar key of an unfinished goal, if there is one."""
     from talkcli.terminal.text import printable
 
     try:

@@ -199,7 +199,7 @@ class ClickCommand(_HelpfulCommand):
         try:
             rest = super().parse_args(ctx, args)
         except click.UsageError as error:
-            error.ctx = error.ctx or ctx  # the message below the error will refer to this command's help
+            error.ctx = error.ctx or ctx  # lets the error message refer to this command's help
             if isinstance(error, click.NoSuchOption) and self.row.unknown_option_hint:
                 words = _describe_error(error)
                 stop = "" if words.endswith("?") else "."

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import Goal
     from talkcli.protocol.events import Event
 
-#: The minimum width of the text. If it doesn't fit beside the goal's id and state, they are left out.
+#: The minimum width of the text. If there is less room, the goal's id and state are left out.
 _MIN_SENTENCE_COLUMNS = 20
 #: Terminal codes that style the current word, the text after it, and normal text.
 _WORD_STYLE, _UNHEARD_STYLE, _NORMAL_STYLE = "\x1b[1;7m", "\x1b[2m", "\x1b[0m"
@@ -192,7 +192,7 @@ class _ResizeWatcher(threading.Thread):
 
 
 class _GoalLine:
-    """The goal, the state and the current word that a line shows."""
+    """The line that shows a goal's state and text, with the current word highlighted."""
 
     def __init__(self, goal: Goal) -> None:
         self.goal = goal

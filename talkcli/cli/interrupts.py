@@ -54,7 +54,7 @@ class Interrupts:
     """
 
     def __init__(self, blocked: Iterable[int] = (), *, output: bool = False) -> None:
-        """Initialize the context manager.
+        """Initialise the context manager.
 
         Args:
             blocked: signals that were blocked earlier and can be handled now.
@@ -122,7 +122,7 @@ class Interrupts:
             discard_output()
 
     def reset(self) -> None:
-        """Let the command clean up after its wait was interrupted.
+        """Prepare for the cleanup after a wait was interrupted.
 
         During the cleanup, only a signal can end a wait.
         """

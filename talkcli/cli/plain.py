@@ -160,7 +160,7 @@ def _connect_early(plain: PlainCommand, before_sending: Callable[[], None]) -> C
     """Connect to the server and send the request, without waiting for a slow server.
 
     Returns:
-        The connection and its progress, or None if the connection broke before anything was sent.
+        The connection attempt, or None if the connection broke before anything was sent.
     """
     early = reach(named_socket(plain.common.get("socket")))
     if early.socket is None:

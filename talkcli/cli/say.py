@@ -1,7 +1,7 @@
 """The command `talk say`, which speaks a text or writes the speech to a file.
 
-`stdin` reads standard input. This module must not import click, because simple command lines are run without it. Only
-`-o` imports the engine, because it works without a server.
+The module `stdin` reads standard input. This module must not import click, because simple command lines are run without
+it. Only `-o` imports the engine, because it works without a server.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from talkcli.fleet.desk.request import Outcome
     from talkcli.fleet.desk.several import FleetRequest
 
-#: The maximum number of names in a message about failures, and of such messages. Standard output lists all failures.
+#: The maximum number of names in a failure message, and the maximum number of failure messages.
 _MAX_NAMES, _MAX_NOTES = 5, 10
 
 
@@ -153,7 +153,7 @@ class _OutcomePrinter:
 
     def __init__(self, options: CommonOptions, request: Request) -> None:
         self._options, self._request = options, request
-        #: each robot's first failure, or its latest outcome if nothing has failed; `last` always comes from the latest
+        #: each robot's first failure, or its latest outcome if it hasn't failed; `last` is taken from the latest
         #: outcome
         self._outcomes: dict[str, Outcome] = {}
         shows_count = not options.quiet and sys.stderr is not None and sys.stderr.isatty()

@@ -42,7 +42,7 @@ _NO_BREAK_SPACE = "\0"
 
 
 class CommonOptions:
-    """The options of every command, and the connection that `plain` may have opened."""
+    """The options common to all commands, and the connection to the server if it is already open."""
 
     socket: str | None = None
     robot: str | None = None
@@ -182,7 +182,7 @@ def handle_output_error(error: Exception) -> int | None:
     Returns:
         The exit code for the error, or None if the error doesn't concern standard output.
     """
-    global _output_lost  # noqa: PLW0603 - standard output is global, too
+    global _output_lost  # noqa: PLW0603 - a process has only one standard output
     if not isinstance(error, OSError):
         return None
     if reader_is_gone(error) or _is_read_only(error):
@@ -206,7 +206,7 @@ def _is_read_only(error: OSError) -> bool:
 
 
 def show_if_possible(put: Callable[..., None], *what: object) -> None:
-    """Call a function that writes output, but only report an error if the disk is full or broken.
+    """Call a function that writes output. If the disk is full or broken, report this and continue.
 
     Raises:
         OSError: the reader of the output is gone.
@@ -273,7 +273,7 @@ def show_result(options: CommonOptions, items: Iterable[JsonObject], lines: Call
 
 
 def _write_json(stream: TextIO, message: JsonObject) -> None:
-    from talkcli.protocol.lines import encode  # imported here because help and completion don't use it
+    from talkcli.protocol.lines import encode  # imported late, because help and completion don't need JSON
 
     line = encode(message)
     if stream.isatty():
@@ -286,7 +286,7 @@ def _write_json(stream: TextIO, message: JsonObject) -> None:
 
 
 def note(words: str) -> None:
-    """Write a message to standard error, wrapped to the width of the terminal."""
+    """Write a message to standard error. On a terminal, long lines are wrapped."""
     lines = f"talk: {words}"
     if sys.stderr is not None and sys.stderr.isatty():
         lines = _wrap(lines)
@@ -368,7 +368,7 @@ def has_colour() -> bool:
 
 
 def screen() -> Screen:
-    """Return the current width and the colour support of standard output."""
+    """Return the width and the colour support of standard output."""
     from talkcli.terminal.text import Screen
 
     if sys.stdout is None or not sys.stdout.isatty():

@@ -47,7 +47,7 @@ _MAX_STDIN_TEXT_BYTES = MAX_TEXT_BYTES + len("\r\n")
 _MAX_BUFFERED_BYTES = 1_000_000
 #: The default for --ahead, which limits the number of pending goals.
 _DEFAULT_PENDING_GOALS = 10
-#: The maximum number of started or ended goals that haven't been reported.
+#: The maximum number of started or ended goals that haven't been reported yet.
 _MAX_UNREPORTED_GOALS = 1_000
 #: The maximum number of expired lines to drop before signals and the server are checked again.
 _MAX_DROPPED_LINES = 1_000
@@ -124,7 +124,7 @@ class LineBuffer:
         self._ttl = ttl
         # Allow one more byte than the longest text has, because a line may end in CRLF.
         self._splitter = LineSplitter(MAX_TEXT_BYTES + 1)
-        #: chunks of input that haven't been split yet, to save memory, with the time when each was read
+        #: unsplit chunks of input and the times at which they were read; splitting them late saves memory
         self._chunks: deque[tuple[float, bytes]] = deque()
         self._lines: deque[InputLine] = deque()
         self._number = 0
@@ -165,7 +165,7 @@ class LineBuffer:
 def _read_available(count: int) -> bytes | None:
     """Read up to `count` bytes of standard input.
 
-    Return no bytes at the end of the input, and None if no input is available at the moment.
+    The result is empty at the end of the input, and None if no input is available yet.
     """
     try:
         return os.read(0, count)
@@ -176,7 +176,7 @@ def _read_available(count: int) -> bytes | None:
 
 
 def _decode(data: bytes) -> str:
-    # Decode invalid bytes to surrogates, which `replace_bad_bytes` will find.
+    # Invalid bytes are decoded to surrogates, which `replace_bad_bytes` replaces later.
     return data.decode(errors="surrogateescape").rstrip("\r\n")
 
 
@@ -193,7 +193,7 @@ class LineSpeaker:
         timeout: float | None,
         ahead: int | None,
     ) -> None:
-        """Initialize the speaker without connecting to the server.
+        """Initialise the speaker without connecting to the server.
 
         Args:
             options: the options of every command.
@@ -217,7 +217,7 @@ class LineSpeaker:
         self._interrupts = Interrupts(output=wait)
         #: the number of the line that was sent but hasn't been accepted or rejected yet, or None
         self._sending: int | None = None
-        #: the goal and the request that the server hasn't answered yet, or None
+        #: the goal and its unanswered request, or None
         self._unanswered: tuple[GoalHandle, Exchange] | None = None
         #: unfinished goals with their line numbers, in the order of the lines; with --wait, also ended goals that
         #: haven't been reported yet
@@ -497,7 +497,7 @@ def _own_goals(client: Client) -> list[str]:
 
 
 def _cancel_goals(client: Client, ids: list[str]) -> list[Goal]:
-    """Cancel these goals, and return the ended goals in the order of `ids`."""
+    """Cancel goals, and return them in the order of `ids`."""
     try:
         done = client.cancel(ids)
     except UnknownGoal as error:

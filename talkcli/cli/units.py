@@ -36,7 +36,7 @@ _BRIDGE_ENVIRONMENTS = {"user": "%h/.config/talk/bridge.env", "system": "/etc/ta
 
 #: Characters that must not occur in a unit: control characters, line separators and surrogates.
 _UNSAFE_CHARACTERS = "[\0-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]"
-#: Directories that are hidden by systemd's setting ProtectHome=.
+#: Directories that systemd's ProtectHome= setting hides.
 _HOME_DIRECTORIES = ("/home/", "/root/", "/run/user/")
 
 
@@ -96,7 +96,7 @@ def _print_unit(
 
 
 def _template(name: str) -> str:
-    """Return the text of a template, including the files that it refers to."""
+    """Return the text of a template with all included files inserted."""
     with open(os.path.join(os.path.dirname(__file__), "systemd", name), encoding="utf-8") as file:
         return "".join(_template(line[1:].strip()) if line.startswith("@") else line for line in file)
 

@@ -42,7 +42,7 @@ class GoalReporter:
     """Prints the ids, events and results of a command's goals, depending on the options."""
 
     def __init__(self, options: CommonOptions, *, feedback: bool) -> None:
-        """Initialize the reporter. With `feedback`, it shows each event."""
+        """Initialise the reporter. If `feedback` is true, it shows each event."""
         self._options = options
         self.feedback = Feedback()
         if feedback:
@@ -78,7 +78,7 @@ class GoalReporter:
     def report_refused(self, goal: Goal, prefix: str = "") -> int:
         """Report a goal that wasn't accepted, and return its exit code.
 
-        A message starts with `prefix`.
+        `prefix` is put in front of any message.
         """
         if self._options.json:
             show_if_possible(self.feedback.show, goal, Result(goal))
@@ -87,7 +87,7 @@ class GoalReporter:
     def report(self, goal: Goal, prefix: str = "") -> int:
         """Report a goal's result or current state, and return its exit code.
 
-        A message starts with `prefix`.
+        `prefix` is put in front of any message.
         """
         if self._options.json and not self.feedback.shows_events:
             show_if_possible(show_json, goal.to_json())
@@ -137,7 +137,7 @@ def wait(options: CommonOptions, ids: tuple[str, ...], timeout: float | None, fe
             first_failure = EXIT_OK
             for goal in goals:
                 ended = goal.wait(seconds_left(end))
-                # If no ids were given, only a lost server counts as a failure.
+                # If no ids were given, only a lost connection to the server counts as a failure.
                 may_fail = bool(ids) or ended.state is State.LOST
                 code = reporter.report(ended) if may_fail or options.json else EXIT_OK
                 if may_fail:

@@ -40,7 +40,7 @@ _LABEL_COLUMNS = 9
 _SENDER_COMMAND_CHARS = 60
 #: The maximum length of a voice's name or language. Voice files may contain longer ones.
 _VOICE_NAME_CHARS = 80
-#: Replaces a text that the server no longer keeps.
+#: Shown in place of a text that the server no longer keeps.
 TEXT_NOT_KEPT = "(text no longer kept)"
 
 #: Formats for fields of the server status. Other fields are shown with their name and value.
@@ -56,8 +56,8 @@ _FIELD_FORMATS = {
 _OPTIONAL_FIELDS = frozenset({"synthesizer", "device", "lead_in", "ttl", "preempt"})
 
 _UNKNOWN_SENDER = "nobody known"
-#: Programs that run a script or another program, by name without version. Each value consists of the options that take
-#: a value, the options that replace the script, and the number of arguments before the script.
+#: Programs that run a script or another program, by name without version number. Each value consists of the options
+#: that take a value, the options that replace the script, and the number of arguments before the script.
 _LAUNCHERS = {
     **dict.fromkeys(("sh", "bash", "dash", "ash", "zsh", "ksh", "fish"), ("o O rcfile init-file", "c s", 0)),
     **dict.fromkeys(("nohup", "setsid"), ("", "", 0)),
@@ -85,7 +85,7 @@ _DESCRIPTOR_PATH = re.compile(r"/dev/(fd/\d+|stdin)|/proc/(self|\d+)/fd/\d+")
 
 
 def describe_end(goal: Goal) -> str:
-    """Describe how a goal ended in one line."""
+    """Return a one-line description of how a goal ended."""
     words = printable(goal.message or goal.state.name)
     if goal.by:
         words += f" ({_describe_cause(goal.by)})"
@@ -207,7 +207,7 @@ def _head_columns(goal: Goal, id_columns: int, screen: Screen) -> str:
 
 
 def _tail_forms(goal: Goal, now: float) -> list[str]:
-    """Return possible texts for the column after a goal's text, longest first."""
+    """Return alternative texts for the last column of a goal's line, longest first."""
     if goal.state.terminal:
         return _muted_note(goal) if goal.state is State.SUCCEEDED else reason_forms(goal)
     # The sender comes first, because text that doesn't fit is cut off at the end.
@@ -312,7 +312,7 @@ def _describe_output(output: Output) -> str:
 
 
 def _muted_note(goal: Goal) -> list[str]:
-    """Return "muted" in a list if the goal's output was muted, otherwise an empty list."""
+    """Return `["muted"]` if the goal's output was muted, otherwise an empty list."""
     return ["muted"] if goal.output and goal.output.muted else []
 
 

@@ -22,16 +22,16 @@ COLUMN_GAP = "  "
 MAX_ID_COLUMNS = 20
 #: The minimum width to assume for a terminal, because shorter lines would be useless.
 MIN_COLUMNS = 40
-#: Replaces text that was cut off.
+#: Marks the place where text was cut off.
 ELLIPSIS = "…"
 
 #: Unicode width classes of characters that are two columns wide. They include most emoji.
 _WIDE_CLASSES = frozenset({"W", "F"})
 #: Unicode categories of marks that are drawn over the preceding character.
 _COMBINING_CATEGORIES = frozenset({"Mn", "Me"})
-#: Turns the preceding character into an emoji, which is two columns wide.
+#: The Unicode character that turns the preceding one into an emoji, which is two columns wide.
 _EMOJI_SELECTOR = "\ufe0f"
-#: The first and last of the letters that flags are composed of. Each letter is two columns wide on a terminal.
+#: The first and last Unicode letter for flag emoji. Each letter is two columns wide on a terminal.
 _FLAG_LETTERS = ("\U0001f1e6", "\U0001f1ff")
 
 #: Unicode categories of characters that are escaped: controls, format characters (such as bidi marks and zero-width
@@ -59,7 +59,7 @@ class Screen:
     colour: bool = False
 
     def columns_left(self, taken: int) -> int | None:
-        """Return how many columns remain if `taken` columns are used, or None for no limit."""
+        """Return how many columns remain if `taken` columns are used, or None if there is no limit."""
         return None if self.width is None else max(self.width, MIN_COLUMNS) - taken
 
     def coloured(self, text: str, state: State | None) -> str:
@@ -113,7 +113,7 @@ def shorten(text: str, columns: int | None) -> str:
 
 
 def max_id_columns(screen: Screen) -> int | None:
-    """Return the maximum width of an id on this screen, or None for no limit."""
+    """Return the maximum width of an id on this screen, or None if there is no limit."""
     columns = screen.columns_left(0)
     return None if columns is None else max(MAX_ID_COLUMNS, columns // 4)
 
@@ -186,7 +186,7 @@ def wrap(pieces: Sequence[str], first: str, screen: Screen) -> list[str]:
 
 
 class MeasuredText:
-    """A text with precomputed character widths, so that parts can be cut out quickly."""
+    """A text with precomputed character widths, so that parts of it can be extracted quickly."""
 
     def __init__(self, text: str) -> None:
         self._shown = [printable(each) for each in text]

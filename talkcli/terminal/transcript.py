@@ -106,7 +106,7 @@ class Transcript:
         if isinstance(event, WordHeard) and self._with_words:
             word = f"{printable(event.word)}{COLUMN_GAP}{event.time:.2f} s"
             return [self._head_columns(event.at or now, "word", None, event.id, screen) + word]
-        return []  # results and unwanted words aren't shown
+        return []  # results aren't shown, and words only on request
 
     def _snapshot_lines(self, event: Snapshot, screen: Screen, now: float) -> list[str]:
         status = event.status
