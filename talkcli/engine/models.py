@@ -35,9 +35,9 @@ _PACKAGE_SUFFIX, _PACKAGE_DIRS = "_piper_voice", ("", "data")
 _MAX_JSON_BYTES = 1 << 20
 #: The maximum number of speakers in a model. Piper's largest model has 904.
 _MAX_SPEAKERS = 4096
-#: The maximum lengths of a text from a JSON file that is shown to users, and of a speaker's name.
+#: The maximum lengths of a text shown to users, and of the name of a speaker.
 _MAX_SHOWN_CHARS, _MAX_SPEAKER_CHARS = 40, 64
-#: The sample rates that players support.
+#: The sample rates in Hz that players support.
 _RATES_HZ = range(4000, 192001)
 #: The maximum number of symbolic links to follow in a path. Linux has the same limit.
 _MAX_LINKS = 40
@@ -93,7 +93,7 @@ def find_models(environment: Mapping[str, str] | None = None) -> dict[str, str]:
     for directory in _model_directories(environment):
         try:
             names = sorted(os.listdir(directory))
-        except OSError:  # usually because the directory doesn't exist
+        except OSError:  # The directory probably doesn't exist.
             continue
         for each in names:
             name = each.removesuffix(_MODEL_SUFFIX)
@@ -108,7 +108,7 @@ def installed_voices() -> tuple[Voice, ...]:
 
 
 def installed_names(environment: Mapping[str, str] | None = None) -> tuple[Voice, ...]:
-    """Return all installed neural voices with only their names, without reading any file."""
+    """Return all installed neural voices, without reading their descriptions."""
     return tuple(Voice(NEURAL_PREFIX + name, None, name) for name in find_models(environment))
 
 
@@ -307,7 +307,7 @@ def _described_voice(name: str, path: str) -> Voice:
 
 
 def _parse_description(found: Any) -> VoiceDescription:
-    """Convert the content of a voice's JSON file.
+    """Create a description from the parsed content of a voice's JSON file.
 
     Raises:
         KeyError, TypeError, ValueError, AttributeError: The content is invalid.

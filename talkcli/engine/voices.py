@@ -38,8 +38,8 @@ _WITH_REGION = re.compile(r"([a-z]{2,3})-(?:[a-z]{2}|[0-9]{3})")
 #: Unknown names are cut off at this length in error messages.
 _MAX_WORD_CHARS = 60
 
-#: The built-in synthesizers, which replace the pyttsx3 drivers of the same name. The keys are values of --driver, the
-#: default first. The values are "module:class" in `talkcli.engine.child.synthesizers`.
+#: The built-in synthesizers, which replace the pyttsx3 drivers of the same name. The keys are the names that --driver
+#: accepts, with the default first. The values are "module:class" in `talkcli.engine.child.synthesizers`.
 SYNTHESIZERS = {"espeak": "combined:CombinedSynthesizer"}
 
 
@@ -95,7 +95,7 @@ def matching_languages(wanted: str, voices: Sequence[Voice]) -> set[str]:
 
 
 def _matches(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> dict[str, Voice]:
-    """Return the voices that a name may refer to, each with an unambiguous name as the key."""
+    """Return the voices that a name may refer to, with their unambiguous names as keys."""
     found = _find_exact(wanted, voices, preferred)
     if found is not None:
         return {wanted: found}
@@ -111,7 +111,7 @@ def _matches(wanted: str, voices: tuple[Voice, ...], preferred: str | None = Non
 
 
 def _other_forms(wanted: str, voices: tuple[Voice, ...]) -> Iterator[list[str]]:
-    """Yield lists of names that the user may have meant by an unknown name, the most likely ones first."""
+    """Yield guesses at the name that the user meant, as lists from most to least likely."""
     name, mark, speaker = wanted.partition(SPEAKER_MARK)
     word = _fold(name)
     neural = [each.id for each in voices if is_neural(each.id)]
@@ -330,7 +330,7 @@ def _similar(wanted: str, words: dict[str, Voice]) -> list[str]:
 
 
 def _to_voice(found: Any) -> Voice:
-    """Convert a voice of pyttsx3."""
+    """Convert a pyttsx3 voice to a `Voice`."""
     language = found.languages[0] if found.languages else None
     if isinstance(language, bytes):  # In old drivers of pyttsx3, a priority byte comes before the language.
         language = language[1:].decode("utf-8", "replace")

@@ -45,7 +45,7 @@ class Fleet:
     """
 
     def __init__(self, broker: str | None = None, *, name: str | None = None, insecure: bool = False) -> None:
-        """Prepare to use a fleet. Each request connects to the broker later.
+        """Configure access to a fleet, without connecting to the broker.
 
         The login and the certificates come from the environment variables TALK_MQTT_*.
 
@@ -63,7 +63,7 @@ class Fleet:
         self._name = name
 
     def robots(self) -> list[Presence]:
-        """List all robots of the fleet by name, including those that are offline.
+        """Return all robots of the fleet, sorted by name. This includes robots that are offline.
 
         Raises:
             ServerUnavailable: The broker can't be reached.

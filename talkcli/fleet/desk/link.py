@@ -76,13 +76,13 @@ class DeskLink:
             UsageError: The user name can't be part of a topic.
         """
         self.broker, self.user = broker, client_user(broker)
-        #: a random part of the reply topics, so that each connection of a user has its own
+        #: a random part of the reply topics, so that each connection of a user has its own topics
         self.session = os.urandom(8).hex()
         #: the current MQTT connection, or None if there is none
         self.link: Link | None = None
-        #: the last error, if connecting failed or the broker rejected the marker message
+        #: the error, if the last attempt to connect failed or the broker rejected the marker message
         self.failure: TalkError | None = None
-        #: when the marker message came back (monotonic time), or None until then. It follows the retained messages.
+        #: when the marker message came back after the retained messages (monotonic time), or None until then
         self.marker_at: float | None = None
         self._inbox: deque[Message] = deque()
         #: callbacks for rejected requests, with the errors to pass. `poll` calls them when the link isn't locked.
@@ -97,7 +97,7 @@ class DeskLink:
 
     @property
     def retained_received(self) -> bool:
-        """Whether all retained messages have probably arrived."""
+        """Whether enough time has passed for all retained messages to arrive."""
         return self.marker_at is not None and time.monotonic() > self.marker_at + RETAINED_GRACE_S
 
     def reply_topic(self, robot: str) -> str:
@@ -123,7 +123,7 @@ class DeskLink:
         wake = self._wake_reader.fileno()
         watched = {wake: select.POLLIN}
         descriptor = -1 if link is None else link.fileno()
-        if link is not None and descriptor >= 0:  # It is -1 if another thread has closed the link.
+        if link is not None and descriptor >= 0:  # It is -1 if another thread closed the link.
             watched[descriptor] = select.POLLIN | (select.POLLOUT if link.wants_write else 0)
         ready = wait_ready(watched, min(timeout, due), interrupt)
         if wake in ready:
@@ -255,7 +255,7 @@ class DeskLink:
         return AccessDenied(f"{words}: its ACL needs the lines of an operator, see 'talk bridge --print-acl'")
 
     def _maintain(self, link: Link | None, now: float) -> float:
-        """Connect, or keep the connection alive. Return how many seconds the next call may be delayed."""
+        """Connect, or keep the connection alive. Return the maximum number of seconds until the next call."""
         if link is not None:
             link.tick()
             if self.marker_at is None or self.retained_received:

@@ -1,4 +1,4 @@
-"""Classes for the robots that a request is for, and for its outcome on each robot.
+"""Classes to select robots for a request, and to describe its outcome on each robot.
 
 The module is pure.
 """
@@ -51,7 +51,7 @@ class Selection:
             if name is not None:
                 fault = topics.name_fault(name)
                 return fault and f"no {kind} can be called '{name}': a name {fault}"
-        # If a bracket isn't closed, it only matches a bracket, which can't occur in a robot's name.
+        # An unclosed bracket matches only itself, and robots' names contain no brackets.
         if not _GLOB.fullmatch(self.text) or "[" in re.sub(r"\[!?[^]]+\]", "", self.text):
             return f"the glob '{self.text}' matches no robot's name: it has A-Z a-z 0-9 . _ - with *, ? and [ ] alone"
         return None

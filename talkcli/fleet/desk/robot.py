@@ -54,7 +54,7 @@ class RobotExchange(Exchange):
 
     #: how many times the request has been sent again
     resends = 0
-    #: when to stop sending the sentence (in `boottime`), or None for no limit
+    #: when the sentence expires (in `boottime`), or None if it never does
     latest: float | None = None
 
 
@@ -106,7 +106,7 @@ class RobotConnection(Connection):
         self.path = f"{robot} ({desk.broker.url})"
         self._interrupt, self._end = interrupt, end
         self._published_at = time.monotonic()
-        #: the robot's presence, or empty if it hasn't arrived since the broker was last connected
+        #: the robot's presence on the current connection to the broker, or empty if it hasn't arrived yet
         self._presence: JsonObject = {}
         #: the session id of the bridge that received the open requests, or None if there is no such bridge
         self._bridge_session: object = None
@@ -114,7 +114,7 @@ class RobotConnection(Connection):
         self.absent_since = self._published_at
         #: the ids of canceled goals, which are canceled again after each absence
         self._canceled: set[str] = set()
-        #: requests to look up goals, which wait until earlier ones have been answered
+        #: queued lookups of goals, which are sent when earlier ones have been answered
         self._lookups: deque[Exchange] = deque()
 
     # -- requests
@@ -134,7 +134,7 @@ class RobotConnection(Connection):
         self.register(exchange, self._published_at)
 
     def cancel_permanently(self, goal_id: str, *, is_sent: bool) -> None:
-        """Cancel a goal now, and again after each absence of the robot.
+        """Cancel a goal now, and again whenever the robot comes back.
 
         Args:
             goal_id: the id of the goal.
@@ -339,7 +339,7 @@ class RobotConnection(Connection):
         self._send_lookups(now)
 
     def _send_lookups(self, now: float) -> None:
-        """Send waiting lookups, as long as not too many are open."""
+        """Send queued lookups, up to the maximum number of open ones."""
         open_count = sum(not isinstance(each, RobotExchange) for each in self.exchanges.values())
         for _ in range(min(len(self._lookups), _MAX_OPEN_LOOKUPS - open_count)):
             exchange = self._lookups.popleft()

@@ -85,7 +85,7 @@ class FleetRequest:
         self._selection, self._name, self._interrupt, self._patience = selection, name, interrupt, patience
         #: all known robots by name, including those that came online too late to receive the request
         self._robots: dict[str, RobotRequest] = {}
-        #: the names of the robots that the request is for, and of those that have more outcomes to come
+        #: the names of the robots that the request is for, and of those that haven't finished yet
         self._included, self._unfinished = set[str](), set[str]()
         self._outcomes: deque[Outcome] = deque()
         self._numbers = itertools.count(FIRST_NUMBER)
@@ -93,7 +93,7 @@ class FleetRequest:
         self._number = next(self._numbers)
         #: the error if the broker has rejected the message to the group
         self._refused: TalkError | None = None
-        #: whether sending the request has begun and `close` hasn't been called yet
+        #: whether the request has been started and not closed yet
         self._began = False
         #: whether all robots are known. Robots that appear later are ignored.
         self._complete = False
@@ -110,7 +110,7 @@ class FleetRequest:
             #: the rejected goal, if the text is too long for any server. The request isn't sent then.
             self._rejected = too_long(request) if isinstance(request, Say) else None
             self._desk.wait_for_retained(patience, interrupt=interrupt)
-            #: when to stop sending the sentence (in `boottime`), or None for no limit
+            #: when the sentence expires (in `boottime`), or None if it never does
             self._latest = boottime() + request.ttl if isinstance(request, Say) and request.ttl else None
             self._began = True
             self._send_to_known_robots()
@@ -133,12 +133,12 @@ class FleetRequest:
 
     @property
     def unfinished_robots(self) -> list[str]:
-        """The names of the robots that have more outcomes to come, sorted."""
+        """The names of the robots that haven't finished yet, sorted."""
         return sorted(self._unfinished)
 
     @property
     def why_disconnected(self) -> str | None:
-        """A message if the connection to the broker is lost, otherwise None."""
+        """An error message if the broker is disconnected, otherwise None."""
         return None if self._desk.link else f"the broker at {self._desk.broker.url} went away"
 
     def results(self, timeout: float | None = None) -> Iterator[Outcome]:
@@ -330,7 +330,7 @@ class FleetRequest:
         return self._robots[name]
 
     def _include(self, name: str) -> None:
-        """Add a robot to the robots that the request is for."""
+        """Add a robot to the request."""
         self._included.add(name)
         self._unfinished.add(name)
 
@@ -345,7 +345,7 @@ class FleetRequest:
 
 
 class RobotRequest:
-    """The request to one of the robots of a `FleetRequest`."""
+    """A request to one of the robots of a `FleetRequest`."""
 
     def __init__(self, connection: RobotConnection, request: Request, record: Callable[..., None]) -> None:
         """Prepare a request. All outcomes are passed to `record`."""
@@ -373,7 +373,7 @@ class RobotRequest:
 
         Args:
             number: the number of the request.
-            latest: when to stop sending the sentence (in `boottime`), or None for no limit.
+            latest: when the sentence expires (in `boottime`), or None if it never does.
         """
         exchange = RobotExchange(self._request, self._on_reply, self._on_failure)
         exchange.number, exchange.latest = number, latest

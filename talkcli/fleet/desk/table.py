@@ -131,7 +131,7 @@ class FleetTranscript:
     """Formats events of robots as lines. Each line begins with the time and the robot's name."""
 
     def __init__(self, *, full: bool) -> None:
-        """Create a transcript. `full` is the option of `Transcript`."""
+        """Create an empty transcript. For `full`, see `Transcript`."""
         self._full = full
         self._columns = ColumnWidths()
         self._transcripts: dict[str, Transcript] = {}
@@ -148,7 +148,7 @@ class FleetTranscript:
         return [cut(f"{clock_time(now)}{COLUMN_GAP}{', '.join(parts)}; {printable(broker)}", screen.columns_left(0))]
 
     def lines(self, name: str, event: Event, screen: Screen, now: float) -> list[str]:
-        """Format an event of a robot, as `Transcript.lines` does."""
+        """Format an event of a robot as lines. For details, see `Transcript.lines`."""
         if name not in self._transcripts:
             self._transcripts[name] = Transcript(full=self._full, words=False, robot=name, widths=self._columns)
         return self._transcripts[name].lines(event, screen, now)

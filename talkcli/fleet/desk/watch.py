@@ -1,4 +1,4 @@
-"""Functions to read the state of a fleet once, or to watch it.
+"""Functions to read the state of a fleet, or to watch it for changes.
 
 Nothing is sent to the robots. If the connection to the broker was lost for a while, FleetWatch compares the retained
 messages with the state before that. They contain each robot's presence, its active goal, and the goal that ended last.
@@ -96,7 +96,7 @@ FleetEvent = FleetSnapshot | RobotChanged | RobotEvent | EventsMissed | BrokerAw
 def read_robots(
     broker: Broker, timeout: float, name: str | None = None, *, with_status: bool = True
 ) -> list[RobotInfo]:
-    """List the robots of a fleet by name, including those that are offline.
+    """Return the robots of a fleet, sorted by name. This includes robots that are offline.
 
     Args:
         broker: the broker of the fleet.
@@ -130,14 +130,14 @@ class _RetainedReader:
         link.subscribe(*self._wanted, retained=True)
 
     def on_disconnected(self, why: str) -> None:
-        pass  # `wait_for_retained` raises the error.
+        pass  # `wait_for_retained` raises the error instead.
 
     def on_message(self, message: Message) -> None:
         self.messages.append(message)
 
 
 def _robots_in(messages: list[Message]) -> list[RobotInfo]:
-    """Read the state of robots from these messages, sorted by name. Omit robots without a presence."""
+    """Read the state of each robot from these messages, sorted by name. Omit robots without a presence."""
     payloads: dict[str, dict[str, bytes]] = {}
     for message in messages:
         _, _, name, kind, *_ = message.topic.split("/")
@@ -164,7 +164,7 @@ class FleetWatch:
         self._desk.handler = self
         self._events: deque[FleetEvent] = deque()
         self._presences: dict[str, Presence] = {}
-        #: for each robot, the goal last reported as ended (key True) and the goal last reported as started (key False)
+        #: for each robot, the ids of the goals last reported as ended (key True) and as started (key False)
         self._reported: dict[str, dict[bool, str]] = {}
         #: the robots whose events may have been missed. Their next status message shows the goals that were missed.
         self._maybe_missed: set[str] = set()
@@ -220,7 +220,7 @@ class FleetWatch:
         _, _, name, kind, *_ = message.topic.split("/")
         if kind == topics.PRESENCE:
             presence = Presence.read(name, message.payload)
-            if presence or not message.payload:  # Otherwise, the message is malformed.
+            if presence or not message.payload:  # Ignore malformed messages.
                 self._missing.pop(name, None)
                 self._set_presence(name, presence if presence and self._selects(presence) else None)
         elif kind == topics.STATUS:

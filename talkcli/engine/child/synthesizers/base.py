@@ -58,10 +58,10 @@ class SampleSink(Protocol):
         """
 
     def write(self, samples: bytes) -> None:
-        """Play these samples. With `b""`, only raise Stopped if the sentence has to end."""
+        """Play these samples. A call with `b""` only checks whether the sentence has to end."""
 
     def wait(self, descriptor: int) -> None:
-        """Play the samples written so far until a descriptor is readable.
+        """Keep playing until a file descriptor becomes readable.
 
         A synthesizer calls this while it waits for its own thread. The method may return early, and it may be called
         before `begin`. The sentence can be paused or stopped during the wait.

@@ -39,8 +39,8 @@ _CALLBACK_MS = 20
 #: A flag that stops the library from calling exit() if its data is missing.
 _DONT_EXIT = 0x8000
 
-#: Two names of the English voice, the faster one first. It is the name of a file, so the library finds it without
-#: reading all voices, which takes 4 to 40 ms.
+#: Two names of the English voice. The first is a file name, so the library doesn't have to read all voices to find it.
+#: This saves 4 to 40 ms.
 _ENGLISH = ("gmw/en", "en")
 
 #: The type of the event that reports the sample rate. pyttsx3's binding doesn't define it.
@@ -48,8 +48,8 @@ _EVENT_SAMPLERATE = 8
 
 #: The library's default rate in words per minute.
 _ESPEAK_DEFAULT_WPM = 175
-#: If the library makes a shorter pause after a dot, the dot belongs to an abbreviation. The pause has at most a hundred
-#: samples after an abbreviation such as "Mr.", and 6,000 after a sentence.
+#: The minimum pause after a sentence. If the pause after a dot is shorter, the dot belongs to an abbreviation. The
+#: library pauses for 6,000 samples after a sentence, but for at most 100 after an abbreviation such as "Mr.".
 _PAUSE_SAMPLES = 2000
 
 #: The mode in which the library returns phonemes in IPA.
@@ -379,14 +379,14 @@ class EspeakPhonemizer:
 
 
 def _word_position(event: _EspeakEvent, text: str) -> tuple[int, int] | None:
-    """Return the start and the length of the word that an event reports, or None if no word is there."""
+    """Return the start and the length of an event's word, or None if the event has no word."""
     start = event.text_position - 1
     length = event.length if event.length > 0 else count_letters(text, start)
     return (start, length) if length else None
 
 
 def _variants(espeak: Any) -> list[Voice]:
-    """Return the library's variants."""
+    """Return all voice variants of the library."""
     found = [(each.id.rpartition("/")[2], each.name) for each in _list_voices(espeak, _VARIANTS)]
     return [Voice(VARIANT_PREFIX + file, None, f"variant {name}") for file, name in found]
 
@@ -408,7 +408,7 @@ def _has_mbrola_data(identifier: str) -> bool:
 
 
 def _list_voices(espeak: Any, kind: bytes | None) -> tuple[Voice, ...]:
-    """Return the library's voices of one kind. By default, return the normal voices."""
+    """Return the library's voices of one kind, or the normal voices if `kind` is None."""
     found = []
     for each in espeak.ListVoices(None if kind is None else espeak.VOICE(languages=kind)):
         # The first byte of `languages` is a priority, not a part of the language.

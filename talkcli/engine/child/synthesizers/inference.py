@@ -57,7 +57,7 @@ _INPUTS, _SPEAKER_INPUT = ("input", "input_lengths", "scales"), "sid"
 #: The maximum size of the cache, which has room for about eight voices. If the cache gets larger, the oldest files are
 #: removed.
 MAX_CACHE_BYTES = 500_000_000
-#: How much of a half to write at a time. All other threads wait while these bytes are copied.
+#: How many bytes of a model to write at a time. All other threads wait while these bytes are copied.
 _WRITE_BYTES = 1 << 20
 _ENCODER_SUFFIX, _DECODER_SUFFIX = ".encoder.onnx", ".decoder.onnx"
 #: The suffix of a temporary directory in the cache, and the age at which it is removed. Writing takes only seconds, so
@@ -243,7 +243,7 @@ class Model:
         import numpy as np
 
         low, high = max(0, begin - CONTEXT_FRAMES), min(frames.count, end + CONTEXT_FRAMES)
-        # If a value doesn't have one item per frame, it belongs to the whole sentence, like the speaker.
+        # If a value doesn't have one item per frame, it applies to the whole sentence, such as the speaker.
         parts = {
             name: each[..., low:high] if each.shape[-1:] == (frames.count,) else each
             for name, each in zip(self._frame_inputs, frames.values, strict=True)

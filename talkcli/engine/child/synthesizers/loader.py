@@ -129,7 +129,7 @@ class ModelLoader:
         #: the private memory of the process before the first load, and how much it had grown at the last report
         self._initial_bytes: int | None = None
         self._reported_growth = 0
-        #: why to measure the memory again: the id of a voice that has spoken, "" if a voice was unloaded, or None
+        #: the reason to measure memory again: the id of a voice that has spoken, or "" if a voice was unloaded
         self._unmeasured: str | None = None
 
     @property
@@ -284,7 +284,7 @@ def _load(path: str) -> Iterator[tuple[Model, _Fingerprints]]:
         VoiceFileError: The model can't be loaded.
     """
     try:
-        load_libraries(path)  # comes first, because reading the files may hang
+        load_libraries(path)  # Import the libraries before reading any files, which may hang.
         fingerprints = _fingerprints(path)
         yield Model(path, models.read_description(path), _open_cache()), fingerprints
     except OSError as error:

@@ -25,7 +25,7 @@ else:
 MAX_PART_PHONEMES = 250
 #: The maximum number of phonemes in a part, not counting the punctuation mark at its end.
 _MAX_SECTION_PHONEMES = MAX_PART_PHONEMES - 1
-#: A longer part ends at the next comma instead of at the end of the sentence.
+#: If a part is longer than this, it ends at the next comma instead of at the end of the sentence.
 _LONG_PART_PHONEMES = 150
 #: The maximum number of comparisons to align two strings of phonemes, which takes up to 50 ms. This is enough for a
 #: clause of 1,000 phonemes. libespeak-ng ends every clause after 800 bytes, so only very long numbers exceed the limit.
