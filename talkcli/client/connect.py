@@ -11,7 +11,7 @@ explains what is wrong. A request that could have an effect is never sent twice.
 
 from __future__ import annotations
 
-import _socket  # `socket` takes longer to import, see `peers`
+import _socket  # importing `socket` takes longer (see `peers`)
 import os
 import time
 
@@ -155,7 +155,7 @@ def send_early(
 
 
 def yield_processor(attempt: ConnectionAttempt, timeout: float | None) -> ConnectionAttempt:
-    """Sleep for a moment, so that the server has the processor for itself.
+    """Sleep for a moment, so that the server can use the processor.
 
     Return the connection, with the bytes that were received during the wait.
 
@@ -351,7 +351,7 @@ def unreachable(attempt: ConnectionAttempt, named: str | None) -> TalkError:
 
 
 def _named_step(named: str, found: str, *, denied: bool) -> str:
-    """Return advice for a user who named a socket by an option or a variable.
+    """Return advice for a user who named a socket with an option or a variable.
 
     Args:
         named: the path as the user named it.

@@ -10,7 +10,7 @@ import os
 import select
 import threading
 import time
-from _socket import SHUT_RDWR, SHUT_WR  # `socket` takes longer to import, see `peers`
+from _socket import SHUT_RDWR, SHUT_WR  # importing `socket` takes longer (see `peers`)
 
 from talkcli import __version__, paths, peers
 from talkcli.client.connect import ANSWER_LIMIT_S, connect, hello, reach, sender_name, unreachable

@@ -178,7 +178,7 @@ class EventListeners:
                     listener(event)
             state = event.state if isinstance(event, StateChanged) and not event.goal else None
             if state is State.PENDING or (state and state.terminal):
-                return  # the server sends watching clients this event again, with the whole goal
+                return  # clients that watch all goals receive this event again, with the whole goal
         elif not isinstance(event, Snapshot):
             return
         for buffer in self._watches:

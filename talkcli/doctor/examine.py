@@ -123,7 +123,7 @@ class LocalExamination:
         needed = used or server_voices or engine.neural_count or env.get("TALK_VOICES")
         if not needed or not is_own_driver(self._setting("driver")):
             return
-        if self._client and self._session.server_pid is None:  # the server's voices may be elsewhere
+        if self._client and self._session.server_pid is None:  # the server may have other voices
             yield from voice.judge_server_voices(server_voices)
             return
         options = voice.EngineOptions(env=env, interrupt=self._interrupt)
@@ -181,7 +181,7 @@ class LocalExamination:
         """Return the options with which the doctor's engine plays in the same way as the server's engine."""
         player, first = self._player, None
         if is_silent(player):
-            player = "null"  # nothing may be added to the server's output file
+            player = "null"  # don't write to the server's output file
         elif player in PLAYERS and not sound.names_a_player(server_pid, self._env):
             player, first = None, player  # the server chose this player automatically
         device, used, driver = map(self._setting, ("device", "voice", "driver"))

@@ -153,7 +153,7 @@ def _find_place(path: str, trusted: Container[str | None]) -> SocketPlace:
         pid, uid = peers.credentials(probe)
     if path not in trusted and uid not in {os.getuid(), 0}:
         return SocketPlace(path, PLACE_FOREIGN, uid, pid)
-    stopped = peers.process_stat(pid)[:1] == [b"T"]  # for example with Ctrl-Z
+    stopped = peers.process_stat(pid)[:1] == [b"T"]  # for example after Ctrl-Z
     return SocketPlace(path, PLACE_STOPPED if stopped else PLACE_LISTENING, uid, pid)
 
 
@@ -165,7 +165,7 @@ def describe_server(client: Client) -> tuple[JsonObject, list[Goal]]:
     end = time.monotonic() + _ENGINE_START_LIMIT_S
     server, log = client.status().server, client.log(_LOG_GOALS_COUNT)
     while server.get("engine") == "starting" and time.monotonic() < end:
-        time.sleep(_ENGINE_POLL_S)  # there is no event that reports this
+        time.sleep(_ENGINE_POLL_S)  # no event reports when the engine is ready
         server = client.status().server
     return server, log
 
@@ -206,12 +206,12 @@ def _format_place(place: SocketPlace) -> str:
 
 
 def _search_step(search: SocketSearch) -> str:
-    """Return advice for a user without a server."""
+    """Return advice for the user if no server was found."""
     named_by = search.named_by
     if search.usual_server is not None:
         return f"{_UNNAMING[named_by]}: a server is on {search.usual_server}"
     place = next((each for what in _PLACE_ADVICE for each in search.places if each.what == what), None)
-    if place is None:  # nothing blocks a new server
+    if place is None:  # a new server could start at any of the places
         if search.foreign_sockets:
             return f"talk serve; or use another user's server: talk --socket {search.foreign_sockets[0]} doctor"
         if named_by is None:
