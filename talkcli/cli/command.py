@@ -73,7 +73,7 @@ class Command:
     name: str
     #: a one-line summary for the list of commands
     summary: str
-    #: the description in the command's help
+    #: the description to show in the command's help
     description: str
     #: the function that runs the command, as "module:name"; its arguments are the common options and the command's own
     function: str
@@ -306,7 +306,7 @@ def replace_bad_bytes(text: str, line: int = 1) -> tuple[str, str | None]:
     words = f"line {line}, column {column}: the byte {_format_byte(text[first])} is not UTF-8, and is not spoken"
     if len(found) > 1:
         words += f" (the first of {len(found):,})"
-    # The engine treats U+FFFD as a space.
+    # The engine treats the replacement character U+FFFD as a space.
     return "".join("\ufffd" if _is_bad_byte(each) else each for each in text), words
 
 

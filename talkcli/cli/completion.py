@@ -50,7 +50,7 @@ _BASH_SPECIAL = re.compile(r"[^\w@%+=:,./-]")
 
 
 class _LineCompletion(ShellComplete):
-    """Base class for our completion scripts, which pass the line up to the cursor in COMP_WORDS."""
+    """Base class for shells whose completion script passes the line up to the cursor in COMP_WORDS."""
 
     #: the file name of the completion script
     script: ClassVar[str]

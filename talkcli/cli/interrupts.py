@@ -122,7 +122,7 @@ class Interrupts:
             discard_output()
 
     def reset(self) -> None:
-        """Prepare for the cleanup after a wait was interrupted.
+        """Prepare for cleanup after an interrupted wait.
 
         During the cleanup, only a signal can end a wait.
         """

@@ -44,9 +44,9 @@ class PlainCommand:
     command: Command
     #: the values of the command's own options and its argument, by name
     given: dict[str, Any]
-    #: the values of the common options on the command line, by name
+    #: the values of the common options that were given, by name
     common: dict[str, Any]
-    #: the names of the command's own options on the command line
+    #: the names of the command's own options that were given
     typed: frozenset[str]
 
 

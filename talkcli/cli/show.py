@@ -294,7 +294,7 @@ def note(words: str) -> None:
 
 
 def write_error_line(line: str = "") -> None:
-    """Write a line to standard error if it is open."""
+    """Write a line to standard error unless it is closed."""
     if sys.stderr is not None:
         # The command must continue even if nothing reads its messages.
         try:
@@ -355,7 +355,7 @@ class Feedback:
         """Show an event of this goal."""
 
     def note(self, words: str) -> None:
-        """Write a note to standard error."""
+        """Write a message to standard error without disturbing the display."""
         note(words)
 
     def close(self) -> None:

@@ -280,7 +280,7 @@ class LineSpeaker:
 
     @property
     def _has_lines(self) -> bool:
-        """Whether there are lines to send, or more input may follow."""
+        """Whether there are more lines to send or more input to expect."""
         return self._buffer.first is not None or not self._buffer.ended
 
     @property

@@ -31,7 +31,7 @@ _WIDE_CLASSES = frozenset({"W", "F"})
 _COMBINING_CATEGORIES = frozenset({"Mn", "Me"})
 #: The Unicode character that turns the preceding one into an emoji, which is two columns wide.
 _EMOJI_SELECTOR = "\ufe0f"
-#: The first and last Unicode letter for flag emoji. Each letter is two columns wide on a terminal.
+#: The first and last of the Unicode letters that make up flag emoji. Each letter is two columns wide on a terminal.
 _FLAG_LETTERS = ("\U0001f1e6", "\U0001f1ff")
 
 #: Unicode categories of characters that are escaped: controls, format characters (such as bidi marks and zero-width
