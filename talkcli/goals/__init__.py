@@ -1,6 +1,6 @@
-"""Goals: what a goal is, when it is spoken, and how it ends.
+"""Goals, the texts that clients ask the server to speak.
 
-These modules are pure. They use no clock, thread or socket, and get the time as an argument. From `talkcli` they import
-only each other and the modules directly in `talkcli/`. A rule about goals belongs in the module named after its
-subject. The messages in which goals travel are in `protocol`.
+These modules are pure: they use no clock, threads or sockets, and receive the time as an argument. From `talkcli` they
+import only each other and the modules directly in `talkcli/`. A rule about goals belongs in the module named after its
+subject. The messages that contain goals are defined in `protocol`.
 """

@@ -1,8 +1,8 @@
-"""Immutable snapshots of goals and their senders, and their JSON form.
+"""Immutable copies of goals and their senders, and conversion to and from JSON.
 
 This module only defines the format. The scheduler decides whether a goal is accepted. Fields may be added, but a field
-never changes its name or meaning. Unknown fields are ignored. Requests, in contrast, are refused if they have unknown
-fields. They are in `options` and `protocol.requests`.
+never changes its name or meaning. Unknown fields are ignored here, but a request with an unknown field is refused.
+Requests are defined in `options` and `protocol.requests`.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ if TYPE_CHECKING:
 
 JsonObject = dict[str, object]
 
-#: The largest time that is accepted: about thirty million years, more than any calendar can show.
+#: Largest accepted time, about 30 million years.
 _MAX_TIME_S = 1e15
 
 
 @frozen
 class Sender:
-    """The program at the other end of a connection. A field is None if it is unknown."""
+    """The program that sent a request. Unknown fields are None."""
 
     pid: int | None = None
     uid: int | None = None
     command: str | None = None
-    #: the command line of the parent process, which is usually a script
+    #: command line of the parent process, usually a script
     parent: str | None = None
-    #: the name that the sender gave itself in `hello`, which nobody verifies
+    #: unverified name from the client's `hello` request
     name: str | None = None
 
     def to_json(self) -> JsonObject:
@@ -43,7 +43,7 @@ class Sender:
 
 @frozen
 class By:
-    """The cause of a goal's end: another goal, or a client's request. Both are None if the server ended the goal."""
+    """The goal or client that ended a goal. Both fields are None if the server itself ended it."""
 
     goal: str | None = None
     client: Sender | None = None
@@ -60,12 +60,12 @@ class By:
 
 @frozen
 class Output:
-    """The audio output of a goal, as reported by the sound server."""
+    """The audio output that played a goal, as reported by the sound server."""
 
     player: str
-    #: the sound server's name for the device
+    #: name of the device in the sound server
     device: str
-    #: volume of the device, where 1 is 100 %
+    #: volume of the device, where 1.0 means 100 %
     volume: float
     #: whether the output was muted or at volume 0 at any time while the goal was spoken
     muted: bool
@@ -81,7 +81,7 @@ class Output:
 
 @frozen
 class Goal:
-    """A snapshot of a goal. Its JSON form always has all keys, with null for unknown values.
+    """An immutable copy of a goal. Its JSON always contains all keys, with null for unknown values.
 
     Times are seconds since 1970 UTC. `duration` is the length of the audio in seconds.
     """
@@ -89,13 +89,13 @@ class Goal:
     id: str
     state: State
     text: str | None = None
-    #: machine-readable reason for the end: a `Reason`, or an unknown string from a newer server
+    #: machine-readable reason why the goal ended; newer servers may use values that aren't in `Reason`
     reason: str | None = None
     by: By | None = None
-    #: human-readable description of the end
+    #: human-readable description of how the goal ended
     message: str | None = None
     format: str = "text"
-    #: the text up to the end of the last word that was heard
+    #: part of the text that has been heard
     spoken: str | None = None
     priority: int = 0
     key: str | None = None
@@ -107,18 +107,18 @@ class Goal:
     started_at: float | None = None
     ended_at: float | None = None
     duration: float | None = None
-    #: id of the voice that is used, which may differ from the requested voice; None until the goal is ACTIVE
+    #: id of the voice that speaks the goal, which may differ from the requested voice
     voice: str | None = None
     output: Output | None = None
 
     @property
     def exit_code(self) -> int | None:
-        """The exit code of a command that waits for this goal, or None until the goal has ended."""
-        # A throttled goal is not a failure, because its sender asked for throttling.
+        """Exit code of a command that waits for this goal, or None if the goal hasn't ended."""
+        # Throttling is not a failure, because the sender asked for it.
         return 0 if self.reason == "throttled" else EXIT_CODES.get(self.state)
 
     def to_json(self) -> JsonObject:
-        # The keys are written out for speed, because a busy server spends most of its time here.
+        # A loop over the fields would be slower, and a busy server spends most of its time here.
         return {
             "id": self.id,
             "state": self.state.name,
@@ -145,15 +145,19 @@ class Goal:
 
     @classmethod
     def from_json(cls, value: object) -> Goal:
-        """Return the goal in a server's message. Raises Unreadable if its id or state is missing or invalid."""
+        """Return the goal in a server's message.
+
+        Raises:
+            Unreadable: if the id or the state is missing or invalid.
+        """
         found = read_fields(cls, value)
-        if not str(found.get("id", "\n")).isprintable() or "state" not in found:  # ids are printed without escaping
+        if not str(found.get("id", "\n")).isprintable() or "state" not in found:  # ids are printed unescaped
             raise Unreadable("what the server sent for a goal has no id that can be one, or an unknown state")
         return cls(**found)
 
 
 def read_fields(cls: type, message: object) -> dict[str, Any]:
-    """Return the values that a JSON object has for the fields of a class. Values of the wrong type are left out."""
+    """Return the fields of a class that a JSON object contains. Values of the wrong type are skipped."""
     found = {}
     values = message if isinstance(message, dict) else {}
     for name, annotation in cls.__annotations__.items():
@@ -164,17 +168,17 @@ def read_fields(cls: type, message: object) -> dict[str, Any]:
 
 
 def _reader(kind: type) -> Callable[[object], object]:
-    """Return a function that returns a value of exactly this type unchanged, and None for every other value."""
+    """Return a function that returns its argument if it has exactly this type, and None otherwise."""
     return lambda value: value if type(value) is kind else None
 
 
 def read_seconds(value: object) -> float | None:
-    """Return a number of seconds from a message, or None if it is not a number or too large to be shown."""
+    """Return a time in seconds from a message, or None if it isn't a number or is too large."""
     number = isinstance(value, int | float) and not isinstance(value, bool)
     return float(value) if number and abs(value) <= _MAX_TIME_S else None  # type: ignore[arg-type]
 
 
-#: Functions that read a field, by the field's annotation. They return None for a value of the wrong type.
+#: Functions that read a field's value, by type annotation. They return None if the value has the wrong type.
 _READERS: dict[str, Callable[[object], object]] = {
     "str": _reader(str),
     "int": _reader(int),

@@ -1,7 +1,8 @@
-"""What the scheduler remembers: ended goals, times of speech, and cancels that arrived before their goal.
+"""The scheduler's records of ended goals, past speech and early cancels.
 
-Pure: each store drops its oldest entries at a fixed limit. Times are arguments, in monotonic seconds. Ended goals are
-kept so that another process can ask for the result later, as `talk wait ID` does.
+Each store has a maximum size and drops its oldest entries. Methods receive the time as an argument, in monotonic
+seconds. Ended goals are kept so that another process can still ask for the result, for example with `talk wait ID`. An
+early cancel is one that arrives before its goal.
 """
 
 from __future__ import annotations
@@ -20,36 +21,36 @@ if TYPE_CHECKING:
 _Key = TypeVar("_Key")
 _Value = TypeVar("_Value")
 
-#: Spoken goals that are kept. They cover the last 100 minutes of a robot that speaks ten times a minute.
+#: Number of spoken goals to keep. A robot that speaks ten times a minute needs 100 minutes to reach it.
 MAX_SPOKEN_GOALS = 1_000
-#: REJECTED goals that are kept. They have their own limit, so that one client's rejected goals can't displace the
-#: results of other clients.
+#: Number of rejected goals to keep. Without a separate limit, one client's rejected goals could displace the results of
+#: other clients.
 MAX_REJECTED_GOALS = 200
-#: RECALLED goals that are kept. One cancel can recall the 1,000 goals of a connection that wait for room, and the
-#: result of each one must stay available.
+#: Number of recalled goals to keep. One cancel can recall 1,000 waiting goals of a connection, and each result must
+#: stay available.
 MAX_RECALLED_GOALS = 1_000
-#: Total size of the texts of ended goals. Without this limit, they could take 40 MB.
+#: Maximum total size of the texts of ended goals. Without a limit, they could use 40 MB of memory.
 MAX_KEPT_TEXT_BYTES = 8 * 1024 * 1024
-#: Keys whose last start is remembered. The limit for texts is the same.
+#: Maximum number of keys, and of texts, whose last start time is kept.
 MAX_SPEECH_TIMES = 10_000
-#: How long the cancel of an unknown id is remembered. If two programs started one after the other send a goal and its
-#: cancel, the cancel may arrive first.
+#: How long to remember a cancel for an unknown id. If two programs send the goal and its cancel, the cancel may arrive
+#: first.
 EARLY_CANCEL_S = 60.0
-#: Cancels of unknown ids that are remembered.
+#: Maximum number of cancels for unknown ids to remember.
 MAX_EARLY_CANCELS = 1_000
 
 
 class History:
-    """The goals that have ended, oldest first."""
+    """Goals that have ended, oldest first."""
 
     def __init__(self) -> None:
         self._all: dict[str, Record] = {}
-        #: the ids of the goals that share a limit, oldest first; all spoken goals are under SUCCEEDED
+        #: goal ids by state, oldest first, with SUCCEEDED used for all spoken goals
         self._ids: defaultdict[State, deque[str]] = defaultdict(deque)
         self._text_bytes = 0
 
     def add(self, record: Record) -> None:
-        """Keep a goal that has ended, and drop the oldest goals and texts above the limits."""
+        """Add an ended goal. If a limit is exceeded, drop the oldest goals or texts."""
         limits = {State.REJECTED: MAX_REJECTED_GOALS, State.RECALLED: MAX_RECALLED_GOALS}
         ids = self._ids[record.state if record.state in limits else State.SUCCEEDED]
         ids.append(record.id)
@@ -63,56 +64,64 @@ class History:
             oldest.drop_text()
 
     def find(self, goal_id: str) -> Record | None:
-        """Return the goal with this id."""
+        """Return the ended goal with this id, or None if it isn't known."""
         return self._all.get(goal_id)
 
     def latest(self, count: int, *, rejected: bool) -> list[Record]:
-        """Return the goals that ended last, oldest first. `rejected` includes REJECTED goals."""
+        """Return the most recently ended goals, oldest first.
+
+        Args:
+            count: the maximum number of goals.
+            rejected: whether to include rejected goals.
+        """
         newest = (each for each in reversed(self._all.values()) if rejected or each.state is not State.REJECTED)
         return list(islice(newest, count))[::-1]
 
 
 class SpeechTimes:
-    """The last time that a goal with each key and each text was spoken."""
+    """Remembers when each key and each text was last spoken."""
 
     def __init__(self) -> None:
-        #: start time and id of the last goal with each key
+        #: start time and id of the last goal, by key
         self._by_key: OrderedDict[str, tuple[float, str]] = OrderedDict()
-        #: start time and id of the last goal with each text, by a hash of the text
+        #: start time and id of the last goal, by a hash of its text
         self._by_text: OrderedDict[bytes, tuple[float, str]] = OrderedDict()
 
     def add(self, record: Record) -> None:
-        """Remember the start of a goal that was at least partly heard."""
+        """Record the start time of a goal that was at least partly heard."""
         start = (record.began_at, record.id)
         if record.key is not None:
             _set_newest(self._by_key, record.key, start, MAX_SPEECH_TIMES)
         _set_newest(self._by_text, _digest(record.text or ""), start, MAX_SPEECH_TIMES)
 
     def find(self, since: float, key: str | None, text: str) -> str | None:
-        """Return the id of the last goal with this key that started after `since`. Without a key, compare the text."""
+        """Return the last goal with the same key that started after `since`, or None.
+
+        If the key is None, return the last goal with the same text instead. Only the goal's id is returned.
+        """
         last = self._by_text.get(_digest(text)) if key is None else self._by_key.get(key)
         return last[1] if last is not None and last[0] > since else None
 
 
 class EarlyCancels:
-    """Cancels of ids that no goal had yet."""
+    """Cancels that arrived before the goals they refer to."""
 
     def __init__(self) -> None:
-        #: by goal id: the time at which the cancel lapses, and the client that sent it
+        #: expiry time and sender of each cancel, by goal id
         self._cancels: OrderedDict[str | None, tuple[float, By]] = OrderedDict()
 
     def add(self, goal_id: str, by: By, now: float) -> None:
-        """Remember that this id was cancelled."""
+        """Remember a cancel for a goal that hasn't arrived yet."""
         _set_newest(self._cancels, goal_id, (now + EARLY_CANCEL_S, by), MAX_EARLY_CANCELS)
 
     def find(self, goal_id: str | None, now: float) -> By | None:
-        """Return the client that cancelled this id, or None if the id was not cancelled."""
+        """Return the client that cancelled this goal id, or None if there was no recent cancel."""
         lapses_at, by = self._cancels.get(goal_id, (now, None))
         return by if now < lapses_at else None
 
 
 def _set_newest(entries: OrderedDict[_Key, _Value], key: _Key, value: _Value, limit: int) -> None:
-    """Set an entry as the newest one, and drop the oldest one above the limit."""
+    """Add or replace an entry as the newest one. If there are too many entries, drop the oldest."""
     entries[key] = value
     entries.move_to_end(key)
     if len(entries) > limit:
@@ -120,5 +129,5 @@ def _set_newest(entries: OrderedDict[_Key, _Value], key: _Key, value: _Value, li
 
 
 def _digest(text: str) -> bytes:
-    """Return a hash of a text. Ten thousand texts themselves could take 400 MB."""
+    """Return a hash of a text. Keeping ten thousand texts instead could use 400 MB of memory."""
     return hashlib.blake2b(text.encode(errors="surrogatepass"), digest_size=16).digest()

@@ -1,14 +1,13 @@
-"""The options of goals and the settings of servers. Each one is described by a row in a table.
+"""The options of goals and the settings of servers, defined in a table.
 
-The rows define the fields of `say` and `set` on the wire, the options of the commands, the checks of all of them, and
-the tables in the documents. `Say` and `Client.say` repeat the rows for type checkers and readers, and tests compare
-them with the rows. Rows may be added, but a row never changes its name or meaning.
+Each row defines a field of the `say` or `set` request, a command-line option, the checks of its values, and an entry in
+the documents. `Say` and `Client.say` repeat the rows for type checkers and readers, and tests compare them with the
+rows. Rows may be added, but a row never changes its name or meaning.
 
 There are two kinds of invalid values. A request with a value of the wrong type is an error and has no effect
 (`Option.type_error`). A goal with a value that is not allowed is REJECTED (`Option.value_error`).
 
-Clients import this module before they send anything, so it imports nothing that is slow to load. The first sentence of
-a request's docstring also describes the request in the protocol's document.
+Clients import this module before they send anything, so it imports nothing that is slow to load.
 """
 
 from __future__ import annotations
@@ -23,74 +22,74 @@ if TYPE_CHECKING:
     from talkcli.goals.reasons import Refusal
 
 MAX_ID_CHARS = 64
-#: Ids in one request. More would not fit into a line.
+#: Maximum number of ids in a request. More would not fit into a line.
 MAX_IDS = 4096
-#: Length of the name that a client gives itself. It is shown on one line of a terminal.
+#: Maximum length of a client's name, which is shown on one line of a terminal.
 MAX_SENDER_NAME_CHARS = 64
-#: Size of a goal's `data` as JSON. It is meant for labels, not for storage.
+#: Maximum size of a goal's `data` as JSON. It is meant for labels, not for storage.
 MAX_DATA_BYTES = 1024
-#: Goals in one reply to `log`. The server keeps this number of ended goals.
+#: Maximum number of goals in a reply to `log`, equal to the number of ended goals that the server keeps.
 MAX_LOG_GOALS = 2_200
-#: Length of a text. It allows for some minutes of speech. A longer text should be sent in parts, so that other goals
+#: Maximum length of a text, enough for several minutes of speech. A longer text should be split, so that other goals
 #: can be spoken in between.
 MAX_TEXT_CHARS = 10_000
-#: Size of a text. A text of 10,000 characters with four bytes each still fits into a request.
+#: Maximum size of a text. 10,000 characters of four bytes each still fit into a request.
 MAX_TEXT_BYTES = 40_000
-#: Largest priority. JSON readers in all languages represent it exactly.
+#: Highest priority. Every JSON parser can represent this number exactly.
 MAX_PRIORITY = 1_000_000
-#: Length of a key, which is shown on one line.
+#: Maximum length of a key, which is shown on one line.
 MAX_KEY_CHARS = 64
-#: Longest silence before a sentence. No output needs more time to wake up.
+#: Maximum silence before a sentence. No audio device takes longer to wake up.
 MAX_LEAD_IN_MS = 5000
-#: Name of the driver's own voice.
+#: Name that selects the speech driver's default voice.
 DEFAULT_VOICE = "default"
-#: Prefix of the ids of neural voices, as in "piper/NAME".
+#: Prefix of neural voice ids, as in "piper/NAME".
 NEURAL_PREFIX = "piper/"
-#: Separator between the id of a neural voice and the speaker, as in "piper/NAME#3".
+#: Separator between a neural voice and its speaker, as in "piper/NAME#3".
 SPEAKER_MARK = "#"
-#: Unicode categories of silent characters: separators, control characters, format characters such as the zero-width
-#: space, and unassigned and private code points.
+#: Unicode categories of characters that are never spoken: separators, control and format characters such as the
+#: zero-width space, and unassigned or private code points.
 _SILENT_CATEGORIES = frozenset({"Zs", "Zl", "Zp", "Cc", "Cf", "Cn", "Co"})
 _DIGITS = frozenset("0123456789")
 _LETTERS = frozenset("abcdefghijklmnopqrstuvwxyz")
 _ID_CHARACTERS = _DIGITS | _LETTERS | frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZ._:/-")
-#: The value of sys.float_info.max. A larger integer can't be converted to a float.
+#: Same as sys.float_info.max. Larger integers can't be converted to a float.
 _MAX_FLOAT = 1.7976931348623157e308
 
 
 def without_speaker(voice: str | None) -> str:
-    """Return the id of a neural voice without its speaker, or "" if there is no voice."""
+    """Return the id of a voice without its speaker, or an empty string if the voice is None."""
     return (voice or "").partition(SPEAKER_MARK)[0]
 
 
 def is_neural(voice: str) -> bool:
-    """Return whether a name has the form of a neural voice's id. The voice need not exist."""
+    """Return whether a name looks like the id of a neural voice. The voice need not exist."""
     return voice.casefold().startswith(NEURAL_PREFIX)
 
 
 @frozen
 class Kind:
-    """The type of an option's values."""
+    """The value type of an option."""
 
-    #: name in the protocol's document
+    #: name of the type in the protocol's document
     name: str
     types: tuple[type, ...]
-    #: error message for a value of another type
+    #: error message if a value has another type
     wrong_type: str
     #: placeholder for the value in help texts
     metavar: str = ""
-    #: function that checks a value of the right type and returns an error message or None
+    #: additional check of a value, which returns an error message or None
     check: Callable[[Any], str | None] | None = None
 
 
 def is_clients_id(goal_id: str) -> bool:
-    """Return whether a client may choose this id. Ids that look like a server's own are reserved."""
+    """Return whether a client may choose this id. Ids that look like the server's own are reserved."""
     if not (0 < len(goal_id) <= MAX_ID_CHARS and _ID_CHARACTERS.issuperset(goal_id)) or goal_id[0] == "-":
         return False
     boot, dash, number = goal_id.partition("-")
     if not dash:
         return not _DIGITS.issuperset(goal_id)
-    # A server's ids look like 4k7f-12. People prefer names such as `goal-1` or `2024-12`, which stay available.
+    # Ids made by a server look like 4k7f-12. Clients can still choose names such as `goal-1` or `2024-12`.
     servers = len(boot) == 4 and _DIGITS.issuperset(boot[::2]) and _LETTERS.issuperset(boot[1::2])
     return not (servers and number and _DIGITS.issuperset(number))
 
@@ -116,19 +115,19 @@ def _data_error(value: JsonObject) -> str | None:
 
 
 def format_number(value: object) -> str:
-    """Return a value in human-readable form. Numbers have at most four decimals."""
+    """Format a value for display, with at most four decimal places."""
     return f"{round(value, 4):.12g}" if isinstance(value, float) else str(value)
 
 
 FLAG = Kind("boolean", (bool,), "must be true or false")
 TEXT = Kind("string", (str,), "must be a string", "TEXT")
-#: A name. On a command line, it must be valid UTF-8 and not empty.
+#: A name. On the command line, it must be valid UTF-8 and must not be empty.
 WORD = Kind("string", (str,), "must be a string")
-#: The path of a file or a socket. On a command line, it may contain any bytes but must not be empty.
+#: A file or socket path. On the command line, it may contain any bytes but must not be empty.
 PATH = Kind("string", (str,), "must be a string", "PATH")
 INTEGER = Kind("integer", (int,), "must be an integer", "N")
 NUMBER = Kind("number", (int, float), "must be a number", "X")
-#: A length of time, 0 or more.
+#: A duration in seconds, which can't be negative.
 SECONDS = Kind("number", (int, float), "must be a number", "SEC")
 DATA = Kind("object", (dict,), f"must be an object of at most {MAX_DATA_BYTES} bytes", check=_data_error)
 ID = Kind("id", (str,), "must be a string", "ID", _id_error)
@@ -137,66 +136,66 @@ IDS = Kind("list", (list, tuple), f"must be a list of at most {MAX_IDS} ids", "[
 
 @frozen
 class Setting:
-    """A server's default for an option of goals."""
+    """The server's default value for a goal option."""
 
     initial: Any
-    #: value that stands for "none", which is shown as null
+    #: value that means "none" and is shown as null
     none_value: Any = None
-    #: meaning in a `set` request, if it differs from the meaning in `say`
+    #: description in the `set` request, if it differs from `say`
     meaning: str = ""
-    #: help in `talk set`, if it differs from the help in `talk say`
+    #: help text in `talk set`, if it differs from `talk say`
     set_help: str = ""
-    #: help in `talk serve`, if it differs from the help in `talk say`
+    #: help text in `talk serve`, if it differs from `talk say`
     serve_help: str = ""
-    #: spellings in `talk set` and `talk serve`, if they differ from those in `talk say`
+    #: flags of `talk set` and `talk serve`, if they differ from `talk say`
     flags: str = ""
-    #: format string for showing the value in a sentence
+    #: format string that describes the value to the user
     words: str = ""
-    #: words for showing that there is no value
+    #: description to use if there is no value
     none_words: str = ""
 
 
 @frozen
 class Option:
-    """An option of a goal or of a command: its name, its allowed values and its descriptions."""
+    """An option of a goal or a command, with its allowed values and its documentation."""
 
     name: str
     kind: Kind
-    #: meaning on the wire, for the documents
+    #: description in the protocol's document
     meaning: str = ""
-    #: value if the option isn't given; if this is None, a request may also contain null
+    #: default value; if it is None, a request may also contain null
     default: Any = None
-    #: minimum and maximum of a number, with None for no limit
+    #: minimum and maximum of a number, or None for no limit
     limits: tuple[float | None, float | None] = (None, None)
-    #: whether the minimum itself is out of range
+    #: whether values must be greater than the minimum
     excludes_minimum: bool = False
-    #: unit of a number, preceded by a space
+    #: unit of a number, with a leading space
     unit: str = ""
-    #: the only allowed values, if the option has a fixed choice
+    #: allowed values, if there is a fixed set of them
     choices: tuple[str, ...] = ()
-    #: additional check of a value of the right type, which returns an error message or None
+    #: additional check of a value, which returns an error message or None
     check: Callable[[Any], str | None] | None = None
-    #: note on the allowed values, for the documents
+    #: description of the allowed values in the protocol's document
     form: str = ""
-    #: note on the default, for the documents; not needed if the default is the server's value
+    #: description of the default in the protocol's document, unless it is the server's default
     default_words: str = ""
-    #: spellings on a command line: "-w, --wait", or "--preempt/--queue" with one for yes and one for no
+    #: command-line flags, such as "-w, --wait", or "--preempt/--queue" for yes and no
     flags: str = ""
     metavar: str = ""
     help: str = ""
-    #: environment variable that is read if the option isn't given
+    #: environment variable that is used if the option isn't given
     env: str = ""
     #: name of the function in `cli.completion` that completes values
     completion: str = ""
-    #: the server's default, if it can be changed with `talk set`
+    #: the server setting that provides the default, if there is one
     setting: Setting | None = None
     #: whether the value is sent to the engine
     for_engine: bool = False
-    #: whether goals show the value
+    #: whether a goal's JSON includes the value
     in_goal: bool = False
 
     def type_error(self, value: Any) -> str | None:
-        """Return an error message such as "must be an integer" if the type or form of a value is wrong."""
+        """Return an error message if a value has the wrong type or format, or None."""
         if value is None and self.default is None:
             return None
         kind = self.kind
@@ -205,7 +204,7 @@ class Option:
         return kind.check(value) if kind.check else None
 
     def value_error(self, value: Any) -> str | None:
-        """Return an error message if a value of the right type is not allowed."""
+        """Return an error message if a value is not allowed, although its type is right."""
         if value is None:
             return None
         if self.limits != (None, None) and self.is_out_of_range(value):
@@ -225,7 +224,7 @@ class Option:
 
     @property
     def range(self) -> str:
-        """The limits in words, or "" if there are none."""
+        """Description of the limits, or an empty string if there are none."""
         low, high = self.limits
         if low is None:
             return ""
@@ -234,13 +233,13 @@ class Option:
         return f"above {low:g}" if self.excludes_minimum else f"from {low:g} on"
 
     def for_set(self) -> Option:
-        """Return the option of `talk set` for this setting. It has no default: omitted settings don't change."""
+        """Return the option for `talk set`. It has no default, because omitted settings don't change."""
         setting = self.setting
         assert setting
         return replace(self, env="", flags=setting.flags or self.flags, help=setting.set_help or self.help)
 
     def for_serve(self) -> Option:
-        """Return the option of `talk serve` for this setting."""
+        """Return the option for `talk serve`."""
         setting = self.setting
         assert setting
         flags = (setting.flags or self.flags).split("/")[0]
@@ -279,7 +278,7 @@ def _voice_error(value: str) -> str | None:
 
 _EXPIRY_HELP = "A goal that has not begun after SEC seconds is recalled; "
 
-#: The options of a goal, in the order of the wire's document and of help.
+#: All options of a goal, in the order of the help text and the protocol's document.
 OPTIONS = (
     Option(
         "text",
@@ -340,7 +339,7 @@ OPTIONS = (
         INTEGER,
         "higher goes first; first in first out among equals",
         default=0,
-        # The range is not in `limits`, because help would show it.
+        # The range is not in `limits`, because the help text would then show it.
         check=_priority_error,
         form=f"{-MAX_PRIORITY:,} to {MAX_PRIORITY:,}",
         flags="--priority",
@@ -492,20 +491,21 @@ OPTIONS = (
 
 #: Names of the options that are sent to the engine.
 ENGINE_OPTIONS = tuple(each.name for each in OPTIONS if each.for_engine)
-#: Options that determine how a goal sounds, even if it is written to a file. Servers have a default for each of them.
+#: Options that affect how speech sounds, even if it is written to a file. Each one has a default on the server.
 SOUND_OPTIONS = tuple(each for each in OPTIONS if each.for_engine and each.setting)
-#: Names of the options that goals show.
+#: Names of the options that a goal's JSON includes.
 SHOWN_OPTIONS = tuple(each.name for each in OPTIONS if each.in_goal)
-#: Options for which servers have a default, starting with those that are sent to the engine.
+#: Options that have a default on the server. Those sent to the engine come first.
 SETTINGS = tuple(sorted((each for each in OPTIONS if each.setting), key=lambda each: not each.for_engine))
 _NONE_VALUES = {each.name: each.setting.none_value for each in SETTINGS if each.setting}
 
 
 @frozen
 class Say:
-    """A goal: speak this. Values that are out of range make the goal REJECTED, bad_option."""
+    """A request to speak a text. If a value is out of range, the goal is rejected."""
 
     kind: ClassVar[str] = "say"
+    meaning: ClassVar[str] = "A goal: speak this"
     options: ClassVar[tuple[Option, ...]] = OPTIONS
     text: str
     wait: bool = False
@@ -531,23 +531,30 @@ class Say:
 
 @frozen
 class Set:
-    """Change the running server's settings, for goals that have not begun; those not given stay."""
+    """A request to change the server's settings for goals that haven't started. None leaves a setting unchanged."""
 
     kind: ClassVar[str] = "set"
+    meaning: ClassVar[str] = "Change the running server's settings, for goals that have not begun; those not given stay"
     options: ClassVar[tuple[Option, ...]] = SETTINGS
-    rate: int | None = None  # words per minute
-    volume: float | None = None  # 0 to 1
-    voice: str | None = None  # id, name or language, or "default" for the driver's own voice
-    pitch: int | None = None  # 0 to 100
+    rate: int | None = None
+    volume: float | None = None
+    voice: str | None = None
+    pitch: int | None = None
     preempt: bool | None = None
-    ttl: float | None = None  # seconds, 0 for no limit
+    ttl: float | None = None
 
 
 @frozen
 class Cancel:
-    """End what these fields select, goals that wait for room (`patient`) too; they add up; without any: everything."""
+    """A request to cancel every goal that matches at least one field, or all goals if no field is set.
+
+    Goals that wait for room in the queue (`patient`) are cancelled, too.
+    """
 
     kind: ClassVar[str] = "cancel"
+    meaning: ClassVar[str] = (
+        "End what these fields select, goals that wait for room (`patient`) too; they add up; without any: everything"
+    )
     options: ClassVar[tuple[Option, ...]] = (
         Option("ids", IDS, "these goals; an empty list selects none", form=f"of to {MAX_IDS:,} ids"),
         Option(
@@ -583,13 +590,13 @@ class Cancel:
 
     @property
     def selects_all(self) -> bool:
-        """Whether all goals are selected."""
+        """Whether the request cancels all goals."""
         return self.ids is None and not self.current and self.before is None and self.key is None
 
     def select_waiting(self, goals: Sequence[Say]) -> list[int]:
-        """Return the indexes of the selected goals in a list of goals that wait for room in the queue.
+        """Return the indexes of the goals to cancel in a list of goals that wait for room in the queue.
 
-        Such goals have an id only if their sender chose one, so `before` has to name an id of this kind to select them.
+        Such goals have an id only if their sender chose one, so `before` selects them only if it names such an id.
         """
         ids = set(self.ids or ())
         last = max((index for index, say in enumerate(goals) if say.id == self.before is not None), default=-1)
@@ -601,7 +608,11 @@ class Cancel:
 
 
 def require_fields(cls: type, options: Iterable[str]) -> None:
-    """Raise TypeError if a class lacks a field for one of these options. This check runs at import."""
+    """Check at import time that a class has a field for each option.
+
+    Raises:
+        TypeError: if a field is missing.
+    """
     for name in options:
         if name not in cls.__annotations__:
             raise TypeError(f"the option {name!r} has a row but {cls.__name__} has no such field")
@@ -610,12 +621,12 @@ def require_fields(cls: type, options: Iterable[str]) -> None:
 for _request in (Say, Set, Cancel):
     require_fields(_request, (each.name for each in _request.options))
 
-#: Settings of a server that was started without any.
+#: Settings of a server that was started without options.
 INITIAL = Set(**{each.name: each.setting.initial for each in SETTINGS if each.setting})
 
 
 def bad_option(asked: Say | Set) -> str | None:
-    """Return an error message if a goal or a change of settings has a value that is not allowed."""
+    """Return an error message if a request contains a value that is not allowed."""
     if isinstance(asked, Say) and asked.flush and asked.preempt is False:
         return "flush preempts: it can't be had together with preempt false"
     for option in asked.options:
@@ -626,7 +637,7 @@ def bad_option(asked: Say | Set) -> str | None:
 
 
 def bad_text(text: str, max_chars: int | None = MAX_TEXT_CHARS) -> Refusal | None:
-    """Return the reason why a text can't be spoken, or None if no problem is found without the engine.
+    """Return the reason why a text can't be spoken, or None if there is no obvious problem.
 
     Args:
         text: the text.
@@ -653,12 +664,15 @@ def bad_text(text: str, max_chars: int | None = MAX_TEXT_CHARS) -> Refusal | Non
 
 
 def given_values(asked: Say | Set) -> dict[str, Any]:
-    """Return the options or settings that have a value, by name."""
+    """Return all values of a request that are not None, by name."""
     return {name: value for name, value in fields(asked).items() if value is not None}
 
 
 def engine_options(say: Say, settings: Set) -> dict[str, Any]:
-    """Return a goal's options for the engine by name. The server's settings are used for omitted options."""
+    """Return the options that the engine needs for a goal, by name.
+
+    If the goal omits an option, the server's setting is used.
+    """
     found = {}
     for name in ENGINE_OPTIONS:
         own = getattr(say, name)
@@ -667,17 +681,17 @@ def engine_options(say: Say, settings: Set) -> dict[str, Any]:
 
 
 def shown_settings(settings: Set) -> JsonObject:
-    """Return settings as the server shows them, with None for the default voice and for a ttl of 0."""
+    """Return settings for display, with None for the default voice and for an unlimited time to live."""
     return _replace_none_values(fields(settings))
 
 
 def _replace_none_values(values: dict[str, Any]) -> dict[str, Any]:
-    """Replace the values that stand for "none" by None."""
+    """Replace values that mean "none" with None."""
     return {name: None if value == _NONE_VALUES.get(name) else value for name, value in values.items()}
 
 
 def describe_settings(settings: JsonObject) -> list[str]:
-    """Return a short description of each setting that a server shows."""
+    """Return a short description of each setting."""
     found = []
     for each in SETTINGS:
         value = settings.get(each.name)

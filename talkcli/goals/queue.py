@@ -1,11 +1,11 @@
-"""The queue: the pending goals in the order in which they will be spoken.
+"""The queue of pending goals, in the order in which they will be spoken.
 
 Higher priorities come first. Goals of the same priority keep the order in which they were accepted, except that a goal
-may be put at the front of its priority or take the place of another goal. If the queue is full, the queue returns the
-goal to displace, and the scheduler decides whether to do so.
+may be put at the front of its priority or take the place of another goal. If the queue is full, it can name a goal to
+displace, and the scheduler decides whether to do so.
 
-At most ten thousand goals wait (`--max-queue`). Methods called for each goal use binary search unless their docstring
-says otherwise.
+The queue may contain ten thousand goals (`--max-queue`). Methods called for each goal use binary search unless their
+docstring says otherwise.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ if TYPE_CHECKING:
 
     from talkcli.goals.record import Record
 
-    #: an entry of a sorted list: a unique sort key, and the goal
+    #: entry of a sorted list: two numbers to sort by, and the goal
     _Entry = tuple[float, int, Record]
 
 _record_of = itemgetter(2)
 
 
 class Queue:
-    """The pending goals."""
+    """The pending goals of a scheduler."""
 
     def __init__(self) -> None:
-        #: all goals in the order of speech, sorted by negative priority and position
+        #: all goals in speaking order, sorted by descending priority and then by position
         self._goals: list[_Entry] = []
-        #: the goals that preempt, sorted by negative priority and position
+        #: preempting goals, sorted by descending priority and then by position
         self._preempting: list[_Entry] = []
-        #: all goals, sorted by negative priority and number; the last one is the first to be displaced
+        #: all goals, sorted by descending priority and then by age; the last goal is displaced first
         self._displaceable: list[_Entry] = []
-        #: the goals with a time to live, sorted by expiry time and number
+        #: goals with a time to live, sorted by expiry time
         self._expiries: list[_Entry] = []
         self._by_key: dict[str, Record] = {}
 
@@ -47,35 +47,35 @@ class Queue:
         return map(_record_of, self._goals)
 
     def first(self) -> Record | None:
-        """Return the next goal."""
+        """Return the next goal to speak, or None if the queue is empty."""
         return self._goals[0][2] if self._goals else None
 
     def with_key(self, key: str | None) -> Record | None:
-        """Return the goal with this key. There is never more than one, because a new one replaces the old one."""
+        """Return the goal with this key, if any. Two pending goals never have the same key."""
         return None if key is None else self._by_key.get(key)
 
     def with_text(self, text: str) -> Record | None:
-        """Return the first goal with this text. This is slow because it searches all goals."""
+        """Return the first goal with this text. This is slow, because it checks every goal."""
         return next((each for each in self if each.text == text), None)
 
     def goals_up_to(self, priority: int) -> list[Record]:
-        """Return the goals of this priority and of all lower priorities."""
+        """Return all goals with this priority or a lower one."""
         return list(map(_record_of, self._goals[bisect_left(self._goals, (-priority,)) :]))
 
     def preempting_goals_up_to(self, priority: int) -> list[Record]:
-        """Return the preempting goals of this priority and of all lower priorities."""
+        """Return all preempting goals with this priority or a lower one."""
         return list(map(_record_of, self._preempting[bisect_left(self._preempting, (-priority,)) :]))
 
     def displaceable_goal(self) -> Record | None:
-        """Return the goal to displace if the queue is full: the newest goal of the lowest priority."""
+        """Return the newest goal of the lowest priority, which is the first to be displaced."""
         return self._displaceable[-1][2] if self._displaceable else None
 
     def add(self, record: Record, replaced: Record | None = None) -> None:
-        """Add a goal at the end of its priority, or at the front if it preempts.
+        """Add a goal behind the others of its priority, or in front of them if it preempts.
 
         Args:
-            record: the goal to add.
-            replaced: a removed goal of the same priority. The new goal takes its place.
+            record: the new goal.
+            replaced: a goal of the same priority that was removed. The new goal takes its place in the queue.
         """
         usual = -record.number if record.preempt else record.number
         record.position = replaced.position if replaced else usual
@@ -85,22 +85,22 @@ class Queue:
             self._by_key[record.key] = record
 
     def remove(self, record: Record) -> None:
-        """Remove a goal."""
+        """Remove a goal from the queue."""
         for goals, entry in self._entries(record):
             del goals[bisect_left(goals, entry)]
         if record.key is not None:
             del self._by_key[record.key]
 
     def next_expiry(self) -> float | None:
-        """Return the time at which the next goal expires (monotonic), or None if no goal has a time to live."""
+        """Return the monotonic time at which the next goal expires, or None if no goal can expire."""
         return self._expiries[0][0] if self._expiries else None
 
     def expired(self, now: float) -> list[Record]:
-        """Return the expired goals in the order of their expiry."""
+        """Return the expired goals, earliest first."""
         return list(map(_record_of, self._expiries[: bisect_left(self._expiries, (now, inf))]))
 
     def _entries(self, record: Record) -> Iterator[tuple[list[_Entry], _Entry]]:
-        """Yield each sorted list that contains a goal, with the goal's entry in that list."""
+        """Yield every sorted list that a goal belongs to, together with the entry for that list."""
         entry = -record.priority, record.position, record
         yield self._goals, entry
         yield self._displaceable, (-record.priority, record.number, record)

@@ -1,4 +1,4 @@
-"""The reasons for which goals are refused or end without success.
+"""Reasons why a goal is rejected or doesn't succeed.
 
 To add a reason, add a member here. The table of reasons in the protocol's document is generated from the members.
 """
@@ -14,14 +14,14 @@ _REJECTED, _ABORTED, _LOST = State.REJECTED, State.ABORTED, State.LOST
 
 
 class Reason(str, Enum):
-    """A machine-readable reason: a string whose meaning never changes.
+    """Machine-readable reason why a goal was rejected or didn't succeed. Its meaning never changes.
 
     `Goal.reason` is a plain string because a newer server may send a reason that this client doesn't know.
     """
 
-    #: the states in which a goal may have this reason
+    #: goal states in which this reason can occur
     states: tuple[State, ...]
-    #: human-readable meaning, in Markdown
+    #: description in Markdown, for the protocol's document
     meaning: str
 
     def __new__(cls, code: str, states: tuple[State, ...] = (), meaning: str = "") -> Reason:
@@ -74,14 +74,14 @@ class Reason(str, Enum):
     ENGINE_HUNG = "engine_hung", (_ABORTED,), "the engine process said nothing any more"
     NOTHING_TO_SAY = "nothing_to_say", (_ABORTED,), "nothing in the text can be spoken"
     NOT_SILENT = "not_silent", (_ABORTED,), "it was stopped, and silence was not confirmed within 2 s"
-    # Only clients set these two reasons.
+    # The next two reasons are set only by clients.
     NOT_SENT = "not_sent", (_REJECTED,), "the client could not send it: it never reached a server"
     LOST = "lost", (_LOST,), "the connection ended first"
 
-    # Make a member look like a plain string in every Python version.
+    # Print members as plain strings in every Python version.
     __str__ = str.__str__
     __repr__ = str.__repr__
 
 
-#: A refusal: the machine-readable reason, and a human-readable message with the details.
+#: A machine-readable reason for a refusal, and a message with the details.
 Refusal = tuple[Reason, str]

@@ -19,54 +19,57 @@ if TYPE_CHECKING:
     from talkcli.goals.options import Say
     from talkcli.goals.reasons import Reason
 
-#: Fields that a goal gets after it was accepted.
+#: Fields of a goal that are set after the goal was accepted.
 _LATER = ("reason", "by", "message", "started_at", "ended_at", "duration", "voice", "output")
 require_fields(Goal, (*SHOWN_OPTIONS, *_LATER))
 
 
 @dataclass(slots=True, eq=False)
 class Record:
-    """One goal from its submission to its end. It has slots because ten thousand goals may wait."""
+    """Everything that the scheduler knows about a goal.
+
+    The class has slots to save memory, because ten thousand goals may be in the queue.
+    """
 
     id: str
     #: position in the order of submission
     number: int
-    #: the request; if the sender gave no time to live, the request contains that of the server
+    #: the client's request; if it has no time to live, the server's default is filled in
     say: Say
     sender: Sender
     queued_at: float
     preempt: bool = False
-    #: time at which it expires unless it has started (monotonic)
+    #: monotonic time at which the goal expires if it hasn't started
     expires_at: float | None = None
-    #: the text, or None after it was dropped to free memory
+    #: text to speak, or None after it was dropped to free memory
     text: str | None = field(init=False)
-    #: a hash of the text, set when the text is dropped
+    #: hash of the text, kept after the text was dropped
     text_hash: int = 0
-    #: size of the text, or 0 after it was dropped
+    #: size of the text in bytes, or 0 after the text was dropped
     text_bytes: int = field(init=False)
     state: State = State.PENDING
-    #: position among the pending goals of its priority, used only by the queue
+    #: sort position among the pending goals of the same priority, used only by the queue
     position: int = 0
     reason: Reason | None = None
     by: By | None = None
     message: str | None = None
-    #: offset of the end of the last word that was heard
+    #: offset in the text up to which the goal has been heard
     spoken_end: int = 0
-    #: whether it was paused in mid-sentence
+    #: whether the goal is paused
     paused: bool = False
-    #: number of times it was paused
+    #: how often the goal has been paused
     pause_count: int = 0
-    #: time at which it became the next goal (monotonic), or inf before that
+    #: monotonic time at which the goal reached the front of the queue, or inf before that
     next_since: float = inf
-    #: time at which it was given to the engine (monotonic)
+    #: monotonic time at which the goal became ACTIVE
     began_at: float = 0.0
     started_at: float | None = None
     ended_at: float | None = None
     duration: float | None = None
-    #: id of the voice that is used
+    #: id of the voice that speaks the goal
     voice: str | None = None
     output: Output | None = None
-    #: time of the first order to stop it (monotonic)
+    #: monotonic time at which the engine was told to stop the goal
     stop_requested_at: float | None = None
 
     def __post_init__(self) -> None:
@@ -75,29 +78,38 @@ class Record:
 
     @property
     def priority(self) -> int:
-        """The goal's priority. Higher priorities are spoken first."""
+        """Priority of the goal. Higher priorities are spoken first."""
         return self.say.priority
 
     @property
     def key(self) -> str | None:
-        """The goal's key, or None. A later goal with the same key replaces this one."""
+        """Key of the goal, or None. While the goal is pending, a newer goal with the same key replaces it."""
         return self.say.key
 
     def change_state(self, state: State) -> None:
-        """Change the state. Raises IllegalTransition if the transition is not allowed."""
+        """Change the state of the goal.
+
+        Raises:
+            IllegalTransition: if the change isn't allowed.
+        """
         self.state = check_transition(self.state, state)
 
     def drop_text(self) -> None:
-        """Drop the text to free memory, and keep everything else."""
+        """Drop the text to save memory."""
         self.text_hash = hash(self.text)
         self.text, self.text_bytes, self.say = None, 0, replace(self.say, text="")
 
     def has_text(self, text: str) -> bool:
-        """Return whether the goal has this text. After the text was dropped, compare hashes."""
+        """Return whether the goal has this text. If the text was dropped, compare hashes."""
         return hash(text) == self.text_hash if self.text is None else text == self.text
 
     def snapshot(self, state: State | None = None) -> Goal:
-        """Return the goal as it is now. With PENDING, return the goal as it was when it was accepted."""
+        """Return an immutable copy of the goal.
+
+        Args:
+            state: the state to show instead of the current one. With PENDING, the copy shows the goal as it was
+                accepted.
+        """
         state = self.state if state is None else state
         shown = {name: getattr(self.say, name) for name in SHOWN_OPTIONS}
         if state is not State.PENDING:

@@ -1,8 +1,9 @@
-"""The scheduler: decides which goal is spoken, which goals wait, how each one ends, and which voices are loaded.
+"""The scheduler decides which goal is spoken next, how goals end, and which voices are loaded.
 
-Pure: methods take a request, a report from the engine or the time, and return effects. A method either does everything
-or raises an error and changes nothing. The caller must carry out the orders for the engine in the order in which they
-were returned, and publish the state changes in their order. Only this package changes the scheduler and its records.
+The scheduler is pure: its methods receive a request, a report from the engine or the time, and return effects. A method
+either does everything or raises an error and changes nothing. The caller must carry out the orders for the engine in
+the order in which they were returned, and publish the state changes in their order. Only this package changes the
+scheduler and its records.
 
 At most one goal is ACTIVE or PREEMPTING at any time. The next goal starts only after that goal has ended, and only with
 an engine and while speech is not paused. Every goal ends exactly once.
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import Output, Sender
     from talkcli.goals.options import Cancel, Say, Set
 
-#: How long the engine may take to confirm silence after a stop. Every cancel must be answered within 2 s.
+#: Time limit for the engine to become silent after a stop. Every cancel must be answered within 2 s.
 CONFIRM_SILENCE_S = 1.9
 
 
@@ -39,7 +40,7 @@ CONFIRM_SILENCE_S = 1.9
 class Now:
     """The current time on two clocks, in seconds.
 
-    The monotonic clock must keep running while the machine is suspended, so that goals expire meanwhile.
+    The monotonic clock must keep running while the machine is suspended, so that goals can expire during that time.
     """
 
     monotonic: float
@@ -49,28 +50,28 @@ class Now:
 
 @frozen
 class StateChange:
-    """Effect: publish a goal's new state."""
+    """An effect that publishes the new state of a goal."""
 
     record: Record
     state: State
 
 
 class Order(Enum):
-    """An order for the engine about a goal. The value is the name in the log."""
+    """An order to the engine concerning a goal. Its value is the name used in the log."""
 
     START = "Start"
-    #: become silent and report the end
+    #: become silent, then report that the goal has ended
     STOP = "Stop"
-    #: replace the engine process because it did not become silent in time
+    #: replace the engine process, because it did not become silent in time
     GIVE_UP = "GiveUp"
-    #: stay silent until RESUME
+    #: pause the speech until RESUME
     HOLD = "Hold"
     RESUME = "Resume"
 
 
 @frozen
 class EngineOrder:
-    """Effect: give the engine an order for a goal."""
+    """An effect that sends the engine an order."""
 
     record: Record
     order: Order
@@ -86,7 +87,7 @@ class Submission:
     #: the new goal, or an earlier goal with the same id and text
     record: Record
     effects: list[Effect]
-    #: whether the record is that of an earlier goal
+    #: whether the record belongs to an earlier goal
     attached: bool = False
 
 
@@ -94,13 +95,13 @@ class Submission:
 class Cancellation:
     """The result of `Scheduler.cancel`."""
 
-    #: pending goals that were recalled by this cancel
+    #: pending goals that this cancel has recalled
     recalled: list[Record] = field(default_factory=list)
     #: the active goal, if it is being stopped
     stopping: Record | None = None
-    #: selected goals that had already ended
+    #: requested goals that had already ended
     ended: list[Record] = field(default_factory=list)
-    #: selected ids that no goal has
+    #: requested ids that don't belong to any goal
     unknown: list[str] = field(default_factory=list)
     effects: list[Effect] = field(default_factory=list)
 
@@ -117,7 +118,7 @@ class Scheduler:
         settings: Set = options.INITIAL,
         voices: VoiceScheduler | None = None,
     ) -> None:
-        """Start without goals and without an engine.
+        """Create a scheduler with no goals and no engine.
 
         Args:
             boot: the first four characters of all goal ids made by this server.
@@ -132,15 +133,15 @@ class Scheduler:
         self.max_text = max_text
         self.history = History()
         self.voices = voices or VoiceScheduler()
-        #: the goal that is ACTIVE or PREEMPTING
+        #: the current goal, which is ACTIVE or PREEMPTING, or None
         self.active: Record | None = None
         #: whether speech is paused
         self.paused = False
-        #: whether goals can be given to the engine, even if only to fail
+        #: whether goals can start, even if each one fails at once because no engine can be started
         self.has_engine = False
-        #: whether `shutdown` was called, after which every new goal is rejected
+        #: whether `shutdown` was called; if so, new goals are rejected
         self.closing = False
-        #: whether a running engine process can load voices
+        #: whether an engine process is running that can load voices
         self._loads_voices = False
         self._queue = Queue()
         self._by_id: dict[str, Record] = {}
@@ -148,7 +149,7 @@ class Scheduler:
         self._early_cancels = EarlyCancels()
         self._count = 0
 
-    # -- the goals
+    # -- goals
 
     @property
     def pending_count(self) -> int:
@@ -156,29 +157,35 @@ class Scheduler:
         return len(self._queue)
 
     def pending(self) -> Iterator[Record]:
-        """Return the pending goals in the order of speech."""
+        """Return the pending goals in speaking order."""
         return iter(self._queue)
 
     def unfinished(self) -> list[Record]:
-        """Return the active goal and the pending goals."""
+        """Return the active goal, if any, and the pending goals."""
         return ([self.active] if self.active else []) + list(self._queue)
 
     def find(self, goal_id: str) -> Record | None:
-        """Return the active, pending or ended goal with this id. The oldest ended goals are no longer known."""
+        """Return the goal with this id, or None. Goals that ended long ago are forgotten."""
         return self._by_id.get(goal_id) or self.history.find(goal_id)
 
     def has_room(self, say: Say) -> bool:
-        """Return whether the queue has room for a goal, or an earlier goal already has its id."""
+        """Return whether the queue has room for a goal. A goal with a known id needs no room."""
         attaches = say.id is not None and self.find(say.id) is not None
         return attaches or self._find_room(say) is not None
 
     def lacks_room(self, say: Say, now: Now, refusal: Refusal | None = None) -> bool:
-        """Return whether a full queue is the only reason to reject a goal. `refusal` is the same as in `submit`."""
+        """Return whether a goal would be rejected only because the queue is full.
+
+        `refusal` is the server's own reason to reject the goal, as in `submit`.
+        """
         canceled = self._early_cancels.find(say.id, now.monotonic)
         return not (canceled or self.has_room(say)) and self._refuse(say, refusal, None) is None
 
     def wanted_voice(self, record: Record) -> str:
-        """Return the voice that a goal asks for, or else the voice in the settings, or "" for the driver's own."""
+        """Return the voice that a goal asks for, or the server's default voice.
+
+        An empty string stands for the driver's default voice.
+        """
         return record.say.voice or self.settings.voice or ""
 
     # -- requests from clients
@@ -237,7 +244,7 @@ class Scheduler:
     def cancel(
         self, selection: Cancel, sender: Sender | None, now: Now, waiting: Collection[str | None] = ()
     ) -> Cancellation:
-        """End the selected goals. Pending goals end at once, and the active goal ends when the engine is silent.
+        """Cancel goals. Pending goals end at once. The active goal ends when the engine is silent.
 
         Args:
             selection: the goals to cancel.
@@ -261,16 +268,19 @@ class Scheduler:
         return result
 
     def change_settings(self, changes: dict[str, object], now: Now) -> list[Effect]:
-        """Change settings for all goals that have not started. If they name a voice that had failed, load it again."""
+        """Change the server's settings. They apply to goals that have not started.
+
+        A new voice that failed to load earlier is loaded again.
+        """
         self.settings = replace(self.settings, **changes)
         voice = changes.get("voice")
         if isinstance(voice, str):
             self.voices.forget_failure(options.without_speaker(voice))
             self._request_voice(voice, now)
-        return self.tick(now)  # the next goal may no longer have to wait for its voice
+        return self.tick(now)  # the next goal may not have to wait for its voice any more
 
     def pause(self) -> list[Effect]:
-        """Pause the active goal, and start no other goal until `resume`."""
+        """Pause the active goal. No other goal starts until `resume` is called."""
         if self.paused:
             return []
         self.paused = True
@@ -281,7 +291,7 @@ class Scheduler:
         return [EngineOrder(self.active, Order.HOLD)]
 
     def resume(self, now: Now) -> list[Effect]:
-        """Continue the paused goal, or start the next one."""
+        """Resume the paused goal, or start the next one."""
         if not self.paused:
             return []
         self.paused = False
@@ -291,7 +301,7 @@ class Scheduler:
         return [EngineOrder(self.active, Order.RESUME)]
 
     def shutdown(self, now: Now) -> list[Effect]:
-        """End all goals, and reject every new goal."""
+        """End all goals and reject new ones."""
         self.closing = True
         effects: list[Effect] = []
         for record in list(self._queue):
@@ -303,53 +313,58 @@ class Scheduler:
     # -- reports from the engine
 
     def engine_lost(self, now: Now) -> list[Effect]:
-        """Record that the engine process has ended. No goal starts until there is another one."""
+        """Record that the engine process has exited. No goal starts until a new engine is ready."""
         self.has_engine = self._loads_voices = False
         return [*self.voices.engine_lost(now.monotonic)]
 
     def engine_ready(self, now: Now) -> list[Effect]:
-        """Record that an engine is ready. Start the next goal, and load the voices that goals need."""
+        """Record that an engine is ready, start the next goal, and load the voices that goals need."""
         self.has_engine = self._loads_voices = True
         for voice in (*self._needed_voices(), self.settings.voice or ""):
             self._request_voice(voice, now)
         return self._start_next(now) + self._load_next(now)
 
     def engine_unavailable(self, now: Now) -> list[Effect]:
-        """Record that the engine can't be started at all. Goals still start, so that each one fails at once."""
+        """Record that no engine can be started. From now on, goals fail at once instead of waiting."""
         self.has_engine, self._loads_voices = True, False
         return self._start_next(now)
 
     def fail_next(self, message: str, now: Now) -> list[Effect]:
-        """Fail the next goal, because no engine could be started for a long time."""
+        """Fail the next goal, because no engine has been available for a long time."""
         if self.has_engine:
             return []
         record, effects = self._activate_next(now)
         return effects + self.failed(record.id, Reason.ENGINE_FAILED, message, None, now) if record else effects
 
     def word_heard(self, goal_id: str, end: int) -> None:
-        """Record that a word of the active goal is being heard. `end` is the offset of its end in the text."""
+        """Record that a word of the active goal is being played.
+
+        Args:
+            goal_id: the id of the goal.
+            end: the offset in the text at which the word ends.
+        """
         record = self._require_active(goal_id)
         record.spoken_end = max(record.spoken_end, end)
 
     def voice_chosen(self, goal_id: str, voice: str, now: Now) -> list[Effect]:
-        """Record the voice that is used for the active goal. If it needs no other voice now, load the next one."""
+        """Record which voice speaks the active goal, and load the next voice if possible."""
         self._require_active(goal_id).voice = voice
         return self._load_next(now)
 
     def output_changed(self, goal_id: str, output: Output | None) -> None:
-        """Record the output of the active goal, or None if the output is unknown."""
+        """Record the audio output of the active goal, or None if it is unknown."""
         self._require_active(goal_id).output = output
 
     def completed(
         self, goal_id: str, duration: float | None, now: Now, gaps: int = 0, gap_seconds: float = 0
     ) -> list[Effect]:
-        """End the active goal, because all of it was played.
+        """End the active goal, because it was played to the end.
 
         Args:
             goal_id: the id of the goal.
             duration: the length of the audio in seconds, or None if unknown.
             now: the current time.
-            gaps: the number of interruptions because speech was not synthesized in time.
+            gaps: how often the audio was interrupted because the synthesis was too slow.
             gap_seconds: the total length of the interruptions.
         """
         record = self._require_active(goal_id)
@@ -361,14 +376,14 @@ class Scheduler:
         if gaps:
             many = f"{gaps} gap{'s' if gaps > 1 else ''} of {gap_seconds:.1f} s in all"
             words += f", but with {many}: this machine is too slow for the voice"
-        # If a stop came too late, its reason and cause don't apply.
+        # The reason for a stop doesn't apply if the goal was played to the end anyway.
         return self._end(record, State.SUCCEEDED, None, words, None, now)
 
     def failed(self, goal_id: str, reason: Reason, message: str, duration: float | None, now: Now) -> list[Effect]:
         """End the active goal, because the engine or the audio failed.
 
-        If the goal was being stopped, the failure has made it silent, so it ends PREEMPTED. It ends ABORTED only with
-        the reason `not_silent`.
+        If the goal was being stopped, the failure has silenced it, so it ends PREEMPTED. It ends ABORTED only with the
+        reason `not_silent`.
         """
         record = self._require_active(goal_id)
         record.duration = duration
@@ -377,12 +392,12 @@ class Scheduler:
         return self._end(record, State.ABORTED, reason, f"Talk aborted: {message}", record.by, now)
 
     def stopped(self, goal_id: str, now: Now) -> list[Effect]:
-        """End the active goal, because it was stopped and is now silent."""
+        """End the active goal, because it was stopped and the engine is silent."""
         record = self._require_active(goal_id)
         return self._end(record, State.PREEMPTED, record.reason, "Talk preempted", record.by, now)
 
     def voice_load_ended(self, voice: str, error: str | None, now: Now, *, has_libraries: bool) -> list[Effect]:
-        """Record that a voice was loaded, or with `error`, that it could not be loaded.
+        """Record that a voice was loaded, or that loading it failed.
 
         Args:
             voice: the id of the voice.
@@ -395,24 +410,30 @@ class Scheduler:
         return self._drop_excess() + self.tick(now)
 
     def voices_measured(self, voice: str, memory_bytes: int, now: Now) -> list[Effect]:
-        """Record the memory use of all voices. `voice` is the voice that was just loaded or has just spoken, or ""."""
+        """Record how much memory all neural voices use.
+
+        Args:
+            voice: the voice that was just loaded or has just spoken, or "" if a voice was dropped.
+            memory_bytes: the memory of all voices together.
+            now: the current time.
+        """
         self.voices.measured(voice, memory_bytes)
         return self._drop_excess() + self._load_next(now)
 
     def voice_unloaded(self, voice: str, now: Now) -> list[Effect]:
-        """Record that the engine has dropped a voice on its own."""
+        """Record that the engine has dropped a voice without being told to."""
         self.voices.unloaded(voice, self._needed_voices())
         return self._load_next(now)
 
-    # -- time
+    # -- time limits
 
     def deadline(self) -> float | None:
-        """Return the time at which `tick` must be called (monotonic), or None if no time limit is running."""
+        """Return the monotonic time at which `tick` must be called, or None if there is no time limit."""
         due = (self._active_deadline(), self._queue.next_expiry(), self._next_deadline())
         return min((each for each in due if each is not None), default=None)
 
     def tick(self, now: Now) -> list[Effect]:
-        """Do everything that is due now.
+        """Handle all time limits that have been reached.
 
         Expired goals are recalled. If the active goal was stopped and did not become silent in time, it is aborted. The
         next goal starts if it no longer has to wait for its voice.
@@ -428,10 +449,13 @@ class Scheduler:
                 effects += self._end(record, State.ABORTED, Reason.NOT_SILENT, words, record.by, now)
         return effects + self._expire(now) + self._start_next(now) + self._load_next(now)
 
-    # -- admission
+    # -- selecting and accepting goals
 
     def _select(self, selection: Cancel, result: Cancellation, waiting: Collection[str | None]) -> list[Record]:
-        """Return the selected goals that have not ended. Add ended goals and unknown ids to `result`."""
+        """Return the unfinished goals that a cancel selects.
+
+        Ended goals and unknown ids are added to `result`.
+        """
         chosen = self.unfinished() if selection.selects_all else []
         for goal_id in dict.fromkeys(selection.ids or ()):
             record = self.find(goal_id)
@@ -452,11 +476,11 @@ class Scheduler:
             else:
                 result.unknown.append(selection.before)
         unique = {each.number: each for each in chosen}.values()
-        # The active goal comes last. Otherwise, the next selected goal could start before it is recalled.
+        # Cancel the active goal last. Otherwise, another selected goal could start before it is recalled.
         return sorted(unique, key=lambda each: (each is self.active, each.number))
 
     def _refuse(self, say: Say, refusal: Refusal | None, first: Record | None) -> Refusal | None:
-        """Return the reason to reject a goal whatever the queue contains, or None.
+        """Return the reason why a goal must be rejected, or None. The state of the queue doesn't matter.
 
         Args:
             say: the goal.
@@ -472,7 +496,10 @@ class Scheduler:
         return options.bad_text(say.text, self.max_text) or refusal
 
     def _throttle(self, say: Say, record: Record, now: Now) -> Refusal | None:
-        """Return the refusal if a goal is throttled, and set `record.by` to the goal that it repeats."""
+        """Return the reason for rejecting a goal that repeats another goal too soon, or None.
+
+        If the goal is rejected, `record.by` is set to the other goal.
+        """
         if say.throttle is None:
             return None
         active = self.active
@@ -493,7 +520,10 @@ class Scheduler:
         return say.flush or bool(self.settings.preempt if say.preempt is None else say.preempt)
 
     def _find_room(self, say: Say) -> list[tuple[Record, Reason]] | None:
-        """Return the pending goals to recall for a new goal, each with the reason, or None if the queue has no room."""
+        """Return the pending goals that a new goal removes from the queue, with the reasons.
+
+        Return None if the queue has no room for the new goal.
+        """
         replaced = self._queue.with_key(say.key)
         preempted: list[Record] = []
         if say.flush:
@@ -502,16 +532,16 @@ class Scheduler:
             preempted = self._queue.preempting_goals_up_to(say.priority)
         recalled = [(replaced, Reason.REPLACED)] if replaced else []
         recalled += [(each, Reason.PREEMPTED) for each in preempted if each is not replaced]
-        # The queue never exceeds its limit, so recalling one goal makes enough room.
+        # The queue never exceeds its limit, so removing one goal is enough.
         if recalled or len(self._queue) < self.max_queue:
             return recalled
         last = self._queue.displaceable_goal()
-        # A goal that was sent with `preempt` also displaces goals of its own priority, except other preempting goals.
+        # A goal sent with `preempt` may also displace a goal of its own priority.
         limit = say.priority if say.preempt else say.priority - 1
         return [(last, Reason.DISPLACED)] if last and last.priority <= limit else None
 
     def _enqueue(self, record: Record, recalled: list[tuple[Record, Reason]], now: Now) -> list[Effect]:
-        """Add an accepted goal to the queue. Recall the given goals, and stop the active goal if it is preempted."""
+        """Add a goal to the queue, recall the given goals, and stop the active goal if it is preempted."""
         by = By(goal=record.id)
         effects: list[Effect] = []
         replaced = None
@@ -527,20 +557,21 @@ class Scheduler:
     # -- voices
 
     def _request_voice(self, voice: str, now: Now) -> None:
-        """Plan to load the voice for a goal if it is a neural voice and an engine process is running."""
+        """Request a neural voice for a goal, if an engine process is running."""
         if self._loads_voices and options.is_neural(model := options.without_speaker(voice)):
             self.voices.request(model, now.monotonic)
 
     def _needed_voices(self) -> list[str]:
-        """Return the neural voices that goals need, in the order of the goals.
+        """Return the neural voices that unfinished goals need, in speaking order.
 
-        If the active goal already has a voice, it needs no other. The engine keeps that voice until the goal ends.
+        If the active goal already has a voice, it needs no other, because the engine keeps that voice until the goal
+        ends.
         """
         voices = (options.without_speaker(self.wanted_voice(each)) for each in self.unfinished() if each.voice is None)
         return list(filter(options.is_neural, dict.fromkeys(voices)))
 
     def _load_next(self, now: Now) -> list[Effect]:
-        """Return the order to load the next voice, if there is one.
+        """Return an order to load the next voice, or an empty list if no voice can be loaded now.
 
         The first voice is not loaded while a goal is active. Loading it imports libraries, which blocks the engine
         process for a tenth of a second.
@@ -555,26 +586,27 @@ class Scheduler:
         return [order] if order else []
 
     def _drop_excess(self) -> list[Effect]:
-        """Return orders to drop voices if the voices use more memory than allowed."""
+        """Return orders to drop voices if they use too much memory."""
         needed = self._needed_voices()
         speaking = options.without_speaker(self.active.voice) if self.active else ""
         if options.is_neural(speaking) and not self.voices.is_loaded(speaking):
-            return []  # a dropped voice that still speaks keeps its memory, and is measured again when it has spoken
+            return []  # the speaking voice was already dropped, but its memory is freed only at the end of the goal
         return [*self.voices.drop_excess(next(iter(needed), speaking), needed)]
 
     # -- starting and ending goals
 
     def _expire(self, now: Now) -> list[Effect]:
-        """Recall the pending goals that have expired."""
+        """Recall all pending goals that have expired."""
         effects: list[Effect] = []
         for record in self._queue.expired(now.monotonic):
             effects += self._recall(record, Reason.EXPIRED, _expiry_message(record), None, now)
         return effects
 
     def _active_deadline(self) -> float | None:
-        """Return the time at which the active goal must be silent if it is being stopped, or at which it expires.
+        """Return the monotonic time limit of the active goal, or None if it has no limit.
 
-        An active goal can expire only if the engine was lost before anything was heard. Then it has to start again.
+        If the goal is being stopped, it must be silent by then. Otherwise, it expires then, but only if the engine was
+        lost before anything was heard, because the goal must start again.
         """
         goal = self.active
         if goal is None:
@@ -584,7 +616,7 @@ class Scheduler:
         return None if self.has_engine or goal.spoken_end else goal.expires_at
 
     def _next_deadline(self) -> float | None:
-        """Return the time at which the next goal stops waiting for its voice, or None if there is no such time."""
+        """Return the monotonic time at which the next goal stops waiting for its voice, or None."""
         record = None if self.active or self.paused or not self.has_engine else self._queue.first()
         if record is None:
             return None
@@ -592,18 +624,21 @@ class Scheduler:
         return start if start < inf else None
 
     def _start_time(self, record: Record) -> float:
-        """Return the earliest time at which the next goal may start (monotonic)."""
+        """Return the earliest monotonic time at which the next goal may start."""
         return self.voices.start_time(record, self.settings.voice) if self._loads_voices else 0.0
 
     def _start_next(self, now: Now) -> list[Effect]:
-        """Start the next goal, if it can start now."""
+        """Start the next goal if possible."""
         if not self.has_engine:
             return []
         record, effects = self._activate_next(now)
         return [*effects, EngineOrder(record, Order.START)] if record else effects
 
     def _activate_next(self, now: Now) -> tuple[Record | None, list[Effect]]:
-        """Make the next goal ACTIVE. Return it with the effects, or None if no goal can start now."""
+        """Make the next goal ACTIVE, and return it with the effects.
+
+        Return None instead of a goal if no goal can start now.
+        """
         if self.active or self.paused:
             return None, []
         effects = self._expire(now)
@@ -620,26 +655,30 @@ class Scheduler:
         return record, [*effects, StateChange(record, State.ACTIVE)]
 
     def _recall(self, record: Record, reason: Reason, words: str, by: By | None, now: Now) -> list[Effect]:
-        """Remove a goal from the queue, and end it RECALLED."""
+        """Remove a goal from the queue and end it with the state RECALLED."""
         self._queue.remove(record)
         return self._end_unqueued(record, reason, words, by, now)
 
     def _end_unqueued(self, record: Record, reason: Reason, words: str, by: By | None, now: Now) -> list[Effect]:
-        """End a PENDING goal as RECALLED. The goal must not be in the queue."""
+        """End a pending goal that is not in the queue with the state RECALLED."""
         record.change_state(State.RECALLING)
         return self._end(record, State.RECALLED, reason, f"Talk recalled: {words}", by, now)
 
     def _stop(self, record: Record, reason: Reason, by: By | None, now: Now) -> list[Effect]:
-        """Order the engine to stop the active goal."""
+        """Tell the engine to stop the active goal."""
         if record.state is State.PREEMPTING:
-            return []  # keep the reason of the first stop
+            return []  # keep the reason for the first stop
         record.change_state(State.PREEMPTING)
         record.reason, record.by, record.stop_requested_at = reason, by, now.monotonic
         record.paused = False
         return [StateChange(record, State.PREEMPTING), EngineOrder(record, Order.STOP)]
 
     def _require_active(self, goal_id: str) -> Record:
-        """Return the active goal. Raises IllegalTransition if its id is another one."""
+        """Return the active goal, which must have this id.
+
+        Raises:
+            IllegalTransition: if another goal or no goal is active.
+        """
         if self.active is None or self.active.id != goal_id:
             raise IllegalTransition(f"{goal_id} is not being spoken")
         return self.active

@@ -1,7 +1,7 @@
-"""The states of a goal, with actionlib's names and numbers, and the table of allowed transitions.
+"""The states of a goal, and the allowed transitions between them.
 
-A transition that is not in the table raises an error and changes nothing. To allow another transition, change the table
-and the tests that repeat it.
+Names and numbers are those of ROS's actionlib. A transition that is not allowed raises an error and changes nothing. To
+allow another transition, add it to the table and to the tests that repeat the table.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from talkcli.errors import TalkError
 
 
 class State(IntEnum):
-    """The state of a goal. The value is actionlib's number. `str` and f-strings give the name."""
+    """State of a goal, numbered as in actionlib. `str()` and f-strings return the name."""
 
-    PENDING = 0  # in the queue
-    ACTIVE = 1  # given to the engine
-    PREEMPTED = 2  # stopped after it had become ACTIVE
-    SUCCEEDED = 3  # completely played
-    ABORTED = 4  # the engine or the audio failed, or the text contains nothing that can be spoken
-    REJECTED = 5  # refused, so never in the queue
-    PREEMPTING = 6  # being stopped, but not silent yet
-    RECALLING = 7  # being removed from the queue; becomes RECALLED in the same step
+    PENDING = 0  # waiting in the queue
+    ACTIVE = 1  # sent to the engine to be spoken
+    PREEMPTED = 2  # stopped after it became ACTIVE
+    SUCCEEDED = 3  # played to the end
+    ABORTED = 4  # the engine or the audio failed, or nothing in the text could be spoken
+    REJECTED = 5  # refused before it entered the queue
+    PREEMPTING = 6  # being stopped, but not yet silent
+    RECALLING = 7  # being removed from the queue, just before it becomes RECALLED
     RECALLED = 8  # removed from the queue before it was spoken
-    LOST = 9  # set by a client if its connection to the server ends after the goal was accepted
+    LOST = 9  # set by a client that lost its connection to the server
 
     @property
     def terminal(self) -> bool:
@@ -34,11 +34,11 @@ class State(IntEnum):
         return self.name
 
     def __format__(self, spec: str) -> str:
-        # In Python 3.11 and later, IntEnum would format the number.
+        # Since Python 3.11, IntEnum formats as the number by default.
         return format(int(self) if spec.endswith("d") else self.name, spec)
 
 
-#: The terminal states, each with the exit code of a command that waits for the goal.
+#: Exit codes of a command that waits for a goal, by the goal's final state.
 EXIT_CODES: dict[State, int] = {
     State.SUCCEEDED: 0,
     State.ABORTED: 4,
@@ -48,8 +48,8 @@ EXIT_CODES: dict[State, int] = {
     State.LOST: 12,
 }
 
-#: The states that may follow each state. A new goal is PENDING or REJECTED. The scheduler changes PREEMPTING to ABORTED
-#: only with the reason `not_silent`. A client may change any non-terminal state to LOST.
+#: Allowed next states for each state. New goals are PENDING or REJECTED. PREEMPTING becomes ABORTED only with the
+#: reason `not_silent`. A client may change any state that isn't terminal to LOST.
 TRANSITIONS: dict[State, frozenset[State]] = {
     State.PENDING: frozenset({State.ACTIVE, State.RECALLING, State.LOST}),
     State.RECALLING: frozenset({State.RECALLED, State.LOST}),
@@ -60,13 +60,17 @@ TRANSITIONS: dict[State, frozenset[State]] = {
 
 
 class IllegalTransition(TalkError):
-    """A transition that the table does not allow. It indicates a bug in the caller. No state was changed."""
+    """Raised for a state change that isn't allowed, which is a bug in the caller."""
 
     code = "illegal_transition"
 
 
 def check_transition(state: State, target: State) -> State:
-    """Return `target`. Raises IllegalTransition if `target` may not follow `state`."""
+    """Check that a goal may change from one state to another, and return the new state.
+
+    Raises:
+        IllegalTransition: if the change isn't allowed.
+    """
     if target not in TRANSITIONS[state]:
         raise IllegalTransition(f"a goal that is {state.name} can't become {target.name}")
     return target

@@ -1,8 +1,8 @@
-"""Neural voices: which one is loaded next, which ones are dropped, and how long a goal waits for its voice.
+"""Decides which neural voices to load and drop, and how long goals wait for them.
 
-Pure: decisions depend on the engine's reports, and the scheduler passes the orders on. The server knows which voices
-exist. A neural voice is identified by its id without a speaker. All other voices are always ready and don't appear
-here.
+This module is pure: its decisions depend on the engine's reports, and the scheduler passes the orders on. The server
+knows which voices exist. A neural voice is identified by its id without a speaker. All other voices are always ready
+and don't appear here.
 """
 
 from __future__ import annotations
@@ -21,46 +21,46 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
     from talkcli.goals.record import Record
 
-#: How long a goal waits for a voice that is being loaded. Loading takes three seconds on a small machine.
+#: How long a goal waits for its voice to load. Loading takes three seconds on a small machine.
 VOICE_PATIENCE_S = 10.0
-#: A goal stops waiting for its voice this long before it expires, so that it can still start.
+#: How long before its expiry a goal stops waiting for its voice, so that it can still start.
 EXPIRY_MARGIN_S = 0.5
-#: Shortest and longest delay before a goal may load a failed voice again. The delay doubles with each failure. A failed
-#: attempt costs a second of processor time, or even a sentence if it kills the engine.
+#: Shortest and longest delay before a failed voice is loaded again. The delay doubles with each failure. A failed
+#: attempt costs a second of processor time, or even a sentence if the engine crashes.
 FIRST_VOICE_RETRY_S, LAST_VOICE_RETRY_S = 5.0, 3600.0
 #: A voice is considered faulty if the engine dies this many times in a row while loading it.
 MAX_ENGINE_DEATHS = 2
 
 
 class VoiceState(Enum):
-    """The state of a neural voice that a goal has asked for."""
+    """The state of a neural voice."""
 
-    WAITING = "waiting"  # not loaded yet
+    WAITING = "waiting"  # not yet loaded
     LOADING = "loading"
     LOADED = "loaded"
-    FAILED = "failed"  # could not be loaded, so another voice speaks instead
+    FAILED = "failed"  # loading failed, so another voice is used
 
 
 @dataclass(slots=True)
 class NeuralVoice:
-    """A neural voice that a goal has asked for."""
+    """A neural voice that a goal has requested."""
 
-    #: memory use as measured by the engine, or the size of the voice's file before the first measurement
+    #: measured memory use, or the size of the voice's file if it hasn't been measured yet
     size_bytes: int
     state: VoiceState = VoiceState.WAITING
-    #: human-readable reason for a failure, or a warning
+    #: message that explains a failure, or a warning
     why: str | None = None
-    #: number of failed attempts to load it since it was last loaded
+    #: number of failed attempts since the voice was last loaded
     failures: int = 0
-    #: whether it should be loaded, or loaded again after a failure
+    #: whether the engine should load the voice
     wanted: bool = True
-    #: earliest time for another attempt after a failure (monotonic)
+    #: monotonic time before which a failed voice is not tried again
     retry_at: float = 0.0
-    #: time at which loading started (monotonic), or inf before that
+    #: monotonic time at which loading started, or inf before that
     loading_since: float = inf
 
     def fail(self, why: str, now: float) -> None:
-        """Record that the voice could not be loaded."""
+        """Record that loading the voice failed."""
         self.failures += 1
         self.retry_at = now + min(LAST_VOICE_RETRY_S, FIRST_VOICE_RETRY_S * 2 ** (self.failures - 1))
         self.state, self.why = VoiceState.FAILED, why
@@ -68,7 +68,7 @@ class NeuralVoice:
 
 @frozen
 class VoiceLoadOrder:
-    """Effect: the engine drops some voices to make room, and then loads a voice."""
+    """An effect that makes the engine load a voice, after dropping others to make room."""
 
     voice: str
     dropped: tuple[str, ...] = ()
@@ -76,14 +76,14 @@ class VoiceLoadOrder:
 
 @frozen
 class VoiceDropOrder:
-    """Effect: the engine drops a voice because the loaded voices use more memory than allowed."""
+    """An effect that makes the engine drop a voice to save memory."""
 
     voice: str
 
 
 @frozen
 class VoiceWarning:
-    """Effect: log a problem with a voice."""
+    """An effect that logs a problem with a voice."""
 
     message: str
 
@@ -92,23 +92,23 @@ class VoiceScheduler:
     """Decides which neural voices the engine loads and drops."""
 
     def __init__(self, limit_bytes: int = 0, file_size: Callable[[str], int] = lambda _: 0) -> None:
-        """Start without any voice.
+        """Create a scheduler with no voices.
 
         Args:
             limit_bytes: memory limit for all loaded voices. A single voice may use more.
-            file_size: function that returns the size of a voice's file in bytes, an estimate of its memory use.
+            file_size: function that returns the size of a voice's file in bytes, as an estimate of its memory use.
         """
         self._limit_bytes = limit_bytes
         self._file_size = file_size
-        #: by id, in the order of the latest requests
+        #: requested voices by id, least recently requested first
         self._voices: dict[str, NeuralVoice] = {}
-        #: memory that each voice used when it was last loaded
+        #: last measured memory use of each voice
         self._measured_bytes: dict[str, int] = {}
-        #: memory that all voices have added to the engine process, according to its latest report
+        #: memory use of all voices, as last reported by the engine
         self._reported_bytes = 0
-        #: the reported memory without the voices that were dropped after the report
+        #: estimated memory use of all voices, without those dropped since the last report
         self._used_bytes = 0
-        #: whether the engine process has imported the libraries, which it does when it loads its first voice
+        #: whether the engine has imported the libraries for neural voices, which it does with the first voice
         self.has_libraries = False
         #: the voice that the engine is loading
         self._loading: str | None = None
@@ -116,20 +116,20 @@ class VoiceScheduler:
     # -- requests from goals
 
     def request(self, voice: str, now: float) -> None:
-        """Plan to load a voice, because a goal asks for it. A failed voice is tried again only after its delay."""
+        """Request a voice for a goal. A voice that failed to load is tried again only after a delay."""
         found = self._voices.pop(voice, None) or self._new(voice)
         self._voices[voice] = found
         if found.state is VoiceState.FAILED and voice != self._loading and now >= found.retry_at:
             found.wanted = True
 
     def forget_failure(self, voice: str) -> None:
-        """Allow the next request to load a failed voice without delay."""
+        """Forget that a voice failed to load, so that the next request loads it without delay."""
         found = self._voices.get(voice)
         if found and found.state is VoiceState.FAILED and voice != self._loading:
             del self._voices[voice]
 
     def start_time(self, record: Record, default_voice: str | None) -> float:
-        """Return the earliest time at which the next goal may start (monotonic), or 0 if it needn't wait for its voice.
+        """Return the monotonic time until which the next goal waits for its voice, or 0 if it doesn't wait.
 
         Urgent goals don't wait. Other goals stop waiting before they expire. A `voice_only` goal waits until its voice
         is loaded or has failed.
@@ -149,23 +149,23 @@ class VoiceScheduler:
         return start if record.expires_at is None else min(start, record.expires_at - EXPIRY_MARGIN_S)
 
     def failure(self, voice: str) -> str | None:
-        """Return the human-readable reason why a voice could not be loaded, or None if it has not failed."""
+        """Return the reason why a voice could not be loaded, or None if it didn't fail."""
         found = self._voices.get(voice)
         return found.why if found and found.state is VoiceState.FAILED else None
 
     def to_json(self) -> JsonObject:
-        """Return the state of each voice, as `status` shows it."""
+        """Return the state of each voice for the reply to `status`."""
         return {voice: {"state": each.state.value, "why": each.why} for voice, each in self._voices.items()}
 
     # -- orders for the engine
 
     @property
     def can_load(self) -> bool:
-        """Whether a voice should be loaded and no other voice is being loaded."""
+        """Whether a voice is waiting to be loaded and the engine is not loading another one."""
         return self._loading is None and any(each.wanted for each in self._voices.values())
 
     def load_next(self, needed: Sequence[str], default_voice: str, now: float) -> VoiceLoadOrder | None:
-        """Start loading the next voice. Return the order for the engine, or None if no voice can be loaded now.
+        """Return an order to load the next voice, or None if no voice can be loaded now.
 
         Only one voice is loaded at a time. If a goal needs a loaded voice sooner than the next one, the loaded voice is
         not dropped, because it would have to be loaded again.
@@ -196,7 +196,7 @@ class VoiceScheduler:
         return None
 
     def drop_excess(self, first: str, needed: Sequence[str]) -> list[VoiceDropOrder | VoiceWarning]:
-        """Drop voices until the others fit into the memory limit. Return the orders for the engine.
+        """Return orders to drop voices until the others fit into the memory limit.
 
         This is necessary if the voices use more memory than was estimated.
 
@@ -220,8 +220,11 @@ class VoiceScheduler:
     # -- reports from the engine
 
     def load_ended(self, voice: str, error: str | None, now: float) -> None:
-        """Record that a voice was loaded, or with `error`, that it could not be loaded."""
-        if voice == self._loading:  # the engine also loads voices on its own, for `voice_only` goals
+        """Record that a voice was loaded, or that loading it failed.
+
+        `error` says why loading failed. It is None if the voice was loaded.
+        """
+        if voice == self._loading:  # the engine also loads voices without an order, for `voice_only` goals
             self._loading = None
         found = self._voices.setdefault(voice, self._new(voice))
         found.wanted = False
@@ -231,7 +234,7 @@ class VoiceScheduler:
             found.fail(error, now)
 
     def measured(self, voice: str, memory_bytes: int) -> None:
-        """Record the memory that all voices have added to the engine process.
+        """Record how much memory the voices use in the engine process.
 
         Args:
             voice: the voice that was just loaded or has just spoken, or "" if a voice was dropped.
@@ -244,15 +247,15 @@ class VoiceScheduler:
             self._measured_bytes[voice] = found.size_bytes
 
     def unloaded(self, voice: str, needed: Collection[str]) -> None:
-        """Record that a voice is no longer loaded. If a goal needs the voice, plan to load it again."""
+        """Record that the engine has dropped a voice. If a goal needs it, plan to load it again."""
         found = self._voices.pop(voice, None)
         if found and found.state is VoiceState.LOADED:
-            self._used_bytes = max(0, self._used_bytes - found.size_bytes)  # an estimate until the next measurement
+            self._used_bytes = max(0, self._used_bytes - found.size_bytes)  # estimated until the next measurement
         if found and voice in needed:
             self._voices[voice] = NeuralVoice(found.size_bytes)
 
     def engine_lost(self, now: float) -> list[VoiceWarning]:
-        """Record that the engine process and all loaded voices are gone. Return a warning if a voice seems faulty."""
+        """Record that the engine process has exited. Return a warning if a voice seems to have caused it."""
         suspect, self._loading, self.has_libraries = self._loading, None, False
         self._reported_bytes = self._used_bytes = 0
         for voice, found in list(self._voices.items()):
@@ -276,11 +279,13 @@ class VoiceScheduler:
         return {voice: each.size_bytes for voice, each in self._voices.items() if each.state is VoiceState.LOADED}
 
     def _unattributed_bytes(self) -> int:
-        """Return the memory that the engine process has gained and no loaded voice accounts for."""
+        """Return the part of the voices' memory that belongs to no loaded voice."""
         return max(0, self._used_bytes - sum(self._loaded().values()))
 
     def _make_room(self, size_bytes: int, keep: Collection[str]) -> tuple[str, ...] | None:
-        """Return the voices to drop for a new one, least recently used first, or None if the new voice can't fit.
+        """Return the voices to drop to make room for a new one, or None if it can't fit.
+
+        The least recently used voices are dropped first.
 
         Args:
             size_bytes: the memory use of the new voice and of the voices to keep.
@@ -296,7 +301,7 @@ class VoiceScheduler:
         return None if keep and total > self._limit_bytes else tuple(dropped)
 
     def _warn_too_large(self) -> list[VoiceWarning]:
-        """Return a warning if the only loaded voice exceeds the memory limit, unless there was a warning before."""
+        """Return a warning if a single voice exceeds the memory limit. Each voice is warned about only once."""
         loaded = self._loaded()
         voice = next(iter(loaded), "")
         taken = self._unattributed_bytes() + sum(loaded.values())
@@ -307,7 +312,7 @@ class VoiceScheduler:
         return [VoiceWarning(f"voice {voice}: {why}")]
 
     def _forget_unneeded(self, needed: Collection[str]) -> None:
-        """Cancel the plans to load voices that no goal needs any more."""
+        """Cancel the plans to load voices that are no longer needed."""
         for voice, found in list(self._voices.items()):
             if found.wanted and voice not in needed:
                 found.wanted = False
@@ -315,5 +320,5 @@ class VoiceScheduler:
                     del self._voices[voice]
 
     def _new(self, voice: str) -> NeuralVoice:
-        """Return a new entry for a voice that is not loaded."""
+        """Create the entry for a voice that is not loaded."""
         return NeuralVoice(self._measured_bytes.get(voice) or self._file_size(voice))

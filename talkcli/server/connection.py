@@ -1,7 +1,7 @@
-"""The connection of a client, with its limits and its unanswered requests.
+"""A client's connection, with its limits and its unanswered requests.
 
 The connection passes requests to a `Handler`, which answers with `send`, `send_list` and `publish`. If a client doesn't
-read its answers, the server stops reading from the client. First the server drops the client's feedback, and then the
+read its replies, the server first drops its feedback and reads no more requests. If that is not enough, it closes the
 connection.
 """
 
@@ -31,79 +31,79 @@ if TYPE_CHECKING:
     from talkcli.goals.record import Record
     from talkcli.server.stream import ClientStreams
 
-    #: requests that wait for the same condition, in the order of their arrival
+    #: requests that wait for the same condition, in order of arrival
     WaitingList = dict["PendingRequest", None]
     Steps = Coroutine[WaitingList, bool | None, None]
 
-#: If a client has more unread output than this, its feedback is dropped and no more requests are read.
+#: If a client has more unread output than this, the server drops its feedback and stops reading its requests.
 CONGESTION_BYTES = 256 * 1024
-#: A client with more unread output than this is dropped.
+#: A client with more unread output than this is disconnected.
 MAX_CLIENT_OUTPUT_BYTES = 4 * 1024 * 1024
-#: A client is dropped if more messages than this are held back while a list is sent to it.
+#: A client is disconnected if more messages than this have to wait while a list is sent to it.
 MAX_HELD_MESSAGES = 10_000
-#: Time from the start of a connection to the end of its first request. Clients send `hello` immediately.
+#: Time limit for a client's first request. Clients send `hello` immediately.
 FIRST_REQUEST_S = 5.0
-#: Time from the start of a line to its end.
+#: Time limit for receiving a whole line.
 LINE_LIMIT_S = 10.0
-#: A connection is closed after this number of consecutive lines that are not JSON.
+#: Number of consecutive lines without valid JSON after which a connection is closed.
 MAX_BAD_LINES = 10
-#: Lines of one client that are processed in one turn of the event loop. A line takes 0.1 to 0.2 ms, so a hundred busy
-#: clients delay all others by 0.1 s.
+#: Maximum number of lines processed for one client before other clients have their turn. A line takes 0.1 to 0.2 ms, so
+#: a hundred busy clients delay all others by 0.1 s.
 LINES_PER_TURN = 8
-#: If more lines of a client than this are waiting to be processed, no more are read.
+#: Maximum number of unprocessed lines of a client before the server stops reading from it.
 READ_AHEAD_LINES = 64
 
 
 class Handler(Protocol):
-    """The methods of the server that connections call."""
+    """The interface that connections use to call the server."""
 
-    #: the first line sent to each admitted client
+    #: first line sent to every admitted client
     greeting: bytes
 
     def joined(self, connection: ClientConnection) -> None:
-        """Identify a new client. Admit the client, keep it waiting, or close its connection."""
+        """Identify a new client, and then admit it, keep it waiting, or refuse it."""
 
     def left(self, connection: ClientConnection) -> None:
-        """Remove a client whose connection has ended."""
+        """Remove a client that has disconnected."""
 
     def handle(self, connection: ClientConnection, seq: int | None, request: Request) -> None:
-        """Carry out a request, and answer it now or later."""
+        """Handle a request. The reply may be sent later."""
 
     def is_waiting(self, connection: ClientConnection) -> bool:
-        """Return whether a client still waits for an answer or an event."""
+        """Return whether a client is still waiting for a reply or an event."""
 
 
 class PendingRequest:
-    """An unanswered request of a client, and the coroutine that carries it out.
+    """A request that has not been answered yet, and the coroutine that handles it.
 
     The coroutine runs until it has to wait, and continues immediately when another part of the server resumes it.
-    Unlike an asyncio task, it never waits for a later turn of the event loop. Therefore, nothing happens in between,
-    and requests that wait for the same condition continue in their order.
+    Unlike an asyncio task, it never waits for a later iteration of the event loop. Therefore, nothing happens in
+    between, and requests that wait for the same condition continue in their order.
     """
 
     def __init__(self, connection: ClientConnection, seq: int | None, request: Request) -> None:
         self.connection = connection
         self.seq = seq
         self.request = request
-        #: the list in which the request waits, or None if it doesn't wait
+        #: the list that the request waits in, or None
         self.waiting_list: WaitingList | None = None
-        #: memory that is counted for the request while it waits
+        #: memory counted for the request while it waits
         self.kept_bytes = 0
-        #: reason why the request was not allowed to wait, if it wasn't
+        #: reason why the request was not allowed to wait, or None
         self.refusal: Refusal | None = None
-        #: the client that cancelled the goal while it waited
+        #: the client that cancelled the goal while it was waiting
         self.canceled_by: By | None = None
-        #: the goal that was recalled because of `canceled_by`
+        #: the waiting goal after it was submitted and recalled
         self.canceled_goal: Record | None = None
         self._steps: Steps
 
     def start(self, steps: Steps) -> None:
-        """Run a coroutine until it waits or ends. It must answer the request and must not raise an error."""
+        """Run the coroutine until it waits or ends. It must answer the request and must not raise."""
         self._steps = steps
         self._step(None)
 
     async def wait(self, waiting_list: WaitingList, limit_s: float | None = None) -> bool:
-        """Wait in a list until the request is resumed. Return False if the time limit was reached."""
+        """Wait until the request is resumed. Return False if the time limit was reached first."""
         timer = None if limit_s is None else asyncio.get_running_loop().call_later(limit_s, self.resume, False)
         try:
             return await _wait_in(waiting_list)
@@ -123,7 +123,7 @@ class PendingRequest:
         waiting_list[self] = None
 
     def drop(self) -> None:
-        """Give up the request, because its client has disconnected."""
+        """Abandon the request, because its client has disconnected."""
         self._leave()
         self._steps.close()
 
@@ -138,7 +138,13 @@ class PendingRequest:
         self._reply(ok(self.seq, **fields), items, events)
 
     def refuse(self, code: str, message: str, items: Iterable[JsonObject] = ()) -> None:
-        """Send an error reply. `items` are the lines of a list to send before the reply."""
+        """Send an error reply.
+
+        Args:
+            code: the machine-readable error.
+            message: the human-readable error.
+            items: the lines of a list to send before the reply.
+        """
         self._reply(failure(self.seq, code, message), items)
 
     def _reply(self, reply: JsonObject, items: Iterable[JsonObject], events: Iterable[JsonObject] = ()) -> None:
@@ -149,11 +155,11 @@ class PendingRequest:
             self.connection.send(reply)
 
     def _step(self, value: bool | None) -> None:
-        with contextlib.suppress(StopIteration):  # raised after the request was answered
+        with contextlib.suppress(StopIteration):  # raised when the coroutine has ended
             self.move_to(self._steps.send(value))
 
     def _leave(self) -> bool:
-        """Remove the request from its waiting list. Return False if it isn't waiting."""
+        """Remove the request from its waiting list. Return False if it wasn't waiting."""
         if self.waiting_list is None:
             return False
         del self.waiting_list[self]
@@ -162,7 +168,7 @@ class PendingRequest:
 
 
 def resume_all(waiting_list: WaitingList) -> None:
-    """Continue all requests in a waiting list, in their order."""
+    """Continue all requests in a waiting list, in order."""
     for each in list(waiting_list):
         each.resume()
 
@@ -175,7 +181,7 @@ def _wait_in(waiting_list: WaitingList) -> Generator[WaitingList, bool, bool]:
 class ClientConnection(asyncio.Protocol):
     """The connection of one client.
 
-    If the server is full, a new client is not `admitted` until another client leaves or it sends an urgent request.
+    If the server is full, a new client is admitted only when another client leaves, or when it sends an urgent request.
     """
 
     def __init__(self, handler: Handler, streams: ClientStreams, connected: socket.socket) -> None:
@@ -186,7 +192,7 @@ class ClientConnection(asyncio.Protocol):
             streams: the streams of all clients.
             connected: the client's non-blocking socket. The connection closes it.
         """
-        #: the program at the other end, set by `Handler.joined`
+        #: the connected program, set by `Handler.joined`
         self.client: Sender
         self.admitted = False
         self.stream = ClientStream(streams, connected, self, CONGESTION_BYTES)
@@ -194,9 +200,9 @@ class ClientConnection(asyncio.Protocol):
         self._loop = streams.loop
         self._splitter = LineSplitter(MAX_LINE_BYTES - 1)
         self._lines: deque[bytes] = deque()
-        #: lists that are being sent, and lines to be sent after them
+        #: lists that are being sent, and lines that follow them
         self._outbox: deque[Iterator[JsonObject] | bytes] = deque()
-        #: the newest feedback that could not be sent because the client was too slow
+        #: latest feedback, held back because the client reads too slowly
         self._held_feedback = b""
         self._half_closed = self._turn_is_due = False
         self._bad_lines = 0
@@ -209,11 +215,12 @@ class ClientConnection(asyncio.Protocol):
         if self.admitted:
             self.stream.begin()
         else:
-            # Read in the next turn, because the server may still notice in this turn that another client has left.
+            # Start reading in the next iteration of the event loop. Until then, the server may notice that another
+            # client has left.
             self._loop.call_soon(self.stream.resume_reading)
 
     def admit(self) -> None:
-        """Admit the client, and send the greeting."""
+        """Admit the client and send it the greeting."""
         self.admitted = True
         self._write(self._handler.greeting)
 
@@ -231,9 +238,9 @@ class ClientConnection(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         self._lines.extend(self._splitter.feed(data))
         if self._splitter.size >= MAX_LINE_BYTES:
-            self._lines.append(self._splitter.take_rest())  # the line is already too long
+            self._lines.append(self._splitter.take_rest())  # this line is too long
         if b"\n" in data:
-            self._stop_line_limit()  # a new line starts, with a new time limit
+            self._stop_line_limit()  # the next line has a new time limit
         self._work()
 
     def eof_received(self) -> bool:
@@ -250,8 +257,8 @@ class ClientConnection(asyncio.Protocol):
     # -- called by the handler
 
     def send(self, message: JsonObject | bytes) -> None:
-        """Send a reply or an encoded line after the lists that are being sent."""
-        if self._half_closed:  # if this is the last answer, the next turn closes the connection
+        """Send a reply or an encoded line. It follows all lists that are still being sent."""
+        if self._half_closed:  # if this is the last reply, close the connection soon
             self._ask_for_turn()
         line = message if isinstance(message, bytes) else encode(message)
         if not self._outbox:
@@ -263,12 +270,12 @@ class ClientConnection(asyncio.Protocol):
             self.stream.abort()
 
     def send_list(self, messages: Iterator[JsonObject]) -> None:
-        """Send a list and its reply as fast as the client reads. Later messages are sent after the list."""
+        """Send a list of messages as fast as the client reads them. Later messages follow the list."""
         self._outbox.append(messages)
         self._ask_for_turn()
 
     def publish(self, event: bytes, *, feedback: bool = False) -> None:
-        """Send an encoded event. If the client is too slow, keep only the newest feedback."""
+        """Send an encoded event. If the client reads too slowly, only the newest feedback is kept."""
         if feedback and self.stream.congested:
             self._held_feedback = event
         else:
@@ -276,23 +283,26 @@ class ClientConnection(asyncio.Protocol):
             self.send(held + event)
 
     def has_hung_up(self) -> bool:
-        """Return whether the client has closed its socket. This also sends the output so far."""
+        """Send pending output, and return whether the client has closed its socket."""
         self.stream.flush()
         return self.stream.closing
 
     def close_with(self, message: JsonObject) -> None:
-        """Send a last message, and close the connection."""
+        """Send a last message and close the connection."""
         self._write(encode(message))
         self.stream.close()
 
-    # -- internal
+    # -- internals
 
     def _close_after(self, seconds: float, words: str) -> asyncio.TimerHandle:
-        """Close the connection with an error message after this time. Return the timer."""
+        """Start a timer that closes the connection with an error message."""
         return self._loop.call_later(seconds, self.close_with, failure(None, "too_slow", words))
 
     def _set_reading(self) -> None:
-        """Start or stop reading. Read only while the client reads its answers and has few unprocessed lines."""
+        """Start or stop reading from the client.
+
+        The server reads only while the client reads its replies and has few unprocessed lines.
+        """
         if self.stream.closing:
             return
         reading = not self.stream.congested and len(self._lines) <= READ_AHEAD_LINES
@@ -316,9 +326,9 @@ class ClientConnection(asyncio.Protocol):
             self.stream.abort()
 
     def _process_last_requests(self) -> None:
-        """Process the last requests of a client that closed its socket without reading the answers.
+        """Process the last requests of a client that closed its socket without reading the replies.
 
-        The system reports this as an error of the connection, but the requests can still be read after that.
+        The system reports this as a connection error, but the requests can still be read after that.
         """
         with contextlib.suppress(OSError):
             while data := self.stream.socket.recv(CONGESTION_BYTES):
@@ -327,7 +337,7 @@ class ClientConnection(asyncio.Protocol):
             self._process_line(self._lines.popleft())
 
     def _work(self) -> None:
-        """Send output and process requests, as much as the limit for one turn allows."""
+        """Send output and process requests, up to the limit for one iteration of the event loop."""
         for _ in range(LINES_PER_TURN):
             if self.stream.closing or self.stream.congested or not self._send_or_process_one():
                 break
@@ -348,7 +358,7 @@ class ClientConnection(asyncio.Protocol):
         self._work()
 
     def _send_or_process_one(self) -> bool:
-        """Send one line or process one request. Return False if there is neither."""
+        """Send one line or process one request. Return False if there is nothing to do."""
         if self._outbox:
             first = self._outbox[0]
             if isinstance(first, bytes):
@@ -369,7 +379,7 @@ class ClientConnection(asyncio.Protocol):
         return True
 
     def _process_line(self, line: bytes) -> None:
-        """Pass the request in a line to the handler, or answer with an error if the line is invalid."""
+        """Pass a request to the handler, or reply with an error if the line is invalid."""
         seq = None
         try:
             message = decode(line)
@@ -377,7 +387,7 @@ class ClientConnection(asyncio.Protocol):
             seq = take_seq(message)
             request = read_request(message)
         except BadRequest as error:
-            # After a line that is too long, the start of the next line is unknown.
+            # After a truncated line, the start of the next line is unknown.
             self._bad_lines += MAX_BAD_LINES if isinstance(line, TruncatedLine) else 1
             self.send(failure(seq, error.code, str(error)))
             if self._bad_lines >= MAX_BAD_LINES or not self.admitted:

@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import By, Sender
     from talkcli.goals.record import Record
 
-#: Length of a program's name or command line in the log.
+#: Maximum length of a program's name or command line in the log.
 _MAX_LOGGED_COMMAND_CHARS = 80
 _NO_PLAYER_NEEDED = "which plays by itself"
 
 
 def goal_ended(record: Record, seconds: float) -> None:
-    """Log that a goal has ended. `seconds` is the time since it became ACTIVE, if it did."""
+    """Log that a goal has ended. `seconds` is how long it was active."""
     took = "" if record.started_at is None else f" after {seconds:.1f} s"
     how = f"{record.id} {record.state.name}{took}"
     if record.state is not State.SUCCEEDED:
@@ -36,7 +36,12 @@ def goal_ended(record: Record, seconds: float) -> None:
 
 
 def engine_ready(engine: Ready, player_options: Sequence[str]) -> None:
-    """Log that an engine is ready. `player_options` are the names of the given player options."""
+    """Log that the engine is ready.
+
+    Args:
+        engine: the engine's description of itself.
+        player_options: the names of the player options that were given.
+    """
     version = f", {sanitize(engine.version)}" if engine.version else ""
     sound = describe_sound(engine)
     words = f"engine ready: driver {engine.driver}{version}, {sound}"
@@ -46,7 +51,7 @@ def engine_ready(engine: Ready, player_options: Sequence[str]) -> None:
 
 
 def voice_load_ended(voice: VoiceLoaded) -> None:
-    """Log that a neural voice was loaded, or that it could not be loaded."""
+    """Log that a neural voice was loaded, or that loading it failed."""
     if voice.error is None:
         write(f"voice {sanitize(voice.voice)} loaded in {voice.seconds:.1f} s")
     else:
@@ -75,7 +80,7 @@ def describe_sender(sender: Sender) -> str:
 
 
 def _cause(by: By | None) -> str:
-    """Return a short description of the goal or client that ended a goal, or "" if there is none."""
+    """Return a short description of what ended a goal, or an empty string if it is unknown."""
     if by is None:
         return ""
     return f" by {by.goal}" if by.goal else f" by {describe_sender(by.client)}" if by.client else ""

@@ -1,7 +1,7 @@
-"""Carries out and answers requests, with one coroutine for each kind of request.
+"""Handles the requests of clients, with one coroutine for each kind of request.
 
 A coroutine may wait for the list of voices, for room in the queue, or for silence. Meanwhile, the client's connection
-stays open. If the connection ends, its requests are dropped.
+stays open. If the client disconnects, its requests are dropped.
 """
 
 from __future__ import annotations
@@ -37,57 +37,62 @@ if TYPE_CHECKING:
     from talkcli.server.connection import ClientConnection, Steps, WaitingList
     from talkcli.server.speech import Speech
 
-#: Ended goals in the reply to `status`.
+#: Number of ended goals in a reply to `status`.
 RECENT_GOALS = 10
 #: How long a request waits for the list of voices. Clients give up after five seconds.
 VOICES_LIMIT_S = 4.0
-#: How long a `pause` waits for silence before it is answered with an error.
+#: How long a `pause` request waits for silence before it fails.
 PAUSE_ANSWER_S = 2.0
-#: Waiting requests of one client, as promised in the protocol's document. The server keeps reading from such a client,
-#: because a cancel may follow.
+#: Maximum number of waiting requests per client, as promised in the protocol's document. At the limit, the server still
+#: reads from the client, because a cancel may follow.
 MAX_CLIENT_REQUESTS = 1_000
-#: Memory for all waiting requests. The limit for unread output is the same.
+#: Maximum memory for all waiting requests, equal to the limit for unread output.
 MAX_KEPT_REQUEST_BYTES = 64 * 1024 * 1024
-#: Memory that is counted for each waiting request in addition to its values. A request actually uses a tenth of it. The
-#: higher number limits the waiting requests to 8,000, so that cancelling all of them takes less than 2 s.
+#: Memory counted for each waiting request in addition to its values. This is ten times the actual size, so that no more
+#: than 8,000 requests wait and all of them can be cancelled within 2 s.
 REQUEST_BYTES = 8 * 1024
 
 
 class Requests:
-    """Carries out the requests of a server's clients."""
+    """Handles the requests of all clients."""
 
     def __init__(self, speech: Speech, describe: Callable[[], JsonObject]) -> None:
-        """Start with no requests. `describe` returns the description of the server for `status`."""
+        """Create the handler.
+
+        Args:
+            speech: the goals and the engine.
+            describe: function that returns the description of the server for `status`.
+        """
         self._speech = speech
         self._scheduler = speech.scheduler
         self._describe = describe
-        #: goals that were cancelled while they waited and have not been submitted yet
+        #: cancelled goals that were waiting and have not been submitted yet
         self._canceled: WaitingList = {}
-        #: the unanswered requests of each connection, in their order
+        #: unanswered requests of each connection, oldest first
         self._pending: dict[ClientConnection, WaitingList] = {}
-        #: memory that is counted for all waiting requests
+        #: memory counted for all waiting requests
         self._waiting_bytes = 0
         self._room_check: asyncio.Handle | None = None
         speech.on_queue_change = self._check_room_soon
 
     def handle(self, connection: ClientConnection, seq: int | None, request: Request) -> None:
-        """Carry out a request, and answer it now or later."""
+        """Handle a request. The reply may be sent later."""
         pending = PendingRequest(connection, seq, request)
         self._pending.setdefault(connection, {})[pending] = None
         pending.start(self._carry_out(pending))
 
     def is_waiting(self, connection: ClientConnection) -> bool:
-        """Return whether a client still waits for an answer or an event."""
+        """Return whether a client is still waiting for a reply or an event."""
         return connection in self._pending or self._speech.subscribers.is_subscribed(connection)
 
     def left(self, connection: ClientConnection) -> None:
-        """Drop the requests and subscriptions of a client whose connection has ended."""
+        """Drop the requests and subscriptions of a client that has disconnected."""
         for each in self._unanswered(connection):
             each.drop()
         self._speech.subscribers.left(connection)
 
     def shut_down(self) -> None:
-        """End all goals, including those that wait for room."""
+        """End all goals, including those that wait for room in the queue."""
         notifications = self._cancel_waiting(self._select_waiting(Cancel()), None)
         self._speech.shut_down()
         resume_all(self._speech.waiting_for_voices)
@@ -123,11 +128,11 @@ class Requests:
         return list(self._pending.get(connection, ()))
 
     def _awaiting_voices(self, connection: ClientConnection) -> list[PendingRequest]:
-        """Return the requests of a connection that wait for the list of voices."""
+        """Return the requests of a connection that are waiting for the list of voices."""
         return [each for each in self._unanswered(connection) if each.waiting_list is self._speech.waiting_for_voices]
 
     def _needs_voices(self, pending: PendingRequest) -> bool:
-        """Return whether a request must wait for the list of voices, or for an earlier request that waits for it."""
+        """Return whether a request needs the list of voices, or follows a request that needs it."""
         request = pending.request
         if self._speech.waiting_for_voices and (isinstance(request, Say) or self._awaiting_voices(pending.connection)):
             return True
@@ -138,16 +143,19 @@ class Requests:
         return isinstance(request, Voices) or (isinstance(request, Say) and request.voice is not None)
 
     def _stop_awaiting_voices(self, connection: ClientConnection) -> None:
-        """Continue the requests of a connection that wait for the list of voices."""
+        """Continue the requests of a connection without waiting any longer for the list of voices."""
         for each in self._awaiting_voices(connection):
             each.resume()
 
     def _may_wait(self, pending: PendingRequest) -> bool:
-        """Return whether a request may wait. If it may, count its memory. If it may not, set its refusal."""
+        """Return whether a request may wait, and count its memory if so.
+
+        If too many requests are waiting already, the refusal of the request is set.
+        """
         if pending.kept_bytes:
             return True  # the request has waited before
         size = REQUEST_BYTES + sum(map(_memory_of, fields(pending.request).values()))
-        if len(self._unanswered(pending.connection)) > MAX_CLIENT_REQUESTS:  # including this one
+        if len(self._unanswered(pending.connection)) > MAX_CLIENT_REQUESTS:  # the list includes this request
             words = f"{MAX_CLIENT_REQUESTS:,} requests of this connection are waiting already"
         elif self._waiting_bytes + size > MAX_KEPT_REQUEST_BYTES:
             words = f"{MAX_KEPT_REQUEST_BYTES >> 20} MiB of requests are waiting already"
@@ -159,20 +167,20 @@ class Requests:
         return False
 
     def _check_room_soon(self) -> None:
-        """Schedule a check of the goals that wait for room, because the queue has changed."""
+        """Schedule a check of the waiting goals after the queue has changed."""
         if self._speech.waiting_for_room and self._room_check is None:
-            # Check in the next turn, because the caller may be in the middle of other changes.
+            # Check in the next iteration of the event loop, because the caller may not have finished its changes.
             self._room_check = asyncio.get_running_loop().call_soon(self._check_room)
 
     def _check_room(self) -> None:
-        """Continue the goals for which the queue has room now."""
+        """Submit the waiting goals for which the queue has room now."""
         self._room_check = None
         without_room: set[object] = set()
         resumed = False
         for each in list(self._speech.waiting_for_room):
             say = each.request
             assert isinstance(say, Say)
-            # If a goal has no id, only these values decide whether it has room. One check is enough for equal goals.
+            # For a goal without an id, the result depends only on these values, so equal goals are checked once.
             kind = (say.priority, say.key, say.flush, say.preempt) if say.id is None else None
             if kind in without_room:
                 continue
@@ -183,18 +191,21 @@ class Requests:
                 each.resume()
                 resumed = True
         if resumed:
-            self._check_room_soon()  # the submitted goals may have made room for earlier ones
+            self._check_room_soon()  # a submitted goal may have made room for an earlier one
 
     def _select_waiting(self, selection: Cancel) -> list[PendingRequest]:
-        """Return the selected goals that wait for room or for the list of voices."""
+        """Return the selected goals that are waiting for room or for the list of voices."""
         waiting = (*self._canceled, *self._speech.waiting_for_room, *self._speech.waiting_for_voices)
         goals = [(each, each.request) for each in waiting if isinstance(each.request, Say)]
         selected = (goals[index][0] for index in selection.select_waiting([say for _, say in goals]))
-        # If a client has disconnected, its waiting goals are dropped and not cancelled.
+        # Waiting goals of a disconnected client are dropped instead of cancelled.
         return [each for each in selected if not each.connection.has_hung_up()]
 
     def _cancel_waiting(self, goals: list[PendingRequest], by: By | None) -> list[Callable[[], None]]:
-        """Cancel waiting goals. Return functions that submit them, so that they are recalled like other goals."""
+        """Mark waiting goals as cancelled, and return functions that submit them.
+
+        The scheduler then recalls them like other goals.
+        """
         new = [each for each in goals if each.waiting_list is not self._canceled]
         for each in new:
             each.canceled_by = by
@@ -210,21 +221,21 @@ class Requests:
         waited = self._speech.now().monotonic - began
         return waited if in_time or ttl is None else max(waited, ttl)
 
-    # -- the coroutines, each named after the kind of its request
+    # -- coroutines, named after the requests that they handle
 
     async def _say(self, pending: PendingRequest, say: Say) -> None:
         speech, scheduler, connection = self._speech, self._scheduler, pending.connection
         waited = 0.0
         if pending.canceled_by is None:
             now = speech.now()
-            if self._room_check:  # waiting goals come first if there is room now
+            if self._room_check:  # goals that are already waiting come first
                 self._room_check.cancel()
                 self._check_room()
-            _, refusal = self._resolve_voice(pending, say)
+            _, refusal = self._check_goal(pending, say)
             if say.patient and scheduler.lacks_room(say, now, refusal) and self._may_wait(pending):
                 waited = await self._await_room(pending, say)
         now = speech.now()
-        say, refusal = self._resolve_voice(pending, say)
+        say, refusal = self._check_goal(pending, say)
         submitted = scheduler.submit(say, connection.client, now, refusal, pending.canceled_by, waited)
         record = submitted.record
         extra: JsonObject = {"paused": True} if scheduler.paused else {}
@@ -245,8 +256,11 @@ class Requests:
             connection.publish(encode({"event": "result", "goal": goal}))
         speech.apply(submitted.effects)
 
-    def _resolve_voice(self, pending: PendingRequest, say: Say) -> tuple[Say, Refusal | None]:
-        """Return a goal with the id of its voice, and a refusal if it can't be spoken with this voice."""
+    def _check_goal(self, pending: PendingRequest, say: Say) -> tuple[Say, Refusal | None]:
+        """Return the goal with the id of its voice, and the server's reason to refuse the goal, or None.
+
+        Refusals that need a clock, files or other I/O belong here. The scheduler decides about all others.
+        """
         voice, refusal = self._speech.voices.look_up(say.voice, self._scheduler.settings.voice)
         say = replace(say, voice=voice)
         if say.pitch not in {None, options.INITIAL.pitch} and options.is_neural(voice or ""):
@@ -255,7 +269,7 @@ class Requests:
         return say, pending.refusal or refusal
 
     async def _wait(self, pending: PendingRequest, request: Wait) -> None:
-        await self._speech.notifications.wait_done(pending)  # earlier events of a goal must come before its result
+        await self._speech.notifications.wait_done(pending)  # send earlier events of a goal before its result
         if request.ids is None:
             records = self._scheduler.unfinished()
         else:
@@ -263,8 +277,8 @@ class Requests:
         for record in records:
             if not record.state.terminal:
                 self._speech.subscribers.await_result(record.id, pending.connection, feedback=request.feedback)
-        # The list contains the goals as they are now, and events report later changes. The snapshot of the active goal
-        # must be made now. Those of pending and ended goals don't change, so they are made when they are sent.
+        # The list shows the goals as they are now, and events report later changes. Only the active goal may look
+        # different later, so its snapshot is made now. The other snapshots are made when they are sent.
         active = self._scheduler.active
         spoken = active.snapshot() if active else None
         states = [(record, record.state) for record in records]
@@ -279,7 +293,7 @@ class Requests:
         notifications = self._cancel_waiting(waiting, By(client=client))
         ids = {each.request.id for each in waiting if isinstance(each.request, Say)}
         result = self._scheduler.cancel(selection, client, now, ids)
-        speech.apply(result.effects)  # apply these effects first, because thousands of notifications may follow
+        speech.apply(result.effects)  # carry out these first, because thousands of notifications may follow
         speech.notifications.add(notifications)
         if result.stopping:
             while not result.stopping.state.terminal:
@@ -317,14 +331,14 @@ class Requests:
         now = speech.now()
         changed, active = scheduler.paused, scheduler.active
         if active and active.state is not State.ACTIVE:
-            active = None  # a goal that is being stopped won't continue
+            active = None  # a goal that is being stopped can't be resumed
         speech.silent_goal = None
         effects = scheduler.resume(now)
         if changed:
             self._publish_pause(active, pending)
         speech.apply(effects)
         if active:
-            resume_all(speech.waiting_for_silence(active))  # these requests no longer have to expect silence
+            resume_all(speech.waiting_for_silence(active))  # requests that wait for silence can be answered now
         self._answer_pause(pending, active)
 
     def _publish_pause(self, held: Record | None, pending: PendingRequest) -> None:
@@ -345,7 +359,7 @@ class Requests:
             pending.answer(goal=self._find(request.id).snapshot().to_json())
 
     async def _watch(self, pending: PendingRequest, _: Watch) -> None:
-        await self._speech.notifications.wait_done(pending)  # earlier events must not be sent after the overview
+        await self._speech.notifications.wait_done(pending)  # send earlier events before the overview
         self._answer_overview(pending)
         self._speech.subscribers.watch(pending.connection)
 
@@ -379,7 +393,7 @@ class Requests:
             raise RequestRefused(refusal[1], refusal[0])
         changes = options.given_values(replace(request, voice=voice))
         effects = scheduler.change_settings(changes, speech.now())
-        self._check_room_soon()  # with the new settings, a waiting goal may preempt and so have room
+        self._check_room_soon()  # a waiting goal may now be able to preempt others
         speech.apply(effects)
         if changes:
             values = ", ".join(f"{name} {options.format_number(value)}" for name, value in changes.items())
@@ -398,11 +412,11 @@ def _unknown_message(*ids: str) -> str:
 
 
 def _goal_lines(name: str, records: Iterable[Record]) -> Iterator[JsonObject]:
-    """Return the lines of a list of goals. The snapshot of each goal is made when its line is sent."""
+    """Return the lines of a list of goals. Each snapshot is made when its line is sent."""
     return ({name: each.snapshot().to_json()} for each in records)
 
 
 def _memory_of(value: object) -> int:
-    """Return the memory that a value of a request uses, which may be many times the size of its JSON."""
+    """Return the memory used by a value, which may be many times the size of its JSON."""
     inside = value.values() if isinstance(value, dict) else value if isinstance(value, (list, tuple)) else ()
     return sys.getsizeof(value) + sum(map(_memory_of, inside))

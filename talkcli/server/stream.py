@@ -1,12 +1,12 @@
-"""Accepts, reads and writes the sockets of clients. All of it runs in the event loop's thread.
+"""Accepts, reads and writes the sockets of clients, all in the event loop's thread.
 
-A stream replaces a transport of asyncio and has a similar interface. There are three reasons for this:
+Streams replace asyncio's transports and have a similar interface. There are three reasons for this:
 
 - No request is lost. If a client closes its connection, asyncio's transport fails to write, stops reading, and drops
   the client's last requests.
-- It is faster. A client is greeted, and its first request is carried out, in the same turn of the event loop in which
-  it connects.
-- All messages of one turn are sent together, because sending a message takes as long as creating it.
+- It is faster. A client is greeted, and its first request is carried out, in the same iteration of the event loop in
+  which it connects.
+- All messages of one iteration are sent together, because sending a message takes as long as creating it.
 """
 
 from __future__ import annotations
@@ -25,56 +25,57 @@ if TYPE_CHECKING:
     import socket
     from collections.abc import Callable
 
-#: Bytes that are read at once. This is the length of the longest request.
+#: Maximum number of bytes to read at once, equal to the maximum length of a request.
 _READ_BYTES = 64 * 1024
-#: If a stream has this much new output, it is sent before the turn ends.
+#: When this much output has collected, it is sent without waiting for the end of the iteration.
 _FLUSH_BYTES = 64 * 1024
-#: Unread output of all clients together. Without this limit, 250 clients could use a gigabyte.
+#: Maximum unread output of all clients together. Without a limit, 250 clients could use a gigabyte.
 MAX_TOTAL_OUTPUT_BYTES = 64 * 1024 * 1024
 
-#: Connections that are accepted in one turn of the event loop. Each new client may send requests immediately.
+#: Maximum number of connections to accept at once. Each new client may send requests immediately.
 ACCEPTS_PER_TURN = 8
-#: Descriptors that clients can't use: nine to restart the engine while the old process still exists, two to bind the
-#: socket again, one to look up a client's process, and some to spare.
+#: File descriptors reserved for the server: nine to restart the engine while the old process still exists, two to bind
+#: the socket again, one to look up a client's process, and some to spare.
 RESERVED_DESCRIPTORS = 16
-#: Descriptors of a server without clients: fourteen of its own, and two for libraries.
+#: File descriptors used by a server without clients: fourteen of its own, and two for libraries.
 OWN_DESCRIPTORS = 16
 _TOO_FEW_DESCRIPTORS = (
     "the server has too few file descriptors for more clients: raise LimitNOFILE= of its unit, or ulimit -n before "
     "talk serve"
 )
-#: Delay before the next attempt after a connection could not be accepted.
+#: How long to wait after an error before accepting connections again.
 ACCEPT_RETRY_S = 1.0
-#: Errors of `accept` if the system has run out of descriptors or memory. New connections stay in the backlog.
+#: Errors of `accept` when the system is out of descriptors or memory. New connections stay in the backlog.
 _EXHAUSTED = {errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM}
-#: Errors of `accept` if there is no new connection, or if the client has closed it already.
+#: Errors of `accept` when there is no connection to accept.
 _NO_CONNECTION = {errno.EAGAIN, errno.ECONNABORTED, errno.EPROTO, errno.EINTR}
 
 
 class ClientStreams:
     """The streams of all clients of one event loop.
 
-    It sends their output at the end of each turn, and limits the unread output of all clients together. All streams
-    share one callback per turn. This saves a third of the time if fifty clients watch the words.
+    It sends their output at the end of each iteration of the event loop, and limits the unread output of all clients
+    together. All streams share one callback per iteration. This saves a third of the time if fifty clients watch the
+    words.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self.loop = loop
         self.open: set[ClientStream] = set()
-        #: size of the unread output of all streams
+        #: total size of the unread output
         self.unread_bytes = 0
-        #: the streams with new output in this turn, in the order of their first output
+        #: streams with new output in this iteration, in the order of their first output
         self._written: dict[ClientStream, None] = {}
 
     def shed_load(self) -> None:
-        """Drop the clients with the most unread output until the total is within the limit."""
+        """Disconnect the clients with the most unread output until the total is within the limit."""
         while self.unread_bytes > MAX_TOTAL_OUTPUT_BYTES and self.open:
             max(self.open, key=lambda each: each.unsent_bytes + each.held_bytes).abort()
             total = MAX_TOTAL_OUTPUT_BYTES >> 20
             log.write_limited("output", f"a client that doesn't read is let go: {total} MiB wait for all together")
 
     def flush_later(self, stream: ClientStream) -> None:
-        """Send the output of a stream at the end of this turn."""
+        """Send a stream's output at the end of this iteration of the event loop."""
         if not self._written:
             self.loop.call_soon(self._flush)
         self._written[stream] = None
@@ -90,7 +91,10 @@ class ClientStreams:
 
 
 class ClientStream:
-    """The socket of one client. It is closed after `connection_lost` of its receiver has been called."""
+    """A client's socket, with buffered output.
+
+    The socket is closed after `connection_lost` of its receiver has been called.
+    """
 
     def __init__(
         self, streams: ClientStreams, connected: socket.socket, receiver: asyncio.Protocol, congestion_bytes: int
@@ -100,7 +104,7 @@ class ClientStream:
         Args:
             streams: the streams of all clients.
             connected: the client's non-blocking socket.
-            receiver: the protocol that gets the data. Its `connection_lost` is called in a later turn.
+            receiver: the protocol that gets the data. Its `connection_lost` is called in a later iteration.
             congestion_bytes: the size of unread output above which `pause_writing` of the receiver is called.
         """
         self.socket = connected
@@ -109,13 +113,13 @@ class ClientStream:
         self._receiver = receiver
         self._congestion_bytes = congestion_bytes
         self._unread = bytearray()
-        #: size of the output that the receiver holds back until the client has read earlier output
+        #: size of the output that the receiver holds back until the client catches up
         self.held_bytes = 0
-        #: whether the stream was closed, so that no more output is accepted
+        #: whether the stream was closed and accepts no more output
         self.closing = False
         #: whether the receiver should pause writing
         self.congested = False
-        #: whether the socket's buffer is full until the client reads
+        #: whether the socket's send buffer is full
         self._blocked = False
         self._reading = self._eof = False
         streams.open.add(self)
@@ -123,14 +127,14 @@ class ClientStream:
     # -- input
 
     def begin(self) -> None:
-        """Send the output so far, and start reading. Data that has already arrived is read at once."""
+        """Send pending output and start reading. Data that has already arrived is read at once."""
         self.flush()
         self.resume_reading()
         if self._reading:
             self._read()
 
     def resume_reading(self) -> None:
-        """Read from the client, unless the end of its input was reached."""
+        """Start reading again, unless the client has closed its end of the connection."""
         if not (self._reading or self._eof or self.closing):
             self._reading = True
             self._loop.add_reader(self.socket, self._read)
@@ -158,25 +162,25 @@ class ClientStream:
             if not self._receiver.eof_received():
                 self.close()
         except Exception:
-            self.abort()  # otherwise, the client would wait for an answer in vain
+            self.abort()  # otherwise, the client would wait forever for a reply
             raise
 
     # -- output
 
     @property
     def unsent_bytes(self) -> int:
-        """The size of the output that has not been sent yet."""
+        """Size of the output that has not been sent yet."""
         return len(self._unread)
 
     def count_held(self, size_bytes: int) -> None:
-        """Add to the size of the output that the receiver holds back. A negative size subtracts from it."""
+        """Add to the size of the output that the receiver holds back. The argument may be negative."""
         if self in self._streams.open:
             self.held_bytes += size_bytes
             self._streams.unread_bytes += size_bytes
             self._streams.shed_load()
 
     def write(self, data: bytes) -> None:
-        """Send data at the end of this turn, or after the client has read earlier output."""
+        """Send data at the end of this iteration, or later if the client reads slowly."""
         if self.closing:
             return
         self._unread += data
@@ -190,7 +194,7 @@ class ClientStream:
         self._streams.shed_load()
 
     def flush(self) -> None:
-        """Send the output now. If the client has closed its socket, the stream is `closing` after this call."""
+        """Send the output now. If the client has closed its socket, this sets `closing`."""
         if self._unread and not self._blocked:
             self._send()
 
@@ -235,11 +239,15 @@ class ClientStream:
     # -- the end
 
     def abort(self, error: OSError | None = None) -> None:
-        """Close the stream now, and drop its output. `error` is the error that broke the connection, if any."""
+        """Close the stream immediately and drop its output.
+
+        Args:
+            error: the error that broke the connection, if any.
+        """
         if self not in self._streams.open:
             return
         if self.closing:
-            error = None  # the server closed the connection first, so later requests are not carried out
+            error = None  # the server closed the connection first, so later requests are ignored
         self.closing = True
         self.pause_reading()
         if self._blocked:
@@ -258,12 +266,12 @@ class ClientStream:
 
 
 def raise_descriptor_limit(clients: int) -> int:
-    """Raise this process's limit of file descriptors for this number of clients. Return the new limit."""
+    """Raise the limit of open files to fit this number of clients, and return the new limit."""
     wanted = clients + RESERVED_DESCRIPTORS + OWN_DESCRIPTORS
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     allowed, most = (2**31 if each == resource.RLIM_INFINITY else each for each in limits)
     if allowed < wanted:
-        with contextlib.suppress(OSError, ValueError):  # a sandbox may forbid it
+        with contextlib.suppress(OSError, ValueError):  # a sandbox may forbid this
             resource.setrlimit(resource.RLIMIT_NOFILE, (min(wanted, most), limits[1]))
             allowed = min(wanted, most)
     if allowed < wanted:
@@ -276,7 +284,7 @@ def raise_descriptor_limit(clients: int) -> int:
 
 
 class Acceptor:
-    """Accepts the connections of a listening socket. Some descriptors stay reserved for the engine."""
+    """Accepts connections on a listening socket. Some descriptors stay reserved for the engine."""
 
     def __init__(
         self, loop: asyncio.AbstractEventLoop, serve: Callable[[socket.socket], None], max_descriptors: int
@@ -285,7 +293,7 @@ class Acceptor:
 
         Args:
             loop: the event loop.
-            serve: function that is called with the socket of each connection and has to close it.
+            serve: function that is called with each connected socket and has to close it.
             max_descriptors: this process's limit of file descriptors.
         """
         self._loop = loop
@@ -295,13 +303,13 @@ class Acceptor:
         self._retry: asyncio.TimerHandle | None = None
 
     def open(self, listening: socket.socket) -> None:
-        """Start accepting connections from this socket, and stop accepting them from an earlier socket."""
+        """Accept connections on this socket, and no longer on an earlier one."""
         self.close()
         self._listening = listening
         self._loop.add_reader(listening, self._accept, listening)
 
     def close(self) -> None:
-        """Stop accepting connections. This must be called before the listening socket is closed."""
+        """Stop accepting connections. Call this before the listening socket is closed."""
         if self._retry:
             self._retry.cancel()
             self._retry = None
@@ -318,7 +326,7 @@ class Acceptor:
                     self._pause(listening, error)
                 return
             connected.setblocking(False)
-            # A new descriptor has the lowest free number, so a high number means that few descriptors are left.
+            # New descriptors get the lowest free number, so a high number means that few are left.
             if connected.fileno() >= self._max_descriptors - RESERVED_DESCRIPTORS:
                 self._turn_away(connected)
                 continue
@@ -329,7 +337,7 @@ class Acceptor:
                 connected.close()
 
     def _turn_away(self, connected: socket.socket) -> None:
-        """Send a client the message that the server has too few descriptors, and close the connection."""
+        """Tell a client that the server has too few file descriptors, and close the connection."""
         log.write_limited(
             "descriptors",
             f"clients are turned away: only {self._max_descriptors} files may be open (raise LimitNOFILE= or ulimit "
@@ -339,7 +347,7 @@ class Acceptor:
             connected.send(encode(busy_greeting(_TOO_FEW_DESCRIPTORS)))
 
     def _pause(self, listening: socket.socket, error: OSError) -> None:
-        """Accept no connections for a while. Otherwise, the event loop would try again without a pause."""
+        """Stop accepting connections for a while. Otherwise, the event loop would retry without a pause."""
         if error.errno not in _EXHAUSTED:
             log.write_bug("taking up a connection", error)
         log.write_limited("accept", f"no connection can be taken up: {error.strerror}; they wait until one can")

@@ -1,4 +1,4 @@
-"""Finds the voice that a client asks for. Loading of voices is in `goals.voices`.
+"""Finds the voice that a client asks for. `goals.voices` decides when voices are loaded.
 
 The directories of neural voices are read only if a client asks for a voice that the engine has not listed.
 """
@@ -18,15 +18,12 @@ if TYPE_CHECKING:
 
 
 class VoiceCatalog:
-    """The voices of a server's engine and the installed neural voices.
-
-    `settings_voice` is the voice in the server's settings. If it is neural, its language is another name for it.
-    """
+    """The voices of a server's engine, including the installed neural voices."""
 
     def __init__(self) -> None:
-        #: the voices that the engine has listed, or None before that
+        #: voices listed by the engine, or None if it hasn't listed them yet
         self.listed: tuple[Voice, ...] | None = None
-        #: name of the engine's driver, or None until the default driver is known
+        #: name of the engine's driver, or None while the default driver is unknown
         self.driver: str | None = None
 
     def look_up(self, voice: str | None, settings_voice: str | None = None) -> tuple[str | None, Refusal | None]:
@@ -34,6 +31,10 @@ class VoiceCatalog:
 
         For a neural voice, the first value is the id. For every other voice, it is the client's input. The default
         voice is never checked, and other voices are not checked before the engine has listed its voices.
+
+        Args:
+            voice: the client's input.
+            settings_voice: the voice in the server's settings. If it is neural, its language is another name for it.
         """
         if not voice or voice == DEFAULT_VOICE or not (self.listed or is_neural(voice)):
             return voice, None
@@ -48,7 +49,7 @@ class VoiceCatalog:
         return found.id, (Reason.UNKNOWN_VOICE, words) if missing else None
 
     def find_new_files(self) -> None:
-        """Update the list of neural voices from the installed files."""
+        """Refresh the list of neural voices from the installed files."""
         from talkcli.engine import models
 
         if self.listed and is_own_driver(self.driver):
@@ -68,7 +69,7 @@ class VoiceCatalog:
         if not (is_neural(voice) or is_neural(settings_voice or "")):
             found = find_voice(voice, self._driver_voices)
             if found is not None:
-                return found  # the directories of neural voices needn't be read
+                return found  # no need to read the directories of neural voices
         return find_voice(voice, self._candidates(voice), settings_voice)
 
     @property
@@ -76,7 +77,7 @@ class VoiceCatalog:
         return tuple(each for each in self.listed or () if not is_neural(each.id))
 
     def _candidates(self, voice: str) -> tuple[Voice, ...]:
-        """Return the voices that a client may mean, including the neural voices that are installed now."""
+        """Return the voices to search, including the neural voices that are installed now."""
         own = () if is_neural(voice) else self._driver_voices
         if self._foreign_driver is not None:
             return own
@@ -87,12 +88,15 @@ class VoiceCatalog:
 
     @property
     def _foreign_driver(self) -> str | None:
-        """The name of the driver if it is not `talk`'s own, so that there are no neural voices, or None."""
+        """Name of the driver if it is not `talk`'s own, or None.
+
+        Other drivers have no neural voices.
+        """
         return None if is_own_driver(self.driver) else self.driver or "the system's own"
 
     @staticmethod
     def _missing(voice: str) -> str | None:
-        """Return the problem if a neural voice's speaker doesn't exist or a package is not installed."""
+        """Return an error message if a neural voice lacks a speaker or a package, or None."""
         from talkcli.engine import models
 
         model, mark, speaker = voice.partition(SPEAKER_MARK)
