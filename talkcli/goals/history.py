@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 _Key = TypeVar("_Key")
 _Value = TypeVar("_Value")
 
-#: Number of spoken goals to keep. A robot that speaks ten times a minute needs 100 minutes to reach it.
+#: Number of spoken goals to keep, enough for 100 minutes of a robot that speaks ten times a minute.
 MAX_SPOKEN_GOALS = 1_000
 #: Number of rejected goals to keep. Without a separate limit, one client's rejected goals could displace the results of
 #: other clients.

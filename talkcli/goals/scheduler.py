@@ -452,7 +452,7 @@ class Scheduler:
     # -- selecting and accepting goals
 
     def _select(self, selection: Cancel, result: Cancellation, waiting: Collection[str | None]) -> list[Record]:
-        """Return the unfinished goals that a cancel selects.
+        """Return the unfinished goals that a cancel request selects.
 
         Ended goals and unknown ids are added to `result`.
         """

@@ -93,7 +93,7 @@ class PendingRequest:
         self.refusal: Refusal | None = None
         #: the client that cancelled the goal while it was waiting
         self.canceled_by: By | None = None
-        #: the waiting goal after it was submitted and recalled
+        #: the goal that was cancelled while it was waiting
         self.canceled_goal: Record | None = None
         self._steps: Steps
 
@@ -257,7 +257,7 @@ class ClientConnection(asyncio.Protocol):
     # -- called by the handler
 
     def send(self, message: JsonObject | bytes) -> None:
-        """Send a reply or an encoded line. It follows all lists that are still being sent."""
+        """Send a reply or an encoded line, after all lists that are still being sent."""
         if self._half_closed:  # if this is the last reply, close the connection soon
             self._ask_for_turn()
         line = message if isinstance(message, bytes) else encode(message)

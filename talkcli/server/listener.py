@@ -1,10 +1,10 @@
-"""The listening socket and its lock, which ensures that only one server uses a path.
+"""The listening socket, and the lock that allows only one server per path.
 
 Only the server that holds the lock may bind the socket and remove an old socket file. If the socket file is removed
 while the server runs, for example by a cleaner of temporary directories, the socket is bound again. `run` decides when
 to check this.
 
-The lock file contains the process id of its holder, and stays after the server has ended. If it is removed, the first
+The lock file contains the process id of its holder, and is kept after the server has ended. If it is removed, the first
 server that creates and locks a new one continues, and the other server ends. Another user may have put something else
 in the place of the lock file, so only a regular file without other hard links is opened.
 """
@@ -28,22 +28,21 @@ from talkcli.errors import AccessDenied, AddressInUse, ServerUnavailable, TalkEr
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-#: Connections that may wait to be accepted. The system also has a limit (net.core.somaxconn).
+#: Maximum number of connections waiting to be accepted. The system also has a limit (net.core.somaxconn).
 MAX_BACKLOG_CONNECTIONS = 1024
-#: How long to wait for the holder of the lock to write its process id.
+#: How long to wait until another server has written its process id to the lock file.
 HOLDER_ID_S = 1.0
 #: The first file descriptor passed by systemd (SD_LISTEN_FDS_START).
 _FIRST_PASSED = 3
 _RESTART_SOCKET = "restart the socket's unit (systemctl restart talk.socket)"
-#: Errors that may not occur at the next attempt: the lack of memory, descriptors or disk space, or a disk that is
-#: read-only for a while.
+#: Errors that may be temporary: not enough memory, disk space or file descriptors, or a read-only file system.
 _TEMPORARY = {errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOBUFS, errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 
 
 class Listener:
     """A listening socket bound by this server, and its lock."""
 
-    #: whether systemd passed the socket and owns its file
+    #: whether systemd passed the socket and owns the socket file
     passed = False
 
     def __init__(self, path: str | None, mode: int) -> None:
@@ -58,7 +57,7 @@ class Listener:
         """
         self.mode = mode
         self.path = paths.server_socket(path)
-        #: the named path made absolute, because the current directory may change before the socket is bound again
+        #: absolute form of the given path, because the current directory may change later
         self._named_path = self.path if path else None
         _check_directory(os.path.dirname(self.path))
         _refuse_other_file(self.path)
@@ -72,18 +71,18 @@ class Listener:
         self._identity = _identity(self.path)
 
     def in_place(self) -> bool:
-        """Return whether the socket file and the lock file are still those of this server."""
+        """Return whether the socket file and the lock file still belong to this server."""
         # A new file can't have the same inode number, because both files are still open.
         return _identity(self.path) == self._identity and self._lock.in_place(self.path)
 
     def bind_again(self) -> socket.socket | None:
-        """Create a missing socket file or lock file again, with the same checks as at the start.
+        """Recreate a missing socket file or lock file, with the same checks as at the start.
 
         Returns:
             The old socket, which the caller must close, or None if it is still in use.
 
         Raises:
-            AddressInUse: if another server or file is in the way. Nothing was changed.
+            AddressInUse: if another server or file is in the way. In this case, nothing was changed.
         """
         path = paths.server_socket(self._named_path)
         _check_directory(os.path.dirname(path))
@@ -137,7 +136,10 @@ class InheritedListener:
         return _identity(self.path) == self._identity
 
     def bind_again(self) -> socket.socket | None:
-        """Raise AddressInUse. After a restart of the server alone, systemd would pass the old socket again."""
+        """Raise AddressInUse, because only systemd can create the socket file again.
+
+        If only the server were restarted, systemd would pass the old socket again.
+        """
         raise AddressInUse(f"the file of the socket {self.path} was removed or replaced: {_RESTART_SOCKET}")
 
     def close(self) -> None:
@@ -146,10 +148,10 @@ class InheritedListener:
 
 
 def listen(path: str | None, mode: int) -> Listener | InheritedListener:
-    """Return the socket passed by systemd if its path is the wanted one, or else bind a new socket.
+    """Return the socket passed by systemd if it has this path. Otherwise, bind a new socket.
 
     Args:
-        path: the path of the socket file, or None for the passed socket or the usual place.
+        path: the path of the socket file, or None for any passed socket, or else the usual place.
         mode: the mode of a new socket file.
     """
     passed = os.environ.get("LISTEN_FDS")
@@ -169,10 +171,14 @@ def is_temporary(error: AddressInUse) -> bool:
 
 
 class Lock:
-    """The lock for a socket's path, held by this server."""
+    """A lock that reserves a socket's path for this server."""
 
     def __init__(self, path: str) -> None:
-        """Acquire the lock. Raises AddressInUse if another server holds it."""
+        """Acquire the lock.
+
+        Raises:
+            AddressInUse: if another server holds the lock.
+        """
         self._path = path
         while True:
             self._fd, self._made = _open_lock(_lock_of(path))
@@ -184,20 +190,20 @@ class Lock:
                 raise _already_served(holder, path, here=holder is not None) from None
             if self.in_place(path):
                 break
-            os.close(self._fd)  # the file was removed before it was locked, so another server may hold a new lock
+            os.close(self._fd)  # the file was removed before it was locked, so try again
         os.ftruncate(self._fd, 0)
-        with contextlib.suppress(OSError):  # the process id is only informative, so a full disk is no problem
+        with contextlib.suppress(OSError):  # the process id is only informative, so ignore a full disk
             os.write(self._fd, f"{os.getpid()}\n".encode())
 
     def in_place(self, path: str) -> bool:
-        """Return whether this lock's file is still the lock file of a path."""
+        """Return whether the lock file of a path is still the one that this server has locked."""
         status = os.fstat(self._fd)
         return _identity(_lock_of(path)) == (status.st_dev, status.st_ino)
 
     def undo(self) -> None:
-        """Release the lock, and remove its file if this server created it.
+        """Release the lock, and remove the lock file if this server created it.
 
-        If another server has already opened the file, it notices after locking that the file is no longer in place.
+        Another server that has already opened the file will notice that it was removed.
         """
         if self._made and self.in_place(self._path):
             with contextlib.suppress(OSError):
@@ -205,13 +211,13 @@ class Lock:
         self.close()
 
     def close(self) -> None:
-        """Release the lock. The lock file stays."""
+        """Release the lock, but keep the lock file."""
         os.close(self._fd)
 
 
 @contextlib.contextmanager
 def _refusing(what: str) -> Iterator[None]:
-    """Replace an OSError by AddressInUse. Its message starts with `what`."""
+    """Turn an OSError into AddressInUse, with a message that starts with `what`."""
     try:
         yield
     except OSError as error:
@@ -219,7 +225,7 @@ def _refusing(what: str) -> Iterator[None]:
 
 
 def _identity(path: str) -> tuple[int, int] | None:
-    """Return the device and inode numbers of a file, or None if there is no accessible file."""
+    """Return the device and inode numbers of a file, or None if the file can't be accessed."""
     try:
         status = os.lstat(path)
     except OSError:
@@ -228,7 +234,10 @@ def _identity(path: str) -> tuple[int, int] | None:
 
 
 def _already_served(pid: int | None, path: str, *, here: bool) -> AddressInUse:
-    """Return the error about another server. `here` means that its process runs on this machine."""
+    """Return an error saying that another server uses the path.
+
+    `here` tells whether that server runs on this machine.
+    """
     name = "unknown" if pid is None else pid
     how = f" (kill {pid})" if here else ""
     return AddressInUse(f"a server (pid {name}) serves {path} already: use it, or end it first{how}")
@@ -238,7 +247,11 @@ def _already_served(pid: int | None, path: str, *, here: bool) -> AddressInUse:
 
 
 def _path_of(passed: socket.socket) -> str:
-    """Return the path of a listening Unix socket. Raises UsageError if the socket is of another type."""
+    """Return the path of a listening Unix socket.
+
+    Raises:
+        UsageError: if the socket is of another type, or has no path.
+    """
     if passed.family != socket.AF_UNIX:
         raise UsageError("the socket that was passed (LISTEN_FDS) is not a Unix socket: use ListenStream=/path")
     if passed.type != socket.SOCK_STREAM or not passed.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):
@@ -250,21 +263,24 @@ def _path_of(passed: socket.socket) -> str:
 
 
 def _refuse_second_server(path: str | None) -> None:
-    """Raise AddressInUse if clients would find another server instead of this one."""
+    """Raise AddressInUse if clients would connect to another server instead of this one."""
     try:
         found = connect(path, hello(None, urgent=True))
     except (ServerUnavailable, AccessDenied):
-        return  # there is no server that would answer clients of this user
+        return  # no server answers clients of this user
     except TalkError as error:
         raise AddressInUse(f"a server is there already: {error}") from error
     assert found.socket
-    here, _ = peers.credentials(found.socket)  # if ssh forwards the socket, this is the process id of ssh
+    here, _ = peers.credentials(found.socket)  # this is the process id of ssh if ssh forwards the socket
     found.socket.close()
     raise _already_served(found.pid, found.path, here=here == found.pid)
 
 
 def _refuse_live_socket(path: str) -> None:
-    """Raise AddressInUse if a program listens at the path without the lock. Its clients could no longer reach it."""
+    """Raise AddressInUse if another program listens at the path without holding the lock.
+
+    Its clients could no longer reach it if the path were bound again.
+    """
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         try:
@@ -277,7 +293,11 @@ def _refuse_live_socket(path: str) -> None:
 
 
 def _check_directory(directory: str) -> None:
-    """Create the directory. Raises AddressInUse if other users could replace the socket in the directory."""
+    """Create the socket's directory if it doesn't exist, and check that it is safe.
+
+    Raises:
+        AddressInUse: if the directory can't be created, or if other users could replace the socket in it.
+    """
     with _refusing(f"the socket's directory {directory} can't be made"), contextlib.suppress(FileExistsError):
         os.mkdir(directory, 0o700)
     status = os.lstat(directory)
@@ -295,7 +315,7 @@ def _check_directory(directory: str) -> None:
 
 
 def _refuse_other_file(path: str) -> None:
-    """Raise AddressInUse if the path exists and is not a socket."""
+    """Raise AddressInUse if the path exists but is not a socket."""
     try:
         mode = os.lstat(path).st_mode
     except OSError:
@@ -309,7 +329,7 @@ def _refuse_other_file(path: str) -> None:
 
 
 def _bind(path: str, mode: int) -> socket.socket:
-    """Return a socket that listens at the path. The lock must be held."""
+    """Create a socket that listens at this path. The caller must hold the lock."""
     _refuse_other_file(path)
     with _refusing(f"the socket {path} of an earlier server can't be removed"), contextlib.suppress(FileNotFoundError):
         os.unlink(path)
@@ -317,12 +337,12 @@ def _bind(path: str, mode: int) -> socket.socket:
     try:
         listening.setblocking(False)
         if sys.platform.startswith("linux"):
-            # Set the mode before `bind`, so that the file is never accessible to more users. `bind` applies the umask,
-            # so `chmod` sets the mode again. Changing the umask could affect an engine that another thread is starting.
+            # Set the mode before `bind`, so that other users can never access the file. `bind` applies the umask, so
+            # `chmod` sets the mode again. Changing the umask could affect an engine that another thread is starting.
             os.fchmod(listening.fileno(), mode)
             listening.bind(path)
             os.chmod(path, mode)
-        else:  # on other systems, a socket has no mode before `bind`
+        else:  # other systems can't set the mode before `bind`
             umask = os.umask(0o777 & ~mode)
             try:
                 listening.bind(path)
@@ -350,10 +370,10 @@ def _open_lock(name: str) -> tuple[int, bool]:
             with contextlib.suppress(FileExistsError):
                 return os.open(name, flags | os.O_CREAT | os.O_EXCL, 0o600), True
             try:
-                _refuse_other_lock(name, os.lstat(name))  # check this first, because opening a device may act on it
+                _refuse_other_lock(name, os.lstat(name))  # check first, because opening a device may have side effects
                 fd = os.open(name, flags)
             except FileNotFoundError:
-                continue  # the file was removed in between
+                continue  # the file has just been removed
         try:
             _refuse_other_lock(name, os.fstat(fd))
         except AddressInUse:
@@ -389,7 +409,7 @@ def _exists(pid: int) -> bool:
 def _holder(fd: int) -> int | None:
     """Return the process id in the lock file, or None if the holder doesn't write it in time.
 
-    A process id that the file contained before may be that of an earlier server, which no longer exists.
+    The id of a process that no longer exists was written by an earlier server, and is ignored.
     """
     end = time.monotonic() + HOLDER_ID_S
     while True:

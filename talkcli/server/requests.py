@@ -293,7 +293,7 @@ class Requests:
         notifications = self._cancel_waiting(waiting, By(client=client))
         ids = {each.request.id for each in waiting if isinstance(each.request, Say)}
         result = self._scheduler.cancel(selection, client, now, ids)
-        speech.apply(result.effects)  # carry out these first, because thousands of notifications may follow
+        speech.apply(result.effects)  # carry out the effects first, because thousands of notifications may follow
         speech.notifications.add(notifications)
         if result.stopping:
             while not result.stopping.state.terminal:

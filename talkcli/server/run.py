@@ -1,4 +1,4 @@
-"""`talk serve`: the server as a whole, with its clients, its status and its shutdown."""
+"""The server behind `talk serve`: start, admission of clients, status and shutdown."""
 
 from __future__ import annotations
 
@@ -36,20 +36,20 @@ from talkcli.server.voices import VoiceCatalog
 if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
 
-#: Connected clients. Each one uses a file descriptor, and a process can usually have 1,024 of them.
+#: Default limit on connected clients. Each client uses a file descriptor, and a process can usually have 1,024 of them.
 MAX_CLIENTS = 256
-#: Pending goals. Speaking them takes about three minutes, and nobody wants to wait longer.
+#: Default limit on pending goals. Speaking them takes about three minutes, and nobody wants to wait longer.
 USUAL_QUEUE_GOALS = 100
-#: Memory for neural voices, enough for four voices of medium size.
+#: Default memory limit for neural voices, enough for four voices of medium size.
 VOICE_MEMORY_MB = 300
-#: Additional clients of a full server. They can only ask for its status or silence it.
+#: Number of additional clients that a full server accepts. They can only ask for the status or cancel goals.
 MAX_EXTRA_CLIENTS = 16
-#: Interval of checks that clients can find the socket. A missing socket must be noticed within 30 s. A check takes two
-#: system calls.
+#: How often to check that clients can find the socket. A missing socket must be noticed within 30 s, and a check takes
+#: only two system calls.
 SOCKET_CHECK_S = 10.0
-#: Time for clients to read their last answers before the server exits.
+#: How long clients have to read their last replies before the server exits.
 _CLIENT_CLOSE_S = 0.3
-#: Time for the engine process to exit before the server exits without waiting for it.
+#: How long the server waits for the engine process to exit.
 _ENGINE_CLOSE_S = 1.0
 
 
@@ -57,15 +57,15 @@ _ENGINE_CLOSE_S = 1.0
 class ServerSettings:
     """The options of `talk serve`."""
 
-    #: the values for options that a goal omits; every setting must have a value
+    #: default values for the options of goals
     goals: Set = INITIAL
     max_queue: int = USUAL_QUEUE_GOALS
     max_text: int = MAX_TEXT_CHARS
     max_clients: int = MAX_CLIENTS
     player: str | None = None
     device: str | None = None
-    lead_in: int = 0  # milliseconds of silence before a sentence if the device has been idle
-    audible: bool = False  # whether a sentence is aborted if its output is muted
+    lead_in: int = 0  # milliseconds of silence before a sentence if the device was idle
+    audible: bool = False  # whether to abort a sentence if the output is muted
     driver: str | None = None
     voice_memory: int = VOICE_MEMORY_MB
     socket: str | None = None
@@ -74,19 +74,19 @@ class ServerSettings:
 
     @property
     def player_options(self) -> list[str]:
-        """The names of the given player options."""
+        """Names of the player options that were given."""
         given = {"--player": self.player, "--device": self.device, "--lead-in": self.lead_in}
         return [name for name, value in given.items() if value]
 
 
 def serve(settings: ServerSettings) -> int:
-    """Run a server until SIGTERM or SIGINT, and return the exit code.
+    """Run a server until it receives SIGTERM or SIGINT, and return the exit code.
 
     Raises:
         AddressInUse: if another server is running, or the socket's directory isn't safe.
         UsageError: if the voice is unknown.
     """
-    # Imported modules are never freed. Without this call, a garbage collection of all objects delays clients by 10 ms.
+    # Exclude imported modules from garbage collection. Otherwise, each full collection delays clients by 10 ms.
     gc.freeze()
     listener = listen(settings.socket, settings.socket_mode)
 
@@ -101,7 +101,7 @@ def serve(settings: ServerSettings) -> int:
 
 
 class Server:
-    """A server, which is also the handler of its connections. It must be created in its event loop."""
+    """A server that handles the connections of its clients. Create it inside a running event loop."""
 
     def __init__(self, settings: ServerSettings, listener: Listener | InheritedListener) -> None:
         self._settings = settings
@@ -123,15 +123,15 @@ class Server:
         self.handle, self.is_waiting = self._requests.handle, self._requests.is_waiting
         self.greeting = encode(greeting(__version__, os.getpid(), self._scheduler.boot))
         self.connections: set[ClientConnection] = set()
-        #: set while there are no connections
+        #: set while no client is connected
         self._no_clients = asyncio.Event()
         self._no_clients.set()
         #: the error that ended the server, if any
         self._fatal_error: TalkError | None = None
         self._started_at = time.time(), time.monotonic()
-        #: the logged reason why clients can't reach the server, or "" if they can
+        #: last logged reason why clients can't connect, or empty if they can
         self._unreachable = ""
-        # A shell without job control starts background processes with SIGINT ignored. Keep ignoring it in this case.
+        # A shell without job control starts background processes with SIGINT ignored. In this case, keep ignoring it.
         ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
         self._end_signals = [signal.SIGTERM] if ignored else [signal.SIGTERM, signal.SIGINT]
 
@@ -162,13 +162,13 @@ class Server:
         )
         try:
             speech.engine.thread.start()
-        except RuntimeError as error:  # Python has no more specific exception
+        except RuntimeError as error:  # there is no more specific exception
             raise TalkError(f"the engine's thread cannot be started: {memory_limits()}") from error
         try:
             self._acceptor.open(self._listener.socket)
             self._socket_check = self._loop.call_later(SOCKET_CHECK_S, self._check_socket)
             if voice or settings.driver:
-                # Wait before logging, because an unknown voice or driver must produce nothing but an error message.
+                # Wait before logging, so that an unknown voice or driver produces nothing but an error message.
                 with contextlib.suppress(asyncio.TimeoutError):
                     await asyncio.wait_for(speech.engine_known.wait(), START_LIMIT_S)
             if not self._scheduler.closing:
@@ -189,10 +189,12 @@ class Server:
             raise self._fatal_error
 
     def _start_voice(self) -> str | None:
-        """Return the voice that the engine process must check at its start, or None if there is none to check.
+        """Return the voice that the engine must check when it starts, or None.
 
-        A neural voice is checked here, and loaded later so that it doesn't delay speech. Raises UsageError if a neural
-        voice is unknown.
+        A neural voice is checked here, and loaded later so that it doesn't delay speech.
+
+        Raises:
+            UsageError: if a neural voice is unknown.
         """
         voices = self.speech.voices
         voice, refusal = voices.look_up(self._settings.goals.voice)
@@ -213,7 +215,7 @@ class Server:
             former = self._listener.bind_again()
         except AddressInUse as error:
             if not (self._listener.passed or is_temporary(error)):
-                # Clients find another server or none, so this server ends. A service manager may start it again.
+                # Clients can't reach this server any more, so shut down. A service manager may restart it.
                 self._socket_check.cancel()
                 log.write(log.sanitize(f"ending: {error}"))
                 self._end(error)
@@ -230,9 +232,9 @@ class Server:
     # -- called by connections
 
     def joined(self, connection: ClientConnection) -> None:
-        """Admit a client, keep it waiting if the server is full, or refuse it."""
+        """Identify a new client, and then admit it, keep it waiting, or refuse it."""
         pid, uid = peers.credentials(connection.stream.socket)
-        # Other users may connect only if the mode of the socket allows it.
+        # Other users may connect only if the socket's mode allows it.
         if uid not in {os.getuid(), 0} and not self._listener.mode & 0o066:
             words = f"this server is uid {os.getuid()}'s; it would have to be started with --socket-mode"
             refusal = {"talk": PROTOCOL, "error": "permission_denied", "message": words}
@@ -248,7 +250,7 @@ class Server:
         connection.close_with(refusal)
 
     def left(self, connection: ClientConnection) -> None:
-        """Remove a client, and admit a waiting client in its place. The goals of the removed client continue."""
+        """Remove a client, and admit the next waiting one. The goals of the removed client continue."""
         self.connections.discard(connection)
         if not self.connections:
             self._no_clients.set()
@@ -260,7 +262,7 @@ class Server:
     # -- the status
 
     def _describe(self) -> JsonObject:
-        """Return the description of the server that `status` shows."""
+        """Return the description of the server for the reply to `status`."""
         speech, settings, scheduler, ready = self.speech, self._settings, self._scheduler, self.speech.ready
         started_at, since = self._started_at
         return {
@@ -286,16 +288,20 @@ class Server:
             "max_clients": settings.max_clients,
         }
 
-    # -- the end
+    # -- shutdown
 
     def _end(self, fatal: TalkError | None = None) -> None:
-        """End all goals, and then the server. `fatal` is the error that makes the server end, if any."""
+        """End all goals and then shut down.
+
+        Args:
+            fatal: the error that caused the shutdown, if any.
+        """
         self._fatal_error = fatal or self._fatal_error
         self._systemd.notify_stopping()
         self._requests.shut_down()
 
     async def _close_connections(self) -> None:
-        """Close all connections, after a short time in which clients can read their last answers."""
+        """Close all connections, after giving clients a short time to read their last replies."""
         for connection in list(self.connections):
             connection.stream.close()
         with contextlib.suppress(asyncio.TimeoutError):
@@ -306,18 +312,18 @@ class Server:
     def _on_signal(self, number: signal.Signals) -> None:
         log.write(f"{signal.Signals(number).name}: ending")
         for each in self._end_signals:
-            # A second signal ends the server immediately. The event loop may be busy, so it doesn't handle the signal.
+            # A second signal ends the server immediately, without the event loop, which may be busy.
             signal.signal(each, self._on_second_signal)
         self._end()
 
     def _on_second_signal(self, number: int, _: object) -> None:
-        """Exit immediately. The engine process notices it and exits, too."""
+        """Exit immediately. The engine process notices this and exits, too."""
         with contextlib.suppress(OSError):
             self._listener.close()
         os._exit(EXIT_SIGNAL + number)
 
 
 def _random_boot_id() -> str:
-    """Return the first four characters of this server's goal ids. `is_clients_id` describes the form of such an id."""
+    """Return a random prefix of four characters for the ids of this server's goals."""
     choice = random.SystemRandom().choice
     return "".join(choice(each) for each in (string.digits, string.ascii_lowercase) * 2)

@@ -1,7 +1,7 @@
-"""Carries out the scheduler's effects, and passes the engine's reports to the scheduler.
+"""Connects the scheduler with the engine.
 
-All of it runs in the event loop's thread and never blocks. The scheduler makes the decisions, the engine thread speaks,
-and `subscribers` publishes the events. A timer in this module calls the scheduler's `tick` at its `deadline`.
+Everything runs in the event loop's thread and never blocks. The scheduler makes the decisions, the engine thread
+speaks, and `subscribers` publishes the events. A timer in this module calls the scheduler's `tick` at its `deadline`.
 """
 
 from __future__ import annotations
@@ -38,27 +38,26 @@ if TYPE_CHECKING:
     from talkcli.goals.scheduler import Scheduler
     from talkcli.server.connection import WaitingList
 
-#: A clock that keeps running while the machine is suspended. Linux has a special clock for this, because its monotonic
-#: clock stops.
+#: A clock that keeps running while the machine is suspended. On Linux, the usual monotonic clock stops.
 _CLOCK = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
-#: How often to compare the clock with the deadline. The event loop's own timers stop while the machine is suspended.
+#: How often to check whether the deadline has passed. The event loop's own timers stop while the machine is suspended.
 CLOCK_CHECK_S = 1.0
-#: Status of an engine that accepts goals.
+#: Status of an engine that is ready to speak.
 READY = "ready"
-#: Reports of the engine that are processed in one turn of the event loop. Publishing this number of words to fifty
-#: watchers takes 10 to 20 ms on a busy machine.
+#: Maximum number of the engine's reports to process at once. Publishing this many words to fifty watchers takes 10 to
+#: 20 ms on a busy machine.
 REPORTS_PER_TURN = 8
 
 require_fields(protocol.Speak, ENGINE_OPTIONS)
 
 
 def elapsed() -> float:
-    """Return the time in seconds of a clock that is never set and keeps running while the machine is suspended."""
+    """Return a monotonic time in seconds, which includes the time that the machine was suspended."""
     return time.clock_gettime(_CLOCK)
 
 
 class Speech:
-    """The goals of one server, and the engine that speaks them."""
+    """Manages the goals of a server and the engine that speaks them."""
 
     def __init__(self, scheduler: Scheduler, player_options: Sequence[str] = ()) -> None:
         """Start without an engine.
@@ -69,45 +68,45 @@ class Speech:
         """
         self.scheduler = scheduler
         self._player_options = player_options
-        #: the engine thread, set before the first client connects
+        #: the supervisor of the engine, set before the first client connects
         self.engine: Supervisor
-        #: called if `status_words` may have changed
+        #: called when `status_words` may have changed
         self.on_status_change: Callable[[], None] = lambda: None
-        #: called after a goal was added to the queue or removed from it
+        #: called when a goal was added to the queue or removed from it
         self.on_queue_change: Callable[[], None] = lambda: None
-        #: called with the error if nothing can be spoken any more
+        #: called with an error when nothing can be spoken any more
         self.on_failure: Callable[[TalkError], None] = lambda _: None
-        #: set when all goals have ended after `shut_down`
+        #: set after a shutdown, when all goals have ended
         self.finished = asyncio.Event()
-        #: the latest description that an engine gave of itself, or None before the first engine is ready
+        #: the latest engine's description of itself, or None before the first engine is ready
         self.ready: protocol.Ready | None = None
         self.voices = VoiceCatalog()
-        #: requests that wait for the engine to list its voices or fail
+        #: requests that are waiting for the engine's list of voices
         self.waiting_for_voices: WaitingList = {}
-        #: goals that wait for room in the queue
+        #: goals that are waiting for room in the queue
         self.waiting_for_room: WaitingList = {}
         #: human-readable status of the engine
         self.engine_status = "starting"
-        #: set when an engine is ready or can't be started at all, and when the server shuts down
+        #: set when an engine is ready or can't be started, and when the server shuts down
         self.engine_known = asyncio.Event()
         self._loop = asyncio.get_running_loop()
         self.subscribers = Subscribers(self._loop, lambda: (each.connection for each in self.waiting_for_room))
         self.streams = ClientStreams(self._loop)
         self.notifications = Notifications(self.streams)
         self._timer: asyncio.TimerHandle | None = None
-        #: requests that wait until a goal is silent or its end has been published
+        #: requests that are waiting for a goal to become silent or to end
         self._waiting_for_silence: dict[Record, WaitingList] = {}
-        #: the paused goal, if the engine has confirmed its silence
+        #: the paused goal, if the engine has confirmed that it is silent
         self.silent_goal: Record | None = None
-        #: reports from the engine thread that have not been processed
+        #: unprocessed reports from the engine thread
         self._reports: deque[Report] = deque()
-        #: whether the event loop was woken to process reports; waking it takes as long as processing a report
+        #: whether the event loop has been woken to process reports, which is too slow to do for each report
         self._reports_due = False
-        #: the latest announcement to the engine: whether a goal follows the active one, and whether its voice is neural
+        #: what the engine was last told: whether another goal follows, and whether its voice is neural
         self._announced_next = False, False
 
     def status_words(self) -> str:
-        """Return a short human-readable status. It doesn't contain texts of goals, because every user may read it."""
+        """Return a short status message. It contains no texts of goals, because every user can read it."""
         scheduler, ready = self.scheduler, self.ready
         if self.engine_status != READY:
             doing = f"engine: {self.engine_status}"
@@ -121,17 +120,17 @@ class Speech:
 
     @property
     def awaits_voices(self) -> bool:
-        """Whether the engine has not listed its voices yet, but is expected to."""
+        """Whether the engine is still expected to list its voices."""
         return self.voices.listed is None and self.engine_status in {"starting", READY}
 
     def waiting_for_silence(self, record: Record) -> WaitingList:
-        """Return the list of requests that wait until this goal is silent, resumed or ended."""
+        """Return the requests that wait for this goal to become silent, to continue or to end."""
         return self._waiting_for_silence.setdefault(record, {})
 
     # -- the scheduler's effects
 
     def now(self) -> Now:
-        """Do everything that is due, and return the current time."""
+        """Handle all time limits that have been reached, and return the current time."""
         now = self._now()
         deadline = self.scheduler.deadline()
         if deadline is not None and deadline <= now.monotonic:
@@ -143,7 +142,7 @@ class Speech:
         return Now(elapsed(), time.time())
 
     def apply(self, effects: list[Effect]) -> None:
-        """Carry out the scheduler's effects. The engine gets its orders first, because it can work meanwhile."""
+        """Carry out the scheduler's effects. The engine gets its orders first, so that it can start working."""
         changes, queue_changed, at = [], False, time.time()
         for effect in effects:
             if isinstance(effect, StateChange):
@@ -194,7 +193,7 @@ class Speech:
             if why := self.scheduler.voices.failure(without_speaker(options["voice"])):
                 self.report(protocol.Ended(record.id, protocol.OUTCOME_FAILED, Reason.VOICE_FAILED, why))
                 return
-            options["pitch"] = INITIAL.pitch  # a neural voice has no other pitch
+            options["pitch"] = INITIAL.pitch  # neural voices don't support other pitches
         self.engine.speak(
             protocol.Speak(
                 record.id, record.text or "", next_waits=next_waits, next_is_neural=next_is_neural, **options
@@ -202,14 +201,14 @@ class Speech:
         )
 
     def _announce_next(self) -> None:
-        """Tell the engine whether a goal follows the active one, so that it can prepare for the change."""
+        """Tell the engine whether another goal follows the active one, so that it can prepare for it."""
         active, following = self.scheduler.active, self._following()
         if active and following != self._announced_next:
             self._announced_next = following
             self.engine.announce_next(active.id, *following)
 
     def _following(self) -> tuple[bool, bool]:
-        """Return whether a goal is pending, and whether the next goal has a neural voice."""
+        """Return whether there is a next goal, and whether its voice is neural."""
         following = next(self.scheduler.pending(), None)
         return following is not None, following is not None and is_neural(self.scheduler.wanted_voice(following))
 
@@ -234,19 +233,19 @@ class Speech:
     # -- reports from the engine
 
     def report(self, report: Report) -> None:
-        """Queue a report from the engine thread. This method may be called in any thread.
+        """Queue a report from the engine thread. This method is thread-safe.
 
-        Only a few reports are processed in one turn of the event loop, so that a sentence of many words doesn't delay
-        other clients.
+        Only a few reports are processed in one iteration of the event loop, so that a sentence of many words doesn't
+        delay other clients.
         """
         self._reports.append(report)
         if not self._reports_due:
             self._reports_due = True
-            with contextlib.suppress(RuntimeError):  # raised if the loop is closed
+            with contextlib.suppress(RuntimeError):  # raised if the event loop is closed
                 self._loop.call_soon_threadsafe(self._process_reports)
 
     def _process_reports(self) -> None:
-        # This comes first, so that a report that arrives after the queue was found empty wakes the loop again.
+        # Reset this first, so that a report that arrives during the loop below wakes the event loop again.
         self._reports_due = False
         for _ in range(REPORTS_PER_TURN):
             if not self._reports:
@@ -260,10 +259,10 @@ class Speech:
         self._loop.call_soon(self._process_reports)
 
     def _process_report(self, report: Report) -> None:
-        """Pass one report to the scheduler."""
+        """Process one report from the engine."""
         now, active = self.now(), self.scheduler.active
         if isinstance(report, protocol.GoalEvent):
-            if active and active.id == report.id:  # ignore reports about a goal that was given up
+            if active and active.id == report.id:  # ignore reports about a goal that is no longer active
                 self._process_goal_event(report, active, now)
         elif not self._process_voice_event(report, now):
             self._process_engine_event(report, now)
@@ -289,7 +288,7 @@ class Speech:
                     resume_all(self.waiting_for_silence(active))
 
     def _process_voice_event(self, event: Report, now: Now) -> bool:
-        """Process an event about voices. Return False for every other event."""
+        """Process an event about voices. Return False if the event is about something else."""
         scheduler = self.scheduler
         match event:
             case protocol.VoiceList():
@@ -321,7 +320,7 @@ class Speech:
             case EngineMissing():
                 self.apply(self.scheduler.fail_next(event.message, now))
             case ThreadDied():
-                # Nothing can be spoken any more, so the server ends. A service manager may start another one.
+                # Nothing can be spoken any more, so shut down. A service manager may restart the server.
                 self._engine_failed(event.message)
                 self.on_failure(TalkError(event.message))
                 if active := self.scheduler.active:
@@ -329,7 +328,7 @@ class Speech:
 
     def _goal_ended(self, ended: protocol.Ended, active: Record, now: Now) -> None:
         scheduler = self.scheduler
-        if self.ready and ended.player:  # `status` shows the player that was used
+        if self.ready and ended.player:  # let `status` show the player that was used
             self.ready = replace(self.ready, player=ended.player)
         if ended.outcome == protocol.OUTCOME_COMPLETED:
             effects = scheduler.completed(ended.id, ended.duration, now, ended.gaps, ended.gap_seconds)
@@ -365,14 +364,14 @@ class Speech:
         resume_all(self.waiting_for_voices)
         self.on_status_change()
 
-    # -- the end
+    # -- shutdown
 
     def shut_down(self) -> None:
-        """End all goals, and reject every new goal."""
+        """End all goals and reject new ones."""
         self.engine_known.set()
         self.apply(self.scheduler.shutdown(self._now()))
 
     def check_finished(self) -> None:
-        """After a shutdown, set `finished` if all goals have ended and all notifications were sent."""
+        """After a shutdown, set `finished` when all goals have ended and all notifications were sent."""
         if self.scheduler.closing and self.scheduler.active is None and self.notifications.done:
             self.finished.set()

@@ -236,7 +236,7 @@ class ClientStream:
             self.congested = False
             self._receiver.resume_writing()
 
-    # -- the end
+    # -- closing
 
     def abort(self, error: OSError | None = None) -> None:
         """Close the stream immediately and drop its output.
@@ -303,7 +303,7 @@ class Acceptor:
         self._retry: asyncio.TimerHandle | None = None
 
     def open(self, listening: socket.socket) -> None:
-        """Accept connections on this socket, and no longer on an earlier one."""
+        """Start accepting connections on this socket instead of an earlier one."""
         self.close()
         self._listening = listening
         self._loop.add_reader(listening, self._accept, listening)

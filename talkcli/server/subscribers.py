@@ -25,19 +25,19 @@ if TYPE_CHECKING:
     from talkcli.server.connection import ClientConnection, PendingRequest
     from talkcli.server.stream import ClientStreams
 
-#: Interval of keep-alive messages. A client considers a server dead after three missing messages.
+#: Interval between keep-alive messages. Clients consider a server dead if three of them are missing.
 CLIENT_ALIVE_INTERVAL_S = 5.0
 
-#: Notifications in one turn of the event loop. They take three milliseconds.
+#: Maximum number of notifications in one iteration of the event loop. They take three milliseconds.
 _MAX_PER_TURN = 64
-#: If the notifications of one turn cause more unread output than this, clients get time to read.
+#: If one iteration adds more unread output than this, the server waits for clients to read.
 _UNREAD_LIMIT_BYTES = 1024 * 1024
-#: Longest time that clients get to read.
+#: Maximum time to wait for clients to read.
 _READ_TIME_S = 0.05
-#: Interval of checks whether clients have read.
+#: How often to check whether clients have read their output.
 _READ_CHECK_S = 0.002
-#: The time to read is multiplied by this factor each time that clients don't read. All these times add up to 0.8 s, so
-#: that a cancel is answered within 2 s even if no client reads.
+#: Factor that shortens the wait each time that clients don't read. All waits add up to 0.8 s, so that a cancel is
+#: answered within 2 s even if no client reads.
 _READ_TIME_FACTOR = 0.94
 
 
@@ -47,7 +47,7 @@ class Subscribers:
     def __init__(
         self, loop: asyncio.AbstractEventLoop, waiting_for_room: Callable[[], Iterable[ClientConnection]]
     ) -> None:
-        """Start with no connections.
+        """Start with no subscribers.
 
         Args:
             loop: the event loop.
@@ -56,7 +56,7 @@ class Subscribers:
         """
         self._loop = loop
         self._waiting_for_room = waiting_for_room
-        #: sequence numbers of events, by which watchers notice dropped feedback
+        #: event numbers, which let watchers detect dropped feedback
         self._numbers = count(1)
         #: the connections that wait for each goal, and whether they want feedback
         self._waiters: dict[str, dict[ClientConnection, bool]] = {}
@@ -64,7 +64,10 @@ class Subscribers:
         self._alive_timer: asyncio.TimerHandle | None = None
 
     def await_result(self, goal_id: str, connection: ClientConnection, *, feedback: bool = False) -> None:
-        """Subscribe a connection to the states and the result of a goal, and with `feedback` also to its words."""
+        """Subscribe a connection to the states and the result of a goal.
+
+        With `feedback`, the connection also receives the words of the goal.
+        """
         waiting = self._waiters.setdefault(goal_id, {})
         waiting[connection] = waiting.get(connection, False) or feedback
         self.keep_alive()
@@ -75,11 +78,11 @@ class Subscribers:
         self.keep_alive()
 
     def is_subscribed(self, connection: ClientConnection) -> bool:
-        """Return whether a connection waits for a goal or watches."""
+        """Return whether a connection is subscribed to any events."""
         return connection in self._watchers or any(connection in each for each in self._waiters.values())
 
     def left(self, connection: ClientConnection) -> None:
-        """Remove a connection that has ended."""
+        """Unsubscribe a connection that was closed."""
         self._watchers.pop(connection, None)
         for waiting in self._waiters.values():
             waiting.pop(connection, None)
@@ -88,34 +91,40 @@ class Subscribers:
         """Publish a goal's new state, and its result if it has ended."""
         event = StateChanged(record.id, state, at, next(self._numbers))
         if self._watchers:
-            # The events of the first and the last state contain the whole goal.
+            # The first and the last event of a goal contain the whole goal.
             whole = record.snapshot(state) if state is State.PENDING or state.terminal else None
             _publish(replace(event, goal=whole).to_json(), self._watchers)
         if not state.terminal:
             _publish(event.to_json(), self._waiters.get(record.id, ()))
         elif record.id in self._waiters:
-            # Encode the lines only once, because a thousand clients may wait for the goal.
+            # Encode the lines only once, because a thousand clients may be waiting for the goal.
             lines = encode(event.to_json()) + encode(Result(record.snapshot()).to_json())
             for connection in self._waiters.pop(record.id):
                 connection.publish(lines)
 
     def word_heard(self, word: Word, text: str, at: float) -> None:
-        """Publish that a word is being heard. `text` is the spelling of the word."""
+        """Publish that a word is being spoken.
+
+        Args:
+            word: the engine's event.
+            text: the word as it is written in the goal's text.
+            at: the time, in seconds since 1970 UTC.
+        """
         event = WordHeard(word.id, text, word.start, word.end, word.number, word.time, at, next(self._numbers))
         _publish(event.to_json(), self._listeners([self._waiters.get(word.id, {})]), feedback=True)
 
     def paused_changed(self, held_id: str | None, *, paused: bool, by: By, at: float) -> None:
-        """Publish that speech was paused or resumed. `held_id` is the id of the paused or resumed goal, if any."""
+        """Publish that speech was paused or resumed. `held_id` is the id of the affected goal, if any."""
         event = PausedChanged(paused, held_id, by, at, next(self._numbers))
         _publish(event.to_json(), self._listeners(self._waiters.values()))
 
     def keep_alive(self) -> None:
-        """Schedule keep-alive messages for all connections that wait or watch."""
+        """Schedule the next keep-alive messages, unless they are scheduled already."""
         if self._alive_timer is None:
             self._alive_timer = self._loop.call_later(CLIENT_ALIVE_INTERVAL_S, self._send_alive)
 
     def _listeners(self, waiting: Iterable[dict[ClientConnection, bool]]) -> dict[ClientConnection, None]:
-        """Return the watchers and the waiting connections that want feedback, without duplicates."""
+        """Return all watchers, and the waiting connections that want feedback."""
         listeners = dict(self._watchers)
         for each in waiting:
             listeners.update((connection, None) for connection, feedback in each.items() if feedback)
@@ -131,7 +140,7 @@ class Subscribers:
 
 def _publish(event: JsonObject, connections: Iterable[ClientConnection], *, feedback: bool = False) -> None:
     receivers = list(connections)
-    line = encode(event) if receivers else b""  # usually, nobody receives the words
+    line = encode(event) if receivers else b""  # usually, there are no receivers
     for connection in receivers:
         connection.publish(line, feedback=feedback)
 
@@ -139,8 +148,8 @@ def _publish(event: JsonObject, connections: Iterable[ClientConnection], *, feed
 class Notifications:
     """A queue of functions that notify clients.
 
-    Usually, they are called immediately. If there are many, only some are called in each turn of the event loop, so
-    that the server can do other work and the clients have time to read.
+    Usually, the functions are called immediately. If there are many, only some are called in each iteration of the
+    event loop, so that the server can do other work and the clients have time to read.
     """
 
     def __init__(self, streams: ClientStreams) -> None:
@@ -157,7 +166,7 @@ class Notifications:
         return not self._pending
 
     def add(self, notifications: Iterable[Callable[[], None]]) -> None:
-        """Add functions to the queue. If a notification itself adds functions, these are called immediately."""
+        """Add functions to the queue. If one of them adds more functions, those are called immediately."""
         if self._working:
             for each in notifications:
                 self._call(each)
@@ -167,13 +176,17 @@ class Notifications:
             self._work(self._streams.unread_bytes)
 
     async def wait_done(self, request: PendingRequest) -> None:
-        """Wait until all functions that are in the queue now have been called."""
+        """Wait until all functions that are now in the queue have been called."""
         if self._pending:
             self._pending.append(request.resume)
             await request.wait({})
 
     def _work(self, unread_before: int) -> None:
-        """Call as many functions as allowed in one turn. `unread_before` is the clients' earlier unread output."""
+        """Call functions from the queue, up to the limit for one iteration of the event loop.
+
+        Args:
+            unread_before: the size of the unread output before the first call.
+        """
         self._turn = None
         self._working = True
         for _ in range(min(_MAX_PER_TURN, len(self._pending))):
@@ -190,7 +203,7 @@ class Notifications:
             self._turn = self._loop.call_soon(self._work, min(unread_before, self._streams.unread_bytes))
 
     def _await_readers(self, unread_before: int, until: float) -> None:
-        """Continue after the clients have read the new output, or at the time `until` even if they have not."""
+        """Continue when the clients have read the new output, or at the time `until` at the latest."""
         if self._streams.unread_bytes <= unread_before:
             self._work(unread_before)
         elif self._loop.time() < until:
