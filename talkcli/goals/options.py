@@ -149,9 +149,9 @@ class Setting:
     serve_help: str = ""
     #: flags of `talk set` and `talk serve`, if they differ from `talk say`
     flags: str = ""
-    #: format string that describes the value to the user
+    #: format string for showing the value in a sentence
     words: str = ""
-    #: description to use if there is no value
+    #: text to show if there is no value
     none_words: str = ""
 
 

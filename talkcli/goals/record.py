@@ -32,7 +32,7 @@ class Record:
     """
 
     id: str
-    #: position in the order of submission
+    #: number of the goal in the order of submission
     number: int
     #: the client's request; if it has no time to live, the server's default is filled in
     say: Say

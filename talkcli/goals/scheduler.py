@@ -133,7 +133,7 @@ class Scheduler:
         self.max_text = max_text
         self.history = History()
         self.voices = voices or VoiceScheduler()
-        #: the current goal, which is ACTIVE or PREEMPTING, or None
+        #: the goal that is being spoken or stopped, or None
         self.active: Record | None = None
         #: whether speech is paused
         self.paused = False
