@@ -117,6 +117,10 @@ class Robot:
             assert time.monotonic() < limit, f"it never came: {self.server.log}"
             time.sleep(0.02)
 
+    def until_crashed(self, times: int) -> None:
+        """Wait until the server has logged this number of engine crashes."""
+        self.until(lambda: self.server.log.count("the engine crashed") == times)
+
     def loads(self, voice: str = TINY) -> None:
         """Wait until a voice is loaded."""
         self.until(lambda: self.neural(voice)["state"] == "loaded")
@@ -285,10 +289,10 @@ def test_an_engine_that_dies_costs_one_goal_and_loads_its_voice_again(env: dict[
 def test_a_voice_that_kills_the_engine_twice_is_left_alone(env: dict[str, str], hold: Path) -> None:
     why = "the engine process ended while it was being loaded"
     with _robot(env, "--voice", TINY) as robot:
-        for _ in range(2):
+        for crashes in (1, 2):
             robot.until(lambda: robot.neural()["state"] == "loading")
             robot.kill_engine()
-            robot.until(lambda: robot.neural()["state"] != "loading")
+            robot.until_crashed(crashes)
         robot.until(lambda: robot.neural()["state"] == "failed")
         assert robot.neural()["why"] == why
         ended = robot.say("hello", None, voice_only=True).wait(LIMIT)
