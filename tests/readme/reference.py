@@ -40,7 +40,7 @@ def requests() -> str:
     """Return the table of requests and their fields."""
     lines = ["| request | field | type | default | meaning |\n| --- | --- | --- | --- | --- |\n"]
     for kind, request in REQUEST_TYPES.items():
-        meaning = re.split(r"\.(?:\s|$)", getattr(request, "meaning", request.__doc__) or "")[0]
+        meaning = request.meaning.removesuffix(".")
         lines.append(f"| `{kind}` | | | | {meaning[0].lower()}{meaning[1:]} |\n")
         lines += [_field(each, changes=request is Set) for each in request.options]
     return "".join(lines)
