@@ -86,6 +86,7 @@ def test_each_usual_place_is_described(home: str) -> None:
     check("a file, and no socket", f"remove {path}, and: talk serve")
 
 
+@pytest.mark.usefixtures("nobody_serves")
 def test_a_named_place_that_is_no_socket_is_told(home: str) -> None:
     found = no_server(f"{home}/run")
     assert f"{home}/run: a directory, and" in found.message
@@ -96,6 +97,7 @@ def test_a_named_place_that_is_no_socket_is_told(home: str) -> None:
     assert found.next == "unset TALK_SOCKET, or name a socket"
 
 
+@pytest.mark.usefixtures("nobody_serves")
 @pytest.mark.parametrize(
     ("greeting", "words", "step"),
     [
@@ -111,6 +113,7 @@ def test_a_process_that_answers_and_takes_no_client_is_named(home: str, greeting
     assert step in str(found.next)
 
 
+@pytest.mark.usefixtures("nobody_serves")
 def test_a_server_that_is_stopped_or_full_is_named(make_talk: MakeTalk, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server, "SocketConnection", partial(SocketConnection, patience=0.5))
     talk = make_talk("--max-clients", "1", scripted=True, watched=False)
@@ -124,6 +127,7 @@ def test_a_server_that_is_stopped_or_full_is_named(make_talk: MakeTalk, monkeypa
     assert found.next == f"let it go on: kill -CONT {talk.pid}"
 
 
+@pytest.mark.usefixtures("nobody_serves")
 def test_a_wrong_variable_is_told_from_the_server_that_runs_elsewhere(home: str) -> None:
     os.chmod(f"{home}/run", 0o700)
     with serving(environment(home, XDG_RUNTIME_DIR=f"{home}/run")):
