@@ -13,18 +13,7 @@ from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import format_number
 from talkcli.goals.states import State
 from talkcli.protocol.lines import encode
-from talkcli.terminal.text import (
-    COLUMN_GAP,
-    MAX_ID_COLUMNS,
-    Screen,
-    cut,
-    fit_columns,
-    max_id_columns,
-    pad,
-    printable,
-    width,
-    wrap,
-)
+from talkcli.terminal.text import COLUMN_GAP, Screen, fit_columns, pad, printable, width, wrap
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -145,8 +134,7 @@ def status_lines(status: ServerStatus, screen: Screen, now: float) -> list[str]:
         lines.append(f"{_label('paused')}{screen.coloured('speech is held', State.PREEMPTING)}: talk resume")
     active = [status.active] if status.active else []
     tables = (("now", active, "silent"), ("queue", status.pending, "nothing"), ("said", status.recent, "nothing"))
-    widest = max((width(printable(goal.id)) for _, goals, _ in tables for goal in goals), default=0)
-    id_columns = min(widest, max_id_columns(screen) or MAX_ID_COLUMNS)
+    id_columns = max((width(screen.fit_name(goal.id)) for _, goals, _ in tables for goal in goals), default=0)
     for label, goals, without in tables:
         lines += _goal_table(label, goals, id_columns, screen, now) if goals else [_label(label) + without]
     return lines
@@ -192,16 +180,13 @@ def _goal_table(label: str, goals: Sequence[Goal], id_columns: int, screen: Scre
     ]
     tails = [_tail_forms(goal, now) for goal in goals]
     texts = [quoted_text(goal, _LISTED_TEXT_CHARS) for goal in goals]
-    columns = screen.columns_left(max(map(width, heads)))
-    if columns is None:
-        return [COLUMN_GAP.join([head + text, *tail[:1]]) for head, text, tail in zip(heads, texts, tails, strict=True)]
-    fitted = fit_columns(texts, [tail or [""] for tail in tails], weights=(1, 1), columns=columns)
+    fitted = fit_columns(texts, tails, weights=(1, 1), columns=screen.columns_left(max(map(width, heads))))
     return [head + words for head, words in zip(heads, fitted, strict=True)]
 
 
 def _head_columns(goal: Goal, id_columns: int, screen: Screen) -> str:
     """Return the columns before a goal's text: its end time, id and state."""
-    goal_id = pad(cut(printable(goal.id), max_id_columns(screen)), id_columns)
+    goal_id = pad(screen.fit_name(goal.id), id_columns)
     head = f"{goal_id}{COLUMN_GAP}{screen.coloured(pad(goal.state.name, 9), goal.state)}{COLUMN_GAP}"
     return f"{clock_time(goal.ended_at)}{COLUMN_GAP}{head}" if goal.state.terminal else head
 
@@ -209,7 +194,7 @@ def _head_columns(goal: Goal, id_columns: int, screen: Screen) -> str:
 def _tail_forms(goal: Goal, now: float) -> list[str]:
     """Return alternative texts for the last column of a goal's line, longest first."""
     if goal.state.terminal:
-        return _muted_note(goal) if goal.state is State.SUCCEEDED else reason_forms(goal)
+        return (_muted_note(goal) or [""]) if goal.state is State.SUCCEEDED else reason_forms(goal)
     # The sender comes first, because text that doesn't fit is cut off at the end.
     return [", ".join([f"from {each}", *_unfinished_details(goal, now)]) for each in sender_forms(goal.client)]
 

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 #: The space between two columns of a table.
 COLUMN_GAP = "  "
-#: The maximum width of an id column. An id can have 64 characters, which would leave no room for the text.
-MAX_ID_COLUMNS = 20
+#: The room for an id on a narrow terminal. An id can have 64 characters, which would leave no room for the text.
+_MIN_ID_COLUMNS = 20
 #: The minimum width to assume for a terminal, because shorter lines would be useless.
 MIN_COLUMNS = 40
 #: Marks the place where text was cut off.
@@ -61,6 +61,17 @@ class Screen:
     def columns_left(self, taken: int) -> int | None:
         """Return how many columns remain if `taken` columns are used, or None if there is no limit."""
         return None if self.width is None else max(self.width, MIN_COLUMNS) - taken
+
+    def fit_name(self, name: str, room: int = _MIN_ID_COLUMNS, share: int = 4) -> str:
+        """Escape a name or an id, and cut it so that it leaves room for other columns.
+
+        Args:
+            name: the name or the id.
+            room: the number of columns that it may always have.
+            share: it may also have this fraction of the line. For example, 4 stands for a quarter.
+        """
+        columns = self.columns_left(0)
+        return cut(printable(name), None if columns is None else max(room, columns // share))
 
     def coloured(self, text: str, state: State | None) -> str:
         """Return the text in the colour of a state, or in bold if the state is None."""
@@ -112,12 +123,6 @@ def shorten(text: str, columns: int | None) -> str:
     return f'"{cut(text[1:-1], columns - 2)}"'
 
 
-def max_id_columns(screen: Screen) -> int | None:
-    """Return the maximum width of an id on this screen, or None if there is no limit."""
-    columns = screen.columns_left(0)
-    return None if columns is None else max(MAX_ID_COLUMNS, columns // 4)
-
-
 def pad(text: str, columns: int) -> str:
     """Pad a text with spaces to this many columns."""
     return text + " " * (columns - width(text))
@@ -147,7 +152,11 @@ def share_columns(wanted: Sequence[int], weights: Sequence[int], columns: int) -
 
 
 def fit_columns(
-    texts: Sequence[str], *others: Sequence[Sequence[str]], weights: Sequence[int], columns: int
+    texts: Sequence[str],
+    *others: Sequence[Sequence[str]],
+    weights: Sequence[int],
+    columns: int | None,
+    min_columns: int = 0,
 ) -> list[str]:
     """Format a table so that each row fits into this many columns.
 
@@ -155,8 +164,12 @@ def fit_columns(
         texts: the cells of the first column.
         others: the other columns. Each cell is a list of possible texts, longest first.
         weights: the share of each column. Space that the other columns don't need goes to the first column.
-        columns: the width of the whole table.
+        columns: the width of the whole table. If it is None, nothing is cut.
+        min_columns: the minimum width of each column if nothing is cut. A longer text moves the columns after it.
     """
+    if columns is None:
+        rows = zip(texts, *([forms[0] for forms in column] for column in others), strict=True)
+        return [COLUMN_GAP.join(pad(cell, min_columns) for cell in row).rstrip() for row in rows]
     columns -= len(COLUMN_GAP) * len(others)
     longest = [max(map(width, texts)), *(max(width(forms[0]) for forms in column) for column in others)]
     shares = share_columns(longest, weights, columns)[1:]

@@ -12,19 +12,7 @@ from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
 from talkcli.protocol.events import PausedChanged, Snapshot, StateChanged, WordHeard, unfinished
 from talkcli.terminal.goals import clock_time, quoted_text, reason_forms, sender_forms
-from talkcli.terminal.text import (
-    COLUMN_GAP,
-    MAX_ID_COLUMNS,
-    Screen,
-    cut,
-    fit_columns,
-    longest_fitting,
-    max_id_columns,
-    pad,
-    printable,
-    shorten,
-    width,
-)
+from talkcli.terminal.text import COLUMN_GAP, Screen, cut, fit_columns, longest_fitting, pad, printable, shorten, width
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -36,10 +24,10 @@ if TYPE_CHECKING:
 _TEXT_COLUMNS = 40
 #: The minimum width of the text if a long reason is shown beside it.
 _MIN_TEXT_COLUMNS = 16
-#: The initial width of the id column, which is enough for the ids of a server's first 999 goals.
-_FIRST_ID_COLUMNS = 8
-#: The initial width of the robot column.
-_FIRST_ROBOT_COLUMNS = 8
+#: The initial width of the robot and id columns, which is enough for the ids of a server's first 999 goals.
+_FIRST_NAME_COLUMNS = 8
+#: The width up to which the robot and id columns grow.
+_MAX_NAME_COLUMNS = 20
 #: The indentation of continuation lines, which is the width of the time column.
 _INDENT_COLUMNS = 10
 #: The maximum number of unfinished goals to remember. The oldest goal is dropped first.
@@ -53,24 +41,22 @@ class ColumnWidths:
     """
 
     def __init__(self) -> None:
-        self.ids = _FIRST_ID_COLUMNS
-        self.robots = _FIRST_ROBOT_COLUMNS
+        self._ids = self._robots = _FIRST_NAME_COLUMNS
 
     def robot(self, name: str, screen: Screen) -> str:
         """Pad a robot's name to the width of its column, which is widened if necessary.
 
         The name takes up at most a sixth of the terminal.
         """
-        columns = screen.columns_left(0)
-        shown = cut(printable(name), None if columns is None else max(_FIRST_ROBOT_COLUMNS, columns // 6))
-        self.robots = max(self.robots, min(width(shown), MAX_ID_COLUMNS))
-        return pad(shown, self.robots)
+        shown = screen.fit_name(name, _FIRST_NAME_COLUMNS, 6)
+        self._robots = max(self._robots, min(width(shown), _MAX_NAME_COLUMNS))
+        return pad(shown, self._robots)
 
     def goal_id(self, goal_id: str, screen: Screen) -> str:
         """Pad a goal id to the width of its column, which is widened if necessary."""
-        shown = cut(printable(goal_id), max_id_columns(screen))
-        self.ids = max(self.ids, min(width(shown), MAX_ID_COLUMNS))
-        return pad(shown, self.ids)
+        shown = screen.fit_name(goal_id)
+        self._ids = max(self._ids, min(width(shown), _MAX_NAME_COLUMNS))
+        return pad(shown, self._ids)
 
 
 class Transcript:
@@ -190,24 +176,16 @@ class Transcript:
 
 def log_lines(goals: Sequence[Goal], screen: Screen, now: float) -> list[str]:
     """Return one line for each ended goal. `now` is a Unix timestamp."""
+    if not goals:
+        return []
     today = time.localtime(now)[:3]
-    heads = [
-        (_log_time(goal.ended_at, today), goal.state.name, cut(printable(goal.id), max_id_columns(screen)))
-        for goal in goals
-    ]
-    widths = [max((width(head[column]) for head in heads), default=0) for column in range(3)]
+    heads = [(_log_time(goal.ended_at, today), goal.state.name, screen.fit_name(goal.id)) for goal in goals]
+    widths = [max(map(width, column)) for column in zip(*heads, strict=True)]
     texts = [quoted_text(goal) for goal in goals]
     senders = [sender_forms(goal.client) for goal in goals]
     reasons = [reason_forms(goal) for goal in goals]
     columns = screen.columns_left(sum(widths) + 3 * len(COLUMN_GAP))
-    if columns is None:
-        # Nothing is cut, so a long text moves the columns after it to the right.
-        details = [
-            COLUMN_GAP.join((pad(text, _TEXT_COLUMNS), pad(sender[0], _TEXT_COLUMNS), reason[0])).rstrip()
-            for text, sender, reason in zip(texts, senders, reasons, strict=True)
-        ]
-    else:
-        details = fit_columns(texts, senders, reasons, weights=(4, 2, 3), columns=columns) if goals else []
+    details = fit_columns(texts, senders, reasons, weights=(4, 2, 3), columns=columns, min_columns=_TEXT_COLUMNS)
     return [
         COLUMN_GAP.join(
             (f"{when:>{widths[0]}}", screen.coloured(pad(state, widths[1]), goal.state), pad(goal_id, widths[2]), words)

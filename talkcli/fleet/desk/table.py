@@ -9,7 +9,7 @@ from talkcli.fleet.payloads import LastGoal, Presence, RobotInfo, RobotStatus
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
 from talkcli.terminal.goals import clock_time
-from talkcli.terminal.text import COLUMN_GAP, Screen, cut, max_id_columns, pad, printable, shorten, width
+from talkcli.terminal.text import COLUMN_GAP, Screen, cut, pad, printable, shorten, width
 from talkcli.terminal.transcript import ColumnWidths, Transcript
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def _cells(robot: RobotInfo, screen: Screen, now: float) -> dict[str, Cell]:
     """Return the cells of a robot's row, by column name."""
     presence, status = robot.presence, robot.status or RobotStatus()
     cells = dict.fromkeys(COLUMN_NAMES, _EMPTY_CELL)
-    cells["ROBOT"] = cut(printable(presence.name), max_id_columns(screen)), None
+    cells["ROBOT"] = screen.fit_name(presence.name), None
     cells["ONLINE"] = ("yes", None) if presence.online else ("OFFLINE", State.LOST)
     if presence.online:
         version = _server_version(presence)
