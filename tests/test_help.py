@@ -93,7 +93,7 @@ def test_help_of_each_command_has_a_purpose_examples_options_and_exit_codes(name
     assert len(purpose) > 30
     for option in ("--socket PATH", "--json", "--quiet", "--help"):
         assert option in out.partition("Options of every command:")[2]
-    codes = command(name).row.exit_codes
+    codes = command(name).exit_codes
     assert 2 in codes
     assert codes.keys() <= ALL_EXIT_CODES.keys()
     assert re.findall(r"(?m)^  (\d\S*) +\S", out.partition("\nExit codes:\n")[2]) == [

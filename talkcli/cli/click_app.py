@@ -173,7 +173,8 @@ class ClickCommand(_HelpfulCommand):
 
     def __init__(self, row: Command) -> None:
         self.row = row
-        self.examples, self.exit_codes = row.examples, row.exit_codes
+        self.examples = row.examples
+        self.exit_codes = {1: "anything not named here; a bug says so", **row.exit_codes}
         arguments: list[click.Parameter] = [_click_argument(row.argument)] if row.argument else []
         own, common = map(_click_option, row.options), [_click_option(each, common=True) for each in COMMON_OPTIONS]
         super().__init__(

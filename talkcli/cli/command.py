@@ -34,7 +34,6 @@ _SINGLE_ROBOT_OPTIONS = ("lines", "ahead", "feedback", "output")
 
 #: The exit codes shared by all commands that use a server. A command can override their descriptions.
 SERVER_EXIT_CODES: ExitCodes = {
-    1: "anything not named here; a bug says so",
     2: "usage: what is wrong stands on standard error",
     3: "no server: nothing was sent, so it is safe to try again",
     5: "the server has as many clients as it takes",
@@ -79,6 +78,7 @@ class Command:
     function: str
     #: example command lines, one per line
     examples: str
+    #: the meanings of the exit codes, except for 1 if it stands for any other error
     exit_codes: ExitCodes
     options: tuple[Option, ...] = ()
     #: the positional argument; it accepts any number of words if its metavar ends with "..."

@@ -10,23 +10,8 @@ import os
 
 from talkcli.cli.command import FILE_MODE, FLEET_EXIT_CODES, OUTPUT_FILE, SERVER_EXIT_CODES, Command, option, spelling
 from talkcli.frozen import TYPE_CHECKING, replace
-from talkcli.goals.options import (
-    FLAG,
-    ID,
-    IDS,
-    INTEGER,
-    MAX_LEAD_IN_MS,
-    MAX_LOG_GOALS,
-    MAX_TEXT_CHARS,
-    NUMBER,
-    OPTIONS,
-    SETTINGS,
-    SOUND_OPTIONS,
-    TEXT,
-    WORD,
-    Cancel,
-    Option,
-)
+from talkcli.goals import options as goal_options
+from talkcli.goals.options import FLAG, ID, IDS, INTEGER, MAX_LOG_GOALS, MAX_TEXT_CHARS, NUMBER, TEXT, WORD, Option
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -34,9 +19,6 @@ if TYPE_CHECKING:
 
 #: The maximum for --max-queue and for --ahead.
 MAX_QUEUED_GOALS = 10_000
-#: The systemd units that `talk serve` and `talk bridge` can print.
-SERVE_UNITS = ("user", "system", "user-socket", "system-socket")
-BRIDGE_UNITS = ("user", "system")
 #: The shells that `talk completion` supports.
 SHELLS = ("bash", "zsh", "fish")
 
@@ -46,14 +28,14 @@ def _timeout_option(words: str) -> Option:
     return option("-t, --timeout", NUMBER, words, limits=(0, None), excludes_minimum=True, metavar="SEC")
 
 
-def _print_unit_option(names: tuple[str, ...]) -> Option:
+def _print_unit_option(*names: str) -> Option:
     words = f"Print a systemd unit with these options, and end. One of {', '.join(names)}; it says where it goes."
     return option("--print-unit", TEXT, words, metavar="UNIT", choices=names)
 
 
 def _say_options() -> Iterator[Option]:
     """Yield the options of `say` in the order in which help lists them."""
-    for each in OPTIONS:
+    for each in goal_options.OPTIONS:
         if each.flags:
             yield replace(each, env="", help=f"{each.help}  [env var, with -o: {each.env}]") if each.env else each
         if each.name == "wait":
@@ -70,7 +52,7 @@ def _say_options() -> Iterator[Option]:
 
 _SAY_OPTIONS = tuple(_say_options())
 #: Options of `say` that can be combined with --output.
-_SERVERLESS_OPTIONS = {"timeout", "output", *(each.name for each in SOUND_OPTIONS)}
+_SERVERLESS_OPTIONS = {"timeout", "output", *(each.name for each in goal_options.SOUND_OPTIONS)}
 #: File extensions of audio formats other than WAV.
 _OTHER_EXTENSIONS = (".aac", ".aiff", ".au", ".flac", ".m4a", ".mp3", ".mp4", ".oga", ".ogg", ".opus", ".webm", ".wma")
 
@@ -100,7 +82,7 @@ def _say_rule(given: Mapping[str, Any], typed: frozenset[str]) -> str | None:
 
 
 _SERVE_OPTIONS = (
-    *(each.for_serve() for each in SETTINGS),
+    *(each.for_serve() for each in goal_options.SETTINGS),
     # At two seconds per sentence, 100 goals are more than three minutes of speech. Searching a queue of the maximum
     # length takes about a millisecond.
     option("--max-queue", INTEGER, "Goals that may wait.", default=100, limits=(1, MAX_QUEUED_GOALS)),
@@ -131,7 +113,7 @@ _SERVE_OPTIONS = (
         "Milliseconds of silence before a sentence; only where the output was idle: HDMI, USB and Bluetooth "
         "outputs fall asleep, and swallow what comes while they wake.",
         default=0,
-        limits=(0, MAX_LEAD_IN_MS),
+        limits=(0, goal_options.MAX_LEAD_IN_MS),
         metavar="MS",
     ),
     option("--audible", FLAG, "Abort every sentence whose output is muted."),
@@ -146,7 +128,7 @@ _SERVE_OPTIONS = (
     option("--driver", TEXT, "A driver of pyttsx3's. [default: the one for this system]", metavar="NAME"),
     option("--socket-mode", FILE_MODE, "Who may connect: the socket's file mode.", default="0600"),
     option("--greeting", TEXT, "A sentence to speak at the start."),
-    _print_unit_option(SERVE_UNITS),
+    _print_unit_option("user", "system", "user-socket", "system-socket"),
 )
 
 
@@ -171,7 +153,7 @@ _BRIDGE_OPTIONS = (
     ),
     option("--no-text", FLAG, "Leave what is said out of status and events."),
     option("--homeassistant", FLAG, "Be a device of Home Assistant's as well."),
-    _print_unit_option(BRIDGE_UNITS),
+    _print_unit_option("user", "system"),
     option("--print-acl", FLAG, "Print who may do what on the broker; for mosquitto's acl_file."),
 )
 
@@ -205,7 +187,6 @@ _ROWS = (
         """,
         exit_codes={
             0: "ended by SIGTERM or SIGINT; by a second one 128+n",
-            1: "anything not named here; a bug says so",
             2: "usage: an option or a voice that there isn't",
             11: "this socket is served already, or its directory is not safe",
         },
@@ -305,7 +286,7 @@ _ROWS = (
             0: "it is silent, or was already",
             8: "an ID is unknown; the others are cancelled all the same",
         },
-        options=tuple(each for each in Cancel.options if each.flags),
+        options=tuple(each for each in goal_options.Cancel.options if each.flags),
         argument=_GOAL_IDS,
         urgent=True,
     ),
@@ -416,7 +397,7 @@ _ROWS = (
             0: "changed, or printed",
             2: "usage: a value out of its range, or an unknown voice; nothing was changed",
         },
-        options=tuple(each.for_set() for each in SETTINGS),
+        options=tuple(each.for_set() for each in goal_options.SETTINGS),
     ),
     Command(
         name="voices",
@@ -471,7 +452,6 @@ _ROWS = (
         """,
         exit_codes={
             0: "a sentence would be heard; with --robot: the robot answers",
-            1: "anything not named here; a bug says so",
             2: "usage",
             4: "it would not, as without a server",
             "128+n": "ended by signal n",
@@ -500,7 +480,6 @@ _ROWS = (
         """,
         exit_codes={
             0: "ended by SIGTERM or SIGINT",
-            1: "anything not named here; a bug says so",
             2: "usage: a setting that is wrong or missing, or paho-mqtt is",
             11: "another bridge of this name is there already",
         },
@@ -529,7 +508,6 @@ _ROWS = (
         """,
         exit_codes={
             0: "shown",
-            1: "anything not named here; a bug says so",
             2: "usage: a setting that is wrong or missing, or paho-mqtt is",
             3: "no broker, or it knows no robot, or none of those that are meant",
             9: "the broker does not speak MQTT 5",
@@ -558,7 +536,6 @@ _ROWS = (
         """,
         exit_codes={
             0: "printed",
-            1: "anything not named here; a bug says so",
             2: "usage: a shell that there is no script for",
         },
         argument=Option("shell", WORD, metavar="SHELL", choices=SHELLS),
