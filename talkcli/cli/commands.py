@@ -177,7 +177,7 @@ _ROWS = (
         It queues sentences and speaks one at a time; its log is on standard error. For systemd it prints its own
         units.
         """,
-        function="serve:serve",
+        function="services:serve",
         plain=False,
         uses_server=False,
         examples="""
@@ -469,7 +469,7 @@ _ROWS = (
         TALK_BROKER names the broker: mqtts://HOST, or mqtt://HOST without TLS. Beside it are TALK_MQTT_USER and
         TALK_MQTT_PASSWORD_FILE, and for certificates TALK_MQTT_CA, TALK_MQTT_CERT and TALK_MQTT_KEY, all three files.
         """,
-        function="fleet:bridge",
+        function="services:bridge",
         plain=False,
         uses_server=False,
         examples="""

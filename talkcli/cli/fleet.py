@@ -1,4 +1,4 @@
-"""The commands `talk bridge`, which connects a robot to a broker, and `talk fleet`, which shows all robots."""
+"""The command `talk fleet`, which shows the robots of a fleet."""
 
 from __future__ import annotations
 
@@ -6,69 +6,18 @@ import time
 from typing import TYPE_CHECKING
 
 from talkcli import paths
-from talkcli.cli import units
-from talkcli.cli.command import nearest
-from talkcli.cli.show import note, screen, show, show_result
+from talkcli.cli.show import note, screen, show_result
 from talkcli.client.connect import ANSWER_LIMIT_S
-from talkcli.errors import EXIT_SIGPIPE, ServerUnavailable, UsageError
-from talkcli.fleet import topics
-from talkcli.fleet.bridge.policy import ALLOWABLE_REQUESTS
+from talkcli.errors import EXIT_SIGPIPE, ServerUnavailable
 from talkcli.fleet.desk.request import Selection
 from talkcli.fleet.desk.table import FleetTranscript, robot_lines
 from talkcli.fleet.payloads import Presence, RobotInfo
-from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from typing import Any
-
     from talkcli.cli.show import CommonOptions
     from talkcli.fleet.broker import Broker
     from talkcli.fleet.desk.watch import FleetEvent
     from talkcli.goals.goal import JsonObject
-
-
-def bridge(options: CommonOptions, print_unit: str | None, print_acl: bool, **given: Any) -> int:
-    """Run the bridge, or print its systemd unit or the broker's access rules. Return the exit code."""
-    _check_names("--name", [] if given["name"] is None else [given["name"]])
-    if print_acl:
-        show(topics.access_rules(homeassistant=given["homeassistant"], name=given["name"]))
-        return 0
-    groups, allow = _split_list(given["group"]), _split_list(given["allow"])
-    _check_names("--group", groups)
-    for each in allow:
-        if each not in ALLOWABLE_REQUESTS:
-            near = nearest(each, ALLOWABLE_REQUESTS)
-            hint = f"did you mean '{near}'?" if near else f"there are {', '.join(ALLOWABLE_REQUESTS)}"
-            raise UsageError(f"--allow: no request is called '{printable(each)}': {hint}")
-    if print_unit:
-        units.print_bridge_unit(options, print_unit, given)
-        return 0
-    broker = options.broker()
-    from talkcli.fleet.bridge.main import BridgeSettings, run_bridge
-
-    settings = BridgeSettings(
-        given["name"],
-        broker,
-        tuple(allow),
-        tuple(groups),
-        options.socket,
-        with_text=not given["no_text"],
-        homeassistant=given["homeassistant"],
-    )
-    return run_bridge(settings, options.broker)
-
-
-def _split_list(value: str | None) -> list[str]:
-    """Split a comma-separated list."""
-    return [] if value is None else [each.strip() for each in value.split(",")]
-
-
-def _check_names(option: str, names: Sequence[str]) -> None:
-    for each in names:
-        fault = topics.name_fault(each)
-        if fault:
-            raise UsageError(f"{option}: the name '{printable(each)}' can't be in a topic, it {fault}")
 
 
 def fleet(options: CommonOptions, what: str) -> int | None:

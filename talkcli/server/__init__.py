@@ -1,6 +1,6 @@
 """The speech server, an asyncio program with a thread for the engine.
 
-This package does the I/O, and `goals` makes the decisions. Only `cli.serve` imports the server.
+This package does the I/O, and `goals` makes the decisions. Only `cli.services` imports the server.
 
     run          starts and stops the server, admits clients, and describes its status
     listener     the listening socket and its lock

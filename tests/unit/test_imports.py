@@ -235,7 +235,7 @@ def test_server_doctor_and_fleet_are_imported_only_if_they_are_asked_for() -> No
         for name, each in inside(module):
             where = f"talkcli.{module}:{each.line} imports {name}"
             if part(name) == "server" and part(module) != "server" and not each.typing:
-                assert module == "cli.serve", where
+                assert module == "cli.services", where
             if part(name) == "doctor" and part(module) != "doctor":
                 assert module == "cli.ask", where
                 assert each.function or each.typing, f"{where}, and the other commands would pay for it"

@@ -1,9 +1,12 @@
-"""Code that generates the systemd units for `talk serve` and `talk bridge`.
+"""The commands `talk serve` and `talk bridge`, which run until they are stopped, and their systemd units.
 
-The templates are in the directory `systemd`. For example, `serve-user` is the template for `talk serve --print-unit
-user`. A name in braces is replaced by its value, and a line such as `@supervision.conf` includes that file. The printed
-units can be used unchanged. System units only give the process access to what it needs. This module doesn't install the
-units.
+The templates of the units are in the directory `systemd`. For example, `serve-user` is the template for `talk serve
+--print-unit user`. A name in braces is replaced by its value, and a line such as `@supervision.conf` includes that
+file. The printed units can be used unchanged. System units only give the process access to what it needs. Members of
+the group `audio` may use the system-wide server, because they can already use the sound card. This module doesn't
+install the units.
+
+No other command imports the server or the bridge.
 """
 
 from __future__ import annotations
@@ -16,10 +19,10 @@ import sys
 from typing import TYPE_CHECKING
 
 from talkcli import paths
-from talkcli.cli.command import FILE_MODE, spelling
+from talkcli.cli.command import FILE_MODE, nearest, spelling
 from talkcli.cli.commands import COMMANDS
 from talkcli.cli.show import note, show
-from talkcli.errors import UsageError
+from talkcli.errors import EXIT_OK, UsageError
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
@@ -29,8 +32,12 @@ if TYPE_CHECKING:
     from talkcli.cli.show import CommonOptions
     from talkcli.goals.options import Option
 
-#: The group whose members may use the system-wide server. They can already use the sound card.
-SOCKET_GROUP = "audio"
+#: The warning that is printed at startup if there is no sound device.
+_NO_DEVICE = (
+    "no sound device is here, and no PulseAudio or PipeWire: plug in a loudspeaker, or hand it to the container ('talk "
+    "doctor' says more); it is looked for with each sentence, which ends ABORTED until it is there; to speak without "
+    "one: '--player file:PATH.wav', '--player null'"
+)
 #: The environment files that contain the broker's address and login.
 _BRIDGE_ENVIRONMENTS = {"user": "%h/.config/talk/bridge.env", "system": "/etc/talk/bridge.env"}
 
@@ -40,25 +47,86 @@ _UNSAFE_CHARACTERS = "[\0-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]"
 _HOME_DIRECTORIES = ("/home/", "/root/", "/run/user/")
 
 
-def print_server_unit(options: CommonOptions, name: str, given: Mapping[str, Any]) -> None:
-    """Print a systemd unit that runs `talk serve` with these options."""
-    mode, words = given["socket_mode"], []
-    if name.startswith("system") and "socket_mode" not in options.typed:
-        mode = 0o660
-        words.append("--socket-mode=0660")
-    _print_unit(options, "serve", name, given, words, mode=f"{mode:04o}")
+def serve(options: CommonOptions, print_unit: str | None, **given: Any) -> int:
+    """Run the server or print a systemd unit for it, and return the exit code.
+
+    `given` contains all other options, by name.
+    """
+    if print_unit:
+        mode, words = given["socket_mode"], []
+        if print_unit.startswith("system") and "socket_mode" not in options.typed:
+            mode = 0o660
+            words.append("--socket-mode=0660")
+        return _print_unit(options, "serve", print_unit, given, words, mode=f"{mode:04o}")
+    if not options.quiet:
+        _warn_about_sound(given["player"] or "", given["driver"])
+    from talkcli.goals.options import SETTINGS, Set
+    from talkcli.server import run
+
+    goals = Set(**{each.name: given.pop(each.name) for each in SETTINGS})
+    return run.serve(run.ServerSettings(socket=paths.named_socket(options.socket), goals=goals, **given))
 
 
-def print_bridge_unit(options: CommonOptions, name: str, given: Mapping[str, Any]) -> None:
-    """Print a systemd unit that runs `talk bridge` with these options."""
-    words = ["--insecure"] if options.insecure else []
-    _print_unit(options, "bridge", name, given, words, environment=_BRIDGE_ENVIRONMENTS[name])
+def _warn_about_sound(player: str, driver: str | None) -> None:
+    """Warn if speech can't be heard, because there is no sound device or the player isn't installed."""
+    from talkcli.engine.players import PACKAGES, PLAYERS, PlayerMissing, has_no_output, is_silent, player_commands
+    from talkcli.engine.voices import is_own_driver
+
+    if is_silent(player) or not is_own_driver(driver):
+        return  # other drivers play sound themselves, and the server reports this
+    if (not player or player in PACKAGES) and has_no_output(os.environ):
+        note(_NO_DEVICE)
+    if not player or (player in PLAYERS and player not in PACKAGES):
+        return  # this player isn't an external program, so it can't be missing
+    try:
+        player_commands(player, None, 0)
+    except PlayerMissing as error:
+        near = nearest(player, PLAYERS.keys() - {player})
+        hint = f"did you mean '{near}'? " if near else ""
+        note(f"{printable(str(error))}: {hint}nothing can be heard until it is there")
+
+
+def bridge(options: CommonOptions, print_unit: str | None, print_acl: bool, **given: Any) -> int:
+    """Run the bridge, or print its systemd unit or the broker's access rules. Return the exit code."""
+    from talkcli.fleet import topics
+    from talkcli.fleet.bridge.policy import ALLOWABLE_REQUESTS
+
+    allow = [each.strip() for each in given["allow"].split(",")]
+    groups = [each.strip() for each in given["group"].split(",")] if given["group"] else []
+    for flag, name in (("--name", given["name"]), *(("--group", each) for each in groups)):
+        fault = None if name is None else topics.name_fault(name)
+        if fault:
+            raise UsageError(f"{flag}: the name '{printable(name)}' can't be in a topic, it {fault}")
+    if print_acl:
+        show(topics.access_rules(homeassistant=given["homeassistant"], name=given["name"]))
+        return EXIT_OK
+    for each in allow:
+        if each not in ALLOWABLE_REQUESTS:
+            near = nearest(each, ALLOWABLE_REQUESTS)
+            hint = f"did you mean '{near}'?" if near else f"there are {', '.join(ALLOWABLE_REQUESTS)}"
+            raise UsageError(f"--allow: no request is called '{printable(each)}': {hint}")
+    if print_unit:
+        words = ["--insecure"] if options.insecure else []
+        return _print_unit(options, "bridge", print_unit, given, words, environment=_BRIDGE_ENVIRONMENTS[print_unit])
+    broker = options.broker()
+    from talkcli.fleet.bridge.main import BridgeSettings, run_bridge
+
+    settings = BridgeSettings(
+        given["name"],
+        broker,
+        tuple(allow),
+        tuple(groups),
+        options.socket,
+        with_text=not given["no_text"],
+        homeassistant=given["homeassistant"],
+    )
+    return run_bridge(settings, options.broker)
 
 
 def _print_unit(
     options: CommonOptions, command: str, name: str, given: Mapping[str, Any], words: Sequence[str], **values: str
-) -> None:
-    """Print a systemd unit, and warn if the service's user can't access the program.
+) -> int:
+    """Print a systemd unit, and warn if the service's user can't access the program. Return the exit code.
 
     Args:
         options: the common options, with the socket and the names of the options to copy into the unit.
@@ -79,7 +147,6 @@ def _print_unit(
     files = (program[0], *map(os.path.realpath, (program[0], sys.executable, __file__)))
     unit = _template(f"{command}-{name}").format(
         command=" ".join(map(_quote, (*program, command, *words, *socket_option, *typed))),
-        group=SOCKET_GROUP,
         home="read-only" if any(each.startswith(_HOME_DIRECTORIES) for each in files) else "yes",
         socket=escape(socket) if socket else usual_socket,
         **values,
@@ -93,6 +160,7 @@ def _print_unit(
             "it for all, as with 'sudo /usr/bin/python3 -m venv /opt/talk && sudo /opt/talk/bin/pip install .' in a "
             "checkout, then print the unit"
         )
+    return EXIT_OK
 
 
 def _template(name: str) -> str:
