@@ -120,16 +120,13 @@ def read_description(path: str) -> VoiceDescription:
     """
     json_path = path + JSON_SUFFIX
     missing = "it belongs to the model: get it from where that came from"
-    with open_checked(json_path, missing=missing, model=path) as file:
-        try:
-            raw = file.read(_MAX_JSON_BYTES + 1)
-        except OSError as error:
-            raise VoiceFileError(f"{json_path} cannot be read: {error.strerror}") from error
     try:
+        with open_checked(json_path, missing=missing, model=path) as file:
+            raw = file.read(_MAX_JSON_BYTES + 1)
         if len(raw) > _MAX_JSON_BYTES:
             raise ValueError("it is too long")
         return _parse_description(json.loads(raw))
-    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+    except (OSError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         why = f"it has no {error}" if isinstance(error, KeyError) else str(error)
         raise VoiceFileError(f"{json_path} does not describe a voice of Piper's ({why[:200]}): get it anew") from error
 
@@ -147,21 +144,13 @@ def open_checked(path: str, missing: str = "put it there again", model: str | No
     """
     try:
         _check_paths(path, *([] if model is None else [model]))
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        if not stat.S_ISREG(os.stat(path).st_mode):  # Opening a pipe would wait for a writer.
+            raise VoiceFileError(f"{path} is no file: put the voice's there")
+        return open(path, "rb")
     except FileNotFoundError as error:
         raise VoiceFileError(f"{path} is not there: {missing}") from error
     except OSError as error:
         raise VoiceFileError(f"{path} cannot be read: {error.strerror}") from error
-    try:
-        status = os.fstat(descriptor)
-        if not stat.S_ISREG(status.st_mode):
-            raise VoiceFileError(f"{path} is no file: put the voice's there")
-        if _others_can_write(path, status, descriptor):
-            raise _writable_error(path)
-        return open(descriptor, "rb", closefd=True)
-    except BaseException:
-        os.close(descriptor)
-        raise
 
 
 def _check_paths(*paths: str) -> None:
@@ -180,7 +169,7 @@ def _check_paths(*paths: str) -> None:
     wrong = []
     for each, sticky_is_safe in may_be_sticky.items():
         status = os.stat(each)
-        if _others_can_write(each, status, each) and not (sticky_is_safe and status.st_mode & stat.S_ISVTX):
+        if _others_can_write(each, status) and not (sticky_is_safe and status.st_mode & stat.S_ISVTX):
             wrong.append(each)
     if wrong:
         raise _writable_error(*wrong)
@@ -223,13 +212,8 @@ def _walk_path(path: str) -> Iterator[tuple[str, bool]]:
     yield at, False
 
 
-def _others_can_write(path: str, status: os.stat_result, file: str | int) -> bool:
-    """Return whether anyone except root and this user can write to a file.
-
-    Args:
-        path: The name of the file for the error message.
-        status: The result of `os.stat` for the file.
-        file: The path or descriptor of the file, used to read its access control list.
+def _others_can_write(path: str, status: os.stat_result) -> bool:
+    """Return whether anyone except root and this user can write to a file with this status.
 
     Raises:
         VoiceFileError: The file belongs to another user.
@@ -239,7 +223,7 @@ def _others_can_write(path: str, status: os.stat_result, file: str | int) -> boo
         return True
     if not status.st_mode & stat.S_IWGRP:
         return False
-    return _has_acl(file) or not any(_is_private_group(each, status.st_gid) for each in {0, os.geteuid()})
+    return _has_acl(path) or not any(_is_private_group(each, status.st_gid) for each in {0, os.geteuid()})
 
 
 def _check_owner(path: str, status: os.stat_result) -> None:
@@ -249,10 +233,10 @@ def _check_owner(path: str, status: os.stat_result) -> None:
         raise VoiceFileError(f"{words}: put it into a directory of your own")
 
 
-def _has_acl(file: str | int) -> bool:
+def _has_acl(path: str) -> bool:
     """Return whether a file has an access control list, which can allow more users to write to it."""
     try:
-        return hasattr(os, "listxattr") and "system.posix_acl_access" in os.listxattr(file)
+        return hasattr(os, "listxattr") and "system.posix_acl_access" in os.listxattr(path)
     except OSError as error:
         return error.errno != errno.ENOTSUP
 
@@ -298,12 +282,11 @@ def _described_voice(name: str, path: str) -> Voice:
         found = read_description(path)
     except VoiceFileError:
         return Voice(NEURAL_PREFIX + name, None, name)
-    names = {number: each for each, number in found.speaker_names.items()}
-    speakers = [names.get(number, "") for number in range(found.speakers if found.speakers > 1 else 0)]
-    for number, each in enumerate(speakers):
-        if not each.isprintable() or not 0 < len(each) <= _MAX_SPEAKER_CHARS:
-            speakers[number] = str(number)
-    return Voice(NEURAL_PREFIX + name, found.language, found.name, found.quality, tuple(speakers) or None)
+    names = {number: str(number) for number in range(found.speakers if found.speakers > 1 else 0)}
+    for each, number in found.speaker_names.items():
+        if number in names and each.isprintable() and 0 < len(each) <= _MAX_SPEAKER_CHARS:
+            names[number] = each
+    return Voice(NEURAL_PREFIX + name, found.language, found.name, found.quality, tuple(names.values()) or None)
 
 
 def _parse_description(found: Any) -> VoiceDescription:
