@@ -25,8 +25,8 @@ CONSTANT = field(1, "value") + field(_TENSOR, tensor("t", [1], 1, more=field(14,
 
 def _halves(model: bytes) -> tuple[bytes, bytes]:
     """Return both, the encoder first, whole."""
-    cut = split_model(model)
-    return b"".join(cut.encoder), b"".join(cut.decoder)
+    encoder, decoder = split_model(model)
+    return b"".join(encoder), b"".join(decoder)
 
 
 def _inside(graph: bytes, deep: int) -> bytes:

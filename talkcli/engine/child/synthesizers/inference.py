@@ -80,9 +80,7 @@ class ModelCache:
         Raises:
             OSError: The directory can't be used.
         """
-        os.makedirs(os.path.dirname(directory), exist_ok=True)
-        with contextlib.suppress(FileExistsError):
-            os.mkdir(directory, 0o700)
+        os.makedirs(directory, 0o700, exist_ok=True)
         status = os.lstat(directory)
         if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid() or status.st_mode & 0o077:
             raise PermissionError(f"{directory} is not this user's alone: chmod 0700, or remove it")
@@ -194,11 +192,9 @@ class Model:
                 unchanged = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
                 self._set_halves(_session(cached[0], unchanged), _session(cached[1]))
                 return
-            except Exception as error:
+            except Exception as error:  # A full disk may have truncated the halves, so split the model again.
                 if _is_out_of_memory(error):
                     raise no_memory_error(path) from error
-                # A full disk may have truncated the cached halves. Split the model again, which also detects a faulty
-                # model.
         self._set_halves(*_split(path, content, cache, key))
 
     def encode(self, ids: Sequence[int], speaker: int, scale: float, run: ModelRun) -> Frames:
@@ -283,7 +279,7 @@ class Model:
         try:
             found: list[Any] = half.run(None, feed, run.options)
         except Exception as error:
-            raise _load_error(self.path, "cannot be run", error) from error
+            raise _model_error(self.path, "cannot be run", error) from error
         return found
 
     def _try_out(self) -> int:
@@ -325,9 +321,7 @@ def load_libraries(path: str) -> None:
         import numpy as np  # noqa: F401 - onnxruntime would hide the reason if numpy can't be imported
         import onnxruntime  # noqa: F401
     except Exception as error:
-        if _is_out_of_memory(error):
-            raise no_memory_error(path) from error
-        raise VoiceFileError(f"{path} cannot be loaded ({_first_line(error)}): {install.neural()}") from error
+        raise _model_error(path, "cannot be loaded", error, install.neural()) from error
 
 
 def _split(path: str, content: bytes, cache: ModelCache | None, key: str) -> tuple[Any, Any]:
@@ -337,16 +331,16 @@ def _split(path: str, content: bytes, cache: ModelCache | None, key: str) -> tup
         VoiceFileError: The model can't be split or loaded.
     """
     try:
-        halves = split_model(content)
+        encoder_file, decoder_file = split_model(content)
     except NotSplit as error:
         raise VoiceFileError(f"{path} {error}: get the voice anew, from a source that you trust") from error
     try:
-        decoder = _session_of(halves.decoder)
+        decoder = _session_of(decoder_file)
         if cache is None:
-            return _session_of(halves.encoder), decoder
-        return cache.store(key, lambda place: _session_of(halves.encoder, place), halves.decoder), decoder
+            return _session_of(encoder_file), decoder
+        return cache.store(key, lambda place: _session_of(encoder_file, place), decoder_file), decoder
     except Exception as error:
-        raise _load_error(path, "cannot be loaded", error) from error
+        raise _model_error(path, "cannot be loaded", error) from error
 
 
 def _session_of(half: Sequence[Buffer], optimized_path: str | None = None) -> Any:
@@ -388,11 +382,12 @@ def _session(model: str | bytes, level: Any = None, optimized_path: str | None =
     return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
 
 
-def _load_error(path: str, what: str, error: Exception) -> VoiceFileError:
-    """Convert an exception of onnxruntime to a VoiceFileError."""
+def _model_error(path: str, problem: str, error: Exception, step: str = "get the voice anew") -> VoiceFileError:
+    """Convert an exception of onnxruntime to a VoiceFileError. `step` tells the user what to do next."""
     if _is_out_of_memory(error):
         return no_memory_error(path)
-    return VoiceFileError(f"{path} {what} ({_first_line(error)}): get the voice anew")
+    first_line = (str(error).strip() or type(error).__name__).splitlines()[0]
+    return VoiceFileError(f"{path} {problem} ({first_line[:_MAX_ERROR_CHARS]}): {step}")
 
 
 def no_memory_error(path: str) -> VoiceFileError:
@@ -402,7 +397,3 @@ def no_memory_error(path: str) -> VoiceFileError:
 
 def _is_out_of_memory(error: BaseException | None) -> bool:
     return isinstance(error, MemoryError) or any(each in str(error) for each in _NO_MEMORY)
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0][:_MAX_ERROR_CHARS]

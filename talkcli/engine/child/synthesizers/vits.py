@@ -13,7 +13,7 @@ field numbers are those of `onnx.proto`.
 
 from __future__ import annotations
 
-from talkcli.frozen import TYPE_CHECKING, frozen
+from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     Buffer = bytes | memoryview
     #: a field of a message: its number, its wire type (one of the four below), and its value. Integers stay encoded.
     Field = tuple[int, int, Buffer]
+    #: half of a model, which is a complete ONNX file in parts. The weights, which make up nearly all of it, are not
+    #: copied.
+    ModelHalf = tuple[Buffer, ...]
 
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 #: The field numbers of a model, an operator set, a graph, a node, an attribute and a tensor.
@@ -56,23 +59,11 @@ class NotSplit(Exception):
     """Raised if a model is unsafe or isn't one of Piper's. The message gives the reason without the file's name."""
 
 
-@frozen
-class ModelHalves:
-    """The two halves of a model: the encoder and the decoder.
-
-    Each half is a complete ONNX file, stored as a sequence of buffers. The weights, which make up nearly all of it, are
-    not copied.
-    """
-
-    #: the encoder, which has the inputs of the whole model. It outputs the decoder's inputs, and then the number of
-    #: frames of each phoneme id.
-    encoder: tuple[Buffer, ...]
-    #: the decoder, which has the output of the whole model. Its inputs are all but the last of the encoder's outputs.
-    decoder: tuple[Buffer, ...]
-
-
-def split_model(model: Buffer) -> ModelHalves:
+def split_model(model: Buffer) -> tuple[ModelHalf, ModelHalf]:
     """Split a model into its encoder and its decoder.
+
+    The encoder has the inputs of the whole model. It outputs the decoder's inputs, and then the number of frames of
+    each phoneme id. The decoder has the output of the whole model.
 
     Raises:
         NotSplit: The model is unsafe, or not one of Piper's.
@@ -101,10 +92,9 @@ def split_model(model: Buffer) -> ModelHalves:
     head = [each for each in fields if _is_shared(reader, each)]
     outputs = [(_OUTPUT, _BYTES, _float_value(name)) for name in [*passed, *durations]]
     inputs = [(_INPUT, _BYTES, _float_value(name)) for name in passed]
-    return ModelHalves(
-        _encode_model(head, [*graph.fields_of(encoder), *graph.inputs, *outputs]),
-        _encode_model(head, [*graph.fields_of(decoder), *inputs, *graph.outputs]),
-    )
+    encoder_fields = [*graph.fields_of(encoder), *graph.inputs, *outputs]
+    decoder_fields = [*graph.fields_of(decoder), *inputs, *graph.outputs]
+    return _encode_model(head, encoder_fields), _encode_model(head, decoder_fields)
 
 
 class _Reader:
@@ -273,8 +263,8 @@ def _encode_integer(value: int) -> bytes:
     return bytes([*out, value])
 
 
-def _encode_model(head: list[Field], graph: list[Field]) -> tuple[Buffer, ...]:
-    """Encode a model with these fields and this graph, as a sequence of buffers."""
+def _encode_model(head: list[Field], graph: list[Field]) -> ModelHalf:
+    """Encode a model with these fields and this graph."""
     parts = list(_encode_fields(graph))
     key = _encode_integer(_GRAPH << 3 | _BYTES) + _encode_integer(sum(map(len, parts)))
     return (*_encode_fields(head), key, *parts)
