@@ -7,6 +7,7 @@ identified by their ids without a speaker.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import threading
@@ -16,7 +17,7 @@ from collections import deque
 from typing import Generic, TypeVar
 
 from talkcli.engine import models
-from talkcli.engine.child.synthesizers.inference import Model, ModelCache, load_libraries
+from talkcli.engine.child.synthesizers.inference import Model, ModelCache, load_libraries, no_memory_error
 from talkcli.engine.models import VoiceFileError
 from talkcli.engine.protocol import LOAD_LIMIT_S, VoiceLoaded, VoiceMemory, VoiceUnloaded
 from talkcli.frozen import TYPE_CHECKING
@@ -195,6 +196,7 @@ class ModelLoader:
         load, voice = self._load, self._voice
         if load is None:
             return
+        error: str | None = None
         try:
             if not load.ready:
                 if time.monotonic() < self.deadline:
@@ -203,15 +205,14 @@ class ModelLoader:
                 raise VoiceFileError(f"{voice} was not loaded within {LOAD_LIMIT_S:g} s: are its files on a slow disk?")
             loaded = load.take()
             assert loaded is not None
-        except VoiceFileError as error:
-            self._record_failure(str(error))
-        except Exception as error:  # noqa: BLE001 - a faulty voice must not stop the engine process
-            traceback.print_exception(error)
-            self._record_failure(f"{voice} cannot be loaded: {type(error).__name__}: {error}")
-        else:
             self._models[voice] = loaded
             self._measure(voice)
-            self._events.append(VoiceLoaded(voice, self._elapsed()))
+        except VoiceFileError as caught:
+            error = self._errors[voice] = str(caught)
+        except Exception as caught:  # noqa: BLE001 - a faulty voice must not stop the engine process
+            traceback.print_exception(caught)
+            error = self._errors[voice] = f"{voice} cannot be loaded: {type(caught).__name__}: {caught}"
+        self._events.append(VoiceLoaded(voice, round(time.monotonic() - self._started_at, 3), error))
         load.close()
         self._load = None
         self._start_next()
@@ -229,43 +230,16 @@ class ModelLoader:
         self._reported_growth = max(0, (_private_bytes() or now) - before)
         self._events.append(VoiceMemory(voice, self._reported_growth))
 
-    def _elapsed(self) -> float:
-        return round(time.monotonic() - self._started_at, 3)
-
-    def _record_failure(self, why: str) -> None:
-        self._errors[self._voice] = why
-        self._events.append(VoiceLoaded(self._voice, self._elapsed(), why))
-
     def _start_next(self) -> None:
         """Start loading the next voice if no other is being loaded.
 
         A load keeps one processor busy, and temporarily needs twice the memory of the model.
         """
-        while self._load is None and self._waiting:
+        if self._load is None and self._waiting:
             self._voice, self._started_at = self._waiting.popleft(), time.monotonic()
-            try:
-                path = _model_path(self._voice)
-            except VoiceFileError as error:
-                self._record_failure(str(error))
-                continue
             if self._initial_bytes is None:
                 self._initial_bytes = _private_bytes()
-            self._load = BackgroundIterator(_load(path), max_ahead=1)
-
-
-def _model_path(voice: str) -> str:
-    """Return the path of a voice's model.
-
-    Raises:
-        VoiceFileError: A package or the model file is missing.
-    """
-    missing = models.missing_package()
-    if missing is not None:
-        raise VoiceFileError(missing)
-    path = models.find_models().get(voice.removeprefix(NEURAL_PREFIX))
-    if path is None:
-        raise VoiceFileError(f"{voice}: its file is not there any more")
-    return path
+            self._load = BackgroundIterator(_load(self._voice), max_ahead=1)
 
 
 def _fingerprints(path: str) -> _Fingerprints:
@@ -277,12 +251,15 @@ def _fingerprints(path: str) -> _Fingerprints:
     return tuple((each.st_ino, each.st_size, each.st_mtime_ns) for each in found)
 
 
-def _load(path: str) -> Iterator[tuple[Model, _Fingerprints]]:
-    """Load the model at a path, and yield it with the fingerprints of its files.
+def _load(voice: str) -> Iterator[tuple[Model, _Fingerprints]]:
+    """Load a voice, and yield its model with the fingerprints of its files.
 
     Raises:
-        VoiceFileError: The model can't be loaded.
+        VoiceFileError: The voice can't be loaded.
     """
+    path = models.find_models().get(voice.removeprefix(NEURAL_PREFIX))
+    if path is None:
+        raise VoiceFileError(f"{voice}: its file is not there any more")
     try:
         load_libraries(path)  # Import the libraries before reading any files, which may hang.
         fingerprints = _fingerprints(path)
@@ -290,7 +267,7 @@ def _load(path: str) -> Iterator[tuple[Model, _Fingerprints]]:
     except OSError as error:
         raise VoiceFileError(f"{path} cannot be read: {error.strerror}") from error
     except MemoryError as error:
-        raise VoiceFileError(f"{path} cannot be loaded: there is no memory for it; end another program") from error
+        raise no_memory_error(path) from error
 
 
 def _open_cache() -> ModelCache | None:
@@ -319,6 +296,5 @@ def _trim_heap() -> None:
     """
     import ctypes
 
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
-        trim(0)
+    with contextlib.suppress(AttributeError):  # Other C libraries don't have this function.
+        ctypes.CDLL(None).malloc_trim(0)
