@@ -48,25 +48,24 @@ class CombinedSynthesizer:
         if neural is None or self._current is not neural or settings.voice_only:
             self._current.speak(text, settings, sink)
             return
-        why = neural.error or f"{neural.voice} is not loaded"
-        if neural.ready:
-            watched = _WatchedSink(sink)
+        why = neural.problem
+        if why is None:
             try:
-                neural.speak(text, replace(settings, pitch=SpeechSettings().pitch), watched)
+                neural.speak(text, replace(settings, pitch=SpeechSettings().pitch), sink)
                 return
             except Stopped:
                 raise
             except CannotSpeak as error:
-                if error.reason != Reason.VOICE_FAILED or watched.used:
+                if error.reason != Reason.VOICE_FAILED or neural.has_written:
                     raise
                 why = str(error)
             except Exception as error:
-                if watched.used:
+                if neural.has_written:
                     raise
                 traceback.print_exc()  # Log the bug, and let the other synthesizer speak instead.
                 why = f"{neural.voice} failed: {type(error).__name__}: {error}"
         self._espeak.load_language(neural.language)
-        self._espeak.speak(text, settings, _WatchedSink(sink, why))
+        self._espeak.speak(text, settings, sink, why)
 
     @property
     def loader(self) -> ModelLoader | None:
@@ -87,29 +86,3 @@ class CombinedSynthesizer:
 
             self._neural = Piper(self._espeak)
         return self._neural
-
-
-class _WatchedSink:
-    """Passes all calls to another sink, and records whether any words or samples were sent.
-
-    Args:
-        sink: The other sink.
-        fallback_reason: A message saying why the requested voice is not used, or None if it is used.
-    """
-
-    def __init__(self, sink: SampleSink, fallback_reason: str | None = None) -> None:
-        self._sink = sink
-        self._fallback_reason = fallback_reason
-        self.used = False
-        self.wait = sink.wait
-
-    def begin(self, rate: int, voice: str, fallback_reason: str | None = None) -> None:
-        self._sink.begin(rate, voice, fallback_reason or self._fallback_reason)
-
-    def word(self, start: int, length: int, position: float) -> None:
-        self.used = True
-        self._sink.word(start, length, position)
-
-    def write(self, samples: bytes) -> None:
-        self.used = self.used or bool(samples)
-        self._sink.write(samples)

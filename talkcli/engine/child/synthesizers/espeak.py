@@ -164,6 +164,7 @@ class Espeak:
         self._parameters = {espeak.RATE: _ESPEAK_DEFAULT_WPM, espeak.VOLUME: 100, espeak.PITCH: 50}
         self._text = ""
         self._sink: SampleSink | None = None
+        self._fallback_reason: str | None = None
         self._raised: BaseException | None = None
         #: the last phonemizer, which may still be using the library, or None if it has been stopped
         self._phonemizer: EspeakPhonemizer | None = None
@@ -191,14 +192,17 @@ class Espeak:
             raise UnknownVoice("part of it is missing")
         self.voice = voice
 
-    def speak(self, text: str, settings: SpeechSettings, sink: SampleSink) -> None:
-        """Synthesize a sentence. The samples vary slightly from call to call."""
+    def speak(self, text: str, settings: SpeechSettings, sink: SampleSink, fallback_reason: str | None = None) -> None:
+        """Synthesize a sentence. The samples vary slightly from call to call.
+
+        If another voice was requested, `fallback_reason` is a message saying why it is not used.
+        """
         self._stop_phonemizer()
-        sink.begin(self._rate, self.voice)
+        sink.begin(self._rate, self.voice, fallback_reason)
         espeak = self._espeak
         self._set_parameters(settings)
         self._text = guard.guarded(text, self.voice)
-        self._sink = sink
+        self._sink, self._fallback_reason = sink, fallback_reason
         status = espeak.Synth(self._text.encode("utf-8", "replace"), flags=espeak.CHARS_UTF8 | espeak.ENDPAUSE)
         raised, self._raised, self._sink = self._raised, None, None
         if raised is not None:
@@ -278,7 +282,7 @@ class Espeak:
             if event.type == _EVENT_SAMPLERATE:
                 if event.id_number != self._rate:
                     self._rate = event.id_number
-                    sink.begin(self._rate, self.voice)
+                    sink.begin(self._rate, self.voice, self._fallback_reason)
             elif event.type == self._espeak.EVENT_WORD:
                 position = _word_position(event, self._text)
                 if position is not None:

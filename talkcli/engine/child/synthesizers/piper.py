@@ -18,7 +18,7 @@ from talkcli.engine.child.synthesizers.phonemes import PAUSE_MARKS, split_text
 from talkcli.engine.models import BEGIN_SYMBOL, END_SYMBOL, PAD_SYMBOL, VoiceFileError
 from talkcli.engine.players import SAMPLE_BYTES
 from talkcli.engine.voices import UnknownVoice, neural_language, speaker_number
-from talkcli.frozen import TYPE_CHECKING, frozen
+from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import NEURAL_PREFIX, SPEAKER_MARK
 from talkcli.goals.reasons import Reason
 
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
     #: for each word, its start and length in the text, and its time in seconds from the start of the part
     WordTimes = tuple[tuple[int, int, float], ...]
+    #: the samples of a piece of sound, and the words that begin in it or later
+    SpokenPart = tuple[bytes, WordTimes]
 
 #: How many frames to decode at a time, at first and at most. A small first part of 0.23 s is ready quickly. Later parts
 #: have up to 0.93 s, because extra frames have to be decoded before and after each part (`inference.CONTEXT_FRAMES`).
@@ -66,14 +68,6 @@ _NATURAL_WPM, _CONSTANT_SHARE = 195, 0.30
 _MIN_SCALE = 0.1
 
 
-@frozen
-class SpokenPart:
-    """A piece of sound, with the words that begin in it or later."""
-
-    samples: bytes
-    words: WordTimes = ()
-
-
 class Piper:
     """A synthesizer for Piper's neural voices. It uses libespeak-ng only while it speaks."""
 
@@ -83,18 +77,17 @@ class Piper:
         self._espeak = espeak
         self.loader = ModelLoader()
         self.voice = ""
+        #: whether any sound of the last sentence was written to its sink
+        self.has_written = False
         #: the id of the current voice without the speaker, the speaker, and the path of the model
         self._model_id, self._speaker, self._path = "", "", ""
 
     @property
-    def ready(self) -> bool:
-        """Whether the current voice is loaded."""
-        return self.loader.model(self._model_id) is not None
-
-    @property
-    def error(self) -> str | None:
-        """The error message if the current voice couldn't be loaded, otherwise None."""
-        return self.loader.error(self._model_id)
+    def problem(self) -> str | None:
+        """A message saying why the current voice can't speak, or None if it is loaded."""
+        if self.loader.model(self._model_id) is not None:
+            return None
+        return self.loader.error(self._model_id) or f"{self.voice} is not loaded"
 
     @property
     def language(self) -> str:
@@ -119,7 +112,7 @@ class Piper:
         if missing is not None:
             raise UnknownVoice(missing)
         model, _, speaker = voice.partition(SPEAKER_MARK)
-        path = models.find_models().get(model.removeprefix(NEURAL_PREFIX)) if voice.startswith(NEURAL_PREFIX) else None
+        path = models.find_models().get(model.removeprefix(NEURAL_PREFIX))
         if path is None:
             raise UnknownVoice("its file is not there any more")
         with contextlib.suppress(VoiceFileError):
@@ -135,6 +128,7 @@ class Piper:
         if settings.pitch != _DEFAULT_PITCH:
             words = f"the voice {self.voice} has no pitch but its own: leave --pitch out, or choose one of espeak's"
             raise CannotSpeak(Reason.BAD_OPTION, words)
+        self.has_written = False
         voice = self._model_id
         model = self._wait_for_model(voice, sink)
         description = model.description
@@ -177,11 +171,13 @@ class Piper:
         spoken_parts = BackgroundIterator(_speak_parts(model, parts, speaker, settings, run), _MAX_PARTS_AHEAD)
         try:
             while (spoken := spoken_parts.take(sink.wait)) is not None:
-                for start, length, position in spoken.words:
+                samples, words = spoken
+                self.has_written = True
+                for start, length, position in words:
                     sink.word(start, length, seconds + position)
-                for at in range(0, len(spoken.samples), write_bytes):
-                    sink.write(spoken.samples[at : at + write_bytes])
-                seconds += len(spoken.samples) / SAMPLE_BYTES / rate
+                for at in range(0, len(samples), write_bytes):
+                    sink.write(samples[at : at + write_bytes])
+                seconds += len(samples) / SAMPLE_BYTES / rate
         finally:
             run.end()
             spoken_parts.close()
@@ -224,7 +220,7 @@ def _speak_parts(
             quiet = len(samples) - 1 - int(audible[-1]) if len(audible) else quiet + len(samples)
             if first:
                 samples, words, first = *_cut_leading_silence(samples, levels, words, model.description.rate), False
-            silent.append(SpokenPart(_to_bytes(samples, settings.volume), words))
+            silent.append((_to_bytes(samples, settings.volume), words))
             if loudest >= _SPEECH_LEVEL:
                 yield from silent
                 silent.clear()
@@ -232,7 +228,7 @@ def _speak_parts(
         if loudest < _SPEECH_LEVEL:
             raise VoiceFileError(f"{model.path} makes no sound of a text: get the voice anew")
         if part.ends_sentence and quiet < pause:
-            yield SpokenPart(bytes((pause - quiet) * SAMPLE_BYTES))
+            yield bytes((pause - quiet) * SAMPLE_BYTES), ()
     if unknown and not any_known:
         why = f"has no number for a sound of the text ({unknown[:20]})"
         raise VoiceFileError(f"{model.path}.json {why}: get both files from the same place")
