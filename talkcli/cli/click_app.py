@@ -20,7 +20,7 @@ from talkcli import __version__
 from talkcli.cli.command import ALL_EXIT_CODES, COMMON_OPTIONS, OUTPUT_FILE, nearest, range_help, read_value, spelling
 from talkcli.cli.commands import COMMANDS
 from talkcli.cli.show import CommonOptions, note, run_command, show_error, write_error_line
-from talkcli.errors import EXIT_ERROR, UsageError
+from talkcli.errors import UsageError
 from talkcli.goals.options import FLAG, INTEGER, NUMBER, SECONDS
 
 if TYPE_CHECKING:
@@ -273,7 +273,9 @@ def run(arguments: list[str]) -> int:
     _signal.signal(_signal.SIGCHLD, _signal.SIG_DFL)
     options = CommonOptions()
     if "_TALK_COMPLETE" in os.environ:
-        return _complete_for_shell(options)
+        from talkcli.cli import completion
+
+        return completion.print_completions(talk, options)
     return run_command(lambda: _run_group(arguments, options), options)
 
 
@@ -297,18 +299,6 @@ def _run_group(arguments: list[str], options: CommonOptions) -> object:
             found = getattr(error, "ctx", None)
             note(f"see '{found.command_path if found else 'talk'} --help'")
         return error.exit_code
-
-
-def _complete_for_shell(options: CommonOptions) -> int:
-    """Print the completions for a shell."""
-    from talkcli.cli import completion  # noqa: F401 - importing it registers our completion classes with click
-
-    try:
-        talk.main([], prog_name="talk", standalone_mode=False, obj=options)  # raises SystemExit when it is done
-    except Exception:
-        if os.environ.get("TALK_DEBUG"):
-            raise
-    return EXIT_ERROR
 
 
 def _write_lines(text: str, formatter: click.HelpFormatter) -> None:

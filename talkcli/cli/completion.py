@@ -3,7 +3,7 @@
 The values come from the server that the command would use. If the server doesn't answer quickly, no values are offered.
 Completion never prints an error.
 
-We use click's classes, but not its scripts. click's scripts pass on the words that the shell has split. But bash also
+We use click's parser, but not its scripts. click's scripts pass on the words that the shell has split. But bash also
 splits at `:` and `=`, which ids may contain, and values with a space, a comma, a quote or a `*` are garbled when they
 are passed back. Our scripts send the line up to the cursor as it was typed, and get back quoted values that they can
 insert unchanged. The scripts are files in this directory, which `talk completion` prints.
@@ -20,17 +20,16 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 import click
-from click.shell_completion import CompletionItem, ShellComplete, add_completion_class, split_arg_string
+from click.shell_completion import CompletionItem, ShellComplete, split_arg_string
 
 from talkcli.cli.show import show
-from talkcli.errors import TalkError
+from talkcli.errors import EXIT_ERROR, EXIT_OK, TalkError
 from talkcli.goals.options import is_neural
 from talkcli.protocol.events import unfinished
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
-    from typing import ClassVar
 
     from talkcli.cli.show import CommonOptions
     from talkcli.goals.goal import Goal, JsonObject
@@ -45,90 +44,69 @@ COMPLETION_TIMEOUT_S = 0.5
 _MAX_ENDED_GOALS = 100
 #: The maximum length of a goal's text, or of a name, in the help text of a value.
 _HELP_TEXT_CHARS = 60
+#: The file names of the completion scripts.
+_SCRIPTS = {"bash": "talk.bash", "zsh": "_talk", "fish": "talk.fish"}
 #: Matches a character that must be escaped in bash.
 _BASH_SPECIAL = re.compile(r"[^\w@%+=:,./-]")
 
 
-class _LineCompletion(ShellComplete):
-    """Base class for shells whose completion script passes the line up to the cursor in COMP_WORDS."""
-
-    #: the file name of the completion script
-    script: ClassVar[str]
-
-    def source(self) -> str:
-        """Return the completion script for this shell."""
-        with open(os.path.join(os.path.dirname(__file__), self.script), encoding="utf-8") as file:
-            return file.read()
-
-    def get_completion_args(self) -> tuple[list[str], str]:
-        line = os.environ["COMP_WORDS"]
-        words = split_arg_string(line)
-        # If the next character would start a new word, the word to complete is empty.
-        if len(split_arg_string(f"{line}x")) > len(words):
-            words.append("")
-        return words[1:-1], words[-1]
-
-    def format_completion(self, item: CompletionItem[str]) -> str:
-        return "file" if item.type == "file" else self.line(item.value, item.help)
-
-    def line(self, value: str, words: str | None) -> str:  # noqa: ARG002
-        """Format a value and its help text (`words`) as a line for the completion script."""
-        return f"plain,{value}"
+def print_completions(talk: click.Command, options: CommonOptions) -> int:
+    """Print the completions of the line that a shell's script has passed, and return the exit code."""
+    try:
+        lines = _completion_lines(talk, options)
+    except Exception:
+        if os.environ.get("TALK_DEBUG"):
+            raise
+        return EXIT_ERROR
+    click.echo("\n".join(lines).encode())
+    return EXIT_OK
 
 
-@add_completion_class
-class BashCompletion(_LineCompletion):
-    """Completion for bash, which inserts values without quoting them.
+def _completion_lines(talk: click.Command, options: CommonOptions) -> list[str]:
+    """Return the completions of the line in COMP_WORDS, in the format of the shell's script."""
+    line, shell = os.environ["COMP_WORDS"], os.environ["_TALK_COMPLETE"].removesuffix("_complete")
+    words = split_arg_string(line)
+    # If the next character would start a new word, the word to complete is empty.
+    if len(split_arg_string(f"{line}x")) > len(words):
+        words.append("")
+    found = ShellComplete(talk, {"obj": options}, "talk", "_TALK_COMPLETE").get_completions(words[1:-1], words[-1])
+    format_line = {"bash": _bash_line, "zsh": _zsh_line, "fish": _fish_line}[shell]
+    return ["file" if each.type == "file" else format_line(line, each.value, each.help) for each in found]
+
+
+def _bash_line(line: str, value: str, _: str | None) -> str:
+    """Return a value as bash inserts it, which doesn't quote it.
 
     bash replaces the text in COMP_CWORD, which may be only the last part of the word.
     """
-
-    name = "bash"
-    script = "talk.bash"
-
-    def line(self, value: str, words: str | None) -> str:  # noqa: ARG002
-        typed, quote = _last_word(os.environ["COMP_WORDS"])
-        replaced = os.environ["COMP_CWORD"]
-        if replaced in {":", "="}:
-            replaced = ""  # after `sudo`, bash passes the separator instead of an empty word
-        stays = typed.removesuffix(replaced) if replaced else typed
-        kept = "".join(split_arg_string(stays))
-        return f"plain,{_quote_for_bash(_with_flag(value, typed).removeprefix(kept), quote)}"
+    typed, quote = _last_word(line)
+    replaced = os.environ["COMP_CWORD"]
+    if replaced in {":", "="}:
+        replaced = ""  # after `sudo`, bash passes the separator instead of an empty word
+    stays = typed.removesuffix(replaced) if replaced else typed
+    kept = "".join(split_arg_string(stays))
+    return f"plain,{_quote_for_bash(_with_flag(value, typed).removeprefix(kept), quote)}"
 
 
-@add_completion_class
-class ZshCompletion(_LineCompletion):
-    """Completion for zsh, which quotes values itself and expects the help text after a colon."""
-
-    name = "zsh"
-    script = "_talk"
-
-    def line(self, value: str, words: str | None) -> str:
-        if not words:
-            return super().line(value, words)
-        value, words = (each.replace("\\", "\\\\") for each in (value, words))
-        value = value.replace(":", "\\:")
-        return f"described,{value}:{words}"
+def _zsh_line(_: str, value: str, words: str | None) -> str:
+    """Return a value and its help text after a colon. zsh quotes the value itself."""
+    if not words:
+        return f"plain,{value}"
+    value, words = (each.replace("\\", "\\\\") for each in (value, words))
+    value = value.replace(":", "\\:")
+    return f"described,{value}:{words}"
 
 
-@add_completion_class
-class FishCompletion(_LineCompletion):
-    """Completion for fish, which quotes values itself and expects the help text after a tab."""
-
-    name = "fish"
-    script = "talk.fish"
-
-    def line(self, value: str, words: str | None) -> str:
-        typed, _ = _last_word(os.environ["COMP_WORDS"])
-        return f"plain,{_with_flag(value, typed)}" + (f"\t{words}" if words else "")
+def _fish_line(line: str, value: str, words: str | None) -> str:
+    """Return a value and its help text after a tab. fish quotes the value itself."""
+    typed, _ = _last_word(line)
+    return f"plain,{_with_flag(value, typed)}" + (f"\t{words}" if words else "")
 
 
 def completion(_: CommonOptions, shell: str) -> None:
     """Print the completion script for a shell."""
-    shell_class = click.shell_completion.get_completion_class(shell)
-    assert shell_class
-    talk = click.get_current_context().find_root().command
-    show(shell_class(talk, {}, "talk", "_TALK_COMPLETE").source().rstrip("\n"))
+    with open(os.path.join(os.path.dirname(__file__), _SCRIPTS[shell]), encoding="utf-8") as file:
+        show(file.read().rstrip("\n"))
 
 
 def _last_word(line: str) -> tuple[str, str]:
