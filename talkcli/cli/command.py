@@ -8,7 +8,6 @@ This module also parses option values, and texts that may contain invalid UTF-8.
 
 from __future__ import annotations
 
-from talkcli.errors import UsageError
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.options import FLAG, ID, INTEGER, NUMBER, PATH, SECONDS, WORD, Kind, Option
 from talkcli.paths import named_robot
@@ -105,10 +104,17 @@ class Command:
             typed: the names of the options on the command line.
             common: the values of the common options on the command line, by name.
         """
-        robot = common.get("robot")
-        if robot is not None and common.get("socket"):
+        robot, socket, connect_timeout = (common.get(each) for each in ("robot", "socket", "connect_timeout"))
+        if robot is not None and socket:
             return "--robot is a robot of a fleet, --socket a server of this machine: leave out one of them"
-        if fault := self._connection_fault(given, robot, common.get("connect_timeout")):
+        is_local = self._is_local(given)
+        local_name = f"{self.name}{' --output' * (given.get('output') is not None)}"
+        if is_local and robot is not None:
+            return f"'talk {local_name}' is of this machine alone: leave out --robot"
+        if connect_timeout is not None and (is_local or not self.connects):
+            return f"'talk {local_name}' does not wait for a server: leave out --connect-timeout"
+        robot = None if is_local else named_robot(robot, socket)
+        if robot and (fault := self._robot_fault(robot, given, connect_timeout)):
             return fault
         for each in self.options:
             if fault := each.value_error(given[each.name]):
@@ -119,31 +125,20 @@ class Command:
         """Return whether the command runs without a server, as `talk say --output` does."""
         return not self.uses_server or given.get("output") is not None
 
-    def _connection_fault(
-        self, given: Mapping[str, Any], robot: str | None, connect_timeout: float | None
-    ) -> str | None:
-        """Return an error message if --robot or --connect-timeout can't be used here, otherwise None."""
-        local_name = f"{self.name}{' --output' * (given.get('output') is not None)}"
-        is_several = False
-        if robot is not None:
-            from talkcli.fleet.desk.request import Selection, selects_several
+    def _robot_fault(self, robot: str, given: Mapping[str, Any], connect_timeout: float | None) -> str | None:
+        """Return an error message if the command can't be sent to this robot or these robots, otherwise None."""
+        from talkcli.fleet.desk.request import Selection, selects_several
 
-            if self._is_local(given):
-                return f"'talk {local_name}' is of this machine alone: leave out --robot"
-            is_several = selects_several(robot)
+        if selects_several(robot):
             single = [f"--{each}" for each in _SINGLE_ROBOT_OPTIONS if given.get(each)]
-            if is_several and (single or not self.fleet_function):
+            if single or not self.fleet_function:
                 what = " ".join([self.name, *single])
                 return (
                     f"'talk {what}' is of one robot: name it; 'talk fleet status' and 'talk fleet watch' show several"
                 )
-            if fault := Selection(robot).fault:
-                return fault
-        if connect_timeout is None:
-            return None
-        if self._is_local(given) or not self.connects:
-            return f"'talk {local_name}' does not wait for a server: leave out --connect-timeout"
-        return "--connect-timeout waits for one robot: name it, or leave out --connect-timeout" if is_several else None
+            if connect_timeout is not None:
+                return "--connect-timeout waits for one robot: name it, or leave out --connect-timeout"
+        return Selection(robot).fault
 
     def run(self, options: CommonOptions, given: Mapping[str, Any]) -> int | None:
         """Run the command with these option values. Return its exit code, or None for success."""
@@ -151,9 +146,6 @@ class Command:
         function = self.function
         robot = None if self._is_local(given) else named_robot(options.robot, options.socket)
         if robot:
-            # Check the robot again, because its name may come from an environment variable.
-            if fault := self._connection_fault(given, robot, options.connect_timeout):
-                raise UsageError(fault)
             from talkcli.fleet.desk.request import selects_several
 
             if selects_several(robot):

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
 #: The maximum for --max-queue and for --ahead.
 MAX_QUEUED_GOALS = 10_000
-#: The shells that `talk completion` supports.
-SHELLS = ("bash", "zsh", "fish")
 
 
 def _timeout_option(words: str) -> Option:
@@ -538,7 +536,7 @@ _ROWS = (
             0: "printed",
             2: "usage: a shell that there is no script for",
         },
-        argument=Option("shell", WORD, metavar="SHELL", choices=SHELLS),
+        argument=Option("shell", WORD, metavar="SHELL", choices=("bash", "zsh", "fish")),
     ),
 )
 COMMANDS = {each.name: each for each in _ROWS}
