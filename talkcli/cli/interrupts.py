@@ -14,7 +14,7 @@ import sys
 from talkcli.cli.show import STDOUT_FD, discard_output, reader_is_gone
 from talkcli.errors import EXIT_SIGNAL, EXIT_SIGPIPE
 from talkcli.frozen import TYPE_CHECKING
-from talkcli.polling import Interrupted
+from talkcli.polling import Interrupted, wait_ready
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -95,8 +95,6 @@ class Interrupts:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> bool:
-        if kind is Interrupted:
-            self.check_reader()
         for each, handler in self._old_handlers.items():
             signal.signal(each, handler)
         signal.set_wakeup_fd(self._old_wakeup_fd)
@@ -104,20 +102,17 @@ class Interrupts:
         os.close(self._write)
         return kind is Interrupted
 
-    def check_reader(self) -> None:
-        """Set `reader_gone` if the reader of standard output has gone away."""
-        self.reader_gone = self.reader_gone or (STDOUT_FD in self.watched and not has_reader())
-
     def record(self, error: Interrupted | OSError) -> None:
         """Record what ended the wait, and discard all output if its reader is gone.
 
         Errors other than an interrupt, a timeout or a missing reader are raised again.
         """
-        if isinstance(error, OSError) and not isinstance(error, TimeoutError):
-            if not reader_is_gone(error):
-                raise error
+        if isinstance(error, Interrupted | TimeoutError):
+            self.reader_gone = STDOUT_FD in self.watched and not has_reader()
+        elif reader_is_gone(error):
             self.reader_gone = True
-        self.check_reader()
+        else:
+            raise error
         if self.reader_gone:
             discard_output()
 
@@ -128,13 +123,9 @@ class Interrupts:
         """
         if self.signal_number is not None:
             signal.set_wakeup_fd(-1)  # a second SIGHUP must not interrupt the cleanup
-        self.check_reader()
         self.watched.pop(STDOUT_FD, None)
-        os.set_blocking(self._descriptor, False)
-        try:
+        if wait_ready({self._descriptor: select.POLLIN}, 0):
             os.read(self._descriptor, 16)
-        except BlockingIOError:
-            pass
 
     def _handle_signal(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
         if self.signal_number is not None:

@@ -133,7 +133,10 @@ def wait(options: CommonOptions, ids: tuple[str, ...], timeout: float | None, fe
         reporter = GoalReporter(options, feedback=feedback)
         try:
             if feedback:
-                _show_events(goals, end, interrupts, reporter)
+                try:
+                    reporter.follow(goals, seconds_left(end))
+                finally:
+                    retry_without_output(reporter.feedback.close)
             first_failure = EXIT_OK
             for goal in goals:
                 ended = goal.wait(seconds_left(end))
@@ -147,14 +150,3 @@ def wait(options: CommonOptions, ids: tuple[str, ...], timeout: float | None, fe
             late = next(each.id for each in goals if not each.state.terminal)
             raise timeout_error(timeout, f"{late} has not ended") from None
     return interrupts.exit_code
-
-
-def _show_events(goals: list[GoalHandle], end: float | None, interrupts: Interrupts, reporter: GoalReporter) -> None:
-    """Show the events of these goals until all of them have ended."""
-    try:
-        reporter.follow(goals, seconds_left(end))
-    except Interrupted:
-        interrupts.check_reader()  # check this before `close` can redirect standard output
-        raise
-    finally:
-        retry_without_output(reporter.feedback.close)
