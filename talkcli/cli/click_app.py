@@ -201,14 +201,9 @@ class ClickCommand(_HelpfulCommand):
             rest = super().parse_args(ctx, args)
         except click.UsageError as error:
             error.ctx = error.ctx or ctx  # lets the error message refer to this command's help
-            if isinstance(error, click.NoSuchOption) and self.row.unknown_option_hint:
-                words = _describe_error(error)
-                stop = "" if words.endswith("?") else "."
-                raise click.UsageError(f"{words}{stop} {self.row.unknown_option_hint}", ctx) from error
             raise
         if rest and not ctx.resilient_parsing:
-            names = [each.make_metavar(ctx) for each in self.params if isinstance(each, click.Argument)]
-            takes = f"nothing after {names[0]}" if names else "options alone"
+            takes = f"nothing after {self.row.argument.metavar}" if self.row.argument else "options alone"
             raise click.UsageError(f"'{ctx.command_path}' takes {takes}: what is '{' '.join(rest)}'?", ctx)
         return rest
 
@@ -331,7 +326,11 @@ def _describe_error(error: click.ClickException) -> str:
     if isinstance(error, click.NoSuchOption):
         # Leading dashes would make unrelated options look similar.
         near = nearest(error.option_name.lstrip("-"), [each.lstrip("-") for each in error.possibilities or ()])
-        return f"no such option '{error.option_name}'" + (f": did you mean '--{near}'?" if near else "")
+        words = f"no such option '{error.option_name}'" + (f": did you mean '--{near}'?" if near else "")
+        command = error.ctx.command if error.ctx else None
+        hint = command.row.unknown_option_hint if isinstance(command, ClickCommand) else ""
+        stop = "." * (not near)
+        return f"{words}{stop} {hint}" if hint else words
     if isinstance(error, click.MissingParameter) and error.param and isinstance(error.param.type, click.Choice):
         return f"{error.param.metavar} is missing: one of {', '.join(error.param.type.choices)}"
     words = error.format_message().rstrip(".")

@@ -73,12 +73,13 @@ class Command:
     summary: str
     #: the description to show in the command's help
     description: str
-    #: the function that runs the command, as "module:name"; its arguments are the common options and the command's own
-    function: str
     #: example command lines, one per line
     examples: str
     #: the meanings of the exit codes, except for 1 if it stands for any other error
     exit_codes: ExitCodes
+    #: the function that runs the command, as "module:name", or an empty string for the command's function in `ask`; its
+    #: arguments are the common options and the command's own
+    function: str = ""
     options: tuple[Option, ...] = ()
     #: the positional argument; it accepts any number of words if its metavar ends with "..."
     argument: Option | None = None
@@ -143,7 +144,7 @@ class Command:
     def run(self, options: CommonOptions, given: Mapping[str, Any]) -> int | None:
         """Run the command with these option values. Return its exit code, or None for success."""
         options.urgent = self.urgent
-        function = self.function
+        function = self.function or f"ask:{self.name}"
         robot = None if self._is_local(given) else named_robot(options.robot, options.socket)
         if robot:
             from talkcli.fleet.desk.request import selects_several

@@ -271,7 +271,6 @@ _ROWS = (
 
         Prints the ids of the goals that ended because of it. Nothing to cancel is success. Selectors add up.
         """,
-        function="ask:cancel",
         fleet_function="several:cancel",
         examples="""
         talk cancel                 everything, now
@@ -292,7 +291,6 @@ _ROWS = (
         name="status",
         summary="What is being said, what will be, what was.",
         description="Show what is being said, what will be and what was; with an ID, all that is known of that goal.",
-        function="ask:status",
         fleet_function="several:status",
         examples="""
         talk status
@@ -314,7 +312,6 @@ _ROWS = (
 
         With --json each event is an object a line, words included; the first is {"event": "snapshot", ...}.
         """,
-        function="ask:watch",
         plain=False,
         examples="""
         talk watch
@@ -337,7 +334,6 @@ _ROWS = (
         Who sent it is the program that called talk, the process id of talk itself, and after "as" what the sender
         calls itself. Rejected goals are listed, too.
         """,
-        function="ask:log",
         examples="""
         talk log
         talk log -n 100 | grep patrol
@@ -356,7 +352,6 @@ _ROWS = (
 
         Nothing is spoken until then, whoever sends it and however urgent it is. Goals can be sent and cancelled.
         """,
-        function="ask:pause",
         fleet_function="several:pause",
         examples="talk pause; listen_to_the_operator; talk resume",
         exit_codes={
@@ -369,7 +364,6 @@ _ROWS = (
         name="resume",
         summary="Go on where speech was held.",
         description="Go on where 'talk pause' held speech. Twice is success, and so is without a pause.",
-        function="ask:resume",
         fleet_function="several:resume",
         examples="talk resume",
         exit_codes={**FLEET_EXIT_CODES, 0: "speech goes on"},
@@ -410,7 +404,6 @@ _ROWS = (
         several speakers, a number or a name goes behind: "piper/NAME#3". Where the server speaks with a neural voice,
         that one's language means it, too.
         """,
-        function="ask:voices",
         examples="""
         talk voices --language en
         talk serve --voice en-us
@@ -438,7 +431,6 @@ _ROWS = (
 
         With --robot it is the way to a robot of a fleet: broker, certificate, login, rights, the robot's answer.
         """,
-        function="ask:doctor",
         plain=False,
         connects=False,
         examples="""

@@ -173,7 +173,7 @@ def test_every_module_is_used() -> None:
     """By the command, by the engine process, or by a module that is itself run."""
     used: set[str] = set()
     runs = {each for command in COMMANDS.values() for each in (command.function, command.fleet_function) if each}
-    new = {"__main__", "engine.child.main", "", *(f"cli.{each.partition(':')[0]}" for each in runs)}
+    new = {"__main__", "engine.child.main", "", "cli.ask", *(f"cli.{each.partition(':')[0]}" for each in runs)}
     new |= {f"engine.child.players.{each.class_path.partition(':')[0]}" for each in PLAYERS.values() if each.class_path}
     new |= {f"engine.child.synthesizers.{each.partition(':')[0]}" for each in SYNTHESIZERS.values()}
     while new:

@@ -301,7 +301,7 @@ def test_a_refusal_says_what_a_value_may_be(option: Option, value: object, words
 @pytest.mark.parametrize("command", COMMANDS)
 def test_what_carries_a_command_out_takes_what_its_row_gives(command: str) -> None:
     row = COMMANDS[command]
-    module, _, name = row.function.partition(":")
+    module, _, name = (row.function or f"ask:{command}").partition(":")
     function = getattr(importlib.import_module(f"talkcli.cli.{module}"), name)
     names = [each.name for each in row.options] + ([row.argument.name] if row.argument else [])
     bound = inspect.signature(function).bind(None, **dict.fromkeys(names))
