@@ -93,14 +93,10 @@ def test_file_in_the_place_of_the_socket_is_not_removed(home: str) -> None:
 def test_server_that_is_refused_leaves_no_lock(home: str) -> None:
     os.mkdir(f"{home}/directory")
     os.mkfifo(f"{home}/pipe")
-    too_long = "s" * (100 - len(home))  # the name of the lock file is not too long, but the path of the socket is
-    for name in ("directory", "pipe", too_long + "s" * 20):
+    for name in ("directory", "pipe"):
         refused(home, "--socket", f"{home}/{name}")
     assert sorted(os.listdir(home)) == ["directory", "pipe"]
-    with open(f"{home}/{too_long}{'s' * 20}.lock", "w", encoding="utf-8"):
-        pass
-    refused(home, "--socket", f"{home}/{too_long}{'s' * 20}")
-    assert len(os.listdir(home)) == 3, "a lock that was there is not its own to remove"
+    assert "cannot listen at" in refused(home, "--socket", f"{home}/{'s' * (120 - len(home))}")
 
 
 @pytest.mark.parametrize("words", ["is no regular file", "is a symbolic link", "is a hard link"])

@@ -63,11 +63,7 @@ class Listener:
         _refuse_other_file(self.path)
         _refuse_second_server(self._named_path)
         self._lock = Lock(self.path)
-        try:
-            self.socket = _bind(self.path, mode)
-        except BaseException:
-            self._lock.undo()
-            raise
+        self.socket = _bind(self.path, mode)
         self._identity = _identity(self.path)
 
     def in_place(self) -> bool:
@@ -82,25 +78,18 @@ class Listener:
             The old socket, which the caller must close, or None if it is still in use.
 
         Raises:
-            AddressInUse: if another server or file is in the way. In this case, nothing was changed.
+            AddressInUse: if another server or file is in the way. In this case, the old socket is kept.
         """
         path = paths.server_socket(self._named_path)
         _check_directory(os.path.dirname(path))
-        lock = self._lock if self._lock.in_place(path) else Lock(path)
-        former = None
-        try:
-            if _identity(path) != self._identity:
-                _refuse_live_socket(path)
-                bound = _bind(path, self.mode)
-                former = self.socket
-                self.socket, self.path, self._identity = bound, path, _identity(path)
-        except BaseException:
-            if lock is not self._lock:
-                lock.undo()
-            raise
-        if lock is not self._lock:
-            self._lock.close()
-            self._lock = lock
+        if not self._lock.in_place(path):
+            former_lock, self._lock = self._lock, Lock(path)
+            former_lock.close()
+        if _identity(path) == self._identity:
+            return None
+        _refuse_live_socket(path)
+        former, self.socket = self.socket, _bind(path, self.mode)
+        self.path, self._identity = path, _identity(path)
         return former
 
     def close(self) -> None:
@@ -120,16 +109,12 @@ class InheritedListener:
     def __init__(self, fd: int) -> None:
         os.set_inheritable(fd, False)
         self.socket = socket.socket(fileno=fd)
-        try:
-            self.path = _path_of(self.socket)
-            self._identity = _identity(self.path)
-            if self._identity is None:
-                raise AddressInUse(f"the passed socket's file {self.path} is gone: {_RESTART_SOCKET}")
-            self.mode = stat.S_IMODE(os.lstat(self.path).st_mode)
-        except BaseException:
-            self.socket.close()
-            raise
         self.socket.setblocking(False)
+        self.path = _path_of(self.socket)
+        self._identity = _identity(self.path)
+        if self._identity is None:
+            raise AddressInUse(f"the passed socket's file {self.path} is gone: {_RESTART_SOCKET}")
+        self.mode = stat.S_IMODE(os.lstat(self.path).st_mode)
 
     def in_place(self) -> bool:
         """Return whether the socket file is still in place."""
@@ -179,14 +164,12 @@ class Lock:
         Raises:
             AddressInUse: if another server holds the lock.
         """
-        self._path = path
         while True:
-            self._fd, self._made = _open_lock(_lock_of(path))
+            self._fd = _open_lock(f"{path}.lock")
             try:
                 fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
                 holder = _holder(self._fd)
-                os.close(self._fd)
                 raise _already_served(holder, path, here=holder is not None) from None
             if self.in_place(path):
                 break
@@ -198,17 +181,7 @@ class Lock:
     def in_place(self, path: str) -> bool:
         """Return whether the lock file of a path is still the one that this server has locked."""
         status = os.fstat(self._fd)
-        return _identity(_lock_of(path)) == (status.st_dev, status.st_ino)
-
-    def undo(self) -> None:
-        """Release the lock, and remove the lock file if this server created it.
-
-        Another server that has already opened the file will notice that it was removed.
-        """
-        if self._made and self.in_place(self._path):
-            with contextlib.suppress(OSError):
-                os.unlink(_lock_of(self._path))
-        self.close()
+        return _identity(f"{path}.lock") == (status.st_dev, status.st_ino)
 
     def close(self) -> None:
         """Release the lock, but keep the lock file."""
@@ -358,28 +331,18 @@ def _bind(path: str, mode: int) -> socket.socket:
 # -- the lock
 
 
-def _lock_of(path: str) -> str:
-    return f"{path}.lock"
-
-
-def _open_lock(name: str) -> tuple[int, bool]:
-    """Open or create a lock file. Return its descriptor, and whether the file was created."""
+def _open_lock(name: str) -> int:
+    """Open or create a lock file, and return its descriptor."""
     flags = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
     while True:
         with _refusing(f"the lock {name} can't be opened"):
             with contextlib.suppress(FileExistsError):
-                return os.open(name, flags | os.O_CREAT | os.O_EXCL, 0o600), True
-            try:
+                return os.open(name, flags | os.O_CREAT | os.O_EXCL, 0o600)
+            with contextlib.suppress(FileNotFoundError):  # the file has just been removed, so try again
                 _refuse_other_lock(name, os.lstat(name))  # check first, because opening a device may have side effects
                 fd = os.open(name, flags)
-            except FileNotFoundError:
-                continue  # the file has just been removed
-        try:
-            _refuse_other_lock(name, os.fstat(fd))
-        except AddressInUse:
-            os.close(fd)
-            raise
-        return fd, False
+                _refuse_other_lock(name, os.fstat(fd))
+                return fd
 
 
 def _refuse_other_lock(name: str, status: os.stat_result) -> None:
