@@ -1,4 +1,4 @@
 """Logging and service manager notifications for a long-running process.
 
-This package knows nothing about goals, clients or engines. `talkcli.server.log` has the server's log lines about those.
+This package knows nothing about goals, clients or engines. `talkcli.server.speech` logs what happens to them.
 """

@@ -286,7 +286,8 @@ GoalCommand = Speak
 Command = Configure | GoalCommand | Stop | Hold | Continue | NextGoal | LoadVoice | DropVoice
 #: Events about the goal with the given `id`.
 GoalEvent = Started | Alive | Word | OutputChanged | VoiceChosen | Held | Ended
-Event = Ready | StartFailed | VoiceList | VoiceLoaded | VoiceUnloaded | VoiceMemory | GoalEvent
+VoiceEvent = VoiceList | VoiceLoaded | VoiceUnloaded | VoiceMemory
+Event = Ready | StartFailed | VoiceEvent | GoalEvent
 
 #: Message classes for each direction, by class name. Each message contains its class name as "kind".
 COMMAND_CLASSES: dict[str, type[Command]] = {each.__name__: each for each in Command.__args__}

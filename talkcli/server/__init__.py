@@ -7,8 +7,7 @@ This package does the I/O, and `goals` makes the decisions. Only `cli.services` 
     stream       sends and receives the bytes of a client
     connection   reads the requests of a client, and limits what the client may send and leave unread
     requests     handles each kind of request
-    speech       connects the scheduler with the engine
+    speech       connects the scheduler with the engine, and logs what happens to goals and engines
     subscribers  sends events to clients that wait or watch
     voices       finds the voices that clients ask for
-    log          log messages about goals, engines and senders
 """

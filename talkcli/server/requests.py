@@ -25,7 +25,7 @@ from talkcli.protocol.events import Result
 from talkcli.protocol.lines import encode
 from talkcli.protocol.requests import Log, Pause, Request, Resume, Status, Voices, Wait, Watch
 from talkcli.server.connection import PendingRequest, resume_all
-from talkcli.server.log import describe_sender
+from talkcli.server.speech import describe_sender
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator

@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING
 from talkcli.daemon import log
 from talkcli.engine import protocol
 from talkcli.engine.parent.supervisor import EngineDied, EngineMissing, EngineSaid, Report, ThreadDied
+from talkcli.engine.players import NO_PLAYER
+from talkcli.engine.voices import is_own_driver
 from talkcli.errors import TalkError, UsageError
 from talkcli.frozen import replace
 from talkcli.goals.goal import Output
@@ -24,16 +26,17 @@ from talkcli.goals.reasons import Reason
 from talkcli.goals.scheduler import Effect, EngineOrder, Now, Order, StateChange
 from talkcli.goals.states import State
 from talkcli.goals.voices import VoiceDropOrder, VoiceLoadOrder, VoiceWarning
-from talkcli.server import log as server_log
 from talkcli.server.connection import resume_all
 from talkcli.server.stream import ClientStreams
 from talkcli.server.subscribers import Notifications, Subscribers
 from talkcli.server.voices import VoiceCatalog
+from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from talkcli.engine.parent.supervisor import Supervisor
+    from talkcli.goals.goal import By, Sender
     from talkcli.goals.record import Record
     from talkcli.goals.scheduler import Scheduler
     from talkcli.server.connection import WaitingList
@@ -47,6 +50,9 @@ READY = "ready"
 #: Maximum number of the engine's reports to process at once. Publishing this many words to fifty watchers takes 10 to
 #: 20 ms on a busy machine.
 REPORTS_PER_TURN = 8
+#: Maximum length of a program's name or command line in the log.
+_MAX_LOGGED_COMMAND_CHARS = 80
+_NO_PLAYER_NEEDED = "which plays by itself"
 
 require_fields(protocol.Speak, ENGINE_OPTIONS)
 
@@ -115,7 +121,7 @@ class Speech:
         else:
             doing = f"speaking {scheduler.active.id}" if scheduler.active else "idle"
         waiting = f", {scheduler.pending_count} waiting" if scheduler.pending_count else ""
-        voice = f"; {ready.version or ready.driver}, {server_log.describe_sound(ready)}" if ready else ""
+        voice = f"; {ready.version or ready.driver}, {_describe_sound(ready)}" if ready else ""
         return log.sanitize(doing + waiting + voice)
 
     @property
@@ -215,7 +221,7 @@ class Speech:
     def _publish_change(self, record: Record, state: State, at: float) -> None:
         self.subscribers.state_changed(record, state, at)
         if state.terminal:
-            server_log.goal_ended(record, elapsed() - record.began_at)
+            _log_end(record, elapsed() - record.began_at)
             resume_all(self._waiting_for_silence.pop(record, {}))
             self.check_finished()
 
@@ -264,7 +270,9 @@ class Speech:
         if isinstance(report, protocol.GoalEvent):
             if active and active.id == report.id:  # ignore reports about a goal that is no longer active
                 self._process_goal_event(report, active, now)
-        elif not self._process_voice_event(report, now):
+        elif isinstance(report, protocol.VoiceEvent):
+            self._process_voice_event(report, now)
+        else:
             self._process_engine_event(report, now)
 
     def _process_goal_event(self, event: protocol.GoalEvent, active: Record, now: Now) -> None:
@@ -287,24 +295,20 @@ class Speech:
                     self.silent_goal = active
                     resume_all(self.waiting_for_silence(active))
 
-    def _process_voice_event(self, event: Report, now: Now) -> bool:
-        """Process an event about voices. Return False if the event is about something else."""
+    def _process_voice_event(self, event: protocol.VoiceEvent, now: Now) -> None:
         scheduler = self.scheduler
         match event:
             case protocol.VoiceList():
                 self.voices.listed = event.voices
                 resume_all(self.waiting_for_voices)
             case protocol.VoiceLoaded():
-                server_log.voice_load_ended(event)
+                _log_voice_load(event)
                 imported = event.seconds > 0
                 self.apply(scheduler.voice_load_ended(event.voice, event.error, now, has_libraries=imported))
             case protocol.VoiceMemory():
                 self.apply(scheduler.voices_measured(event.voice, event.memory, now))
             case protocol.VoiceUnloaded():
                 self.apply(scheduler.voice_unloaded(event.voice, now))
-            case _:
-                return False
-        return True
 
     def _process_engine_event(self, event: Report, now: Now) -> None:
         match event:
@@ -343,7 +347,7 @@ class Speech:
         if self.ready is None and ready.voice is not None:
             self.apply(self.scheduler.change_settings({"voice": ready.voice}, now))
         if self.ready is None or self.ready != replace(ready, player=self.ready.player):
-            server_log.engine_ready(ready, self._player_options)
+            _log_engine(ready, self._player_options)
         self.ready, self.engine_status, self.voices.driver = ready, READY, ready.driver
         self.engine_known.set()
         self.apply(self.scheduler.engine_ready(now))
@@ -375,3 +379,67 @@ class Speech:
         """After a shutdown, set `finished` when all goals have ended and all notifications were sent."""
         if self.scheduler.closing and self.scheduler.active is None and self.notifications.done:
             self.finished.set()
+
+
+# -- the log
+
+
+def _log_end(record: Record, seconds: float) -> None:
+    """Log that a goal has ended. `seconds` is how long it was active."""
+    took = "" if record.started_at is None else f" after {seconds:.1f} s"
+    how = f"{record.id} {record.state.name}{took}"
+    if record.state is not State.SUCCEEDED:
+        how += f" ({record.reason}{_cause(record.by)})"
+    detail = f"; {log.sanitize(record.message)}" if record.state is State.ABORTED and record.message else ""
+    log.write(f'{how}: "{log.sanitize(record.text or "")}" from {describe_sender(record.sender)}{detail}')
+
+
+def _log_engine(engine: protocol.Ready, player_options: Sequence[str]) -> None:
+    """Log that the engine is ready.
+
+    Args:
+        engine: the engine's description of itself.
+        player_options: the names of the player options that were given.
+    """
+    version = f", {log.sanitize(engine.version)}" if engine.version else ""
+    sound = _describe_sound(engine)
+    words = f"engine ready: driver {engine.driver}{version}, {sound}"
+    if player_options and sound == _NO_PLAYER_NEEDED:
+        words += f": {' and '.join(player_options)} {'has' if len(player_options) == 1 else 'have'} no effect"
+    log.write(words)
+
+
+def _log_voice_load(voice: protocol.VoiceLoaded) -> None:
+    """Log that a neural voice was loaded, or that loading it failed."""
+    how = f"loaded in {voice.seconds:.1f} s"
+    if voice.error is not None:
+        how = f"cannot be loaded, espeak speaks where it may: {log.sanitize(voice.error)}"
+    log.write(f"voice {log.sanitize(voice.voice)} {how}")
+
+
+def _describe_sound(engine: protocol.Ready) -> str:
+    """Return a short description of the engine's audio output."""
+    if engine.player:
+        return f"player {engine.player}"
+    return NO_PLAYER if is_own_driver(engine.driver) else _NO_PLAYER_NEEDED
+
+
+def describe_sender(sender: Sender) -> str:
+    """Return a short description of the program that sent a request."""
+    parts = [] if sender.uid is None else [f"uid {sender.uid}"]
+    if sender.pid is not None:
+        parts.append(f"pid {sender.pid}")
+    if sender.command:
+        parts.append(printable(sender.command, _MAX_LOGGED_COMMAND_CHARS))
+    if sender.parent:
+        parts.append(f"started by {printable(sender.parent, _MAX_LOGGED_COMMAND_CHARS)}")
+    if sender.name:
+        parts.append(f'calls itself "{printable(sender.name)}"')
+    return ", ".join(parts) or "nobody known"
+
+
+def _cause(by: By | None) -> str:
+    """Return a short description of what ended a goal, or an empty string if it is unknown."""
+    if by is None:
+        return ""
+    return f" by {by.goal}" if by.goal else f" by {describe_sender(by.client)}" if by.client else ""
