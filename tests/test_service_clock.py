@@ -47,7 +47,7 @@ async def _queued_behind_another(ttl: float) -> Speech:
     served.engine = _BusyEngine()  # type: ignore[assignment]
     served.scheduler.engine_ready(served.now())
     for text in ("a long sentence", "the door is open"):
-        served.apply(served.scheduler.submit(Say(text), Sender(), served.now()).effects)
+        served.apply(served.scheduler.submit(Say(text), Sender(), served.now())[1])
     return served
 
 
@@ -68,7 +68,7 @@ async def test_no_request_after_a_suspend_finds_a_goal_whose_time_is_over(slept:
     served = await _queued_behind_another(ttl=600)
     slept.append(3_600)
     served.now()  # every request begins with this
-    assert served.scheduler.pending_count == 0
+    assert len(served.scheduler.pending) == 0
 
 
 @pytest.mark.skipif(not hasattr(time, "CLOCK_BOOTTIME"), reason="this system has no clock that counts a suspend")

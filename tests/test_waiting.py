@@ -102,7 +102,7 @@ class Server:
 
     def make_room(self) -> None:
         """Cancel the pending goal."""
-        (pending,) = self.speech.scheduler.pending()
+        (pending,) = self.speech.scheduler.pending
         self.speech.apply(self.speech.scheduler.cancel(Cancel(ids=(pending.id,)), None, self.speech.now()).effects)
 
 
@@ -375,7 +375,7 @@ async def test_engine_gets_its_next_task_before_clients_get_events() -> None:
 
     served.subscribers.state_changed = changed  # type: ignore[assignment, method-assign]
     for text, preempt in (("first", False), ("second", True)):
-        served.apply(served.scheduler.submit(Say(text, preempt=preempt), Sender(), served.now()).effects)
+        served.apply(served.scheduler.submit(Say(text, preempt=preempt), Sender(), served.now())[1])
     served.report(protocol.Ended("4k7f-1", protocol.OUTCOME_STOPPED))
     await asyncio.sleep(0)
     assert written == [

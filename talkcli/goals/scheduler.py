@@ -27,7 +27,7 @@ from talkcli.goals.states import IllegalTransition, State
 from talkcli.goals.voices import VoiceDropOrder, VoiceLoadOrder, VoiceScheduler, VoiceWarning
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Collection
 
     from talkcli.goals.goal import Output, Sender
     from talkcli.goals.options import Cancel, Say, Set
@@ -80,17 +80,6 @@ class EngineOrder:
 Effect = StateChange | EngineOrder | VoiceLoadOrder | VoiceDropOrder | VoiceWarning
 
 
-@frozen
-class Submission:
-    """The result of `Scheduler.submit`."""
-
-    #: the new goal, or an earlier goal with the same id and text
-    record: Record
-    effects: list[Effect]
-    #: whether the record belongs to an earlier goal
-    attached: bool = False
-
-
 @dataclass(slots=True)
 class Cancellation:
     """The result of `Scheduler.cancel`."""
@@ -131,6 +120,7 @@ class Scheduler:
         self.settings = settings
         self.max_queue = max_queue
         self.max_text = max_text
+        self.pending = Queue()
         self.history = History()
         self.voices = voices or VoiceScheduler()
         #: the goal that is being spoken or stopped, or None
@@ -143,7 +133,6 @@ class Scheduler:
         self.closing = False
         #: whether an engine process is running that can load voices
         self._loads_voices = False
-        self._queue = Queue()
         self._by_id: dict[str, Record] = {}
         self._speech_times = SpeechTimes()
         self._early_cancels = EarlyCancels()
@@ -151,18 +140,9 @@ class Scheduler:
 
     # -- goals
 
-    @property
-    def pending_count(self) -> int:
-        """The number of pending goals."""
-        return len(self._queue)
-
-    def pending(self) -> Iterator[Record]:
-        """Return the pending goals in speaking order."""
-        return iter(self._queue)
-
     def unfinished(self) -> list[Record]:
         """Return the active goal, if any, and the pending goals."""
-        return ([self.active] if self.active else []) + list(self._queue)
+        return ([self.active] if self.active else []) + list(self.pending)
 
     def find(self, goal_id: str) -> Record | None:
         """Return the goal with this id, or None. Goals that ended long ago are forgotten."""
@@ -198,7 +178,7 @@ class Scheduler:
         refusal: Refusal | None = None,
         canceled: By | None = None,
         waited_s: float = 0.0,
-    ) -> Submission:
+    ) -> tuple[Record, list[Effect]]:
         """Accept or reject a goal. A rejected goal doesn't affect other goals.
 
         Args:
@@ -208,10 +188,14 @@ class Scheduler:
             refusal: the server's own reason to reject the goal, or None.
             canceled: the client that cancelled the goal while it waited for room. The goal is accepted and recalled.
             waited_s: how long the goal waited for room, which counts towards its time to live.
+
+        Returns:
+            The record of the goal, and the effects. If an earlier goal has the same id and text, its record is returned
+            without effects.
         """
         first = self.find(say.id) if say.id is not None and options.is_clients_id(say.id) else None
         if first is not None and first.has_text(say.text):
-            return Submission(first, [], attached=True)
+            return first, []
         self._count += 1
         ttl = (self.settings.ttl if say.ttl is None else say.ttl) or None
         expires_at = None if ttl is None else now.monotonic + ttl - waited_s
@@ -222,24 +206,24 @@ class Scheduler:
         expired = expires_at is not None and expires_at <= now.monotonic
         recalled = self._find_room(say)
         if recalled is None and not (by or refused or expired):
-            refused = Reason.QUEUE_FULL, f"{len(self._queue)} goals are waiting already (`talk serve --max-queue`)"
+            refused = Reason.QUEUE_FULL, f"{len(self.pending)} goals are waiting already (`talk serve --max-queue`)"
         if refused:
             record.reason, words = refused
             record.state, record.message, record.ended_at = State.REJECTED, f"Talk rejected: {words}", now.wall
             self.history.add(record)
-            return Submission(record, [StateChange(record, State.REJECTED)])
+            return record, [StateChange(record, State.REJECTED)]
         record.id = say.id or record.id
         self._by_id[record.id] = record
         effects: list[Effect] = [StateChange(record, State.PENDING)]
         if by:
             words = "canceled before it was spoken" if canceled else "canceled before it arrived"
-            return Submission(record, effects + self._end_unqueued(record, Reason.CANCELED, words, by, now))
+            return record, effects + self._end_unqueued(record, Reason.CANCELED, words, by, now)
         if expired:
             words = _expiry_message(record)
-            return Submission(record, effects + self._end_unqueued(record, Reason.EXPIRED, words, None, now))
+            return record, effects + self._end_unqueued(record, Reason.EXPIRED, words, None, now)
         effects += self._enqueue(record, recalled or [], now)
         self._request_voice(self.wanted_voice(record), now)
-        return Submission(record, effects + self._start_next(now) + self._load_next(now))
+        return record, effects + self._start_next(now) + self._load_next(now)
 
     def cancel(
         self, selection: Cancel, sender: Sender | None, now: Now, waiting: Collection[str | None] = ()
@@ -304,7 +288,7 @@ class Scheduler:
         """End all goals and reject new ones."""
         self.closing = True
         effects: list[Effect] = []
-        for record in list(self._queue):
+        for record in list(self.pending):
             effects += self._recall(record, Reason.SHUTDOWN, "the server was stopped", None, now)
         if self.active:
             effects += self._stop(self.active, Reason.SHUTDOWN, None, now)
@@ -429,7 +413,7 @@ class Scheduler:
 
     def deadline(self) -> float | None:
         """Return the monotonic time at which `tick` must be called, or None if there is no time limit."""
-        due = (self._active_deadline(), self._queue.next_expiry(), self._next_deadline())
+        due = (self._active_deadline(), self.pending.next_expiry(), self._next_deadline())
         return min((each for each in due if each is not None), default=None)
 
     def tick(self, now: Now) -> list[Effect]:
@@ -467,7 +451,7 @@ class Scheduler:
                 result.unknown.append(goal_id)
         if self.active and (selection.current or self.active.key == selection.key is not None):
             chosen.append(self.active)
-        if pending := self._queue.with_key(selection.key):
+        if pending := self.pending.with_key(selection.key):
             chosen.append(pending)
         if selection.before is not None:
             last = self.find(selection.before)
@@ -503,7 +487,7 @@ class Scheduler:
         if say.throttle is None:
             return None
         active = self.active
-        waiting = self._queue.with_text(say.text) if say.key is None else None
+        waiting = self.pending.with_text(say.text) if say.key is None else None
         if active and (active.text == say.text if say.key is None else active.key == say.key):
             first, words = active.id, "is being said"
         elif waiting:
@@ -524,18 +508,18 @@ class Scheduler:
 
         Return None if the queue has no room for the new goal.
         """
-        replaced = self._queue.with_key(say.key)
+        replaced = self.pending.with_key(say.key)
         preempted: list[Record] = []
         if say.flush:
-            preempted = self._queue.goals_up_to(say.priority)
+            preempted = self.pending.goals_up_to(say.priority)
         elif self._preempts(say):
-            preempted = self._queue.preempting_goals_up_to(say.priority)
+            preempted = self.pending.preempting_goals_up_to(say.priority)
         recalled = [(replaced, Reason.REPLACED)] if replaced else []
         recalled += [(each, Reason.PREEMPTED) for each in preempted if each is not replaced]
         # The queue never exceeds its limit, so removing one goal is enough.
-        if recalled or len(self._queue) < self.max_queue:
+        if recalled or len(self.pending) < self.max_queue:
             return recalled
-        last = self._queue.displaceable_goal()
+        last = self.pending.displaceable_goal()
         # A goal sent with `preempt` may also displace a goal of its own priority.
         limit = say.priority if say.preempt else say.priority - 1
         return [(last, Reason.DISPLACED)] if last and last.priority <= limit else None
@@ -551,7 +535,7 @@ class Scheduler:
             effects += self._recall(each, reason, f"{reason} by {record.id}", by, now)
         if record.preempt and self.active and self.active.priority <= record.priority:
             effects += self._stop(self.active, Reason.PREEMPTED, by, now)
-        self._queue.add(record, replaced)
+        self.pending.add(record, replaced)
         return effects
 
     # -- voices
@@ -598,7 +582,7 @@ class Scheduler:
     def _expire(self, now: Now) -> list[Effect]:
         """Recall all pending goals that have expired."""
         effects: list[Effect] = []
-        for record in self._queue.expired(now.monotonic):
+        for record in self.pending.expired(now.monotonic):
             effects += self._recall(record, Reason.EXPIRED, _expiry_message(record), None, now)
         return effects
 
@@ -617,7 +601,7 @@ class Scheduler:
 
     def _next_deadline(self) -> float | None:
         """Return the monotonic time at which the next goal stops waiting for its voice, or None."""
-        record = None if self.active or self.paused or not self.has_engine else self._queue.first()
+        record = None if self.active or self.paused or not self.has_engine else self.pending.first()
         if record is None:
             return None
         start = 0.0 if record.next_since == inf else self._start_time(record)
@@ -642,21 +626,21 @@ class Scheduler:
         if self.active or self.paused:
             return None, []
         effects = self._expire(now)
-        record = self._queue.first()
+        record = self.pending.first()
         if record is None:
             return None, effects
         record.next_since = min(record.next_since, now.monotonic)
         if self._start_time(record) > now.monotonic:
             return None, effects
         record.change_state(State.ACTIVE)
-        self._queue.remove(record)
+        self.pending.remove(record)
         record.started_at, record.began_at = now.wall, now.monotonic
         self.active = record
         return record, [*effects, StateChange(record, State.ACTIVE)]
 
     def _recall(self, record: Record, reason: Reason, words: str, by: By | None, now: Now) -> list[Effect]:
         """Remove a goal from the queue and end it with the state RECALLED."""
-        self._queue.remove(record)
+        self.pending.remove(record)
         return self._end_unqueued(record, reason, words, by, now)
 
     def _end_unqueued(self, record: Record, reason: Reason, words: str, by: By | None, now: Now) -> list[Effect]:

@@ -236,10 +236,10 @@ class Requests:
                 waited = await self._await_room(pending, say)
         now = speech.now()
         say, refusal = self._check_goal(pending, say)
-        submitted = scheduler.submit(say, connection.client, now, refusal, pending.canceled_by, waited)
-        record = submitted.record
+        record, effects = scheduler.submit(say, connection.client, now, refusal, pending.canceled_by, waited)
         extra: JsonObject = {"paused": True} if scheduler.paused else {}
-        if submitted.attached:
+        attached = not effects  # the goal was sent before
+        if attached:
             state = record.state
             extra["attached"] = True
         else:
@@ -248,13 +248,13 @@ class Requests:
             if pending.canceled_by and record.by is pending.canceled_by:
                 pending.canceled_goal = record
         goal = record.snapshot(state).to_json()
-        ended = submitted.attached and state.terminal
+        ended = attached and state.terminal
         if (say.wait or say.feedback) and not ended:
             speech.subscribers.await_result(record.id, connection, feedback=say.feedback)
         pending.answer(goal=goal, **extra)
         if ended and (say.wait or say.feedback):
             connection.publish(encode({"event": "result", "goal": goal}))
-        speech.apply(submitted.effects)
+        speech.apply(effects)
 
     def _check_goal(self, pending: PendingRequest, say: Say) -> tuple[Say, Refusal | None]:
         """Return the goal with the id of its voice, and the server's reason to refuse the goal, or None.
@@ -367,7 +367,7 @@ class Requests:
         recent = self._scheduler.history.latest(RECENT_GOALS, rejected=False)
         active = self._scheduler.active
         now = active.snapshot().to_json() if active else None
-        goals = chain(_goal_lines("pending", list(self._scheduler.pending())), _goal_lines("recent", recent))
+        goals = chain(_goal_lines("pending", list(self._scheduler.pending)), _goal_lines("recent", recent))
         pending.answer(goals, server=self._describe(), active=now)
 
     async def _voices(self, pending: PendingRequest, _: Voices) -> None:

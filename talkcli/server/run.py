@@ -176,7 +176,8 @@ class Server:
                 log.write(f"ready on {self._listener.path} (pid {os.getpid()})")
             if settings.greeting:
                 itself = Sender(os.getpid(), os.getuid(), "talk")
-                speech.apply(self._scheduler.submit(Say(settings.greeting), itself, speech.now()).effects)
+                _, effects = self._scheduler.submit(Say(settings.greeting), itself, speech.now())
+                speech.apply(effects)
             await speech.finished.wait()
             self._socket_check.cancel()
             self._acceptor.close()
@@ -282,7 +283,7 @@ class Server:
             **shown_settings(scheduler.settings),
             "neural_voices": scheduler.voices.to_json(),
             "paused": scheduler.paused,
-            "pending": scheduler.pending_count,
+            "pending": len(scheduler.pending),
             "max_queue": settings.max_queue,
             "clients": len(self.connections),
             "max_clients": settings.max_clients,

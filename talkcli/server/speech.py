@@ -120,7 +120,7 @@ class Speech:
             doing = "paused"
         else:
             doing = f"speaking {scheduler.active.id}" if scheduler.active else "idle"
-        waiting = f", {scheduler.pending_count} waiting" if scheduler.pending_count else ""
+        waiting = f", {len(scheduler.pending)} waiting" if scheduler.pending else ""
         voice = f"; {ready.version or ready.driver}, {_describe_sound(ready)}" if ready else ""
         return log.sanitize(doing + waiting + voice)
 
@@ -215,7 +215,7 @@ class Speech:
 
     def _following(self) -> tuple[bool, bool]:
         """Return whether there is a next goal, and whether its voice is neural."""
-        following = next(self.scheduler.pending(), None)
+        following = self.scheduler.pending.first()
         return following is not None, following is not None and is_neural(self.scheduler.wanted_voice(following))
 
     def _publish_change(self, record: Record, state: State, at: float) -> None:

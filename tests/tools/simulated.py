@@ -120,7 +120,7 @@ class Server:
             "engine": self._speech.engine_status,
             **shown_settings(scheduler.settings),
             "paused": scheduler.paused,
-            "pending": scheduler.pending_count,
+            "pending": len(scheduler.pending),
         }
 
 

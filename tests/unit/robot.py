@@ -25,7 +25,7 @@ import pytest
 from talkcli.goals.goal import By, Sender
 from talkcli.goals.options import INITIAL, Cancel, Say
 from talkcli.goals.reasons import Reason
-from talkcli.goals.scheduler import Cancellation, Effect, EngineOrder, Now, Scheduler, StateChange, Submission
+from talkcli.goals.scheduler import Cancellation, Effect, EngineOrder, Now, Scheduler, StateChange
 from talkcli.goals.voices import VoiceDropOrder, VoiceLoadOrder, VoiceScheduler
 
 if TYPE_CHECKING:
@@ -76,17 +76,14 @@ class Robot:
 
     # -- single steps
 
-    def submits(self, say: Say, name: str = "", **known: Any) -> Submission:
-        done = self.scheduler.submit(say, ARM, self.now, **known)
-        if name and done.attached:
-            self.attached.append(f"{name} is {self.name_of(done.record)}")
+    def asks(self, say: Say, name: str = "", **known: Any) -> Record:
+        record, effects = self.scheduler.submit(say, ARM, self.now, **known)
+        if name and not effects:
+            self.attached.append(f"{name} is {self.name_of(record)}")
         elif name:
-            self.goals[name] = done.record
-        self.see(done.effects)
-        return done
-
-    def asks(self, say: Say) -> Record:
-        return self.submits(say).record
+            self.goals[name] = record
+        self.see(effects)
+        return record
 
     def says(self, text: str = "door open", *, preempt: bool | None = None, priority: int = 0) -> Record:
         return self.asks(Say(text, preempt=preempt, priority=priority))
@@ -133,7 +130,7 @@ class Robot:
                     known["refusal"] = Reason(known["refusal"]), "it can't be had"
                 if "canceled" in known:
                     known["canceled"] = By(client=DOOR)
-                self.submits(Say(**{"text": verb, **given}), verb, **known)
+                self.asks(Say(**{"text": verb, **given}), verb, **known)
             elif verb == "cancel":
                 given = options(words)
                 ids = [self._id(each) for each in words if "=" not in each and each != "current"]

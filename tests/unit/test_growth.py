@@ -60,7 +60,7 @@ def crowd(size: int) -> Robot:
     for number in range(size):
         ttl = 1_000.0 + number if number % 2 else None
         robot.asks(Say("waiting", priority=-(number % 1_000), ttl=ttl, key=f"key {number}", id=f"goal:{number}"))
-    assert robot.scheduler.pending_count == size
+    assert len(robot.scheduler.pending) == size
     robot.seen.clear()
     return robot
 
@@ -78,7 +78,7 @@ def ask_for_room(robot: Robot) -> None:
 
 
 def write_a_status_line(robot: Robot) -> None:
-    encode(events.item(7, pending=next(robot.scheduler.pending()).snapshot().to_json()))
+    encode(events.item(7, pending=next(iter(robot.scheduler.pending)).snapshot().to_json()))
 
 
 #: The steps to measure: a function, or a script with an effect that it must have.
@@ -132,7 +132,7 @@ def test_a_pending_goal_takes_less_than_a_kilobyte() -> None:
         before = tracemalloc.get_traced_memory()[0]
         for number in range(5_000):
             robot.scheduler.submit(Say(f"battery low, the {number}th time"), ARM, robot.now)
-        taken = (tracemalloc.get_traced_memory()[0] - before) / robot.scheduler.pending_count
+        taken = (tracemalloc.get_traced_memory()[0] - before) / len(robot.scheduler.pending)
     finally:
         tracemalloc.stop()
     assert taken < MEMORY, f"{taken:.0f} bytes a goal"

@@ -95,7 +95,7 @@ def test_silence_is_given_up_within_the_two_seconds_in_which_a_cancel_is_answere
 
 def test_a_goal_that_succeeded_shows_how_it_was_spoken() -> None:
     robot = Robot()
-    record = robot.submits(Say("door", data={"page": 3}, priority=-7), "a").record
+    record = robot.asks(Say("door", data={"page": 3}, priority=-7), "a")
     goal = robot.play("pass 3; completed a").goals["a"].snapshot()
     assert (goal, play("a format=x").goals["a"].snapshot().format) == (record.snapshot(), "x")
     assert (goal.id, goal.state, goal.client, goal.priority) == ("4k7f-1", State.SUCCEEDED, ARM, -7)
@@ -174,7 +174,7 @@ def test_a_result_is_found_after_the_end() -> None:
 def test_time_on_the_wall_does_not_matter() -> None:
     robot = play("a; b ttl=1; completed a; c; d ttl=1")
     assert robot.scheduler.tick(Now(robot.seconds + 0.5, 9e9)) == []
-    assert robot.scheduler.submit(Say("a", throttle=60), ARM, Now(159, 9e9)).record.reason == "throttled"
+    assert robot.scheduler.submit(Say("a", throttle=60), ARM, Now(159, 9e9))[0].reason == "throttled"
 
 
 def test_a_cancel_tells_what_it_ended_and_what_it_did_not_find() -> None:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import Goal
     from talkcli.goals.options import Say
     from talkcli.goals.record import Record
-    from talkcli.goals.scheduler import Cancellation, Effect, Submission
+    from talkcli.goals.scheduler import Cancellation, Effect
 
 #: Few values for each option, so that goals collide. Times are multiples of the clock's steps, so that they coincide.
 OPTIONS = [
@@ -92,26 +92,25 @@ class Checked(Robot):
         """The current time. The wall clock jumps, because nothing may depend on it."""
         return Now(self.seconds, 1.7e9 + self.seconds * 7_919 % 7_200)
 
-    def submits(self, say: Say, name: str = "", **known: Any) -> Submission:
+    def asks(self, say: Say, name: str = "", **known: Any) -> Record:
         before = self.scheduler.unfinished()
         full = self.scheduler.lacks_room(say, self.now)
-        done = super().submits(say, name, **known)
-        if done.attached:
-            assert done.effects == []
-            return done
-        assert done.record.id not in self.records, "an id was given twice"
-        self.records[done.record.id] = done.record
-        if done.record.state.terminal:
+        record = super().asks(say, name, **known)
+        if self.records.get(record.id) is record:
+            return record  # the goal was sent before
+        assert record.id not in self.records, "an id was given twice"
+        self.records[record.id] = record
+        if record.state.terminal:
             assert self.scheduler.unfinished() == before, "a goal that was not queued has done something"
-        assert full or done.record.reason != "queue_full", "refused for want of room that there was"
-        return done
+        assert full or record.reason != "queue_full", "refused for want of room that there was"
+        return record
 
     def cancels(self, *ids: str, waiting: tuple[str, ...] = (), **selection: Any) -> Cancellation:
         done = super().cancels(*ids, waiting=waiting, **selection)
         assert all(each.state is State.RECALLED for each in done.recalled)
         assert done.stopping is None or done.stopping.state is State.PREEMPTING
         if not ids and selection in ({}, {"current": False}):
-            assert self.scheduler.pending_count == 0
+            assert len(self.scheduler.pending) == 0
         return done
 
     def waits(self, seconds: float) -> None:
@@ -185,8 +184,8 @@ class Checked(Robot):
 
     def check(self) -> None:
         scheduler = self.scheduler
-        waiting = list(scheduler.pending())
-        assert scheduler.pending_count == len(waiting) <= scheduler.max_queue
+        waiting = list(scheduler.pending)
+        assert len(scheduler.pending) == len(waiting) <= scheduler.max_queue
         assert [each.priority for each in waiting] == sorted((each.priority for each in waiting), reverse=True)
         plain = [(-each.priority, each.number) for each in waiting if each.key is None and not each.preempt]
         assert plain == sorted(plain), "equals are not first in, first out"

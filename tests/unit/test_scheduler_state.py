@@ -21,7 +21,7 @@ STATE = {
     *(name for each in (Scheduler("4k7f", max_queue=1), History(), Queue(), VoiceScheduler()) for name in vars(each)),
 }
 #: Objects of the scheduler that other packages may read, with the methods that they may call.
-READ = {"history": {"find", "latest", "log"}, "voices": {"failure", "to_json"}}
+READ = {"history": {"find", "latest", "log"}, "pending": {"first"}, "voices": {"failure", "to_json"}}
 
 
 def writes(source: str) -> list[str]:
@@ -71,7 +71,7 @@ def test_nothing_outside_goals_writes_to_the_scheduler_s_state(path: Path) -> No
         "del self.speech.scheduler.active",
         "active.spoken_end += 1",
         "speech.scheduler.voices.request('piper/joe', now)",
-        "self._scheduler._queue.remove(record)",
+        "self._scheduler.pending.remove(record)",
         "scheduler.history.add(record)",
         "setattr(record, 'state', state)",
     ],

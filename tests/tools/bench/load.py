@@ -169,11 +169,11 @@ class BusyScheduler:
     def times(self) -> dict[str, float]:
         """Return the microseconds of each step; as many goals are pending afterwards as before."""
         enqueue = _microseconds(repeat(self._enqueue, _STEPS))
-        first = (self._scheduler.pending_count - _STEPS) // 2
-        chosen = [each.id for each in islice(self._scheduler.pending(), first, first + _STEPS)]
+        first = (len(self._scheduler.pending) - _STEPS) // 2
+        chosen = [each.id for each in islice(self._scheduler.pending, first, first + _STEPS)]
         steps = [partial(self._scheduler.cancel, Cancel((each,)), _SENDER, _NOW) for each in chosen]
         cancel = _microseconds(steps)
-        records = iter(self._scheduler.pending())
+        records = iter(self._scheduler.pending)
         line = lambda: encode(events.item(1, pending=next(records).snapshot().to_json()))  # noqa: E731
         status = _microseconds(repeat(line, _STEPS))
         return {"one enqueue": enqueue, "one cancel in the middle": cancel, "one line of a status": status}
