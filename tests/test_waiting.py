@@ -371,7 +371,7 @@ async def test_engine_gets_its_next_task_before_clients_get_events() -> None:
     served.scheduler.engine_ready(served.now())
 
     def changed(record: Record, state: State, _: float) -> None:
-        written.append(f"{state.name} {record.text}")
+        written.append(f"{state.name} {record.say.text}")
 
     served.subscribers.state_changed = changed  # type: ignore[assignment, method-assign]
     for text, preempt in (("first", False), ("second", True)):

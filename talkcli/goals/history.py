@@ -31,8 +31,8 @@ MAX_REJECTED_GOALS = 200
 MAX_RECALLED_GOALS = 1_000
 #: Maximum total size of the texts of ended goals. Without a limit, they could use 40 MB of memory.
 MAX_KEPT_TEXT_BYTES = 8 * 1024 * 1024
-#: Maximum number of keys, and of texts, whose last start time is kept.
-MAX_SPEECH_TIMES = 10_000
+#: Maximum number of keys and texts whose last start time is kept.
+MAX_SPEECH_TIMES = 20_000
 #: How long to remember a cancel for an unknown id. If two programs send the goal and its cancel, the cancel may arrive
 #: first.
 EARLY_CANCEL_S = 60.0
@@ -59,7 +59,7 @@ class History:
         if len(ids) > limits.get(record.state, MAX_SPOKEN_GOALS):
             self._text_bytes -= self._all.pop(ids.popleft()).text_bytes
         while self._text_bytes > MAX_KEPT_TEXT_BYTES:
-            oldest = next(each for each in self._all.values() if each.text is not None)
+            oldest = next(each for each in self._all.values() if each.say.text)
             self._text_bytes -= oldest.text_bytes
             oldest.drop_text()
 
@@ -82,24 +82,21 @@ class SpeechTimes:
     """Remembers when each key and each text was last spoken."""
 
     def __init__(self) -> None:
-        #: start time and id of the last goal, by key
-        self._by_key: OrderedDict[str, tuple[float, str]] = OrderedDict()
-        #: start time and id of the last goal, by a hash of its text
-        self._by_text: OrderedDict[bytes, tuple[float, str]] = OrderedDict()
+        #: start time and id of the last goal, by its key and by a hash of its text
+        self._starts: OrderedDict[str | bytes, tuple[float, str]] = OrderedDict()
 
     def add(self, record: Record) -> None:
         """Record the start time of a goal that was at least partly heard."""
-        start = (record.began_at, record.id)
-        if record.key is not None:
-            _set_newest(self._by_key, record.key, start, MAX_SPEECH_TIMES)
-        _set_newest(self._by_text, _digest(record.text or ""), start, MAX_SPEECH_TIMES)
+        for each in (record.say.key, _digest(record.say.text)):
+            if each is not None:
+                _set_newest(self._starts, each, (record.began_at, record.id), MAX_SPEECH_TIMES)
 
     def find(self, since: float, key: str | None, text: str) -> str | None:
         """Return the last goal with the same key that started after `since`, or None.
 
         If the key is None, return the last goal with the same text instead. Only the goal's id is returned.
         """
-        last = self._by_text.get(_digest(text)) if key is None else self._by_key.get(key)
+        last = self._starts.get(_digest(text) if key is None else key)
         return last[1] if last is not None and last[0] > since else None
 
 

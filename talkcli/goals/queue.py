@@ -56,7 +56,7 @@ class Queue:
 
     def with_text(self, text: str) -> Record | None:
         """Return the first goal with this text. This is slow, because it checks every goal."""
-        return next((each for each in self if each.text == text), None)
+        return next((each for each in self if each.say.text == text), None)
 
     def goals_up_to(self, priority: int) -> list[Record]:
         """Return all goals with this priority or a lower one."""
@@ -81,15 +81,15 @@ class Queue:
         record.position = replaced.position if replaced else usual
         for goals, entry in self._entries(record):
             insort(goals, entry)
-        if record.key is not None:
-            self._by_key[record.key] = record
+        if record.say.key is not None:
+            self._by_key[record.say.key] = record
 
     def remove(self, record: Record) -> None:
         """Remove a goal from the queue."""
         for goals, entry in self._entries(record):
             del goals[bisect_left(goals, entry)]
-        if record.key is not None:
-            del self._by_key[record.key]
+        if record.say.key is not None:
+            del self._by_key[record.say.key]
 
     def next_expiry(self) -> float | None:
         """Return the monotonic time at which the next goal expires, or None if no goal can expire."""
@@ -101,9 +101,9 @@ class Queue:
 
     def _entries(self, record: Record) -> Iterator[tuple[list[_Entry], _Entry]]:
         """Yield every sorted list that a goal belongs to, together with the entry for that list."""
-        entry = -record.priority, record.position, record
+        entry = -record.say.priority, record.position, record
         yield self._goals, entry
-        yield self._displaceable, (-record.priority, record.number, record)
+        yield self._displaceable, (-record.say.priority, record.number, record)
         if record.preempt:
             yield self._preempting, entry
         if record.expires_at is not None:

@@ -5,14 +5,14 @@ Only the `goals` package changes records. Other packages may read them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import inf
 from typing import TYPE_CHECKING
 
 from talkcli.frozen import replace
 from talkcli.goals.goal import By, Goal
 from talkcli.goals.options import SHOWN_OPTIONS, require_fields
-from talkcli.goals.states import State, check_transition
+from talkcli.goals.states import TRANSITIONS, IllegalTransition, State
 
 if TYPE_CHECKING:
     from talkcli.goals.goal import Output, Sender
@@ -41,12 +41,8 @@ class Record:
     preempt: bool = False
     #: monotonic time at which the goal expires if it hasn't started
     expires_at: float | None = None
-    #: text to speak, or None after it was dropped to free memory
-    text: str | None = field(init=False)
-    #: hash of the text, kept after the text was dropped
-    text_hash: int = 0
-    #: size of the text in bytes, or 0 after the text was dropped
-    text_bytes: int = field(init=False)
+    #: hash of the text, or None unless the text was dropped to free memory
+    text_hash: int | None = None
     state: State = State.PENDING
     #: sort position among the pending goals of the same priority, used only by the queue
     position: int = 0
@@ -72,19 +68,10 @@ class Record:
     #: monotonic time at which the engine was told to stop the goal
     stop_requested_at: float | None = None
 
-    def __post_init__(self) -> None:
-        self.text = self.say.text
-        self.text_bytes = len(self.text.encode(errors="surrogatepass"))
-
     @property
-    def priority(self) -> int:
-        """Priority of the goal. Higher priorities are spoken first."""
-        return self.say.priority
-
-    @property
-    def key(self) -> str | None:
-        """Key of the goal, or None. While the goal is pending, a newer goal with the same key replaces it."""
-        return self.say.key
+    def text_bytes(self) -> int:
+        """Size of the text in bytes, or 0 after the text was dropped."""
+        return len(self.say.text.encode(errors="surrogatepass"))
 
     def change_state(self, state: State) -> None:
         """Change the state of the goal.
@@ -92,16 +79,17 @@ class Record:
         Raises:
             IllegalTransition: if the change isn't allowed.
         """
-        self.state = check_transition(self.state, state)
+        if state not in TRANSITIONS[self.state]:
+            raise IllegalTransition(f"a goal that is {self.state.name} can't become {state.name}")
+        self.state = state
 
     def drop_text(self) -> None:
         """Drop the text to save memory."""
-        self.text_hash = hash(self.text)
-        self.text, self.text_bytes, self.say = None, 0, replace(self.say, text="")
+        self.text_hash, self.say = hash(self.say.text), replace(self.say, text="")
 
     def has_text(self, text: str) -> bool:
         """Return whether the goal has this text. If the text was dropped, compare hashes."""
-        return hash(text) == self.text_hash if self.text is None else text == self.text
+        return text == self.say.text if self.text_hash is None else hash(text) == self.text_hash
 
     def snapshot(self, state: State | None = None) -> Goal:
         """Return an immutable copy of the goal.
@@ -111,15 +99,16 @@ class Record:
                 accepted.
         """
         state = self.state if state is None else state
+        text = self.say.text if self.text_hash is None else None
         shown = {name: getattr(self.say, name) for name in SHOWN_OPTIONS}
         if state is not State.PENDING:
             shown |= {name: getattr(self, name) for name in _LATER}
-            if self.started_at is not None and self.text is not None:
-                shown["spoken"] = self.text[: self.spoken_end]
+            if self.started_at is not None and text is not None:
+                shown["spoken"] = text[: self.spoken_end]
         return Goal(
             id=self.id,
             state=state,
-            text=self.text,
+            text=text,
             client=self.sender,
             paused=self.paused and state is self.state,
             queued_at=self.queued_at,

@@ -353,7 +353,7 @@ class Scheduler:
         """
         record = self._require_active(goal_id)
         record.duration = duration
-        record.spoken_end = len(record.text or "")
+        record.spoken_end = len(record.say.text)
         words = "Talk completed successfully"
         if record.output and record.output.muted:
             words += f", but the output was muted: {record.output.device}"
@@ -449,7 +449,7 @@ class Scheduler:
                 chosen.append(record)
             elif goal_id not in waiting:
                 result.unknown.append(goal_id)
-        if self.active and (selection.current or self.active.key == selection.key is not None):
+        if self.active and (selection.current or self.active.say.key == selection.key is not None):
             chosen.append(self.active)
         if pending := self.pending.with_key(selection.key):
             chosen.append(pending)
@@ -488,7 +488,7 @@ class Scheduler:
             return None
         active = self.active
         waiting = self.pending.with_text(say.text) if say.key is None else None
-        if active and (active.text == say.text if say.key is None else active.key == say.key):
+        if active and (active.say.text == say.text if say.key is None else active.say.key == say.key):
             first, words = active.id, "is being said"
         elif waiting:
             first, words = waiting.id, "is waiting already"
@@ -522,7 +522,7 @@ class Scheduler:
         last = self.pending.displaceable_goal()
         # A goal sent with `preempt` may also displace a goal of its own priority.
         limit = say.priority if say.preempt else say.priority - 1
-        return [(last, Reason.DISPLACED)] if last and last.priority <= limit else None
+        return [(last, Reason.DISPLACED)] if last and last.say.priority <= limit else None
 
     def _enqueue(self, record: Record, recalled: list[tuple[Record, Reason]], now: Now) -> list[Effect]:
         """Add a goal to the queue, recall the given goals, and stop the active goal if it is preempted."""
@@ -530,10 +530,10 @@ class Scheduler:
         effects: list[Effect] = []
         replaced = None
         for each, reason in recalled:
-            if reason is Reason.REPLACED and each.priority == record.priority and not record.preempt:
+            if reason is Reason.REPLACED and each.say.priority == record.say.priority and not record.preempt:
                 replaced = each
             effects += self._recall(each, reason, f"{reason} by {record.id}", by, now)
-        if record.preempt and self.active and self.active.priority <= record.priority:
+        if record.preempt and self.active and self.active.say.priority <= record.say.priority:
             effects += self._stop(self.active, Reason.PREEMPTED, by, now)
         self.pending.add(record, replaced)
         return effects

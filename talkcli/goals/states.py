@@ -63,14 +63,3 @@ class IllegalTransition(TalkError):
     """Raised for a state change that isn't allowed, which is a bug in the caller."""
 
     code = "illegal_transition"
-
-
-def check_transition(state: State, target: State) -> State:
-    """Check that a goal may change from one state to another, and return the new state.
-
-    Raises:
-        IllegalTransition: if the change isn't allowed.
-    """
-    if target not in TRANSITIONS[state]:
-        raise IllegalTransition(f"a goal that is {state.name} can't become {target.name}")
-    return target

@@ -143,7 +143,7 @@ class VoiceScheduler:
             return 0.0
         if record.say.voice_only:
             return inf
-        if record.preempt or record.priority > 0:
+        if record.preempt or record.say.priority > 0:
             return 0.0
         start = (found.loading_since if found.loading_since < inf else record.next_since) + VOICE_PATIENCE_S
         return start if record.expires_at is None else min(start, record.expires_at - EXPIRY_MARGIN_S)

@@ -201,9 +201,7 @@ class Speech:
                 return
             options["pitch"] = INITIAL.pitch  # neural voices don't support other pitches
         self.engine.speak(
-            protocol.Speak(
-                record.id, record.text or "", next_waits=next_waits, next_is_neural=next_is_neural, **options
-            )
+            protocol.Speak(record.id, record.say.text, next_waits=next_waits, next_is_neural=next_is_neural, **options)
         )
 
     def _announce_next(self) -> None:
@@ -280,7 +278,7 @@ class Speech:
         match event:
             case protocol.Word():
                 scheduler.word_heard(event.id, event.end)
-                text = (active.text or "")[event.start : event.end]
+                text = active.say.text[event.start : event.end]
                 self.notifications.add([partial(self.subscribers.word_heard, event, text, time.time())])
             case protocol.Ended():
                 self._goal_ended(event, active, now)
@@ -391,7 +389,7 @@ def _log_end(record: Record, seconds: float) -> None:
     if record.state is not State.SUCCEEDED:
         how += f" ({record.reason}{_cause(record.by)})"
     detail = f"; {log.sanitize(record.message)}" if record.state is State.ABORTED and record.message else ""
-    log.write(f'{how}: "{log.sanitize(record.text or "")}" from {describe_sender(record.sender)}{detail}')
+    log.write(f'{how}: "{log.sanitize(record.say.text)}" from {describe_sender(record.sender)}{detail}')
 
 
 def _log_engine(engine: protocol.Ready, player_options: Sequence[str]) -> None:

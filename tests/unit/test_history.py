@@ -62,9 +62,9 @@ def test_texts_take_eight_mebibytes_and_the_oldest_goes_first_but_its_result_sta
     first, second, third = (ended(number, text=half) for number in range(3))
     history.add(first)
     history.add(second)
-    assert (first.text, second.text) == (half, half)
+    assert (first.snapshot().text, second.snapshot().text) == (half, half)
     history.add(third)
-    assert (first.text, second.text, third.text) == (None, half, half)
+    assert (first.snapshot().text, second.snapshot().text, third.snapshot().text) == (None, half, half)
     kept = history.find(first.id)
     assert kept is first
     assert (kept.state, kept.reason, kept.snapshot().text) == (State.SUCCEEDED, "canceled", None)
@@ -75,7 +75,7 @@ def test_bytes_count_not_characters() -> None:
     first, second = ended(1, text="🤖" * (1024 * 1024)), ended(2, text="a" * (4 * 1024 * 1024 + 1))
     history.add(first)
     history.add(second)
-    assert (first.text, second.text is None) == (None, False)
+    assert (first.snapshot().text, second.snapshot().text is None) == (None, False)
 
 
 def test_a_text_without_words_spoken_is_forgotten_with_them() -> None:
@@ -105,7 +105,7 @@ def test_limits_hold_after_any_goals_and_only_the_oldest_texts_are_gone(goals: l
         each for each in records if each.state is State.SUCCEEDED
     ][-7:]
     assert history.latest(100, rejected=True) == kept
-    assert sum(len(each.text.encode()) for each in kept if each.text is not None) <= 40
-    with_text = [each.text is not None for each in kept]
+    assert sum(len(each.say.text.encode()) for each in kept) <= 40
+    with_text = [each.snapshot().text is not None for each in kept]
     assert with_text == sorted(with_text), "a newer text went before an older one"
-    assert not kept or kept[-1].text is not None
+    assert not kept or kept[-1].snapshot().text is not None

@@ -246,8 +246,8 @@ def test_a_goal_that_waits_for_room_goes_on_if_it_has_it_or_never_will() -> None
 
 
 def test_as_many_keys_and_texts_are_remembered_as_may_be_and_the_oldest_goes(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert MAX_SPEECH_TIMES == 10_000
-    monkeypatch.setattr(history, "MAX_SPEECH_TIMES", 3)
+    assert MAX_SPEECH_TIMES == 20_000
+    monkeypatch.setattr(history, "MAX_SPEECH_TIMES", 6)
     robot = Robot()
     for name in ("a", "b", "c", "a", "d"):
         robot.tells("completed", robot.asks(Say(f"text {name}", key=f"key {name}")).id)

@@ -186,10 +186,10 @@ class Checked(Robot):
         scheduler = self.scheduler
         waiting = list(scheduler.pending)
         assert len(scheduler.pending) == len(waiting) <= scheduler.max_queue
-        assert [each.priority for each in waiting] == sorted((each.priority for each in waiting), reverse=True)
-        plain = [(-each.priority, each.number) for each in waiting if each.key is None and not each.preempt]
+        assert [each.say.priority for each in waiting] == sorted((each.say.priority for each in waiting), reverse=True)
+        plain = [(-each.say.priority, each.number) for each in waiting if each.say.key is None and not each.preempt]
         assert plain == sorted(plain), "equals are not first in, first out"
-        keys = [each.key for each in waiting if each.key is not None]
+        keys = [each.say.key for each in waiting if each.say.key is not None]
         assert len(keys) == len(set(keys)), "two goals with one key wait"
         assert all(scheduler.find(each.id) is each for each in scheduler.unfinished())
         if waiting and not (scheduler.active or scheduler.paused) and scheduler.has_engine:
