@@ -40,7 +40,6 @@ class Told(asyncio.Protocol):
         self.ends = 0
         self.congested: list[bool] = []
         self.lost: list[Exception | None] = []
-        self.stays_open = True
         self.fault: Exception | None = None
 
     def data_received(self, data: bytes) -> None:
@@ -48,9 +47,8 @@ class Told(asyncio.Protocol):
         if self.fault:
             raise self.fault
 
-    def eof_received(self) -> bool:
+    def eof_received(self) -> None:
         self.ends += 1
-        return self.stays_open
 
     def pause_writing(self) -> None:
         self.congested.append(True)
@@ -185,16 +183,6 @@ async def test_end_of_the_input_is_told_once_and_replies_still_go_out() -> None:
         pair.stream.close()
         await until_lost(pair)
         assert (pair.receive(), pair.told.lost) == (b"answer\n", [None])
-
-
-@in_loop
-async def test_end_of_the_input_closes_the_stream_if_the_receiver_says_so() -> None:
-    async with paired() as pair:
-        pair.told.stays_open = False
-        pair.stream.begin()
-        pair.client.close()
-        await until_lost(pair)
-        assert (pair.told.ends, pair.told.lost, pair.socket.fileno()) == (1, [None], -1)
 
 
 def test_close_sends_the_rest_of_the_output_and_abort_does_not() -> None:

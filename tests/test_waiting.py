@@ -42,6 +42,7 @@ class Client:
 
     def __init__(self) -> None:
         self.told: list[JsonObject] = []
+        self.unanswered: dict[PendingRequest, None] = {}
 
     def send(self, message: JsonObject) -> None:
         self.told.append(message)

@@ -167,7 +167,7 @@ def option(flags: str, kind: Kind, words: str, **more: Any) -> Option:
         more: further fields of `Option`.
     """
     name = flags.rpartition("--")[2].replace("-", "_")
-    return Option(name, kind, flags=flags, help=words, **{"default": False if kind is FLAG else None, **more})
+    return Option(name, kind, special_flags=flags, help=words, **{"default": False if kind is FLAG else None, **more})
 
 
 #: The options that every command accepts, before or after the command's name.

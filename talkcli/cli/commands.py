@@ -40,7 +40,7 @@ def _say_options() -> Iterator[Option]:
             yield _timeout_option("With --wait: cancel it after SEC seconds; time in the queue counts; exit code 124.")
         elif each.name == "id":
             what = "What the sender calls itself."
-            yield Option("name", WORD, flags="--as", metavar="NAME", help=what, env="TALK_NAME")
+            yield Option("name", WORD, special_flags="--as", metavar="NAME", help=what, env="TALK_NAME")
     yield option("--lines", FLAG, "Speak each line of standard input, as it comes; no TEXT then.")
     words = "With --lines: at most N of its goals are pending; other lines wait in the command.  [default: 10]"
     yield option("--ahead", INTEGER, words, limits=(1, MAX_QUEUED_GOALS))

@@ -59,7 +59,7 @@ class History:
         if len(ids) > limits.get(record.state, MAX_SPOKEN_GOALS):
             self._text_bytes -= self._all.pop(ids.popleft()).text_bytes
         while self._text_bytes > MAX_KEPT_TEXT_BYTES:
-            oldest = next(each for each in self._all.values() if each.say.text)
+            oldest = next(each for each in self._all.values() if each.text_hash is None)
             self._text_bytes -= oldest.text_bytes
             oldest.drop_text()
 

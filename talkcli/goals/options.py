@@ -76,7 +76,7 @@ class Kind:
     types: tuple[type, ...]
     #: error message if a value has another type
     wrong_type: str
-    #: placeholder for the value in help texts
+    #: placeholder for the value in help texts, or an empty string to use the option's name
     metavar: str = ""
     #: additional check of a value, which returns an error message or None
     check: Callable[[Any], str | None] | None = None
@@ -179,8 +179,8 @@ class Option:
     form: str = ""
     #: description of the default in the protocol's document, unless it is the server's default
     default_words: str = ""
-    #: command-line flags, such as "-w, --wait", or "--preempt/--queue" for yes and no
-    flags: str = ""
+    #: command-line flags that don't follow from the name, such as "-w, --wait", or "--preempt/--queue" for yes and no
+    special_flags: str = ""
     metavar: str = ""
     help: str = ""
     #: environment variable that is used if the option isn't given
@@ -193,6 +193,11 @@ class Option:
     for_engine: bool = False
     #: whether a goal's JSON includes the value
     in_goal: bool = False
+
+    @property
+    def flags(self) -> str:
+        """Command-line flags, or an empty string if the option isn't available on the command line."""
+        return self.special_flags or (f"--{self.name.replace('_', '-')}" if self.help else "")
 
     def type_error(self, value: Any) -> str | None:
         """Return an error message if a value has the wrong type or format, or None."""
@@ -236,14 +241,14 @@ class Option:
         """Return the option for `talk set`. It has no default, because omitted settings don't change."""
         setting = self.setting
         assert setting
-        return replace(self, env="", flags=setting.flags or self.flags, help=setting.set_help or self.help)
+        return replace(self, env="", special_flags=setting.flags or self.flags, help=setting.set_help or self.help)
 
     def for_serve(self) -> Option:
         """Return the option for `talk serve`."""
         setting = self.setting
         assert setting
         flags = (setting.flags or self.flags).split("/")[0]
-        return replace(self, default=setting.initial, flags=flags, help=setting.serve_help or self.help)
+        return replace(self, default=setting.initial, special_flags=flags, help=setting.serve_help or self.help)
 
 
 def _priority_error(value: int) -> str | None:
@@ -293,7 +298,7 @@ OPTIONS = (
         FLAG,
         "send this connection the goal's states, and its result",
         default=False,
-        flags="-w, --wait",
+        special_flags="-w, --wait",
         help="Wait until it has ended; the exit code tells how.",
     ),
     Option(
@@ -301,7 +306,7 @@ OPTIONS = (
         FLAG,
         "… and each word as it is heard; implies `wait`",
         default=False,
-        flags="-f, --feedback",
+        special_flags="-f, --feedback",
         help="Show each word as it is heard; implies --wait.",
     ),
     Option(
@@ -314,7 +319,7 @@ OPTIONS = (
         "preempt",
         FLAG,
         "stop what is being spoken, if its priority is not higher, and go first",
-        flags="--preempt/--queue",
+        special_flags="--preempt/--queue",
         help="Stop what is spoken and go first, or wait in the queue. [default: as 'talk serve' was told]",
         setting=Setting(
             False,
@@ -331,7 +336,6 @@ OPTIONS = (
         FLAG,
         "as `preempt`, and recall all that is pending of the same or a lower priority",
         default=False,
-        flags="--flush",
         help="As --preempt, and drop what is in the queue.",
     ),
     Option(
@@ -342,7 +346,6 @@ OPTIONS = (
         # The range is not in `limits`, because the help text would then show it.
         check=_priority_error,
         form=f"{-MAX_PRIORITY:,} to {MAX_PRIORITY:,}",
-        flags="--priority",
         help="Higher goes first; what has a higher one is neither stopped nor dropped.",
         in_goal=True,
     ),
@@ -351,7 +354,6 @@ OPTIONS = (
         SECONDS,
         "seconds from now in which it must begin, else RECALLED; 0 for no limit",
         limits=(0, None),
-        flags="--ttl",
         help="Drop it if it has not begun within SEC seconds; 0: no limit.",
         setting=Setting(
             0,
@@ -370,8 +372,6 @@ OPTIONS = (
         "replaces the pending goal that has the same key",
         check=key_error,
         form=f"1 to {MAX_KEY_CHARS} characters",
-        flags="--key",
-        metavar="KEY",
         help=f"A label of up to {MAX_KEY_CHARS} characters; replaces what waits under the same one.",
         completion="keys",
         in_goal=True,
@@ -382,7 +382,6 @@ OPTIONS = (
         "REJECTED where a goal of this key, or else of this text, is being spoken or began less than so many seconds "
         "ago",
         limits=(0, None),
-        flags="--throttle",
         help="Don't say the same again within SEC seconds; what is the same, --key says, or else the text.",
     ),
     Option(
@@ -392,8 +391,6 @@ OPTIONS = (
         check=_own_id_error,
         form=f"1 to {MAX_ID_CHARS} of `A-Z a-z 0-9 . _ : / -`",
         default_words="the server's",
-        flags="--id",
-        metavar="ID",
         help="An id of your own: sent twice, it is spoken once.",
     ),
     Option(
@@ -403,7 +400,6 @@ OPTIONS = (
         # libespeak-ng accepts no other rates.
         limits=(80, 450),
         unit=" words per minute",
-        flags="--rate",
         help="Words per minute.",
         env="TALK_RATE",
         setting=Setting(200, words="rate {}"),
@@ -414,7 +410,6 @@ OPTIONS = (
         NUMBER,
         "loudness",
         limits=(0.0, 1.0),
-        flags="--volume",
         help="Loudness.",
         env="TALK_VOLUME",
         setting=Setting(1.0, words="volume {}"),
@@ -425,8 +420,6 @@ OPTIONS = (
         WORD,
         f"id, name or language; `{DEFAULT_VOICE}` for the driver's own",
         check=_voice_error,
-        flags="--voice",
-        metavar="VOICE",
         help="Voice by id, name or language: see 'talk voices'.",
         env="TALK_VOICE",
         completion="voices",
@@ -445,7 +438,6 @@ OPTIONS = (
         "whether it waits for its voice while that is loaded, and is ABORTED, `voice_failed`, where it can't be had; "
         "else espeak speaks then",
         default=False,
-        flags="--voice-only",
         help="Insist on the voice: wait until it is loaded, or be aborted.",
         for_engine=True,
     ),
@@ -454,7 +446,6 @@ OPTIONS = (
         INTEGER,
         "50 is the voice's own; a neural voice has no other",
         limits=(0, 100),
-        flags="--pitch",
         help="Pitch of the voice; 50 is its own, and a neural voice has no other.",
         setting=Setting(50, words="pitch {}"),
         for_engine=True,
@@ -465,7 +456,6 @@ OPTIONS = (
         "milliseconds of silence before it, also where the output was not idle; 0 for none",
         limits=(0, MAX_LEAD_IN_MS),
         unit=" milliseconds",
-        flags="--lead-in",
         metavar="MS",
         help="Milliseconds of silence before it; also where the output was not idle; 0: none. [default: as 'talk "
         "serve' was told]",
@@ -475,7 +465,6 @@ OPTIONS = (
         "audible",
         FLAG,
         "whether it is ABORTED, `muted`, where its output is muted; where that can't be known it is spoken",
-        flags="--audible",
         help="Abort it where its output is muted. [default: as 'talk serve' was told]",
         for_engine=True,
     ),
@@ -562,14 +551,12 @@ class Cancel:
             FLAG,
             "the goal being spoken",
             default=False,
-            flags="--current",
             help="The goal that is being spoken.",
         ),
         Option(
             "before",
             ID,
             "this goal, and all accepted before it",
-            flags="--before",
             help="This goal, and all that were accepted before it.",
             completion="goal_ids",
         ),
@@ -577,8 +564,6 @@ class Cancel:
             "key",
             WORD,
             "the goals with this key, spoken or pending",
-            flags="--key",
-            metavar="KEY",
             help="The goals with this key, spoken or waiting.",
             completion="unfinished_keys",
         ),
@@ -661,11 +646,6 @@ def bad_text(text: str, max_chars: int | None = MAX_TEXT_CHARS) -> Refusal | Non
     if all(unicodedata.category(each) in _SILENT_CATEGORIES for each in text):
         return Reason.INVALID_TEXT, "the text is empty" if not text.strip() else "the text has nothing that can be seen"
     return None
-
-
-def given_values(asked: Say | Set) -> dict[str, Any]:
-    """Return all values of a request that are not None, by name."""
-    return {name: value for name, value in fields(asked).items() if value is not None}
 
 
 def engine_options(say: Say, settings: Set) -> dict[str, Any]:

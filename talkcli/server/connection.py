@@ -195,6 +195,8 @@ class ClientConnection(asyncio.Protocol):
         #: the connected program, set by `Handler.joined`
         self.client: Sender
         self.admitted = False
+        #: requests that have not been answered yet, oldest first
+        self.unanswered: WaitingList = {}
         self.stream = ClientStream(streams, connected, self, CONGESTION_BYTES)
         self._handler = handler
         self._loop = streams.loop
@@ -243,10 +245,9 @@ class ClientConnection(asyncio.Protocol):
             self._stop_line_limit()  # the next line has a new time limit
         self._work()
 
-    def eof_received(self) -> bool:
+    def eof_received(self) -> None:
         self._half_closed = True
         self._work()
-        return not self.stream.closing
 
     def pause_writing(self) -> None:
         self._set_reading()

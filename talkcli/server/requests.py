@@ -68,8 +68,6 @@ class Requests:
         self._describe = describe
         #: cancelled goals that were waiting and have not been submitted yet
         self._canceled: WaitingList = {}
-        #: unanswered requests of each connection, oldest first
-        self._pending: dict[ClientConnection, WaitingList] = {}
         #: memory counted for all waiting requests
         self._waiting_bytes = 0
         self._room_check: asyncio.Handle | None = None
@@ -78,16 +76,16 @@ class Requests:
     def handle(self, connection: ClientConnection, seq: int | None, request: Request) -> None:
         """Handle a request. The reply may be sent later."""
         pending = PendingRequest(connection, seq, request)
-        self._pending.setdefault(connection, {})[pending] = None
+        connection.unanswered[pending] = None
         pending.start(self._carry_out(pending))
 
     def is_waiting(self, connection: ClientConnection) -> bool:
         """Return whether a client is still waiting for a reply or an event."""
-        return connection in self._pending or self._speech.subscribers.is_subscribed(connection)
+        return bool(connection.unanswered) or self._speech.subscribers.is_subscribed(connection)
 
     def left(self, connection: ClientConnection) -> None:
         """Drop the requests and subscriptions of a client that has disconnected."""
-        for each in self._unanswered(connection):
+        for each in list(connection.unanswered):
             each.drop()
         self._speech.subscribers.left(connection)
 
@@ -117,19 +115,13 @@ class Requests:
             pending.refuse("internal_error", f"{request.kind} failed: a bug of talk's, see its log")
         finally:
             self._waiting_bytes -= pending.kept_bytes
-            mine = self._pending[pending.connection]
-            del mine[pending]
-            if not mine:
-                del self._pending[pending.connection]
+            del pending.connection.unanswered[pending]
 
     # -- requests that wait
 
-    def _unanswered(self, connection: ClientConnection) -> list[PendingRequest]:
-        return list(self._pending.get(connection, ()))
-
     def _awaiting_voices(self, connection: ClientConnection) -> list[PendingRequest]:
         """Return the requests of a connection that are waiting for the list of voices."""
-        return [each for each in self._unanswered(connection) if each.waiting_list is self._speech.waiting_for_voices]
+        return [each for each in connection.unanswered if each.waiting_list is self._speech.waiting_for_voices]
 
     def _needs_voices(self, pending: PendingRequest) -> bool:
         """Return whether a request needs the list of voices, or follows a request that needs it."""
@@ -155,7 +147,7 @@ class Requests:
         if pending.kept_bytes:
             return True  # the request has waited before
         size = REQUEST_BYTES + sum(map(_memory_of, fields(pending.request).values()))
-        if len(self._unanswered(pending.connection)) > MAX_CLIENT_REQUESTS:  # the list includes this request
+        if len(pending.connection.unanswered) > MAX_CLIENT_REQUESTS:  # this request is included
             words = f"{MAX_CLIENT_REQUESTS:,} requests of this connection are waiting already"
         elif self._waiting_bytes + size > MAX_KEPT_REQUEST_BYTES:
             words = f"{MAX_KEPT_REQUEST_BYTES >> 20} MiB of requests are waiting already"
@@ -391,7 +383,8 @@ class Requests:
         voice, refusal = speech.voices.look_up(request.voice)
         if refusal:
             raise RequestRefused(refusal[1], refusal[0])
-        changes = options.given_values(replace(request, voice=voice))
+        given = fields(replace(request, voice=voice))
+        changes = {name: value for name, value in given.items() if value is not None}
         effects = scheduler.change_settings(changes, speech.now())
         self._check_room_soon()  # a waiting goal may now be able to preempt others
         speech.apply(effects)

@@ -45,8 +45,6 @@ _TOO_FEW_DESCRIPTORS = (
 )
 #: How long to wait after an error before accepting connections again.
 ACCEPT_RETRY_S = 1.0
-#: Errors of `accept` when the system is out of descriptors or memory. New connections stay in the backlog.
-_EXHAUSTED = {errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM}
 #: Errors of `accept` when there is no connection to accept.
 _NO_CONNECTION = {errno.EAGAIN, errno.ECONNABORTED, errno.EPROTO, errno.EINTR}
 
@@ -159,8 +157,7 @@ class ClientStream:
                 return
             self.pause_reading()
             self._eof = True
-            if not self._receiver.eof_received():
-                self.close()
+            self._receiver.eof_received()
         except Exception:
             self.abort()  # otherwise, the client would wait forever for a reply
             raise
@@ -347,9 +344,10 @@ class Acceptor:
             connected.send(encode(busy_greeting(_TOO_FEW_DESCRIPTORS)))
 
     def _pause(self, listening: socket.socket, error: OSError) -> None:
-        """Stop accepting connections for a while. Otherwise, the event loop would retry without a pause."""
-        if error.errno not in _EXHAUSTED:
-            log.write_bug("taking up a connection", error)
+        """Stop accepting connections for a while after an error, usually because of too few descriptors.
+
+        Otherwise, the event loop would retry without a pause. New connections stay in the backlog.
+        """
         log.write_limited("accept", f"no connection can be taken up: {error.strerror}; they wait until one can")
         self.close()
         self._retry = self._loop.call_later(ACCEPT_RETRY_S, self.open, listening)

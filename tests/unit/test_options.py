@@ -41,7 +41,6 @@ from talkcli.goals.options import (
     bad_option,
     describe_settings,
     engine_options,
-    given_values,
     is_clients_id,
     require_fields,
     shown_settings,
@@ -261,7 +260,6 @@ def test_the_engine_is_told_the_goal_s_own_value_else_the_server_s() -> None:
     own = Say("hi", rate=80, volume=0.0, voice=DEFAULT_VOICE, pitch=0, lead_in=0, audible=False)
     asked = {"rate": 80, "volume": 0.0, "voice": None, "pitch": 0, "lead_in": 0, "audible": False, "voice_only": False}
     assert engine_options(own, settings) == asked
-    assert given_values(Set(preempt=False, ttl=0)) == {"preempt": False, "ttl": 0}
 
 
 def test_a_server_that_is_told_nothing_is_what_its_command_says() -> None:
