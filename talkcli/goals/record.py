@@ -10,13 +10,11 @@ from math import inf
 from typing import TYPE_CHECKING
 
 from talkcli.frozen import replace
-from talkcli.goals.goal import By, Goal
-from talkcli.goals.options import SHOWN_OPTIONS, require_fields
+from talkcli.goals.goal import By, Goal, Output, Sender
+from talkcli.goals.options import SHOWN_OPTIONS, Say, require_fields
 from talkcli.goals.states import TRANSITIONS, IllegalTransition, State
 
 if TYPE_CHECKING:
-    from talkcli.goals.goal import Output, Sender
-    from talkcli.goals.options import Say
     from talkcli.goals.reasons import Reason
 
 #: Fields of a goal that are set after the goal was accepted.

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from talkcli.frozen import frozen, replace
 from talkcli.goals import options
-from talkcli.goals.goal import By
+from talkcli.goals.goal import By, Output, Sender
 from talkcli.goals.history import EarlyCancels, History, SpeechTimes
 from talkcli.goals.queue import Queue
 from talkcli.goals.reasons import Reason, Refusal
@@ -29,7 +29,6 @@ from talkcli.goals.voices import VoiceDropOrder, VoiceLoadOrder, VoiceScheduler,
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from talkcli.goals.goal import Output, Sender
     from talkcli.goals.options import Cancel, Say, Set
 
 #: Time limit for the engine to become silent after a stop. Every cancel must be answered within 2 s.

@@ -167,23 +167,21 @@ class VoiceScheduler:
     def load_next(self, needed: Sequence[str], default_voice: str, now: float) -> VoiceLoadOrder | None:
         """Return an order to load the next voice, or None if no voice can be loaded now.
 
-        Only one voice is loaded at a time. If a goal needs a loaded voice sooner than the next one, the loaded voice is
-        not dropped, because it would have to be loaded again.
+        Call this only if `can_load` is true. A loaded voice is not dropped if a goal needs it sooner than the next
+        voice, because it would have to be loaded again.
 
         Args:
             needed: the voices that waiting goals need, in the order of the goals.
             default_voice: the voice of goals that don't name one. Unless a goal needs it, no voice is dropped for it.
             now: the time (monotonic).
         """
-        if not self.can_load:
-            return None
-        before: dict[str, int] = {}
+        before: set[str] = set()
         for voice in (*needed, default_voice):
             found = self._voices.get(voice)
             if found and found.state is VoiceState.LOADED:
-                before[voice] = found.size_bytes
+                before.add(voice)
             elif found and found.wanted:
-                drop = self._make_room(sum(before.values()) + found.size_bytes, before)
+                drop = self._make_room(found.size_bytes, before)
                 if drop is None or (drop and voice not in needed):
                     return None
                 self._loading, found.wanted = voice, False
@@ -208,7 +206,7 @@ class VoiceScheduler:
         order = [each for each in loaded if each not in needed]
         order += [each for each in reversed(needed) if each in loaded]
         dropped: list[str] = []
-        total = self._unattributed_bytes() + sum(loaded.values())
+        total = self._total_bytes()
         for each in order:
             if total > self._limit_bytes and each != first and len(dropped) < len(loaded) - 1:
                 total -= loaded[each]
@@ -278,9 +276,9 @@ class VoiceScheduler:
         """Return the memory use of each loaded voice."""
         return {voice: each.size_bytes for voice, each in self._voices.items() if each.state is VoiceState.LOADED}
 
-    def _unattributed_bytes(self) -> int:
-        """Return the part of the voices' memory that belongs to no loaded voice."""
-        return max(0, self._used_bytes - sum(self._loaded().values()))
+    def _total_bytes(self) -> int:
+        """Return the memory use of all voices together, including memory that belongs to no loaded voice."""
+        return max(self._used_bytes, sum(self._loaded().values()))
 
     def _make_room(self, size_bytes: int, keep: Collection[str]) -> tuple[str, ...] | None:
         """Return the voices to drop to make room for a new one, or None if it can't fit.
@@ -288,14 +286,13 @@ class VoiceScheduler:
         The least recently used voices are dropped first.
 
         Args:
-            size_bytes: the memory use of the new voice and of the voices to keep.
+            size_bytes: the memory use of the new voice.
             keep: the loaded voices that must stay. If there are none, the new voice always fits.
         """
-        others = {voice: size for voice, size in self._loaded().items() if voice not in keep}
-        total = size_bytes + self._unattributed_bytes() + sum(others.values())
+        total = size_bytes + self._total_bytes()
         dropped = []
-        for voice, size in others.items():
-            if total > self._limit_bytes:
+        for voice, size in self._loaded().items():
+            if total > self._limit_bytes and voice not in keep:
                 total -= size
                 dropped.append(voice)
         return None if keep and total > self._limit_bytes else tuple(dropped)
@@ -304,7 +301,7 @@ class VoiceScheduler:
         """Return a warning if a single voice exceeds the memory limit. Each voice is warned about only once."""
         loaded = self._loaded()
         voice = next(iter(loaded), "")
-        taken = self._unattributed_bytes() + sum(loaded.values())
+        taken = self._total_bytes()
         if self._loading or len(loaded) != 1 or not 0 < self._limit_bytes < taken or self._voices[voice].why:
             return []
         why = f"it takes {taken / 1e6:.0f} MB, more than --voice-memory {self._limit_bytes / 1e6:.0f}"

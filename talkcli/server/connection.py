@@ -20,7 +20,7 @@ from talkcli.goals.options import Cancel
 from talkcli.protocol.events import busy_greeting, failure, item, ok, take_seq
 from talkcli.protocol.lines import MAX_LINE_BYTES, LineSplitter, TruncatedLine, decode, encode
 from talkcli.protocol.requests import Hello, Request, Status, read_request
-from talkcli.server.stream import ClientStream
+from talkcli.server.stream import ClientStream, ClientStreams
 
 if TYPE_CHECKING:
     import socket
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import By, JsonObject, Sender
     from talkcli.goals.reasons import Refusal
     from talkcli.goals.record import Record
-    from talkcli.server.stream import ClientStreams
 
     #: requests that wait for the same condition, in order of arrival
     WaitingList = dict["PendingRequest", None]

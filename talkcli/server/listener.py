@@ -17,7 +17,6 @@ import fcntl
 import os
 import socket
 import stat
-import sys
 import time
 from typing import TYPE_CHECKING
 
@@ -309,18 +308,8 @@ def _bind(path: str, mode: int) -> socket.socket:
     listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         listening.setblocking(False)
-        if sys.platform.startswith("linux"):
-            # Set the mode before `bind`, so that other users can never access the file. `bind` applies the umask, so
-            # `chmod` sets the mode again. Changing the umask could affect an engine that another thread is starting.
-            os.fchmod(listening.fileno(), mode)
-            listening.bind(path)
-            os.chmod(path, mode)
-        else:  # other systems can't set the mode before `bind`
-            umask = os.umask(0o777 & ~mode)
-            try:
-                listening.bind(path)
-            finally:
-                os.umask(umask)
+        listening.bind(path)
+        os.chmod(path, mode)  # nobody can connect before `listen`, so the file is never too accessible
         listening.listen(MAX_BACKLOG_CONNECTIONS)
     except OSError as error:
         listening.close()

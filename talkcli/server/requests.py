@@ -17,9 +17,9 @@ from talkcli.daemon import log
 from talkcli.errors import RequestRefused, UnknownGoal
 from talkcli.frozen import fields, replace
 from talkcli.goals import options
-from talkcli.goals.goal import By
+from talkcli.goals.goal import By, JsonObject
 from talkcli.goals.options import Cancel, Say, Set
-from talkcli.goals.reasons import Reason
+from talkcli.goals.reasons import Reason, Refusal
 from talkcli.goals.states import State
 from talkcli.protocol.events import Result
 from talkcli.protocol.lines import encode
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
     from typing import Any
 
-    from talkcli.goals.goal import JsonObject
-    from talkcli.goals.reasons import Refusal
     from talkcli.goals.record import Record
     from talkcli.server.connection import ClientConnection, Steps, WaitingList
     from talkcli.server.speech import Speech

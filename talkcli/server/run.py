@@ -10,7 +10,6 @@ import random
 import signal
 import string
 import time
-from typing import TYPE_CHECKING
 
 from talkcli import __version__, peers
 from talkcli.daemon import log
@@ -20,7 +19,7 @@ from talkcli.engine.parent.supervisor import Supervisor
 from talkcli.engine.protocol import START_LIMIT_S
 from talkcli.errors import EXIT_OK, EXIT_SIGNAL, AddressInUse, TalkError, UsageError, memory_limits
 from talkcli.frozen import frozen
-from talkcli.goals.goal import Sender
+from talkcli.goals.goal import JsonObject, Sender
 from talkcli.goals.options import INITIAL, MAX_TEXT_CHARS, Say, Set, is_neural, shown_settings
 from talkcli.goals.scheduler import Scheduler
 from talkcli.goals.voices import VoiceScheduler
@@ -32,9 +31,6 @@ from talkcli.server.requests import Requests
 from talkcli.server.speech import Speech
 from talkcli.server.stream import Acceptor, raise_descriptor_limit
 from talkcli.server.voices import VoiceCatalog
-
-if TYPE_CHECKING:
-    from talkcli.goals.goal import JsonObject
 
 #: Default limit on connected clients. Each client uses a file descriptor, and a process can usually have 1,024 of them.
 MAX_CLIENTS = 256

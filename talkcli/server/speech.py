@@ -20,7 +20,7 @@ from talkcli.engine.players import NO_PLAYER
 from talkcli.engine.voices import is_own_driver
 from talkcli.errors import TalkError, UsageError
 from talkcli.frozen import replace
-from talkcli.goals.goal import Output
+from talkcli.goals.goal import By, Output, Sender
 from talkcli.goals.options import ENGINE_OPTIONS, INITIAL, engine_options, is_neural, require_fields, without_speaker
 from talkcli.goals.reasons import Reason
 from talkcli.goals.scheduler import Effect, EngineOrder, Now, Order, StateChange
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from talkcli.engine.parent.supervisor import Supervisor
-    from talkcli.goals.goal import By, Sender
     from talkcli.goals.record import Record
     from talkcli.goals.scheduler import Scheduler
     from talkcli.server.connection import WaitingList
@@ -137,15 +136,11 @@ class Speech:
 
     def now(self) -> Now:
         """Handle all time limits that have been reached, and return the current time."""
-        now = self._now()
+        now = Now(elapsed(), time.time())
         deadline = self.scheduler.deadline()
         if deadline is not None and deadline <= now.monotonic:
             self.apply(self.scheduler.tick(now))
         return now
-
-    @staticmethod
-    def _now() -> Now:
-        return Now(elapsed(), time.time())
 
     def apply(self, effects: list[Effect]) -> None:
         """Carry out the scheduler's effects. The engine gets its orders first, so that it can start working."""
@@ -232,7 +227,8 @@ class Speech:
             self._timer = self._loop.call_later(min(deadline - elapsed(), CLOCK_CHECK_S), self._tick)
 
     def _tick(self) -> None:
-        self.apply(self.scheduler.tick(self._now()))
+        self.now()
+        self._set_timer()
 
     # -- reports from the engine
 
@@ -371,7 +367,7 @@ class Speech:
     def shut_down(self) -> None:
         """End all goals and reject new ones."""
         self.engine_known.set()
-        self.apply(self.scheduler.shutdown(self._now()))
+        self.apply(self.scheduler.shutdown(self.now()))
 
     def check_finished(self) -> None:
         """After a shutdown, set `finished` when all goals have ended and all notifications were sent."""

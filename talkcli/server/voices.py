@@ -8,13 +8,13 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING
 
+from talkcli.engine import models
 from talkcli.engine.voices import UnknownVoice, find_voice, is_own_driver, speaker_number, unknown_voice_message
 from talkcli.goals.options import DEFAULT_VOICE, NEURAL_PREFIX, SPEAKER_MARK, is_neural
-from talkcli.goals.reasons import Reason
+from talkcli.goals.reasons import Reason, Refusal
 
 if TYPE_CHECKING:
     from talkcli.engine.protocol import Voice
-    from talkcli.goals.reasons import Refusal
 
 
 class VoiceCatalog:
@@ -50,16 +50,12 @@ class VoiceCatalog:
 
     def find_new_files(self) -> None:
         """Refresh the list of neural voices from the installed files."""
-        from talkcli.engine import models
-
         if self.listed and is_own_driver(self.driver):
             self.listed = (*self._driver_voices, *models.installed_voices())
 
     @staticmethod
     def file_size(voice: str) -> int:
         """Return the size of a neural voice's file in bytes, or 0 if there is no file."""
-        from talkcli.engine import models
-
         try:
             return os.path.getsize(models.find_models()[voice.removeprefix(NEURAL_PREFIX)])
         except (KeyError, OSError):  # the engine will report the error when it loads the voice
@@ -81,8 +77,6 @@ class VoiceCatalog:
         own = () if is_neural(voice) else self._driver_voices
         if self._foreign_driver is not None:
             return own
-        from talkcli.engine import models
-
         listed = {each.id: each for each in self.listed or ()}
         return (*own, *(listed.get(each.id, each) for each in models.installed_names()))
 
@@ -97,8 +91,6 @@ class VoiceCatalog:
     @staticmethod
     def _missing(voice: str) -> str | None:
         """Return an error message if a neural voice lacks a speaker or a package, or None."""
-        from talkcli.engine import models
-
         model, mark, speaker = voice.partition(SPEAKER_MARK)
         if mark:
             try:

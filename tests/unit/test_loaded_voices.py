@@ -152,7 +152,7 @@ class Asked(VoiceScheduler):
         steps[verb]()
 
     def _load_next(self, needed: list[str], default: list[str], now: float) -> None:
-        order = self.load_next(needed, "".join(default), now)
+        order = self.load_next(needed, "".join(default), now) if self.can_load else None
         self._tell(order.voice if order else "", order.dropped if order else ())
 
     def _drop_excess(self, first: str, needed: list[str]) -> None:
