@@ -21,33 +21,22 @@ if TYPE_CHECKING:
 def main() -> NoReturn:
     """Run the command line in `sys.argv`, and exit."""
     try:
-        code = _run_plain(sys.argv[1:])
+        code = run(sys.argv[1:])
     except KeyboardInterrupt:  # no command has been started yet
         code = 128 + 2
-    if code is None:
-        sys.exit(_run_with_click(sys.argv[1:]))
     # All output has been written. Skip the interpreter's cleanup, which would take an eighth of the command's run time.
     os._exit(code)
 
 
 def run(arguments: list[str]) -> int:
     """Run a command line, and return its exit code."""
-    code = _run_plain(arguments)
-    return _run_with_click(arguments) if code is None else code
-
-
-def _run_plain(arguments: list[str]) -> int | None:
-    """Run a simple command line, and return its exit code, or None if click has to parse it."""
     _prepare_streams()
-    if "_TALK_COMPLETE" in os.environ:
-        return None
-    from talkcli.cli import plain
+    if "_TALK_COMPLETE" not in os.environ:
+        from talkcli.cli import plain
 
-    command = plain.read(arguments, os.environ)
-    return None if command is None else plain.run(command)
-
-
-def _run_with_click(arguments: list[str]) -> int:
+        command = plain.read(arguments, os.environ)
+        if command is not None:
+            return plain.run(command)
     from talkcli.cli import click_app
 
     return click_app.run(arguments)

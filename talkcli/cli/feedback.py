@@ -11,7 +11,7 @@ import signal
 import sys
 import threading
 
-from talkcli.cli.show import DEFAULT_COLUMNS, Feedback, has_colour, note, show, show_json, terminal_columns
+from talkcli.cli.show import Feedback, has_colour, note, show, show_json, terminal_columns
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
 from talkcli.polling import wait_ready
@@ -214,7 +214,7 @@ class _GoalLine:
     def painted(self) -> str:
         """Return the line as text with terminal codes."""
         # Leave the last column free, because some terminals start a new line as soon as it is filled.
-        columns = (terminal_columns(sys.stdout) or DEFAULT_COLUMNS) - 1
+        columns = terminal_columns(sys.stdout) - 1
         state = "PAUSED" if self.paused and self.state is State.ACTIVE else self.state.name
         head = f"{printable(self.goal.id)}  {Screen(colour=True).coloured(f'{state:<9}', self.state)}  "
         if columns - width(head) < _MIN_SENTENCE_COLUMNS:

@@ -54,7 +54,7 @@ def read(arguments: list[str], environment: Mapping[str, str]) -> PlainCommand |
     """Parse a command line, or return None if click has to parse it."""
     try:
         return _parse(arguments, environment)
-    except (ValueError, StopIteration):  # an option's value is invalid or missing
+    except (LookupError, ValueError, StopIteration):  # an option is unknown, or its value is invalid or missing
         return None
 
 
@@ -67,14 +67,12 @@ def _parse(arguments: list[str], environment: Mapping[str, str]) -> PlainCommand
         if command is None and word in COMMANDS:
             command = COMMANDS[word]
             flags |= _flag_table(command.options)
-        elif word == "--" and command:
+        elif command and word == "--":
             words += rest
-        elif word[:1] != "-" or word == "-":
+        elif command and (word[:1] != "-" or word == "-"):
             words.append(word)
-        elif not _read_option(flags, word, rest, given):
-            return None
-        if command is None and words:
-            return None
+        else:
+            _read_option(flags, word, rest, given)
     return _add_defaults(command, given, words, environment) if command and command.plain else None
 
 
@@ -88,16 +86,17 @@ def _flag_table(options: Iterable[Option]) -> Flags:
     return found
 
 
-def _read_option(flags: Flags, word: str, rest: Iterator[str], given: dict[str, Any]) -> bool:
-    """Parse an option into `given`. Return False if click has to parse it."""
+def _read_option(flags: Flags, word: str, rest: Iterator[str], given: dict[str, Any]) -> None:
+    """Parse an option into `given`.
+
+    Raises:
+        KeyError, ValueError, StopIteration: click has to parse the option.
+    """
     name, equals, text = word.partition("=")
-    if name not in flags or (equals and name[:2] != "--"):
-        return False
     option, value = flags[name]
-    if option.kind is OUTPUT_FILE or (option.kind is FLAG and equals):
-        return False
+    if option.kind is OUTPUT_FILE or (equals and (option.kind is FLAG or name[:2] != "--")):
+        raise ValueError(f"{word} isn't a plain option")
     given[option.name] = value if option.kind is FLAG else read_value(option, text if equals else next(rest))
-    return True
 
 
 def _add_defaults(

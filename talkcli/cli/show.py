@@ -36,7 +36,7 @@ _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 #: Whether output was lost because of a disk error. The command continues, but its exit code isn't 0.
 _output_lost = False
 #: The width to assume if a terminal doesn't report its width.
-DEFAULT_COLUMNS = 80
+_DEFAULT_COLUMNS = 80
 #: Temporarily replaces a space at which a line must not be broken.
 _NO_BREAK_SPACE = "\0"
 
@@ -305,16 +305,19 @@ def write_error_line(line: str = "") -> None:
 
 
 def terminal_columns(stream: TextIO) -> int:
-    """Return the width of a terminal, or 0 if it is unknown or the stream isn't a terminal."""
+    """Return the width of a terminal, or the usual width if the terminal doesn't report it."""
     try:
-        return os.get_terminal_size(stream.fileno()).columns
+        columns = os.get_terminal_size(stream.fileno()).columns
     except OSError:
-        return 0
+        columns = 0
+    # COLUMNS is only a fallback, because it may be outdated after the window has been resized.
+    named = os.environ.get("COLUMNS", "")
+    return columns or (int(named) if named.isascii() and named.isdecimal() else 0) or _DEFAULT_COLUMNS
 
 
 def _wrap(text: str) -> str:
     """Wrap the text to the width of the terminal."""
-    columns = terminal_columns(sys.stderr) or DEFAULT_COLUMNS
+    columns = terminal_columns(sys.stderr)
     if all(len(line) <= columns for line in text.split("\n")):
         return text
     import re
@@ -373,9 +376,4 @@ def screen() -> Screen:
 
     if sys.stdout is None or not sys.stdout.isatty():
         return Screen()
-    # COLUMNS is only a fallback, because it may be outdated after the window has been resized.
-    width = terminal_columns(sys.stdout)
-    if not width:
-        columns = os.environ.get("COLUMNS", "")
-        width = int(columns) if columns.isascii() and columns.isdecimal() else 0
-    return Screen(width or DEFAULT_COLUMNS, has_colour())
+    return Screen(terminal_columns(sys.stdout), has_colour())
