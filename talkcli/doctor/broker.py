@@ -26,10 +26,9 @@ from talkcli.errors import ServerUnavailable, TalkError, UsageError
 from talkcli.fleet import topics
 from talkcli.fleet.broker import CA, URL, USER, client_user, from_environment, is_local
 from talkcli.fleet.desk.robot import connect_robot
-from talkcli.fleet.desk.watch import read_robots
-from talkcli.fleet.link import LOGIN_LIMIT_S, REASON_NOT_AUTHORIZED, Link
+from talkcli.fleet.link import LOGIN_LIMIT_S, MAX_RECEIVE_COUNT, REASON_NOT_AUTHORIZED, Link
 from talkcli.fleet.payloads import Message, Presence
-from talkcli.frozen import frozen, replace
+from talkcli.frozen import replace
 from talkcli.polling import wait_ready
 from talkcli.terminal.text import printable
 
@@ -44,8 +43,8 @@ _Result = TypeVar("_Result")
 #: Time limit for each check. It is longer than `LOGIN_LIMIT_S`, because looking up the broker's host name also takes
 #: time.
 _STEP_LIMIT_S = 2 * LOGIN_LIMIT_S
-#: How long to wait for a test message to come back after the broker has acknowledged it.
-_ECHO_RETURN_LIMIT_S = 1.0
+#: How long to wait for a test message, and for the presence of robots, after the broker has acknowledged all messages.
+_RETURN_LIMIT_S = 1.0
 #: Payload of the test message that the broker should send back. Bridges use another payload for their own test
 #: messages.
 _ECHO_PAYLOAD = b"doctor"
@@ -62,42 +61,6 @@ _UNREACHABLE_STEPS = {
 #: OpenSSL's error codes for a certificate with an invalid date, and for a certificate of another host.
 _DATE_CODES, _HOST_CODES = (9, 10), (62, 64)
 _LOG_STEP = "see what the broker's log says: journalctl -u mosquitto"
-
-
-@frozen
-class BrokerConnection:
-    """The result of connecting to the broker without logging in.
-
-    Attributes:
-        took: seconds that it took to connect, including TLS.
-        trouble: why the broker can't be reached, or None if it can.
-        tls_error: why TLS failed; None if it succeeded or is not used.
-        certificate_code: OpenSSL's error code if the certificate was rejected, otherwise 0.
-        expires_at: when the certificate expires, in seconds since 1970; None without TLS.
-    """
-
-    took: float = 0.0
-    trouble: str | None = None
-    tls_error: str | None = None
-    certificate_code: int = 0
-    expires_at: float | None = None
-
-
-@frozen
-class AccessRights:
-    """The user's access rights, as shown by test messages.
-
-    Attributes:
-        presence: the robot's presence; None if it is unknown to the broker, or if the user may not read it.
-        unwritable: topics to which the user must not publish.
-        unreadable: topics that the user can't read, because no message came back.
-        trouble: why the rights could not be tested, or None if they could.
-    """
-
-    presence: Presence | None
-    unwritable: tuple[str, ...] = ()
-    unreadable: tuple[str, ...] = ()
-    trouble: str | None = None
 
 
 class BrokerExamination:
@@ -145,16 +108,10 @@ class BrokerExamination:
         except UsageError as error:
             yield judge_settings(error.message, named=bool(self._environment.get(URL)))
             return
-        try:
-            connection = self._wait_for(partial(_connect, broker, context))
-        except TimeoutError:
-            connection = BrokerConnection(trouble=_NO_ANSWER)
-        yield judge_connection(broker, connection)
-        if connection.trouble is not None:
-            return
-        yield from judge_certificate(broker, connection, time.time(), near=is_local(broker.host))
-        if connection.tls_error is not None:
-            return
+        for finding in self._check_connection(broker, context):
+            yield finding
+            if finding.state == FAILURE:
+                return
         try:
             link = self._log_in(broker, self._inbox.append)
         except TalkError as error:
@@ -163,24 +120,42 @@ class BrokerExamination:
         with contextlib.closing(link):
             yield judge_login(broker, None)
             yield judge_anonymous(self._anonymous_refusal(broker))
-            rights = self._test_rights(link, name)
-        rights_finding = judge_rights(name, rights)
-        if rights.presence is not None:
-            presence_finding = judge_presence(rights.presence, time.time())
+            rights_finding, presences = self._test_rights(link, name)
+        if self._robot in presences:
+            presence_finding = judge_presence(presences[self._robot], time.time())
         elif self._is_robot:
             presence_finding = ok("name", f"'{self._robot}' is free: no bridge has it, and none had it")
         else:
             privileged = rights_finding.state != FAILURE
-            known = self._known_robots(broker) if privileged else ()
+            known = tuple(sorted(presences)) if privileged else ()
             presence_finding = judge_unknown(self._robot, known, name, privileged=privileged)
         yield presence_finding
         yield rights_finding
         if not self._is_robot and FAILURE not in (presence_finding.state, rights_finding.state):
             yield self._ask_robot(broker)
 
+    def _check_connection(self, broker: Broker, context: ssl.SSLContext | None) -> Iterator[Finding]:
+        """Connect to the broker without logging in, and yield the findings about the connection and the certificate."""
+        began = time.monotonic()
+        try:
+            connection = self._wait_for(partial(socket.create_connection, (broker.host, broker.port), LOGIN_LIMIT_S))
+        except OSError as error:
+            yield judge_unreachable(broker, error)
+            return
+        yield ok("broker", f"{broker.url} takes connections, in {(time.monotonic() - began) * 1000:.0f} ms")
+        result: float | OSError | None = None
+        with connection:
+            if context is not None:
+                try:
+                    result = self._wait_for(partial(_read_expiry, connection, context, broker.host))
+                except OSError as error:
+                    result = error
+        if broker.tls or not is_local(broker.host):
+            yield judge_certificate(broker, result, time.time())
+
     def _log_in(self, broker: Broker, on_message: Callable[[Message], None]) -> Link:
         """Connect to the broker and log in. Raises the same errors as `Link.open`."""
-        link = Link(broker, f"talk-doctor-{os.urandom(8).hex()}", on_message)
+        link = Link(broker, f"talk-doctor-{os.urandom(8).hex()}", on_message, receive_maximum=MAX_RECEIVE_COUNT)
         try:
             self._wait_for(link.open)
         except TimeoutError as error:
@@ -195,48 +170,47 @@ class BrokerExamination:
             return error.message
         return None
 
-    def _test_rights(self, link: Link, name: str) -> AccessRights:
-        """Find out whether the user has the access rights of an operator, or of this robot's bridge."""
+    def _test_rights(self, link: Link, name: str) -> tuple[Finding, dict[str, Presence]]:
+        """Find out whether the user has the access rights of an operator, or of this robot's bridge.
+
+        Return the finding about the rights, and the presence messages by the robots' names. Other robots are included
+        only if the broker sent no presence of this robot, and the user isn't the robot.
+        """
         robot, replies = partial(topics.robot, self._robot), partial(topics.reply, name, os.urandom(8).hex())
         if self._is_robot:
             echo = robot(topics.ECHO)
             others = [robot(topics.STATUS), robot(topics.EVENT, "doctor"), replies(self._robot)]
         else:
             echo, others = replies(topics.MARKER), [robot(topics.REQUEST, name)]
-        presence_topic, codes = robot(topics.PRESENCE), dict[str, int]()
+        codes, presences = dict[str, int](), dict[str, Presence]()
         link.subscribe(echo, retained=False)
-        link.subscribe(presence_topic, retained=True)
+        link.subscribe(robot(topics.PRESENCE), retained=True)
         tested = {echo: _ECHO_PAYLOAD} | dict.fromkeys(others, b"")
         for topic, payload in tested.items():
             link.publish(topic, payload, acknowledged=partial(codes.__setitem__, topic))
         now = time.monotonic()
         end = now + LOGIN_LIMIT_S
         is_acknowledged = is_back = False
-        presence: Presence | None = None
-        while link.ended is None and now < end and not (is_acknowledged and is_back and presence):
+        while link.ended is None and now < end and not (is_acknowledged and is_back and self._robot in presences):
             watched = {link.fileno(): select.POLLIN | (select.POLLOUT if link.wants_write else 0)}
             if link.fileno() in wait_ready(watched, end - now, self._interrupt):
                 link.read()
             for message in self._inbox:
                 is_back = is_back or (message.topic, message.payload) == (echo, _ECHO_PAYLOAD)
-                if message.topic == presence_topic:
-                    presence = Presence.read(self._robot, message.payload)
+                _, _, sender, kind, *_ = message.topic.split("/")
+                if kind == topics.PRESENCE and (presence := Presence.read(sender, message.payload)):
+                    presences[sender] = presence
             self._inbox.clear()
             now = time.monotonic()
             if not is_acknowledged and len(codes) == len(tested):
-                is_acknowledged, end = True, min(end, now + _ECHO_RETURN_LIMIT_S)
+                is_acknowledged, end = True, min(end, now + _RETURN_LIMIT_S)
+                if not (self._is_robot or self._robot in presences):
+                    link.subscribe(topics.robot(topics.ANY, topics.PRESENCE), retained=True)
         unwritable = tuple(each for each in tested if codes.get(each) == REASON_NOT_AUTHORIZED)
         missing = [each for each in tested if each not in codes]
         trouble = link.ended or (f"it has acknowledged nothing of {missing[0]}" if missing else None)
-        return AccessRights(presence, unwritable, () if is_back or echo in unwritable else (echo,), trouble)
-
-    def _known_robots(self, broker: Broker) -> tuple[str, ...]:
-        """Return the names of all robots that the broker knows. If they can't be read, the result is empty."""
-        try:
-            found = self._wait_for(partial(read_robots, broker, LOGIN_LIMIT_S, with_status=False))
-            return tuple(each.presence.name for each in found)
-        except (TalkError, TimeoutError):
-            return ()
+        unreadable = () if is_back or echo in unwritable else (echo,)
+        return judge_rights(name, unwritable, unreadable, trouble), presences
 
     def _ask_robot(self, broker: Broker) -> Finding:
         """Check whether the robot's server answers a status request."""
@@ -262,48 +236,33 @@ class BrokerExamination:
             Interrupted: The examination was interrupted.
         """
         result: Future[_Result] = Future()
-        reader, writer = os.pipe()
+        reader, writer = socket.socketpair()
 
         def run() -> None:
-            try:
-                result.set_result(work())
-            except BaseException as error:  # noqa: BLE001 - raised again in the waiting thread
-                result.set_exception(error)
-            finally:
-                os.close(writer)
+            with writer:
+                try:
+                    result.set_result(work())
+                except BaseException as error:  # noqa: BLE001 - raised again in the waiting thread
+                    result.set_exception(error)
 
         threading.Thread(target=run, name="talk doctor: asking", daemon=True).start()
-        try:
-            if not wait_ready({reader: 0}, _STEP_LIMIT_S, self._interrupt):
+        with reader:
+            if not wait_ready({reader.fileno(): 0}, _STEP_LIMIT_S, self._interrupt):
                 raise TimeoutError
-        finally:
-            os.close(reader)
         return result.result()
 
 
-def _connect(broker: Broker, context: ssl.SSLContext | None) -> BrokerConnection:
-    """Connect to the broker, do the TLS handshake, and disconnect."""
-    began = time.monotonic()
-    try:
-        connection = socket.create_connection((broker.host, broker.port), LOGIN_LIMIT_S)
-    except OSError as error:
-        return BrokerConnection(trouble=_describe_error(error))
-    with connection:
-        if context is None:
-            return BrokerConnection(time.monotonic() - began)
-        try:
-            with context.wrap_socket(connection, server_hostname=broker.host) as secured:
-                expires_at = ssl.cert_time_to_seconds(str((secured.getpeercert() or {})["notAfter"]))
-                return BrokerConnection(time.monotonic() - began, expires_at=expires_at)
-        except ssl.SSLCertVerificationError as error:
-            tls_error, code = error.verify_message, error.verify_code
-        except OSError as error:
-            reason = error.reason if isinstance(error, ssl.SSLError) else _describe_error(error)
-            tls_error, code = reason or str(error), 0
-        return BrokerConnection(time.monotonic() - began, tls_error=tls_error, certificate_code=code)
+def _read_expiry(connection: socket.socket, context: ssl.SSLContext, host: str) -> float:
+    """Start TLS, and return when the broker's certificate expires, in seconds since 1970."""
+    with context.wrap_socket(connection, server_hostname=host) as secured:
+        return ssl.cert_time_to_seconds(str((secured.getpeercert() or {})["notAfter"]))
 
 
 def _describe_error(error: OSError) -> str:
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return error.verify_message
+    if isinstance(error, ssl.SSLError):
+        return error.reason or str(error)
     if isinstance(error, ConnectionRefusedError):
         return "connection refused"
     if isinstance(error, socket.gaierror):
@@ -323,52 +282,47 @@ def judge_settings(words: str, *, named: bool) -> Finding:
     return failure("broker", words, "mend it where it is set: the shell's start file, or EnvironmentFile= of a unit")
 
 
-def judge_connection(broker: Broker, connection: BrokerConnection) -> Finding:
-    """Return the finding about the connection to the broker."""
-    if connection.trouble is None:
-        return ok("broker", f"{broker.url} takes connections, in {connection.took * 1000:.0f} ms")
-    step = _UNREACHABLE_STEPS.get(connection.trouble, _UNREACHABLE_STEPS[_NO_ANSWER])
-    return failure("broker", f"{broker.url}: {connection.trouble}", step.format(host=broker.host, port=broker.port))
+def judge_unreachable(broker: Broker, error: OSError) -> Finding:
+    """Return the finding about a broker that can't be reached."""
+    trouble = _describe_error(error)
+    step = _UNREACHABLE_STEPS.get(trouble, _UNREACHABLE_STEPS[_NO_ANSWER])
+    return failure("broker", f"{broker.url}: {trouble}", step.format(host=broker.host, port=broker.port))
 
 
-def judge_certificate(broker: Broker, connection: BrokerConnection, now: float, *, near: bool) -> list[Finding]:
-    """Return the findings about TLS and the broker's certificate.
+def judge_certificate(broker: Broker, result: float | OSError | None, now: float) -> Finding:
+    """Return the finding about TLS and the broker's certificate.
 
     Args:
         broker: the broker.
-        connection: the result of the first connection to the broker.
+        result: when the certificate expires, in seconds since 1970; the error if TLS failed; None without TLS.
         now: the current time in seconds since 1970.
-        near: whether the broker is on this machine.
     """
     check = "certificate"
-    if not broker.tls:
-        if near:
-            return []
+    if result is None:
         words = f"none: whoever is between here and {broker.host} can read all of it, and change it"
         step = f"give the broker a certificate (listener, certfile, keyfile in mosquitto.conf), and: {URL}=mqtts://…"
-        return [warning(check, words, step)]
+        return warning(check, words, step)
     by = f"the CA in {broker.ca}" if broker.ca else "the system's CAs"
-    if connection.tls_error is not None:
-        return [failure(check, f"{connection.tls_error} (by {by})", _trust_step(broker, connection, now))]
-    if connection.expires_at is None:
-        return []
-    date = time.strftime("%Y-%m-%d", time.gmtime(connection.expires_at))
-    if connection.expires_at - now < _RENEWAL_LIMIT_S:
-        words = f"good until {date}, {format_span(connection.expires_at - now)} from now; trusted by {by}"
-        return [warning(check, words, f"renew the certificate of {broker.host}, and have mosquitto read it: SIGHUP")]
-    return [ok(check, f"trusted by {by}; good until {date}")]
+    if isinstance(result, OSError):
+        return failure(check, f"{_describe_error(result)} (by {by})", _trust_step(broker, result, now))
+    date = time.strftime("%Y-%m-%d", time.gmtime(result))
+    if result - now < _RENEWAL_LIMIT_S:
+        words = f"good until {date}, {format_span(result - now)} from now; trusted by {by}"
+        return warning(check, words, f"renew the certificate of {broker.host}, and have mosquitto read it: SIGHUP")
+    return ok(check, f"trusted by {by}; good until {date}")
 
 
-def _trust_step(broker: Broker, connection: BrokerConnection, now: float) -> str:
+def _trust_step(broker: Broker, error: OSError, now: float) -> str:
     """Return advice on how to fix a TLS error."""
-    if connection.certificate_code in _DATE_CODES:
+    code = error.verify_code if isinstance(error, ssl.SSLCertVerificationError) else 0
+    if code in _DATE_CODES:
         clock = time.strftime("%Y-%m-%d %H:%M", time.gmtime(now))
         return f"renew the certificate of {broker.host}; or set this machine's clock: it says {clock} UTC"
-    if connection.certificate_code in _HOST_CODES:
+    if code in _HOST_CODES:
         return f"name the host in {URL} as its certificate does, or have it certified as {broker.host}"
-    if "ALERT" in str(connection.tls_error):
+    if "ALERT" in _describe_error(error):
         return "log in with a certificate that the broker takes: TALK_MQTT_CERT and TALK_MQTT_KEY name it"
-    if not connection.certificate_code:
+    if not code:
         return f"name the port that has TLS in {URL}, if {broker.port} of {broker.host} has none; or {_LOG_STEP}"
     other = "another file" if broker.ca else "the file"
     return f"name {other} of the CA that the certificate of {broker.host} is of: {CA}=FILE"
@@ -440,16 +394,23 @@ def judge_unknown(robot: str, known: tuple[str, ...], name: str, *, privileged: 
     return failure("name", words, f"{step}; or let '{name}' read presence: talk bridge --print-acl")
 
 
-def judge_rights(name: str, rights: AccessRights) -> Finding:
-    """Return the finding about the user's access rights."""
-    parts = [f"write {' and '.join(rights.unwritable)}"] if rights.unwritable else []
+def judge_rights(name: str, unwritable: tuple[str, ...], unreadable: tuple[str, ...], trouble: str | None) -> Finding:
+    """Return the finding about the user's access rights, as shown by test messages.
+
+    Args:
+        name: the user's name.
+        unwritable: topics to which the user must not publish.
+        unreadable: topics that the user can't read, because no message came back.
+        trouble: why the rights could not be tested, or None if they could.
+    """
+    parts = [f"write {' and '.join(unwritable)}"] if unwritable else []
     # If the connection broke, a missing message doesn't prove that reading is forbidden.
-    parts += [f"read {' and '.join(rights.unreadable)}"] if rights.unreadable and rights.trouble is None else []
+    parts += [f"read {' and '.join(unreadable)}"] if unreadable and trouble is None else []
     if parts:
         words = f"the broker does not let '{name}' {', nor '.join(parts)}"
         return failure("rights", words, "give the broker's acl_file the lines for that: talk bridge --print-acl")
-    if rights.trouble is not None:
-        return failure("rights", f"what '{name}' may do can't be found out: {rights.trouble}", _LOG_STEP)
+    if trouble is not None:
+        return failure("rights", f"what '{name}' may do can't be found out: {trouble}", _LOG_STEP)
     return ok("rights", f"the broker lets '{name}' do what is needed")
 
 
