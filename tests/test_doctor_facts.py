@@ -17,8 +17,8 @@ import pytest
 
 from talkcli.client.connection import SocketConnection
 from talkcli.doctor import server, sound, voice
-from talkcli.doctor.report import FAILURE
-from talkcli.doctor.sound import Cards, Players, ProgramOutput, SoundServer, UserSession
+from talkcli.doctor.report import FAILURE, OK, WARNING
+from talkcli.doctor.sound import Cards, ProgramOutput, SoundServer, UserSession
 from tests.conformance.bareserve import environment, serving
 from tests.conformance.rawsocket import FakeServer
 from tests.faults.broken import write
@@ -200,9 +200,9 @@ def test_the_output_of_a_program_is_kept_and_its_complaint_is_one_line(tmp_path:
     assert killed.error == "it was killed by SIGILL"
     good, bad = sound.run_program("good", env=env), sound.run_program("bad", env=env)
     assert (good, bad) == (ProgramOutput(None, "out\nC\n"), ProgramOutput("first line", "\n"))
-    assert sound.run_program("missing", env=env) == ProgramOutput("missing is not there")
     write(tmp_path / "broken", "#!/no/such/interpreter\n", 0o755)
-    assert "No such file" in str(sound.run_program("broken", env=env).error)
+    for name in ("broken", "missing"):
+        assert "No such file" in str(sound.run_program(name, env=env).error)
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc is Linux's")
@@ -238,32 +238,51 @@ def _runs(pid: int) -> bool:
 
 def test_the_players_that_are_installed_are_found_in_their_order(tmp_path: Path) -> None:
     env = env_with(tmp_path, **dict.fromkeys(("pacat", "aplay", "mine"), "exit 0"))
-    assert sound.find_players({"PATH": "/nowhere"}, None, None) == Players((), None, runs=False)
-    assert sound.find_players(env, None) == Players(("aplay", "pacat"), None, runs=False, first="aplay")
-    assert sound.find_players(env, None, "pulse").first == "pulse"
-    runs = {each: sound.find_players(env, each, None).runs for each in ("pulse", "mine -x", "theirs", "'")}
-    assert runs == {"pulse": True, "mine -x": True, "theirs": False, "'": False}
+    assert sound.installed_players({"PATH": "/nowhere"}) == []
+    assert sound.installed_players(env) == ["aplay", "pacat"]
+    runs = {each: sound.check_player(env, each, each, by_server=False).state == OK for each in ("mine -x", "theirs")}
+    assert runs == {"mine -x": True, "theirs": False}
+
+
+APLAY = "printf 'null\\n    Discard\\ndefault\\n    Default\\nplughw:CARD=Device,DEV=0\\n    USB\\n'"
 
 
 def test_devices_are_named_as_their_player_names_them(tmp_path: Path) -> None:
-    aplay = "printf 'null\\n    Discard\\ndefault\\n    Default\\nplughw:CARD=Device,DEV=0\\n    USB\\n'"
     pactl = "printf '0\\tusb\\tm.c\\ts16le 2ch 44100Hz\\tSUSPENDED\\n1\\thdmi\\tm.c\\ts16le 2ch 44100Hz\\tIDLE\\n'"
-    env = env_with(tmp_path, aplay=aplay, pactl=pactl, pw_cli=f"/bin/cat <<'X'{PW_NODES}X")
-    found = {each: sound.find_devices(env, each, None) for each in ("aplay", "pacat", "pw-cat")}
-    assert {player: each and each.names for player, each in found.items()} == {
-        "aplay": ("default", "plughw:CARD=Device,DEV=0"),
-        "pacat": ("usb", "hdmi"),
-        "pw-cat": ("alsa_output.usb",),
+    env = env_with(tmp_path, aplay=APLAY, pactl=pactl, pw_cli=f"/bin/cat <<'X'{PW_NODES}X")
+    found = {each: sound.check_device(env, each, None) for each in ("aplay", "pulse", "pacat", "pw-cat")}
+    assert {each.state for each in found.values()} == {OK}
+    assert {player: each.message for player, each in found.items()} == {
+        "aplay": "the default; aplay -L lists default, plughw:CARD=Device,DEV=0",
+        "pulse": "the default; pactl list short sinks lists usb, hdmi",
+        "pacat": "the default; pactl list short sinks lists usb, hdmi",
+        "pw-cat": "the default; pw-cli ls Node lists alsa_output.usb",
     }
-    assert sound.find_devices(env, "my-player", None) is None
+    assert "my-player" not in sound.DEVICE_LISTS
     assert sound.suspended_sinks(env) == ("usb",)
+
+
+def test_a_device_is_looked_up_in_the_player_s_list(tmp_path: Path) -> None:
+    env = env_with(tmp_path, aplay=APLAY)
+    for wanted in ("default", "plughw:1,0"):
+        assert sound.check_device(env, "aplay", wanted).state == OK
+    found = sound.check_device(env, "aplay", "robot_speaker")
+    assert (found.state, "robot_speaker is not among" in found.message) == (WARNING, True)
+    assert "plughw:CARD=Device,DEV=0" in found.message
+    assert sound.check_device(env, "pacat", None).state == OK, "it is a fault only if a device is named"
+    found = sound.check_device(env, "pacat", "usb")
+    assert (found.state, found.next) == (WARNING, "sudo apt-get install -y pulseaudio-utils")
+    env = env_with(tmp_path, aplay="exit 0")
+    assert sound.check_device(env, "aplay", None).state == WARNING
 
 
 def test_programs_that_fail_or_hang_say_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sound, "PROGRAM_LIMIT_S", 0.3)
     env = env_with(tmp_path, aplay="exec /bin/sleep 98", pactl="echo Connection refused >&2; exit 1")
-    found = [sound.find_devices(env, player, None) for player in ("aplay", "pacat", "pw-cat")]
-    assert [each and each.error for each in found] == ["no answer within 0.3 s", "Connection refused", None]
+    found = [sound.check_device(env, player, None) for player in ("aplay", "pacat", "pw-cat")]
+    assert [(each.state, each.message.partition(": ")[2]) for each in found] == [
+        (WARNING, "no answer within 0.3 s"), (WARNING, "Connection refused"), (OK, "pw-cli is not installed")
+    ]  # fmt: skip
     assert sound.find_sound_server(env, STRANGER).hangs is False
     assert sound.find_sound_server(env_with(tmp_path, pactl="exec /bin/sleep 98", pw_cli="exit 0"), STRANGER).hangs
 

@@ -141,12 +141,15 @@ class LocalExamination:
             yield sound.judge_silent_player(self._player, by_server=by_server)
             return
         cards = sound.find_cards(session)
-        chosen = None if by_server else self._engine.player
-        first = chosen or ("pulse" if sound_server.name and sound_server.accepts_pulse else None)
-        players = sound.find_players(env, self._player, first, by_server=by_server)
-        used = self._player or players.first
-        devices = None if used == "pulse" and sound_server.hangs else sound.find_devices(env, used, device)
-        yield from sound.judge_sound(players, devices, cards, sound_server, session)
+        program = next(iter(sound.installed_players(env)), None)
+        likely = "pulse" if sound_server.name and sound_server.accepts_pulse else program
+        used = self._player or (None if by_server else self._engine.player) or likely
+        yield sound.check_player(env, self._player, used, by_server=by_server)
+        if used in sound.DEVICE_LISTS and not (used == "pulse" and sound_server.hangs):
+            yield sound.check_device(env, used, device)
+        yield sound.judge_cards(cards, sound_server, session)
+        yield sound.judge_access(cards, sound_server, session)
+        yield sound.judge_sound_server(sound_server, cards, session)
         levels = tuple(sound.find_levels(env, sound_server, cards))
         yield from sound.judge_levels(levels, is_used=device is None and used in PLAYERS)
 

@@ -123,37 +123,6 @@ class ProgramOutput:
 
 
 @frozen
-class Players:
-    """The installed players, and which of them is used."""
-
-    #: the installed player programs, best first
-    found: tuple[str, ...]
-    #: the player set by the server or by TALK_PLAYER, or None for the automatic choice
-    configured: str | None
-    #: whether the configured player's program exists
-    runs: bool = True
-    #: the player that is tried first if none is configured, or None if there is none
-    first: str | None = None
-    #: True if the server uses the player, False if the doctor's own engine does
-    by_server: bool = False
-
-
-@frozen
-class Devices:
-    """The names of the devices that a player can use."""
-
-    #: the command that lists the devices
-    list_command: str
-    names: tuple[str, ...] = ()
-    #: why the devices can't be listed, or None if they can
-    error: str | None = None
-    #: the configured device, or None for the player's default device
-    configured: str | None = None
-    #: the package to install if the listing program is missing, or None if it is installed
-    package: str | None = None
-
-
-@frozen
 class SoundServer:
     """Facts about the sound server, which is PulseAudio or PipeWire."""
 
@@ -338,8 +307,6 @@ def run_program(program: str, *arguments: str, env: Mapping[str, str], limit: fl
     The default limit is PROGRAM_LIMIT_S.
     """
     limit = PROGRAM_LIMIT_S if limit is None else limit
-    if not on_path(program, env):
-        return ProgramOutput(f"{program} is not there")
     # Use files instead of pipes, because a background process of the program would keep a pipe open.
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         try:
@@ -383,29 +350,9 @@ def _program_of(command: str) -> str | None:
         return None
 
 
-def find_players(
-    env: Mapping[str, str], configured: str | None, first: str | None = None, *, by_server: bool = False
-) -> Players:
-    """Find out which players are installed.
-
-    The other arguments are only stored in the result.
-    """
-    found = tuple(each for each in PACKAGES if on_path(each, env))
-    program = _program_of(configured or "")
-    runs = program == "pulse" or bool(program and on_path(program, env))
-    return Players(found, configured, runs, first or next(iter(found), None), by_server)
-
-
-def find_devices(env: Mapping[str, str], player: str | None, configured: str | None) -> Devices | None:
-    """Return the devices of a player, or None if there is no program to list them."""
-    if player not in _DEVICE_LISTS:
-        return None
-    command, parse, package = _DEVICE_LISTS[player]
-    program, *arguments = command.split()
-    if not on_path(program, env):
-        return Devices(command, configured=configured, package=package)
-    output = run_program(program, *arguments, env=env)
-    return Devices(command, tuple(parse(output)), output.error, configured)
+def installed_players(env: Mapping[str, str]) -> list[str]:
+    """Return the names of the installed player programs, best first."""
+    return [each for each in PACKAGES if on_path(each, env)]
 
 
 def _parse_alsa(output: ProgramOutput) -> list[str]:
@@ -431,7 +378,7 @@ def _parse_nodes(output: ProgramOutput) -> list[str]:
 
 _LIST_SINKS = "pactl list short sinks"
 #: For each player: the command that lists its devices, the parser for the command's output, and the command's package.
-_DEVICE_LISTS: dict[str | None, tuple[str, Callable[[ProgramOutput], Iterable[str]], str]] = {
+DEVICE_LISTS: dict[str, tuple[str, Callable[[ProgramOutput], Iterable[str]], str]] = {
     "aplay": ("aplay -L", _parse_alsa, PACKAGES["aplay"]),
     "pulse": (_LIST_SINKS, _parse_sinks, PACKAGES["pacat"]),
     "pacat": (_LIST_SINKS, _parse_sinks, PACKAGES["pacat"]),
@@ -557,52 +504,57 @@ def judge_silent_player(player: str | None, *, by_server: bool) -> Finding:
     return failure("player", f"{player} ({_set_by(by_server)}): it keeps the time and makes no sound", step)
 
 
-def judge_sound(
-    players: Players, devices: Devices | None, cards: Cards, server: SoundServer, session: UserSession
-) -> list[Finding]:
-    """Return the findings about everything between the engine and the loudspeaker, except the volume."""
-    return [
-        _judge_player(players),
-        *([] if devices is None else [_judge_device(devices)]),
-        _judge_cards(cards, server, session),
-        _judge_access(cards, server, session),
-        _judge_sound_server(server, cards, session),
-    ]
-
-
 def _set_by(by_server: bool) -> str:
     """Return a description of what configured the player."""
     return "the server's" if by_server else "TALK_PLAYER"
 
 
-def _judge_player(players: Players) -> Finding:
-    configured, found = players.configured, players.found
-    broken = warning if players.by_server else failure
+def check_player(env: Mapping[str, str], configured: str | None, used: str | None, *, by_server: bool) -> Finding:
+    """Check whether the player is installed.
+
+    Args:
+        env: the environment of the player.
+        configured: the player set by the server or by TALK_PLAYER, or None for the automatic choice.
+        used: the player that is tried first, or None if no player is installed.
+        by_server: whether the server uses the player. Otherwise, the doctor's own engine does.
+    """
+    others = [each for each in installed_players(env) if each != used]
+    broken = warning if by_server else failure
+    if used is None:
+        package = next(iter(PACKAGES.values()))
+        return broken("player", f"none is on the PATH: {', '.join(PACKAGES)}", f"sudo apt-get install -y {package}")
     if configured is None:
-        pulse = players.first == "pulse"
-        if not pulse and not found:
-            package = next(iter(PACKAGES.values()))
-            return broken("player", f"none is on the PATH: {', '.join(PACKAGES)}", f"sudo apt-get install -y {package}")
-        used, others = ("pulse is used, by the sound server", found) if pulse else (f"{found[0]} is used", found[1:])
-        return ok("player", used + (f"; then {', '.join(others)}" if others else ""))
-    if not players.runs:
+        how = ", by the sound server" if used == "pulse" else ""
+        return ok("player", f"{used} is used{how}" + (f"; then {', '.join(others)}" if others else ""))
+    words = f"{configured} ({_set_by(by_server)})"
+    program = _program_of(configured)
+    if program is None or not (program == "pulse" or on_path(program, env)):
         known = PACKAGES.get(configured)
         step = f"sudo apt-get install -y {known}" if known else "name a program that is there, with --player"
-        return broken("player", f"{configured} ({_set_by(players.by_server)}) is not there", step)
-    others = tuple(each for each in found if each != configured)
+        return broken("player", f"{words} is not there", step)
     also = f"; there {'is' if len(others) == 1 else 'are'} also {', '.join(others)}" if others else ""
-    return ok("player", f"{configured} ({_set_by(players.by_server)}){also}")
+    return ok("player", words + also)
 
 
-def _judge_device(devices: Devices) -> Finding:
-    configured, command, names = devices.configured, devices.list_command, devices.names
+def check_device(env: Mapping[str, str], player: str, configured: str | None) -> Finding:
+    """Check whether the device is among those that the player can use.
+
+    Args:
+        env: the environment of the player.
+        player: a player in DEVICE_LISTS.
+        configured: the configured device, or None for the player's default device.
+    """
+    command, parse, package = DEVICE_LISTS[player]
+    program, *arguments = command.split()
     used = configured or "the default"
-    if devices.package is not None:
-        words = f"{used}; others cannot be listed: {command.split()[0]} is not installed"
-        step = f"sudo apt-get install -y {devices.package}"
+    if not on_path(program, env):
+        words = f"{used}; others cannot be listed: {program} is not installed"
+        step = f"sudo apt-get install -y {package}"
         return ok("device", words) if configured is None else warning("device", words, step)
-    if devices.error is not None:
-        return warning("device", f"{command}: {devices.error}", f"look at what this says: {command}")
+    output = run_program(program, *arguments, env=env)
+    names = tuple(parse(output))
+    if output.error is not None:
+        return warning("device", f"{command}: {output.error}", f"look at what this says: {command}")
     if not names:
         step = "plug in a loudspeaker; in a container, hand the device in"
         return warning("device", f"{command} lists none", step)
@@ -613,7 +565,8 @@ def _judge_device(devices: Devices) -> Finding:
     return warning("device", words, "start the server with --device and one of these names")
 
 
-def _judge_cards(cards: Cards, server: SoundServer, session: UserSession) -> Finding:
+def judge_cards(cards: Cards, server: SoundServer, session: UserSession) -> Finding:
+    """Return the finding about the kernel's sound cards."""
     if cards.names:
         return ok("cards", join_names(cards.names))
     if server.name is not None:
@@ -625,7 +578,8 @@ def _judge_cards(cards: Cards, server: SoundServer, session: UserSession) -> Fin
     return warning("cards", words, "plug in a loudspeaker or sound card, and look with: aplay -l")
 
 
-def _judge_access(cards: Cards, server: SoundServer, session: UserSession) -> Finding:
+def judge_access(cards: Cards, server: SoundServer, session: UserSession) -> Finding:
+    """Return the finding about the user's permission to open the sound cards."""
     group = cards.group
     if not cards.nodes:
         return ok("group", f"nothing in /dev/snd to open, so the group {group} is not needed")
@@ -641,7 +595,8 @@ def _judge_access(cards: Cards, server: SoundServer, session: UserSession) -> Fi
     return warning("group", words, f"sudo usermod -aG {group} {session.user}, and log in again")
 
 
-def _judge_sound_server(server: SoundServer, cards: Cards, session: UserSession) -> Finding:
+def judge_sound_server(server: SoundServer, cards: Cards, session: UserSession) -> Finding:
+    """Return the finding about the sound server, which shows whether players can use it."""
     check = _SOUND_SERVER_CHECK
     where = "from here" if session.server_pid is None else f"from the server (process {session.server_pid})"
     if server.name is not None and server.sink == DUMMY_SINK:

@@ -14,7 +14,7 @@ from talkcli.doctor.examine import LocalExamination
 from talkcli.doctor.report import FAILURE, OK, WARNING, Finding, failure, has_passed, next_step, ok, warning
 from talkcli.doctor.sentence import SentenceResult, find_playback_step
 from talkcli.doctor.server import SocketPlace, SocketSearch
-from talkcli.doctor.sound import Cards, Devices, MixerLevel, Players, SoundServer, UserSession
+from talkcli.doctor.sound import Cards, MixerLevel, SoundServer, UserSession
 from talkcli.doctor.voice import SENTENCE_TEXT, EngineOptions, EngineReport
 from talkcli.engine.players import DUMMY_SINK
 from talkcli.frozen import replace
@@ -400,8 +400,6 @@ def test_in_a_pipe_a_finding_is_one_line_without_colour() -> None:
 
 
 PI = UserSession(1000, "pi", groups=("pi", "audio"), gids=(1000, 29), runtime_dir="/run/user/1000", runtime_owner=1000)
-PLAYERS = Players(("aplay", "pacat"), None, first="aplay")
-DEVICES = Devices("aplay -L", ("default", "plughw:CARD=Device,DEV=0"))
 CARDS = Cards(in_kernel=True, names=("USB Audio Device",), nodes=("/dev/snd/pcmC0D0p",), group="audio")
 NO_CARDS = Cards(in_kernel=True)
 NO_SERVER = SoundServer(error="Connection refused")
@@ -409,35 +407,36 @@ WIRE = SoundServer("PipeWire, without its PulseAudio part", accepts_pulse=False)
 PULSE = SoundServer(name="PulseAudio (on PipeWire 1.2.7)", sink="alsa_output.usb")
 
 
-def judged(
-    check: str,
-    players: Players = PLAYERS,
-    devices: Devices | None = DEVICES,
-    cards: Cards = CARDS,
-    server: SoundServer = NO_SERVER,
-    session: UserSession = PI,
-    *,
-    by_server: bool = False,
-) -> Finding:
-    players = replace(players, by_server=by_server)
-    found = sound.judge_sound(players, devices, cards, server, session)
-    return next(each for each in found if each.check == check)
+def judged(check: str, cards: Cards = CARDS, server: SoundServer = NO_SERVER, session: UserSession = PI) -> Finding:
+    found = (
+        sound.judge_cards(cards, server, session),
+        sound.judge_access(cards, server, session),
+        sound.judge_sound_server(server, cards, session),
+    )
+    return of(list(found), check)
+
+
+def player(configured: str | None, used: str | None, *installed: str, by_server: bool = False) -> Finding:
+    """Return the finding about a player if only these programs are installed."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sound, "on_path", lambda program, _: program in installed)
+        return sound.check_player({}, configured, used, by_server=by_server)
 
 
 def test_a_robot_with_a_card_and_nothing_else_is_well() -> None:
-    found = sound.judge_sound(PLAYERS, DEVICES, CARDS, SoundServer(), PI)
-    assert [each.check for each in found] == ["player", "device", "cards", "group", "sound server"]
+    found = [judged(each, server=SoundServer()) for each in ("cards", "group", "sound server")]
     assert {each.state for each in found} == {OK}, found
-    assert found[0].message == "aplay is used; then pacat"
+    used = player(None, "aplay", "aplay", "pacat")
+    assert (used.state, used.message) == (OK, "aplay is used; then pacat")
 
 
 def test_a_sound_server_that_answers_needs_no_program() -> None:
-    chosen = replace(PLAYERS, first="pulse")
-    assert judged("player", chosen).message == "pulse is used, by the sound server; then aplay, pacat"
-    alone = judged("player", replace(chosen, found=()))
+    assert player(None, "pulse", "aplay", "pacat").message == "pulse is used, by the sound server; then aplay, pacat"
+    alone = player(None, "pulse")
     assert (alone.state, alone.message) == (OK, "pulse is used, by the sound server")
-    assert judged("player", Players((), "pulse"), by_server=True).message == "pulse (the server's)"
-    assert judged("player").message == "aplay is used; then pacat"
+    assert player("pulse", "pulse", by_server=True).message == "pulse (the server's)"
+    both = player("pacat", "pacat", "aplay", "pacat", "pw-cat")
+    assert both.message == "pacat (TALK_PLAYER); there are also aplay, pw-cat"
 
 
 def test_the_player_is_chosen_by_the_engine_process_or_else_by_the_sound_server(
@@ -470,13 +469,15 @@ def test_a_sound_server_with_only_a_dummy_output_is_not_heard() -> None:
 
 
 def test_a_missing_player_is_named_with_its_package() -> None:
-    found = judged("player", Players((), None))
+    found = player(None, None)
     assert (found.state, found.next) == (FAILURE, "sudo apt-get install -y alsa-utils")
-    assert judged("player", Players((), None), by_server=True).state == WARNING
-    found = judged("player", Players(("aplay",), "pw-cat", runs=False))
+    assert player(None, None, by_server=True).state == WARNING
+    found = player("pw-cat", "pw-cat", "aplay")
     assert (found.state, found.next) == (FAILURE, "sudo apt-get install -y pipewire-bin")
-    found = judged("player", Players(("aplay",), "/opt/play", runs=False))
-    assert (found.state, "/opt/play (TALK_PLAYER)" in found.message) == (FAILURE, True)
+    for each in ("/opt/play -x", "'"):
+        found = player(each, each, "aplay")
+        assert (found.state, f"{each} (TALK_PLAYER) is not there" in found.message) == (FAILURE, True)
+    assert player("/opt/play -x", "/opt/play -x", "/opt/play", "aplay").state == OK
 
 
 def test_a_player_without_sound_is_not_heard(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -487,20 +488,6 @@ def test_a_player_without_sound_is_not_heard(monkeypatch: pytest.MonkeyPatch) ->
         (found,) = examination._check_sound()
         assert (found.check, found.state, found.next) == ("player", FAILURE, "unset TALK_PLAYER")
         assert "without --player" in str(sound.judge_silent_player(player, by_server=True).next)
-
-
-def test_a_device_is_looked_up_in_the_player_s_list() -> None:
-    for wanted in ("default", "plughw:1,0"):
-        assert judged("device", devices=replace(DEVICES, configured=wanted)).state == OK
-    found = judged("device", devices=replace(DEVICES, configured="robot_speaker"))
-    assert (found.state, "robot_speaker is not among" in found.message) == (WARNING, True)
-    assert "plughw:CARD=Device,DEV=0" in found.message
-    assert judged("device", devices=Devices("aplay -L")).state == WARNING
-    assert "no answer" in judged("device", devices=Devices("aplay -L", error="no answer")).message
-    unlisted = Devices("pactl list short sinks", package="pulseaudio-utils")
-    assert judged("device", devices=unlisted).state == OK, "it is a fault only if a device is named"
-    found = judged("device", devices=replace(unlisted, configured="usb"))
-    assert (found.state, found.next) == (WARNING, "sudo apt-get install -y pulseaudio-utils")
 
 
 def test_a_step_that_needs_pactl_names_its_package(tmp_path: Path) -> None:
