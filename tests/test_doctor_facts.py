@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import grp
 import os
 import shutil
 import socket
@@ -10,6 +11,7 @@ import sys
 import time
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import espeakng_loader
@@ -18,7 +20,8 @@ import pytest
 from talkcli.client.connection import SocketConnection
 from talkcli.doctor import server, sound, voice
 from talkcli.doctor.report import FAILURE, OK, WARNING
-from talkcli.doctor.sound import Cards, ProgramOutput, SoundServer, UserSession
+from talkcli.doctor.sound import ProgramOutput, SoundServer, UserSession
+from talkcli.frozen import replace
 from tests.conformance.bareserve import environment, serving
 from tests.conformance.rawsocket import FakeServer
 from tests.faults.broken import write
@@ -313,41 +316,62 @@ def test_a_sound_server_is_found_by_its_own_program_or_by_its_socket(tmp_path: P
 
 
 def test_the_volume_is_read_from_the_mixer_in_charge(tmp_path: Path) -> None:
-    server, cards = SoundServer(name="PipeWire"), Cards(in_kernel=True, names=("USB",))
+    server, cards = SoundServer(name="PipeWire"), ("USB",)
     controls = "case $1 in scontrols) echo \"Simple mixer control 'Master',0\";; *) echo 'Mono: 0 [0%] [off]';; esac"
     env = env_with(tmp_path, amixer=controls, wpctl="echo 'Volume: 0.40 [MUTED]'")
-    (alsa,) = sound.find_levels(env, SoundServer(), cards)
-    assert (alsa.name, alsa.muted, alsa.unmute_command) == ("Master", True, "amixer sset Master unmute")
-    (wire,) = sound.find_levels(env, server, cards)
-    assert (wire.muted, wire.percent, wire.unmute_command) == (True, 40, "wpctl set-mute @DEFAULT_AUDIO_SINK@ 0")
+    (alsa,) = sound.check_levels(env, SoundServer(), cards, is_used=True)
+    assert (alsa.message, alsa.next) == ("Master is muted", "amixer sset Master unmute")
+    (wire,) = sound.check_levels(env, server, cards, is_used=True)
+    assert (wire.message, wire.next) == (
+        "the default sink is muted", "wpctl set-mute @DEFAULT_AUDIO_SINK@ 0"
+    )  # fmt: skip
     env = env_with(
-        tmp_path, pactl="case $1 in get-sink-mute) echo Mute: no;; *) echo 'Volume: mono: 9 / 30% / x';; esac"
+        tmp_path, pactl="case $1 in get-sink-mute) echo Mute: no;; *) echo 'Volume: mono: 9 / 15% / x';; esac"
     )
-    (pulse,) = sound.find_levels(env, server, cards)
-    assert (pulse.muted, pulse.percent, pulse.louder_command) == (False, 30, "pactl set-sink-volume @DEFAULT_SINK@ 70%")
-    assert not [*sound.find_levels(env, SoundServer(), Cards(in_kernel=False))]
-    assert not [*sound.find_levels(env, SoundServer(hangs=True), cards)]
+    (pulse,) = sound.check_levels(env, server, cards, is_used=True)
+    assert pulse.message == "the default sink is at 15%: few will hear it"
+    assert pulse.next == "pactl set-sink-volume @DEFAULT_SINK@ 70%"
+    assert sound.check_levels(env, SoundServer(), (), is_used=True) == []
+    assert sound.check_levels(env, SoundServer(hangs=True), cards, is_used=True) == []
 
 
 # System files
 
 
-def test_a_card_may_be_opened_by_root_by_its_group_or_by_its_mode(tmp_path: Path) -> None:
-    kernel, nodes = tmp_path / "asound", tmp_path / "snd"
-    kernel.mkdir()
-    nodes.mkdir()
-    write(kernel / "cards", " 0 [Device         ]: USB-Audio - USB Audio Device\n              C-Media at usb-1\n")
+@pytest.fixture
+def nodes(tmp_path: Path) -> str:
+    """Return a directory with the device files of a card that only its group may open, and of one for everybody."""
     for name, mode in (("pcmC0D0p", 0o660), ("pcmC0D0c", 0o660), ("pcmC1D0p", 0o666)):
-        write(nodes / name, "", mode)
-    found = sound.find_cards(STRANGER, str(kernel), str(nodes))
-    assert found.names == ("USB Audio Device",)
-    assert found.nodes == (f"{nodes}/pcmC0D0p", f"{nodes}/pcmC1D0p")
-    assert found.forbidden == (f"{nodes}/pcmC0D0p",), "others may open the second one, by its mode"
-    member = UserSession(4141, "member", gids=(os.stat(nodes / "pcmC0D0p").st_gid,))
-    for each in (member, UserSession(0, "root")):
-        assert sound.find_cards(each, str(kernel), str(nodes)).forbidden == ()
-    gone = str(tmp_path / "gone")
-    assert sound.find_cards(STRANGER, gone, gone) == Cards(in_kernel=False, group="audio")
+        write(tmp_path / name, "", mode)
+    return str(tmp_path)
+
+
+def test_a_card_may_be_opened_by_root_by_its_group_or_by_its_mode(nodes: str) -> None:
+    group = os.stat(f"{nodes}/pcmC0D0p").st_gid
+    name = grp.getgrgid(group).gr_name if group else "audio"
+    found = sound.check_access(SoundServer(), STRANGER, nodes)
+    assert (found.state, found.next) == (WARNING, f"sudo usermod -aG {name} stranger, and log in again")
+    assert found.message == f"user stranger may not open {nodes}/pcmC0D0p: not in the group {name}"
+    assert sound.check_access(SoundServer("PipeWire"), STRANGER, nodes).state == OK, "it opens them"
+    member = UserSession(4141, "member", groups=(name,), gids=(group,))
+    assert sound.check_access(SoundServer(), member, nodes).message == (
+        f"user member may open the cards (in the group {name})"
+    )
+    assert "needs not to be" in sound.check_access(SoundServer(), UserSession(0, "root"), nodes).message
+    assert "nothing in /gone to open" in sound.check_access(SoundServer(), STRANGER, "/gone").message
+
+
+def test_a_new_member_of_the_group_is_to_log_in_again(nodes: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(grp, "getgrnam", lambda _: SimpleNamespace(gr_mem=["stranger"]))
+    assert sound.check_access(SoundServer(), STRANGER, nodes).next == "log out and in again"
+    served = sound.check_access(SoundServer(), replace(STRANGER, server_pid=7), nodes)
+    assert served.next == "start the server again, from a new login"
+
+
+def test_cards_have_the_kernel_s_names(tmp_path: Path) -> None:
+    write(tmp_path / "cards", " 0 [Device         ]: USB-Audio - USB Audio Device\n              C-Media at usb-1\n")
+    assert sound.find_cards(str(tmp_path)) == ("USB Audio Device",)
+    assert sound.find_cards("/gone") == ()
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc is Linux's")

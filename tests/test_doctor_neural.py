@@ -16,8 +16,8 @@ from talkcli import Client, install
 from talkcli.doctor import examine, voice
 from talkcli.doctor.report import FAILURE, OK, WARNING
 from talkcli.doctor.sound import UserSession
-from talkcli.doctor.voice import EngineOptions, EngineReport, NeuralVoices, VoiceTrial
-from talkcli.frozen import replace
+from talkcli.doctor.voice import EngineOptions, EngineReport, VoiceTrial
+from talkcli.engine.protocol import Ready
 from talkcli.install import NEURAL_PACKAGES
 from talkcli.polling import Interrupted
 from tests.conformance.bareserve import environment, serving
@@ -59,8 +59,8 @@ def _environment(home: str, tmp_path: Path, code: str) -> dict[str, str]:
 
 def _found(used: str | None, env: dict[str, str], limit: float = LIMIT) -> dict[str, Finding]:
     """Return the findings about the voices of this environment, by their checks."""
-    facts = voice.find_neural(used, EngineOptions(env=env), limit)
-    return {each.check: each for each in voice.judge_neural(facts, has_server=False, server_voices={})}
+    found = voice.check_neural(used, EngineOptions(env=env), limit, has_server=False, server_voices={})
+    return {each.check: each for each in found}
 
 
 def test_the_voice_in_use_is_loaded_and_timed(alone: dict[str, str]) -> None:
@@ -157,18 +157,26 @@ def test_the_server_s_voice_is_tried_in_its_environment(alone: dict[str, str]) -
 
 
 HERE, SERVED = UserSession(0, "root"), UserSession(0, "root", server_pid=7)
-ESPEAK, UNKNOWN = EngineReport("espeak"), EngineReport(reason="unknown_voice", message="x")
+UNKNOWN = EngineReport(reason="unknown_voice", message="x")
+
+
+def started(voice: str | None = None, *voices: str, driver: str = "espeak") -> EngineReport:
+    """Return the report of an engine; `voice`: the neural voice in its settings, `voices`: all of its voices."""
+    return EngineReport(Ready(driver, None, None, voice), voices)
+
+
+ESPEAK = started()
 
 
 def test_only_a_voice_that_is_used_is_tried(home: str, monkeypatch: pytest.MonkeyPatch) -> None:
     tiny_voice.put(Path(home) / "v", "tiny")
     asked: list[str | None] = []
 
-    def find_neural(used: str | None, *_: object) -> NeuralVoices:
+    def check_neural(used: str | None, *_: object, **__: object) -> list[Finding]:
         asked.append(used)
-        return NeuralVoices()
+        return []
 
-    monkeypatch.setattr(voice, "find_neural", find_neural)
+    monkeypatch.setattr(voice, "check_neural", check_neural)
 
     def tried(used: str | None, engine: EngineReport, here: UserSession = HERE, **told: object) -> list[str | None]:
         env = {"TALK_VOICES": f"{home}/v"} if told.pop("installed", False) else {}
@@ -180,14 +188,14 @@ def test_only_a_voice_that_is_used_is_tried(home: str, monkeypatch: pytest.Monke
         examination._engine, examination._session, examination._env = engine, here, env
         asked.clear()
         found = list(examination._check_neural())
-        assert bool(found) == bool(asked) or found[0].message == "of the server: piper/a"
+        assert not found or found[0].message == "of the server: piper/a"
         return [*asked]
 
     assert tried(None, ESPEAK) == tried("de", ESPEAK) == []
-    assert tried("piper/ti", EngineReport("dummy"), driver="dummy") == []
-    assert tried(None, EngineReport("espeak", neural_count=1)) == tried(None, ESPEAK, installed=True) == [None]
+    assert tried("piper/ti", started(driver="dummy"), driver="dummy") == []
+    assert tried(None, started(None, "en", "piper/tiny")) == tried(None, ESPEAK, installed=True) == [None]
     assert tried("piper/ti", ESPEAK) == ["piper/ti"]
-    assert tried("ti", EngineReport("espeak", neural_voice="piper/tiny")) == ["piper/tiny"]
+    assert tried("ti", started("piper/tiny")) == ["piper/tiny"]
     assert tried("tiny", UNKNOWN, installed=True) == ["tiny"]
     assert tried("none", UNKNOWN, installed=True) == [None]
     voices = {"piper/a": {"state": "loaded"}}
@@ -212,9 +220,8 @@ assert not {"onnxruntime", "numpy"} & {*sys.modules}, sys.modules.keys()
 
 
 def test_a_voice_that_takes_too_long_is_given_up(alone: dict[str, str]) -> None:
-    tried = voice.find_neural("piper/tiny", EngineOptions(env=alone), 0.01).trial
-    assert tried
-    assert tried.fault[0] == "it was not loaded, and had not spoken, after 0.01 s"
+    found = _found("piper/tiny", alone, 0.01)["neural voice"]
+    assert found.message == "piper/tiny is in use: it was not loaded, and had not spoken, after 0.01 s"
 
 
 def test_a_voice_that_kills_the_engine_process_is_a_fact(home: str, tmp_path: Path) -> None:
@@ -224,17 +231,16 @@ def test_a_voice_that_kills_the_engine_process_is_a_fact(home: str, tmp_path: Pa
         "from talkcli.engine.child.synthesizers import inference\nimport os\n"
         "inference.split_model = lambda _: os.abort()\n"
     )
-    tried = voice.find_neural("piper/tiny", EngineOptions(env=_environment(home, tmp_path, dies)), LIMIT).trial
-    assert tried
-    assert "SIGABRT" in tried.fault[0]
+    assert "SIGABRT" in _found("piper/tiny", _environment(home, tmp_path, dies))["neural voice"].message
 
 
 def test_a_signal_ends_the_trial(alone: dict[str, str]) -> None:
     readable, writable = os.pipe()
     os.write(writable, b"x")
+    options = EngineOptions(env=alone, interrupt={readable: 1})
     try:
         with pytest.raises(Interrupted):
-            voice.find_neural("piper/tiny", EngineOptions(env=alone, interrupt={readable: 1}), LIMIT)
+            list(voice.check_neural("piper/tiny", options, LIMIT, has_server=False, server_voices={}))
     finally:
         os.close(readable)
         os.close(writable)
@@ -256,15 +262,14 @@ def test_a_server_s_words_about_its_voices_are_told_if_they_cannot_be_examined()
 
 
 def test_a_voice_that_speaks_here_and_that_the_server_has_given_up_is_a_warning() -> None:
-    facts = NeuralVoices(used="piper/b", trial=VoiceTrial(load_s=0.5, speed=9.0))
-    assert voice.judge_neural(facts, has_server=True, server_voices=FAILED_THEN)[-1].state == WARNING
-    assert voice.judge_neural(facts, has_server=True, server_voices={})[-1].state == OK
+    trial = VoiceTrial(load_s=0.5, speed=9.0)
+    assert voice.judge_trial("piper/b", trial, has_server=True, server_voices=FAILED_THEN).state == WARNING
+    assert voice.judge_trial("piper/b", trial, has_server=True, server_voices={}).state == OK
 
 
 def _judged(**tried: object) -> Finding:
     trial = VoiceTrial(**tried)  # type: ignore[arg-type]
-    facts = NeuralVoices(used="piper/a", trial=trial)
-    return voice.judge_neural(facts, has_server=False, server_voices={})[-1]
+    return voice.judge_trial("piper/a", trial, has_server=False, server_voices={})
 
 
 def test_on_a_slow_machine_another_voice_is_the_next_step() -> None:
@@ -278,14 +283,20 @@ def test_on_a_slow_machine_another_voice_is_the_next_step() -> None:
     assert "MB" not in _judged(speed=2.0).message
 
 
-def test_a_voice_that_fails_is_a_warning_if_a_server_speaks_with_espeak_instead() -> None:
-    facts = NeuralVoices(used="piper/a", trial=VoiceTrial(fault=("x is no model", "get it anew")))
-    without = NeuralVoices(("onnxruntime is missing", "install it"), used="piper/a")
+def test_a_voice_that_fails_is_a_warning_if_a_server_speaks_with_espeak_instead(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(voice, "_find_package_fault", lambda _: ("onnxruntime is missing", "install it"))
+    trial = VoiceTrial(fault=("x is no model", "get it anew"))
+
+    def packages(used: str | None, *, has_server: bool) -> str:
+        options = EngineOptions(env={})
+        return next(voice.check_neural(used, options, LIMIT, has_server=has_server, server_voices={})).state
+
     for has_server, state in ((False, FAILURE), (True, WARNING)):
-        assert voice.judge_neural(facts, has_server=has_server, server_voices={})[-1].state == state
-        assert voice.judge_neural(without, has_server=has_server, server_voices={})[0].state == state
-    unused = replace(without, used=None)
-    assert voice.judge_neural(unused, has_server=False, server_voices={})[0].state == WARNING
+        assert voice.judge_trial("piper/a", trial, has_server=has_server, server_voices={}).state == state
+        assert packages("piper/a", has_server=has_server) == state
+    assert packages(None, has_server=False) == WARNING
 
 
 def test_a_voice_that_needs_a_missing_package_is_cured_by_installing_it() -> None:

@@ -16,7 +16,7 @@ from functools import partial
 from talkcli.cli.command import nearest
 from talkcli.cli.show import note, screen, show, show_json, show_result
 from talkcli.errors import EXIT_SIGPIPE, TalkError, UnknownGoal
-from talkcli.frozen import TYPE_CHECKING
+from talkcli.frozen import TYPE_CHECKING, fields
 from talkcli.paths import named_robot
 from talkcli.protocol.events import Canceled, unfinished
 
@@ -146,7 +146,7 @@ def _show_paused(options: CommonOptions, goal: Goal | None, *, paused: bool, wor
 def doctor(options: CommonOptions, silent: bool) -> int:
     """Run the doctor's checks, show the findings and the next step, and return the exit code."""
     from talkcli.cli.interrupts import Interrupts
-    from talkcli.doctor.report import format_conclusion, format_finding, has_passed
+    from talkcli.doctor.report import format_conclusion, format_finding, next_step
     from talkcli.goals.states import EXIT_CODES, State
 
     findings = []
@@ -154,7 +154,7 @@ def doctor(options: CommonOptions, silent: bool) -> int:
         examination = _examination(options, interrupts.watched, silent=silent)
         for finding in examination.findings():
             findings.append(finding)
-            show_result(options, [finding.to_json()], partial(format_finding, finding, screen()))
+            show_result(options, [fields(finding)], partial(format_finding, finding, screen()))
             if interrupts.signal_number is not None:
                 break
     if interrupts.signal_number is not None:
@@ -162,7 +162,7 @@ def doctor(options: CommonOptions, silent: bool) -> int:
     if not options.json and not options.quiet:
         note(format_conclusion(findings, screen(), examination.question))
     # If speech can't be heard, exit with the same code as for an aborted goal.
-    return 0 if has_passed(findings, examination.question) else EXIT_CODES[State.ABORTED]
+    return 0 if next_step(findings) is None else EXIT_CODES[State.ABORTED]
 
 
 def _examination(

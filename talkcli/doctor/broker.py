@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from talkcli.client.client import Client
 from talkcli.doctor import report
-from talkcli.doctor.report import FAILURE, Finding, Question, failure, join_names, ok, warning
+from talkcli.doctor.report import FAILURE, Finding, failure, join_names, ok, warning
 from talkcli.doctor.server import format_span, summarize_server
 from talkcli.errors import ServerUnavailable, TalkError, UsageError
 from talkcli.fleet import topics
@@ -94,11 +94,8 @@ class BrokerExamination:
         #: whether the doctor logs in as the robot's bridge
         self._is_robot = environment.get(USER) == robot
         self._inbox: list[Message] = []
-
-    @property
-    def question(self) -> Question:
-        """The question that the report answers."""
-        return report.BRIDGE_QUESTION if self._is_robot else report.ROBOT_QUESTION
+        #: the question that the report answers
+        self.question = report.BRIDGE_QUESTION if self._is_robot else report.ROBOT_QUESTION
 
     def findings(self) -> Iterator[Finding]:
         """Run the checks, and yield their findings. Stop at a failure that makes further checks impossible."""
@@ -119,7 +116,7 @@ class BrokerExamination:
             return
         with contextlib.closing(link):
             yield judge_login(broker, None)
-            yield judge_anonymous(self._anonymous_refusal(broker))
+            yield self._check_anonymous(broker)
             rights_finding, presences = self._test_rights(link, name)
         if self._robot in presences:
             presence_finding = judge_presence(presences[self._robot], time.time())
@@ -162,13 +159,14 @@ class BrokerExamination:
             raise ServerUnavailable(f"the broker at {broker.url} does not answer within {_STEP_LIMIT_S:g} s") from error
         return link
 
-    def _anonymous_refusal(self, broker: Broker) -> str | None:
-        """Return why the broker refuses clients without credentials, or None if it accepts them."""
+    def _check_anonymous(self, broker: Broker) -> Finding:
+        """Check whether the broker refuses clients without credentials."""
         try:
             self._log_in(replace(broker, user=None, password=None, cert=None, key=None), lambda _: None).close()
-        except TalkError as error:
-            return error.message
-        return None
+        except TalkError:
+            return ok("anonymous", "who has no credentials is not let in")
+        words = "the broker lets in who has no credentials: anybody on the network can make the robots speak"
+        return warning("anonymous", words, "allow_anonymous false in mosquitto.conf, and: talk bridge --print-acl")
 
     def _test_rights(self, link: Link, name: str) -> tuple[Finding, dict[str, Presence]]:
         """Find out whether the user has the access rights of an operator, or of this robot's bridge.
@@ -343,14 +341,6 @@ def judge_login(broker: Broker, refusal: str | None) -> Finding:
     how = [words for words, given in (("a password", broker.password), ("a certificate", broker.cert)) if given]
     who = "nobody" if broker.user is None else f"'{broker.user}'"
     return ok("login", f"as {who}, with {' and '.join(how) or 'neither password nor certificate'}")
-
-
-def judge_anonymous(refusal: str | None) -> Finding:
-    """Return the finding about logging in without credentials. `refusal` is the broker's reason, or None."""
-    if refusal is not None:
-        return ok("anonymous", "who has no credentials is not let in")
-    words = "the broker lets in who has no credentials: anybody on the network can make the robots speak"
-    return warning("anonymous", words, "allow_anonymous false in mosquitto.conf, and: talk bridge --print-acl")
 
 
 def judge_presence(presence: Presence, now: float) -> Finding:

@@ -118,17 +118,19 @@ class LocalExamination:
         reported = self._server.get("neural_voices")
         server_voices = reported if isinstance(reported, dict) else {}
         if used and not is_neural(used):
-            # The engine reports the full name of a voice, unless it failed because of the name.
-            used = used if engine.reason and find_voice(used, models.installed_names(env)) else engine.neural_voice
-        needed = used or server_voices or engine.neural_count or env.get("TALK_VOICES")
+            if engine.ready is not None:
+                used = engine.ready.voice
+            elif not find_voice(used, models.installed_names(env)):  # the engine may have failed because of the name
+                used = None
+        needed = used or server_voices or any(map(is_neural, engine.voices or ())) or env.get("TALK_VOICES")
         if not needed or not is_own_driver(self._setting("driver")):
             return
         if self._client and self._session.server_pid is None:  # the server may have other voices
             yield from voice.judge_server_voices(server_voices)
             return
         options = voice.EngineOptions(env=env, interrupt=self._interrupt)
-        facts = voice.find_neural(used, options, SENTENCE_LIMIT_S)
-        yield from voice.judge_neural(facts, has_server=self._client is not None, server_voices=server_voices)
+        given = used, options, SENTENCE_LIMIT_S
+        yield from voice.check_neural(*given, has_server=self._client is not None, server_voices=server_voices)
 
     def _check_sound(self) -> Iterator[Finding]:
         """Check everything between the engine and the loudspeaker."""
@@ -140,18 +142,19 @@ class LocalExamination:
         if is_silent(self._player):
             yield sound.judge_silent_player(self._player, by_server=by_server)
             return
-        cards = sound.find_cards(session)
+        cards = sound.find_cards()
         program = next(iter(sound.installed_players(env)), None)
-        likely = "pulse" if sound_server.name and sound_server.accepts_pulse else program
-        used = self._player or (None if by_server else self._engine.player) or likely
+        used = "pulse" if sound_server.name and sound_server.accepts_pulse else program
+        if self._engine.ready is not None and not by_server:
+            used = self._engine.ready.player or used
+        used = self._player or used
         yield sound.check_player(env, self._player, used, by_server=by_server)
         if used in sound.DEVICE_LISTS and not (used == "pulse" and sound_server.hangs):
             yield sound.check_device(env, used, device)
         yield sound.judge_cards(cards, sound_server, session)
-        yield sound.judge_access(cards, sound_server, session)
+        yield sound.check_access(sound_server, session)
         yield sound.judge_sound_server(sound_server, cards, session)
-        levels = tuple(sound.find_levels(env, sound_server, cards))
-        yield from sound.judge_levels(levels, is_used=device is None and used in PLAYERS)
+        yield from sound.check_levels(env, sound_server, cards, is_used=device is None and used in PLAYERS)
 
     def _check_sentence(self) -> Finding:
         """Speak the sentence, and return the finding."""

@@ -7,14 +7,12 @@ from __future__ import annotations
 
 import textwrap
 
-from talkcli.frozen import TYPE_CHECKING, fields, frozen
+from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.states import State
 from talkcli.terminal.text import COLUMN_GAP, Screen, pad, printable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-    from talkcli.goals.goal import JsonObject
 
 #: The states of a finding. A warning means that speech may be inaudible, and a failure that it certainly is.
 OK, WARNING, FAILURE = "ok", "warning", "failed"
@@ -44,29 +42,22 @@ class Finding:
     #: what the user should do next, or None if nothing is wrong
     next: str | None = None
 
-    def to_json(self) -> JsonObject:
-        return fields(self)
-
 
 @frozen
 class Question:
     """The question that an examination answers."""
 
-    #: the check that must succeed for the answer "yes"
-    check: str
     #: the human-readable answers
     yes: str
     no: str
 
 
 SENTENCE_QUESTION = Question(
-    SENTENCE_CHECK, "a sentence is heard, unless the loudspeaker itself is off", "a sentence would not be heard"
+    "a sentence is heard, unless the loudspeaker itself is off", "a sentence would not be heard"
 )
-ROBOT_QUESTION = Question("bridge", "the robot answers", "the robot would not answer")
+ROBOT_QUESTION = Question("the robot answers", "the robot would not answer")
 #: The question for a robot that checks its own access to the broker.
-BRIDGE_QUESTION = Question(
-    "rights", "the broker takes what this robot's bridge says", "this robot's bridge would not be heard"
-)
+BRIDGE_QUESTION = Question("the broker takes what this robot's bridge says", "this robot's bridge would not be heard")
 
 
 def ok(check: str, message: str) -> Finding:
@@ -90,16 +81,12 @@ def join_names(names: tuple[str, ...]) -> str:
     return ", ".join(names) if hidden <= 1 else f"{', '.join(names[:_SHOWN_NAMES_COUNT])} and {hidden} more"
 
 
-def has_passed(findings: Sequence[Finding], question: Question = SENTENCE_QUESTION) -> bool:
-    """Return whether the answer to the question is yes.
-
-    For this, the question's check must have been made, and no check may have failed.
-    """
-    return any(each.check == question.check for each in findings) and all(each.state != FAILURE for each in findings)
-
-
 def next_step(findings: Sequence[Finding]) -> str | None:
-    """Return the advice for the first failure, or None if nothing failed."""
+    """Return the advice for the first failure, or None if no check failed.
+
+    If no check failed, the answer to the question is yes, because every examination ends with a failure or with the
+    check that proves the answer.
+    """
     return next((each.next for each in findings if each.state == FAILURE), None)
 
 
@@ -121,12 +108,10 @@ def format_finding(finding: Finding, screen: Screen) -> list[str]:
 
 def format_conclusion(findings: Sequence[Finding], screen: Screen, question: Question = SENTENCE_QUESTION) -> str:
     """Format the answer to the question, and the advice if a check failed."""
-    if has_passed(findings, question):
-        warned = sum(each.state == WARNING for each in findings)
-        return question.yes + ("" if not warned else "; 1 warning" if warned == 1 else f"; {warned} warnings")
     step = next_step(findings)
     if step is None:
-        return question.no
+        warned = sum(each.state == WARNING for each in findings)
+        return question.yes + ("" if not warned else "; 1 warning" if warned == 1 else f"; {warned} warnings")
     steps = _wrap(step, screen.columns_left(len(_FINAL_STEP_INDENT)))
     return "\n".join([f"{question.no}; do this next:", *(_FINAL_STEP_INDENT + each for each in steps)])
 

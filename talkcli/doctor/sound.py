@@ -20,7 +20,7 @@ import tempfile
 from typing import TYPE_CHECKING
 
 from talkcli import paths
-from talkcli.doctor.report import Finding, failure, join_names, ok, warning
+from talkcli.doctor.report import FAILURE, WARNING, Finding, failure, join_names, ok, warning
 from talkcli.engine.players import (
     DUMMY_SINK,
     PACKAGES,
@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
     from typing import Any
 
+#: The kernel's description of its sound cards. Containers can hide this directory.
+_KERNEL_SOUND = "/proc/asound"
 #: The group that may use sound cards in Debian.
 _AUDIO_GROUP = "audio"
 #: Files that container runtimes create in every container.
@@ -96,23 +98,6 @@ class UserSession:
 
 
 @frozen
-class Cards:
-    """The sound cards that the kernel has found."""
-
-    #: whether /proc/asound exists, which containers can hide
-    in_kernel: bool
-    names: tuple[str, ...] = ()
-    #: the device files for playback, such as /dev/snd/pcmC0D0p
-    nodes: tuple[str, ...] = ()
-    #: device files that the user may not open
-    forbidden: tuple[str, ...] = ()
-    #: group that owns the device files
-    group: str = _AUDIO_GROUP
-    #: whether the user will belong to that group after the next login
-    member_after_login: bool = False
-
-
-@frozen
 class ProgramOutput:
     """A program's output, and the reason if it failed."""
 
@@ -140,19 +125,6 @@ class SoundServer:
     hangs: bool = False
     #: value of PULSE_SERVER, or None if it isn't set
     pulse_server: str | None = None
-
-
-@frozen
-class MixerLevel:
-    """The volume of one output."""
-
-    #: name of the sink or the mixer control
-    name: str
-    muted: bool
-    #: the volume, or None if the mixer doesn't report it
-    percent: int | None
-    unmute_command: str
-    louder_command: str
 
 
 def find_session(server_pid: int | None) -> tuple[UserSession, Mapping[str, str]]:
@@ -241,29 +213,11 @@ def _origins(environment: Mapping[str, str], pid: int) -> Iterable[str]:
         yield "an ssh session"
 
 
-def find_cards(session: UserSession, kernel: str = "/proc/asound", nodes: str = "/dev/snd") -> Cards:
-    """Return the sound cards that the kernel has found, and which of them the user may open."""
+def find_cards(directory: str = _KERNEL_SOUND) -> tuple[str, ...]:
+    """Return the names of the sound cards that the kernel has found."""
     # The first of a card's two lines looks like " 0 [Device         ]: USB-Audio - USB Audio Device".
-    names = re.findall(r"^\s*\d+ \[[^\]]*\]:.*? - (.*)$", _read_text(f"{kernel}/cards"), re.MULTILINE)
-    playing = playback_devices(nodes)
-    group, forbidden = _AUDIO_GROUP, []
-    for each in playing:
-        with contextlib.suppress(OSError):
-            found = os.stat(each)
-            group = _name(grp.getgrgid, found.st_gid) if found.st_gid else group
-            if not _may_open(found, _access_list(each), session):
-                forbidden.append(each)
-    members: list[str] = []
-    with contextlib.suppress(KeyError):
-        members = grp.getgrnam(group).gr_mem
-    return Cards(
-        in_kernel=os.path.isdir(kernel),
-        names=tuple(each.strip() for each in names),
-        nodes=tuple(playing),
-        forbidden=tuple(forbidden),
-        group=group,
-        member_after_login=session.user in members,
-    )
+    names = re.findall(r"^\s*\d+ \[[^\]]*\]:.*? - (.*)$", _read_text(f"{directory}/cards"), re.MULTILINE)
+    return tuple(each.strip() for each in names)
 
 
 def _may_open(found: os.stat_result, entries: list[tuple[int, int, int]], session: UserSession) -> bool:
@@ -436,38 +390,68 @@ def _pulse_address(env: Mapping[str, str]) -> str | None:
     return None
 
 
-def find_levels(env: Mapping[str, str], server: SoundServer, cards: Cards) -> Iterable[MixerLevel]:
-    """Yield the volume of the default sink, or of the sound cards if there is no sound server."""
-    if server.hangs:
-        return
+def check_levels(
+    env: Mapping[str, str], server: SoundServer, cards: tuple[str, ...], *, is_used: bool
+) -> list[Finding]:
+    """Check the volume of the default sink, or of the sound cards if there is no sound server.
+
+    Args:
+        env: the environment of the player.
+        server: the sound server.
+        cards: the names of the sound cards.
+        is_used: whether speech is known to go to these outputs.
+    """
+    levels = [judge_level(*each, is_used=is_used) for each in _find_levels(env, server, cards)]
+    bad = [each for state in (FAILURE, WARNING) for each in levels if each.state == state]
+    return bad[:1] or ([ok(_LOUDNESS_CHECK, ", ".join(each.message for each in levels))] if levels else [])
+
+
+def _find_levels(
+    env: Mapping[str, str], server: SoundServer, cards: tuple[str, ...]
+) -> Iterable[tuple[str, str, str, str]]:
+    """Yield the arguments of `judge_level` for each output."""
     if server.name is not None:
         mute = run_program("pactl", "get-sink-mute", "@DEFAULT_SINK@", env=env)
         if mute.error is None:
             volume = run_program("pactl", "get-sink-volume", "@DEFAULT_SINK@", env=env)
-            yield parse_level(_DEFAULT_SINK, mute.stdout + volume.stdout, *_PACTL_COMMANDS)
+            yield _DEFAULT_SINK, mute.stdout + volume.stdout, *_PACTL_COMMANDS
             return
         both = run_program("wpctl", "get-volume", "@DEFAULT_AUDIO_SINK@", env=env)
         if both.error is None:
-            yield parse_level(_DEFAULT_SINK, both.stdout, *_WPCTL_COMMANDS)
-    elif cards.names:
+            yield _DEFAULT_SINK, both.stdout, *_WPCTL_COMMANDS
+    elif cards and not server.hangs:
         found = re.findall(r"control '([^']*)'", run_program("amixer", "scontrols", env=env).stdout)
         for each in filter(found.__contains__, _ALSA_CONTROLS):
             output = run_program("amixer", "sget", each, env=env)
             if output.error is None:
-                yield parse_level(each, output.stdout, f"amixer sset {each} unmute", f"amixer sset {each} 70%")
+                yield each, output.stdout, f"amixer sset {each} unmute", f"amixer sset {each} 70%"
 
 
-def parse_level(name: str, text: str, unmute_command: str, louder_command: str) -> MixerLevel:
-    """Parse the output of a mixer program, and return the volume of the loudest channel.
+def judge_level(name: str, text: str, unmute_command: str, louder_command: str, *, is_used: bool) -> Finding:
+    """Return the finding about the volume of one output, in which the loudest channel counts.
 
-    The formats are "Mute: no" and "40%" for pactl, "Volume: 0.40 [MUTED]" for wpctl, and "[40%] [on]" for amixer. In
-    amixer's output, the sound is muted if every channel is off.
+    Args:
+        name: the name of the sink or the mixer control.
+        text: the output of a mixer program: "Mute: no" and "40%" by pactl, "Volume: 0.40 [MUTED]" by wpctl, or
+            "[40%] [on]" for each channel by amixer.
+        unmute_command: the command that unmutes the output.
+        louder_command: the command that makes the output louder.
+        is_used: whether speech is known to go to this output.
     """
+    broken = failure if is_used else warning
     switches = re.findall(r"\[(on|off)\]", text)
-    muted = "Mute: yes" in text or "[MUTED]" in text or (bool(switches) and "on" not in switches)
+    if "Mute: yes" in text or "[MUTED]" in text or (switches and "on" not in switches):
+        return broken(_LOUDNESS_CHECK, f"{name} is muted", unmute_command)
     percents = [int(each) for each in re.findall(r"(\d+)%", text)]
     percents += [round(float(each) * 100) for each in re.findall(r"Volume: (\d+(?:\.\d+)?)", text)]
-    return MixerLevel(name, muted, max(percents, default=None), unmute_command, louder_command)
+    if not percents:
+        return ok(_LOUDNESS_CHECK, f"{name} on")
+    percent = max(percents)
+    if percent == 0:
+        return broken(_LOUDNESS_CHECK, f"{name} is at 0%", louder_command)
+    if percent < _FAINT_PERCENT:
+        return warning(_LOUDNESS_CHECK, f"{name} is at {percent}%: few will hear it", louder_command)
+    return ok(_LOUDNESS_CHECK, f"{name} at {percent}%")
 
 
 def judge_session(session: UserSession) -> Finding:
@@ -565,37 +549,45 @@ def check_device(env: Mapping[str, str], player: str, configured: str | None) ->
     return warning("device", words, "start the server with --device and one of these names")
 
 
-def judge_cards(cards: Cards, server: SoundServer, session: UserSession) -> Finding:
+def judge_cards(cards: tuple[str, ...], server: SoundServer, session: UserSession) -> Finding:
     """Return the finding about the kernel's sound cards."""
-    if cards.names:
-        return ok("cards", join_names(cards.names))
+    if cards:
+        return ok("cards", join_names(cards))
     if server.name is not None:
         return ok("cards", "none of this machine's own; the sound server has what is needed")
     if _CONTAINER in session.origins:
         step = "start the container with --device /dev/snd, or with the sound server's socket: see the README"
         return warning("cards", "none in this container", step)
-    words = "the kernel knows none" if cards.in_kernel else "the kernel has no sound (no /proc/asound)"
+    has_sound = os.path.isdir(_KERNEL_SOUND)
+    words = "the kernel knows none" if has_sound else f"the kernel has no sound (no {_KERNEL_SOUND})"
     return warning("cards", words, "plug in a loudspeaker or sound card, and look with: aplay -l")
 
 
-def judge_access(cards: Cards, server: SoundServer, session: UserSession) -> Finding:
-    """Return the finding about the user's permission to open the sound cards."""
-    group = cards.group
-    if not cards.nodes:
-        return ok("group", f"nothing in /dev/snd to open, so the group {group} is not needed")
-    if not cards.forbidden:
+def check_access(server: SoundServer, session: UserSession, directory: str = "/dev/snd") -> Finding:
+    """Check whether the user may open the sound cards."""
+    nodes, group, forbidden = playback_devices(directory), _AUDIO_GROUP, []
+    for each in nodes:
+        with contextlib.suppress(OSError):
+            found = os.stat(each)
+            group = _name(grp.getgrgid, found.st_gid) if found.st_gid else group
+            if not _may_open(found, _access_list(each), session):
+                forbidden.append(each)
+    if not nodes:
+        return ok("group", f"nothing in {directory} to open, so the group {group} is not needed")
+    if not forbidden:
         member = "in the group {}" if group in session.groups else "not in the group {}, and needs not to be"
         return ok("group", f"user {session.user} may open the cards ({member.format(group)})")
-    words = f"user {session.user} may not open {join_names(cards.forbidden)}: not in the group {group}"
+    words = f"user {session.user} may not open {join_names(tuple(forbidden))}: not in the group {group}"
     if server.name is not None:
         return ok("group", f"{words}; the sound server opens them")
-    if cards.member_after_login:
-        step = "log out and in again" if session.server_pid is None else "start the server again, from a new login"
-        return warning("group", f"{words} yet, though it is to be from the next login on", step)
+    with contextlib.suppress(KeyError):
+        if session.user in grp.getgrnam(group).gr_mem:
+            step = "log out and in again" if session.server_pid is None else "start the server again, from a new login"
+            return warning("group", f"{words} yet, though it is to be from the next login on", step)
     return warning("group", words, f"sudo usermod -aG {group} {session.user}, and log in again")
 
 
-def judge_sound_server(server: SoundServer, cards: Cards, session: UserSession) -> Finding:
+def judge_sound_server(server: SoundServer, cards: tuple[str, ...], session: UserSession) -> Finding:
     """Return the finding about the sound server, which shows whether players can use it."""
     check = _SOUND_SERVER_CHECK
     where = "from here" if session.server_pid is None else f"from the server (process {session.server_pid})"
@@ -608,9 +600,9 @@ def judge_sound_server(server: SoundServer, cards: Cards, session: UserSession) 
         step = "restart it: systemctl --user restart pipewire pipewire-pulse (or: pulseaudio -k)"
         return warning(check, f"there is one, but it does not answer {where}", step)
     if not server.sockets and server.pulse_server is None:
-        if session.origins and not cards.names:
+        if session.origins and not cards:
             return _judge_unreachable(server, session, f"none can be reached {where}")
-        alone = "; players use ALSA" if cards.names else ""
+        alone = "; players use ALSA" if cards else ""
         return ok(check, f"no PulseAudio or PipeWire runs for user {session.user}{alone}")
     at = f"{server.pulse_server} (PULSE_SERVER)" if server.pulse_server else join_names(server.sockets)
     if server.error is None:
@@ -636,23 +628,3 @@ def _judge_unreachable(server: SoundServer, session: UserSession, words: str) ->
     elif session.runtime_dir is None and session.usual_runtime_dir is not None:
         step = f"export XDG_RUNTIME_DIR={session.usual_runtime_dir}"
     return warning(_SOUND_SERVER_CHECK, words + hint, step)
-
-
-def judge_levels(levels: tuple[MixerLevel, ...], *, is_used: bool) -> list[Finding]:
-    """Return the findings about the volume.
-
-    Args:
-        levels: the outputs' volumes.
-        is_used: whether speech is known to go to these outputs.
-    """
-    broken = failure if is_used else warning
-    check = _LOUDNESS_CHECK
-    for each in levels:
-        if each.muted or each.percent == 0:
-            fault, step = ("muted", each.unmute_command) if each.muted else ("at 0%", each.louder_command)
-            return [broken(check, f"{each.name} is {fault}", step)]
-    for each in levels:
-        if each.percent is not None and each.percent < _FAINT_PERCENT:
-            return [warning(check, f"{each.name} is at {each.percent}%: few will hear it", each.louder_command)]
-    shown = [f"{each.name} at {each.percent}%" if each.percent is not None else f"{each.name} on" for each in levels]
-    return [ok(check, ", ".join(shown))] if levels else []

@@ -23,13 +23,13 @@ from talkcli.doctor.report import Finding, failure, join_names, ok, warning
 from talkcli.doctor.sound import run_program
 from talkcli.engine import models, protocol
 from talkcli.engine.parent.process import EngineFailed, PrivateEngine
-from talkcli.frozen import frozen, replace
-from talkcli.goals.options import NEURAL_PREFIX, is_neural
+from talkcli.frozen import frozen
+from talkcli.goals.options import NEURAL_PREFIX
 from talkcli.goals.reasons import Reason
 from talkcli.peers import read_proc_file
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
     from typing import Any
 
 #: The sentence that the doctor speaks, and its speed in words per minute.
@@ -87,17 +87,10 @@ class EngineOptions:
 class EngineReport:
     """What an engine process reported when it started."""
 
-    driver: str | None = None
-    #: name and version of the synthesizer, such as "eSpeak NG 1.51 (system)"
-    synthesizer: str | None = None
-    #: number of voices, or None if the engine did not list them
-    voice_count: int | None = None
-    #: number of neural voices
-    neural_count: int = 0
-    #: the player that the engine would try first, or None if there is none
-    player: str | None = None
-    #: id of the configured voice, or None if it is not a neural voice
-    neural_voice: str | None = None
+    #: its first message, or None if the engine did not start
+    ready: protocol.Ready | None = None
+    #: ids of the voices, or None if the engine did not list them
+    voices: tuple[str, ...] | None = None
     #: the machine-readable reason why the engine did not start, or None if it did
     reason: str | None = None
     message: str = ""
@@ -115,24 +108,6 @@ class VoiceTrial:
     memory_bytes: int | None = None
     #: why the voice failed, and what the user should do next
     fault: tuple[str, str] = ("", "")
-
-
-@frozen
-class NeuralVoices:
-    """Facts about neural voices and their packages."""
-
-    #: error message and advice if a package can't be imported, or None if all can
-    package_fault: tuple[str, str] | None = None
-    #: installed packages with their versions, such as "onnxruntime 1.23.2"
-    installed: tuple[str, ...] = ()
-    #: ids of the voices with valid files
-    valid: tuple[str, ...] = ()
-    #: id, fault and advice for each voice with invalid files
-    invalid: tuple[tuple[str, str, str], ...] = ()
-    #: the neural voice in use, as the user wrote it, or None if no neural voice is in use
-    used: str | None = None
-    #: result of trying the voice in use, or None if it was not tried
-    trial: VoiceTrial | None = None
 
 
 def installed_version(package: str) -> str | None:
@@ -161,18 +136,16 @@ def start_engine(options: EngineOptions, limit: float = math.inf, output: int | 
 
 def find_engine(options: EngineOptions) -> EngineReport:
     """Start an engine process, and return its report."""
-    report = EngineReport()
+    ready = None
     try:
         with start_engine(options) as engine:
             ready = engine.wait_for(protocol.Ready)
-            report = EngineReport(ready.driver, ready.version, player=ready.player, neural_voice=ready.voice)
-            ids = [each.id for each in engine.wait_for(protocol.VoiceList).voices]
-            return replace(report, voice_count=len(ids), neural_count=sum(map(is_neural, ids)))
+            return EngineReport(ready, tuple(each.id for each in engine.wait_for(protocol.VoiceList).voices))
     except EngineFailed as error:
-        if report.driver is None or error.reason == Reason.ENGINE_CRASHED:
+        if ready is None or error.reason == Reason.ENGINE_CRASHED:
             reason, message = explain_failure(error)
             return EngineReport(reason=reason, message=message)
-    return report  # the engine started, but didn't list its voices
+    return EngineReport(ready)  # the engine started, but didn't list its voices
 
 
 def explain_failure(error: EngineFailed) -> tuple[str, str]:
@@ -200,11 +173,11 @@ def judge_engine(pyttsx3: str | None, engine: EngineReport, *, server: str | Non
             doctor's own engine are only warnings.
     """
     broken = warning if server in WORKING_STATES else failure
-    if server not in {None, *WORKING_STATES} and engine.reason is None:
+    if engine.ready is not None and server not in {None, *WORKING_STATES}:
         engine = EngineReport(reason=Reason.ENGINE_FAILED, message=f"the server's engine: {server}")
-    if engine.reason is None:
-        words = f"{pyttsx3 or 'of an unknown version'}, driver {engine.driver}"
-        return [ok("pyttsx3", words), *_judge_library(engine)]
+    if engine.ready is not None:
+        words = f"{pyttsx3 or 'of an unknown version'}, driver {engine.ready.driver}"
+        return [ok("pyttsx3", words), *_judge_library(engine.ready.version, engine.voices)]
     # Remove the advice, which the finding shows separately.
     message = engine.message.removesuffix(f": {_INSTALL_PYTTSX3}").removesuffix(f": {INSTALL_LIBRARY}")
     if "pyttsx3 is missing" in message or pyttsx3 is None:
@@ -221,37 +194,58 @@ def judge_engine(pyttsx3: str | None, engine: EngineReport, *, server: str | Non
     return [found, broken("libespeak-ng", message, step)]
 
 
-def _judge_library(engine: EngineReport) -> list[Finding]:
-    name = engine.synthesizer
-    found = [] if name is None else [ok("libespeak-ng", f"{name}, with its data")]
-    if engine.voice_count is None:
+def _judge_library(synthesizer: str | None, voices: tuple[str, ...] | None) -> list[Finding]:
+    found = [] if synthesizer is None else [ok("libespeak-ng", f"{synthesizer}, with its data")]
+    if voices is None:
         return [*found, warning("voices", "the engine listed none in time", "run talk doctor again")]
-    if not engine.voice_count:
+    if not voices:
         step = "sudo apt-get install --reinstall -y espeak-ng-data"
         return [*found, warning("voices", "the engine has none", step)]
-    return [*found, ok("voices", f"{engine.voice_count}, listed by 'talk voices'")]
+    return [*found, ok("voices", f"{len(voices)}, listed by 'talk voices'")]
 
 
-def find_neural(used: str | None, options: EngineOptions, limit: float) -> NeuralVoices:
-    """Check the files of all neural voices, and try the voice in use.
+def check_neural(
+    used: str | None, options: EngineOptions, limit: float, *, has_server: bool, server_voices: dict[str, Any]
+) -> Iterator[Finding]:
+    """Check the packages and files of neural voices, and try the voice in use.
 
     Args:
         used: the voice in use, as the user wrote it, or None if no neural voice is in use.
         options: options for the engine process.
         limit: time limit for trying the voice, in seconds.
+        has_server: whether a server runs. It speaks with espeak if a neural voice fails.
+        server_voices: the server's description of its neural voices, which is empty if there is no server.
     """
+    broken = warning if has_server or used is None else failure
     fault = _find_package_fault(os.environ if options.env is None else options.env)
+    if fault is None:
+        yield ok(_PACKAGES_CHECK, ", ".join(map(_with_version, install.NEURAL_PACKAGES)))
+    else:
+        yield broken(_PACKAGES_CHECK, *fault)
+    yield from _check_files(options.env)
+    if used is not None and fault is None:
+        trial = _try_voice(used, options, limit)
+        yield judge_trial(used, trial, has_server=has_server, server_voices=server_voices)
+
+
+def _check_files(env: Mapping[str, str] | None) -> Iterator[Finding]:
+    """Check the files of all neural voices that are found."""
     valid, invalid = [], []
-    for name, path in models.find_models(options.env).items():
+    for name, path in models.find_models(env).items():
         try:
             models.read_description(path)
             models.open_checked(path).close()
             valid.append(NEURAL_PREFIX + name)
         except models.VoiceFileError as error:
-            invalid.append((NEURAL_PREFIX + name, *_split_step(str(error))))
-    trial = None if used is None or fault else _try_voice(used, options, limit)
-    installed = tuple(map(_with_version, install.NEURAL_PACKAGES))
-    return NeuralVoices(fault, installed, tuple(valid), tuple(invalid), used, trial)
+            invalid.append((NEURAL_PREFIX + name, str(error)))
+    if invalid:
+        (voice, error_message), *others = invalid
+        message, step = _split_step(error_message)
+        names = join_names(tuple(each for each, _ in others))
+        more = f"; and something is wrong with {names}" if others else ""
+        yield warning(_FILES_CHECK, f"{voice}: {message}{more}", step)
+    elif valid:
+        yield ok(_FILES_CHECK, f"as they should be: {join_names(tuple(valid))}")
 
 
 def _find_package_fault(env: Mapping[str, str]) -> tuple[str, str] | None:
@@ -342,44 +336,19 @@ def _failed_voices(voices: dict[str, Any]) -> dict[str, str]:
     return {voice: str(each.get("why")) for voice, each in voices.items() if each.get("state") == "failed"}
 
 
-def judge_neural(neural: NeuralVoices, *, has_server: bool, server_voices: dict[str, Any]) -> list[Finding]:
-    """Return the findings about the packages and files of neural voices, and about the voice in use.
-
-    Args:
-        neural: the facts about neural voices.
-        has_server: whether a server runs. It speaks with espeak if a neural voice fails.
-        server_voices: the server's description of its neural voices, which is empty if there is no server.
-    """
-    trial = neural.trial
-    broken = warning if has_server or neural.used is None else failure
-    if neural.package_fault is not None:
-        found = [broken(_PACKAGES_CHECK, *neural.package_fault)]
-    else:
-        found = [ok(_PACKAGES_CHECK, ", ".join(neural.installed))]
-    if neural.invalid:
-        (voice, message, step), *others = neural.invalid
-        names = join_names(tuple(each[0] for each in others))
-        more = f"; and something is wrong with {names}" if others else ""
-        found.append(warning(_FILES_CHECK, f"{voice}: {message}{more}", step))
-    elif neural.valid:
-        found.append(ok(_FILES_CHECK, f"as they should be: {join_names(neural.valid)}"))
-    if trial is None:
-        return found
-    if trial.speed is not None and _failed_voices(server_voices):
-        return [*found, *judge_server_voices(server_voices)]  # the doctor could load the voice, but the server couldn't
+def judge_trial(used: str, trial: VoiceTrial, *, has_server: bool, server_voices: dict[str, Any]) -> Finding:
+    """Return the finding about the neural voice in use. The arguments are those of `check_neural`."""
+    words = f"{used} is in use: "
     if trial.speed is None:
         message, step = trial.fault
-        return [*found, broken(_NEURAL_CHECK, f"{neural.used} is in use: {message}", step)]
-    return [*found, _judge_speed(f"{neural.used} is in use", trial, trial.speed)]
-
-
-def _judge_speed(words: str, trial: VoiceTrial, speed: float) -> Finding:
-    """Return the finding about the speed of a voice on this machine."""
+        return (warning if has_server else failure)(_NEURAL_CHECK, words + message, step)
+    if _failed_voices(server_voices):
+        return judge_server_voices(server_voices)[0]  # the doctor could load the voice, but the server couldn't
     facts = [] if trial.load_s is None else [f"loaded in {trial.load_s:.1f} s"]
-    facts.append(f"makes a sentence {speed:.1f} times as fast as it is heard")
+    facts.append(f"makes a sentence {trial.speed:.1f} times as fast as it is heard")
     facts += [] if trial.memory_bytes is None else [f"takes {trial.memory_bytes / 1e6:.0f} MB with its engine"]
-    words = f"{words}: {', '.join(facts)}"
-    if speed < _MIN_REAL_TIME_FACTOR:
+    words += ", ".join(facts)
+    if trial.speed < _MIN_REAL_TIME_FACTOR:
         step = "choose a voice whose quality is low or x_low, or one of espeak's: talk set --voice en"
         return warning(_NEURAL_CHECK, f"{words}: this machine is too slow for it, or too busy", step)
     return ok(_NEURAL_CHECK, words)
