@@ -63,9 +63,8 @@ def no_server(named: str | None = None) -> Finding:
     """Return the finding about the missing server, with this TALK_SOCKET."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TALK_SOCKET", named or "")
-        client, found = server.connect(None, None)
+        client, finding = server.connect(None, None)
     assert client is None
-    finding = server.judge_search(found)
     assert finding.state == FAILURE
     return finding
 

@@ -66,15 +66,15 @@ class LocalExamination:
 
     def findings(self) -> Iterator[Finding]:
         """Run all checks, and yield each finding as soon as it is known."""
-        client, search = server.connect(self._socket, self._interrupt)
+        client, socket = server.connect(self._socket, self._interrupt)
         with client or contextlib.nullcontext():
-            for each in self._run_checks(client, search):
+            for each in self._run_checks(client, socket):
                 finding = sound.add_pactl_package(each, self._env)
                 self._findings.append(finding)
                 yield finding
 
-    def _run_checks(self, client: Client | None, search: server.SocketSearch) -> Iterator[Finding]:
-        """Run all checks. `client` is None if there is no server."""
+    def _run_checks(self, client: Client | None, socket: Finding) -> Iterator[Finding]:
+        """Run all checks. The arguments are the results of `connect`."""
         of_server: list[Finding] = []
         if client is not None:
             try:
@@ -98,7 +98,7 @@ class LocalExamination:
         elif sys.platform.startswith("linux"):
             yield sound.judge_session(self._session)
             yield from self._check_sound()
-        yield server.judge_search(search)
+        yield socket
         yield from of_server
         yield self._check_sentence()
 

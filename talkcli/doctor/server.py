@@ -44,7 +44,6 @@ _ENGINE_START_LIMIT_S, _ENGINE_POLL_S = 1.0, 0.05
 PLACE_FOREIGN = "another user's server"
 PLACE_LISTENING = "something listens"
 PLACE_STOPPED = "a process listens that is stopped"
-PLACE_SERVER = "the server"
 #: Advice if the server refuses the client, by error code.
 _REFUSAL_ADVICE = {
     "protocol_mismatch": "install the same talk on both sides, and start the server again",
@@ -82,26 +81,8 @@ class SocketPlace:
     pid: int | None = None
 
 
-@frozen
-class SocketSearch:
-    """The result of searching for a server."""
-
-    #: the places that were tried. If a server was found, its place is the last one.
-    places: tuple[SocketPlace, ...]
-    #: the option or variable that named the only place to try, or None if the usual places were tried
-    named_by: str | None = None
-    #: why the server refused the client, or None if no server was found
-    message: str | None = None
-    #: code of the client's error, or None if there was none
-    code: str | None = None
-    #: path of this user's server at one of the usual places, if the user named another place
-    usual_server: str | None = None
-    #: paths of other users' sockets
-    foreign_sockets: tuple[str, ...] = ()
-
-
-def connect(option: str | None, interrupt: Mapping[int, int] | None) -> tuple[Client | None, SocketSearch]:
-    """Connect to the server, and find out what is at each place where a server may listen.
+def connect(option: str | None, interrupt: Mapping[int, int] | None) -> tuple[Client | None, Finding]:
+    """Connect to the server, and return the client with the finding about the server's socket.
 
     The client is None if no connection was possible.
 
@@ -117,20 +98,15 @@ def connect(option: str | None, interrupt: Mapping[int, int] | None) -> tuple[Cl
     try:
         client = Client.over(SocketConnection(option, name=DOCTOR_NAME, interrupt=interrupt))
     except TalkError as error:
-        found = tuple(_find_place(each, trusted) for each in tried)
-        usual = paths.client_sockets(None) if named else []
-        usual_server = next((each for each in usual if _find_place(each, set()).what == PLACE_LISTENING), None)
-        # Only root can see the sockets of all users.
-        others = sorted({*glob.glob(f"/run/user/*/talk/{paths.SOCKET_NAME}")}.difference(tried))
-        message = _client_message(error.message.splitlines(), found)
-        return None, SocketSearch(found, named_by, message, error.code, usual_server, tuple(others))
-    before = tuple(_find_place(each, trusted) for each in tried[: tried.index(client.path)])
-    place = SocketPlace(client.path, PLACE_SERVER, pid=client.server_pid)
-    return client, SocketSearch((*before, place), named_by)
+        return None, judge_missing([_find_place(each, trusted) for each in tried], named_by, error)
+    before = [_find_place(each, trusted) for each in tried[: tried.index(client.path)]]
+    by = f"{named_by}, " if named_by else ""
+    return client, judge_found(f"the server is on {client.path} ({by}process {client.server_pid})", before)
 
 
-def _client_message(lines: list[str], found: tuple[SocketPlace, ...]) -> str | None:
+def _client_message(error: TalkError, found: list[SocketPlace]) -> str | None:
     """Return the part of an error message that says why a listening process refused the client."""
+    lines = error.message.splitlines()
     if not lines[0].startswith(_NO_SERVER_PREFIX):
         return lines[0]
     listening = [f"{each.path}: " for each in found if each.what == PLACE_LISTENING]
@@ -182,22 +158,34 @@ def local_pid(client: Client) -> int | None:
     return client.server_pid if is_local else None
 
 
-def judge_search(search: SocketSearch) -> Finding:
-    """Return the finding about the server's socket, and about anything at the places that clients try first."""
-    *before, last = search.places
-    if last.what == PLACE_SERVER:
-        obstacles = [each for each in before if each.what != PLACE_ABSENT]
-        by = f"{search.named_by}, " if search.named_by else ""
-        words = f"the server is on {last.path} ({by}process {last.pid})"
-        if not obstacles:
-            return ok("socket", words)
-        words = f"{words}; before it: {'; '.join(map(_format_place, obstacles))}"
-        return warning("socket", words, f"remove what is in the way: {obstacles[0].path}")
-    tried = f"named by {search.named_by}" if search.named_by else "tried"
-    words = f"no server; {tried}: {'; '.join(map(_format_place, search.places))}"
-    if search.message is not None and not any(each.what == PLACE_STOPPED for each in search.places):
-        words = f"{words}; {search.message}"
-    return failure("socket", words, _search_step(search))
+def judge_found(words: str, before: list[SocketPlace]) -> Finding:
+    """Return the finding about the server's socket, and about anything at the places that clients try first.
+
+    Args:
+        words: the description of the server's socket.
+        before: the places that clients try first.
+    """
+    obstacles = [each for each in before if each.what != PLACE_ABSENT]
+    if not obstacles:
+        return ok("socket", words)
+    words = f"{words}; before it: {'; '.join(map(_format_place, obstacles))}"
+    return warning("socket", words, f"remove what is in the way: {obstacles[0].path}")
+
+
+def judge_missing(places: list[SocketPlace], named_by: str | None, error: TalkError) -> Finding:
+    """Return the finding about a missing server.
+
+    Args:
+        places: the places that were tried.
+        named_by: the option or variable that named the only place to try, or None if the usual places were tried.
+        error: why the client could not connect.
+    """
+    tried = f"named by {named_by}" if named_by else "tried"
+    words = f"no server; {tried}: {'; '.join(map(_format_place, places))}"
+    message = _client_message(error, places)
+    if message is not None and not any(each.what == PLACE_STOPPED for each in places):
+        words = f"{words}; {message}"
+    return failure("socket", words, _missing_step(places, named_by, error.code))
 
 
 def _format_place(place: SocketPlace) -> str:
@@ -205,21 +193,23 @@ def _format_place(place: SocketPlace) -> str:
     return f"{place.path}: {place.what}{whose}"
 
 
-def _search_step(search: SocketSearch) -> str:
-    """Return advice for the user if no server was found."""
-    named_by = search.named_by
-    if search.usual_server is not None:
-        return f"{_UNNAMING[named_by]}: a server is on {search.usual_server}"
-    place = next((each for what in _PLACE_ADVICE for each in search.places if each.what == what), None)
+def _missing_step(places: list[SocketPlace], named_by: str | None, code: str) -> str:
+    """Return advice for the user if no server was found. `code` is the code of the client's error."""
+    for each in paths.client_sockets(None) if named_by else []:
+        if _find_place(each, set()).what == PLACE_LISTENING:
+            return f"{_UNNAMING[named_by]}: a server is on {each}"
+    place = next((each for what in _PLACE_ADVICE for each in places if each.what == what), None)
     if place is None:  # a new server could start at any of the places
-        if search.foreign_sockets:
-            return f"talk serve; or use another user's server: talk --socket {search.foreign_sockets[0]} doctor"
+        # Only root can see the sockets of all users.
+        others = {*glob.glob(f"/run/user/*/talk/{paths.SOCKET_NAME}")}.difference(each.path for each in places)
+        if others:
+            return f"talk serve; or use another user's server: talk --socket {min(others)} doctor"
         if named_by is None:
             return "talk serve"
-        option = f" --socket {search.places[0].path}" if named_by == "--socket" else ""
+        option = f" --socket {places[0].path}" if named_by == "--socket" else ""
         return f"{_UNNAMING[named_by]}, or start a server there: talk serve{option}"
-    if place.what == PLACE_LISTENING and search.code in _REFUSAL_ADVICE:
-        return _REFUSAL_ADVICE[search.code]
+    if place.what == PLACE_LISTENING and code in _REFUSAL_ADVICE:
+        return _REFUSAL_ADVICE[code]
     if named_by is not None and place.what == PLACE_DIRECTORY:
         return f"name the socket in it: {_NAMING[named_by]}{place.path.rstrip('/')}/talk.sock"
     if named_by is not None and place.what == PLACE_FILE:

@@ -8,16 +8,17 @@ from typing import TYPE_CHECKING, cast
 
 import pytest
 
-from talkcli import __version__
+from talkcli import __version__, paths
 from talkcli.doctor import report, sentence, server, sound, voice
 from talkcli.doctor.examine import LocalExamination
 from talkcli.doctor.report import FAILURE, OK, WARNING, Finding, failure, next_step, ok, warning
 from talkcli.doctor.sentence import SentenceResult, find_playback_step
-from talkcli.doctor.server import SocketPlace, SocketSearch
+from talkcli.doctor.server import SocketPlace
 from talkcli.doctor.sound import SoundServer, UserSession
 from talkcli.doctor.voice import SENTENCE_TEXT, EngineOptions, EngineReport
 from talkcli.engine.players import DUMMY_SINK
 from talkcli.engine.protocol import Ready
+from talkcli.errors import Busy, ServerUnavailable, TalkError
 from talkcli.frozen import replace
 from talkcli.goals.goal import Goal
 from talkcli.goals.states import State
@@ -251,36 +252,42 @@ def test_a_library_that_the_server_lacks_comes_before_its_silent_player() -> Non
 PATH = "/run/user/1000/talk/talk.sock"
 
 
+NO_ANSWER, FULL, NONE = ServerUnavailable("it does not answer"), Busy("too many"), ServerUnavailable("no server")
+OTHER_SOCKET = "/run/user/7/talk/talk.sock"
+
+
 @pytest.mark.parametrize(
-    ("found", "words", "step"),
+    ("place", "named_by", "error", "others", "words", "step"),
     [
-        (SocketSearch((SocketPlace(PATH, PLACE_FORBIDDEN, 7),)), "no permission (uid 7)", "have uid 7 let you in"),
-        (SocketSearch((SocketPlace(PATH, PLACE_ABSENT),), "--socket"), "named by --socket", "leave --socket out, or"),
-        (
-            SocketSearch((SocketPlace(PATH, server.PLACE_LISTENING),), None, "it does not answer"),
-            "it does not answer",
-            "restart",
-        ),
-        (SocketSearch((SocketPlace(PATH, server.PLACE_LISTENING),), None, "busy", "busy"), "busy", "--max-clients"),
-        (
-            SocketSearch((SocketPlace(PATH, PLACE_ABSENT),), foreign_sockets=("/run/user/7/s",)),
-            "not there",
-            "talk --socket /run/user/7/s",
-        ),
+        (SocketPlace(PATH, PLACE_FORBIDDEN, 7), None, NONE, [], "no permission (uid 7)", "have uid 7 let you in"),
+        (SocketPlace(PATH, PLACE_ABSENT), "--socket", NONE, [], "named by --socket", "leave --socket out, or"),
+        (SocketPlace(PATH, server.PLACE_LISTENING), None, NO_ANSWER, [], "it does not answer", "restart"),
+        (SocketPlace(PATH, server.PLACE_LISTENING), None, FULL, [], "too many", "--max-clients"),
+        (SocketPlace(PATH, PLACE_ABSENT), None, NONE, [OTHER_SOCKET], "not there", f"talk --socket {OTHER_SOCKET}"),
     ],
 )
-def test_without_a_server_each_place_is_described(found: SocketSearch, words: str, step: str) -> None:
-    judgement = server.judge_search(found)
+def test_without_a_server_each_place_is_described(
+    monkeypatch: pytest.MonkeyPatch,
+    place: SocketPlace,
+    named_by: str | None,
+    error: TalkError,
+    others: list[str],
+    words: str,
+    step: str,
+) -> None:
+    monkeypatch.setattr(paths, "client_sockets", lambda _: [])
+    monkeypatch.setattr("glob.glob", lambda _: others)
+    judgement = server.judge_missing([place], named_by, error)
     assert judgement.state == FAILURE
     assert words in judgement.message
     assert step in str(judgement.next)
 
 
 def test_an_obstacle_before_the_server_s_place_is_a_warning() -> None:
-    served = SocketPlace(PATH, server.PLACE_SERVER, pid=4711)
-    found = server.judge_search(SocketSearch((SocketPlace("/a", PLACE_ABSENT), served)))
-    assert (found.state, found.message) == (OK, f"the server is on {PATH} (process 4711)")
-    found = server.judge_search(SocketSearch((SocketPlace("/a", server.PLACE_FOREIGN, 7), served)))
+    words = f"the server is on {PATH} (process 4711)"
+    found = server.judge_found(words, [SocketPlace("/a", PLACE_ABSENT)])
+    assert (found.state, found.message) == (OK, words)
+    found = server.judge_found(words, [SocketPlace("/a", server.PLACE_FOREIGN, 7)])
     assert found.state == WARNING
     assert "/a: another user's server (uid 7)" in found.message
 
