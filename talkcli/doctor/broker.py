@@ -137,18 +137,20 @@ class BrokerExamination:
         try:
             connection = self._wait_for(partial(socket.create_connection, (broker.host, broker.port), LOGIN_LIMIT_S))
         except OSError as error:
-            yield judge_unreachable(broker, error)
+            yield judge_unreachable(broker, _describe_error(error))
             return
         yield ok("broker", f"{broker.url} takes connections, in {(time.monotonic() - began) * 1000:.0f} ms")
-        result: float | OSError | None = None
+        expires_at = None
         with connection:
             if context is not None:
                 try:
-                    result = self._wait_for(partial(_read_expiry, connection, context, broker.host))
+                    expires_at = self._wait_for(partial(_read_expiry, connection, context, broker.host))
                 except OSError as error:
-                    result = error
+                    code = error.verify_code if isinstance(error, ssl.SSLCertVerificationError) else 0
+                    yield judge_tls_error(broker, _describe_error(error), code, time.time())
+                    return
         if broker.tls or not is_local(broker.host):
-            yield judge_certificate(broker, result, time.time())
+            yield judge_certificate(broker, expires_at, time.time())
 
     def _log_in(self, broker: Broker, on_message: Callable[[Message], None]) -> Link:
         """Connect to the broker and log in. Raises the same errors as `Link.open`."""
@@ -280,45 +282,52 @@ def judge_settings(words: str, *, named: bool) -> Finding:
     return failure("broker", words, "mend it where it is set: the shell's start file, or EnvironmentFile= of a unit")
 
 
-def judge_unreachable(broker: Broker, error: OSError) -> Finding:
+def judge_unreachable(broker: Broker, trouble: str) -> Finding:
     """Return the finding about a broker that can't be reached."""
-    trouble = _describe_error(error)
     step = _UNREACHABLE_STEPS.get(trouble, _UNREACHABLE_STEPS[_NO_ANSWER])
     return failure("broker", f"{broker.url}: {trouble}", step.format(host=broker.host, port=broker.port))
 
 
-def judge_certificate(broker: Broker, result: float | OSError | None, now: float) -> Finding:
-    """Return the finding about TLS and the broker's certificate.
+def judge_certificate(broker: Broker, expires_at: float | None, now: float) -> Finding:
+    """Return the finding about the broker's certificate. The times are in seconds since 1970, or None without TLS."""
+    if expires_at is None:
+        words = f"none: whoever is between here and {broker.host} can read all of it, and change it"
+        step = f"give the broker a certificate (listener, certfile, keyfile in mosquitto.conf), and: {URL}=mqtts://…"
+        return warning("certificate", words, step)
+    date = time.strftime("%Y-%m-%d", time.gmtime(expires_at))
+    if expires_at - now < _RENEWAL_LIMIT_S:
+        words = f"good until {date}, {format_span(expires_at - now)} from now; trusted by {_authority(broker)}"
+        step = f"renew the certificate of {broker.host}, and have mosquitto read it: SIGHUP"
+        return warning("certificate", words, step)
+    return ok("certificate", f"trusted by {_authority(broker)}; good until {date}")
+
+
+def judge_tls_error(broker: Broker, message: str, code: int, now: float) -> Finding:
+    """Return the finding about a broker with which TLS failed.
 
     Args:
         broker: the broker.
-        result: when the certificate expires, in seconds since 1970; the error if TLS failed; None without TLS.
+        message: the error message.
+        code: OpenSSL's error code if the certificate was rejected, otherwise 0.
         now: the current time in seconds since 1970.
     """
-    check = "certificate"
-    if result is None:
-        words = f"none: whoever is between here and {broker.host} can read all of it, and change it"
-        step = f"give the broker a certificate (listener, certfile, keyfile in mosquitto.conf), and: {URL}=mqtts://…"
-        return warning(check, words, step)
-    by = f"the CA in {broker.ca}" if broker.ca else "the system's CAs"
-    if isinstance(result, OSError):
-        return failure(check, f"{_describe_error(result)} (by {by})", _trust_step(broker, result, now))
-    date = time.strftime("%Y-%m-%d", time.gmtime(result))
-    if result - now < _RENEWAL_LIMIT_S:
-        words = f"good until {date}, {format_span(result - now)} from now; trusted by {by}"
-        return warning(check, words, f"renew the certificate of {broker.host}, and have mosquitto read it: SIGHUP")
-    return ok(check, f"trusted by {by}; good until {date}")
+    step = _trust_step(broker, message, code, now)
+    return failure("certificate", f"{message} (by {_authority(broker)})", step)
 
 
-def _trust_step(broker: Broker, error: OSError, now: float) -> str:
-    """Return advice on how to fix a TLS error."""
-    code = error.verify_code if isinstance(error, ssl.SSLCertVerificationError) else 0
+def _authority(broker: Broker) -> str:
+    """Return a description of the CAs that the broker's certificate is checked with."""
+    return f"the CA in {broker.ca}" if broker.ca else "the system's CAs"
+
+
+def _trust_step(broker: Broker, message: str, code: int, now: float) -> str:
+    """Return advice on how to fix a TLS error. The arguments are those of `judge_tls_error`."""
     if code in _DATE_CODES:
         clock = time.strftime("%Y-%m-%d %H:%M", time.gmtime(now))
         return f"renew the certificate of {broker.host}; or set this machine's clock: it says {clock} UTC"
     if code in _HOST_CODES:
         return f"name the host in {URL} as its certificate does, or have it certified as {broker.host}"
-    if "ALERT" in _describe_error(error):
+    if "ALERT" in message:
         return "log in with a certificate that the broker takes: TALK_MQTT_CERT and TALK_MQTT_KEY name it"
     if not code:
         return f"name the port that has TLS in {URL}, if {broker.port} of {broker.host} has none; or {_LOG_STEP}"

@@ -151,7 +151,7 @@ class LocalExamination:
         yield sound.check_player(env, self._player, used, by_server=by_server)
         if used in sound.DEVICE_LISTS and not (used == "pulse" and sound_server.hangs):
             yield sound.check_device(env, used, device)
-        yield sound.judge_cards(cards, sound_server, session)
+        yield sound.check_cards(cards, sound_server, session)
         yield sound.check_access(sound_server, session)
         yield sound.judge_sound_server(sound_server, cards, session)
         yield from sound.check_levels(env, sound_server, cards, is_used=device is None and used in PLAYERS)

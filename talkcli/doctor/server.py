@@ -98,7 +98,7 @@ def connect(option: str | None, interrupt: Mapping[int, int] | None) -> tuple[Cl
     try:
         client = Client.over(SocketConnection(option, name=DOCTOR_NAME, interrupt=interrupt))
     except TalkError as error:
-        return None, judge_missing([_find_place(each, trusted) for each in tried], named_by, error)
+        return None, explain_missing([_find_place(each, trusted) for each in tried], named_by, error)
     before = [_find_place(each, trusted) for each in tried[: tried.index(client.path)]]
     by = f"{named_by}, " if named_by else ""
     return client, judge_found(f"the server is on {client.path} ({by}process {client.server_pid})", before)
@@ -172,7 +172,7 @@ def judge_found(words: str, before: list[SocketPlace]) -> Finding:
     return warning("socket", words, f"remove what is in the way: {obstacles[0].path}")
 
 
-def judge_missing(places: list[SocketPlace], named_by: str | None, error: TalkError) -> Finding:
+def explain_missing(places: list[SocketPlace], named_by: str | None, error: TalkError) -> Finding:
     """Return the finding about a missing server.
 
     Args:

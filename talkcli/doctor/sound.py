@@ -549,8 +549,8 @@ def check_device(env: Mapping[str, str], player: str, configured: str | None) ->
     return warning("device", words, "start the server with --device and one of these names")
 
 
-def judge_cards(cards: tuple[str, ...], server: SoundServer, session: UserSession) -> Finding:
-    """Return the finding about the kernel's sound cards."""
+def check_cards(cards: tuple[str, ...], server: SoundServer, session: UserSession) -> Finding:
+    """Check whether the kernel has found sound cards."""
     if cards:
         return ok("cards", join_names(cards))
     if server.name is not None:

@@ -277,7 +277,7 @@ def test_without_a_server_each_place_is_described(
 ) -> None:
     monkeypatch.setattr(paths, "client_sockets", lambda _: [])
     monkeypatch.setattr("glob.glob", lambda _: others)
-    judgement = server.judge_missing([place], named_by, error)
+    judgement = server.explain_missing([place], named_by, error)
     assert judgement.state == FAILURE
     assert words in judgement.message
     assert step in str(judgement.next)
@@ -422,7 +422,7 @@ def player(configured: str | None, used: str | None, *installed: str, by_server:
 
 
 def test_a_robot_with_a_card_and_nothing_else_is_well() -> None:
-    assert {sound.judge_cards(CARDS, SoundServer(), PI).state, judged_server(SoundServer()).state} == {OK}
+    assert {sound.check_cards(CARDS, SoundServer(), PI).state, judged_server(SoundServer()).state} == {OK}
     used = player(None, "aplay", "aplay", "pacat")
     assert (used.state, used.message) == (OK, "aplay is used; then pacat")
 
@@ -499,11 +499,11 @@ def test_a_step_that_needs_pactl_names_its_package(tmp_path: Path) -> None:
 
 
 def test_a_missing_device_is_to_be_plugged_in_or_given_to_the_container() -> None:
-    found = sound.judge_cards((), NO_SERVER, PI)
+    found = sound.check_cards((), NO_SERVER, PI)
     assert (found.state, "plug in" in str(found.next)) == (WARNING, True)
-    found = sound.judge_cards((), NO_SERVER, replace(PI, origins=("a container",)))
+    found = sound.check_cards((), NO_SERVER, replace(PI, origins=("a container",)))
     assert "--device /dev/snd" in str(found.next)
-    assert sound.judge_cards((), PULSE, PI).state == OK
+    assert sound.check_cards((), PULSE, PI).state == OK
 
 
 @pytest.mark.parametrize(
