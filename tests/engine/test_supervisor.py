@@ -1,6 +1,6 @@
 """Tests for the engine thread, with the scripted engine as its process.
 
-Goals are sent directly to the process. Whatever happens to the process, each goal is spoken or ends.
+Whatever happens to the process, each goal is spoken or ends.
 """
 
 from __future__ import annotations
@@ -14,8 +14,6 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
 import pytest
@@ -44,7 +42,7 @@ from talkcli.polling import wait_ready
 from tests.engine.threads import CONFIGURE, PATIENCE, Thread, answering
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from talkcli.engine.parent.supervisor import Report
@@ -209,71 +207,6 @@ def test_the_process_is_told_whether_a_goal_follows(answers: Callable[..., Threa
     assert thread.until(protocol.Ended) == protocol.Ended("g1", OUTCOME_COMPLETED, None, f"{followed} True")
 
 
-def test_a_goal_behind_another_wakes_the_thread_once(
-    monkeypatch: pytest.MonkeyPatch, answers: Callable[..., Thread]
-) -> None:
-    """The wake-up is the reply of the process, which arrives in one piece."""
-    monkeypatch.setattr(supervisor, "HANG_LIMIT_S", 600.0)  # longer than any goal takes on a slow machine
-    thread = answers("tell(protocol.Started(command.id), protocol.Ended(command.id, protocol.OUTCOME_COMPLETED))")
-    process = _process(thread)
-    thread.spoken("the first may find it asleep for longer", "g0")
-    woken: list[list[int]] = []
-    select = thread.engine._selector.select
-
-    def counted(timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        found = select(timeout)
-        woken.append([key.fd for key, _ in found])
-        return found
-
-    monkeypatch.setattr(thread.engine._selector, "select", counted)
-    for number in range(1, 51):
-        assert thread.spoken("yes", f"g{number}") == protocol.Ended(f"g{number}", OUTCOME_COMPLETED)
-    # Only the messages of the process wake the thread. The reply to the first goal may have arrived earlier.
-    assert {each for fds in woken for each in fds} == {process.socket.fileno()}
-    # If the thread wasn't asleep yet, one wake-up may serve two goals.
-    assert sum(bool(fds) for fds in woken) <= 50
-
-
-def test_a_process_that_hangs_is_noticed_although_nobody_woke_the_thread(start: Start) -> None:
-    thread = start(HANG_LIMIT_S=0.5)
-    assert thread.spoken("length=0").outcome == OUTCOME_COMPLETED
-    # submitted while the thread naps
-    assert thread.spoken("length=0.05 hang", "g2").reason == "engine_hung"
-    assert thread.spoken("yes", "g3").outcome == OUTCOME_COMPLETED
-    assert thread.next(0.7) is None  # the nap is over
-    assert thread.spoken("length=0.05 hang", "g4").reason == "engine_hung"
-
-
-def test_the_answer_to_a_goal_is_understood_before_the_goal_is_noted(monkeypatch: pytest.MonkeyPatch) -> None:
-    posted: list[Report] = []
-    said: list[protocol.Command] = []
-    engine = Supervisor(CONFIGURE, posted.append)
-
-    def send(command: protocol.Command) -> bool:
-        said.append(command)
-        return True
-
-    # The reply arrives before the thread has recorded the goal.
-    swift = SimpleNamespace(send=send, receive=lambda: [protocol.Ended("g1", OUTCOME_COMPLETED)] * said.count(YES))
-    for name in ("_process", "_direct_process"):
-        monkeypatch.setattr(engine, name, swift)
-    engine.speak(YES)
-    engine._receive(cast("EngineProcess", swift))
-    assert posted == [protocol.Ended("g1", OUTCOME_COMPLETED)]
-    engine._actions.close()
-
-
-@pytest.mark.parametrize("takes", [True, False], ids=["taken by the system", "refused"])
-def test_a_goal_sent_to_a_lost_process_is_spoken_by_the_next(
-    start: Start, monkeypatch: pytest.MonkeyPatch, takes: bool
-) -> None:
-    thread = start(HANG_LIMIT_S=1.0)  # the longest nap of the thread
-    thread.until(protocol.Ready)
-    monkeypatch.setattr(thread.engine, "_direct_process", SimpleNamespace(send=lambda _: takes))
-    assert thread.spoken("yes") == SPOKEN
-    assert not any(isinstance(each, EngineDied) for each in thread.seen)
-
-
 def test_a_process_that_takes_no_goal_is_ended(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
     """The next process gets the goal."""
     thread = start()
@@ -320,7 +253,6 @@ def test_a_goal_that_ended_before_it_was_given_up_costs_no_process(start: Start)
     for number in (2, 3):
         assert thread.spoken("yes", f"g{number}").id == f"g{number}"
     assert thread.engine._process is process
-    assert thread.engine._direct_process is process
 
 
 def test_a_closed_process_takes_no_command(start: Start) -> None:
@@ -586,142 +518,42 @@ tell(protocol.Ended(command.id, protocol.OUTCOME_COMPLETED))
 # -- the queue of actions
 
 
-Sleepers = Callable[[float], "Sleeper"]
-
-
-class Sleeper:
-    """A thread that only waits for actions. `wakes` is the number of bytes written to wake the thread."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, doze: float) -> None:
-        self.queue = ActionQueue(doze)
-        self.wakes = 0
-        self.asleep = threading.Event()
-        self._ending = False
-        select, write = self.queue.selector.select, os.write
-
-        def told(timeout: float | None = None) -> object:
-            self.asleep.set()
-            return select(timeout)
-
-        def counted(descriptor: int, data: bytes) -> int:
-            self.wakes += descriptor == self.queue._writer
-            return write(descriptor, data)
-
-        monkeypatch.setattr(self.queue.selector, "select", told)
-        monkeypatch.setattr("os.write", counted)
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-        assert self.asleep.wait(PATIENCE)
-
-    def _run(self) -> None:
-        while not self._ending:
-            self.queue.wait(NEVER)
-
-    def do(self, action: Callable[[], None]) -> None:
-        """Run an action in the thread, and wait until the thread sleeps again."""
-        done = threading.Event()
-
-        def act() -> None:
-            action()
-            self.asleep.clear()
-            done.set()
-
-        self.queue.call(act)
-        assert done.wait(PATIENCE)
-        assert self.asleep.wait(PATIENCE)
-
-    def close(self) -> None:
-        self.queue.call(lambda: setattr(self, "_ending", True))
-        self._thread.join(PATIENCE)
-        assert not self._thread.is_alive()
-        self.queue.close()
-
-
-@pytest.fixture
-def sleepers(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[float], Sleeper]]:
-    """Return a function that starts sleeping threads, which are closed at the end of the test."""
-    with contextlib.ExitStack() as stack:
-        yield lambda doze: stack.enter_context(contextlib.closing(Sleeper(monkeypatch, doze)))
-
-
-def test_an_action_does_not_wake_a_thread_that_dozes_and_is_done_in_order(
-    sleepers: Sleepers,
-) -> None:
-    sleeper, done = sleepers(1000.0), list[str]()
-    sleeper.do(lambda: None)
-    wakes = sleeper.wakes
-    for each in ("first", "second"):
-        sleeper.queue.call(lambda each=each: done.append(each), by=time.monotonic() + 1000)  # type: ignore[misc]
-    assert sleeper.wakes == wakes
-    sleeper.do(lambda: done.append("third"))
-    assert done == ["first", "second", "third"]
-    assert sleeper.wakes == wakes + 1
-
-
-def test_an_action_that_is_due_before_the_thread_would_wake_wakes_it(sleepers: Sleepers) -> None:
-    sleeper, done = sleepers(0.0), threading.Event()
-    sleeper.do(lambda: None)
-    wakes = sleeper.wakes
-    sleeper.queue.call(done.set, by=time.monotonic() + 1000)  # without a nap, the thread would sleep forever
-    assert done.wait(PATIENCE)
-    assert sleeper.wakes == wakes + 1
-
-
-def test_a_thread_that_dozes_does_its_actions_before_it_sleeps_on(
-    sleepers: Sleepers,
-) -> None:
-    sleeper, done = sleepers(0.2), threading.Event()
-    sleeper.do(lambda: None)
-    wakes = sleeper.wakes
-    sleeper.queue.call(done.set, by=time.monotonic() + 1000)
-    assert done.wait(PATIENCE)
-    assert sleeper.wakes <= wakes + 1  # one wake-up if this test was slower than the nap
-
-
-def test_nothing_is_lost_and_nothing_overtakes_if_several_threads_hand_in(
-    sleepers: Sleepers,
-) -> None:
-    sleeper, done = sleepers(0.001), list[tuple[int, int]]()
+def test_nothing_is_lost_and_nothing_overtakes_if_several_threads_hand_in() -> None:
+    queue, done = ActionQueue(), list[tuple[int, int]]()
     count = 1000
 
     def hand_in(who: int) -> None:
         for number in range(count):
-            by = 0.0 if number % 3 else time.monotonic() + 0.002 * (number % 2)
-            sleeper.queue.call(lambda number=number: done.append((who, number)), by)  # type: ignore[misc]
+            queue.call(lambda number=number: done.append((who, number)))  # type: ignore[misc]
 
     threads = [threading.Thread(target=hand_in, args=(who,)) for who in range(3)]
     for each in threads:
         each.start()
+    end = time.monotonic() + PATIENCE
+    while len(done) < 3 * count and time.monotonic() < end:
+        assert queue.wait(end) == []
     for each in threads:
         each.join(PATIENCE)
-    sleeper.do(lambda: None)
     assert [[number for who, number in done if who == each] for each in range(3)] == [list(range(count))] * 3
-    assert sleeper.wakes <= 3 * count + 1
-
-
-def test_nothing_is_done_once_no_more_is_taken() -> None:
-    queue, done = ActionQueue(0.0), list[str]()
     queue.close()
-    queue.call(lambda: done.append("late"))
-    queue.run()
-    assert done == []
 
 
-def test_a_queue_is_not_closed_under_a_thread_that_wakes_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Otherwise, the byte could be written to another file that has reused the descriptor."""
-    queue, closed, write = ActionQueue(0.0), threading.Event(), os.write
+def test_an_action_wakes_a_thread_that_waits_without_a_limit() -> None:
+    queue, done = ActionQueue(), threading.Event()
+    thread = threading.Thread(target=lambda: queue.wait(NEVER))
+    thread.start()
+    queue.call(done.set)
+    thread.join(PATIENCE)
+    assert done.is_set()
+    queue.close()
 
-    def close() -> None:
-        queue.close()
-        closed.set()
 
-    def slowly(descriptor: int, data: bytes) -> int:
-        threading.Thread(target=close).start()
-        assert not closed.wait(0.1)
-        return write(descriptor, data)
-
-    monkeypatch.setattr(os, "write", slowly)
-    monkeypatch.setattr(queue, "_sleeps_until", NEVER)
-    queue.call(lambda: None)
-    assert closed.wait(PATIENCE)
-    queue.call(lambda: None)  # does nothing
+def test_a_queue_takes_any_number_of_actions_and_those_that_come_after_its_end() -> None:
+    queue, done = ActionQueue(), list[int]()
+    for number in range(100_000):  # more than there is room for bytes that wake the thread
+        queue.call(lambda number=number: done.append(number))  # type: ignore[misc]
+    queue.wait(NEVER)
+    assert done == list(range(100_000))
+    queue.close()
+    queue.call(lambda: done.append(0))
+    assert len(done) == 100_000

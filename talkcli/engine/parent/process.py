@@ -15,7 +15,6 @@ import select
 import socket
 import subprocess
 import sys
-import threading
 import time
 from typing import TYPE_CHECKING
 
@@ -24,7 +23,7 @@ from talkcli.engine import protocol
 from talkcli.engine.protocol import HANG_LIMIT_S, KILL_LIMIT_S, START_LIMIT_S
 from talkcli.goals.reasons import Reason
 from talkcli.polling import wait_ready
-from talkcli.processes import close, kill, kill_holders, open_pipes, processes, signal_name
+from talkcli.processes import close, is_held, kill, kill_holders, open_pipes, processes, signal_name
 from talkcli.protocol.lines import LineSplitter
 
 if TYPE_CHECKING:
@@ -77,9 +76,6 @@ class EngineProcess:
         self.start_failure: protocol.StartFailed | None = None
         #: monotonic time by which the process must have exited after a kill; set by the supervisor
         self.exit_deadline = float("inf")
-        # This lock is held while sending. Otherwise, another thread could close the descriptor, and its number could be
-        # reused.
-        self._sending = threading.Lock()
         self._lines = LineSplitter()
         self._stderr_lines = LineSplitter(MAX_STDERR_LINE_BYTES)
         self._last_stderr_line = ""
@@ -111,13 +107,12 @@ class EngineProcess:
         self.send(configure)
 
     def send(self, command: protocol.Command) -> bool:
-        """Send a command without blocking, and return whether it was sent. May be called from any thread."""
+        """Send a command without blocking, and return whether it was sent."""
         line = protocol.encode(command)
-        with self._sending:
-            try:
-                return self.socket.send(line) == len(line)
-            except OSError:  # the socket is closed, the process is dead, the buffer is full, or memory is short
-                return False
+        try:
+            return self.socket.send(line) == len(line)
+        except OSError:  # the process is dead, the buffer is full, or memory is short
+            return False
 
     def receive(self) -> Iterator[protocol.Event | None]:
         """Yield the events that have arrived, without blocking.
@@ -170,12 +165,7 @@ class EngineProcess:
 
     def describe_exit(self) -> str:
         """Return a human-readable description of how the process exited. Kill it if it is still running."""
-        end = time.monotonic() + _EXIT_WAIT_S
-        # macOS has no waitid before Python 3.13. The exit status may then be that of the kill below.
-        while hasattr(os, "waitid") and time.monotonic() < end:
-            if os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is not None:
-                break
-            time.sleep(0.001)
+        is_held(self.liveness, _EXIT_WAIT_S)
         self.kill()  # must happen before the process is reaped, because its group ID may be reused afterwards
         try:
             status = self._process.wait(_EXIT_WAIT_S)
@@ -186,16 +176,11 @@ class EngineProcess:
         how = f"it was killed by {signal_name(-status)}" if status < 0 else f"it exited with status {status}"
         return f"{how} ({self._last_stderr_line})" if self._last_stderr_line else how
 
-    def is_gone(self) -> bool:
-        """Return whether the process and its player have exited. Call this only if `liveness` is readable."""
-        return os.read(self.liveness, 1) == b""
-
     def close(self) -> None:
         """Reap the process if it has exited, and close the descriptors."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(_EXIT_WAIT_S)
-        with self._sending:
-            self.socket.close()
+        self.socket.close()
         close(self.liveness, self.stderr)
 
 

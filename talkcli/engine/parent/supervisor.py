@@ -7,8 +7,9 @@ It knows nothing about clients or the queue.
 
 from __future__ import annotations
 
-import os
+import contextlib
 import selectors
+import socket
 import threading
 import time
 from collections import deque
@@ -75,44 +76,19 @@ class ActionQueue:
     `call` may be used from any thread. Only the waiting thread may use the other methods.
     """
 
-    def __init__(self, nap_s: float) -> None:
-        """Create the queue.
-
-        Args:
-            nap_s: maximum time until the waiting thread wakes up on its own after any work. Actions that can wait that
-                long don't need to wake the thread.
-        """
+    def __init__(self) -> None:
         self.selector = selectors.DefaultSelector()
-        self._actions: deque[Callable[[], None]] = deque()
-        self._closed = False
-        #: lock that prevents the descriptor from being closed while `call` uses it
-        self._calling = threading.Lock()
-        #: monotonic time at which the thread wakes up on its own; 0 while it is awake or being woken
-        self._sleeps_until = 0.0
-        self._nap_s = nap_s
-        self._nap_ends_at = 0.0
-        self._reader, self._writer = os.pipe()
-        os.set_blocking(self._reader, False)
-        os.set_blocking(self._writer, False)
-        self.selector.register(self._reader, selectors.EVENT_READ)
+        self._actions: deque[Callable[[], object]] = deque()
+        self._receiver, self._sender = socket.socketpair()
+        self._receiver.setblocking(False)
+        self._sender.setblocking(False)
+        self.selector.register(self._receiver, selectors.EVENT_READ)
 
-    def call(self, action: Callable[[], None], by: float = 0.0) -> None:
-        """Run an action in the waiting thread. If the queue is closed, do nothing.
-
-        Args:
-            action: the function to call.
-            by: monotonic time by which the action must run. The thread is only woken if it would sleep longer, because
-                waking it and switching to it takes about 50 µs.
-        """
-        with self._calling:
-            if self._closed:
-                return
-            self._actions.append(action)
-            # `wait` sets `_sleeps_until` before it checks for actions. Therefore, either this method finds the thread
-            # asleep, or `wait` finds the action.
-            if self._sleeps_until > by:
-                self._sleeps_until = 0.0
-                os.write(self._writer, b"\0")
+    def call(self, action: Callable[[], object]) -> None:
+        """Run an action in the waiting thread. If the queue is closed, do nothing."""
+        self._actions.append(action)
+        with contextlib.suppress(OSError):  # the queue is closed, or has enough bytes to wake the thread
+            self._sender.send(b"\0")
 
     def wait(self, until: float) -> list[selectors.SelectorKey]:
         """Wait for a registered descriptor, an action or a time limit, and run any waiting actions.
@@ -120,19 +96,12 @@ class ActionQueue:
         Returns:
             The keys of the ready descriptors.
         """
-        now = time.monotonic()
-        if now < self._nap_ends_at < until:
-            until = self._nap_ends_at
-        self._sleeps_until = until
-        timeout = 0.0 if self._actions else max(0.0, until - now)
-        ready = [key for key, _ in self.selector.select(None if timeout == NEVER else timeout)]
-        self._sleeps_until = 0.0
-        if ready:
-            self._nap_ends_at = time.monotonic() + self._nap_s
-        if any(key.fd == self._reader for key in ready):
-            os.read(self._reader, 4096)
+        timeout = None if until == NEVER else max(0.0, until - time.monotonic())
+        ready = [key for key, _ in self.selector.select(timeout)]
+        if any(key.fileobj is self._receiver for key in ready):
+            self._receiver.recv(4096)
         self.run()
-        return [key for key in ready if key.fd != self._reader]
+        return [key for key in ready if key.fileobj is not self._receiver]
 
     def run(self) -> None:
         """Run the waiting actions."""
@@ -140,12 +109,10 @@ class ActionQueue:
             self._actions.popleft()()
 
     def close(self) -> None:
-        """Accept no more actions and close the queue's own descriptors."""
-        with self._calling:
-            self._closed = True
+        """Close the queue's own descriptors."""
         self.selector.close()
-        os.close(self._reader)
-        os.close(self._writer)
+        self._receiver.close()
+        self._sender.close()
 
 
 class RestartPolicy:
@@ -231,11 +198,9 @@ class Supervisor:
         self.thread = threading.Thread(target=self._run, name="engine", daemon=True)
         self._configure = configure
         self._post = post
-        self._actions = ActionQueue(nap_s=HANG_LIMIT_S)
+        self._actions = ActionQueue()
         self._selector = self._actions.selector
         self._process: EngineProcess | None = None
-        #: the process to which `speak` sends goals directly; None if the engine thread has to send them
-        self._direct_process: EngineProcess | None = None
         self._started_at = 0.0
         self._restarts = RestartPolicy(time.monotonic())
         self._goal: SupervisedGoal | None = None
@@ -251,15 +216,8 @@ class Supervisor:
     # -- methods for other threads
 
     def speak(self, command: protocol.GoalCommand) -> None:
-        """Submit a goal. The previous goal must have ended or been given up. Always call this from the same thread.
-
-        If possible, the goal is sent from the caller's thread. Waking the engine thread first would increase the cost
-        of a goal by 10 to 20 percent.
-        """
-        process, now = self._direct_process, time.monotonic()
-        self._actions.call(lambda: self._begin_goal(command, process, now), by=now + HANG_LIMIT_S if process else 0.0)
-        if process and not process.send(command):
-            self._actions.call(lambda: self._requeue_goal(command.id, process))
+        """Submit a goal. The previous goal must have ended or been given up."""
+        self._actions.call(lambda: self._begin_goal(command))
 
     def stop(self, goal_id: str) -> None:
         """Stop the goal."""
@@ -276,24 +234,21 @@ class Supervisor:
     def announce_next(self, goal_id: str, next_waits: bool, next_is_neural: bool) -> None:
         """Tell the process whether another goal is waiting behind this one.
 
-        If so, the process shortens the silence between the two. A message that can't be sent is dropped, because it
-        isn't important.
+        If so, the process shortens the silence between the two.
         """
-        process = self._direct_process
-        if process:
-            process.send(protocol.NextGoal(goal_id, next_waits, next_is_neural))
+        command = protocol.NextGoal(goal_id, next_waits, next_is_neural)
+        self._actions.call(lambda: self._send(command))
 
     def load(self, voice: str) -> None:
         """Load a neural voice. `VoiceLoaded` is posted when loading has finished or failed."""
-        self._actions.call(lambda: self._send_voice_command(protocol.LoadVoice(voice)))
+        self._actions.call(lambda: self._load_voice(voice))
 
     def drop(self, voice: str) -> None:
         """Unload a neural voice."""
-        self._actions.call(lambda: self._send_voice_command(protocol.DropVoice(voice)))
+        self._actions.call(lambda: self._send(protocol.DropVoice(voice)))
 
     def give_up(self, goal_id: str) -> None:
         """Abandon a goal that didn't end in time, and replace its process. No `Ended` is posted for the goal."""
-        self._direct_process = None
         self._actions.call(lambda: self._give_up_goal(goal_id))
 
     def close(self) -> None:
@@ -309,10 +264,10 @@ class Supervisor:
             while not self._closing:
                 # The time is taken before waiting. If the machine is suspended during the wait, messages that have
                 # arrived are then read before any deadline counts as missed.
-                now = time.monotonic()
-                for key in self._actions.wait(self._next_deadline()):
+                now, deadline = time.monotonic(), self._next_deadline()
+                for key in self._actions.wait(deadline):
                     self._handle_ready(key)
-                if not self._closing:
+                if now >= deadline and not self._closing:
                     self._check_deadlines(now)
             self._actions.run()  # actions submitted before `close`
         except Exception as error:
@@ -365,8 +320,7 @@ class Supervisor:
                 self._receive(process)  # read the last messages of the process before handling its death
             if process is self._process:
                 self._handle_crash(process)
-            if process.is_gone():
-                self._release_process(process)
+            self._release_process(process)
         elif key.fd == process.stderr:
             if not process.read_stderr():
                 self._selector.unregister(process.stderr)
@@ -379,56 +333,40 @@ class Supervisor:
         """Return the goal with this ID, or None if the goal has ended."""
         return self._goal if self._goal and self._goal.command.id == goal_id else None
 
-    def _begin_goal(self, command: protocol.GoalCommand, sent_to: EngineProcess | None, at: float) -> None:
-        """Make this the current goal, and send it to the process unless `speak` has already sent it.
-
-        Args:
-            command: the goal.
-            sent_to: the process to which the goal was sent, or None.
-            at: monotonic time at which the goal was sent.
-        """
+    def _begin_goal(self, command: protocol.GoalCommand) -> None:
+        """Make this the current goal, and send it to the process."""
         self._goal = SupervisedGoal(command)
-        if sent_to is not None and sent_to is self._process:
-            self._goal.sent, self._last_sign_at = True, at
-        elif self._restarts.permanent_error is not None:
+        if self._restarts.permanent_error is not None:
             self._fail_goal(self._goal, Reason.ENGINE_FAILED, self._restarts.permanent_error)
         else:
             self._send_goal()
 
     def _send_goal(self) -> None:
         """Send the current goal to the process, if the goal is waiting and the process is ready."""
-        goal, process = self._goal, self._process
-        waits = goal and not (goal.sent or goal.hold_number or goal.end)
-        if goal and waits and process and process.ready:
-            goal.sent, self._last_sign_at = True, time.monotonic()
-            if not process.send(goal.command):
-                self._requeue_goal(goal.command.id, process)
+        goal = self._goal
+        if goal and not (goal.sent or goal.hold_number or goal.end):
+            self._last_sign_at = time.monotonic()
+            goal.sent = self._send(goal.command)
 
-    def _requeue_goal(self, goal_id: str, process: EngineProcess) -> None:
-        """Keep a goal that could not be sent, and replace the process."""
-        if process is self._process:
-            goal = self._current(goal_id)
-            if goal:
-                goal.sent = False
-            self._replace_unresponsive(process)
+    def _load_voice(self, voice: str) -> None:
+        """Load a voice. If no process is ready, do nothing, because the server repeats the command to the next one."""
+        if self._send(protocol.LoadVoice(voice)):
+            self._loading, self._last_sign_at = voice, time.monotonic()
 
-    def _send_voice_command(self, command: protocol.LoadVoice | protocol.DropVoice) -> None:
-        """Send a voice command to the process. If no process is ready, drop the command.
+    def _send(self, command: protocol.Command) -> bool:
+        """Send a command to the process if it is ready, and return whether it was sent.
 
-        The server sends such commands again whenever a new process becomes ready.
+        A process that doesn't accept the command is replaced.
         """
         process = self._process
-        if process and process.ready:
-            if isinstance(command, protocol.LoadVoice):
-                self._loading, self._last_sign_at = command.voice, time.monotonic()
-            if not process.send(command):
-                self._replace_unresponsive(process)
-
-    def _replace_unresponsive(self, process: EngineProcess) -> None:
-        """Replace a process that no longer accepts commands."""
+        if process is None or not process.ready:
+            return False
+        if process.send(command):
+            return True
         self._receive(process)  # if the process is dead, this reports a crash instead
         if process is self._process:
             self._lose_process("the engine takes no commands", Reason.ENGINE_HUNG)
+        return False
 
     def _hold_goal(self, goal_id: str, number: int | None) -> None:
         """Pause the goal, or resume it if `number` is None."""
@@ -438,9 +376,7 @@ class Supervisor:
         goal.hold_number = number
         goal.hold_sent_at = time.monotonic() if goal.sent and number is not None else None
         if goal.sent:
-            command = protocol.Continue(goal_id) if number is None else protocol.Hold(goal_id, number)
-            if self._process and not self._process.send(command):
-                self._replace_unresponsive(self._process)
+            self._send(protocol.Continue(goal_id) if number is None else protocol.Hold(goal_id, number))
         elif number is not None:
             self._post(protocol.Held(goal_id, number))  # the goal is already silent, because no process is speaking it
         else:
@@ -455,9 +391,9 @@ class Supervisor:
             goal.end = stopped
         elif not goal.sent:
             self._end_goal(stopped)
-        elif self._process:
+        else:
             goal.stop_sent_at = time.monotonic()
-            self._process.send(protocol.Stop(goal_id))
+            self._send(protocol.Stop(goal_id))
 
     def _give_up_goal(self, goal_id: str) -> None:
         goal = self._current(goal_id)
@@ -465,7 +401,6 @@ class Supervisor:
             self._goal = None
             if goal.sent:
                 self._lose_process("the engine could not be silenced", Reason.NOT_SILENT)
-        self._direct_process = self._process if self._process and self._process.ready else None
 
     def _fail_goal(self, goal: SupervisedGoal, reason: Reason, message: str) -> None:
         self._end_goal(protocol.Ended(goal.command.id, protocol.OUTCOME_FAILED, reason, message))
@@ -499,7 +434,6 @@ class Supervisor:
     def _receive(self, process: EngineProcess) -> None:
         """Handle the messages that have arrived from the process."""
         for event in process.receive():
-            self._actions.run()  # the event's goal may still be waiting in the queue of actions
             if process is not self._process:
                 return
             if event is None:
@@ -513,14 +447,14 @@ class Supervisor:
     def _handle_event(self, process: EngineProcess, event: protocol.Event) -> None:
         self._last_sign_at = time.monotonic()
         if isinstance(event, protocol.GoalEvent):
-            if self._goal and self._goal.sent and event.id == self._goal.command.id:  # ignore events about other goals
+            goal = self._current(event.id)
+            if goal:
                 process.had_goal = True
-                self._handle_goal_event(self._goal, event)
+                self._handle_goal_event(goal, event)
             return
         if isinstance(event, protocol.Ready):
             process.ready = True
             self._restarts.permanent_error = None
-            self._direct_process = process
         elif isinstance(event, protocol.StartFailed):
             process.start_failure = event
         elif isinstance(event, protocol.VoiceLoaded) and event.voice == self._loading:
@@ -551,7 +485,7 @@ class Supervisor:
         process, now = self._process, time.monotonic()
         if process is None:
             return
-        self._process = self._direct_process = self._loading = None
+        self._process = self._loading = None
         process.kill()
         self._selector.unregister(process.socket.fileno())
         process.exit_deadline = now + KILL_LIMIT_S
