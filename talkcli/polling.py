@@ -8,6 +8,10 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 
+#: A time that never comes, for a wait without a time limit.
+NEVER = float("inf")
+
+
 class Interrupted(Exception):
     """The wait was interrupted."""
 

@@ -25,10 +25,6 @@ PIECE_S = 0.02
 #: player stalls. A buffer of less than three periods of 20 ms would cause gaps on a busy machine.
 BUFFER_MS = 60
 
-#: Milliseconds of sound to queue for aplay while it starts. aplay starts playing once its buffer is full, and reads
-#: whole periods of 15 ms. If it received one piece of 20 ms at a time, it would start 2 ms later (measured on a PC).
-APLAY_START_MS = 80
-
 #: Bytes that a program may read before it opens its device (one block of standard input). If it reads more, it must be
 #: playing.
 READ_AHEAD_BYTES = 4096
@@ -55,8 +51,6 @@ class PlayerCommand:
     read_ahead: int = READ_AHEAD_BYTES
     #: bytes to write before the samples
     preamble: bytes = b""
-    #: the number of sample bytes that may be queued while the program starts, or 0 to queue only one piece
-    at_start: int = 0
 
 
 @frozen
@@ -84,7 +78,7 @@ def _aplay(rate: int, device: str | None) -> PlayerCommand:
     argv += [f"--buffer-time={BUFFER_MS * 1000}"]
     argv += ["-D", device] if device else []
     # aplay opens the device before it reads any samples.
-    return PlayerCommand("aplay", tuple(argv), read_ahead=0, at_start=APLAY_START_MS * rate // 1000 * SAMPLE_BYTES)
+    return PlayerCommand("aplay", tuple(argv), read_ahead=0)
 
 
 def _pacat(rate: int, device: str | None) -> PlayerCommand:

@@ -23,6 +23,7 @@ from talkcli.engine.child.players.builtin import NullPlayer, WavPlayer, WavStrea
 from talkcli.engine.child.players.program import ProgramPlayer
 from talkcli.engine.child.players.pulse import PulsePlayer
 from talkcli.engine.players import PIECE_S, SAMPLE_BYTES, PlayerCommand
+from talkcli.polling import NEVER
 from tests.engine.spawned import PATIENCE
 from tests.support.processes import children
 from tests.support.surroundings import short_directory
@@ -239,9 +240,9 @@ def _await(player: Player) -> None:
     for descriptor, events in player.interests():
         poll.register(descriptor, events)
     until = player.wake_at()
-    assert until is not None or player.interests(), "nothing would ever wake it"
+    assert until != NEVER or player.interests(), "nothing would ever wake it"
     end = time.monotonic() + PATIENCE
-    seconds = PATIENCE if until is None else min(PATIENCE, until - time.monotonic())
+    seconds = min(PATIENCE, until - time.monotonic())
     poll.poll(max(0.0, seconds) * 1000)
     assert time.monotonic() < end, "nothing has woken it"
 

@@ -57,14 +57,14 @@ class Rig:
         assert player._clock_report is told or until == 0, "it was told the time, and nobody looks at it"
         while time.monotonic() < end:
             now = time.monotonic()
-            if until is not None and now >= until:
+            if now >= until:
                 return
             own = select.poll()
             for descriptor, events in player.interests():
                 own.register(descriptor, events)
             if own.poll(0):
                 return
-            self.pass_on(player, (end if until is None else min(until, end)) - now)
+            self.pass_on(player, min(until, end) - now)
         if self.limit is not None:
             raise CannotSpeak(Reason.ENGINE_HUNG, "nothing came any more")
         raise AssertionError(f"nothing has woken it in {PATIENCE:g} s")

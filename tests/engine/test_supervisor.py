@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import os
 import select
-import selectors
 import signal
 import socket
 import sys
@@ -25,7 +24,6 @@ from talkcli.engine.parent.supervisor import ENGINE_WAIT_LIMIT_S as WAITED
 from talkcli.engine.parent.supervisor import (
     MAX_STDERR_LINES,
     MIN_LIFETIME_S,
-    NEVER,
     RESTART_DELAYS_S,
     STDERR_PERIOD_S,
     ActionQueue,
@@ -354,7 +352,7 @@ def _watching(process: EngineProcess, posted: list[Report]) -> Supervisor:
     """Return a supervisor with this process, without running its thread."""
     engine = Supervisor(CONFIGURE, posted.append)
     for descriptor in (process.socket.fileno(), process.liveness):
-        engine._selector.register(descriptor, selectors.EVENT_READ, process)
+        engine._watched[descriptor] = process
     engine._process = process
     engine._started_at = time.monotonic()
     return engine
@@ -529,22 +527,12 @@ def test_nothing_is_lost_and_nothing_overtakes_if_several_threads_hand_in() -> N
     threads = [threading.Thread(target=hand_in, args=(who,)) for who in range(3)]
     for each in threads:
         each.start()
-    end = time.monotonic() + PATIENCE
-    while len(done) < 3 * count and time.monotonic() < end:
-        assert queue.wait(end) == []
+    while len(done) < 3 * count:
+        assert wait_ready({queue.fileno(): select.POLLIN}, PATIENCE)
+        queue.run()
     for each in threads:
         each.join(PATIENCE)
     assert [[number for who, number in done if who == each] for each in range(3)] == [list(range(count))] * 3
-    queue.close()
-
-
-def test_an_action_wakes_a_thread_that_waits_without_a_limit() -> None:
-    queue, done = ActionQueue(), threading.Event()
-    thread = threading.Thread(target=lambda: queue.wait(NEVER))
-    thread.start()
-    queue.call(done.set)
-    thread.join(PATIENCE)
-    assert done.is_set()
     queue.close()
 
 
@@ -552,7 +540,7 @@ def test_a_queue_takes_any_number_of_actions_and_those_that_come_after_its_end()
     queue, done = ActionQueue(), list[int]()
     for number in range(100_000):  # more than there is room for bytes that wake the thread
         queue.call(lambda number=number: done.append(number))  # type: ignore[misc]
-    queue.wait(NEVER)
+    queue.run()
     assert done == list(range(100_000))
     queue.close()
     queue.call(lambda: done.append(0))

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from talkcli.engine.child.synthesizers import espeak
 from talkcli.engine.child.words import TimedWord, WordClock, WordFinder, count_letters
+from talkcli.polling import NEVER
 from tests.support.reference import Sentence, render_with_words
 
 if TYPE_CHECKING:
@@ -106,7 +107,7 @@ def test_the_clock_stands_until_it_is_started_and_is_held_back_by_the_player() -
     clock.add(first)
     clock.add(second)
     assert clock.pop_started(100.0) == []
-    assert clock.next_word_at() is None
+    assert clock.next_word_at() == NEVER
     clock.start(100.0)
     assert clock.pop_started(100.0) == [first]
     assert clock.next_word_at() == 100.5
@@ -151,7 +152,7 @@ def test_another_stream_begins_where_the_audio_goes_on() -> None:
     clock.reset(2.0)
     clock.add(missed)
     clock.add(word)
-    assert clock.next_word_at() is None
+    assert clock.next_word_at() == NEVER
     assert clock.heard_position(200.0) == 2.0
     clock.add_silence(2.0, 0.25)
     clock.start(200.0)
@@ -165,7 +166,7 @@ def test_the_outputs_own_clock_stands_until_something_is_heard() -> None:
     clock.add(TimedWord(0, 1, 0.5))
     clock.start(100.0)
     clock.set_elapsed(100.2, 0.0)
-    assert (clock.elapsed(100.2), clock.next_word_at()) == (0.0, None)
+    assert (clock.elapsed(100.2), clock.next_word_at()) == (0.0, NEVER)
     clock.set_elapsed(100.4, 0.1)
     assert clock.elapsed(100.4) == pytest.approx(0.1)
     assert clock.next_word_at() == pytest.approx(100.8)

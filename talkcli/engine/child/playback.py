@@ -15,6 +15,7 @@ from talkcli.engine.child.words import TimedWord, WordClock
 from talkcli.engine.players import PIECE_S, SAMPLE_BYTES
 from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.reasons import Reason
+from talkcli.polling import NEVER
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -305,7 +306,7 @@ class Playback:
         If all samples so far are silent, they are stored until the first sound follows.
         """
         self._samples.add(samples)
-        self._wait((), 0.0)  # check for a stop here, because writing to a file never waits
+        self._wait(until=0.0)  # check for a stop here, because writing to a file never waits
         if self._samples.audible and self._find_start():
             self._with_player(self._send_all)
 
@@ -320,7 +321,7 @@ class Playback:
             self._with_player(lambda feed: self._await_samples(feed, more))
             return
         self._await_continue()
-        self._wait((more,), None)
+        self._wait((more,))
 
     # -- methods for the driver
 
@@ -362,7 +363,7 @@ class Playback:
         while not player.gone():
             if time.monotonic() >= deadline:
                 raise CannotEnd(f"{player.name} could not be ended within {PLAYER_KILL_LIMIT_S:g} s")
-            self._runner.wait((), time.monotonic() + PIECE_S)
+            self._runner.wait(until=time.monotonic() + PIECE_S)
         if player.real_time and player.proven:
             self._players.device_released(self._silent_at)
         self._feed = None
@@ -418,7 +419,7 @@ class Playback:
             raise error if lost else first
         self.silence()
         if not others:
-            self._wait((), time.monotonic() + DEVICE_RETRY_INTERVAL_S)
+            self._wait(until=time.monotonic() + DEVICE_RETRY_INTERVAL_S)
 
     def _is_busy(self, error: CannotSpeak) -> bool:
         """Return whether the device is busy and should be tried again."""
@@ -457,9 +458,9 @@ class Playback:
             if taken:
                 continue
             limit = FIRST_SOUND_LIMIT_S if feed.consumed == 0 else STALL_LIMIT_S
-            due = feed.progress_at + limit if feed.player.real_time else None  # the reader of a pipe may be slow
+            due = feed.progress_at + limit if feed.player.real_time else NEVER  # the reader of a pipe may be slow
             self._wait_for(feed, due)
-            if due and time.monotonic() >= due and not self._runner.hold_number and not self._offer(feed):
+            if time.monotonic() >= due and not self._runner.hold_number and not self._offer(feed):
                 raise CannotSpeak(Reason.AUDIO_STALLED, f"{feed.player.name} took no sound for {limit:g} s")
 
     def _await_samples(self, feed: PlayerFeed, more: Interest) -> None:
@@ -467,7 +468,7 @@ class Playback:
         if self._runner.hold_number:
             self._keep_silent(feed)
         feed.player.ended()  # check for a failure here, because the wait below doesn't report it
-        self._wait_for(feed, None, more)
+        self._wait_for(feed, NEVER, more)
         self._update(feed)
         feed.progress_at = time.monotonic()  # until now, the player had nothing to play
 
@@ -631,28 +632,29 @@ class Playback:
         """Wait without a player until the sentence continues."""
         while self._runner.hold_number:
             self._runner.confirm_hold()
-            self._wait((), None)
+            self._wait()
 
-    def _wait_for(self, feed: PlayerFeed, until: float | None, more: Interest | None = None) -> None:
+    def _wait_for(self, feed: PlayerFeed, until: float, more: Interest | None = None) -> None:
         """Wait until the player needs attention or a time limit is reached.
 
         Args:
             feed: the stream of the player.
-            until: the monotonic time, or None for no limit.
+            until: the monotonic time.
             more: the descriptor that announces more samples, if there are none to write.
         """
         player, now = feed.player, time.monotonic()
         idle = more is not None or self._has_enough_silence(feed)
-        moments = [until, now + PIECE_S if idle else player.wake_at()]
-        moments.append(self._clock.next_word_at() if player.proven else None)
+        until = min(until, now + PIECE_S if idle else player.wake_at())
+        if player.proven:
+            until = min(until, self._clock.next_word_at())
         if feed.consumed < feed.written:  # poll doesn't always report that a player has consumed samples
-            moments.append(now + PROGRESS_CHECK_INTERVAL_S)
+            until = min(until, now + PROGRESS_CHECK_INTERVAL_S)
         # If there are no samples to write, don't wait for a writable player, because that would end the wait at once.
         interests = [each for each in player.interests() if not (idle and each[1] == select.POLLOUT)]
         interests += [] if more is None else [more]
-        self._wait(interests, min((moment for moment in moments if moment is not None), default=None))
+        self._wait(interests, until)
 
-    def _wait(self, interests: Sequence[Interest], until: float | None) -> None:
+    def _wait(self, interests: Sequence[Interest] = (), until: float = NEVER) -> None:
         """Wait in the runner. If the sentence is stopped during the wait, raise Stopped."""
         self._runner.wait(interests, until)
         self._check_stopped()

@@ -23,10 +23,11 @@ from talkcli.engine.child.words import WordFinder
 from talkcli.engine.voices import list_voices
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.reasons import Reason
+from talkcli.polling import NEVER, wait_ready
 from talkcli.protocol.lines import LineSplitter
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable
     from typing import Any
 
     from talkcli.engine.child.players.base import Interest
@@ -184,44 +185,37 @@ class GoalRunner:
             self._channel.send(protocol.VoiceList(voices))
         while not self._channel.closed:
             if not self._backlog:
-                self.wait((), None)
+                self.wait()
                 continue
             command = self._backlog.popleft()
             if isinstance(command, protocol.GoalCommand):  # all other commands are for goals that have already ended
                 self._speak(command)
 
-    def wait(self, interests: Sequence[Interest], until: float | None) -> None:
+    def wait(self, interests: Iterable[Interest] = (), until: float = NEVER) -> None:
         """Wait for a descriptor, a command or a time limit, and execute any commands that arrive.
 
         This method may return early. By then, a command may have stopped or paused the sentence.
 
         Args:
             interests: the descriptors, with the poll events to wait for.
-            until: the monotonic time, or None for no limit.
+            until: the monotonic time.
         """
         self._send_voice_events()
-        poll = select.poll()
+        watched, until = dict(interests), min(until, self._alive_due())
         if not self._channel.closed:
-            poll.register(self._channel.descriptor, select.POLLIN)
-        for descriptor, events in interests:
-            poll.register(descriptor, events)
-        deadlines = [until, self._alive_due()]
+            watched[self._channel.descriptor] = select.POLLIN
         loader = self._synthesizer.loader if self._synthesizer else None
         if loader is not None and loader.descriptor is not None:
-            poll.register(loader.descriptor, select.POLLIN)
-            deadlines.append(loader.deadline)
-        first = min((each for each in deadlines if each is not None), default=None)
-        timeout = None if first is None else max(0.0, first - time.monotonic()) * 1000
-        ready = [descriptor for descriptor, _ in poll.poll(timeout)]
-        if self._channel.descriptor in ready:
+            watched[loader.descriptor] = select.POLLIN
+            until = min(until, loader.deadline)
+        if self._channel.descriptor in wait_ready(watched, until - time.monotonic()):
             for command in self._channel.receive():
                 self._execute(command)
             if self._channel.closed:
                 self._stop_goal()
         self._send_voice_events()
         self._report_output()
-        alive_due = self._alive_due()
-        if alive_due is not None and time.monotonic() >= alive_due:
+        if time.monotonic() >= self._alive_due():
             self._channel.send(protocol.Alive(self._goal.id if self._goal else ""))
 
     def _execute(self, command: protocol.Command) -> None:
@@ -305,7 +299,7 @@ class GoalRunner:
                 self._step_driver(goal)
             elif self._pump is not None and self.hold_number:
                 self.confirm_hold()
-                self.wait((), None)
+                self.wait()
             else:
                 self._send_to_driver(goal)
 
@@ -334,7 +328,7 @@ class GoalRunner:
             self._engine.proxy.setBusy(False)  # otherwise, pyttsx3 would not send the next text to the driver
             self._driver_finished(goal.id, completed=False)
         else:
-            self.wait((), time.monotonic() + DRIVER_STEP_S)
+            self.wait(until=time.monotonic() + DRIVER_STEP_S)
             self._pump()
 
     def _report_word(self, location: int, length: int, **_: object) -> None:
@@ -385,12 +379,12 @@ class GoalRunner:
         gaps = len(self.gaps), round(sum(self.gaps), 3)
         self._channel.send(protocol.Ended(goal.id, outcome, reason, message, self.duration, *gaps, self.players.chosen))
 
-    def _alive_due(self) -> float | None:
-        """Return the time at which to send the next `Alive`, or None if none is needed."""
+    def _alive_due(self) -> float:
+        """Return the time at which to send the next `Alive`, or NEVER if none is needed."""
         loader = self._synthesizer.loader if self._synthesizer else None
         loading = loader is not None and loader.descriptor is not None
         if not loading and (self._goal is None or self._is_overdue(self._goal)):
-            return None
+            return NEVER
         return self._channel.sent_at + protocol.ALIVE_INTERVAL_S
 
     def _is_overdue(self, goal: ActiveGoal) -> bool:

@@ -10,6 +10,7 @@ import unicodedata
 from collections import deque
 
 from talkcli.frozen import frozen, replace
+from talkcli.polling import NEVER
 
 #: The rest of a word after its first part. Synthesizers report only "it" for "it's", and "well" for "well-known".
 _WORD_REST = re.compile(r"(?:['’-][^\W\d_]\w*|\.[^\W\d_](?!\w))+")
@@ -150,10 +151,10 @@ class WordClock:
             position = max(before, position - seconds)
         return position
 
-    def next_word_at(self) -> float | None:
-        """Return the time at which the next word starts, or None if no word is left or the clock is stopped."""
+    def next_word_at(self) -> float:
+        """Return the time at which the next word starts, or NEVER if no word is left or the clock is stopped."""
         if self._started_at is None or not self._waiting:
-            return None
+            return NEVER
         position = self._waiting[0].position
         silence = sum(seconds for before, seconds in self._silences if before <= position)
         return self._started_at + position - self._begin + silence
@@ -161,7 +162,7 @@ class WordClock:
     def pop_started(self, now: float) -> list[TimedWord]:
         """Remove and return the words that have started."""
         words = []
-        while (begins_at := self.next_word_at()) is not None and begins_at <= now:
+        while self.next_word_at() <= now:
             words.append(self._waiting.popleft())
         return words
 

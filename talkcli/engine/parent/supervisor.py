@@ -8,7 +8,7 @@ It knows nothing about clients or the queue.
 from __future__ import annotations
 
 import contextlib
-import selectors
+import select
 import socket
 import threading
 import time
@@ -22,6 +22,7 @@ from talkcli.engine.parent.process import EngineProcess
 from talkcli.engine.protocol import HANG_LIMIT_S, HOLD_LIMIT_S, KILL_LIMIT_S, START_LIMIT_S, STOP_LIMIT_S
 from talkcli.frozen import frozen, replace
 from talkcli.goals.reasons import Reason
+from talkcli.polling import NEVER, wait_ready
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -36,7 +37,6 @@ STDERR_PERIOD_S = 60.0
 MIN_LIFETIME_S = 1.0
 #: If no process has been ready for this long, each failed start also fails a goal. Otherwise, goals would wait forever.
 ENGINE_WAIT_LIMIT_S = 10.0
-NEVER = float("inf")
 
 
 @frozen
@@ -71,46 +71,36 @@ Report = protocol.Event | EngineDied | EngineMissing | EngineSaid | ThreadDied
 
 
 class ActionQueue:
-    """Runs actions from other threads in a thread that waits for descriptors.
+    """Runs actions from other threads in the engine thread.
 
-    `call` may be used from any thread. Only the waiting thread may use the other methods.
+    `call` may be used from any thread. Only the engine thread may use the other methods.
     """
 
     def __init__(self) -> None:
-        self.selector = selectors.DefaultSelector()
         self._actions: deque[Callable[[], object]] = deque()
         self._receiver, self._sender = socket.socketpair()
         self._receiver.setblocking(False)
         self._sender.setblocking(False)
-        self.selector.register(self._receiver, selectors.EVENT_READ)
+
+    def fileno(self) -> int:
+        """Return the descriptor that becomes readable when an action is waiting."""
+        return self._receiver.fileno()
 
     def call(self, action: Callable[[], object]) -> None:
-        """Run an action in the waiting thread. If the queue is closed, do nothing."""
+        """Run an action in the engine thread. If the queue is closed, do nothing."""
         self._actions.append(action)
-        with contextlib.suppress(OSError):  # the queue is closed, or has enough bytes to wake the thread
+        with contextlib.suppress(OSError):  # the queue is closed, or its buffer is full
             self._sender.send(b"\0")
-
-    def wait(self, until: float) -> list[selectors.SelectorKey]:
-        """Wait for a registered descriptor, an action or a time limit, and run any waiting actions.
-
-        Returns:
-            The keys of the ready descriptors.
-        """
-        timeout = None if until == NEVER else max(0.0, until - time.monotonic())
-        ready = [key for key, _ in self.selector.select(timeout)]
-        if any(key.fileobj is self._receiver for key in ready):
-            self._receiver.recv(4096)
-        self.run()
-        return [key for key in ready if key.fileobj is not self._receiver]
 
     def run(self) -> None:
         """Run the waiting actions."""
+        with contextlib.suppress(BlockingIOError):
+            self._receiver.recv(65536)
         while self._actions:
             self._actions.popleft()()
 
     def close(self) -> None:
-        """Close the queue's own descriptors."""
-        self.selector.close()
+        """Close the descriptors."""
         self._receiver.close()
         self._sender.close()
 
@@ -199,7 +189,8 @@ class Supervisor:
         self._configure = configure
         self._post = post
         self._actions = ActionQueue()
-        self._selector = self._actions.selector
+        #: the process to which each open descriptor belongs
+        self._watched: dict[int, EngineProcess] = {}
         self._process: EngineProcess | None = None
         self._started_at = 0.0
         self._restarts = RestartPolicy(time.monotonic())
@@ -265,8 +256,7 @@ class Supervisor:
                 # The time is taken before waiting. If the machine is suspended during the wait, messages that have
                 # arrived are then read before any deadline counts as missed.
                 now, deadline = time.monotonic(), self._next_deadline()
-                for key in self._actions.wait(deadline):
-                    self._handle_ready(key)
+                self._wait(deadline)
                 if now >= deadline and not self._closing:
                     self._check_deadlines(now)
             self._actions.run()  # actions submitted before `close`
@@ -276,6 +266,16 @@ class Supervisor:
             raise
         finally:
             self._shut_down()
+
+    def _wait(self, until: float) -> None:
+        """Wait until a process sends something, an action is submitted, or the time is reached, and handle it."""
+        watched = dict.fromkeys([self._actions.fileno(), *self._watched], select.POLLIN)
+        ready = wait_ready(watched, until - time.monotonic())
+        self._actions.run()
+        for descriptor in ready:
+            process = self._watched.get(descriptor)  # None if handling another descriptor has closed this one
+            if process:
+                self._handle_ready(process, descriptor)
 
     def _next_deadline(self) -> float:
         deadlines = [deadline for deadline, _ in self._deadlines()] + [each.exit_deadline for each in self._dying]
@@ -311,19 +311,16 @@ class Supervisor:
                 message = f"the player could not be ended within {KILL_LIMIT_S:g} s"
                 self._fail_goal(self._goal, Reason.NOT_SILENT, message)
 
-    def _handle_ready(self, key: selectors.SelectorKey) -> None:
-        if key.fd not in self._selector.get_map():
-            return  # handling another descriptor has closed this one
-        process: EngineProcess = key.data
-        if key.fd == process.liveness:
+    def _handle_ready(self, process: EngineProcess, descriptor: int) -> None:
+        if descriptor == process.liveness:
             if process is self._process:
                 self._receive(process)  # read the last messages of the process before handling its death
             if process is self._process:
                 self._handle_crash(process)
             self._release_process(process)
-        elif key.fd == process.stderr:
+        elif descriptor == process.stderr:
             if not process.read_stderr():
-                self._selector.unregister(process.stderr)
+                del self._watched[process.stderr]
         elif process is self._process:
             self._receive(process)
 
@@ -421,8 +418,7 @@ class Supervisor:
             self._handle_failed_start(message)
             return
         self._process = process
-        for fd in (process.socket.fileno(), process.liveness, process.stderr):
-            self._selector.register(fd, selectors.EVENT_READ, process)
+        self._watched |= dict.fromkeys((process.socket.fileno(), process.liveness, process.stderr), process)
 
     def _report_stderr(self, line: str) -> None:
         omitted = self._stderr_quota.allow(time.monotonic())
@@ -487,7 +483,7 @@ class Supervisor:
             return
         self._process = self._loading = None
         process.kill()
-        self._selector.unregister(process.socket.fileno())
+        del self._watched[process.socket.fileno()]
         process.exit_deadline = now + KILL_LIMIT_S
         self._dying.append(process)
         goal = self._goal if self._goal and self._goal.sent else None
@@ -531,10 +527,9 @@ class Supervisor:
 
     def _release_process(self, process: EngineProcess) -> None:
         """Clean up after a process that has exited, and end its goal."""
-        self._selector.unregister(process.liveness)
-        if process.stderr in self._selector.get_map():
+        del self._watched[process.liveness]
+        if self._watched.pop(process.stderr, None):
             process.read_stderr()
-            self._selector.unregister(process.stderr)
         process.close()
         self._dying.remove(process)
         goal = self._goal
@@ -546,8 +541,7 @@ class Supervisor:
         self._lose_process("the server ends", Reason.SHUTDOWN)
         deadline = time.monotonic() + KILL_LIMIT_S / 4
         while self._dying and time.monotonic() < deadline:
-            for key in self._actions.wait(deadline):
-                self._handle_ready(key)
+            self._wait(deadline)
         for process in self._dying:
             process.close()
         self._actions.close()

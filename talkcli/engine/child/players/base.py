@@ -125,8 +125,8 @@ class Player(Protocol):
         The playback ignores descriptors that only wait for POLLOUT while it has no samples to offer.
         """
 
-    def wake_at(self) -> float | None:
-        """Return the monotonic time at which to check the player again, or None if poll is enough."""
+    def wake_at(self) -> float:
+        """Return the monotonic time at which to check the player again, or NEVER if poll is enough."""
 
     def kill(self) -> None:
         """Stop playing at once, and start to release all resources.

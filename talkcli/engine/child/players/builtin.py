@@ -13,6 +13,7 @@ from talkcli.engine.child.players.base import CannotSpeak, Player
 from talkcli.engine.players import FILE_PREFIX, SAMPLE_BYTES
 from talkcli.engine.protocol import OUTPUT_STREAM_NAME
 from talkcli.goals.reasons import Reason
+from talkcli.polling import NEVER
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ class BuiltInPlayer(Player):
     def interests(self) -> Sequence[Interest]:
         return ()
 
-    def wake_at(self) -> float | None:
+    def wake_at(self) -> float:
         return 0.0
 
     def kill(self) -> None:
@@ -92,7 +93,7 @@ class NullPlayer(BuiltInPlayer):
     def ended(self) -> bool:
         return self._closed and self._clock() >= self._end_time
 
-    def wake_at(self) -> float | None:
+    def wake_at(self) -> float:
         # At this time, a third of the buffer is free, so this player wakes up no more often than a real one.
         return self._end_time if self._closed else self._end_time - NULL_AHEAD_S * 2 / 3
 
@@ -191,8 +192,8 @@ class WavStreamPlayer(BuiltInPlayer):
     def interests(self) -> list[Interest]:
         return [(self._output, select.POLLOUT)]
 
-    def wake_at(self) -> float | None:
-        return None
+    def wake_at(self) -> float:
+        return NEVER
 
 
 @contextlib.contextmanager

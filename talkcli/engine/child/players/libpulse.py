@@ -17,6 +17,8 @@ from ctypes import CFUNCTYPE, POINTER, Structure, c_char_p, c_int, c_size_t, c_u
 from functools import cache
 from types import SimpleNamespace
 
+from talkcli.polling import NEVER
+
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
@@ -182,9 +184,9 @@ class MainLoop:
         self._pointer = library.mainloop_new()
         self._callback = PollCallback(self._poll)
         library.mainloop_set_poll_func(self._pointer, self._callback, None)
-        #: the descriptors that libpulse wants to wait for, and the monotonic time of its next timer (or None)
+        #: the descriptors that libpulse wants to wait for, and the monotonic time of its next timer
         self.interests: list[Interest] = []
-        self.wake_at: float | None = None
+        self.wake_at = NEVER
         self.freed = False
 
     @property
@@ -202,11 +204,11 @@ class MainLoop:
     def free(self) -> None:
         """Free the loop, after its contexts have been released."""
         self._library.mainloop_free(self._pointer)
-        self.freed, self.interests, self.wake_at = True, [], None
+        self.freed, self.interests, self.wake_at = True, [], NEVER
 
     def _poll(self, wanted: Any, count: int, timeout: int, _: object) -> int:
         self.interests = [(wanted[number].fd, wanted[number].events) for number in range(count)]
-        self.wake_at = None if timeout < 0 else time.monotonic() + timeout / 1000
+        self.wake_at = NEVER if timeout < 0 else time.monotonic() + timeout / 1000
         return int(self._library.poll(wanted, count, 0))
 
 

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import io
 import os
 import re
 import select
@@ -33,6 +34,7 @@ import time
 from talkcli.engine.child.players.base import CannotSpeak, Player
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.reasons import Reason
+from talkcli.polling import NEVER
 from talkcli.processes import close, is_held, kill, kill_holders, open_pipes, signal_name
 from talkcli.protocol.lines import LineSplitter
 
@@ -93,6 +95,12 @@ class PlayerProcess:
             OSError: The program can't be started.
         """
         (stdin, our_stdin), (our_stderr, stderr), (tied, leash) = open_pipes(3)
+        #: our non-blocking ends of the program's standard input and standard error
+        self.stdin, self.stderr = io.FileIO(our_stdin, "w"), io.FileIO(our_stderr)
+        self._leash = io.FileIO(leash, "w")
+        #: a file that becomes readable when the program exits; None on macOS and on Linux before 5.3
+        self.exit: io.FileIO | None = None
+        self._status: int | None = None
         try:
             os.set_blocking(our_stdin, False)
             os.set_blocking(our_stderr, False)
@@ -101,17 +109,12 @@ class PlayerProcess:
             self.pid = _spawn(argv, stdin, stderr, [tied, *inherited])
             _attach_leash(tied, self.pid)
         except BaseException:
-            close(our_stdin, our_stderr, leash)
+            self.release()
             raise
         finally:
             close(stdin, stderr, tied)
-        #: our non-blocking ends of the program's standard input and standard error, or None once they are closed
-        self.stdin: int | None = our_stdin
-        self.stderr: int | None = our_stderr
-        #: a descriptor that becomes readable when the program exits; None on macOS and on Linux before 5.3
-        self.exit = _exit_descriptor(self.pid)
-        self._leash: int | None = leash
-        self._status: int | None = None
+        with contextlib.suppress(AttributeError, OSError):  # the system is too old, or a sandbox forbids it
+            self.exit = io.FileIO(os.pidfd_open(self.pid))
 
     def status(self) -> int | None:
         """Return the exit status, or None while the program runs.
@@ -127,10 +130,11 @@ class PlayerProcess:
             pid, status = os.waitpid(self.pid, os.WNOHANG)
             if pid:
                 self._status = os.waitstatus_to_exitcode(status)
-        if self._status is None or self._leash is None:
+        if self._status is None or self._leash.closed:
             return self._status
         # Processes of other users can't be killed, so they are ignored here. The server reports them.
-        return None if kill_holders(self._leash) and is_held(self._leash) else self._status
+        leash = self._leash.fileno()
+        return None if kill_holders(leash) and is_held(leash) else self._status
 
     def kill(self) -> None:
         """Kill the program and its process group."""
@@ -149,24 +153,11 @@ class PlayerProcess:
             wait.register(self.exit, select.POLLIN)
             wait.poll(seconds * 1000)
 
-    def close_stdin(self) -> None:
-        """Close the program's standard input."""
-        if self.stdin is not None:
-            close(self.stdin)
-            self.stdin = None
-
-    def close_stderr(self) -> None:
-        """Close the program's standard error."""
-        if self.stderr is not None:
-            close(self.stderr)
-            self.stderr = None
-
     def release(self) -> None:
         """Close all descriptors of a program that has been reaped. May be called again."""
-        self.close_stdin()
-        self.close_stderr()
-        close(*(each for each in (self.exit, self._leash) if each is not None))
-        self.exit = self._leash = None
+        for each in (self.stdin, self.stderr, self._leash, self.exit):
+            if each is not None:
+                each.close()
 
 
 def _spawn(argv: tuple[str, ...], stdin: int, stderr: int, inherited: Sequence[int]) -> int:
@@ -196,14 +187,6 @@ def _attach_leash(leash: int, group: int) -> None:
         fcntl.fcntl(leash, fcntl.F_SETOWN, -group)
         fcntl.fcntl(leash, fcntl.F_SETSIG, signal.SIGKILL)
         fcntl.fcntl(leash, fcntl.F_SETFL, fcntl.fcntl(leash, fcntl.F_GETFL) | os.O_ASYNC)
-
-
-def _exit_descriptor(pid: int) -> int | None:
-    """Return a descriptor that becomes readable when the process exits, or None if the system doesn't support this."""
-    try:
-        return os.pidfd_open(pid)
-    except (AttributeError, OSError):  # the system or the kernel is too old, or a sandbox forbids it
-        return None
 
 
 class ErrorOutput:
@@ -267,26 +250,23 @@ class ProgramPlayer(Player):
         #: the number of sample bytes written so far, which is negative until the preamble is written
         self._written = -len(command.preamble)
         self._consumed = 0
-        self._broken_at: float | None = None
+        #: the time by which the program must have exited after it has closed its input
+        self._exit_due = NEVER
         self._closed = False
         self._write(memoryview(command.preamble))
 
     def offer(self, data: memoryview) -> int:
         self.ended()  # raises CannotSpeak if the program has exited
-        if self._process.stdin is None:
+        stdin = self._process.stdin
+        if stdin.closed:
             return 0
         # Only one piece is kept in the pipe, because sound in the pipe is still played after a pause begins.
-        waiting = _unread_bytes(self._process.stdin)
         # If no process has the read end open, the program has closed its input, and the write fails.
-        if waiting == 0 or not is_held(self._process.stdin):
-            return self._write(data)
-        # If the program has read nothing yet, it gets as much as it needs to start.
-        room = self._command.at_start - waiting if waiting == self._written else 0
-        return self._write(data[:room]) if room > 0 else 0
+        return self._write(data) if _unread_bytes(stdin) == 0 or not is_held(stdin.fileno()) else 0
 
     def consumed(self) -> int:
         """Return the number of sample bytes that the program has read from the pipe."""
-        if self._process.stdin is not None and self._broken_at is None:
+        if not self._process.stdin.closed:
             self._consumed = max(self._consumed, self._written - _unread_bytes(self._process.stdin))
         elif self._closed:
             self._consumed = self._written
@@ -296,13 +276,13 @@ class ProgramPlayer(Player):
 
     def close(self) -> None:
         self._closed = True
-        self._process.close_stdin()
+        self._process.stdin.close()
 
     def ended(self) -> bool:
         self._read_stderr()
         status = self._process.status()
         if status is None:
-            if self._broken_at is not None and time.monotonic() - self._broken_at >= ERROR_GRACE_S:
+            if time.monotonic() >= self._exit_due:
                 line = self._errors.line()
                 raise CannotSpeak(Reason.AUDIO_LOST, line or f"{self.name} closed its input before the sound was over")
             return False
@@ -313,18 +293,15 @@ class ProgramPlayer(Player):
 
     def interests(self) -> list[Interest]:
         process = self._process
-        stdin = process.stdin if self._broken_at is None else None
-        wanted = ((stdin, select.POLLOUT), (process.stderr, select.POLLIN), (process.exit, select.POLLIN))
-        return [(descriptor, events) for descriptor, events in wanted if descriptor is not None]
+        wanted = ((process.stdin, select.POLLOUT), (process.stderr, select.POLLIN), (process.exit, select.POLLIN))
+        return [(file.fileno(), events) for file, events in wanted if file is not None and not file.closed]
 
-    def wake_at(self) -> float | None:
-        if self._process.exit is None:
-            return time.monotonic() + EXIT_CHECK_S
-        return None if self._broken_at is None else self._broken_at + ERROR_GRACE_S
+    def wake_at(self) -> float:
+        return time.monotonic() + EXIT_CHECK_S if self._process.exit is None else self._exit_due
 
     def kill(self) -> None:
         self._process.kill()
-        self._process.close_stdin()
+        self._process.stdin.close()
         self._process.await_end(REAP_WAIT_S)
         self.gone()
 
@@ -335,14 +312,11 @@ class ProgramPlayer(Player):
         return True
 
     def _write(self, data: memoryview) -> int:
-        if self._process.stdin is None or self._broken_at is not None:
-            return 0
         try:
-            written = os.write(self._process.stdin, data)
-        except BlockingIOError:
-            return 0
+            written = self._process.stdin.write(data) or 0  # None if the pipe is full
         except BrokenPipeError:
-            self._broken_at = time.monotonic()
+            self._process.stdin.close()
+            self._exit_due = time.monotonic() + ERROR_GRACE_S
             return 0
         self._written += written
         return written
@@ -359,19 +333,15 @@ class ProgramPlayer(Player):
         return CannotSpeak(reason, line or f"{self.name} exited with status {status}")
 
     def _read_stderr(self) -> None:
-        if self._process.stderr is None:
-            return
-        try:
-            data = os.read(self._process.stderr, STDERR_READ_BYTES)
-        except BlockingIOError:
-            return
+        stderr = self._process.stderr
+        data = None if stderr.closed else stderr.read(STDERR_READ_BYTES)  # None if there is nothing to read
         if data:
             self._errors.feed(data)
-        else:
-            self._process.close_stderr()
+        elif data == b"":
+            stderr.close()
 
 
-def _unread_bytes(pipe: int) -> int:
+def _unread_bytes(pipe: io.FileIO) -> int:
     """Return the number of unread bytes in a pipe, or 0 if the system doesn't report it."""
     try:
         return int(struct.unpack("i", fcntl.ioctl(pipe, termios.FIONREAD, b"\0\0\0\0"))[0])

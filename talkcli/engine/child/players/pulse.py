@@ -16,6 +16,7 @@ from talkcli.engine.players import BUFFER_MS, DUMMY_SINK, SAMPLE_BYTES
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.goal import Output
 from talkcli.goals.reasons import Reason
+from talkcli.polling import NEVER
 
 if TYPE_CHECKING:
     from typing import Any
@@ -82,16 +83,18 @@ class PulsePlayer(Player):
         self._clock_report: tuple[float, float] | None = None
         #: the number of bytes written when the server last ran out of samples, or None while it plays
         self._dry_at: int | None = None
-        #: when to send the next request for the playback time; None while a request is pending
-        self._time_request_at: float | None = 0.0
+        #: when to send the next request for the playback time
+        self._time_request_at = NEVER
         self._closed = self._draining = self._drained = False
         self._error: CannotSpeak | None = None
         self._stream: int | None = None
         self._sink_index = libpulse.NO_INDEX
         #: the time until which a stream volume of 0 is ignored
         self._volume_settled_at = 0.0
+        #: the time by which the server must have created the stream
         self._ready_by = time.monotonic() + READY_LIMIT_S
-        self._suspended_at: float | None = None
+        #: the time by which a suspended sink must be running again
+        self._resumed_by = NEVER
         #: the number of pending requests for the stream's volume
         self._pending_levels = 0
         self._sink_level: Level | None = None
@@ -160,7 +163,7 @@ class PulsePlayer(Player):
     def interests(self) -> list[Interest]:
         return self._loop.interests
 
-    def wake_at(self) -> float | None:
+    def wake_at(self) -> float:
         """Return the time at which libpulse has work to do or a time limit ends.
 
         The result is 0, which means now, if the server has room for samples. It is also 0 after each report of the
@@ -170,16 +173,8 @@ class PulsePlayer(Player):
         self._run()
         if self._error is not None or self._drained or self._clock_report is not report or self._room():
             return 0.0
-        times = [self._loop.wake_at]
-        if self._sink_index == libpulse.NO_INDEX:
-            times.append(self._ready_by)
-        if self._suspended_at is not None:
-            times.append(self._suspended_at + SUSPENDED_LIMIT_S)
-        if self._is_volume_pending():
-            times.append(self._volume_settled_at)
-        if self.proven and self._clock_report is None:
-            times.append(self._time_request_at)
-        return min((each for each in times if each is not None), default=None)
+        settled_at = self._volume_settled_at if self._is_volume_pending() else NEVER
+        return min(self._loop.wake_at, self._ready_by, self._resumed_by, self._time_request_at, settled_at)
 
     def kill(self) -> None:
         """Close the connection, so that the server drops the stream and its remaining samples."""
@@ -229,7 +224,7 @@ class PulsePlayer(Player):
         if state in (libpulse.CONTEXT_FAILED, libpulse.CONTEXT_TERMINATED):
             self._fail(Reason.AUDIO_DEVICE if self._written == 0 else Reason.AUDIO_LOST)
             return False
-        if self._sink_index == libpulse.NO_INDEX and time.monotonic() >= self._ready_by:
+        if time.monotonic() >= self._ready_by:
             self._error = CannotSpeak(
                 Reason.AUDIO_DEVICE, f"the sound server does not answer within {READY_LIMIT_S:g} s"
             )
@@ -278,29 +273,28 @@ class PulsePlayer(Player):
                 self._error = CannotSpeak(reason, f"the sound server has only a dummy output{left}", final=True)
             self._request_sink_level()
             if begins:
-                self._volume_settled_at = time.monotonic() + VOLUME_SETTLES_S
+                self._ready_by, self._volume_settled_at = NEVER, time.monotonic() + VOLUME_SETTLES_S
                 self._lib.context_set_subscribe_callback(self._context, self._change_callback, None)
                 mask = libpulse.MASK_SINK | libpulse.MASK_SINK_INPUT
                 self._release(self._lib.context_subscribe(self._context, mask, None, None))
                 self._request_stream_level()
         self._check_mute()
         if not self._lib.stream_is_suspended(self._stream):
-            if self._suspended_at is not None:
-                self._suspended_at = None
+            if self._resumed_by != NEVER:
+                self._resumed_by = NEVER
                 self._restart_clock()
             return changed
         now = time.monotonic()
-        self._suspended_at = self._suspended_at or now
-        if now >= self._suspended_at + SUSPENDED_LIMIT_S:
+        self._resumed_by = min(self._resumed_by, now + SUSPENDED_LIMIT_S)
+        if now >= self._resumed_by:
             self._error = CannotSpeak(Reason.AUDIO_STALLED, f"the sound server has suspended {self.device}")
         return changed
 
     def _request_time(self) -> bool:
         """Send a request for the playback time if one is due, and return whether it was sent."""
-        due = self._time_request_at
-        if not self.proven or self._clock_report or due is None or time.monotonic() < due:
+        if time.monotonic() < self._time_request_at:
             return False
-        self._time_request_at = None
+        self._time_request_at = NEVER
         self._release(self._lib.stream_update_timing_info(self._stream, None, None))
         return True
 
@@ -377,11 +371,13 @@ class PulsePlayer(Player):
         self._dry_at = self._written
 
     def _on_time(self, *_: Any) -> None:
+        if not self.proven:
+            return  # before the stream has started, the reported time is only the delay of the answer
         heard, now = c_uint64(), time.monotonic()
-        self._time_request_at = now + TIME_REQUEST_S
-        # Before the stream has started, the reported time is only the delay of the answer.
-        if self.proven and self._lib.stream_get_time(self._stream, byref(heard)) == 0 and heard.value:
-            self._clock_report = heard.value / 1_000_000, now
+        if self._lib.stream_get_time(self._stream, byref(heard)) == 0 and heard.value:
+            self._clock_report, self._time_request_at = (heard.value / 1_000_000, now), NEVER
+        elif self._clock_report is None:
+            self._time_request_at = now + TIME_REQUEST_S
 
     def _on_drained(self, _stream: int, success: int, _data: object) -> None:
         if not success:
