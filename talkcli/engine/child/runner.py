@@ -15,7 +15,6 @@ import select
 import sys
 import time
 import traceback
-from collections import deque
 
 from talkcli.engine import protocol
 from talkcli.engine.child.players.base import CannotSpeak
@@ -129,8 +128,6 @@ class GoalRunner:
         """
         self._channel = channel
         self.players = players
-        #: commands to execute after the current goal
-        self._backlog: deque[protocol.Command] = deque()
         self._goal: ActiveGoal | None = None
         self._engine: Any = None
         self._set_properties: Any = None
@@ -184,12 +181,10 @@ class GoalRunner:
                 voices = ()
             self._channel.send(protocol.VoiceList(voices))
         while not self._channel.closed:
-            if not self._backlog:
+            if self._goal is None:
                 self.wait()
-                continue
-            command = self._backlog.popleft()
-            if isinstance(command, protocol.GoalCommand):  # all other commands are for goals that have already ended
-                self._speak(command)
+            else:
+                self._speak(self._goal)
 
     def wait(self, interests: Iterable[Interest] = (), until: float = NEVER) -> None:
         """Wait for a descriptor, a command or a time limit, and execute any commands that arrive.
@@ -219,15 +214,15 @@ class GoalRunner:
             self._channel.send(protocol.Alive(self._goal.id if self._goal else ""))
 
     def _execute(self, command: protocol.Command) -> None:
-        """Execute a command for the current goal or for a voice. Add any other command to the backlog."""
+        """Execute a command. A command for a goal that has already ended is ignored."""
         goal = self._goal
         if isinstance(command, protocol.LoadVoice | protocol.DropVoice):
             if self._synthesizer is not None:
                 self._synthesizer.carry_out(command)
-        elif goal is None or isinstance(command, protocol.Configure | protocol.GoalCommand):
-            self._backlog.append(command)
-        elif goal.id != command.id:
-            return  # the goal has already ended
+        elif isinstance(command, protocol.GoalCommand):
+            self._begin_goal(command)
+        elif goal is None or isinstance(command, protocol.Configure) or goal.id != command.id:
+            return
         elif isinstance(command, protocol.Stop):
             self._stop_goal()
         elif isinstance(command, protocol.NextGoal):
@@ -276,25 +271,23 @@ class GoalRunner:
 
     # -- one goal
 
-    def _speak(self, command: protocol.Speak) -> None:
-        """Speak a goal. Return when the goal has ended."""
-        self._goal = goal = ActiveGoal(command, time.monotonic())
+    def _begin_goal(self, command: protocol.Speak) -> None:
+        """Make this the current goal, which `run` speaks next. Commands for it may have arrived together with it."""
+        self._goal = ActiveGoal(command, time.monotonic())
         self.hold_number, self.duration, self.gaps = 0, None, []
         self.players.begin(command)
         self._channel.send(protocol.Started(command.id))
-        # Some commands for this goal may have arrived together with it.
-        backlog, self._backlog = self._backlog, deque()
-        for each in backlog:
-            self._execute(each)
+
+    def _speak(self, goal: ActiveGoal) -> None:
+        """Speak a goal. Return when the goal has ended."""
         try:
-            goal.fallback_reason = self._set_properties(command)
+            goal.fallback_reason = self._set_properties(goal.command)
         except CannotSpeak as error:
-            if self._goal is not None:
-                self._fail(error.reason, str(error))
-        if self._goal is not None and self._pump is not None and command.lead_in:
+            self._fail(error.reason, str(error))
+        if self._goal is goal and self._pump is not None and goal.command.lead_in:
             self._fail(Reason.BAD_OPTION, "this driver plays by itself: it can't be given a lead-in")
         goal.error = None
-        while self._goal is not None:
+        while self._goal is goal:
             if goal.with_driver:
                 self._step_driver(goal)
             elif self._pump is not None and self.hold_number:
@@ -319,7 +312,7 @@ class GoalRunner:
         `talk`'s own driver speaks the whole text in one step. A third-party driver needs many steps.
         """
         self._engine.iterate()
-        if self._goal is None:
+        if self._goal is not goal:
             return
         if self._pump is None:
             self._fail(Reason.ENGINE_FAILED, "the driver lost the sentence")

@@ -21,13 +21,14 @@ from typing import TYPE_CHECKING
 from talkcli.engine import protocol
 from talkcli.engine.parent.process import EngineFailed, PrivateEngine
 from talkcli.errors import EXIT_ERROR, TalkError, UsageError
-from talkcli.goals.options import MAX_TEXT_CHARS, bad_text
+from talkcli.goals.options import INITIAL, MAX_TEXT_CHARS, SOUND_OPTIONS, bad_text
 from talkcli.goals.reasons import Reason
 from talkcli.goals.states import EXIT_CODES, State
 from talkcli.polling import wait_ready
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
+    from typing import Any
 
 #: Failures that exit with the code of a rejected goal. All other failures exit with the code of an aborted goal.
 _REJECTED_REASONS = frozenset({Reason.INVALID_TEXT, Reason.UNKNOWN_VOICE, Reason.BAD_OPTION})
@@ -68,26 +69,20 @@ def render(
     text: str,
     path: str,
     *,
-    rate: int = 200,
-    volume: float = 1.0,
-    voice: str | None = None,
-    pitch: int = 50,
     driver: str | None = None,
     timeout: float | None = None,
     interrupt: Mapping[int, int] | None = None,
+    **sound: Any,
 ) -> float:
     """Render a text to a WAV file, and return the length of the audio in seconds.
 
     Args:
         text: the text, of any length.
         path: the file to write, or "-" for standard output.
-        rate: words per minute, 80 to 450.
-        volume: 0.0 to 1.0.
-        voice: ID, name or language of a voice, or None for the default.
-        pitch: 0 to 100.
         driver: name of a pyttsx3 driver, or None for the default.
         timeout: time limit in seconds, or None for no limit.
         interrupt: descriptors that interrupt the rendering, as in `polling.wait_ready`.
+        sound: rate, volume, voice and pitch, if they differ from the defaults.
 
     Raises:
         RenderFailed: the text can't be spoken or the file can't be written.
@@ -100,11 +95,10 @@ def render(
     fault = bad_text(text, None)
     if fault is not None:
         raise RenderFailed(*fault)
+    sound = {each.name: getattr(INITIAL, each.name) for each in SOUND_OPTIONS} | sound
     # A rendering can wait for its voice to load. A file with a different voice would be useless.
-    commands = (
-        protocol.Speak(f"{number}", piece, rate, volume, voice, pitch, voice_only=True)
-        for number, piece in enumerate(pieces(text), 1)
-    )
+    numbered = enumerate(pieces(text), 1)
+    commands = (protocol.Speak(f"{number}", piece, **sound, voice_only=True) for number, piece in numbered)
     with contextlib.ExitStack() as stack:
         player: str | None = None
         output_fd: int | None = None

@@ -152,8 +152,7 @@ class WavPlayer(BuiltInPlayer):
             self.close()
 
     def _write_header(self) -> None:
-        length = self._start + self._taken
-        os.pwrite(self._file, _WAV_HEADER.pack(*_header_fields(self._rate, _RIFF_HEADER_BYTES + length, length)), 0)
+        os.pwrite(self._file, _WAV_HEADER.pack(*_header_fields(self._rate, self._start + self._taken)), 0)
 
 
 class WavStreamPlayer(BuiltInPlayer):
@@ -171,19 +170,15 @@ class WavStreamPlayer(BuiltInPlayer):
         """Open the player for a descriptor. If this is the `first` sentence, write a header before it."""
         super().__init__()
         self._output = output
-        self._header = _WAV_HEADER.pack(*_header_fields(rate, _UNKNOWN_BYTES, _UNKNOWN_BYTES)) if first else b""
+        self._header = _WAV_HEADER.pack(*_header_fields(rate, _UNKNOWN_BYTES)) if first else b""
         self._poll = select.poll()
         self._poll.register(output, select.POLLOUT)
 
     def offer(self, data: memoryview) -> int:
         if not self._poll.poll(0):  # a writable pipe has room for at least a header and a piece of samples
             return 0
-        try:
-            written = os.write(self._output, self._header + data if self._header else data)
-        except BlockingIOError:
-            return 0
-        except OSError as error:
-            raise CannotSpeak(Reason.AUDIO_LOST, f"{self.name}: {error.strerror}") from error
+        with _os_errors(Reason.AUDIO_LOST, self.name):
+            written = os.write(self._output, self._header + data)
         header = min(written, len(self._header))
         self._header = self._header[header:]
         self._taken += written - header
@@ -215,9 +210,10 @@ def _open_regular(path: str) -> int:
     return file
 
 
-def _header_fields(rate: int, riff_bytes: int, sample_bytes: int) -> tuple[bytes | int, ...]:
-    """Return the fields of a WAV header, given the lengths of the RIFF chunk and the samples."""
+def _header_fields(rate: int, sample_bytes: int) -> tuple[bytes | int, ...]:
+    """Return the fields of a WAV header, given the length of the samples."""
     audio_format = (1, 1, rate, rate * SAMPLE_BYTES, SAMPLE_BYTES, 8 * SAMPLE_BYTES)  # PCM, one channel
+    riff_bytes = min(_UNKNOWN_BYTES, _RIFF_HEADER_BYTES + sample_bytes)
     return b"RIFF", riff_bytes, b"WAVE", b"fmt ", 16, *audio_format, b"data", sample_bytes
 
 
@@ -233,7 +229,7 @@ def _sample_bytes(file: int, path: str, rate: int) -> int:
     header = os.pread(file, _WAV_HEADER.size, 0)
     found = _WAV_HEADER.unpack(header.ljust(_WAV_HEADER.size, b"\0"))
     found_rate, length = int(found[7]), int(found[12])
-    if found != _header_fields(found_rate, _RIFF_HEADER_BYTES + length, length):
+    if found != _header_fields(found_rate, length):
         fault = "is no WAV file of talk's (16 bit, one channel)"
     elif found_rate != rate:
         fault = f"has {found_rate} samples a second, this voice {rate}"

@@ -40,7 +40,6 @@ STREAM_READY, STREAM_FAILED, STREAM_TERMINATED = 2, 3, 4
 AUTO_TIMING_UPDATE, ADJUST_LATENCY = 0x8, 0x2000
 FLAT_VOLUME = 0x40
 MASK_SINK, MASK_SINK_INPUT = 0x1, 0x4
-FACILITY_MASK, EVENT_SINK, EVENT_SINK_INPUT = 0xF, 0, 2
 NO_ENTITY, CONNECTION_REFUSED, INVALID_SERVER = 5, 6, 13
 #: The value that a function returns instead of a size if it fails. This is -1 as a size_t.
 SIZE_ERROR = c_size_t(-1).value
@@ -121,8 +120,7 @@ PollCallback = CFUNCTYPE(c_int, POINTER(PollDescriptor), ctypes.c_ulong, c_int, 
 StreamCallback = CFUNCTYPE(None, c_void_p, c_void_p)
 #: A callback that receives a stream or context, whether an operation succeeded, and user data.
 SuccessCallback = CFUNCTYPE(None, c_void_p, c_int, c_void_p)
-#: A callback that receives a context, the facility and type of a change, the index of the changed object, and user
-#: data.
+#: A callback that receives a context, the kind of a change, the index of the changed object, and user data.
 ChangeCallback = CFUNCTYPE(None, c_void_p, c_int, c_uint32, c_void_p)
 SinkCallback = CFUNCTYPE(None, c_void_p, POINTER(SinkInfo), c_int, c_void_p)
 SinkInputCallback = CFUNCTYPE(None, c_void_p, POINTER(SinkInputInfo), c_int, c_void_p)
@@ -184,15 +182,12 @@ class MainLoop:
         self._pointer = library.mainloop_new()
         self._callback = PollCallback(self._poll)
         library.mainloop_set_poll_func(self._pointer, self._callback, None)
+        #: the pointer to pass to `pa_context_new`
+        self.api: int = library.mainloop_get_api(self._pointer)
         #: the descriptors that libpulse wants to wait for, and the monotonic time of its next timer
         self.interests: list[Interest] = []
         self.wake_at = NEVER
         self.freed = False
-
-    @property
-    def api(self) -> int:
-        """The pointer to pass to `pa_context_new`."""
-        return self._library.mainloop_get_api(self._pointer)  # type: ignore[no-any-return]
 
     def iterate(self) -> bool:
         """Run one iteration without waiting, and return whether it did any work."""

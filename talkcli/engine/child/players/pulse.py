@@ -109,7 +109,7 @@ class PulsePlayer(Player):
         self._underflow_callback = libpulse.StreamCallback(self._on_underflow)
         self._time_callback = libpulse.StreamCallback(self._on_time)
         self._drained_callback = libpulse.SuccessCallback(self._on_drained)
-        self._change_callback = libpulse.ChangeCallback(self._on_change)
+        self._change_callback = libpulse.ChangeCallback(self._request_levels)
         self._sink_callback = libpulse.SinkCallback(self._on_sink)
         self._stream_callback = libpulse.SinkInputCallback(self._on_stream)
         self._loop = libpulse.MainLoop(self._lib)
@@ -132,7 +132,7 @@ class PulsePlayer(Player):
         if length == 0:
             return 0
         if self._lib.stream_write(self._stream, bytes(data[:length]), length, None, 0, 0) < 0:
-            self._fail(Reason.AUDIO_LOST)
+            self._fail()
             self._check()
         self._written += length
         self._run()
@@ -222,7 +222,7 @@ class PulsePlayer(Player):
             return False
         state = self._lib.context_get_state(self._context)
         if state in (libpulse.CONTEXT_FAILED, libpulse.CONTEXT_TERMINATED):
-            self._fail(Reason.AUDIO_DEVICE if self._written == 0 else Reason.AUDIO_LOST)
+            self._fail()
             return False
         if time.monotonic() >= self._ready_by:
             self._error = CannotSpeak(
@@ -233,7 +233,7 @@ class PulsePlayer(Player):
             return state == libpulse.CONTEXT_READY and self._open_stream()
         state = self._lib.stream_get_state(self._stream)
         if state in (libpulse.STREAM_FAILED, libpulse.STREAM_TERMINATED):
-            self._fail(Reason.AUDIO_DEVICE if self._written == 0 else Reason.AUDIO_LOST)
+            self._fail()
         elif state == libpulse.STREAM_READY:
             asked = self._check_sink() or self._request_time()
             if self._closed and not self._draining and self._error is None:
@@ -250,7 +250,7 @@ class PulsePlayer(Player):
         spec = libpulse.SampleSpec(libpulse.S16LE, self._rate, 1)
         self._stream = self._lib.stream_new(self._context, b"talk", byref(spec), None)
         if self._stream is None:
-            self._fail(Reason.AUDIO_DEVICE)
+            self._fail()
             return False
         self._lib.stream_set_started_callback(self._stream, self._started_callback, None)
         self._lib.stream_set_underflow_callback(self._stream, self._underflow_callback, None)
@@ -258,7 +258,7 @@ class PulsePlayer(Player):
         flags = libpulse.ADJUST_LATENCY | libpulse.AUTO_TIMING_UPDATE
         device = None if self._wanted_device is None else self._wanted_device.encode()
         if self._lib.stream_connect_playback(self._stream, device, byref(sizes), flags, None, None) < 0:
-            self._fail(Reason.AUDIO_DEVICE)
+            self._fail()
         return True
 
     def _check_sink(self) -> bool:
@@ -271,13 +271,12 @@ class PulsePlayer(Player):
             if self.device == DUMMY_SINK != self._wanted_device:  # no other player would be heard either
                 reason, left = (Reason.AUDIO_DEVICE, "") if begins else (Reason.AUDIO_LOST, " left")
                 self._error = CannotSpeak(reason, f"the sound server has only a dummy output{left}", final=True)
-            self._request_sink_level()
             if begins:
                 self._ready_by, self._volume_settled_at = NEVER, time.monotonic() + VOLUME_SETTLES_S
                 self._lib.context_set_subscribe_callback(self._context, self._change_callback, None)
                 mask = libpulse.MASK_SINK | libpulse.MASK_SINK_INPUT
                 self._release(self._lib.context_subscribe(self._context, mask, None, None))
-                self._request_stream_level()
+            self._request_levels()
         self._check_mute()
         if not self._lib.stream_is_suspended(self._stream):
             if self._resumed_by != NEVER:
@@ -298,14 +297,12 @@ class PulsePlayer(Player):
         self._release(self._lib.stream_update_timing_info(self._stream, None, None))
         return True
 
-    def _request_sink_level(self) -> None:
-        index = self._sink_index
-        self._release(self._lib.context_get_sink_info_by_index(self._context, index, self._sink_callback, None))
-
-    def _request_stream_level(self) -> None:
+    def _request_levels(self, *_: Any) -> None:
+        """Request the volumes of the sink and the stream. libpulse calls this if any volume may have changed."""
         self._pending_levels += 1
-        index = self._lib.stream_get_index(self._stream)
-        self._release(self._lib.context_get_sink_input_info(self._context, index, self._stream_callback, None))
+        sink, stream = self._sink_index, self._lib.stream_get_index(self._stream)
+        self._release(self._lib.context_get_sink_info_by_index(self._context, sink, self._sink_callback, None))
+        self._release(self._lib.context_get_sink_input_info(self._context, stream, self._stream_callback, None))
 
     def _release(self, operation: int | None) -> None:
         """Release the handle of an operation, if there is one. The operation keeps running."""
@@ -341,10 +338,11 @@ class PulsePlayer(Player):
         """Forget the reported playback time, and request it again."""
         self._clock_report, self._time_request_at = None, 0.0
 
-    def _fail(self, reason: Reason) -> None:
+    def _fail(self) -> None:
         """Record that the stream has failed, with a message for libpulse's error number."""
         if self._error is not None:
             return
+        reason = Reason.AUDIO_DEVICE if self._written == 0 else Reason.AUDIO_LOST
         number = self._lib.context_errno(self._context)
         words = self._lib.strerror(number).decode("utf-8", "replace")
         message = f"the sound server ended the stream: {words}"
@@ -381,20 +379,12 @@ class PulsePlayer(Player):
 
     def _on_drained(self, _stream: int, success: int, _data: object) -> None:
         if not success:
-            self._fail(Reason.AUDIO_LOST)
+            self._fail()
             return
         self._check_sink()  # the stream may have been moved in the meantime
         self._volume_settled_at = 0.0
         self._check_mute()
         self._drained = self.proven = self._error is None
-
-    def _on_change(self, _context: int, event: int, index: int, _data: object) -> None:
-        """Request a volume that may have changed."""
-        facility = event & libpulse.FACILITY_MASK
-        if facility == libpulse.EVENT_SINK and index == self._sink_index:
-            self._request_sink_level()
-        elif facility == libpulse.EVENT_SINK_INPUT and index == self._lib.stream_get_index(self._stream):
-            self._request_stream_level()
 
     def _on_sink(self, _context: int, found: Any, end: int, _data: object) -> None:
         if end == 0 and found[0].index == self._sink_index:  # ignore a sink that the stream has left
