@@ -44,7 +44,9 @@ def main() -> None:
     # The server may have exited before `_die_with_parent` took effect.
     if not isinstance(configure, protocol.Configure) or os.getppid() != configure.server_pid:
         return
-    runner = GoalRunner(channel, PlayerChooser(configure, _inherited_descriptors()))
+    liveness = int(os.environ[protocol.LIVENESS_VARIABLE])
+    os.set_inheritable(liveness, False)  # if the descriptor isn't open, fail now instead of at every sentence
+    runner = GoalRunner(channel, PlayerChooser(configure, [liveness]))
     try:
         channel.send(start(configure, runner))
         runner.run(send_voices=configure.list_voices)
@@ -91,13 +93,3 @@ def _limit_memory() -> None:
     limit = max(_MIN_MEMORY_BYTES, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2)
     if soft == resource.RLIM_INFINITY or soft > limit:
         resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
-
-
-def _inherited_descriptors() -> list[int]:
-    """Return the descriptors that a player must inherit. The list is empty if the process was started by hand."""
-    value = os.environ.get(protocol.LIVENESS_VARIABLE)
-    if value is None:
-        return []
-    descriptor = int(value)
-    os.set_inheritable(descriptor, False)  # if the descriptor isn't open, fail now instead of at every sentence
-    return [descriptor]

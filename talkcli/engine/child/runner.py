@@ -88,16 +88,16 @@ class ActiveGoal:
         self.id = command.id
         self.command = command
         self.words = WordFinder(command.text)
-        #: time at which the goal started, plus the length of all its pauses
-        self.began_at = now
+        #: time at which the driver last received text
+        self.resumed_at = now
+        #: seconds of speech before that, if a third-party driver was paused
+        self.spoken_s = 0.0
         #: time at which the driver last received text or reported a word
         self.progress_at = now
         #: whether the driver is speaking the text; False while a third-party driver is paused
         self.with_driver = False
         #: whether a third-party driver was stopped in order to pause the goal
         self.interrupted = False
-        #: time at which a stopped third-party driver reported that it is silent
-        self.silent_at: float | None = None
         #: offset in the text at which the driver started speaking
         self.offset = 0
         #: offset in the text of the last word heard
@@ -298,11 +298,9 @@ class GoalRunner:
 
     def _send_to_driver(self, goal: ActiveGoal) -> None:
         """Have the driver speak the text, starting at the last word heard."""
-        goal.progress_at = time.monotonic()
-        if goal.silent_at is not None:
-            goal.began_at += goal.progress_at - goal.silent_at
+        goal.progress_at = goal.resumed_at = time.monotonic()
         goal.offset = goal.last_word
-        goal.with_driver, goal.interrupted, goal.silent_at = True, False, None
+        goal.with_driver, goal.interrupted = True, False
         if self._engine.say(goal.command.text[goal.offset :], goal.id) is not None:
             self._fail(Reason.NOTHING_TO_SAY, "nothing in the text can be spoken")
 
@@ -336,7 +334,8 @@ class GoalRunner:
         if found is not None:
             start, end, number = found
             goal.last_word, goal.progress_at = start, time.monotonic()
-            seconds = goal.progress_at - goal.began_at if self.position is None else self.position
+            spoken_s = goal.spoken_s + goal.progress_at - goal.resumed_at
+            seconds = spoken_s if self.position is None else self.position
             self._channel.send(protocol.Word(goal.id, start, end, number, round(seconds, 3)))
 
     def _record_error(self, exception: Exception, **_: object) -> None:
@@ -349,7 +348,8 @@ class GoalRunner:
             return
         error = goal.error
         if goal.interrupted and not (completed or goal.stop_requested or error):
-            goal.with_driver, goal.silent_at = False, time.monotonic()
+            goal.with_driver = False
+            goal.spoken_s += time.monotonic() - goal.resumed_at
         elif completed:
             self._end(protocol.OUTCOME_COMPLETED)
         elif isinstance(error, CannotSpeak):

@@ -10,7 +10,6 @@ import unicodedata
 from collections import deque
 
 from talkcli.frozen import frozen, replace
-from talkcli.polling import NEVER
 
 #: The rest of a word after its first part. Synthesizers report only "it" for "it's", and "well" for "well-known".
 _WORD_REST = re.compile(r"(?:['’-][^\W\d_]\w*|\.[^\W\d_](?!\w))+")
@@ -152,9 +151,9 @@ class WordClock:
         return position
 
     def next_word_at(self) -> float:
-        """Return the time at which the next word starts, or NEVER if no word is left or the clock is stopped."""
+        """Return the time at which the next word starts, or infinity if no word is left or the clock is stopped."""
         if self._started_at is None or not self._waiting:
-            return NEVER
+            return float("inf")
         position = self._waiting[0].position
         silence = sum(seconds for before, seconds in self._silences if before <= position)
         return self._started_at + position - self._begin + silence

@@ -131,8 +131,8 @@ _SIGNATURES: tuple[tuple[str, Any, list[Any]], ...] = (
     ("mainloop_free context_disconnect context_unref operation_unref stream_unref", None, [c_void_p]),
     ("mainloop_get_api", c_void_p, [c_void_p]),
     ("mainloop_set_poll_func", None, [c_void_p, PollCallback, c_void_p]),
-    ("mainloop_prepare", c_int, [c_void_p, c_int]),
-    ("mainloop_poll mainloop_dispatch context_get_state context_errno", c_int, [c_void_p]),
+    ("mainloop_iterate", c_int, [c_void_p, c_int, c_void_p]),
+    ("context_get_state context_errno", c_int, [c_void_p]),
     ("context_new", c_void_p, [c_void_p, c_char_p]),
     ("context_connect", c_int, [c_void_p, c_char_p, c_int, c_void_p]),
     ("context_set_subscribe_callback", None, [c_void_p, ChangeCallback, c_void_p]),
@@ -191,10 +191,8 @@ class MainLoop:
 
     def iterate(self) -> bool:
         """Run one iteration without waiting, and return whether it did any work."""
-        if self.freed or self._library.mainloop_prepare(self._pointer, -1) < 0:
-            return False
-        self._library.mainloop_poll(self._pointer)  # without this call, dispatch would abort the process
-        return bool(self._library.mainloop_dispatch(self._pointer) > 0)
+        # libpulse counts this as a wait, and so gives `_poll` the time of its next timer.
+        return not self.freed and bool(self._library.mainloop_iterate(self._pointer, 1, None) > 0)
 
     def free(self) -> None:
         """Free the loop, after its contexts have been released."""
@@ -204,7 +202,7 @@ class MainLoop:
     def _poll(self, wanted: Any, count: int, timeout: int, _: object) -> int:
         self.interests = [(wanted[number].fd, wanted[number].events) for number in range(count)]
         self.wake_at = NEVER if timeout < 0 else time.monotonic() + timeout / 1000
-        return int(self._library.poll(wanted, count, 0))
+        return max(0, int(self._library.poll(wanted, count, 0)))  # libpulse aborts the process after an error
 
 
 def loudest(volume: Volume) -> float:
