@@ -30,11 +30,11 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
     from talkcli.protocol.requests import Request
 
-PLAIN = [each.name for each in COMMANDS.values() if each.plain]
+PLAIN = [*COMMANDS]
 #: The options of a goal.
 GIVEN = [each.name for each in Say.options if each.flags and each.name not in {"wait", "feedback"}]
 TYPED = ParameterSource.COMMANDLINE
-ROWS = [*COMMON_OPTIONS, *(option for each in COMMANDS.values() if each.plain for option in each.options)]
+ROWS = [*COMMON_OPTIONS, *(option for each in COMMANDS.values() for option in each.options)]
 SPELLINGS = {form: each for each in ROWS for part in each.flags.split("/") for form in part.split(", ")}
 OPTIONS = sorted(SPELLINGS)
 VALUES = [
@@ -148,7 +148,15 @@ def test_the_lines_of_scripts_are_plain(line: str) -> None:
 @pytest.mark.parametrize(
     "line",
     [
-        *([], ["serve"], ["sya", "hello"], ["--version"], ["say", "-h"], ["say"], ["say", "--lines", "x"]),
+        *(
+            [],
+            ["serve", "--print-unit", "x"],
+            ["sya", "hello"],
+            ["--version"],
+            ["say", "-h"],
+            ["say"],
+            ["say", "--lines", "x"],
+        ),
         *(["say", "--wiat", "x"], ["say", "-x"], ["say", "x", "--rate", "79"], ["say", "x", "--rate"]),
         *(["say", "-w5", "x"], ["say", "x", "--flush", "--queue"], ["say", "x", "-t", "5"], ["say", "-wt", "0", "x"]),
         *(["status", "1", "2"], ["say", "x", "--ttl", "nan"], ["say", "x", "--key", ""], ["say", "x", "--wait=1"]),

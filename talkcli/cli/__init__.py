@@ -3,12 +3,13 @@
 Only this package uses click, prints to the terminal or exits the process.
 
 Scripts often call `say`, `wait`, `cancel` and `status`, and importing click takes longer than the server takes to
-answer. So `plain` parses simple command lines of these commands. It sends the request first, and imports the rest of
-the program afterwards. Click handles all other command lines, all errors and all help.
+answer. So `plain` parses simple command lines. If it can, it sends the request first, and imports the rest of the
+program afterwards. Click handles all other command lines, all errors and all help.
 """
 
 from __future__ import annotations
 
+import _signal
 import os
 import sys
 
@@ -31,6 +32,8 @@ def main() -> NoReturn:
 def run(arguments: list[str]) -> int:
     """Run a command line, and return its exit code."""
     _prepare_streams()
+    # The parent process may have left SIGCHLD ignored. The exit statuses of child processes would then be lost.
+    _signal.signal(_signal.SIGCHLD, _signal.SIG_DFL)
     if "_TALK_COMPLETE" not in os.environ:
         from talkcli.cli import plain
 

@@ -7,7 +7,6 @@ A command's function is only imported when the command is run, so that no comman
 
 from __future__ import annotations
 
-import _signal
 import os
 import re
 from inspect import cleandoc
@@ -264,8 +263,6 @@ def _first_screen(context: click.Context) -> str:
 
 def run(arguments: list[str]) -> int:
     """Run a command line or print its completions, and return the exit code."""
-    # The parent process may have left SIGCHLD ignored. The exit statuses of child processes would then be lost.
-    _signal.signal(_signal.SIGCHLD, _signal.SIG_DFL)
     options = CommonOptions()
     if "_TALK_COMPLETE" in os.environ:
         from talkcli.cli import completion

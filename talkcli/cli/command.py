@@ -87,8 +87,6 @@ class Command:
     urgent: bool = False
     #: a hint to add to the error message for an unknown option
     unknown_option_hint: str = ""
-    #: whether the lightweight parser in `plain` may parse the command
-    plain: bool = True
     #: whether the command uses a server, on this machine or on a robot of a fleet
     uses_server: bool = True
     #: whether --connect-timeout can be used with the command
@@ -224,6 +222,8 @@ def read_value(option: Option, text: str) -> Any:
         bad = next(filter(_is_bad_byte, text), None)
         if bad:
             raise ValueError(f"the byte {_format_byte(bad)} in it is not UTF-8")
+    if option.choices and text not in option.choices:
+        raise ValueError(f"'{text}' is not one of {', '.join(option.choices)}")
     if not text and kind in (WORD, ID, PATH):  # an empty value usually comes from an unset variable
         raise ValueError("empty; is the variable set that it comes from?")
     return text

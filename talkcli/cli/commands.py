@@ -176,7 +176,6 @@ _ROWS = (
         units.
         """,
         function="services:serve",
-        plain=False,
         uses_server=False,
         examples="""
         talk serve --rate 150
@@ -312,7 +311,6 @@ _ROWS = (
 
         With --json each event is an object a line, words included; the first is {"event": "snapshot", ...}.
         """,
-        plain=False,
         examples="""
         talk watch
         ssh robot talk watch
@@ -431,7 +429,6 @@ _ROWS = (
 
         With --robot it is the way to a robot of a fleet: broker, certificate, login, rights, the robot's answer.
         """,
-        plain=False,
         connects=False,
         examples="""
         talk doctor
@@ -460,7 +457,6 @@ _ROWS = (
         TALK_MQTT_PASSWORD_FILE, and for certificates TALK_MQTT_CA, TALK_MQTT_CERT and TALK_MQTT_KEY, all three files.
         """,
         function="services:bridge",
-        plain=False,
         uses_server=False,
         examples="""
         TALK_BROKER=mqtts://broker talk bridge --name anna
@@ -517,7 +513,6 @@ _ROWS = (
         voices.
         """,
         function="completion:completion",
-        plain=False,
         uses_server=False,
         examples="""
         eval "$(talk completion bash)"   the last line of ~/.bashrc

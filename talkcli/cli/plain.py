@@ -73,7 +73,7 @@ def _parse(arguments: list[str], environment: Mapping[str, str]) -> PlainCommand
             words.append(word)
         else:
             _read_option(flags, word, rest, given)
-    return _add_defaults(command, given, words, environment) if command and command.plain else None
+    return _add_defaults(command, given, words, environment) if command else None
 
 
 def _flag_table(options: Iterable[Option]) -> Flags:
@@ -107,8 +107,8 @@ def _add_defaults(
     typed = frozenset(given)
     for option in command.options:
         if option.name not in given:
-            text = environment.get(option.env) if option.env else None
-            given[option.name] = read_value(option, text) if text else option.default
+            value = (environment.get(option.env) if option.env else None) or option.default
+            given[option.name] = read_value(option, value) if isinstance(value, str) else value
     argument = command.argument
     if argument:
         many = argument.metavar.endswith("...")
