@@ -267,7 +267,7 @@ def test_watch_ends_with_its_iterator() -> None:
             break
         client.events()  # not even begun
         client.status()
-        watches = client._connection.listeners._watches
+        watches = client._connection.listeners.watches
         assert watches is not None
         assert len(watches) == 0
 

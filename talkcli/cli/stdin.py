@@ -349,11 +349,10 @@ class LineSpeaker:
 
     def _take_answer(self) -> None:
         """Process the server's answer to the last line, if it has arrived or the connection has ended."""
-        if self._unanswered is None or not (self._unanswered[1].over or self._connection.ended):
+        if self._unanswered is None or not self._unanswered[1].over:
             return
         (handle, exchange), number = self._unanswered, self._sending or 0
         self._unanswered = None
-        self._connection.forget(exchange)
         reply, _ = self._connection.answer(exchange)
         if handle.state is State.REJECTED:
             self._report_refused(number, handle.goal)

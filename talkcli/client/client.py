@@ -381,7 +381,7 @@ class Client:
 
         def accepted(reply: JsonObject, items: list[JsonObject]) -> None:
             buffer.add(Snapshot(ServerStatus.from_reply(reply, items)))
-            self._connection.listeners.watch(buffer)
+            self._connection.listeners.watches.add(buffer)
 
         self._connection.request(Watch(), accepted)
         return self._take_all(buffer)

@@ -141,12 +141,7 @@ class Connection(ClientCore):
         # `say` can be interrupted, because closing the connection cancels a goal that is waiting for room in the queue.
         interruptible = exchange.slow or not isinstance(request, Say)
         try:
-            deadline = self.answer_by(exchange)
-            while not self.wait_until(lambda: exchange.over, deadline, interruptible=interruptible):
-                # Each received line extends the deadline.
-                earlier, deadline = deadline, self.answer_by(exchange)
-                if deadline == earlier:
-                    break
+            self.wait_until(lambda: exchange.over, None, interruptible=interruptible)
         finally:
             with self.changed:
                 if not self.forget(exchange):
@@ -156,19 +151,15 @@ class Connection(ClientCore):
     def begin(self, request: Request, on_reply: OnReply | None = None, on_failure: OnFailure | None = None) -> Exchange:
         """Send a request without waiting for the answer. The arguments are those of `Exchange`.
 
-        If `on_failure` is None, the caller must call `forget` in the end.
-
-        Raises:
-            ServerUnavailable: nothing can be sent.
+        If `on_failure` is None, and the caller stops waiting for the answer, the caller must call `forget`.
         """
         exchange = self.exchange_type(request, on_reply, on_failure)
         with self.changed:
             self.register(exchange, time.monotonic())
             try:
                 self._send(exchange)
-            except BaseException:
-                self.forget(exchange)
-                raise
+            except ServerUnavailable as error:
+                self.fail(exchange, error)
         return exchange
 
     def submit(self, request: Request, on_reply: OnReply, on_failure: OnFailure) -> None:
@@ -189,17 +180,6 @@ class Connection(ClientCore):
             if self.ended is not None:
                 raise ServerUnavailable(f"nothing was sent to the server at {self.path}: {self.ended}")
             self.begin(request, on_reply, on_failure)
-
-    def post(self, request: Request) -> None:
-        """Send a request without blocking, and ignore the answer.
-
-        Raises:
-            ServerUnavailable: the request can't be sent.
-        """
-        failures: list[TalkError] = []
-        self.submit(request, lambda *_: None, failures.append)
-        if failures:
-            raise failures[0]
 
     def wait_until(
         self,
@@ -227,27 +207,28 @@ class Connection(ClientCore):
             Interrupted: one of the interrupting descriptors is ready.
         """
         began = time.monotonic() if since is None else since
-        last = False
+        deadline = float("inf") if deadline is None else deadline
+        late = False
         while True:
             with self.changed:
                 now = time.monotonic()
-                if not self.expire(now):
+                if late and not self.expire(now):
                     self._cut_off()
                 if done():
                     return True
                 if self.ended is not None:
                     return False
                 silent_at, why = self.silent_by(began)
-                end = silent_at if deadline is None else min(deadline, silent_at)
-                if last and now >= end:
-                    if deadline is not None and deadline <= silent_at:
+                if late and now >= min(deadline, silent_at):
+                    if deadline <= silent_at:
                         return False
                     self.break_off(why, now)
                     continue
-                # At the deadline, read once more without waiting, because messages that have already arrived must be
-                # processed.
-                last = now >= end
-                wait_s = max(0.0, min(end, self.next_expiry()) - now)
+                # When a time limit is reached, first read once more without waiting, because messages that have
+                # already arrived must be processed.
+                end = min(deadline, silent_at, self.next_expiry())
+                late = now >= end
+                wait_s = max(0.0, end - now)
                 if self._reading:
                     self.changed.wait(min(wait_s, threading.TIMEOUT_MAX))
                     continue
@@ -355,15 +336,10 @@ class SocketConnection(Connection):
 
     def _send(self, exchange: Exchange) -> None:
         line = self.line(exchange)
-        try:
-            if exchange.on_failure and self.unsent_bytes + len(line) > MAX_UNSENT_BYTES:
-                words = f"{MAX_UNSENT_BYTES >> 10} KiB wait to be sent to the server at {self.path} already"
-                raise ServerUnavailable(f"nothing was sent: {words}")
-            self.queue(line, exchange)
-        except ServerUnavailable as error:
-            if exchange.on_failure is None:
-                raise
-            self.fail(exchange, error)
+        if exchange.on_failure and self.unsent_bytes + len(line) > MAX_UNSENT_BYTES:
+            words = f"{MAX_UNSENT_BYTES >> 10} KiB wait to be sent to the server at {self.path} already"
+            raise ServerUnavailable(f"nothing was sent: {words}")
+        self.queue(line, exchange)
         self._flush()
 
     def _flush(self) -> None:
@@ -375,7 +351,7 @@ class SocketConnection(Connection):
             pass
         except OSError as error:  # keep the connection, because the server's last messages can still be read
             if self.greeted:
-                self.stop_sending("the server went away", f"the server at {self.path} went away: {error.strerror}")
+                self.stop_sending(f"the server went away: {error.strerror}")
 
     def _step(self, timeout: float, interruptible: bool) -> None:
         with self.changed:
@@ -419,7 +395,7 @@ class SocketConnection(Connection):
             self._socket.close()
 
     def _cut_off(self) -> None:
-        self.stop_sending(f"it took nothing for {self._patience:g} s", f"the server at {self.path} does not answer")
+        self.stop_sending(f"it took nothing for {self._patience:g} s")
         self._shut(SHUT_WR)
 
     def _shut(self, direction: int) -> None:
@@ -483,12 +459,6 @@ class ReconnectingConnection(SocketConnection):
             for each in self._given_up:
                 each.close()
             self._given_up.clear()
-
-    def post(self, request: Request) -> None:
-        failures: list[TalkError] = []
-        self.submit(request, lambda *_: None, failures.append)
-        if failures and self.unsent_bytes:  # the buffer is full, because it would be empty if the connection had broken
-            raise failures[0]
 
     def receive(self, data: bytes, now: float) -> None:
         try:

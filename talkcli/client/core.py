@@ -20,7 +20,7 @@ from collections import deque
 from collections.abc import Callable
 
 from talkcli.errors import AccessDenied, BadRequest, Lost, ServerUnavailable, TalkError, Unreadable, refusal
-from talkcli.frozen import TYPE_CHECKING, frozen, replace
+from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import Say
 from talkcli.goals.states import State
@@ -40,8 +40,6 @@ if TYPE_CHECKING:
 OnReply = Callable[["JsonObject", "list[JsonObject]"], None]
 #: A callback for the error if a request was refused, not sent, or not answered.
 OnFailure = Callable[["TalkError"], None]
-#: A callback for the events of a goal. After reconnecting, it is also called with the goal's current state.
-Listener = Callable[["Event | Goal | GoalLost"], None]
 
 #: If the server sends nothing for this time, the connection is treated as broken. A working server sends waiting
 #: clients a message at least every 5 s.
@@ -56,14 +54,6 @@ MAX_FEEDBACK_EVENTS = 5_000
 #: Maximum number of buffered state changes, which is enough for about 3,000 goals. If there are more, the reader's
 #: stream ends.
 MAX_STATE_EVENTS = 10_000
-
-
-@frozen
-class GoalLost:
-    """Tells a goal's listeners that the goal is lost, so that no more events will follow."""
-
-    #: a human-readable reason
-    why: str
 
 
 class EventBuffer:
@@ -111,48 +101,32 @@ class EventBuffer:
 
 
 class EventListeners:
-    """The listeners of single goals, and the event buffers of readers that watch all goals."""
+    """The receivers of a connection's events: followed goals, and readers that watch all goals."""
 
     def __init__(self) -> None:
-        #: listeners by goal id, and whether each of them also receives words
-        self._goals: dict[str, dict[Listener, bool]] = {}
-        #: weak references, because a reader stops watching by dropping its iterator
-        self._watches: WeakSet[EventBuffer] = WeakSet()
+        #: the followed goals, by id. A goal can be followed several times.
+        self._goals: dict[str, set[TrackedGoal]] = {}
+        #: the buffers of the readers that watch all goals. A reader stops watching by dropping its buffer.
+        self.watches: WeakSet[EventBuffer] = WeakSet()
 
-    def add(self, goal_id: str, listener: Listener, *, feedback: bool = False) -> None:
-        """Add a listener for a goal's events and for all pauses. It is removed when the goal has ended or is lost.
-
-        Args:
-            goal_id: the goal's id.
-            listener: the function to call. Adding the same listener again has no effect, except for `feedback`.
-            feedback: whether the listener also receives words.
-        """
-        listeners = self._goals.setdefault(goal_id, {})
-        listeners[listener] = feedback or listeners.get(listener, False)
-
-    def watch(self, buffer: EventBuffer) -> None:
-        """Add all events to this buffer until its reader drops it."""
-        self._watches.add(buffer)
-
-    @property
-    def watched(self) -> bool:
-        """Whether any reader watches all goals."""
-        return bool(self._watches)
+    def add(self, tracked: TrackedGoal) -> None:
+        """Pass a goal's events and all pauses to this object, until the goal has ended or is lost."""
+        self._goals.setdefault(tracked.goal.id, set()).add(tracked)
 
     @property
     def goals(self) -> dict[str, bool]:
-        """The ids of all goals with listeners, and whether any of a goal's listeners receives words."""
-        return {goal_id: any(listeners.values()) for goal_id, listeners in self._goals.items()}
+        """The ids of all followed goals, and whether any follower of a goal receives words."""
+        return {goal_id: any(each._with_feedback for each in some) for goal_id, some in self._goals.items()}
 
     def lose(self, goal_id: str, why: str) -> None:
-        """Tell a goal's listeners that the goal is lost, and remove them. `why` is a human-readable reason."""
-        for listener in self._goals.pop(goal_id, {}):
-            listener(GoalLost(why))
+        """End a followed goal as LOST. `why` is a human-readable reason."""
+        for tracked in self._goals.pop(goal_id, set()):
+            tracked._mark_lost(why)
 
     def update(self, goal: Goal) -> None:
-        """Pass the current state of a goal to its listeners."""
-        for listener in self._goals.get(goal.id, {}):
-            listener(goal)
+        """Pass on the current state of a followed goal."""
+        for tracked in self._goals.get(goal.id, set()):
+            tracked._hear(goal)
 
     def end_watches(self, why: str, *, include_reconnecting: bool) -> None:
         """Close the buffers of the readers that watch all goals.
@@ -161,27 +135,27 @@ class EventListeners:
             why: a human-readable reason.
             include_reconnecting: whether to also close buffers that are still used after reconnecting.
         """
-        for buffer in list(self._watches):
+        for buffer in list(self.watches):
             if include_reconnecting or not buffer.reconnects:
                 buffer.closed = buffer.closed or why
-                self._watches.discard(buffer)
+                self.watches.discard(buffer)
 
     def publish(self, event: Event | None) -> None:
-        """Pass an event to the goal's listeners and to the readers that watch all goals. None is ignored."""
+        """Pass an event to the followed goal and to the readers that watch all goals. None is ignored."""
         if isinstance(event, Result):
-            for listener in self._goals.pop(event.goal.id, {}):
-                listener(event)
+            for tracked in self._goals.pop(event.goal.id, set()):
+                tracked._update(event.goal)
             return
         if isinstance(event, StateChanged | WordHeard | PausedChanged):
             for goal_id in self._goals if isinstance(event, PausedChanged) else [event.id]:
-                for listener in self._goals.get(goal_id, {}):
-                    listener(event)
+                for tracked in self._goals.get(goal_id, set()):
+                    tracked._hear(event)
             state = event.state if isinstance(event, StateChanged) and not event.goal else None
             if state is State.PENDING or (state and state.terminal):
                 return  # clients that watch all goals receive this event again, with the whole goal
         elif not isinstance(event, Snapshot):
             return
-        for buffer in self._watches:
+        for buffer in self.watches:
             buffer.add(event)
 
 
@@ -219,36 +193,38 @@ class TrackedGoal:
         if self._followed_at is None:
             self._followed_at = now
         if not self.goal.state.terminal:
-            listeners.add(self.goal.id, self._hear, feedback=feedback)
+            listeners.add(self)
 
     def _fail(self, error: TalkError) -> None:
         """End the goal because `say` failed: as LOST if the goal may be spoken, and otherwise as REJECTED."""
         from talkcli.goals.reasons import Reason  # rarely needed, and slow to import
 
         if isinstance(error, Lost):
-            self._update(lost(self.goal, error.message))
+            self._mark_lost(error.message)
         else:
             reason = Reason.NOT_SENT.value if isinstance(error, ServerUnavailable) else error.code
             message = f"Talk rejected: {error.message}"
             self._update(replace(self.goal, state=State.REJECTED, reason=reason, message=message))
+
+    def _mark_lost(self, why: str) -> None:
+        """End the goal as LOST. `why` is a human-readable reason."""
+        from talkcli.goals.reasons import Reason  # rarely needed, and slow to import
+
+        self._update(replace(self.goal, state=State.LOST, reason=Reason.LOST.value, message=f"Talk lost: {why}"))
 
     def _update(self, goal: Goal) -> None:
         """Update the goal, unless it has already ended."""
         if not self.goal.state.terminal:
             self.goal = goal
 
-    def _hear(self, event: Event | Goal | GoalLost) -> None:
-        """Process an event of this goal, or a pause of all speech."""
+    def _hear(self, event: StateChanged | WordHeard | PausedChanged | Goal) -> None:
+        """Process an event of this goal, a pause of all speech, or the goal's current state after reconnecting."""
         if self.goal.state.terminal:
             return
         if isinstance(event, Goal):
             if event.state is not self.goal.state:
                 self._buffer.add(StateChanged(event.id, event.state))
             self.goal = event
-        elif isinstance(event, GoalLost):
-            self.goal = lost(self.goal, event.why)
-        elif isinstance(event, Result):
-            self.goal = event.goal
         elif isinstance(event, StateChanged):
             # A terminal state is followed by the Result, which has more details.
             if not event.state.terminal:
@@ -269,13 +245,6 @@ class TrackedGoal:
     def _take(self) -> Event | None:
         """Remove and return the oldest event. If there is none, return the Result of an ended goal."""
         return self._buffer.take() or (Result(self.goal) if self.goal.state.terminal else None)
-
-
-def lost(goal: Goal, why: str) -> Goal:
-    """Return a copy of a goal in the state LOST. `why` is a human-readable reason."""
-    from talkcli.goals.reasons import Reason  # rarely needed, and slow to import
-
-    return replace(goal, state=State.LOST, reason=Reason.LOST.value, message=f"Talk lost: {why}")
 
 
 def read_greeting(line: bytes, path: str, version: str) -> JsonObject:
@@ -320,7 +289,7 @@ class Exchange:
             request: the request.
             on_reply: called if the server accepts the request.
             on_failure: called if the server refuses the request or doesn't answer. Without this function, the caller
-                must wait for the answer.
+                must wait for the answer, and the request isn't kept until the client has reconnected.
         """
         self.request = request
         self.on_reply, self.on_failure = on_reply, on_failure
@@ -331,7 +300,7 @@ class Exchange:
         #: the list items that have been received
         self.items: list[JsonObject] = []
         self.reply: JsonObject | None = None
-        #: the error, if the request failed without a reply
+        #: the error, if the request failed
         self.error: TalkError | None = None
         #: monotonic time of the last received line, or of the beginning of the exchange
         self.heard_at = 0.0
@@ -417,9 +386,8 @@ class ClientCore:
         Raises:
             ServerUnavailable: nothing more can be sent.
         """
-        why = self.ended or self._sending_ended
-        if why:
-            raise ServerUnavailable(f"nothing was sent to the server at {self.path}: {why}")
+        if self.ended is not None or self._sending_ended is not None:
+            raise self.unanswered(exchange)
         self._unsent.append((line, exchange))
         early, self._sent_early = self._sent_early, b""
         if not line.startswith(early):
@@ -466,18 +434,13 @@ class ClientCore:
                 break
         return True
 
-    def stop_sending(self, why: str, message: str) -> None:
-        """Fail all unsent and later requests. Answers to earlier requests can still be received.
-
-        Args:
-            why: the reason, which becomes a part of the error messages of later requests.
-            message: the whole error message of requests that are waiting to be sent.
-        """
+    def stop_sending(self, why: str) -> None:
+        """Fail all unsent and later requests, for this reason. Answers to earlier requests can still be received."""
         self._sending_ended = self._sending_ended or why
         unsent = [exchange for _, exchange in self._unsent]
         self._drop_lines()
         for exchange in unsent:
-            self.fail(exchange, ServerUnavailable(message))
+            self.fail(exchange, self.unanswered(exchange))
 
     def answer(self, exchange: Exchange) -> tuple[JsonObject, list[JsonObject]]:
         """Return the reply to a request, and its list items.
@@ -487,12 +450,8 @@ class ClientCore:
             ServerUnavailable: the request was not sent, or the server didn't answer a request without lasting effect.
             Lost: the request was sent, but not answered. It may have taken effect.
         """
-        if exchange.error is not None:
-            raise exchange.error
         if exchange.reply is None:
-            raise self.unanswered(exchange)
-        if exchange.reply.get("ok") is not True:
-            raise self.refusal(exchange.reply, exchange.items)
+            raise exchange.error or self.unanswered(exchange)
         return exchange.reply, exchange.items
 
     def unanswered(self, exchange: Exchange) -> TalkError:
@@ -502,8 +461,7 @@ class ClientCore:
         if not exchange.sent:
             if self.connect_error and not self.ended:
                 why = " ".join(self.connect_error.message.split())
-            if not why:
-                return ServerUnavailable(f"the server at {self.path} does not answer")
+            why = why or self._sending_ended or "it does not answer"
             return ServerUnavailable(f"nothing was sent to the server at {self.path}: {why}")
         why = why or f"it did not reply within {self._patience:g} s"
         words = f"{request.kind} was sent to the server at {self.path}, but {why}"
@@ -544,7 +502,7 @@ class ClientCore:
 
     def next_expiry(self) -> float:
         """Return the time by which `expire` must be called."""
-        times = [self.answer_by(each) for each in self.exchanges.values() if each.on_failure]
+        times = [self.answer_by(each) for each in self.exchanges.values()]
         if self.listeners.goals:
             times.append(self.goals_lost_at())
         return min(times, default=float("inf"))
@@ -552,13 +510,11 @@ class ClientCore:
     def expire(self, now: float) -> bool:
         """Fail exchanges that have reached their time limit, and lose goals after a long disconnection.
 
-        Exchanges without an `on_failure` are not affected, because their callers wait for the answer.
-
         Returns:
             False if the connection must be closed, because a part of a line has been sent (see `forget`).
         """
         intact = True
-        for exchange in [each for each in self.exchanges.values() if each.on_failure and self.answer_by(each) <= now]:
+        for exchange in [each for each in self.exchanges.values() if self.answer_by(each) <= now]:
             intact = self.forget(exchange) and intact
             self.fail(exchange, self.unanswered(exchange))
         if now >= self.goals_lost_at():
@@ -617,7 +573,7 @@ class ClientCore:
         if message.get("seq") is None and message.get("ok") is False:
             self._last_error = f"the server closed it: {self.refusal(message, [])}"
         exchange = self.match(message)
-        if exchange is None or exchange.over:
+        if exchange is None:
             return None
         exchange.heard_at = now
         if "ok" not in message:
@@ -632,21 +588,19 @@ class ClientCore:
         Raises:
             Unreadable: a goal in the reply is malformed.
         """
-        if exchange.on_failure:
-            del self.exchanges[exchange.number]
-        if reply.get("ok") is not True and exchange.on_failure:
-            exchange.on_failure(self.refusal(reply, exchange.items))
-        elif reply.get("ok") is True and exchange.on_reply:
-            try:
+        if reply.get("ok") is not True:
+            self.fail(exchange, self.refusal(reply, exchange.items))
+            return
+        try:
+            if exchange.on_reply:
                 exchange.on_reply(reply, exchange.items)
-            except Unreadable as error:
-                # This request may have taken effect, so `unanswered` creates its error instead.
-                if not isinstance(exchange.request, self.lasting):
-                    exchange.error = error
-                if exchange.on_failure:
-                    exchange.on_failure(exchange.error or self.unanswered(exchange))
-                raise
-        exchange.reply = reply  # a malformed reply raises an error before this line
+        except Unreadable as error:
+            # If the request may have taken effect, it fails when this error breaks the connection.
+            if not isinstance(exchange.request, self.lasting):
+                self.fail(exchange, error)
+            raise
+        exchange.reply = reply
+        self.exchanges.pop(exchange.number, None)
 
     # -- disconnecting and reconnecting
 
@@ -659,9 +613,7 @@ class ClientCore:
         if self.ended is not None:
             return
         self.ended = self._last_error or why
-        self._drop_lines()
-        for exchange in [each for each in self.exchanges.values() if each.on_failure]:
-            self.fail(exchange, self.unanswered(exchange))
+        self._fail_all()
 
     def disconnected(self, why: str, now: float) -> None:
         """Record that the connection has broken and the shell is going to reconnect. All unanswered requests fail."""
@@ -669,9 +621,7 @@ class ClientCore:
         self.absent_since, self._last_error, self._sending_ended = now, None, None
         self.greeted = False
         self.begin_stream()
-        self._drop_lines()
-        for exchange in list(self.exchanges.values()):
-            self.fail(exchange, self.unanswered(exchange))
+        self._fail_all()
         why = f"nothing more is heard of the server at {self.path}: {self.absence}"
         self.listeners.end_watches(why, include_reconnecting=False)
 
@@ -713,7 +663,7 @@ class ClientCore:
         waiting, self._unsent = self._unsent, deque()
         for goal_id, feedback in self.listeners.goals.items():
             self._follow_again(goal_id, feedback=feedback, now=now)
-        if self.listeners.watched:
+        if self.listeners.watches:
             self._watch_again(now)
         for _, exchange in waiting:
             self.queue(self._line_now(exchange, now), exchange)
@@ -762,9 +712,15 @@ class ClientCore:
         if exchange.over:
             return
         exchange.error = error
+        self.exchanges.pop(exchange.number, None)
         if exchange.on_failure:
-            self.exchanges.pop(exchange.number, None)
             exchange.on_failure(error)
+
+    def _fail_all(self) -> None:
+        """Fail all unanswered requests, and send nothing more of them."""
+        self._drop_lines()
+        for exchange in list(self.exchanges.values()):
+            self.fail(exchange, self.unanswered(exchange))
 
     def _lose_goals(self) -> None:
         """End all followed goals as LOST."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 
 from talkcli.client.connection import taken
-from talkcli.client.core import TrackedGoal, lost
+from talkcli.client.core import TrackedGoal
 from talkcli.errors import UsageError
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.goal import Goal
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from talkcli.client.connection import Connection
+    from talkcli.errors import TalkError
     from talkcli.goals.goal import JsonObject
     from talkcli.protocol.events import Event
 
@@ -130,7 +131,10 @@ class GoalHandle(TrackedGoal):
             ServerUnavailable: the client is closed, or 256 KiB of requests are waiting to be sent.
         """
         if self.id and (not self.state.terminal or self.state is State.LOST):
-            self._connection.post(Cancel((self.id,)))
+            failures: list[TalkError] = []
+            self._connection.submit(Cancel((self.id,)), lambda *_: None, failures.append)
+            if failures and self._connection.unsent_bytes:  # the buffer is full; after a break, it would be empty
+                raise failures[0]
 
     def cancel(self) -> Goal:
         """Cancel the goal, and return it once it has ended and is silent.
@@ -186,7 +190,7 @@ class GoalHandle(TrackedGoal):
         ended = self._connection.ended
         if ended is not None:
             with self._connection.changed:
-                self._update(lost(self.goal, f"{ended}; it may still be spoken"))
+                self._mark_lost(f"{ended}; it may still be spoken")
         return ended is not None
 
 

@@ -120,7 +120,7 @@ class LocalConnection(ClientCore):
             pass
         except OSError as error:
             # Send nothing more, because the server may have received half a line. `read` will report the error.
-            self.stop_sending("the server went away", str(error))
+            self.stop_sending(str(error))
             self.abort()
         if self.outgoing():
             self._loop.add_writer(self._socket, self._flush)

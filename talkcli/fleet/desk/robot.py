@@ -290,7 +290,7 @@ class RobotConnection(Connection):
                 self.fail(exchange, self._lost_error(exchange, self.absence))
             else:
                 self._resend(exchange)
-        if self.listeners.watched:
+        if self.listeners.watches:
             self._watch_again(now)
 
     def _resend(self, exchange: RobotExchange) -> None:
