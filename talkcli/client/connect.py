@@ -37,12 +37,9 @@ _REFUSALS = (b'"ok": false', b'"state": "REJECTED"')
 ANSWER_LIMIT_S = 5.0
 #: How long to keep trying if a server has too many clients or a full backlog.
 BUSY_LIMIT_S = 5.0
-#: The minimum and maximum pause before trying again if a server is busy. The pause is random, so that refused clients
-#: don't all try again at the same moment.
-BUSY_PAUSE_S = (0.02, 0.2)
-#: The first and longest pause before trying again if a server has not started yet. The pause doubles after each
-#: attempt.
-_FIRST_RETRY_PAUSE_S, _LONGEST_RETRY_PAUSE_S = 0.02, 0.25
+#: The minimum and maximum pause before trying again. The pause is random, so that refused clients don't all try again
+#: at the same moment.
+RETRY_PAUSE_S = (0.02, 0.2)
 #: Advice for users who can't connect to a server.
 _START_STEP = "start one with: talk serve"
 _LET_IN_STEP = "have its owner let you in, with `talk serve --socket-mode 0660` and the socket's group"
@@ -232,16 +229,14 @@ def connect(
     from talkcli.errors import AccessDenied, Busy, ServerUnavailable
 
     give_up = time.monotonic() + (keep_trying or min(BUSY_LIMIT_S, patience))
-    attempt, next_pause = attempt or reach(named), _FIRST_RETRY_PAUSE_S
+    attempt = attempt or reach(named)
     while True:
         error: TalkError | None = None
-        busy = attempt.backlog_full
-        again = busy or (keep_trying > 0 and _may_start(attempt))
+        again = attempt.backlog_full or (keep_trying > 0 and _may_start(attempt))
         if attempt.socket:
-            greet_by = time.monotonic() + patience
-            if keep_trying:
-                greet_by = max(greet_by, give_up)
-                greet_by = greet_by if end is None else min(greet_by, end)
+            greet_by = max(time.monotonic() + patience, give_up)
+            if keep_trying and end is not None:
+                greet_by = min(greet_by, end)
             try:
                 return _greet(attempt, attempt.socket, hello, greet_by, interrupt)
             except AccessDenied as denied:
@@ -250,21 +245,16 @@ def connect(
                 attempt = reach(named, (*attempt.failures, (attempt.path, denied)))
                 continue
             except Busy as refused:
-                error, again, busy = refused, True, True
+                error, again = refused, True
             except ConnectionError:
                 error = ServerUnavailable(f"the server at {attempt.path} closed the connection before it answered")
                 again = keep_trying > 0
         left = give_up - time.monotonic()
         if not again or attempt.request_sent or left <= 0:
             raise error or unreachable(attempt, named)
-        pause = next_pause
-        if busy:
-            import random
+        import random  # rarely needed, and slow to import
 
-            pause = random.uniform(*BUSY_PAUSE_S)
-        else:
-            next_pause = min(2 * pause, _LONGEST_RETRY_PAUSE_S)
-        wait_ready({}, min(pause, left), interrupt)
+        wait_ready({}, min(random.uniform(*RETRY_PAUSE_S), left), interrupt)
         attempt = reach(named)
 
 
@@ -292,8 +282,8 @@ def _greet(
     """
     from select import POLLIN
 
-    from talkcli import __version__, peers
-    from talkcli.client.core import identity, read_greeting
+    from talkcli import peers
+    from talkcli.client.core import read_greeting
     from talkcli.errors import ServerUnavailable
     from talkcli.protocol.lines import request_line
 
@@ -314,7 +304,7 @@ def _greet(
                 raise ConnectionResetError
             received += data
         line, _, received = received.partition(b"\n")
-        boot, pid = identity(read_greeting(line, attempt.path, __version__))
+        boot, pid = read_greeting(line, attempt.path)
     except BaseException:
         connected.close()
         raise

@@ -10,9 +10,9 @@ import os
 import select
 import threading
 import time
-from _socket import SHUT_RDWR, SHUT_WR  # importing `socket` takes longer (see `peers`)
+from _socket import SHUT_RDWR  # importing `socket` takes longer (see `peers`)
 
-from talkcli import __version__, paths, peers
+from talkcli import paths, peers
 from talkcli.client.connect import ANSWER_LIMIT_S, connect, hello, reach, sender_name, unreachable
 from talkcli.client.core import MAX_UNSENT_BYTES, ClientCore, Exchange
 from talkcli.errors import ServerUnavailable, TalkError, UsageError
@@ -42,6 +42,16 @@ _FIRST_RECONNECT_PAUSE_S, _LONGEST_RECONNECT_PAUSE_S = 0.02, 0.5
 _MAX_READS = 4
 #: How often a thread without a socket checks whether another thread has reconnected.
 _RECONNECT_CHECK_S = 0.1
+
+
+def checked_sender_name(name: str | None) -> str | None:
+    """Return the same as `sender_name`. Raises UsageError if the name is too long."""
+    name = sender_name(name)
+    if name and len(name) > MAX_SENDER_NAME_CHARS:
+        raise UsageError(
+            f"the name of the sender has {len(name)} characters, the longest allowed is {MAX_SENDER_NAME_CHARS}"
+        )
+    return name
 
 
 def taken(connection: Connection, take: Callable[[], _T], end: float | None) -> Iterator[_T]:
@@ -250,7 +260,11 @@ class Connection(ClientCore):
             if heard == self._heard:
                 break
 
-    # -- methods that each transport implements. Callers of `_send`, `_hang_up` and `_cut_off` hold the lock `changed`.
+    def _cut_off(self) -> None:
+        """Break the connection, because a line could only be sent in part. The caller must hold the lock `changed`."""
+        self.break_off(f"it took nothing for {self._patience:g} s", time.monotonic())
+
+    # -- methods that each transport implements. Callers of `_send` and `_hang_up` hold the lock `changed`.
 
     def _send(self, exchange: Exchange) -> None:
         """Send or queue the request of a registered exchange.
@@ -275,9 +289,6 @@ class Connection(ClientCore):
     def _drop(self) -> None:
         """Close this process's descriptors, but not those of the parent process."""
         raise NotImplementedError
-
-    def _cut_off(self) -> None:
-        """Disconnect, because a line could only be sent in part."""
 
 
 class SocketConnection(Connection):
@@ -312,12 +323,7 @@ class SocketConnection(Connection):
         """
         super().__init__(patience)
         self._interrupt = interrupt
-        name = sender_name(name)
-        if name and len(name) > MAX_SENDER_NAME_CHARS:
-            raise UsageError(
-                f"the name of the sender has {len(name)} characters, the longest allowed is {MAX_SENDER_NAME_CHARS}"
-            )
-        self._hello_message = hello(name, urgent=urgent)
+        self._hello_message = hello(checked_sender_name(name), urgent=urgent)
         self._named = paths.named_socket(socket)
         give_up = time.monotonic() + keep_trying
         attempt = connect(self._named, self._hello_message, patience, self._interrupt, attempt, keep_trying, end)
@@ -388,22 +394,15 @@ class SocketConnection(Connection):
                 self.break_off(why, now)
 
     def _hang_up(self) -> None:
-        self._shut(SHUT_RDWR)  # closing the socket would not wake the reading thread
+        try:
+            if self._socket is not None:
+                self._socket.shutdown(SHUT_RDWR)  # closing the socket would not wake the reading thread
+        except OSError:
+            pass  # the server has closed the connection
 
     def _drop(self) -> None:
         if self._socket is not None:
             self._socket.close()
-
-    def _cut_off(self) -> None:
-        self.stop_sending(f"it took nothing for {self._patience:g} s")
-        self._shut(SHUT_WR)
-
-    def _shut(self, direction: int) -> None:
-        try:
-            if self._socket is not None:
-                self._socket.shutdown(direction)
-        except OSError:
-            pass  # the server has closed the connection
 
 
 class ReconnectingConnection(SocketConnection):
@@ -415,8 +414,6 @@ class ReconnectingConnection(SocketConnection):
     def __init__(self, socket: str | None = None, *, name: str | None = None, patience: float = ANSWER_LIMIT_S) -> None:
         """Connect to a server. The arguments are those of `SocketConnection`."""
         super().__init__(socket, name=name, patience=patience)
-        #: former sockets, which only the reading thread may close, because it may still be polling them
-        self._given_up: list[_socket.socket] = []
         #: monotonic time of the next attempt to connect. During an attempt, this is the time limit for the greeting.
         self._due = 0.0
         #: the pause to make after the next failed attempt
@@ -448,17 +445,18 @@ class ReconnectingConnection(SocketConnection):
         with self.changed:
             now = time.monotonic()
             if self._socket is not None and not self.greeted and now >= self._due:
+                self._drop()
                 self._give_up_socket()
                 self._not_connected(ServerUnavailable(f"the server at {self.path} does not answer"), now)
             if self.ended is None:
                 self._connect_again(now)
             if not self.greeted:
                 timeout = max(0.0, min(timeout, self._due - now))
+            polled = self._socket
         super()._step(timeout, interruptible)
         with self.changed:
-            for each in self._given_up:
-                each.close()
-            self._given_up.clear()
+            if polled is not None and polled is not self._socket:
+                polled.close()
 
     def receive(self, data: bytes, now: float) -> None:
         try:
@@ -476,7 +474,7 @@ class ReconnectingConnection(SocketConnection):
             self._not_connected(unreachable(found, self._named), now)
             return
         self._socket, self._due = found.socket, now + self._patience
-        self.connecting(request_line(self._hello_message), __version__)
+        self.connecting(request_line(self._hello_message))
         self._flush()
 
     def _not_connected(self, error: TalkError, now: float) -> None:
@@ -485,16 +483,11 @@ class ReconnectingConnection(SocketConnection):
         self.not_connected(error)
 
     def _give_up_socket(self) -> None:
-        """Disconnect. If a thread is reading, that thread closes the socket later.
+        """Disconnect. If a thread is reading, that thread closes the socket, because it may still be polling it.
 
         The caller must hold the lock `changed`.
         """
         self._hang_up()
-        if self._socket is not None and self._reading:
-            self._given_up.append(self._socket)
-        elif self._socket is not None:
-            self._socket.close()
+        if not self._reading:
+            self._drop()
         self._socket = None
-
-    def _cut_off(self) -> None:
-        self.break_off(f"it took nothing for {self._patience:g} s", time.monotonic())

@@ -247,13 +247,8 @@ class TrackedGoal:
         return self._buffer.take() or (Result(self.goal) if self.goal.state.terminal else None)
 
 
-def read_greeting(line: bytes, path: str, version: str) -> JsonObject:
-    """Read a server's greeting, and check that this client can use the server.
-
-    Args:
-        line: the server's first line, without its newline.
-        path: the server's socket or address, for error messages.
-        version: this client's version, for error messages.
+def read_greeting(line: bytes, path: str) -> tuple[str, int | None]:
+    """Read a server's first line, and return the server's boot id and process id.
 
     Raises:
         ServerUnavailable: the line is not a greeting.
@@ -265,12 +260,12 @@ def read_greeting(line: bytes, path: str, version: str) -> JsonObject:
         greeting = {}
     if "talk" not in greeting:
         raise ServerUnavailable(f"what answers at {path} is no talk server")
-    events.check_greeting(greeting, version)
+    events.check_greeting(greeting)
     if "error" in greeting:
         from talkcli.terminal.text import printable  # rarely needed, and slow to import
 
         raise AccessDenied(f"the server refuses: {printable(str(greeting.get('message') or greeting['error']))}")
-    return greeting
+    return identity(greeting)
 
 
 def identity(server: JsonObject) -> tuple[str, int | None]:
@@ -359,8 +354,6 @@ class ClientCore:
         self._first_sent_bytes = 0
         #: the unsent part of the hello line, which is sent before the server's greeting arrives
         self._hello = b""
-        #: this client's version, for error messages
-        self._version = ""
         #: the bytes of the first request that were sent before this object was created
         self._sent_early = b""
         #: why requests can no longer be sent, or None if they can. Answers may still be received.
@@ -546,7 +539,7 @@ class ClientCore:
             if self.ended is not None or self._splitter is not splitter:
                 return  # processing the previous line has ended the connection
             if not self.greeted:
-                self.connected(*identity(read_greeting(line, self.path, self._version)), now)
+                self.connected(*read_greeting(line, self.path), now)
                 continue
             try:
                 self.dispatch(decode(line), now)
@@ -625,14 +618,9 @@ class ClientCore:
         why = f"nothing more is heard of the server at {self.path}: {self.absence}"
         self.listeners.end_watches(why, include_reconnecting=False)
 
-    def connecting(self, hello: bytes, version: str) -> None:
-        """Prepare for a new connection. Requests wait until the server has sent its greeting.
-
-        Args:
-            hello: the line to be sent first.
-            version: this client's version, for error messages.
-        """
-        self.greeted, self._hello, self._version = False, hello, version
+    def connecting(self, hello: bytes) -> None:
+        """Prepare for a new connection, on which `hello` is sent first. Requests wait for the server's greeting."""
+        self.greeted, self._hello = False, hello
         self.begin_stream()
 
     def not_connected(self, error: TalkError) -> None:

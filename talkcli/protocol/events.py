@@ -8,6 +8,7 @@ another PROTOCOL number. `{"request": "cancel"}` and `{"request": "status"}` sta
 
 from __future__ import annotations
 
+from talkcli import __version__
 from talkcli.errors import BadRequest, Busy, ProtocolMismatch, Unreadable
 from talkcli.frozen import TYPE_CHECKING, fields, frozen
 from talkcli.goals.goal import By, Goal, read_fields
@@ -214,7 +215,7 @@ def busy_greeting(message: str | None = None) -> JsonObject:
     return {"talk": PROTOCOL, "error": "busy", **({} if message is None else {"message": message})}
 
 
-def check_greeting(message: JsonObject, version: str) -> None:
+def check_greeting(message: JsonObject) -> None:
     """Raise ProtocolMismatch or Busy if a greeting shows that this client can't use the server."""
     theirs = message.get("talk")
     if theirs != PROTOCOL or isinstance(theirs, bool):
@@ -222,7 +223,7 @@ def check_greeting(message: JsonObject, version: str) -> None:
         older = isinstance(theirs, int) and theirs < PROTOCOL
         side = "restart the server with the newer version" if older else "upgrade this command"
         raise ProtocolMismatch(
-            f"this command (version {version}) speaks protocol {PROTOCOL}, the server (version {server}) speaks "
+            f"this command (version {__version__}) speaks protocol {PROTOCOL}, the server (version {server}) speaks "
             f"{theirs!a}: {side}"
         )
     if message.get("error") == "busy":

@@ -112,7 +112,7 @@ def say(core: ClientCore, now: float = 0.0, **options: Any) -> TrackedGoal:
 
 
 def greet(core: ClientCore, boot: str = "4k7f", now: float = 2.0) -> None:
-    core.connecting(HELLO, "1.0")
+    core.connecting(HELLO)
     core.mark_sent(len(HELLO))
     hear(core, {"talk": 1, "version": "1.0", "pid": 7, "boot": boot, "features": []}, now=now)
 
@@ -425,7 +425,7 @@ def test_a_goal_that_is_said_without_a_connection_waits_for_one(reconnecting: Cl
     reconnecting.not_connected(ServerUnavailable("no server"))
     with pytest.raises(ServerUnavailable, match="no server"):
         reconnecting.answer(waits_for)
-    reconnecting.connecting(HELLO, "1.0")
+    reconnecting.connecting(HELLO)
     assert reconnecting.outgoing() == HELLO
     reconnecting.mark_sent(len(HELLO))
     assert reconnecting.outgoing() == b""
@@ -460,7 +460,7 @@ def test_a_greeting_that_refuses_is_an_error(
     reconnecting: ClientCore, greeting: JsonObject, error: type[TalkError]
 ) -> None:
     reconnecting.disconnected("it is gone", 1.0)
-    reconnecting.connecting(HELLO, "1.0")
+    reconnecting.connecting(HELLO)
     with pytest.raises(error):
         hear(reconnecting, greeting)
 

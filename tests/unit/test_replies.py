@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from talkcli import __version__
 from talkcli.errors import BadRequest, Busy, ProtocolMismatch
 from talkcli.protocol.events import PROTOCOL, busy_greeting, check_greeting, failure, greeting, item, ok, take_seq
 from talkcli.protocol.lines import decode, encode
@@ -18,8 +19,8 @@ def test_greeting_says_protocol_version_process_and_boot() -> None:
     message = greeting("1.2.3", 4711, "4k7f")
     assert message == {"talk": 1, "version": "1.2.3", "pid": 4711, "boot": "4k7f", "features": []}
     assert PROTOCOL == 1
-    check_greeting(decode(encode(message)), "0.9")
-    check_greeting({**message, "features": ["pause"], "new": {"a": 1}}, "0.1")
+    check_greeting(decode(encode(message)))
+    check_greeting({**message, "features": ["pause"], "new": {"a": 1}})
 
 
 @pytest.mark.parametrize(
@@ -28,16 +29,16 @@ def test_greeting_says_protocol_version_process_and_boot() -> None:
 )
 def test_another_protocol_is_a_mismatch_that_says_which_side_to_upgrade(theirs: int, side: str) -> None:
     with pytest.raises(ProtocolMismatch, match=side) as mismatch:
-        check_greeting({**greeting("3.0", 1, "4k7f"), "talk": theirs}, "0.1")
+        check_greeting({**greeting("3.0", 1, "4k7f"), "talk": theirs})
     assert mismatch.value.exit_code == 9
-    assert "0.1" in mismatch.value.message
+    assert __version__ in mismatch.value.message
     assert "3.0" in mismatch.value.message
 
 
 @pytest.mark.parametrize("message", [{}, {"talk": None}, {"talk": "1"}, {"talk": True}, {"talk": [1]}, {"ok": True}])
 def test_what_is_no_greeting_is_a_mismatch(message: JsonObject) -> None:
     with pytest.raises(ProtocolMismatch):
-        check_greeting(message, "0.1")
+        check_greeting(message)
 
 
 @pytest.mark.parametrize(
@@ -52,7 +53,7 @@ def test_what_is_no_greeting_is_a_mismatch(message: JsonObject) -> None:
 )
 def test_a_server_that_is_full_is_busy_and_may_say_why(greeting: JsonObject, words: str) -> None:
     with pytest.raises(Busy, match=words) as busy:
-        check_greeting(greeting, "0.1")
+        check_greeting(greeting)
     assert (busy.value.code, busy.value.exit_code) == ("busy", 5)
 
 

@@ -11,9 +11,9 @@ import contextlib
 import random
 from typing import TYPE_CHECKING
 
-from talkcli import __version__, paths, peers
+from talkcli import paths, peers
 from talkcli.client import connect
-from talkcli.client.core import ClientCore, identity, read_greeting
+from talkcli.client.core import ClientCore, read_greeting
 from talkcli.errors import AccessDenied, Busy, ServerUnavailable, TalkError
 from talkcli.protocol.lines import MAX_LINE_BYTES, request_line
 
@@ -46,24 +46,24 @@ class LocalConnection(ClientCore):
         Raises:
             ServerUnavailable, AccessDenied, ProtocolMismatch, Busy: the server can't be used.
         """
-        self.connecting(request_line(hello), __version__)
+        self.connecting(request_line(hello))
         self._flush()
-        pid, _ = peers.credentials(self._socket)
+        listener, _ = peers.credentials(self._socket)
         limit = self._loop.call_later(connect.ANSWER_LIMIT_S, self.abort)
         try:
             first, *self._lines = await self.read() or [b""]
             if not first and self._loop.time() >= limit.when():
-                hint = f"look at process {pid}, and restart it if it hangs"
+                hint = f"look at process {listener}, and restart it if it hangs"
                 raise ServerUnavailable(f"the server at {self.path} does not answer; {hint}")
             if not first:
                 raise ServerUnavailable(f"the server at {self.path} closed the connection before it answered")
-            greeting = read_greeting(first, self.path, __version__)
+            boot, pid = read_greeting(first, self.path)
         except BaseException:
             self.close()
             raise
         finally:
             limit.cancel()
-        self.connected(*identity(greeting), self._loop.time())
+        self.connected(boot, pid, self._loop.time())
 
     async def read(self) -> list[bytes]:
         """Wait for lines, and return them without their newlines.
@@ -182,4 +182,4 @@ async def _dial(place: str | None, hello: JsonObject) -> LocalConnection:
             error = connect.unreachable(attempt, place)
         if not (attempt.backlog_full or isinstance(error, Busy)) or loop.time() > give_up:
             raise error
-        await asyncio.sleep(random.uniform(*connect.BUSY_PAUSE_S))
+        await asyncio.sleep(random.uniform(*connect.RETRY_PAUSE_S))

@@ -13,9 +13,8 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Any
 
-from talkcli import __version__
-from talkcli.client.connect import ANSWER_LIMIT_S, sender_name
-from talkcli.client.connection import Connection
+from talkcli.client.connect import ANSWER_LIMIT_S
+from talkcli.client.connection import Connection, checked_sender_name
 from talkcli.client.core import Exchange, identity
 from talkcli.errors import AccessDenied, BadRequest, Lost, ServerUnavailable, TalkError, UnknownGoal, UsageError
 from talkcli.fleet import topics
@@ -23,7 +22,7 @@ from talkcli.fleet.desk.link import ABSENCE_LIMIT_S, DeskLink
 from talkcli.fleet.desk.request import NoServer
 from talkcli.fleet.link import Link, boottime
 from talkcli.frozen import replace
-from talkcli.goals.options import MAX_SENDER_NAME_CHARS, Cancel, Say, Set
+from talkcli.goals.options import Cancel, Say, Set
 from talkcli.polling import wait_ready
 from talkcli.protocol.events import check_greeting
 from talkcli.protocol.lines import decode
@@ -96,11 +95,7 @@ class RobotConnection(Connection):
         fault = topics.name_fault(robot)
         if fault:
             raise UsageError(f"no robot can be called '{printable(robot)}': a name {fault}")
-        self._sender = sender_name(name)
-        if self._sender and len(self._sender) > MAX_SENDER_NAME_CHARS:
-            raise UsageError(
-                f"the name of the sender has {len(self._sender)} characters, the longest is {MAX_SENDER_NAME_CHARS}"
-            )
+        self._sender = checked_sender_name(name)
         self.robot, self._desk = robot, desk
         self._numbers = numbers or self._numbers
         self.path = f"{robot} ({desk.broker.url})"
@@ -265,7 +260,7 @@ class RobotConnection(Connection):
 
     def check_online(self) -> None:
         """Raise ServerUnavailable or ProtocolMismatch if the robot can't receive requests at the moment."""
-        check_greeting(self._presence, __version__)
+        check_greeting(self._presence)
         if self.absent_since is not None:
             raise ServerUnavailable(f"{self.absence}: nothing was sent")
 
