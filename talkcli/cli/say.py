@@ -60,18 +60,17 @@ def say(
         from talkcli.cli.stdin import LineSpeaker
 
         return LineSpeaker(options, name, goal_options, wait, feedback, timeout, ahead).run()
-    sentence = " ".join(text)
+    sentence: str | int = " ".join(text)
     if text == ("-",):
         from talkcli.cli.stdin import InputTooLong, read_text, rejected_goal
 
         try:
-            read = read_text(options.deadline(timeout), wait=wait, whole=output is not None)
+            sentence = read_text(options.deadline(timeout), wait=wait, whole=output is not None)
         except InputTooLong as error:
             reporter = GoalReporter(options, feedback=feedback)
             return retry_without_output(reporter.report_refused, rejected_goal(str(error)))
-        if isinstance(read, int):
-            return read  # a signal or closed output has ended the reading
-        sentence = read
+    if isinstance(sentence, int):
+        return sentence  # a signal or closed output has ended the reading
     if output is not None:
         return _write_file(output, sentence, goal_options, timeout, options)
     return _say_text(sentence, goal_options, name, timeout, options, wait=wait, feedback=feedback)
@@ -87,7 +86,7 @@ def _say_text(
     wait: bool,
     feedback: bool,
 ) -> int:
-    text, end = _without_bad_bytes(text, options), options.deadline(timeout)
+    text, end = without_bad_bytes(text, options), options.deadline(timeout)
     with Interrupts(blocked=options.blocked_signals, output=wait) as interrupts:
         try:
             with options.connect(timeout, name=name, interrupt=interrupts.watched) as client:
@@ -107,7 +106,7 @@ def _say_text(
     return interrupts.exit_code
 
 
-def _without_bad_bytes(text: str, options: CommonOptions) -> str:
+def without_bad_bytes(text: str, options: CommonOptions) -> str:
     """Replace bytes that aren't valid UTF-8, and print a message about them."""
     text, problem = replace_bad_bytes(text)
     if problem and not options.quiet:
@@ -164,7 +163,7 @@ def _write_file(
         if options.json:
             raise UsageError("--json prints to standard output, where the sound goes: leave one of them out")
         standard_output()
-    text = _without_bad_bytes(text, options)
+    text = without_bad_bytes(text, options)
     with Interrupts() as interrupts:
         try:
             seconds = render(text, path, timeout=seconds_at_most, interrupt=interrupts.watched, **settings)

@@ -12,12 +12,12 @@ import sys
 from typing import TYPE_CHECKING
 
 from talkcli import paths
-from talkcli.cli.command import replace_bad_bytes
 from talkcli.cli.interrupts import Interrupts, discard_unread_output
+from talkcli.cli.say import without_bad_bytes
 from talkcli.cli.show import note, retry_without_output, show, show_error, show_if_possible, show_json
 from talkcli.cli.wait import CANCEL_TIMEOUT_S, seconds_left, timeout_error
 from talkcli.client.connect import ANSWER_LIMIT_S
-from talkcli.errors import EXIT_DIFFER, EXIT_OK, EXIT_TIMEOUT, TalkError, UsageError
+from talkcli.errors import EXIT_DIFFER, EXIT_OK, EXIT_TIMEOUT, TalkError
 from talkcli.frozen import replace
 from talkcli.goals.options import Cancel, Say, Set
 from talkcli.polling import Interrupted
@@ -49,21 +49,14 @@ def say(
     The arguments are explained in `say.say`.
     """
     discard_unread_output()
-    sentence = " ".join(text)
+    sentence: str | int = " ".join(text)
     if text == ("-",):
-        from talkcli.cli.stdin import InputTooLong, read_text
+        from talkcli.cli.stdin import read_text
 
-        try:
-            read = read_text(options.deadline(timeout), wait=wait)
-        except InputTooLong as error:
-            raise UsageError(str(error)) from error
-        if isinstance(read, int):
-            return read  # a signal or closed output has ended the reading
-        sentence = read
-    sentence, unreadable = replace_bad_bytes(sentence)
-    if unreadable and not options.quiet:
-        note(unreadable)
-    return _ask(options, Say(sentence, wait=wait, **chosen), timeout, name)
+        sentence = read_text(options.deadline(timeout), wait=wait)
+    if isinstance(sentence, int):
+        return sentence  # a signal or closed output has ended the reading
+    return _ask(options, Say(without_bad_bytes(sentence, options), wait=wait, **chosen), timeout, name)
 
 
 def wait(options: CommonOptions, ids: tuple[str, ...], timeout: float | None) -> int:

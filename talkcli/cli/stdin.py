@@ -14,19 +14,19 @@ import signal
 import time
 from collections import deque
 from functools import partial
-from itertools import islice
 
 from talkcli.cli.command import replace_bad_bytes
 from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.show import note, retry_without_output, show_error, show_if_possible, write_error_line
 from talkcli.cli.wait import CANCEL_TIMEOUT_S, GoalReporter, seconds_left, timeout_error
-from talkcli.errors import EXIT_OK, ServerUnavailable, TalkError, TimedOut, UnknownGoal, UsageError
+from talkcli.client.core import MIN_TTL_S
+from talkcli.errors import EXIT_OK, ServerUnavailable, TalkError, TimedOut, UsageError
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import MAX_TEXT_BYTES, MAX_TEXT_CHARS, Say, format_number
 from talkcli.goals.states import State
 from talkcli.polling import Interrupted, wait_ready
-from talkcli.protocol.events import Canceled, Result, unfinished
+from talkcli.protocol.events import Result, unfinished
 from talkcli.protocol.lines import LineSplitter, TruncatedLine
 
 if TYPE_CHECKING:
@@ -49,15 +49,11 @@ _MAX_BUFFERED_BYTES = 1_000_000
 _DEFAULT_PENDING_GOALS = 10
 #: The maximum number of started or ended goals that haven't been reported yet.
 _MAX_UNREPORTED_GOALS = 1_000
-#: The maximum number of expired lines to drop before signals and the server are checked again.
-_MAX_DROPPED_LINES = 1_000
 #: The deadline that is used if there is no time limit.
 _NO_LIMIT = float("inf")
-#: The minimum ttl that is sent, because 0 would mean no limit.
-_MIN_TTL_S = 0.01
 
 
-class InputTooLong(Exception):
+class InputTooLong(UsageError):
     """Raised if standard input exceeds the maximum length of a text."""
 
 
@@ -310,7 +306,7 @@ class LineSpeaker:
             TimeoutError: the time limit of the command is over.
         """
         if self._error is None:
-            for line in islice(self._buffer.take_late(time.monotonic()), _MAX_DROPPED_LINES):
+            for line in self._buffer.take_late(time.monotonic()):
                 self._report_expired(line)
             while self._buffer.first and not (self._unanswered or self._full):
                 self._send(self._buffer.take())
@@ -338,7 +334,7 @@ class LineSpeaker:
             self._feedback.note(problem)
         goal_options = self._goal_options
         if self._ttl:
-            goal_options = {**goal_options, "ttl": max(_MIN_TTL_S, round(line.end - time.monotonic(), 2))}
+            goal_options = {**goal_options, "ttl": max(MIN_TTL_S, round(line.end - time.monotonic(), 2))}
         # Follow the goal even without --wait, to find out when it is no longer pending.
         request = Say(text, wait=True, feedback=self._feedback.shows_events, patient=True, **goal_options)
         handle, accepted = self._client._handle(request)
@@ -459,12 +455,14 @@ class LineSpeaker:
         """Cancel these goals, and report how they ended."""
         self._options.urgent = True
         try:
-            with self._options.connect(CANCEL_TIMEOUT_S, interrupt=self._interrupts.watched) as client:
+            with self._options.connect(CANCEL_TIMEOUT_S, interrupt=self._interrupts.watched, end=None) as client:
                 # The server may have accepted one more goal just before the connection was closed.
-                ended = _cancel_goals(client, list(dict.fromkeys([*ids, *_own_goals(client)])))
+                ids = list(dict.fromkeys([*ids, *_own_goals(client)]))
+                done = client.cancel(ids)
         except (TalkError, Interrupted) as error:
             self._feedback.note(f"cancelled, but it is not known whether it is silent: {str(error) or 'interrupted'}")
             return
+        ended = sorted((*done.ended, *done.canceled), key=lambda each: ids.index(each.id))
         for goal in ended:
             if self._feedback.shows_events:
                 retry_without_output(self._feedback.show, goal, Result(goal))
@@ -493,12 +491,3 @@ def _own_goals(client: Client) -> list[str]:
         return []  # process ids can't be compared with those of another machine
     goals = unfinished(client.status())
     return [each.id for each in goals if each.client is not None and each.client.pid == os.getpid()]
-
-
-def _cancel_goals(client: Client, ids: list[str]) -> list[Goal]:
-    """Cancel goals, and return them in the order of `ids`."""
-    try:
-        done = client.cancel(ids)
-    except UnknownGoal as error:
-        done = Canceled.from_items(error.items)
-    return sorted((*done.ended, *done.canceled), key=lambda each: ids.index(each.id))

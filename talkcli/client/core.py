@@ -47,7 +47,7 @@ SILENCE_LIMIT_S = 15.0
 #: Maximum size of the requests that are waiting to be sent.
 MAX_UNSENT_BYTES = 256 * 1024
 #: The minimum TTL in a request, because 0 would mean no limit.
-_MIN_TTL_S = 0.01
+MIN_TTL_S = 0.01
 #: Maximum number of buffered words and pauses. If there are more, the oldest are dropped. This is enough for the
 #: longest text, which has 10,000 characters and thus at most 5,000 words.
 MAX_FEEDBACK_EVENTS = 5_000
@@ -660,7 +660,7 @@ class ClientCore:
         """Return a waiting request's line, with its TTL reduced by the time waited."""
         request = exchange.request
         if isinstance(request, Say) and request.ttl:
-            exchange.request = replace(request, ttl=max(_MIN_TTL_S, request.ttl - (now - exchange.heard_at)))
+            exchange.request = replace(request, ttl=max(MIN_TTL_S, request.ttl - (now - exchange.heard_at)))
         exchange.heard_at = now
         return self.line(exchange)
 

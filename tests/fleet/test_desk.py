@@ -8,12 +8,15 @@ import os
 import re
 import signal
 import socket
+import subprocess
+import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from talkcli import Client, Fleet, State
+from talkcli.cli.wait import CANCEL_TIMEOUT_S
 from talkcli.errors import Lost
 from tests.fleet.robot import LONG, Robot
 from tests.fleet.told import presence
@@ -131,6 +134,22 @@ def test_lines_are_spoken_in_their_order_also_if_there_are_more_than_may_wait(ro
         assert (done.code, len(done.out.splitlines())) == (0, len(lines)), done
     assert robot.talk.run("wait").code == 0
     assert robot.talk.watcher.texts("SUCCEEDED") == lines * 2
+
+
+def test_ctrl_c_cancels_the_lines_that_were_sent_however_long_ago_the_command_began(robot: Robot) -> None:
+    with Desk(robot.broker) as somebody:
+        client = somebody.start("--robot", "anna", "say", "--lines", "--wait", stdin=subprocess.PIPE)
+        assert client.stdin
+        assert client.stdout
+        client.stdin.write("never-ends words=1\nsecond\n")
+        client.stdin.flush()
+        ids = [client.stdout.readline().strip() for _ in range(2)]
+        robot.talk.watcher.wait_for_word(ids[0])
+        time.sleep(CANCEL_TIMEOUT_S)
+        client.send_signal(signal.SIGINT)
+        done = somebody.finish(client)
+    assert (done.code, "not known" in done.err) == (130, False), done
+    assert [robot.talk.watcher.wait_for_terminal(each) for each in ids] == ["PREEMPTED", "RECALLED"]
 
 
 @pytest.mark.parametrize(
