@@ -41,7 +41,6 @@ def frozen(cls: type[_T]) -> type[_T]:
         "__match_args__": names,
         "_defaults": defaults,
         "_made": 0,
-        "_names": frozenset(names),
         "__qualname__": cls.__qualname__,
     }
     meta: Any = type(cls)
@@ -70,7 +69,7 @@ class _Methods:
         values = {**cls._defaults, **given, **named}
         cls._made += 1
         # The arguments are valid if they set each field exactly once.
-        invalid = values.keys() != cls._names or len(given) != len(arguments) or not named.keys().isdisjoint(given)
+        invalid = values.keys() != set(names) or len(given) != len(arguments) or not named.keys().isdisjoint(given)
         if invalid or cls._made > _COMPILE_AFTER_COUNT:
             cls.__init__ = _compile_init(cls)
             cls.__init__(self, *arguments, **named)  # raises the usual TypeError if the arguments are invalid

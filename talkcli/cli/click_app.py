@@ -172,8 +172,7 @@ class ClickCommand(_HelpfulCommand):
 
     def __init__(self, row: Command) -> None:
         self.row = row
-        self.examples = row.examples
-        self.exit_codes = {1: "anything not named here; a bug says so", **row.exit_codes}
+        self.examples, self.exit_codes = row.examples, row.all_exit_codes
         arguments: list[click.Parameter] = [_click_argument(row.argument)] if row.argument else []
         own, common = map(_click_option, row.options), [_click_option(each, common=True) for each in COMMON_OPTIONS]
         super().__init__(

@@ -31,8 +31,8 @@ FILE_MODE = Kind("string", (str,), "must be a string", "MODE")
 #: Options that can't be used with several robots.
 _SINGLE_ROBOT_OPTIONS = ("lines", "ahead", "feedback", "output")
 
-#: The exit codes shared by all commands that use a server. A command can override their descriptions.
-SERVER_EXIT_CODES: ExitCodes = {
+#: The exit codes shared by all commands that connect to a server. A command can override their descriptions.
+_SERVER_EXIT_CODES: ExitCodes = {
     2: "usage: what is wrong stands on standard error",
     3: "no server: nothing was sent, so it is safe to try again",
     5: "the server has as many clients as it takes",
@@ -41,13 +41,13 @@ SERVER_EXIT_CODES: ExitCodes = {
     12: "lost: it was sent, then nothing more was heard; it may have an effect all the same",
 }
 #: The exit codes shared by all commands that can be sent to several robots.
-FLEET_EXIT_CODES: ExitCodes = {
-    **SERVER_EXIT_CODES,
+_FLEET_EXIT_CODES: ExitCodes = {
+    **_SERVER_EXIT_CODES,
     13: "robots differ: those that did not do it failed in more than one way",
 }
 #: All exit codes, for `talk --help` and the README. Each command's own help is more specific.
 ALL_EXIT_CODES: ExitCodes = {
-    **FLEET_EXIT_CODES,
+    **_FLEET_EXIT_CODES,
     0: "accepted; with --wait succeeded: all of it was played",
     1: "anything not named here; a bug says so, and TALK_DEBUG=1 where",
     2: "usage",
@@ -75,7 +75,7 @@ class Command:
     description: str
     #: example command lines, one per line
     examples: str
-    #: the meanings of the exit codes, except for 1 if it stands for any other error
+    #: the meanings of the exit codes that the command has besides the usual ones, or describes more precisely
     exit_codes: ExitCodes
     #: the function that runs the command, as "module:name", or an empty string for the command's function in `ask`; its
     #: arguments are the common options and the command's own
@@ -94,6 +94,14 @@ class Command:
     #: the function that sends the command to several robots, as "module:name", or an empty string
     fleet_function: str = ""
     rule: Rule | None = None
+
+    @property
+    def all_exit_codes(self) -> ExitCodes:
+        """The meanings of all exit codes of the command."""
+        usual: ExitCodes = {}
+        if self.uses_server and self.connects:
+            usual = _FLEET_EXIT_CODES if self.fleet_function else _SERVER_EXIT_CODES
+        return {1: "anything not named here; a bug says so", 2: "usage", **usual, **self.exit_codes}
 
     def usage_fault(self, given: Mapping[str, Any], typed: frozenset[str], common: Mapping[str, Any]) -> str | None:
         """Return an error message if the options can't be combined, otherwise None.

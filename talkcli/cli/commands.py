@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 
-from talkcli.cli.command import FILE_MODE, FLEET_EXIT_CODES, OUTPUT_FILE, SERVER_EXIT_CODES, Command, option, spelling
+from talkcli.cli.command import FILE_MODE, OUTPUT_FILE, Command, option, spelling
 from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals import options as goal_options
 from talkcli.goals.options import FLAG, ID, IDS, INTEGER, MAX_LOG_GOALS, MAX_TEXT_CHARS, NUMBER, TEXT, WORD, Option
@@ -214,7 +214,6 @@ _ROWS = (
         talk say -o - "hello" | aplay
         """,
         exit_codes={
-            **FLEET_EXIT_CODES,
             0: "accepted; with --wait succeeded: all of it was played; throttled, as was asked for",
             4: "aborted: engine or audio failed; 'talk doctor' says more",
             5: "rejected: never queued (bad text, full queue or full server)",
@@ -245,7 +244,6 @@ _ROWS = (
         talk wait "$id"
         """,
         exit_codes={
-            **FLEET_EXIT_CODES,
             0: "all succeeded; or no ID was given, and all have ended",
             4: "aborted; 4 to 7 are those of the first goal in order that did not succeed",
             5: "rejected; or the server has as many clients as it takes",
@@ -277,11 +275,7 @@ _ROWS = (
         talk cancel --key battery   what was sent with --key battery
         talk cancel 12 13           these goals of this server
         """,
-        exit_codes={
-            **FLEET_EXIT_CODES,
-            0: "it is silent, or was already",
-            8: "an ID is unknown; the others are cancelled all the same",
-        },
+        exit_codes={0: "it is silent, or was already", 8: "an ID is unknown; the others are cancelled all the same"},
         options=tuple(each for each in goal_options.Cancel.options if each.flags),
         argument=_GOAL_IDS,
         urgent=True,
@@ -296,7 +290,7 @@ _ROWS = (
         talk status 12                          goal 12 of this server
         talk --json status | jq .active.text
         """,
-        exit_codes={**FLEET_EXIT_CODES, 0: "the server runs", 8: "unknown goal"},
+        exit_codes={0: "the server runs", 8: "unknown goal"},
         argument=Option("goal_id", ID, metavar="[ID]", completion="known_ids"),
         urgent=True,
     ),
@@ -317,7 +311,6 @@ _ROWS = (
         talk --json watch | jq -r 'select(.event == "word").word'
         """,
         exit_codes={
-            **SERVER_EXIT_CODES,
             12: "lost: the server went away",
             "128+n": "ended by signal n: 130 by Ctrl-C, 141 where its reader is gone",
         },
@@ -337,7 +330,7 @@ _ROWS = (
         talk log -n 100 | grep patrol
         talk --json log | jq -r 'select(.state == "ABORTED").message'
         """,
-        exit_codes={**SERVER_EXIT_CODES, 0: "listed"},
+        exit_codes={0: "listed"},
         options=(
             option("-n, --count", INTEGER, "The last N goals that ended.", default=20, limits=(1, MAX_LOG_GOALS)),
         ),
@@ -353,7 +346,6 @@ _ROWS = (
         fleet_function="several:pause",
         examples="talk pause; listen_to_the_operator; talk resume",
         exit_codes={
-            **FLEET_EXIT_CODES,
             0: "speech is held, and it is silent",
             1: "speech is held, but that it is silent was not known within 2 seconds",
         },
@@ -364,7 +356,7 @@ _ROWS = (
         description="Go on where 'talk pause' held speech. Twice is success, and so is without a pause.",
         fleet_function="several:resume",
         examples="talk resume",
-        exit_codes={**FLEET_EXIT_CODES, 0: "speech goes on"},
+        exit_codes={0: "speech goes on"},
     ),
     Command(
         name="set",
@@ -383,7 +375,6 @@ _ROWS = (
         talk set --voice en-us --no-preempt
         """,
         exit_codes={
-            **FLEET_EXIT_CODES,
             0: "changed, or printed",
             2: "usage: a value out of its range, or an unknown voice; nothing was changed",
         },
@@ -407,11 +398,7 @@ _ROWS = (
         talk serve --voice en-us
         talk say --voice en-us+f3 "a variant"
         """,
-        exit_codes={
-            **SERVER_EXIT_CODES,
-            0: "listed",
-            1: "no voice speaks that language, or the engine can't list them",
-        },
+        exit_codes={0: "listed", 1: "no voice speaks that language, or the engine can't list them"},
         options=(
             option("--language", TEXT, "Only this language, with its variants: en, pt-BR, german.", metavar="LANGUAGE"),
         ),
@@ -439,7 +426,6 @@ _ROWS = (
         """,
         exit_codes={
             0: "a sentence would be heard; with --robot: the robot answers",
-            2: "usage",
             4: "it would not, as without a server",
             "128+n": "ended by signal n",
         },
