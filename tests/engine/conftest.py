@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 from typing import TYPE_CHECKING
 
 import pytest
@@ -11,7 +10,7 @@ import pytest
 from talkcli.engine.parent import supervisor
 from tests.engine.programs import Player
 from tests.engine.threads import Thread
-from tests.support import scripted_engine
+from tests.support import scripted_serve
 from tests.support.real_voice import real_voice
 
 if TYPE_CHECKING:
@@ -38,9 +37,7 @@ def engine(shared: Shared, request: pytest.FixtureRequest) -> Spawned:
 @pytest.fixture
 def scripted_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the scripted engine started as the engine process."""
-    monkeypatch.setattr(
-        "talkcli.engine.parent.process.engine_command", lambda: [sys.executable, scripted_engine.__file__]
-    )
+    monkeypatch.setattr("talkcli.engine.parent.process.engine_command", scripted_serve.engine_command)
 
 
 @pytest.fixture

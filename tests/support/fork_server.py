@@ -4,8 +4,8 @@ It reads requests from the socket whose number is its argument: eight bytes of l
 input, output and error and one for the child's exit status; then so many bytes of JSON. It answers with the child's id.
 It ends with its socket, and each child with it.
 
-A child leaves `_serve` and runs to the end of this file, so that it ends as any interpreter does. No thread is started
-here, as a fork would leave it behind.
+A child leaves `_serve` and runs to the end of this file. Its interpreter isn't cleaned up, which would take longer than
+most commands. No thread is started here, as a fork would leave it behind.
 """
 
 from __future__ import annotations
@@ -23,9 +23,11 @@ import signal
 import socket
 import struct
 import sys
+import threading
 from typing import Any
 
 import talkcli
+from tests.support import scripted_serve
 
 _KILLED_WITH_PARENT = 1  # PR_SET_PDEATHSIG
 #: Modules that no client and no server imports.
@@ -66,6 +68,15 @@ def _serve(channel: socket.socket) -> dict[str, Any]:
             channel.sendall(struct.pack("<q", child))
 
 
+def _end(code: object) -> None:
+    """End this process with its output written; return if a thread still runs or the output can't be written."""
+    with contextlib.suppress(OSError, ValueError):
+        if threading.active_count() == 1 and isinstance(code, int):
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(code)
+
+
 def _receive(channel: socket.socket) -> tuple[dict[str, Any], list[int]]:
     head, given, _, _ = socket.recv_fds(channel, 8, 4)
     length = struct.unpack("<q", head)[0] if head else 0
@@ -102,8 +113,6 @@ def _become(asked: dict[str, Any], given: list[int], parent: int) -> None:
     sys.stderr.reconfigure(line_buffering=True)
     sys.argv = ["talk", *asked["words"]]
     if asked["scripted"]:
-        from tests.support import scripted_serve
-
         scripted_serve.replace_engine()
 
 
@@ -122,4 +131,8 @@ if __name__ == "__main__":
 
     from talkcli.cli import main
 
-    main()
+    try:
+        main()
+    except SystemExit as end:
+        _end(end.code)
+        raise

@@ -1,23 +1,19 @@
 """An engine process that fails, hangs, crashes or ignores stop if the text of a goal says so; see `script`.
 
-It replaces `talkcli.engine.child.main`, and speaks the same protocol on file descriptor 0.
+It replaces `talkcli.engine.child.main`, and speaks the same protocol on file descriptor 0. It is started hundreds of
+times in a run, so it imports little.
 """
 
 from __future__ import annotations
 
-import contextlib
 import os
-import resource
 import select
 import signal
-import subprocess
 import sys
 import time
-from typing import TYPE_CHECKING
-
-sys.path.insert(1, os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))))
 
 from talkcli.engine import protocol
+from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.reasons import Reason
 from tests.support import script
 
@@ -186,6 +182,8 @@ class Engine:
 
     def _act(self, what: str, value: str = "") -> None:
         if what == "crash":
+            import resource
+
             resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
             signal.signal(signal.SIGSEGV, signal.SIG_DFL)
             os.kill(os.getpid(), signal.SIGSEGV)
@@ -217,6 +215,8 @@ class Engine:
 
 
 def _linger(seconds: float) -> None:
+    import subprocess
+
     fd = os.environ.get("TALK_LIVENESS_FD")
     # Blocked signals are inherited: the process ignores them from its first moment.
     blocked = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
@@ -240,6 +240,9 @@ def _hang() -> None:
     os._exit(1)
 
 
-if __name__ == "__main__":
-    with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+def main() -> None:
+    try:
         Engine().run()
+    except (BrokenPipeError, ConnectionResetError):
+        pass
+    os._exit(0)

@@ -8,12 +8,18 @@ import sys
 from talkcli.cli import main as run_talk
 from talkcli.engine.parent import process
 
-_ENGINE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "scripted_engine.py")
+_ROOT = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+_CODE = f"import sys; sys.path.insert(0, {_ROOT!r}); from tests.support.scripted_engine import main; main()"
+
+
+def engine_command() -> list[str]:
+    """Return the command of the scripted engine, without a search for installed packages."""
+    return [sys.executable, "-S", "-c", _CODE]
 
 
 def replace_engine() -> None:
     """Have this process start the scripted engine."""
-    process.engine_command = lambda: [sys.executable, _ENGINE]
+    process.engine_command = engine_command
 
 
 def main() -> None:
