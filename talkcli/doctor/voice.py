@@ -253,14 +253,16 @@ def _find_package_fault(env: Mapping[str, str]) -> tuple[str, str] | None:
     missing = models.missing_package()
     if missing is not None:
         return _split_step(missing)
-    env = {**env, **models.NO_TELEMETRY}
-    for package in reversed(install.NEURAL_PACKAGES):  # numpy is first, because onnxruntime imports it
+    env = {**env, **models.PACKAGE_VARIABLES}
+    fault = None
+    for package in install.NEURAL_PACKAGES:  # the first one imports numpy, which may be the one that doesn't work
         output = run_program(sys.executable, "-c", _IMPORT_PROGRAM + package, env=env, limit=_IMPORT_LIMIT_S)
-        if output.error is not None:
-            message = f"{_with_version(package)} cannot be imported: "
-            message += _IMPORT_TIMED_OUT if output.timed_out else output.error
-            return message, next(step for clue, step in _IMPORT_ADVICE.items() if clue in message)
-    return None
+        if output.error is None:
+            break
+        message = f"{_with_version(package)} cannot be imported: "
+        message += _IMPORT_TIMED_OUT if output.timed_out else output.error
+        fault = message, next(step for clue, step in _IMPORT_ADVICE.items() if clue in message)
+    return fault
 
 
 def _with_version(package: str) -> str:

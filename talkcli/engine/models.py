@@ -23,10 +23,14 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from typing import Any
 
-#: Environment variables that turn off onnxruntime's telemetry. Since version 1.30, it writes a device id into
-#: ~/.cache/Microsoft when it is imported, and contacts a server some seconds later. A robot must never do this, so
-#: these values replace any that the user has set.
-NO_TELEMETRY = {"ORT_DISABLE_TELEMETRY": "1"}
+#: Environment variables for the packages of neural voices, which replace any values that the user has set.
+PACKAGE_VARIABLES = {
+    # Since version 1.30, onnxruntime writes a device id into ~/.cache/Microsoft when it is imported, and contacts a
+    # server some seconds later. A robot must never do this.
+    "ORT_DISABLE_TELEMETRY": "1",
+    # When it is imported, numpy would start threads that take longer than the import itself. Voices don't need them.
+    "OPENBLAS_NUM_THREADS": "1",
+}
 
 _MODEL_SUFFIX, JSON_SUFFIX = ".onnx", ".json"
 #: The suffix of Python packages that contain voices, and where to look for models in such a package.

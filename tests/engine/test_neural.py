@@ -274,7 +274,7 @@ def test_a_machine_without_memory_for_a_model_says_so_and_speaks_on(real: dict[s
         assert engine.spoken("a", "g0", voice=REAL_VOICE).outcome == protocol.OUTCOME_COMPLETED
         kept = _kept(real)
     with Spawned(target, environment=real) as engine:
-        with _little_memory(engine, 350 << 20):
+        with _little_memory(engine, 280 << 20):
             message = _failed(engine.spoken(TEXT, "g1", voice=REAL_VOICE))
             assert "there is no memory for it; end another program" in message
             assert "en_US-joe-medium.onnx" in message

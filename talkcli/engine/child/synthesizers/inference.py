@@ -20,7 +20,7 @@ import time
 
 from talkcli import install
 from talkcli.engine.child.synthesizers.vits import NotSplit, split_model
-from talkcli.engine.models import BEGIN_SYMBOL, END_SYMBOL, NO_TELEMETRY, PAD_SYMBOL, VoiceFileError, open_checked
+from talkcli.engine.models import BEGIN_SYMBOL, END_SYMBOL, PACKAGE_VARIABLES, PAD_SYMBOL, VoiceFileError, open_checked
 from talkcli.frozen import TYPE_CHECKING, frozen
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from talkcli.engine.child.synthesizers.vits import Buffer
     from talkcli.engine.models import VoiceDescription
 
-os.environ.update(NO_TELEMETRY)  # must be set before onnxruntime is imported
+os.environ.update(PACKAGE_VARIABLES)  # must be set before the packages are imported
 
 #: How many extra frames to decode before and after a part, because they affect its samples. The calculated value for
 #: Piper's largest decoder ("high") is 13.4. With 10 frames, the samples of a "medium" decoder differ by 1 in 400,000.
