@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import signal
+import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -43,6 +45,17 @@ def nobody_serves() -> None:
 def pytest_configure() -> None:
     """Time the control of limits while the machine is quiet; the workers of a run inherit the result."""
     calibrate()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Import the tests without looking for garbage, keep them compiled, and never look for garbage among them."""
+    sys.dont_write_bytecode = False
+    gc.disable()
+    result = yield
+    gc.freeze()
+    gc.enable()
+    return result
 
 
 @pytest.hookimpl(wrapper=True)
