@@ -76,8 +76,7 @@ def _show_event(options: CommonOptions, broker: Broker, transcript: FleetTranscr
         objects = (_snapshot_object(each) for each in event.robots)
         show_result(options, objects, lambda: transcript.begin(robots, broker.url, screen(), now))
     elif isinstance(event, RobotChanged):
-        presence = None if event.now is None else event.now.to_json()
-        message: JsonObject = {"robot": event.name, "event": "presence", "presence": presence}
+        message: JsonObject = {"robot": event.name, "event": "presence", "presence": event.now and event.now.to_json()}
         robot = event.now or Presence(event.name, online=False)
         show_result(options, [message], lambda: transcript.change(event.before, robot, screen(), now))
     elif isinstance(event, RobotEvent):
@@ -87,12 +86,11 @@ def _show_event(options: CommonOptions, broker: Broker, transcript: FleetTranscr
         name = event.robot.presence.name
         lines = (line for each in event.events for line in transcript.lines(name, each, screen(), now))
         show_result(options, [_snapshot_object(event.robot)], lambda: lines)
-    elif options.quiet:
-        pass
-    elif isinstance(event, BrokerAway):
-        note(f"{event.why}; it is tried again for {event.limit:g} s")
-    else:
-        note(f"the broker at {broker.url} is back, after {event.after:.1f} s")
+    elif not options.quiet:
+        if isinstance(event, BrokerAway):
+            note(f"{event.why}; it is tried again for {event.limit:g} s")
+        else:
+            note(f"the broker at {broker.url} is back, after {event.after:.1f} s")
 
 
 def _snapshot_object(robot: RobotInfo) -> JsonObject:

@@ -131,12 +131,9 @@ def run(plain: PlainCommand) -> int:
         wanted = {_signal.SIGINT, _signal.SIGTERM, _signal.SIGHUP} if command == "say" else set()
         blocked.update(wanted - _signal.pthread_sigmask(_signal.SIG_BLOCK, wanted))
 
-    try:
-        early = _connect_early(plain, block_signals) if may_send_early(plain) else None
-        if early and early.request_sent and given.get("wait") and not given.get("feedback"):
-            early = yield_processor(early, given["timeout"])
-    except KeyboardInterrupt:
-        return 128 + int(_signal.SIGINT)  # no request has been sent
+    early = _connect_early(plain, block_signals) if may_send_early(plain) else None
+    if early and early.request_sent and given.get("wait") and not given.get("feedback"):
+        early = yield_processor(early, given["timeout"])
     from talkcli.cli.show import CommonOptions, run_command
 
     options = CommonOptions(

@@ -113,12 +113,11 @@ class GoalReporter:
             goal.request_cancel()
             problem = "cancelled, but it is not known whether it is silent"
             retry_without_output(self.follow, [goal], CANCEL_TIMEOUT_S)
+            problem = ""
         except TimeoutError:
             problem = f"cancelled, but the server did not confirm within {CANCEL_TIMEOUT_S:g} s that it is silent"
         except (Interrupted, ServerUnavailable) as error:
             problem += f": {error or 'interrupted'}"
-        else:
-            problem = ""
         if problem:
             retry_without_output(self.feedback.note, f"{goal.id}: {problem}")
         retry_without_output(self.report, goal.goal)
