@@ -15,7 +15,7 @@ from talkcli import install
 from talkcli.fleet import topics
 from tests.conformance.bareserve import TALK, environment, run, serving
 from tests.faults.supervisor import Supervisor
-from tests.fleet.asker import Asker
+from tests.fleet.remote_client import RemoteClient
 from tests.support.processes import run_talk
 from tests.support.spied import spied
 from tests.support.surroundings import needs
@@ -146,10 +146,10 @@ def test_a_supervisor_is_told_the_state_with_and_without_a_broker(home: str, scr
                 broker.start()
                 supervisor.wait_for("STATUS", f"anna at {broker.url}: online, server there", since=ready)
                 scripted.request("pause")
-                with Asker(broker) as asker:
-                    asker.say("a secret")
+                with RemoteClient(broker) as client:
+                    client.say("a secret")
                     pending = supervisor.wait_for("STATUS", "1 goal pending")
-                    asker.ask("cancel")
+                    client.ask("cancel")
                 supervisor.wait_for("STATUS", "0 goals pending", since=pending)
                 supervisor.wait_for("WATCHDOG", "1", since=pending)
                 assert not any("secret" in value for _, value, _ in supervisor.told)
@@ -167,6 +167,6 @@ def test_the_bridge_uses_the_socket_that_is_named(
 ) -> None:
     with serving(environment(home, TALK_SOCKET=f"{home}/s")):
         make_bridge(scripted, broker, "berta", "--socket", f"{home}/s")
-        with Asker(broker) as asker:
-            asker.send({"seq": 1, "request": "status"}, to="talk/robot/berta")
-            assert asker.reply(1)["server"]["socket"] == f"{home}/s"
+        with RemoteClient(broker) as client:
+            client.send({"seq": 1, "request": "status"}, to="talk/robot/berta")
+            assert client.reply(1)["server"]["socket"] == f"{home}/s"

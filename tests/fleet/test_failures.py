@@ -12,8 +12,8 @@ from paho.mqtt import client as paho
 from talkcli.fleet import broker as brokers
 from talkcli.fleet.bridge.main import Bridge, BridgeSettings
 from talkcli.fleet.broker import from_environment
-from tests.fleet.asker import Asker
 from tests.fleet.conftest import in_loop
+from tests.fleet.remote_client import RemoteClient
 from tests.fleet.robot import LONG, Robot
 from tests.support.bridge import desk
 from tests.support.connection import PATIENCE
@@ -54,7 +54,7 @@ def test_a_robot_that_is_offline_is_told_at_once_and_speaks_nothing_of_it_when_i
             done = desk(robot.broker, name, "say", "--wait", "nobody hears this")
             assert_within(done.seconds, AT_ONCE, "a say to a robot that is not there")
             assert_refused(done, 3, words)
-    with Asker(robot.broker, "olga") as olga:  # which doesn't look first
+    with RemoteClient(robot.broker, "olga") as olga:  # which doesn't look first
         olga.post("say", text="nor this")
         olga.send("nor that", kind="say", response=None)
         robot.bridge.start()
@@ -93,7 +93,7 @@ async def test_a_connection_that_breaks_under_an_answer_is_made_again(
     bridge = Bridge(settings, lambda: settings.broker)
     work = asyncio.create_task(bridge.run())
     await asyncio.wait_for(until(lambda: bridge.ready), PATIENCE)
-    with Asker(broker, "olga") as olga, Listener(broker, "talk/robot/anna/presence") as listener:
+    with RemoteClient(broker, "olga") as olga, Listener(broker, "talk/robot/anna/presence") as listener:
         monkeypatch.setattr(paho.Client, "_sock_send", send)
         olga.send({"seq": 1, "request": "set", "rate": 200})
         gone = await asyncio.to_thread(listener.await_message, lambda each: not each.json["online"], PATIENCE)
@@ -110,7 +110,7 @@ async def test_a_connection_that_breaks_under_an_answer_is_made_again(
 
 def test_a_goal_that_comes_several_times_is_spoken_once(robot: Robot) -> None:
     line = '{"seq": %d, "request": "say", "id": "once", "text": "only once"}'
-    with Asker(robot.broker, "olga") as olga:
+    with RemoteClient(robot.broker, "olga") as olga:
         for seq in (1, 2, 3):
             olga.send(line % seq)
         olga.send(line % 4, to="talk/group/all")
@@ -142,7 +142,7 @@ def test_a_goal_that_an_earlier_server_had_is_not_sent_to_the_next(robot: Robot,
 def test_a_retained_message_is_dropped_as_it_comes(robot: Robot) -> None:
     robot.talk.run("say", "--id", "mine", "--", LONG)
     robot.talk.watcher.wait_for("mine", "ACTIVE")
-    with Asker(robot.broker, "olga") as olga:
+    with RemoteClient(robot.broker, "olga") as olga:
         olga.send({"seq": 99, "request": "say", "text": "kept"}, retain=True)
         for kind, text in (("say", "kept, too"), ("cancel", "all")):
             olga.send(text, retain=True, kind=kind, response=None)
@@ -158,7 +158,7 @@ def test_a_message_that_the_broker_has_kept_is_not_spoken(
 ) -> None:
     talk = make_talk(scripted=True)
     talk.run("say", "--id", "mine", "--", LONG)
-    with Asker(broker, "olga") as olga:
+    with RemoteClient(broker, "olga") as olga:
         say = {"seq": 99, "request": "say", "text": "kept"}
         for topic in ("robot/anna", "group/all", "group/warehouse"):
             olga.listener.publish(f"talk/{topic}/request/olga", say, retain=True, response=olga.response)
@@ -175,7 +175,7 @@ def test_a_malformed_request_is_answered_with_the_error_of_the_wire(lasting_robo
     """`tests/unit/test_fleet_policy.py` has all of these errors."""
     status = b'{"seq": 7, "request": "status"}'
     before = lasting_robot.spoken
-    with Asker(lasting_robot.broker, "olga") as olga:
+    with RemoteClient(lasting_robot.broker, "olga") as olga:
         olga.send(status.ljust(LONGEST_LINE - 1))
         assert olga.reply(7)["ok"]
         for payload, code in ((b'["say", "hello"]', "bad_json"), (status.ljust(LONGEST_LINE), "line_too_long")):
@@ -220,7 +220,7 @@ def is_plain(log: str) -> bool:
 def test_a_plain_text_is_spoken_as_it_stands_and_no_log_has_control_characters(robot: Robot) -> None:
     talk, watcher = robot.talk, robot.talk.watcher
     before = talk.request("set")["settings"]
-    with Asker(robot.broker, "olga") as olga:
+    with RemoteClient(robot.broker, "olga") as olga:
         for each in TEXTS:
             olga.send(each, kind="say", response=None)
         watcher.wait_until(lambda _: len(watcher.texts("PENDING")) == len(TEXTS))
@@ -253,7 +253,7 @@ def test_a_robot_publishes_nothing_on_the_response_topic_of_another(lasting_robo
     """`tests/unit/test_fleet_topics.py` has all forms of such topics."""
     responses = {"talk/reply/otto/session/anna", "talk/robot/bert/say/olga", "elsewhere"}
     before = lasting_robot.spoken
-    with Listener(lasting_robot.broker, "#") as everything, Asker(lasting_robot.broker, "olga") as olga:
+    with Listener(lasting_robot.broker, "#") as everything, RemoteClient(lasting_robot.broker, "olga") as olga:
         for each in responses:
             olga.send({"request": "say", "text": "hello"}, response=each)
         assert olga.ask("status")["ok"]
@@ -261,7 +261,7 @@ def test_a_robot_publishes_nothing_on_the_response_topic_of_another(lasting_robo
     assert lasting_robot.spoken == before
 
 
-def test_with_no_text_only_the_asker_reads_a_sentence(broker: Broker, make_robot: MakeRobot) -> None:
+def test_with_no_text_only_the_remote_client_reads_a_sentence(broker: Broker, make_robot: MakeRobot) -> None:
     robot = make_robot("anna", "--no-text")
     with Listener(broker, "talk/robot/anna/+", "talk/robot/anna/event/+") as everybody:
         done = robot.desk("say", "--wait", "--feedback", "--key", "door", "the secret word")

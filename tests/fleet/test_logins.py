@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from talkcli.fleet import topics
-from tests.fleet.asker import Asker
 from tests.fleet.conftest import OPERATORS, OTHERS, ROBOTS
+from tests.fleet.remote_client import RemoteClient
 from tests.fleet.robot import Robot
 from tests.support.bridge import Desk, desk
 from tests.support.broker import Broker
@@ -153,7 +153,7 @@ def test_a_fleet_works_by_the_rules_and_a_login_without_rights_is_told_what_is_m
         assert f"does not let '{user}'" in done.err
         assert "ACL" in done.err
         assert "talk bridge --print-acl" in done.err
-    with Asker(secure_broker, "olga", login="olga") as olga:
+    with RemoteClient(secure_broker, "olga", login="olga") as olga:
         olga.send("plain", to="talk/robot/bert", kind="say", response=None)
         assert olga.ask("hello", to="talk/robot/bert")["ok"]
     bert.talk.watcher.wait_for(None, "SUCCEEDED")

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.fleet.asker import Asker
 from tests.fleet.many import RealRobots, Roll, SimulatedRobots, alike, assert_told
+from tests.fleet.remote_client import RemoteClient
 from tests.support.bridge import Desk
 from tests.support.broker import Broker
 from tests.support.mqtt import Listener, mosquitto
@@ -57,7 +57,7 @@ def counts(robots: RealRobots, text: str) -> Counter[str]:
 
 def test_what_comes_to_a_group_several_times_is_spoken_once_by_each(robots: RealRobots, broker: Broker) -> None:
     line = '{"seq": %d, "request": "say", "id": "once", "text": "once by each", "wait": true}'
-    with Asker(broker, "olga") as olga:
+    with RemoteClient(broker, "olga") as olga:
         response = ["-D", "publish", "response-topic", olga.response]
         for seq in (1, 2):
             words = ["-q", "1", "-t", f"talk/group/{GROUP}/request/olga", *response, "-m", line % seq]

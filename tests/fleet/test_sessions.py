@@ -60,7 +60,7 @@ async def await_clients(talk: Talk, most: int) -> None:
 
 @pytest.mark.parametrize("waits", ["for room", "for a result", "for events"])
 @in_loop
-async def test_an_asker_that_is_silent_for_90_s_is_gone_whatever_it_waits_for(
+async def test_a_remote_client_that_is_silent_for_90_s_is_gone_whatever_it_waits_for(
     talk: Talk, pass_time: Callable[[float], None], waits: str
 ) -> None:
     anna = SessionsWithoutBroker(talk.socket)
@@ -91,7 +91,9 @@ async def test_an_asker_that_is_silent_for_90_s_is_gone_whatever_it_waits_for(
 
 
 @in_loop
-async def test_an_asker_that_says_hello_keeps_what_it_waits_for(talk: Talk, pass_time: Callable[[float], None]) -> None:
+async def test_a_remote_client_that_says_hello_keeps_what_it_waits_for(
+    talk: Talk, pass_time: Callable[[float], None]
+) -> None:
     anna = SessionsWithoutBroker(talk.socket)
     goal = await anna.ask(say(1, wait=True))
     for each in range(2, 8):
@@ -105,7 +107,7 @@ async def test_an_asker_that_says_hello_keeps_what_it_waits_for(talk: Talk, pass
 
 
 @in_loop
-async def test_an_asker_to_whom_nothing_is_owed_is_let_go_without_a_word(
+async def test_a_remote_client_to_whom_nothing_is_owed_is_let_go_without_a_word(
     talk: Talk, pass_time: Callable[[float], None]
 ) -> None:
     anna = SessionsWithoutBroker(talk.socket)
@@ -140,7 +142,7 @@ async def test_requests_before_a_goodbye_are_carried_out_except_goals_that_wait_
 
 
 @in_loop
-async def test_a_cancel_takes_the_place_of_the_asker_that_is_silent_for_longest(
+async def test_a_cancel_takes_the_place_of_the_remote_client_that_is_silent_for_longest(
     talk: Talk, pass_time: Callable[[float], None]
 ) -> None:
     anna = SessionsWithoutBroker(talk.socket)
@@ -161,7 +163,7 @@ async def test_a_cancel_takes_the_place_of_the_asker_that_is_silent_for_longest(
 
 
 @in_loop
-async def test_askers_that_come_and_go_at_a_server_that_hangs_take_32_connections_and_no_threads() -> None:
+async def test_remote_clients_that_come_and_go_at_a_server_that_hangs_take_32_connections_and_no_threads() -> None:
     """A closed connection stays in the backlog. A client that leaves before its turn is not connected."""
     with short_directory() as directory, socket.socket(socket.AF_UNIX) as listening:
         listening.bind(f"{directory}/s")
@@ -188,7 +190,7 @@ async def test_askers_that_come_and_go_at_a_server_that_hangs_take_32_connection
 
 
 @in_loop
-async def test_all_askers_hold_four_mebibytes_and_a_cancel_is_taken_beyond(talk: Talk) -> None:
+async def test_all_remote_clients_hold_four_mebibytes_and_a_cancel_is_taken_beyond(talk: Talk) -> None:
     anna = SessionsWithoutBroker(talk.socket)
     for each in range(20):
         await anna.ask(say(each), "full")

@@ -11,10 +11,10 @@ import pytest
 
 from talkcli.errors import UsageError
 from tests.fleet import told as robots_told
-from tests.fleet.asker import Asker
 from tests.fleet.conftest import fleet_of
 from tests.fleet.many import RealRobots, alike, assert_told, at_once, request, told
 from tests.fleet.pretended import Pretended
+from tests.fleet.remote_client import RemoteClient
 from tests.fleet.robot import LONG
 from tests.support.bridge import Desk
 from tests.support.connection import PATIENCE
@@ -296,7 +296,7 @@ def test_a_sentence_can_be_cancelled_until_all_outcomes_were_taken(fleet: Fleet,
 def test_a_patient_sentence_waits_for_room_longer_than_for_an_answer(fleet: Fleet, pair: RealRobots, to: str) -> None:
     goal = f"patient-{PICKS.index(to)}"
     request(pair, "say", id=f"before-{goal}", text=LONG)
-    with Asker(pair.broker) as bob:
+    with RemoteClient(pair.broker) as bob:
         for number in range(PENDING):
             bob.send({"seq": number, "request": "say", "text": "length=0"}, to="talk/group/warehouse")
         assert bob.listener.find(lambda _: sum("ok" in each for each in bob.lines) == 2 * PENDING, PATIENCE)

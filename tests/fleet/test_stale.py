@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.fleet.asker import Asker
+from tests.fleet.remote_client import RemoteClient
 from tests.fleet.robot import LONG, Robot
 from tests.support.bridge import Desk
 from tests.support.proxy import Proxy
@@ -48,7 +48,7 @@ def test_a_sentence_that_was_held_for_long_is_refused_and_the_next_is_spoken(
     stalled: tuple[Robot, Proxy], how: str
 ) -> None:
     robot, _ = stalled
-    with Asker(robot.broker, "olga") as olga, robot.listen("echo") as listener:
+    with RemoteClient(robot.broker, "olga") as olga, robot.listen("echo") as listener:
         began = time.monotonic()
         go_on = stall(stalled, how)
         asked = olga.post("say", text="late")
@@ -82,7 +82,7 @@ def test_a_sentence_that_was_held_for_a_moment_is_spoken(stalled: tuple[Robot, P
 @pytest.mark.slow
 def test_without_echoes_no_sentence_is_spoken_that_may_be_old(stalled: tuple[Robot, Proxy]) -> None:
     robot, proxy = stalled
-    with Asker(robot.broker, "olga") as olga:
+    with RemoteClient(robot.broker, "olga") as olga:
         proxy.hold("to_broker")
         early = olga.post("say", text="in time")
         robot.talk.watcher.wait_for(None, "SUCCEEDED")
@@ -98,7 +98,7 @@ def test_without_echoes_no_sentence_is_spoken_that_may_be_old(stalled: tuple[Rob
 def test_the_expiry_of_a_message_counts_in_the_queue_of_the_robot_too(robot: Robot) -> None:
     robot.talk.run("say", "--", LONG)
     robot.talk.watcher.wait_for(None, "ACTIVE")
-    with Asker(robot.broker, "olga") as olga:
+    with RemoteClient(robot.broker, "olga") as olga:
         olga.send({"seq": 1, "request": "say", "id": "short", "text": "a", "ttl": 100}, expiry=1)
         olga.send({"seq": 2, "request": "say", "id": "shorter", "text": "b", "ttl": 0.2}, expiry=100)
         olga.send("c", expiry=1, kind="say", response=None)
@@ -120,7 +120,7 @@ def test_a_sentence_that_was_held_begins_no_later_than_its_ttl_and_six_seconds(
     robot, proxy = stalled
     robot.talk.run("say", "--", LONG)
     robot.talk.watcher.wait_for(None, "ACTIVE")
-    with Asker(robot.broker, "olga") as olga, contextlib.ExitStack() as stack:
+    with RemoteClient(robot.broker, "olga") as olga, contextlib.ExitStack() as stack:
         stack.callback(proxy.release)
         said = time.monotonic()
         proxy.hold("to_client")

@@ -64,7 +64,7 @@ def test_a_topic_says_what_is_asked_and_by_whom(topic: str, asked: RequestTopic 
         ("homeassistant/light", None),
     ],
 )
-def test_a_robot_answers_nobody_but_the_asker(response: str, answer: str | None) -> None:
+def test_a_robot_answers_nobody_but_the_remote_client(response: str, answer: str | None) -> None:
     assert topics.checked_reply(response, "olga", "anna") == answer
 
 

@@ -95,9 +95,11 @@ def test_limits_of_a_fleet_are_those_of_the_code() -> None:
     assert f"past {policy.MAX_CORRELATION_BYTES} bytes the request" in FLEET.section("Requests and replies")
     assert f"at most {(link.MAX_PACKET_BYTES - link.MAX_HEADER_BYTES) // 1024} KiB" in limits["a reply's payload"]
     assert limits["goals from afar that are pending"] == str(policy.MAX_REMOTE_GOALS)
-    assert limits["askers"].startswith(f"{session.MAX_SESSIONS}, and {session.MAX_WAITING_REQUESTS} requests of each")
-    assert limits["requests that wait"].startswith(f"{session.MAX_WAITING_BYTES >> 20} MiB for all askers")
-    assert limits["an asker that says nothing"] == f"{session.CLIENT_SILENCE_LIMIT_S:g} s"
+    assert limits["remote clients"].startswith(
+        f"{session.MAX_SESSIONS}, and {session.MAX_WAITING_REQUESTS} requests of each"
+    )
+    assert limits["requests that wait"].startswith(f"{session.MAX_WAITING_BYTES >> 20} MiB for all remote clients")
+    assert limits["a remote client that says nothing"] == f"{session.CLIENT_SILENCE_LIMIT_S:g} s"
     assert limits["ids that are remembered"] == f"{policy.MAX_REMEMBERED_IDS:,}"
     assert f"past {bridge.SLOW_BROKER_BYTES // 1024} KiB" in limits["what the broker is slow to take"]
     assert f"past {bridge.STUCK_BROKER_BYTES // 2**20} MiB" in limits["what the broker is slow to take"]

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 ANNA = "talk/robot/anna"
 
 
-class Asker(contextlib.AbstractContextManager["Asker"]):
+class RemoteClient(contextlib.AbstractContextManager["RemoteClient"]):
     """A user with one session. `listener` has all messages to it."""
 
     def __init__(self, broker: Broker, user: str = "bob", session: str = "", *, login: str | None = None) -> None:
