@@ -65,15 +65,14 @@ class Broker:
         """
         if not self.tls:
             return None
+        names, path = CA, self.ca
         try:
-            context = ssl.create_default_context(cafile=self.ca)
-        except OSError as error:
-            raise UsageError(f"{CA}: {_file_error(self.ca, error)}") from error
-        if self.cert:
-            try:
-                context.load_cert_chain(self.cert, self.key, password=_no_passphrase)
-            except (OSError, UsageError) as error:
-                raise UsageError(f"{CERT} and {KEY}: {_file_error(self.cert, error)}") from error
+            context = ssl.create_default_context(cafile=path)
+            if self.cert:
+                names, path = f"{CERT} and {KEY}", self.cert
+                context.load_cert_chain(path, self.key, password=_no_passphrase)
+        except (OSError, UsageError) as error:
+            raise UsageError(f"{names}: {_file_error(path, error)}") from error
         return context
 
 

@@ -24,7 +24,7 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
-from talkcli.errors import AccessDenied, ProtocolMismatch, RequestRefused, ServerUnavailable, TalkError
+from talkcli.errors import AccessDenied, ProtocolMismatch, ServerUnavailable, TalkError
 from talkcli.fleet.payloads import Message
 from talkcli.polling import wait_ready
 from talkcli.terminal.text import printable
@@ -52,9 +52,10 @@ MAX_HEADER_BYTES = 1024
 #: Maximum number of unacknowledged QoS 1 messages. paho queues further messages. A broker announces its own limit, but
 #: paho ignores that. HiveMQ Cloud accepts 10 messages, and other brokers accept more.
 _MAX_UNACKNOWLEDGED_MESSAGES = 10
-#: The highest receive maximum that MQTT allows. A client that receives messages from all robots needs it. By default,
-#: mosquitto queues only 1,000 messages for a client, and silently drops the rest, even retained messages.
-MAX_RECEIVE_COUNT = 65_535
+#: Maximum number of received QoS 1 messages that aren't acknowledged yet. This is the highest value that MQTT allows.
+#: Clients that receive messages from all robots need it. By default, mosquitto queues only 1,000 messages for a client,
+#: and silently drops the rest, even retained messages.
+_MAX_RECEIVED_MESSAGES = 65_535
 # MQTT 5 reason codes. All codes from REASON_FAILURE upwards are failures.
 _REASONS_DENIED = (0x86, 0x87, 0x8A, 0x8C)
 _REASON_UNSUPPORTED_PROTOCOL = 0x84
@@ -81,7 +82,6 @@ class Link:
         on_message: Callable[[Message], None],
         will: Message | None = None,
         max_packet_bytes: int = MAX_PACKET_BYTES,
-        receive_maximum: int | None = None,
     ) -> None:
         """Create a link that isn't connected yet.
 
@@ -91,7 +91,6 @@ class Link:
             on_message: called with each received message.
             will: retained message that the broker publishes if the connection breaks.
             max_packet_bytes: largest packet that the broker may send.
-            receive_maximum: how many unacknowledged QoS 1 messages the broker may send; None for the broker's default.
 
         Raises:
             UsageError: a certificate or key file is unusable.
@@ -99,7 +98,6 @@ class Link:
         self._broker = broker
         self._deliver = on_message
         self._max_packet_bytes = max_packet_bytes
-        self._receive_maximum = receive_maximum
         #: why the connection has ended; None if it hasn't
         self.ended: str | None = None
         #: total size of the unsent and unacknowledged messages
@@ -147,8 +145,7 @@ class Link:
         properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
         properties.SessionExpiryInterval = 0
         properties.MaximumPacketSize = self._max_packet_bytes
-        if self._receive_maximum is not None:
-            properties.ReceiveMaximum = self._receive_maximum
+        properties.ReceiveMaximum = _MAX_RECEIVED_MESSAGES
         self._paho.connect_timeout = LOGIN_LIMIT_S
         try:
             self._paho.connect(
@@ -258,13 +255,6 @@ class Link:
                 self.outstanding_bytes += size
             self.write()
         return True
-
-    def size_error(self, line: bytes, kind: str) -> RequestRefused | None:
-        """Return an error if a request is too long for the broker, or None if it fits."""
-        if len(line) <= self.max_payload_bytes:
-            return None
-        words = f"{kind} has {len(line):,} bytes, and the broker takes {self.max_payload_bytes:,}: nothing was sent"
-        return RequestRefused(words, "too_long")
 
     def subscribe(self, *topics: str, retained: bool) -> None:
         """Subscribe to topics.

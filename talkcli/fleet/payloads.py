@@ -195,9 +195,7 @@ _AVAILABLE = "{{ 'online' if value_json.online and value_json.server else 'offli
 # These templates extract values from the status payload. Home Assistant shows `None` as unknown.
 _STATE_TEMPLATE = "{{ 'paused' if value_json.paused else 'speaking' if value_json.active else 'idle' }}"
 _SPEAKING_TEMPLATE = "{{ 'ON' if value_json.active and not value_json.paused else 'OFF' }}"
-_PENDING_TEMPLATE = "{{ value_json.pending }}"
 _LAST_TEMPLATE = "{{ value_json.last.state if value_json.last else None }}"
-_LAST_ATTRIBUTES_TEMPLATE = "{{ (value_json.last or {}) | tojson }}"
 
 
 def homeassistant_device(name: str, allow: Collection[str], version: str) -> tuple[str, bytes]:
@@ -215,7 +213,7 @@ def homeassistant_device(name: str, allow: Collection[str], version: str) -> tup
         "cancel": _command(name, topics.PLAIN_CANCEL, "button", "Cancel", allowed="cancel" in allow),
         "state": _sensor(name, "State", _STATE_TEMPLATE, device_class="enum", options=["idle", "speaking", "paused"]),
         "speaking": _sensor(name, "Speaking", _SPEAKING_TEMPLATE, platform="binary_sensor"),
-        "pending": _sensor(name, "Pending", _PENDING_TEMPLATE, state_class="measurement"),
+        "pending": _sensor(name, "Pending", "{{ value_json.pending }}", state_class="measurement"),
         "last": _sensor(
             name,
             "Last result",
@@ -223,7 +221,7 @@ def homeassistant_device(name: str, allow: Collection[str], version: str) -> tup
             device_class="enum",
             options=[each.name for each in EXIT_CODES],
             json_attributes_topic=topics.robot(name, topics.STATUS),
-            json_attributes_template=_LAST_ATTRIBUTES_TEMPLATE,
+            json_attributes_template="{{ (value_json.last or {}) | tojson }}",
         ),
     }
     for key, component in components.items():

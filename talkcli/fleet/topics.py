@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import re
 
-from talkcli.frozen import frozen
 from talkcli.goals.options import MAX_SENDER_NAME_CHARS
 
 PREFIX = "talk"
@@ -73,24 +72,18 @@ def homeassistant_device(name: str) -> str:
     return "/".join((HOMEASSISTANT, "device", f"{PREFIX}-dots", escaped, "config"))
 
 
-@frozen
-class RequestTopic:
-    """The parsed topic of a client's request."""
+def parse_request(topic: str) -> tuple[str, str] | None:
+    """Parse a request topic, or return None for any other topic.
 
-    #: REQUEST, PLAIN_SAY or PLAIN_CANCEL
-    kind: str
-    #: the client's user name, verified by the broker's access rules
-    user: str
-
-
-def parse_request(topic: str) -> RequestTopic | None:
-    """Parse a request topic, or return None for any other topic."""
+    Returns:
+        REQUEST, PLAIN_SAY or PLAIN_CANCEL, and the client's user name. The broker's access rules verify the name.
+    """
     levels = topic.split("/")
     if len(levels) != 5 or levels[0] != PREFIX or name_fault(levels[4]):
         return None
     _, receiver, _, kind, user = levels
     kinds = {ROBOT_LEVEL: REQUEST_LEVELS, _GROUP: (REQUEST,)}.get(receiver, ())
-    return RequestTopic(kind, user) if kind in kinds else None
+    return (kind, user) if kind in kinds else None
 
 
 def checked_reply(response: str, user: str, robot_name: str) -> str | None:

@@ -211,6 +211,34 @@ async def test_all_remote_clients_hold_four_mebibytes_and_a_cancel_is_taken_beyo
     anna.sessions.end_all()
 
 
+@pytest.mark.parametrize(("wait", "feedback"), [(False, False), (True, False), (False, True)])
+@in_loop
+async def test_a_goal_that_never_reached_the_server_is_told_as_the_server_would(
+    talk: Talk, wait: bool, feedback: bool
+) -> None:
+    anna = SessionsWithoutBroker(talk.socket)
+    for each in range(20):
+        await anna.ask(say(each), "full")
+    more = {"wait": wait, "feedback": feedback, "key": "k", "priority": -2}
+    anna.post(say(1, id="waits", patient=True, **more))
+    await anna.ask(say(2, id="mine", **more))
+    await anna.ask({"seq": 3, "request": "cancel", "ids": ["waits"]}, "another")
+    await anna.line(lambda each: each.get("seq") == 1)
+    for number, state, reason in ((1, "RECALLED", "canceled"), (2, "REJECTED", "queue_full")):
+        reply = await anna.line(lambda each, number=number: each.get("seq") == number)
+        goal = reply["goal"]
+        assert (reply["ok"], goal["state"], goal["reason"]) == (True, state, reason)
+        assert (goal["text"], goal["key"], goal["priority"]) == (f"sentence {number}", "k", -2)
+        assert goal["client"] == {"name": "mqtt:bob", **dict.fromkeys(goal["client"].keys() - {"name"})}
+        assert bool(goal["by"]) == (number == 1)
+        assert (goal["id"] == "waits") == (number == 1)  # a rejected goal never has the id that its client chose
+        assert goal["id"] != "mine"
+        told = [each for each in anna.lines() if "event" in each and goal["id"] in json.dumps(each)]
+        assert [each["event"] for each in told] == (["state", "result"] if wait or feedback else [])
+        assert all(each["goal"] == goal for each in told[1:])
+    anna.sessions.end_all()
+
+
 @in_loop
 async def test_an_answer_that_is_too_long_for_the_broker_has_no_words_or_is_an_error(talk: Talk) -> None:
     anna = SessionsWithoutBroker(talk.socket, room=3_000)

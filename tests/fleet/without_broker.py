@@ -41,7 +41,8 @@ class SessionsWithoutBroker:
         asked = topics.parse_request(topic)
         assert asked
         message = Message(topic, payload, response=response, correlation=correlation)
-        found = self._policy.decide(message, asked, self._boottime(), stale=False)
+        now = self._policy.newest_echo_at = self._boottime()
+        found = self._policy.decide(message, *asked, now)
         if isinstance(found, policy.Goodbye):
             self.sessions.say_goodbye(found.user, found.reply_topic)
         else:

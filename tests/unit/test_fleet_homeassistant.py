@@ -34,7 +34,7 @@ def test_an_announcement_keeps_home_assistants_rules(name: str) -> None:
     }  # fmt: skip
     for key in ("say", "cancel"):
         topic = found["components"][key]["command_topic"]
-        assert topics.parse_request(topic) == topics.RequestTopic(key, "homeassistant")
+        assert topics.parse_request(topic) == (key, "homeassistant")
         assert topic.startswith(f"talk/robot/{name}/")
         assert not found["components"][key].get("retain")  # retained requests are never spoken
     assert {*found["components"]["last"]["options"]} == {each.name for each in State if each.terminal}

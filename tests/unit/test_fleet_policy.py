@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from talkcli.fleet import topics
 from talkcli.fleet.bridge import policy
 from talkcli.fleet.bridge.policy import (
-    EchoTracker,
     Goodbye,
     Ignored,
     Policy,
@@ -22,9 +21,7 @@ from talkcli.fleet.bridge.policy import (
 )
 from talkcli.fleet.payloads import Message
 from talkcli.frozen import replace
-from talkcli.goals.goal import By, Goal, Sender
 from talkcli.goals.options import MAX_SENDER_NAME_CHARS, Cancel, Say, is_clients_id
-from talkcli.goals.states import State
 from talkcli.protocol.lines import MAX_LINE_BYTES
 from talkcli.protocol.requests import REQUEST_TYPES
 
@@ -40,7 +37,9 @@ Judged = RemoteRequest | Refusal | Goodbye | Ignored
 def judge(message: Message, *, stale: bool = False, allow: tuple[str, ...] = policy.ALLOWABLE_REQUESTS) -> Judged:
     asked = topics.parse_request(message.topic)
     assert asked
-    return Policy("anna", allow).decide(message, asked, NOW, stale=stale)
+    rules = Policy("anna", allow)
+    rules.newest_echo_at = NOW - (6.01 if stale else 6)
+    return rules.decide(message, *asked, NOW)
 
 
 def request(fields: object = SAY, topic: str = OWN, response: str | None = REPLY, **more: object) -> Message:
@@ -194,54 +193,68 @@ def test_a_sentence_must_begin_before_its_message_expires(
     assert (say.ttl, say.id) == (left, "x")
 
 
-def text(number: int) -> bytes:
-    """Return the number of an echo in the form of its payload."""
-    return f"{number}".encode()
+def is_stale(rules: Policy, now: float) -> bool:
+    """Return whether a sentence that arrives now is refused."""
+    found = rules.decide(request(), topics.REQUEST, "bob", now)
+    return isinstance(found, Refusal) and found.error.code == "stale"
+
+
+def returned(rules: Policy, sent_at: float, now: float) -> bool:
+    """Return an echo to the robot."""
+    return rules.echo_returned(f"{sent_at}".encode(), now)
+
+
+def connected(now: float) -> Policy:
+    """Return the rules of a robot that has just connected to the broker."""
+    rules = Policy("anna", policy.ALLOWABLE_REQUESTS)
+    rules.newest_echo_at = now
+    return rules
 
 
 def test_what_comes_within_six_seconds_of_the_newest_echo_that_came_back_is_taken() -> None:
-    echoes = EchoTracker(100.0)
-    assert not echoes.is_stale(106.0)
-    assert echoes.is_stale(106.01)
-    first, second = echoes.add(104.0), echoes.add(105.0)
-    assert echoes.returned(text(first))
-    assert not echoes.is_stale(110.0)
-    assert echoes.is_stale(110.01)
-    assert echoes.returned(text(second))
-    assert not echoes.is_stale(111.0)
+    rules = connected(100.0)
+    assert not is_stale(rules, 106.0)
+    assert is_stale(rules, 106.01)
+    assert returned(rules, 104.0, 105.0)
+    assert not is_stale(rules, 110.0)
+    assert is_stale(rules, 110.01)
+    assert returned(rules, 105.0, 105.1)
+    assert not is_stale(rules, 111.0)
 
 
-@pytest.mark.parametrize("unknown", [b"2", b"0", b"-1", b"", b"1.0", b"one", b"7" * 5000, b"\xb2", b"\xff"])
+@pytest.mark.parametrize(
+    "unknown", [b"20.1", b"0", b"-1", b"", b"one", b"7" * 5000, b"inf", b"nan", b"15.0 15.0", b"\xb2", b"\xff"]
+)
 def test_an_unknown_echo_tells_nothing(unknown: bytes) -> None:
-    echoes = EchoTracker(0.0)
-    number = text(echoes.add(10.0))
-    assert not echoes.returned(unknown)
-    assert echoes.is_stale(10.0)
-    assert echoes.returned(number)
-    assert not echoes.returned(number)  # twice
-    assert not echoes.is_stale(10.0)
+    rules = connected(0.0)
+    assert not rules.echo_returned(unknown, 20.0)
+    assert is_stale(rules, 10.0)
+    assert returned(rules, 10.0, 20.0)
+    assert not returned(rules, 10.0, 20.0)  # twice
+    assert not is_stale(rules, 10.0)
 
 
 @given(st.lists(st.tuples(st.sampled_from(["send", "come", "wait"]), st.integers(0, 12)), max_size=60))
 def test_messages_older_than_the_newest_echo_allows_are_refused(steps: list[tuple[str, int]]) -> None:
     """The broker forwards a message that arrives after an echo no earlier than the echo was sent."""
-    now, proved, echoes = 0.0, 0.0, EchoTracker(0.0)
-    sent: dict[int, float] = {}
+    now, proved, rules = 0.0, 0.0, connected(0.0)
+    sent: list[float] = []
     for what, number in steps:
         if what == "wait":
             now += number
         elif what == "send":
-            sent[echoes.add(now)] = now
-        elif echoes.returned(text(number)):
+            sent.append(now)
+        elif number < len(sent):
+            assert returned(rules, sent[number], now) == (sent[number] > proved)
             proved = max(proved, sent[number])
-        assert echoes.is_stale(now) == (now - proved > policy.STALE_AFTER_S)
+        assert is_stale(rules, now) == (now - proved > policy.STALE_AFTER_S)
 
 
-def test_of_a_thousand_echoes_the_newest_alone_counts() -> None:
-    echoes = EchoTracker(0.0)
-    numbers = [echoes.add(float(each)) for each in range(1000)]
-    assert sum(echoes.returned(text(each)) for each in reversed(numbers)) == 1
-    assert echoes.add(0.0) == 1001
+def test_an_echo_that_comes_after_a_newer_one_tells_nothing() -> None:
+    rules = connected(0.0)
+    assert sum(returned(rules, float(each), 1000.0) for each in reversed(range(1000))) == 1
+    assert not is_stale(rules, 1005.0)
+    assert is_stale(rules, 1005.01)
 
 
 # Goals that were sent before
@@ -317,20 +330,7 @@ def test_the_share_counts_like_a_slow_model(steps: list[tuple[str, int]]) -> Non
         assert (len(share), share.pending_count) == (len(on_way | pending), len(pending))
 
 
-# Goals that end before they are sent to the server
-
-
-@pytest.mark.parametrize(("wait", "feedback"), [(False, False), (True, False), (False, True)])
-def test_a_goal_that_never_reached_the_server_is_told_as_the_server_would(wait: bool, feedback: bool) -> None:
-    say = {"seq": 3, **SAY, "wait": wait, "feedback": feedback, "key": "k", "priority": 2}
-    goal, lines = policy.end_unsent(
-        asked(judge(request(say))), "anna-x1", State.RECALLED, "canceled", "words", 5.0, By(client=Sender(name="x"))
-    )
-    assert Goal.from_json(lines[0]["goal"]) == goal
-    assert (lines[0]["seq"], lines[0]["ok"]) == (3, True)
-    assert (goal.text, goal.key, goal.priority, goal.reason) == ("hello", "k", 2, "canceled")
-    assert goal.client == Sender(name="mqtt:bob")
-    assert [each["event"] for each in lines[1:]] == (["state", "result"] if wait or feedback else [])
+# Names
 
 
 def test_the_name_of_a_user_from_afar_fits_and_says_so() -> None:

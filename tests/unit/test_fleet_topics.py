@@ -7,7 +7,6 @@ import re
 import pytest
 
 from talkcli.fleet import topics
-from talkcli.fleet.topics import RequestTopic
 from talkcli.goals.options import MAX_SENDER_NAME_CHARS
 
 
@@ -27,10 +26,10 @@ def test_a_name_that_would_be_another_topic_is_refused(name: str) -> None:
 @pytest.mark.parametrize(
     ("topic", "asked"),
     [
-        ("talk/robot/anna/request/olga", RequestTopic("request", "olga")),
-        ("talk/robot/anna/say/olga", RequestTopic("say", "olga")),
-        ("talk/robot/anna/cancel/olga", RequestTopic("cancel", "olga")),
-        ("talk/group/all/request/olga", RequestTopic("request", "olga")),
+        ("talk/robot/anna/request/olga", ("request", "olga")),
+        ("talk/robot/anna/say/olga", ("say", "olga")),
+        ("talk/robot/anna/cancel/olga", ("cancel", "olga")),
+        ("talk/group/all/request/olga", ("request", "olga")),
         ("talk/group/all/say/olga", None),
         ("talk/robot/anna/echo", None),
         ("talk/robot/anna/event/state", None),
@@ -42,7 +41,7 @@ def test_a_name_that_would_be_another_topic_is_refused(name: str) -> None:
         ("", None),
     ],
 )
-def test_a_topic_says_what_is_asked_and_by_whom(topic: str, asked: RequestTopic | None) -> None:
+def test_a_topic_says_what_is_asked_and_by_whom(topic: str, asked: tuple[str, str] | None) -> None:
     assert topics.parse_request(topic) == asked
 
 

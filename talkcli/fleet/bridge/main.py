@@ -16,14 +16,15 @@ from typing import TYPE_CHECKING
 from talkcli import __version__
 from talkcli.daemon import log
 from talkcli.daemon.systemd import ServiceManager
-from talkcli.errors import EXIT_OK, AddressInUse, TalkError
+from talkcli.errors import AddressInUse, TalkError
 from talkcli.fleet import topics
-from talkcli.fleet.bridge.policy import ECHO_EVERY_S, STALE_CODE, EchoTracker, Goodbye, Ignored, Policy, Refusal
+from talkcli.fleet.bridge.policy import ECHO_EVERY_S, STALE_CODE, Goodbye, Ignored, Policy, RemoteRequest
 from talkcli.fleet.bridge.publisher import Publisher
 from talkcli.fleet.bridge.session import RemoteSessions
 from talkcli.fleet.link import REASON_NOT_AUTHORIZED, Link, LinkOpener, boottime
 from talkcli.fleet.payloads import HOMEASSISTANT_ONLINE, Message, Presence, bridge_rank, homeassistant_device
-from talkcli.frozen import frozen
+from talkcli.frozen import frozen, replace
+from talkcli.protocol.events import PROTOCOL
 from talkcli.protocol.lines import MAX_LINE_BYTES, encode
 
 if TYPE_CHECKING:
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
     from typing import Any
 
     from talkcli.fleet.broker import Broker
-    from talkcli.goals.goal import JsonObject
 
 #: How long the broker keeps a robot's presence, and how often the bridge renews it.
 PRESENCE_EXPIRY_S, PRESENCE_EVERY_S = 150, 60.0
@@ -80,8 +80,8 @@ class BridgeSettings:
     homeassistant: bool = False
 
 
-def run_bridge(settings: BridgeSettings, read_broker: Callable[[], Broker]) -> int:
-    """Run the bridge until SIGTERM or SIGINT, and return the exit code.
+async def run_bridge(settings: BridgeSettings, read_broker: Callable[[], Broker]) -> None:
+    """Run the bridge until SIGTERM or SIGINT.
 
     Args:
         settings: the bridge's settings, including the broker for the first connection.
@@ -91,11 +91,6 @@ def run_bridge(settings: BridgeSettings, read_broker: Callable[[], Broker]) -> i
         UsageError: a certificate or key file is unusable.
         AddressInUse: an older bridge has the same robot name.
     """
-    asyncio.run(_run(settings, read_broker))
-    return EXIT_OK
-
-
-async def _run(settings: BridgeSettings, read_broker: Callable[[], Broker]) -> None:
     loop, bridge = asyncio.get_running_loop(), Bridge(settings, read_broker)
 
     def on_signal(number: signal.Signals) -> None:
@@ -123,14 +118,17 @@ class Bridge:
         self._echo_topic = topics.robot(settings.name, topics.ECHO)
         self._presence_topic = topics.robot(settings.name, topics.PRESENCE)
         self._broker, self._read_broker = settings.broker, read_broker
-        self._groups = tuple(dict.fromkeys((topics.ALL_ROBOTS, *settings.groups)))
         self._loop = asyncio.get_running_loop()
-        self._session = f"{random.getrandbits(64):016x}"
-        self._since = time.time()
+        self._session, self._since = f"{random.getrandbits(64):016x}", time.time()
+        groups = tuple(dict.fromkeys((topics.ALL_ROBOTS, *settings.groups)))
+        #: the presence that this bridge publishes, except for the state of the server
+        self._presence = Presence(
+            settings.name, True, self._session, self._since, groups, settings.allow, version=__version__
+        )
         self._policy = Policy(settings.name, settings.allow)
         self._systemd = ServiceManager(self._loop, self._status_text)
         self._sessions = RemoteSessions(
-            settings.name, settings.socket, self._publish_reply, self._max_payload, self._systemd.schedule_status
+            settings.name, settings.socket, self._publish, self._max_payload, self._systemd.schedule_status
         )
         self._publisher = Publisher(
             self._sessions, self._publish_to_all, self._server_changed, with_text=settings.with_text
@@ -147,8 +145,6 @@ class Bridge:
         self._echo_at = 0.0
         #: when the presence was last published, by the event loop's clock
         self._presence_at = 0.0
-        #: timer that calls `_publish_device` after Home Assistant has started
-        self._device_timer: asyncio.TimerHandle | None = None
         self._ending = asyncio.Event()
         self._error: BaseException | None = None
 
@@ -241,7 +237,7 @@ class Bridge:
         self._rival_seen = False
         #: timer that takes the robot online unless another bridge answers; None until this bridge's question returns
         self._rival_timer: asyncio.TimerHandle | None = None
-        self._echoes = EchoTracker(boottime())
+        self._policy.newest_echo_at = boottime()
         #: when the bridge began to wait for an echo, by the event loop's clock; None if it isn't waiting
         self._unanswered_since: float | None = None
         self._loop.add_reader(self._descriptor, self._on_ready, Link.read)
@@ -259,7 +255,7 @@ class Bridge:
         self._online, self._retry_s = True, _FIRST_BROKER_RETRY_S
         name = self._settings.name
         wanted = [topics.robot(name, each, topics.ANY) for each in topics.REQUEST_LEVELS]
-        wanted += [topics.group(each, topics.REQUEST, topics.ANY) for each in self._groups]
+        wanted += [topics.group(each, topics.REQUEST, topics.ANY) for each in self._presence.groups]
         if self._settings.homeassistant:
             wanted.append(topics.HOMEASSISTANT_STATUS)
         self._link.subscribe(*wanted, retained=False)
@@ -301,10 +297,8 @@ class Bridge:
         if link is not self._link or self._descriptor < 0:
             return
         if link.ended is None and link.outstanding_bytes > STUCK_BROKER_BYTES:
-            mebibytes = STUCK_BROKER_BYTES >> 20
-            log.write_limited(
-                "output", f"the broker takes nothing: {mebibytes} MiB wait, so the connection is given up"
-            )
+            words = f"{STUCK_BROKER_BYTES >> 20} MiB wait, so the connection is given up"
+            log.write_limited("output", f"the broker takes nothing: {words}")
             link.close()
         if link.ended is not None:
             # Stop watching the descriptor now, because its number may be reused. Disconnect later, because the caller
@@ -321,8 +315,11 @@ class Bridge:
         else:
             self._loop.remove_writer(self._descriptor)
 
-    def _publish(self, topic: str, payload: bytes, qos: int = 1, **more: Any) -> None:
-        """Publish a message if there is a connection. Drop it if it is too long for the broker."""
+    def _publish(self, topic: str, payload: bytes, qos: int = 1, correlation: bytes | None = None, **more: Any) -> None:
+        """Publish a message if there is a connection. Drop it if it is too long for the broker.
+
+        `more` are other arguments of `Link.publish`. By default, a warning is logged if the broker rejects the message.
+        """
         link = self._link
         if link is None:
             return
@@ -330,13 +327,8 @@ class Bridge:
             words = f"{len(payload):,} bytes for {topic} are not published"
             log.write_limited("long", f"{words}: the broker takes {link.max_payload_bytes:,}")
             return
-        link.publish(topic, payload, qos, **more)
+        link.publish(topic, payload, qos, correlation=correlation, **{"acknowledged": self._log_denial, **more})
         self._check_link(link)
-
-    def _publish_reply(self, topic: str, payload: bytes, qos: int, correlation: bytes | None) -> None:
-        """Publish lines for a remote client."""
-        acknowledged = self._log_denial if qos else None
-        self._publish(topic, payload, qos, correlation=correlation, acknowledged=acknowledged)
 
     def _publish_to_all(self, topic: str, payload: bytes, expiry: float | None) -> None:
         """Publish an event, or a retained message if `expiry` is None.
@@ -371,28 +363,23 @@ class Bridge:
             self._handle_presence(message.payload)
             return
         if message.topic == topics.HOMEASSISTANT_STATUS and message.payload == HOMEASSISTANT_ONLINE:
-            delay = random.uniform(0, _DEVICE_DELAY_S)
-            self._device_timer = self._device_timer or self._loop.call_later(delay, self._publish_device)
+            self._loop.call_later(random.uniform(0, _DEVICE_DELAY_S), self._publish_device)
         topic = topics.parse_request(message.topic)
         if topic is None or not self._online:
             return
-        now = boottime()
-        decision = self._policy.decide(message, topic, now, stale=self._echoes.is_stale(now))
+        decision = self._policy.decide(message, *topic, boottime())
         if isinstance(decision, Ignored):
             log.write_limited(decision.kind, log.sanitize(decision.words))
         elif isinstance(decision, Goodbye):
             self._sessions.say_goodbye(decision.user, decision.reply_topic)
-        elif isinstance(decision, Refusal):
-            self._refuse(decision, topic.user)
-        else:
+        elif isinstance(decision, RemoteRequest):
             self._sessions.submit(decision)
-
-    def _refuse(self, refusal: Refusal, user: str) -> None:
-        self._sessions.refuse(refusal)
-        error = refusal.error
-        log.write_limited(error.code, f"a request of {user} is refused: {log.sanitize(error.message)}")
-        if error.code == STALE_CODE and self._loop.time() - self._echo_at >= _ECHO_PAUSE_S:
-            self._send_echo()
+        else:
+            self._sessions.refuse(decision)
+            error = decision.error
+            log.write_limited(error.code, f"a request of {topic[1]} is refused: {log.sanitize(error.message)}")
+            if error.code == STALE_CODE and self._loop.time() - self._echo_at >= _ECHO_PAUSE_S:
+                self._send_echo()
 
     def _handle_echo(self, payload: bytes) -> None:
         """Process a message on the echo topic: an echo, or a bridge's question about the robot's name."""
@@ -404,8 +391,8 @@ class Bridge:
                 wait = _RIVAL_LIMIT_S if self._rival_seen else 0
                 self._rival_timer = self._loop.call_later(wait, self._go_online)
             return
-        session, _, number = payload.partition(b" ")
-        if session == self._session.encode() and self._echoes.returned(number):
+        session, _, sent_at = payload.partition(b" ")
+        if session == self._session.encode() and self._policy.echo_returned(sent_at, boottime()):
             self._unanswered_since = None
 
     def _handle_presence(self, payload: bytes) -> None:
@@ -436,28 +423,19 @@ class Bridge:
 
     def _publish_presence(self) -> None:
         self._presence_at = self._loop.time()
-        presence: JsonObject = {
-            "talk": 1,
-            "version": __version__,
-            "online": True,
-            "session": self._session,
-            "since": self._since,
-            "groups": list(self._groups),
-            "allow": list(self._settings.allow),
-            "server": self._publisher.server,
-        }
-        line = encode(presence)
-        self._publish(self._presence_topic, line, retain=True, expiry=PRESENCE_EXPIRY_S, acknowledged=self._log_denial)
+        presence = replace(self._presence, server=self._publisher.server).to_json()
+        line = encode({"talk": PROTOCOL, "version": __version__, **presence})
+        self._publish(self._presence_topic, line, retain=True, expiry=PRESENCE_EXPIRY_S)
 
     def _offline_presence(self) -> bytes:
-        return encode({"talk": 1, "online": False, "session": self._session, "groups": list(self._groups)})
+        groups = list(self._presence.groups)
+        return encode({"talk": PROTOCOL, "online": False, "session": self._session, "groups": groups})
 
     def _publish_device(self) -> None:
         """Publish the robot's description for Home Assistant as a retained message, if enabled."""
-        self._device_timer = None
         if self._settings.homeassistant and self._online:
             topic, device = homeassistant_device(self._settings.name, self._settings.allow, __version__)
-            self._publish(topic, device, retain=True, acknowledged=self._log_denial)
+            self._publish(topic, device, retain=True)
 
     def _server_changed(self) -> None:
         self._systemd.schedule_status()
@@ -468,8 +446,7 @@ class Bridge:
         now = self._echo_at = self._loop.time()
         if self._unanswered_since is None:
             self._unanswered_since = now
-        number = self._echoes.add(boottime())
-        self._publish(self._echo_topic, f"{self._session} {number}".encode())
+        self._publish(self._echo_topic, f"{self._session} {boottime()}".encode())
 
     def _tick(self) -> None:
         """Send an echo, check for timeouts, and renew the presence if it is due."""

@@ -11,18 +11,16 @@ from typing import TYPE_CHECKING
 from talkcli.errors import BadRequest, LineTooLong, RequestRefused
 from talkcli.fleet import topics
 from talkcli.frozen import frozen, replace
-from talkcli.goals.goal import By, Goal, Sender
-from talkcli.goals.options import MAX_SENDER_NAME_CHARS, SHOWN_OPTIONS, Say
-from talkcli.protocol.events import Result, StateChanged, ok, take_seq
-from talkcli.protocol.lines import MAX_DIGITS, MAX_LINE_BYTES, decode
+from talkcli.goals.options import MAX_SENDER_NAME_CHARS, Say
+from talkcli.protocol.events import take_seq
+from talkcli.protocol.lines import MAX_LINE_BYTES, decode
 from talkcli.protocol.requests import REQUEST_TYPES, read_request
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
     from talkcli.fleet.payloads import Message
-    from talkcli.goals.goal import JsonObject
-    from talkcli.goals.states import State
+    from talkcli.goals.goal import Goal, JsonObject
     from talkcli.protocol.requests import Request
 
 #: Error code for a message that may be outdated.
@@ -36,8 +34,6 @@ ALLOWABLE_REQUESTS = tuple(each for each in REQUEST_TYPES if each not in ALWAYS_
 ECHO_EVERY_S = 5.0
 #: A message is stale if the newest returned echo is older than this. The extra second is for transmission.
 STALE_AFTER_S = ECHO_EVERY_S + 1.0
-#: Maximum number of echoes that have not returned. This is enough for one per second over half a minute.
-_MAX_ECHOES = 32
 #: Maximum number of pending goals from remote clients. The other places in the server's queue, which usually has 100,
 #: are left to local clients.
 MAX_REMOTE_GOALS = 20
@@ -107,7 +103,13 @@ class Ignored:
 
 
 class Policy:
-    """Decides which messages to a robot are accepted."""
+    """Decides which messages to a robot are accepted.
+
+    The bridge sends echoes to itself to detect messages that may be outdated. The broker forwards messages in order. A
+    message that arrives after an echo must have been forwarded after the echo was sent. Therefore, the age of the
+    newest returned echo limits the delay of the next message. There is no need to compare the clocks of different
+    machines.
+    """
 
     def __init__(self, name: str, allow: Collection[str]) -> None:
         """Create the policy of one robot.
@@ -118,34 +120,45 @@ class Policy:
         """
         self._name = name
         self._allow = {*allow, *ALWAYS_ALLOWED}
+        #: when the newest returned echo was sent, or when the connection was opened, by the `boottime` clock
+        self.newest_echo_at = 0.0
 
-    def decide(
-        self, message: Message, topic: topics.RequestTopic, now: float, *, stale: bool
-    ) -> RemoteRequest | Refusal | Goodbye | Ignored:
+    def echo_returned(self, sent_at_text: bytes, now: float) -> bool:
+        """Record that an echo has returned. Return False if its time is invalid or it isn't the newest one."""
+        try:
+            sent_at = float(sent_at_text)
+        except ValueError:
+            return False
+        if not self.newest_echo_at < sent_at <= now:
+            return False
+        self.newest_echo_at = sent_at
+        return True
+
+    def decide(self, message: Message, kind: str, user: str, now: float) -> RemoteRequest | Refusal | Goodbye | Ignored:
         """Decide what to do with a message.
 
         Args:
             message: a message on a request topic of the robot or one of its groups.
-            topic: the parts of the message's topic.
+            kind: the kind of request topic: `topics.REQUEST`, `PLAIN_SAY` or `PLAIN_CANCEL`.
+            user: the client's user name.
             now: the current time, by the `boottime` clock.
-            stale: whether the message may be outdated.
         """
         if message.retained:
             return Ignored("retained", f"a retained message on {message.topic} is dropped: it is no request of now")
         reply_topic = None
         if message.response is not None:
-            reply_topic = topics.checked_reply(message.response, topic.user, self._name)
+            reply_topic = topics.checked_reply(message.response, user, self._name)
             if reply_topic is None:
                 words = f"its response topic, {message.response}, is not its own"
-                return Ignored("response", f"a message of {topic.user} is dropped: {words}")
-        if not message.payload and topic.kind != topics.PLAIN_CANCEL:
-            if reply_topic is None or topic.kind == topics.PLAIN_SAY:
+                return Ignored("response", f"a message of {user} is dropped: {words}")
+        if not message.payload and kind != topics.PLAIN_CANCEL:
+            if reply_topic is None or kind == topics.PLAIN_SAY:
                 return Ignored("empty", f"an empty message on {message.topic} asks for nothing")
-            return Goodbye(topic.user, reply_topic)
+            return Goodbye(user, reply_topic)
         repeatable = len(message.correlation or b"") <= MAX_CORRELATION_BYTES
         seq, correlation = None, message.correlation if repeatable else None
         try:
-            fields = _request_fields(topic.kind, message.payload)
+            fields = _request_fields(kind, message.payload)
             seq = take_seq(fields)
             if not repeatable:
                 raise BadRequest(f"correlation data have at most {MAX_CORRELATION_BYTES} bytes", "bad_field")
@@ -153,14 +166,14 @@ class Policy:
             if request.kind not in self._allow:
                 words = f"this robot takes no {request.kind} from afar: see its --allow"
                 raise BadRequest(words, "not_allowed")
-            if stale and isinstance(request, Say):
+            if isinstance(request, Say) and now - self.newest_echo_at > STALE_AFTER_S:
                 words = "the line to the broker stalled, so this may be old: say it again if it still holds"
                 raise BadRequest(words, STALE_CODE)
         except BadRequest as error:
             return Refusal(reply_topic, seq, correlation, error)
         start_by = None if message.expiry is None else now + message.expiry
-        size = 0 if topic.kind == topics.PLAIN_CANCEL else len(message.payload)
-        return RemoteRequest(topic.user, reply_topic, seq, request, correlation, size, start_by)
+        size = 0 if kind == topics.PLAIN_CANCEL else len(message.payload)
+        return RemoteRequest(user, reply_topic, seq, request, correlation, size, start_by)
 
 
 def _request_fields(kind: str, payload: bytes) -> JsonObject:
@@ -181,43 +194,6 @@ def _request_fields(kind: str, payload: bytes) -> JsonObject:
     except UnicodeDecodeError as error:
         words = f"a text is UTF-8, but byte {error.start} of this one is not"
         raise BadRequest(words, "bad_encoding") from None
-
-
-class EchoTracker:
-    """Detects messages that may be outdated, using echoes that the bridge sends to itself.
-
-    The broker forwards messages in order. A message that arrives after an echo must have been forwarded after the echo
-    was sent. Therefore, the age of the newest returned echo limits the delay of the next message. There is no need to
-    compare the clocks of different machines.
-    """
-
-    def __init__(self, now: float) -> None:
-        """Start tracking a connection that was opened at the time `now`."""
-        self._newest_at = now
-        self._sent: dict[int, float] = {}
-        self._number = 0
-
-    def add(self, now: float) -> int:
-        """Record that an echo is being sent, and return its number."""
-        self._number += 1
-        self._sent[self._number] = now
-        while len(self._sent) > _MAX_ECHOES:
-            del self._sent[next(iter(self._sent))]
-        return self._number
-
-    def returned(self, number_text: bytes) -> bool:
-        """Record that an echo has returned. Return False if the echo is unknown."""
-        number = int(number_text) if number_text.isdigit() and len(number_text) <= MAX_DIGITS else 0
-        sent = self._sent.get(number)
-        if sent is None:
-            return False
-        self._newest_at = max(self._newest_at, sent)
-        self._sent = {each: at for each, at in self._sent.items() if each > number}
-        return True
-
-    def is_stale(self, now: float) -> bool:
-        """Return whether a message that arrives now may be outdated."""
-        return now - self._newest_at > STALE_AFTER_S
 
 
 class SentIds:
@@ -316,42 +292,6 @@ class RemoteGoals:
         """
         self._goals = {each: found for each, found in self._goals.items() if not found[1]}
         self._goals |= {goal_id: (key, True) for goal_id, key in pending}
-
-
-def end_unsent(
-    request: RemoteRequest, goal_id: str, state: State, reason: str, words: str, at: float, by: By | None = None
-) -> tuple[Goal, list[JsonObject]]:
-    """End a goal that was never sent to the server. Return the goal and the lines for its client.
-
-    The server would send the same lines.
-
-    Args:
-        request: the `say`.
-        goal_id: the goal's id.
-        state: the goal's end state.
-        reason: the machine-readable reason for the end.
-        words: the human-readable reason for the end.
-        at: the current time, in seconds since 1970 UTC.
-        by: the client that canceled the goal, or None.
-    """
-    say = request.request
-    assert isinstance(say, Say)
-    goal = Goal(
-        goal_id,
-        state,
-        say.text,
-        reason=reason,
-        by=by,
-        message=words,
-        client=Sender(name=sender_name(request.user)),
-        queued_at=at,
-        ended_at=at,
-        **{name: getattr(say, name) for name in SHOWN_OPTIONS},
-    )
-    lines = [ok(request.seq, goal=goal.to_json())]
-    if say.wait or say.feedback:
-        lines += [StateChanged(goal_id, state, at).to_json(), Result(goal).to_json()]
-    return goal, lines
 
 
 def without_texts(message: JsonObject) -> JsonObject:

@@ -44,8 +44,6 @@ _STATUS_EVERY_S = 1.0
 _STATUS_AFTER_CHANGE_S = 0.1
 #: Maximum length of a goal's text in the status. Longer texts are cut off.
 _MAX_STATUS_TEXT_CHARS = 1_000
-#: The server counts as hung if it sends nothing for this long. A working server sends a sign of life every 5 s.
-_SERVER_SILENCE_LIMIT_S = 15.0
 #: Longest random pause before the first attempt to reconnect to the server, and before later attempts.
 _FIRST_SERVER_RETRY_S, _LAST_SERVER_RETRY_S = 0.2, 5.0
 
@@ -71,8 +69,6 @@ class Publisher:
         #: boot id, pid and version of the server; None if the bridge isn't connected to it
         self.server: JsonObject | None = None
         self._connection: LocalConnection | None = None
-        #: when the server last sent data, by the event loop's clock
-        self._heard_at = 0.0
         #: texts of unfinished goals, by goal id
         self._texts: dict[str, str | None] = {}
         #: id of the active goal
@@ -104,11 +100,18 @@ class Publisher:
             self._retry_s = min(_LAST_SERVER_RETRY_S, self._retry_s * 2)
 
     async def _follow(self, server: LocalConnection) -> None:
-        """Process the server's lines until the connection ends."""
-        self._heard_at = self._loop.time()
-        watch = partial(self._watch, server)
+        """Watch the server, and process its lines until the connection ends."""
+
+        def remember(_: JsonObject, ended: list[JsonObject]) -> None:
+            for goal in goals(ended, "goal"):
+                self._sessions.remember(goal, server.boot)
+
+        def refuse(error: TalkError) -> None:
+            raise ServerUnavailable(f"the server at {server.path} can't be watched: {error}")
+
         # Request the log first, because it contains the goals that an earlier bridge has sent.
-        server.send(Exchange(Log(MAX_LOG_GOALS), watch, lambda _: watch({}, [])))
+        server.send(Exchange(Log(MAX_LOG_GOALS), remember, lambda _: None))
+        server.send(Exchange(Watch(), partial(self._on_watching, server), refuse))
         while lines := await server.read():
             self._receive(server, lines)
         log.write("the server's connection has ended")
@@ -122,35 +125,23 @@ class Publisher:
     def tick(self) -> None:
         """Disconnect from the server if it hangs. Call this every few seconds."""
         server = self._connection
-        if server and self._loop.time() - self._heard_at > _SERVER_SILENCE_LIMIT_S:
-            log.write_limited(
-                "silence", f"the server at {log.sanitize(server.path)} says nothing: restart it if it hangs"
-            )
+        if server and self._loop.time() > server.silent_by(0.0)[0]:
+            path = log.sanitize(server.path)
+            log.write_limited("silence", f"the server at {path} says nothing: restart it if it hangs")
             server.abort()
 
     # -- from the server
 
     def _receive(self, server: LocalConnection, lines: list[bytes]) -> None:
-        now = self._heard_at = self._loop.time()
         for line in lines:
             try:
                 message = decode(line)
                 if "event" in message:
                     self._receive_event(server, message, line)
                 else:
-                    server.dispatch(message, now)
+                    server.dispatch(message, self._loop.time())
             except (BadRequest, ValueError) as error:
                 log.write_limited("line", f"what the server says can't be read: {log.sanitize(str(error))}")
-
-    def _watch(self, server: LocalConnection, _reply: JsonObject, ended: list[JsonObject]) -> None:
-        """Remember the goals in the server's log, and start watching the server."""
-
-        def refuse(error: TalkError) -> None:
-            raise ServerUnavailable(f"the server at {server.path} can't be watched: {error}")
-
-        for goal in goals(ended, "goal"):
-            self._sessions.remember(goal, server.boot)
-        server.send(Exchange(Watch(), partial(self._on_watching, server), refuse))
 
     def _on_watching(self, server: LocalConnection, reply: JsonObject, items: list[JsonObject]) -> None:
         """Store the server's state from its reply to `watch`."""
@@ -185,7 +176,9 @@ class Publisher:
             self._update(event)
             self._sessions.goal_changed(event, server.boot)
             if event.goal and (not self._with_text or len(line) >= self._sessions.max_payload()):
-                line = encode(replace(event, goal=_without_text(event.goal)).to_json()).removesuffix(b"\n")
+                # The goal's message may quote its text.
+                goal = replace(event.goal, text=None, spoken=None, message=None)
+                line = encode(replace(event, goal=goal).to_json()).removesuffix(b"\n")
         elif isinstance(event, PausedChanged):
             self._paused = event.paused
         else:
@@ -209,27 +202,19 @@ class Publisher:
 
     def _publish_status(self) -> None:
         self._timer, self._published_at = None, self._loop.time()
-        status = self._status(with_text=self._with_text)
-        if len(status) > self._sessions.max_payload():
-            status = self._status(with_text=False)
-        self._publish(topics.robot(self._sessions.name, topics.STATUS), status, None)
-
-    def _status(self, *, with_text: bool) -> bytes:
         active, last = self._active, self._last
         text = self._texts.get(active) if active else None
         ended = LastGoal(last.id, last.state, last.reason, _shown_text(last), last.ended_at) if last else None
         status = RobotStatus(active, text, len(self._texts.keys() - {active}), self._paused, ended).to_json()
-        for each in (status, status["last"]):
-            if not with_text and isinstance(each, dict):
-                del each["text"]
-        return encode(status)
+        payload = encode(status)
+        if not self._with_text or len(payload) > self._sessions.max_payload():
+            for each in (status, status["last"]):
+                if isinstance(each, dict):
+                    del each["text"]
+            payload = encode(status)
+        self._publish(topics.robot(self._sessions.name, topics.STATUS), payload, None)
 
 
 def _shown_text(goal: Goal | None) -> str | None:
     """Return the beginning of a goal's text, as shown in the status."""
     return goal.text[:_MAX_STATUS_TEXT_CHARS] if goal and goal.text else None
-
-
-def _without_text(goal: Goal) -> Goal:
-    """Return a goal without its text, and without its message, which may quote the text."""
-    return replace(goal, text=None, spoken=None, message=None)

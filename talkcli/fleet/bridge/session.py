@@ -20,10 +20,10 @@ from talkcli.fleet.bridge import policy
 from talkcli.fleet.bridge.local import dial
 from talkcli.fleet.link import boottime
 from talkcli.frozen import replace
-from talkcli.goals.goal import By, Sender
-from talkcli.goals.options import Cancel, Say, Set
+from talkcli.goals.goal import By, Goal, Sender
+from talkcli.goals.options import SHOWN_OPTIONS, Cancel, Say, Set
 from talkcli.goals.states import State
-from talkcli.protocol.events import failure
+from talkcli.protocol.events import Result, StateChanged, failure, ok
 from talkcli.protocol.lines import MAX_LINE_BYTES, decode, encode
 from talkcli.protocol.requests import Hello, Pause, Resume, Status, Wait, Watch
 
@@ -32,8 +32,7 @@ if TYPE_CHECKING:
 
     from talkcli.fleet.bridge.local import LocalConnection
     from talkcli.fleet.bridge.policy import RemoteRequest
-    from talkcli.goals.goal import Goal, JsonObject
-    from talkcli.protocol.events import StateChanged
+    from talkcli.goals.goal import JsonObject
     from talkcli.protocol.requests import Request
 
     #: Publishes lines for a client, given the topic, the payload, the QoS, and the correlation data.
@@ -48,8 +47,6 @@ MAX_WAITING_BYTES = 4 * 1024 * 1024
 #: A client's session ends if the client sends nothing for this long, because MQTT doesn't report when a client leaves.
 #: Waiting clients send `hello` every 30 s, so that two of these messages may get lost.
 CLIENT_SILENCE_LIMIT_S = 90.0
-#: Time allowed for the server to answer the requests of a client that has said goodbye.
-_GOODBYE_LIMIT_S = 5.0
 #: A generated goal id begins with the robot's name, which is cut to this length. An id has at most 64 characters.
 _MAX_ID_PREFIX_CHARS = 48
 #: Message to a client after the server has closed the client's connection.
@@ -167,11 +164,8 @@ class RemoteSessions:
         """Cancel the waiting goals that match a `cancel` request, and return them."""
         selected = [self.waiting[each] for each in selection.select_waiting([say for _, say, _ in self.waiting])]
         self.waiting = [each for each in self.waiting if not any(each is other for other in selected)]
-        words = "canceled before it was spoken"
-        return [
-            session.end_goal(request, say.id, State.RECALLED, "canceled", words, by)
-            for request, say, session in selected
-        ]
+        ending = State.RECALLED, "canceled", "canceled before it was spoken", by
+        return [session.end_goal(request, say, *ending) for request, say, session in selected]
 
     def schedule_release(self) -> None:
         """Schedule `_release`, which sends waiting goals to the server.
@@ -264,8 +258,8 @@ class RemoteSession:
         #: ids of the goals whose results the client is waiting for
         self._awaited: set[str] = set()
         self._watching = False
-        #: timer that ends the session after a goodbye
-        self._goodbye_timer: asyncio.TimerHandle | None = None
+        #: whether the client has said goodbye
+        self._said_goodbye = False
 
     # -- from the client
 
@@ -282,9 +276,8 @@ class RemoteSession:
     def submit(self, request: RemoteRequest) -> None:
         """Send or queue a request, or refuse it if too many requests are unanswered."""
         self.used_at = self._loop.time()
-        if self._goodbye_timer:  # the client has returned
-            self._goodbye_timer.cancel()
-            self._goodbye_timer, self._reply_topic = None, request.reply_topic
+        if self._said_goodbye:  # the client has returned
+            self._said_goodbye, self._reply_topic = False, request.reply_topic
         urgent = isinstance(request.request, Cancel | Status)
         limit = 2 * MAX_WAITING_BYTES if urgent else MAX_WAITING_BYTES
         if len(self._unanswered) + len(self._waiting_for_room()) >= MAX_WAITING_REQUESTS:
@@ -304,10 +297,9 @@ class RemoteSession:
         The client gets no more answers, and its waiting goals are dropped. The session stays open until the server has
         answered requests with a lasting effect.
         """
-        self._reply_topic = None
+        self._said_goodbye, self._reply_topic = True, None
         self._drop_waiting()
         self._queue = deque(each for each in self._queue if _has_lasting_effect(each))
-        self._goodbye_timer = self._goodbye_timer or self._loop.call_later(_GOODBYE_LIMIT_S, self.end)
         self._end_if_done()
 
     def end(self, why: str | None = None) -> None:
@@ -319,8 +311,6 @@ class RemoteSession:
         if why and not self.idle:
             self._send_gone(why)
         self._reply_topic = None
-        if self._goodbye_timer:
-            self._goodbye_timer.cancel()
         if self._task:
             self._task.cancel()
         self._clean_up()
@@ -351,7 +341,7 @@ class RemoteSession:
 
     def _end_if_done(self) -> None:
         """End the session if the client has said goodbye and its important requests have been answered."""
-        if self._goodbye_timer and not any(map(_has_lasting_effect, self._unanswered)):
+        if self._said_goodbye and not any(map(_has_lasting_effect, self._unanswered)):
             self.end()
 
     # -- to the server
@@ -393,7 +383,8 @@ class RemoteSession:
             shared.waiting.append((remote, say, self))
         else:
             words = f"{policy.MAX_REMOTE_GOALS} goals from afar are waiting already"
-            self.end_goal(remote, None, State.REJECTED, "queue_full", words, None)
+            # As at the server, a rejected goal doesn't get the id that its client has chosen.
+            self.end_goal(remote, replace(say, id=None), State.REJECTED, "queue_full", words)
 
     def _send_cancel(self, remote: RemoteRequest, cancel: Cancel) -> None:
         """Cancel waiting goals, and then send the `cancel` request to the server.
@@ -510,12 +501,30 @@ class RemoteSession:
         self._publish([(encode(failure(request.seq, code, words)), request.correlation)])
 
     def end_goal(
-        self, request: RemoteRequest, goal_id: str | None, state: State, reason: str, words: str, by: By | None
+        self, remote: RemoteRequest, say: Say, state: State, reason: str, words: str, by: By | None = None
     ) -> Goal:
-        """End a goal that was never sent to the server. The arguments are those of `policy.end_unsent`."""
-        goal, lines = policy.end_unsent(request, goal_id or self._new_id(), state, reason, words, time.time(), by)
-        answer, *events = (encode(each) for each in lines)
-        self._publish([(answer, request.correlation), *((each, None) for each in events)])
+        """End a goal that was never sent to the server, and return it.
+
+        Its client gets the lines that the server would send.
+
+        Args:
+            remote: the client's request.
+            say: the goal in it.
+            state: the goal's end state.
+            reason: the machine-readable reason for the end.
+            words: the human-readable reason for the end.
+            by: the client that canceled the goal, or None.
+        """
+        goal_id, sender, now = say.id or self._new_id(), Sender(name=policy.sender_name(self._user)), time.time()
+        goal = Goal(goal_id, state, say.text, reason, by, words, client=sender, queued_at=now, ended_at=now)
+        goal = replace(goal, **{name: getattr(say, name) for name in SHOWN_OPTIONS})
+        lines = [(encode(ok(remote.seq, goal=goal.to_json())), remote.correlation)]
+        if say.wait or say.feedback:
+            lines += [
+                (encode(StateChanged(goal_id, state, now).to_json()), None),
+                (encode(Result(goal).to_json()), None),
+            ]
+        self._publish(lines)
         return goal
 
     def _send_gone(self, why: str) -> None:

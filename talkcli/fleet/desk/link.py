@@ -13,18 +13,10 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Protocol
 
-from talkcli.errors import AccessDenied, ServerUnavailable, TalkError
+from talkcli.errors import AccessDenied, RequestRefused, ServerUnavailable, TalkError
 from talkcli.fleet import topics
 from talkcli.fleet.broker import Broker, client_user
-from talkcli.fleet.link import (
-    KEEPALIVE_S,
-    MAX_RECEIVE_COUNT,
-    REASON_FAILURE,
-    REASON_NOT_AUTHORIZED,
-    TICK_EVERY_S,
-    Link,
-    LinkOpener,
-)
+from talkcli.fleet.link import KEEPALIVE_S, REASON_FAILURE, REASON_NOT_AUTHORIZED, TICK_EVERY_S, Link, LinkOpener
 from talkcli.goals.options import Say
 from talkcli.polling import wait_ready
 from talkcli.protocol.lines import request_line, write_request
@@ -188,8 +180,9 @@ class DeskLink:
                 self._refusals.append((on_refused, error))
 
         line = request_line({"seq": number, **write_request(request)})
-        if (error := self.link.size_error(line, request.kind)) is not None:
-            on_refused(error)
+        if len(line) > self.link.max_payload_bytes:
+            limit = f"the broker takes {self.link.max_payload_bytes:,}: nothing was sent"
+            on_refused(RequestRefused(f"{request.kind} has {len(line):,} bytes, and {limit}", "too_long"))
             return False
         expiry = (request.ttl or None) if isinstance(request, Say) else _REQUEST_EXPIRY_S
         topic, response = self._topics(to, is_group=is_group)
@@ -265,9 +258,7 @@ class DeskLink:
             self._end_attempt(self._opening)
             return 0.0
         if self._opening is None and now >= self._next_attempt_at:
-            # When a thousand robots answer at once, a broker with default settings would drop some of the messages.
-            name = f"talk-desk-{self.user}-{self.session}"
-            new = Link(self.broker, name, self._inbox.append, receive_maximum=MAX_RECEIVE_COUNT)
+            new = Link(self.broker, f"talk-desk-{self.user}-{self.session}", self._inbox.append)
             self._opening = LinkOpener(new, self.wake)
         return TICK_EVERY_S if self._opening else max(0.0, self._next_attempt_at - now)
 
