@@ -225,7 +225,7 @@ async def test_a_goal_that_never_reached_the_server_is_told_as_the_server_would(
     await anna.ask({"seq": 3, "request": "cancel", "ids": ["waits"]}, "another")
     await anna.line(lambda each: each.get("seq") == 1)
     for number, state, reason in ((1, "RECALLED", "canceled"), (2, "REJECTED", "queue_full")):
-        reply = await anna.line(lambda each, number=number: each.get("seq") == number)
+        (reply,) = [each for each in anna.lines() if each.get("seq") == number]
         goal = reply["goal"]
         assert (reply["ok"], goal["state"], goal["reason"]) == (True, state, reason)
         assert (goal["text"], goal["key"], goal["priority"]) == (f"sentence {number}", "k", -2)

@@ -520,10 +520,8 @@ class RemoteSession:
         goal = replace(goal, **{name: getattr(say, name) for name in SHOWN_OPTIONS})
         lines = [(encode(ok(remote.seq, goal=goal.to_json())), remote.correlation)]
         if say.wait or say.feedback:
-            lines += [
-                (encode(StateChanged(goal_id, state, now).to_json()), None),
-                (encode(Result(goal).to_json()), None),
-            ]
+            events = StateChanged(goal_id, state, now).to_json(), Result(goal).to_json()
+            lines += [(encode(each), None) for each in events]
         self._publish(lines)
         return goal
 
