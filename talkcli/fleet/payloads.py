@@ -13,7 +13,7 @@ from __future__ import annotations
 from talkcli.errors import BadRequest
 from talkcli.fleet import topics
 from talkcli.frozen import TYPE_CHECKING, fields, frozen
-from talkcli.goals.goal import Goal, read_fields, read_seconds
+from talkcli.goals.goal import Goal, read_fields
 from talkcli.goals.states import EXIT_CODES, State
 from talkcli.protocol.events import StateChanged
 from talkcli.protocol.lines import decode, encode
@@ -45,7 +45,7 @@ class Presence:
     """A robot's presence: whether it is online, and details of its bridge and server."""
 
     name: str
-    online: bool
+    online: bool = False
     #: random id of the bridge process; "" if unknown
     session: str = ""
     #: Unix timestamp of the bridge's start, by the robot's clock; None if the robot is offline
@@ -67,17 +67,8 @@ class Presence:
         said = _object(payload)
         if said is None or topics.name_fault(name):
             return None
-        server = said.get("server")
-        return cls(
-            name,
-            said.get("online") is True,
-            _text(said.get("session")) or "",
-            read_seconds(said.get("since")),
-            _texts(said.get("groups")),
-            _texts(said.get("allow")),
-            server if isinstance(server, dict) else None,
-            _text(said.get("version")) or "",
-        )
+        lists = {each: _texts(said.pop(each, None)) for each in ("groups", "allow")}
+        return cls(**{**read_fields(cls, said), **lists, "name": name})
 
     def to_json(self) -> JsonObject:
         """Return the presence as a JSON object, without the robot's name."""
@@ -128,15 +119,10 @@ class RobotStatus:
         said = _object(payload)
         if said is None:
             return None
-        pending, last = said.get("pending"), said.get("last")
-        found = read_fields(LastGoal, last) if isinstance(last, dict) else {}
-        return cls(
-            _text(said.get("active")),
-            _text(said.get("text")),
-            max(0, pending) if isinstance(pending, int) else 0,
-            said.get("paused") is True,
-            LastGoal(**found) if "id" in found and "state" in found else None,
-        )
+        last = read_fields(LastGoal, said.pop("last", None))
+        found = read_fields(cls, said)
+        found["pending"] = max(0, found.get("pending", 0))
+        return cls(**found, last=LastGoal(**last) if "id" in last and "state" in last else None)
 
     def events(self) -> list[StateChanged]:
         """Convert the status to events: the end of the last goal, and the start of the active goal."""
@@ -175,10 +161,6 @@ def _object(payload: bytes) -> JsonObject | None:
         return decode(payload.strip())
     except BadRequest:
         return None
-
-
-def _text(value: object) -> str | None:
-    return value if isinstance(value, str) else None
 
 
 def _texts(value: object) -> tuple[str, ...]:

@@ -92,7 +92,7 @@ async def test_a_connection_that_breaks_under_an_answer_is_made_again(
     settings = BridgeSettings("anna", from_environment(broker.env()), ("say",), socket=scripted.socket)
     bridge = Bridge(settings, lambda: settings.broker)
     work = asyncio.create_task(bridge.run())
-    await asyncio.wait_for(until(lambda: bridge.ready), PATIENCE)
+    await asyncio.wait_for(until(lambda: bridge._online and bridge._publisher.server), PATIENCE)
     with RemoteClient(broker, "olga") as olga, Listener(broker, "talk/robot/anna/presence") as listener:
         monkeypatch.setattr(paho.Client, "_sock_send", send)
         olga.send({"seq": 1, "request": "set", "rate": 200})

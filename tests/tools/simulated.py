@@ -144,7 +144,7 @@ async def run(names: list[str], broker_url: str, directory: str, spoken: TextIO)
 
     def tell_ready() -> None:
         nonlocal look
-        if not all(each.ready for each in bridges):
+        if not all(each._online and each._publisher.server for each in bridges):
             look = loop.call_later(_LOOK_EVERY_S, tell_ready)
             return
         # A garbage collection of everything would delay hundreds of robots.

@@ -200,8 +200,10 @@ def is_stale(rules: Policy, now: float) -> bool:
 
 
 def returned(rules: Policy, sent_at: float, now: float) -> bool:
-    """Return an echo to the robot."""
-    return rules.echo_returned(f"{sent_at}".encode(), now)
+    """Return an echo to the robot, and tell whether it is the newest one."""
+    before = rules.newest_echo_at
+    rules.echo_returned(f"{sent_at}".encode(), now)
+    return rules.newest_echo_at > before
 
 
 def connected(now: float) -> Policy:
@@ -227,7 +229,7 @@ def test_what_comes_within_six_seconds_of_the_newest_echo_that_came_back_is_take
 )
 def test_an_unknown_echo_tells_nothing(unknown: bytes) -> None:
     rules = connected(0.0)
-    assert not rules.echo_returned(unknown, 20.0)
+    rules.echo_returned(unknown, 20.0)
     assert is_stale(rules, 10.0)
     assert returned(rules, 10.0, 20.0)
     assert not returned(rules, 10.0, 20.0)  # twice

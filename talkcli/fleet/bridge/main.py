@@ -40,7 +40,7 @@ _RIVAL_LIMIT_S = 1.0
 #: Longest random pause before the first attempt to reconnect to the broker, and before later attempts. Without
 #: randomness, a thousand robots would reconnect at the same moment.
 _FIRST_BROKER_RETRY_S, _LAST_BROKER_RETRY_S = 0.5, 10.0
-#: The connection is closed if no echo has returned for this long.
+#: The connection is closed if the last echo was sent this long after the newest echo that has returned.
 _ECHO_TIMEOUT_S = 15.0
 #: After refusing a stale message, the bridge sends an extra echo if the last one is at least this old.
 _ECHO_PAUSE_S = 1.0
@@ -141,7 +141,7 @@ class Bridge:
         self._retry_s = _FIRST_BROKER_RETRY_S
         #: whether this bridge has claimed the robot's name and accepts requests
         self._online = False
-        #: when the last echo was sent, by the event loop's clock
+        #: when the last echo was sent, by the `boottime` clock
         self._echo_at = 0.0
         #: when the presence was last published, by the event loop's clock
         self._presence_at = 0.0
@@ -178,11 +178,6 @@ class Bridge:
         """End the bridge if a task has failed, so that the service manager restarts it."""
         if not task.cancelled() and (error := task.exception()):
             self.end(error)
-
-    @property
-    def ready(self) -> bool:
-        """Whether the robot is online and its server is running."""
-        return self._online and self._publisher.server is not None
 
     def _status_text(self) -> str:
         """Return the status line for systemd."""
@@ -238,8 +233,6 @@ class Bridge:
         #: timer that takes the robot online unless another bridge answers; None until this bridge's question returns
         self._rival_timer: asyncio.TimerHandle | None = None
         self._policy.newest_echo_at = boottime()
-        #: when the bridge began to wait for an echo, by the event loop's clock; None if it isn't waiting
-        self._unanswered_since: float | None = None
         self._loop.add_reader(self._descriptor, self._on_ready, Link.read)
         link.subscribe(self._presence_topic, retained=True)
         link.subscribe(self._echo_topic, retained=False)
@@ -378,7 +371,7 @@ class Bridge:
             self._sessions.refuse(decision)
             error = decision.error
             log.write_limited(error.code, f"a request of {topic[1]} is refused: {log.sanitize(error.message)}")
-            if error.code == STALE_CODE and self._loop.time() - self._echo_at >= _ECHO_PAUSE_S:
+            if error.code == STALE_CODE and boottime() - self._echo_at >= _ECHO_PAUSE_S:
                 self._send_echo()
 
     def _handle_echo(self, payload: bytes) -> None:
@@ -392,8 +385,8 @@ class Bridge:
                 self._rival_timer = self._loop.call_later(wait, self._go_online)
             return
         session, _, sent_at = payload.partition(b" ")
-        if session == self._session.encode() and self._policy.echo_returned(sent_at, boottime()):
-            self._unanswered_since = None
+        if session == self._session.encode():
+            self._policy.echo_returned(sent_at, boottime())
 
     def _handle_presence(self, payload: bytes) -> None:
         """Process a message on the robot's presence topic.
@@ -443,14 +436,11 @@ class Bridge:
             self._publish_presence()
 
     def _send_echo(self) -> None:
-        now = self._echo_at = self._loop.time()
-        if self._unanswered_since is None:
-            self._unanswered_since = now
-        self._publish(self._echo_topic, f"{self._session} {boottime()}".encode())
+        self._echo_at = boottime()
+        self._publish(self._echo_topic, f"{self._session} {self._echo_at}".encode())
 
     def _tick(self) -> None:
         """Send an echo, check for timeouts, and renew the presence if it is due."""
-        now, due = self._loop.time(), self._tick_timer.when()
         self._tick_timer = self._loop.call_later(ECHO_EVERY_S, self._tick)
         self._sessions.tick()
         self._publisher.tick()
@@ -459,15 +449,13 @@ class Bridge:
             return
         link.tick()
         self._check_link(link)
-        if self._unanswered_since is not None:
-            # Don't count time during which this process was stopped, because it couldn't read any echoes.
-            self._unanswered_since += now - due
-            if now - self._unanswered_since > _ECHO_TIMEOUT_S:
-                log.write_limited("echo", f"nothing that this robot sends itself comes back: {_RIGHTS}")
-                self._disconnect(link)
-                return
+        # The present time doesn't count. If this process was stopped for a while, it couldn't send and read any echoes.
+        if self._echo_at - self._policy.newest_echo_at > _ECHO_TIMEOUT_S:
+            log.write_limited("echo", f"nothing that this robot sends itself comes back: {_RIGHTS}")
+            self._disconnect(link)
+            return
         self._send_echo()
-        if self._online and now - self._presence_at >= PRESENCE_EVERY_S:
+        if self._online and self._loop.time() - self._presence_at >= PRESENCE_EVERY_S:
             self._publish_presence()
 
     async def _go_offline(self) -> None:

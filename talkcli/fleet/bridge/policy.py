@@ -6,6 +6,7 @@ may still be rejected by the server, which makes all decisions about speech. All
 
 from __future__ import annotations
 
+import contextlib
 from typing import TYPE_CHECKING
 
 from talkcli.errors import BadRequest, LineTooLong, RequestRefused
@@ -123,16 +124,12 @@ class Policy:
         #: when the newest returned echo was sent, or when the connection was opened, by the `boottime` clock
         self.newest_echo_at = 0.0
 
-    def echo_returned(self, sent_at_text: bytes, now: float) -> bool:
-        """Record that an echo has returned. Return False if its time is invalid or it isn't the newest one."""
-        try:
+    def echo_returned(self, sent_at_text: bytes, now: float) -> None:
+        """Record that an echo has returned. Ignore it if it has an invalid time, or one after `now`."""
+        with contextlib.suppress(ValueError):
             sent_at = float(sent_at_text)
-        except ValueError:
-            return False
-        if not self.newest_echo_at < sent_at <= now:
-            return False
-        self.newest_echo_at = sent_at
-        return True
+            if self.newest_echo_at < sent_at <= now:
+                self.newest_echo_at = sent_at
 
     def decide(self, message: Message, kind: str, user: str, now: float) -> RemoteRequest | Refusal | Goodbye | Ignored:
         """Decide what to do with a message.

@@ -11,6 +11,7 @@ import select
 import socket
 import time
 from collections import deque
+from functools import partial
 from typing import TYPE_CHECKING, Protocol
 
 from talkcli.errors import AccessDenied, RequestRefused, ServerUnavailable, TalkError
@@ -76,9 +77,8 @@ class DeskLink:
         self.failure: TalkError | None = None
         #: when the marker message came back after the retained messages (monotonic time), or None until then
         self.marker_at: float | None = None
-        self._inbox: deque[Message] = deque()
-        #: callbacks for rejected requests, with the errors to pass. `poll` calls them when the link isn't locked.
-        self._refusals: deque[tuple[Callable[[TalkError], None], TalkError]] = deque()
+        #: calls to process received messages and rejected requests. `poll` makes them when the link isn't locked.
+        self._calls: deque[Callable[[], object]] = deque()
         self._opening: LinkOpener | None = None
         self._failed_attempts = 0
         self._next_attempt_at = self._polled_at = time.monotonic()
@@ -123,16 +123,16 @@ class DeskLink:
         self._polled_at = time.monotonic()
         if link is not None and descriptor in ready:
             link.read()
-        while self._refusals:
-            on_refused, error = self._refusals.popleft()
-            on_refused(error)
-        while self._inbox:
-            message = self._inbox.popleft()
-            if message.topic == self.reply_topic(topics.MARKER):
-                self.marker_at = time.monotonic()
-            else:
-                self.handler.on_message(message)
+        while self._calls:
+            self._calls.popleft()()
         return descriptor in ready
+
+    def _receive(self, message: Message) -> None:
+        """Process the marker message, or pass another message to the handler."""
+        if message.topic == self.reply_topic(topics.MARKER):
+            self.marker_at = time.monotonic()
+        else:
+            self.handler.on_message(message)
 
     def wait_for_retained(
         self, timeout: float, is_enough: Callable[[], bool] = lambda: True, interrupt: Mapping[int, int] | None = None
@@ -177,7 +177,7 @@ class DeskLink:
         def on_acknowledged(code: int) -> None:
             if code >= REASON_FAILURE:
                 error = self.publish_error(code, f"ask {'the group ' * is_group}{to} for anything")
-                self._refusals.append((on_refused, error))
+                self._calls.append(partial(on_refused, error))
 
         line = request_line({"seq": number, **write_request(request)})
         if len(line) > self.link.max_payload_bytes:
@@ -258,7 +258,8 @@ class DeskLink:
             self._end_attempt(self._opening)
             return 0.0
         if self._opening is None and now >= self._next_attempt_at:
-            new = Link(self.broker, f"talk-desk-{self.user}-{self.session}", self._inbox.append)
+            name = f"talk-desk-{self.user}-{self.session}"
+            new = Link(self.broker, name, lambda message: self._calls.append(partial(self._receive, message)))
             self._opening = LinkOpener(new, self.wake)
         return TICK_EVERY_S if self._opening else max(0.0, self._next_attempt_at - now)
 
@@ -274,7 +275,7 @@ class DeskLink:
             return
         link, self._failed_attempts, self._polled_at = opening.link, 0, time.monotonic()
         self.link = link
-        self._inbox.clear()
+        self._calls.clear()
         link.subscribe(self.reply_topic(topics.MARKER), retained=False)
         self.handler.on_connected(link)
         # The broker sends this message back after the retained messages, so it marks their end.
