@@ -218,35 +218,20 @@ class Link:
             if self.ended is None:
                 self._paho.loop_misc()
 
-    def publish(
-        self,
-        topic: str,
-        payload: bytes,
-        qos: int = 1,
-        *,
-        retain: bool = False,
-        expiry: float | None = None,
-        response: str | None = None,
-        correlation: bytes | None = None,
-        acknowledged: OnAcknowledged | None = None,
-    ) -> bool:
+    def publish(self, message: Message, qos: int = 1, acknowledged: OnAcknowledged | None = None) -> bool:
         """Publish a message, and return whether the connection was still open.
 
         Args:
-            topic: the topic, without wildcards.
-            payload: at most `max_payload_bytes`.
+            message: the message. Its payload has at most `max_payload_bytes`.
             qos: 0 or 1.
-            retain: whether the broker keeps the message for later subscribers.
-            expiry: seconds after which the broker discards an undelivered message.
-            response: topic for answers.
-            correlation: data that the receiver repeats in answers.
             acknowledged: called with the reason code of the broker's acknowledgement of a QoS 1 message.
         """
-        properties = _properties(expiry, response, correlation)
+        topic, payload = message.topic, message.payload
+        properties = _properties(message.expiry, message.response, message.correlation)
         with self._lock:
             if self.ended is not None:
                 return False
-            info = self._paho.publish(topic, payload, qos, retain, properties)
+            info = self._paho.publish(topic, payload, qos, message.retained, properties)
             if info.rc == MQTTErrorCode.MQTT_ERR_NO_CONN or self.ended is not None:
                 return False
             if not info.is_published():

@@ -37,7 +37,7 @@ class Message:
     #: data that the reply must repeat; None if the sender gave none
     correlation: bytes | None = None
     #: seconds until the message expires; None if it never does
-    expiry: int | None = None
+    expiry: float | None = None
 
 
 @frozen
@@ -72,9 +72,7 @@ class Presence:
 
     def to_json(self) -> JsonObject:
         """Return the presence as a JSON object, without the robot's name."""
-        said = fields(self)
-        del said["name"]
-        return {**said, "groups": list(self.groups), "allow": list(self.allow)}
+        return {name: value for name, value in fields(self).items() if name != "name"}
 
 
 def bridge_rank(presence: Presence | None) -> tuple[float, str] | None:
@@ -180,8 +178,8 @@ _SPEAKING_TEMPLATE = "{{ 'ON' if value_json.active and not value_json.paused els
 _LAST_TEMPLATE = "{{ value_json.last.state if value_json.last else None }}"
 
 
-def homeassistant_device(name: str, allow: Collection[str], version: str) -> tuple[str, bytes]:
-    """Create the message that adds a robot to Home Assistant, and return its topic and payload.
+def homeassistant_device(name: str, allow: Collection[str], version: str) -> Message:
+    """Return the message that adds a robot to Home Assistant.
 
     Args:
         name: the robot's name.
@@ -215,7 +213,7 @@ def homeassistant_device(name: str, allow: Collection[str], version: str) -> tup
         "availability": [{"topic": topics.robot(name, topics.PRESENCE), "value_template": _AVAILABLE}],
         "components": components,
     }
-    return topics.homeassistant_device(name), encode(payload)
+    return Message(topics.homeassistant_device(name), encode(payload), retained=True)
 
 
 def _command(name: str, kind: str, platform: str, shown: str | None, *, allowed: bool) -> JsonObject:

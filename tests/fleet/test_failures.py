@@ -12,6 +12,7 @@ from paho.mqtt import client as paho
 from talkcli.fleet import broker as brokers
 from talkcli.fleet.bridge.main import Bridge, BridgeSettings
 from talkcli.fleet.broker import from_environment
+from talkcli.fleet.payloads import Message
 from tests.fleet.conftest import in_loop
 from tests.fleet.remote_client import RemoteClient
 from tests.fleet.robot import LONG, Robot
@@ -24,7 +25,6 @@ from tests.support.timing import assert_within, limits
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from talkcli.fleet.payloads import Message
     from tests.conftest import MakeTalk
     from tests.fleet.conftest import MakeBridge, MakeRobot
     from tests.support.broker import Broker
@@ -92,7 +92,7 @@ async def test_a_connection_that_breaks_under_an_answer_is_made_again(
     settings = BridgeSettings("anna", from_environment(broker.env()), ("say",), socket=scripted.socket)
     bridge = Bridge(settings, lambda: settings.broker)
     work = asyncio.create_task(bridge.run())
-    await asyncio.wait_for(until(lambda: bridge._online and bridge._publisher.server), PATIENCE)
+    await asyncio.wait_for(until(lambda: bridge._online and bridge._publisher.server is not None), PATIENCE)
     with RemoteClient(broker, "olga") as olga, Listener(broker, "talk/robot/anna/presence") as listener:
         monkeypatch.setattr(paho.Client, "_sock_send", send)
         olga.send({"seq": 1, "request": "set", "rate": 200})
@@ -286,12 +286,12 @@ def test_broker_that_dies_while_it_is_answered_ends_the_connection(broker: Broke
         heard.append(message.payload)
         broker.kill()
         for _ in range(3):  # the first is answered by a reset, which the next one finds
-            link.publish("an/answer", b"answer")
+            link.publish(Message("an/answer", b"answer"))
 
     link = Link(brokers.from_environment(broker.env()), "somebody", hear)
     link.open()
     link.subscribe("a/question", retained=False)
-    link.publish("a/question", b"question")
+    link.publish(Message("a/question", b"question"))
     while link.ended is None:
         assert select.select([link.fileno()], [], [], 10)[0], "the broker tells nothing"
         link.read()

@@ -71,6 +71,6 @@ class SessionsWithoutBroker:
         self.post(fields, session)
         return await self.line(lambda each: each.get("seq") == fields["seq"] and "ok" in each, session)
 
-    def _publish(self, topic: str, payload: bytes, _qos: int, _correlation: bytes | None) -> None:
-        self.published.append((topic, [json.loads(each) for each in payload.splitlines()]))
+    def _publish(self, message: Message, _qos: int) -> None:
+        self.published.append((message.topic, [json.loads(each) for each in message.payload.splitlines()]))
         self._more.set()

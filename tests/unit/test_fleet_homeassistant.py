@@ -20,9 +20,10 @@ UNTOLD = {name: each for name, each in ENDED.items() if name != "text"}
 
 
 def announced(name: str = "anna", allow: tuple[str, ...] = ALLOWABLE_REQUESTS) -> dict[str, Any]:
-    topic, payload = homeassistant_device(name, allow, "0.1.0")
-    assert faults(topic, payload) == []
-    found: dict[str, Any] = json.loads(payload)
+    message = homeassistant_device(name, allow, "0.1.0")
+    assert message.retained
+    assert faults(message.topic, message.payload) == []
+    found: dict[str, Any] = json.loads(message.payload)
     return found
 
 

@@ -29,9 +29,9 @@ from talkcli.protocol.lines import MAX_LINE_BYTES, encode
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from typing import Any
 
     from talkcli.fleet.broker import Broker
+    from talkcli.fleet.link import OnAcknowledged
 
 #: How long the broker keeps a robot's presence, and how often the bridge renews it.
 PRESENCE_EXPIRY_S, PRESENCE_EVERY_S = 150, 60.0
@@ -80,7 +80,7 @@ class BridgeSettings:
     homeassistant: bool = False
 
 
-async def run_bridge(settings: BridgeSettings, read_broker: Callable[[], Broker]) -> None:
+def run_bridge(settings: BridgeSettings, read_broker: Callable[[], Broker]) -> None:
     """Run the bridge until SIGTERM or SIGINT.
 
     Args:
@@ -91,6 +91,10 @@ async def run_bridge(settings: BridgeSettings, read_broker: Callable[[], Broker]
         UsageError: a certificate or key file is unusable.
         AddressInUse: an older bridge has the same robot name.
     """
+    asyncio.run(_run(settings, read_broker))
+
+
+async def _run(settings: BridgeSettings, read_broker: Callable[[], Broker]) -> None:
     loop, bridge = asyncio.get_running_loop(), Bridge(settings, read_broker)
 
     def on_signal(number: signal.Signals) -> None:
@@ -133,6 +137,9 @@ class Bridge:
         self._publisher = Publisher(
             self._sessions, self._publish_to_all, self._server_changed, with_text=settings.with_text
         )
+        offline = {"talk": PROTOCOL, "online": False, "session": self._session, "groups": groups}
+        #: the message that reports that the robot is offline
+        self._will = Message(self._presence_topic, encode(offline), retained=True)
         self._link: Link | None = None
         #: the link's descriptor while the event loop watches it, otherwise -1
         self._descriptor = -1
@@ -192,10 +199,9 @@ class Bridge:
     async def _stay_connected(self) -> None:
         """Connect to the broker, and reconnect whenever the connection ends."""
         client_id = f"talk-{self._settings.name}-{self._session}"
-        will = Message(self._presence_topic, self._offline_presence(), retained=True)
         while True:
             try:
-                link = Link(self._broker, client_id, self._on_message, will, _MAX_INCOMING_BYTES)
+                link = Link(self._broker, client_id, self._on_message, self._will, _MAX_INCOMING_BYTES)
                 try:
                     await self._open(link)
                     self._on_connect(link)
@@ -238,7 +244,7 @@ class Bridge:
         link.subscribe(self._echo_topic, retained=False)
         # The broker sends the retained presence of another bridge before it returns this question. If that bridge is
         # still running, its answer arrives afterwards.
-        self._publish(self._echo_topic, _RIVAL_QUESTION + self._session.encode())
+        self._publish(Message(self._echo_topic, _RIVAL_QUESTION + self._session.encode()))
         self._send_echo()
 
     def _go_online(self) -> None:
@@ -308,29 +314,25 @@ class Bridge:
         else:
             self._loop.remove_writer(self._descriptor)
 
-    def _publish(self, topic: str, payload: bytes, qos: int = 1, correlation: bytes | None = None, **more: Any) -> None:
+    def _publish(self, message: Message, qos: int = 1, acknowledged: OnAcknowledged | None = None) -> None:
         """Publish a message if there is a connection. Drop it if it is too long for the broker.
 
-        `more` are other arguments of `Link.publish`. By default, a warning is logged if the broker rejects the message.
+        The arguments are those of `Link.publish`. By default, a warning is logged if the broker rejects the message.
         """
         link = self._link
         if link is None:
             return
-        if len(payload) > link.max_payload_bytes:  # otherwise, the broker would close the connection
-            words = f"{len(payload):,} bytes for {topic} are not published"
+        if len(message.payload) > link.max_payload_bytes:  # otherwise, the broker would close the connection
+            words = f"{len(message.payload):,} bytes for {message.topic} are not published"
             log.write_limited("long", f"{words}: the broker takes {link.max_payload_bytes:,}")
             return
-        link.publish(topic, payload, qos, correlation=correlation, **{"acknowledged": self._log_denial, **more})
+        link.publish(message, qos, acknowledged or self._log_denial)
         self._check_link(link)
 
-    def _publish_to_all(self, topic: str, payload: bytes, expiry: float | None) -> None:
-        """Publish an event, or a retained message if `expiry` is None.
-
-        Events are dropped if the broker is slow.
-        """
-        retain = expiry is None
-        if self._online and self._link and (retain or self._link.outstanding_bytes <= SLOW_BROKER_BYTES):
-            self._publish(topic, payload, retain=retain, expiry=expiry)
+    def _publish_to_all(self, message: Message) -> None:
+        """Publish a status or an event. Events are dropped if the broker is slow."""
+        if self._online and self._link and (message.retained or self._link.outstanding_bytes <= SLOW_BROKER_BYTES):
+            self._publish(message)
 
     def _log_denial(self, reason: int) -> None:
         """Log a warning if the broker's reason code means that a message was not authorized."""
@@ -418,17 +420,12 @@ class Bridge:
         self._presence_at = self._loop.time()
         presence = replace(self._presence, server=self._publisher.server).to_json()
         line = encode({"talk": PROTOCOL, "version": __version__, **presence})
-        self._publish(self._presence_topic, line, retain=True, expiry=PRESENCE_EXPIRY_S)
-
-    def _offline_presence(self) -> bytes:
-        groups = list(self._presence.groups)
-        return encode({"talk": PROTOCOL, "online": False, "session": self._session, "groups": groups})
+        self._publish(Message(self._presence_topic, line, retained=True, expiry=PRESENCE_EXPIRY_S))
 
     def _publish_device(self) -> None:
         """Publish the robot's description for Home Assistant as a retained message, if enabled."""
         if self._settings.homeassistant and self._online:
-            topic, device = homeassistant_device(self._settings.name, self._settings.allow, __version__)
-            self._publish(topic, device, retain=True)
+            self._publish(homeassistant_device(self._settings.name, self._settings.allow, __version__))
 
     def _server_changed(self) -> None:
         self._systemd.schedule_status()
@@ -437,7 +434,7 @@ class Bridge:
 
     def _send_echo(self) -> None:
         self._echo_at = boottime()
-        self._publish(self._echo_topic, f"{self._session} {self._echo_at}".encode())
+        self._publish(Message(self._echo_topic, f"{self._session} {self._echo_at}".encode()))
 
     def _tick(self) -> None:
         """Send an echo, check for timeouts, and renew the presence if it is due."""
@@ -466,14 +463,11 @@ class Bridge:
         taken = asyncio.Event()
         was_online = self._online and not isinstance(self._error, AddressInUse)
         self._online = False  # otherwise, the bridge would overwrite its own offline message
-        if was_online:
-            topic, payload = self._presence_topic, self._offline_presence()
-        else:
-            # Publish a message that has no effect, and wait until everything is acknowledged. Otherwise, `Link.close`
-            # would not send a DISCONNECT packet, and the broker would publish the will. The robot would seem to be
-            # offline although another bridge is online.
-            topic, payload = self._echo_topic, f"{self._session} 0".encode()
-        self._publish(topic, payload, retain=was_online, acknowledged=lambda _: taken.set())
+        # If another bridge is online, publish a message that has no effect, and wait until everything is acknowledged.
+        # Otherwise, `Link.close` would not send a DISCONNECT packet, and the broker would publish the will. The robot
+        # would seem to be offline.
+        message = self._will if was_online else Message(self._echo_topic, f"{self._session} 0".encode())
+        self._publish(message, acknowledged=lambda _: taken.set())
         with contextlib.suppress(asyncio.TimeoutError):
             await asyncio.wait_for(taken.wait(), _OFFLINE_LIMIT_S)
         self._disconnect(link)

@@ -16,7 +16,7 @@ from talkcli.daemon import log
 from talkcli.errors import BadRequest, ServerUnavailable, TalkError
 from talkcli.fleet import topics
 from talkcli.fleet.bridge.local import dial
-from talkcli.fleet.payloads import LastGoal, RobotStatus
+from talkcli.fleet.payloads import LastGoal, Message, RobotStatus
 from talkcli.frozen import replace
 from talkcli.goals.options import MAX_LOG_GOALS
 from talkcli.goals.states import State
@@ -31,9 +31,7 @@ if TYPE_CHECKING:
     from talkcli.fleet.bridge.session import RemoteSessions
     from talkcli.goals.goal import Goal, JsonObject
 
-    #: Publishes a message to all subscribers, given its topic, its payload, and its expiry in seconds. A message
-    #: without an expiry is retained.
-    PublishToAll = Callable[[str, bytes, float | None], None]
+    PublishToAll = Callable[[Message], None]
 
 #: How long the broker keeps an undelivered event.
 EVENT_EXPIRY_S = 60
@@ -184,7 +182,7 @@ class Publisher:
         else:
             return
         topic = topics.robot(self._sessions.name, topics.EVENT, str(message["event"]))
-        self._publish(topic, line + b"\n", EVENT_EXPIRY_S)
+        self._publish(Message(topic, line + b"\n", expiry=EVENT_EXPIRY_S))
         self.schedule_status()
 
     def _update(self, event: StateChanged) -> None:
@@ -212,7 +210,7 @@ class Publisher:
                 if isinstance(each, dict):
                     del each["text"]
             payload = encode(status)
-        self._publish(topics.robot(self._sessions.name, topics.STATUS), payload, None)
+        self._publish(Message(topics.robot(self._sessions.name, topics.STATUS), payload, retained=True))
 
 
 def _shown_text(goal: Goal | None) -> str | None:

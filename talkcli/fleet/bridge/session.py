@@ -19,11 +19,12 @@ from talkcli.errors import BadRequest, Busy, TalkError
 from talkcli.fleet.bridge import policy
 from talkcli.fleet.bridge.local import dial
 from talkcli.fleet.link import boottime
+from talkcli.fleet.payloads import Message
 from talkcli.frozen import replace
 from talkcli.goals.goal import By, Goal, Sender
 from talkcli.goals.options import SHOWN_OPTIONS, Cancel, Say, Set
 from talkcli.goals.states import State
-from talkcli.protocol.events import Result, StateChanged, failure, ok
+from talkcli.protocol.events import Result, StateChanged, failure, item, ok
 from talkcli.protocol.lines import MAX_LINE_BYTES, decode, encode
 from talkcli.protocol.requests import Hello, Pause, Resume, Status, Wait, Watch
 
@@ -34,9 +35,6 @@ if TYPE_CHECKING:
     from talkcli.fleet.bridge.policy import RemoteRequest
     from talkcli.goals.goal import JsonObject
     from talkcli.protocol.requests import Request
-
-    #: Publishes lines for a client, given the topic, the payload, the QoS, and the correlation data.
-    Publish = Callable[[str, bytes, int, bytes | None], None]
 
 #: Maximum number of sessions. Each has a connection to the server, which accepts 256 connections by default.
 MAX_SESSIONS = 32
@@ -63,7 +61,7 @@ class RemoteSessions:
         self,
         name: str,
         socket: str | None,
-        publish: Publish,
+        publish: Callable[[Message, int], None],
         max_payload: Callable[[], int],
         on_change: Callable[[], None],
     ) -> None:
@@ -72,7 +70,7 @@ class RemoteSessions:
         Args:
             name: the robot's name.
             socket: path of the server's socket, or None for the default locations.
-            publish: publishes lines for a client.
+            publish: publishes lines for a client, with a QoS of 0 or 1.
             max_payload: returns the size of the largest payload that the broker accepts, in bytes.
             on_change: called when the number of pending goals may have changed.
         """
@@ -108,7 +106,7 @@ class RemoteSessions:
         """Send the error for a refused request to its client, if the client wants answers."""
         if refusal.reply_topic is not None:
             line = encode(failure(refusal.seq, refusal.error.code, refusal.error.message))
-            self.publish(refusal.reply_topic, line, 1, refusal.correlation)
+            self.publish(Message(refusal.reply_topic, line, correlation=refusal.correlation), 1)
 
     def say_goodbye(self, user: str, reply_topic: str) -> None:
         """End a client's session once the server has answered its requests."""
@@ -157,8 +155,7 @@ class RemoteSessions:
 
     def waiting_bytes(self) -> int:
         """Return the total size of all clients' unanswered requests."""
-        in_sessions = sum(each.waiting_bytes for each in self._sessions.values())
-        return in_sessions + sum(request.size_bytes for request, _, _ in self.waiting)
+        return sum(each.size_bytes for session in self._sessions.values() for each in session.unanswered)
 
     def cancel_waiting(self, selection: Cancel, by: By | None) -> list[Goal]:
         """Cancel the waiting goals that match a `cancel` request, and return them."""
@@ -266,12 +263,7 @@ class RemoteSession:
     @property
     def idle(self) -> bool:
         """Whether the client isn't waiting for anything."""
-        return not (self._unanswered or self._awaited or self._watching or self._waiting_for_room())
-
-    @property
-    def waiting_bytes(self) -> int:
-        """Total size of the unanswered requests, not including waiting goals."""
-        return sum(each.size_bytes for each in self._unanswered)
+        return not (self.unanswered or self._awaited or self._watching)
 
     def submit(self, request: RemoteRequest) -> None:
         """Send or queue a request, or refuse it if too many requests are unanswered."""
@@ -280,7 +272,7 @@ class RemoteSession:
             self._said_goodbye, self._reply_topic = False, request.reply_topic
         urgent = isinstance(request.request, Cancel | Status)
         limit = 2 * MAX_WAITING_BYTES if urgent else MAX_WAITING_BYTES
-        if len(self._unanswered) + len(self._waiting_for_room()) >= MAX_WAITING_REQUESTS:
+        if len(self.unanswered) >= MAX_WAITING_REQUESTS:
             self._refuse(request, Busy.code, f"{MAX_WAITING_REQUESTS} requests of yours are waiting already")
         elif self._sessions.waiting_bytes() + request.size_bytes > limit:
             self._refuse(request, Busy.code, f"{MAX_WAITING_BYTES >> 20} MiB of requests are waiting already")
@@ -327,9 +319,9 @@ class RemoteSession:
         return [each for each in exchanges if isinstance(each, _RemoteExchange)]
 
     @property
-    def _unanswered(self) -> list[RemoteRequest]:
-        """The client's unanswered requests, not including waiting goals."""
-        return [*self._queue, *(each.remote for each in self._exchanges)]
+    def unanswered(self) -> list[RemoteRequest]:
+        """The client's unanswered requests, including goals that are waiting for room."""
+        return [*self._queue, *(each.remote for each in self._exchanges), *self._waiting_for_room()]
 
     def _waiting_for_room(self) -> list[RemoteRequest]:
         """Return the client's goals that are waiting for room in the server's queue."""
@@ -341,7 +333,7 @@ class RemoteSession:
 
     def _end_if_done(self) -> None:
         """End the session if the client has said goodbye and its important requests have been answered."""
-        if self._said_goodbye and not any(map(_has_lasting_effect, self._unanswered)):
+        if self._said_goodbye and not any(map(_has_lasting_effect, self.unanswered)):
             self.end()
 
     # -- to the server
@@ -474,8 +466,7 @@ class RemoteSession:
             count = message.get("count")
             if found and isinstance(count, int):
                 message["count"] = count + len(found)
-        numbered = (each if remote.seq is None else {"seq": remote.seq, **each} for each in (*found, message))
-        return [(encode(each), remote.correlation) for each in numbered]
+        return [(encode(item(remote.seq, **each)), remote.correlation) for each in (*found, message)]
 
     def _await_result(self, remote: RemoteRequest, goal: JsonObject) -> None:
         """Record that the client is waiting for a goal's result, if the request asks for it."""
@@ -541,12 +532,12 @@ class RemoteSession:
         for whole, correlation in lines:
             line = whole if len(whole) <= limit else self._shortened(whole, limit)
             if payload and (correlation != current or len(payload) + len(line) > limit):
-                self._sessions.publish(self._reply_topic, payload, int(reliable), current)
+                self._sessions.publish(Message(self._reply_topic, payload, correlation=current), int(reliable))
                 payload, reliable = b"", False
             payload, current = payload + line, correlation
             reliable = reliable or not line.startswith(_UNRELIABLE)
         if payload:
-            self._sessions.publish(self._reply_topic, payload, int(reliable), current)
+            self._sessions.publish(Message(self._reply_topic, payload, correlation=current), int(reliable))
 
     def _shortened(self, line: bytes, limit: int) -> bytes:
         """Shorten a line that is too long for the broker.

@@ -18,6 +18,7 @@ from talkcli.errors import AccessDenied, RequestRefused, ServerUnavailable, Talk
 from talkcli.fleet import topics
 from talkcli.fleet.broker import Broker, client_user
 from talkcli.fleet.link import KEEPALIVE_S, REASON_FAILURE, REASON_NOT_AUTHORIZED, TICK_EVERY_S, Link, LinkOpener
+from talkcli.fleet.payloads import Message
 from talkcli.goals.options import Say
 from talkcli.polling import wait_ready
 from talkcli.protocol.lines import request_line, write_request
@@ -25,7 +26,6 @@ from talkcli.protocol.lines import request_line, write_request
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from talkcli.fleet.payloads import Message
     from talkcli.protocol.requests import Request
 
 #: How long a broker or a robot may be absent before open requests count as lost. A bridge reconnects within 15 s after
@@ -186,13 +186,14 @@ class DeskLink:
             return False
         expiry = (request.ttl or None) if isinstance(request, Say) else _REQUEST_EXPIRY_S
         topic, response = self._topics(to, is_group=is_group)
-        return self.link.publish(topic, line, expiry=expiry, response=response, acknowledged=on_acknowledged)
+        message = Message(topic, line, response=response, expiry=expiry)
+        return self.link.publish(message, acknowledged=on_acknowledged)
 
     def end_session(self, to: str, *, is_group: bool = False) -> None:
         """Tell the bridge of a robot, or all bridges of a group, that no more requests will follow."""
         if self.link is not None:
             topic, response = self._topics(to, is_group=is_group)
-            self.link.publish(topic, b"", 0, response=response)
+            self.link.publish(Message(topic, b"", response=response), 0)
 
     def _topics(self, to: str, *, is_group: bool) -> tuple[str, str]:
         """Return the topics for requests to a robot or a group, and for their replies."""
@@ -279,7 +280,7 @@ class DeskLink:
         link.subscribe(self.reply_topic(topics.MARKER), retained=False)
         self.handler.on_connected(link)
         # The broker sends this message back after the retained messages, so it marks their end.
-        link.publish(self.reply_topic(topics.MARKER), b"\n", acknowledged=self._on_marker_acknowledged)
+        link.publish(Message(self.reply_topic(topics.MARKER), b"\n"), acknowledged=self._on_marker_acknowledged)
 
     def _on_marker_acknowledged(self, code: int) -> None:
         if code >= REASON_FAILURE:
