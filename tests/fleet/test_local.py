@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import gc
 import os
 import socket
 import threading
@@ -171,39 +170,6 @@ async def test_a_refused_connection_raises_busy_or_unavailable(
                 server.sendall(said)
     with pytest.raises(Busy if said.startswith(b"{") else ServerUnavailable):
         await dialing
-
-
-@pytest.mark.parametrize("wait", [0.0, 0.4])
-@in_loop
-async def test_a_dial_that_is_cancelled_keeps_its_slot_until_the_server_has_greeted(
-    listening: socket.socket, wait: float
-) -> None:
-    slots = asyncio.Semaphore(1)
-    dialing = asyncio.create_task(dial(listening.getsockname(), "bob", slots=slots))
-    await asyncio.sleep(wait)
-    with await accepted(listening) as server:
-        dialing.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await dialing
-        assert slots.locked()
-        server.sendall(GREETING)
-        await slots.acquire()
-        assert lines(server, 2) == [encode({"request": "hello", "name": "bob"}), b""]
-    gc.collect()  # reports sockets that were left open
-
-
-@in_loop
-async def test_a_dial_without_a_free_descriptor_gives_its_slot_back(
-    listening: socket.socket, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def none_left(*_: object) -> None:
-        raise OSError("Too many open files")
-
-    monkeypatch.setattr("talkcli.client.connect.reach", none_left)
-    slots = asyncio.Semaphore(1)
-    with pytest.raises(OSError, match="Too many"):
-        await dial(listening.getsockname(), "bob", slots=slots)
-    assert not slots.locked()
 
 
 @in_loop

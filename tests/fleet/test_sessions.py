@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import json
 import socket
 import threading
@@ -11,6 +12,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from talkcli import __version__
+from talkcli.protocol.events import greeting
+from talkcli.protocol.lines import encode
 from tests.fleet.conftest import in_loop
 from tests.fleet.without_broker import SessionsWithoutBroker
 from tests.support.surroundings import short_directory
@@ -187,6 +191,38 @@ async def test_remote_clients_that_come_and_go_at_a_server_that_hangs_take_32_co
         listening.setblocking(False)
         with pytest.raises(BlockingIOError):
             listening.accept()
+
+
+@in_loop
+async def test_a_session_that_ends_keeps_its_slot_until_the_server_has_greeted() -> None:
+    with short_directory() as directory, socket.socket(socket.AF_UNIX) as listening:
+        listening.bind(f"{directory}/s")
+        listening.listen()
+        listening.settimeout(5)
+        anna = SessionsWithoutBroker(f"{directory}/s")
+        slots = anna.sessions.dialing = asyncio.Semaphore(1)
+        anna.post({"seq": 1, "request": "log"})
+        with (await asyncio.to_thread(listening.accept))[0] as server, server.makefile("rb") as said:
+            anna.post(b"")
+            await asyncio.sleep(0.1)
+            assert slots.locked()
+            server.sendall(encode(greeting(__version__, 7, "a1b2")))
+            await asyncio.wait_for(slots.acquire(), 5)
+            assert await asyncio.to_thread(said.readlines) == [encode({"request": "hello", "name": "mqtt:bob"})]
+    gc.collect()  # reports sockets that were left open
+
+
+@in_loop
+async def test_a_session_without_a_free_descriptor_gives_its_slot_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    def none_left(*_: object) -> None:
+        raise OSError("Too many open files")
+
+    monkeypatch.setattr("talkcli.client.connect.reach", none_left)
+    anna = SessionsWithoutBroker("unused")
+    slots = anna.sessions.dialing = asyncio.Semaphore(1)
+    anna.post({"seq": 1, "request": "status"})
+    await asyncio.sleep(0.1)
+    assert not slots.locked()
 
 
 @in_loop

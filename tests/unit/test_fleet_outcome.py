@@ -18,7 +18,7 @@ from talkcli.errors import (
     UnknownGoal,
     UsageError,
 )
-from talkcli.fleet.desk.request import Outcome, cancel_outcomes, failure_outcome, reply_outcomes
+from talkcli.fleet.desk.request import NoServer, Outcome, RobotOffline, cancel_outcomes, failure_outcome, reply_outcomes
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import Cancel, Say, Set
 from talkcli.goals.states import State
@@ -31,26 +31,24 @@ GOAL = Goal("a", State.PREEMPTED, "hello", reason="canceled")
 
 
 @pytest.mark.parametrize(
-    ("error", "named", "state", "exit_code", "code"),
+    ("error", "state", "exit_code", "code"),
     [
-        (UnknownGoal("no goal 'a'", "unknown_goal", [{"id": "b"}]), None, "UNKNOWN", 8, "unknown_goal"),
-        (Lost("it was sent"), None, "LOST", 12, "lost"),
-        (AccessDenied("not allowed"), None, "REFUSED", 10, "permission_denied"),
-        (ServerUnavailable("no answer"), None, "UNREACHABLE", 3, "no_server"),
-        (ServerUnavailable("nothing was sent"), "OFFLINE", "OFFLINE", 3, "no_server"),
-        (ServerUnavailable("nothing was sent"), "NO_SERVER", "NO_SERVER", 3, "no_server"),
-        (Busy("too many"), None, "REFUSED", 5, "busy"),
-        (BadOption("no such voice", "unknown_voice"), None, "REFUSED", 2, "unknown_voice"),
-        (RequestRefused("a line is too long", "too_long"), None, "REFUSED", 1, "too_long"),
-        (ProtocolMismatch("another version"), None, "REFUSED", 9, "protocol_mismatch"),
-        (UsageError("no meaning"), None, "REFUSED", 2, "usage"),
-        (TalkError("anything"), None, "REFUSED", 1, "error"),
+        (UnknownGoal("no goal 'a'", "unknown_goal", [{"id": "b"}]), "UNKNOWN", 8, "unknown_goal"),
+        (Lost("it was sent"), "LOST", 12, "lost"),
+        (AccessDenied("not allowed"), "REFUSED", 10, "permission_denied"),
+        (ServerUnavailable("no answer"), "UNREACHABLE", 3, "no_server"),
+        (RobotOffline("nothing was sent"), "OFFLINE", 3, "no_server"),
+        (NoServer("nothing was sent"), "NO_SERVER", 3, "no_server"),
+        (Busy("too many"), "REFUSED", 5, "busy"),
+        (BadOption("no such voice", "unknown_voice"), "REFUSED", 2, "unknown_voice"),
+        (RequestRefused("a line is too long", "too_long"), "REFUSED", 1, "too_long"),
+        (ProtocolMismatch("another version"), "REFUSED", 9, "protocol_mismatch"),
+        (UsageError("no meaning"), "REFUSED", 2, "usage"),
+        (TalkError("anything"), "REFUSED", 1, "error"),
     ],
 )
-def test_an_error_is_a_state_and_an_exit_code(
-    error: TalkError, named: str | None, state: str, exit_code: int, code: str
-) -> None:
-    outcome = failure_outcome("anna", error, named)
+def test_an_error_is_a_state_and_an_exit_code(error: TalkError, state: str, exit_code: int, code: str) -> None:
+    outcome = failure_outcome("anna", error)
     assert (outcome.error, outcome.goal, outcome.said, outcome.last) == (error, None, None, True)
     told = {"code": code, "message": str(error)}
     assert outcome.to_json() == {"robot": "anna", "state": state, "exit_code": exit_code, "error": told}

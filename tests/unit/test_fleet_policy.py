@@ -137,7 +137,14 @@ def test_a_malformed_request_has_the_error_of_the_wire_also_if_it_is_stale_and_n
 def test_an_error_has_the_number_and_the_correlation_of_its_request(response: str | None) -> None:
     found = judge(request({"seq": 7, "request": "say"}, response=response, correlation=b"c"))
     assert isinstance(found, Refusal)
-    assert (found.seq, found.correlation, found.reply_topic) == (7, b"c", response and f"{REPLY}/anna")
+    assert found.error.code == "bad_field"
+    if response is None:
+        assert found.reply is None
+    else:
+        error = {"code": "bad_field", "message": found.error.message}
+        assert found.reply
+        assert (found.reply.topic, found.reply.correlation) == (f"{REPLY}/anna", b"c")
+        assert json.loads(found.reply.payload) == {"seq": 7, "ok": False, "error": error}
 
 
 @pytest.mark.parametrize(
@@ -147,7 +154,9 @@ def test_correlation_data_that_are_too_long_are_on_no_answer(fields: object, cod
     assert asked(judge(request(correlation=LONGEST))).correlation == LONGEST
     found = judge(request(fields, correlation=LONGEST + b"c"), stale=True, allow=())
     assert isinstance(found, Refusal)
-    assert (refused(found), found.correlation, found.seq) == (code, None, seq)
+    assert found.reply
+    assert (refused(found), found.reply.correlation) == (code, None)
+    assert json.loads(found.reply.payload).get("seq") == seq
 
 
 def test_each_kind_of_request_can_be_forbidden_but_hello_and_watch() -> None:

@@ -128,41 +128,18 @@ class LocalConnection(ClientCore):
             self._loop.remove_writer(self._socket)
 
 
-async def dial(
-    socket: str | None, name: str, *, urgent: bool = False, slots: asyncio.Semaphore | None = None
-) -> LocalConnection:
+async def dial(socket: str | None, name: str, *, urgent: bool = False) -> LocalConnection:
     """Connect to the server, and wait for its greeting.
 
     Args:
         socket: path of the server's socket, or None for the default locations.
         name: the client's name.
         urgent: whether the client sends only `status` and `cancel`. The server reserves connections for such clients.
-        slots: limits how many connections wait for a greeting at the same time. A cancelled call keeps its slot until
-            the server answers, because a hung server's backlog also holds connections that the client has closed.
 
     Raises:
         ServerUnavailable, AccessDenied, ProtocolMismatch, Busy: no usable server was found.
     """
-    if slots:
-        await slots.acquire()
-    dialing = asyncio.create_task(_dial(paths.named_socket(socket), connect.hello(name, urgent=urgent)))
-    if slots:
-        dialing.add_done_callback(lambda _: slots.release())
-    try:
-        return await asyncio.shield(dialing)
-    except asyncio.CancelledError:
-        dialing.add_done_callback(_discard)
-        raise
-
-
-def _discard(dialing: asyncio.Task[LocalConnection]) -> None:
-    """Close a connection that was opened after `dial` had been cancelled."""
-    if not dialing.cancelled() and not dialing.exception():
-        dialing.result().close()
-
-
-async def _dial(place: str | None, hello: JsonObject) -> LocalConnection:
-    loop = asyncio.get_running_loop()
+    place, hello, loop = paths.named_socket(socket), connect.hello(name, urgent=urgent), asyncio.get_running_loop()
     give_up = loop.time() + connect.BUSY_LIMIT_S
     failures: tuple[tuple[str, Exception], ...] = ()
     while True:

@@ -370,8 +370,9 @@ class Bridge:
         elif isinstance(decision, RemoteRequest):
             self._sessions.submit(decision)
         else:
-            self._sessions.refuse(decision)
             error = decision.error
+            if decision.reply:
+                self._publish(decision.reply)
             log.write_limited(error.code, f"a request of {topic[1]} is refused: {log.sanitize(error.message)}")
             if error.code == STALE_CODE and boottime() - self._echo_at >= _ECHO_PAUSE_S:
                 self._send_echo()

@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING
 
 from talkcli.errors import BadRequest, LineTooLong, RequestRefused
 from talkcli.fleet import topics
+from talkcli.fleet.payloads import Message
 from talkcli.frozen import frozen, replace
 from talkcli.goals.options import MAX_SENDER_NAME_CHARS, Say
-from talkcli.protocol.events import take_seq
-from talkcli.protocol.lines import MAX_LINE_BYTES, decode
+from talkcli.protocol.events import failure, take_seq
+from talkcli.protocol.lines import MAX_LINE_BYTES, decode, encode
 from talkcli.protocol.requests import REQUEST_TYPES, read_request
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
-    from talkcli.fleet.payloads import Message
     from talkcli.goals.goal import Goal, JsonObject
     from talkcli.protocol.requests import Request
 
@@ -78,12 +78,11 @@ class RemoteRequest:
 
 @frozen
 class Refusal:
-    """A refused request, and the error to send to its client."""
+    """A refused request."""
 
-    reply_topic: str | None
-    seq: int | None
-    correlation: bytes | None
     error: RequestRefused
+    #: the message that reports the error to the client; None if the client wants no answers
+    reply: Message | None
 
 
 @frozen
@@ -167,7 +166,9 @@ class Policy:
                 words = "the line to the broker stalled, so this may be old: say it again if it still holds"
                 raise BadRequest(words, STALE_CODE)
         except BadRequest as error:
-            return Refusal(reply_topic, seq, correlation, error)
+            line = encode(failure(seq, error.code, error.message))
+            reply = None if reply_topic is None else Message(reply_topic, line, correlation=correlation)
+            return Refusal(error, reply)
         start_by = None if message.expiry is None else now + message.expiry
         size = 0 if kind == topics.PLAIN_CANCEL else len(message.payload)
         return RemoteRequest(user, reply_topic, seq, request, correlation, size, start_by)

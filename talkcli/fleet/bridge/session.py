@@ -95,18 +95,13 @@ class RemoteSessions:
 
     def submit(self, request: RemoteRequest) -> None:
         """Pass a request to its client's session, which is created if necessary."""
-        session = self._sessions.get((request.user, request.reply_topic)) or self._new_session(request)
-        if session:
+        key = request.user, request.reply_topic
+        session = self._sessions.get(key) or RemoteSession(self, *key)
+        if key in self._sessions or self._make_room(urgent=isinstance(request.request, Cancel | Status)):
+            self._sessions[key] = session
             session.submit(request)
         else:
-            error = Busy(f"{self.name} has as many askers as it takes: {MAX_SESSIONS}")
-            self.refuse(policy.Refusal(request.reply_topic, request.seq, request.correlation, error))
-
-    def refuse(self, refusal: policy.Refusal) -> None:
-        """Send the error for a refused request to its client, if the client wants answers."""
-        if refusal.reply_topic is not None:
-            line = encode(failure(refusal.seq, refusal.error.code, refusal.error.message))
-            self.publish(Message(refusal.reply_topic, line, correlation=refusal.correlation), 1)
+            session.refuse(request, Busy.code, f"{self.name} has as many askers as it takes: {MAX_SESSIONS}")
 
     def say_goodbye(self, user: str, reply_topic: str) -> None:
         """End a client's session once the server has answered its requests."""
@@ -130,22 +125,19 @@ class RemoteSessions:
             else:
                 session.send_alive()
 
-    def _new_session(self, request: RemoteRequest) -> RemoteSession | None:
-        """Create a session, or return None if there are too many already.
+    def _make_room(self, *, urgent: bool) -> bool:
+        """End an idle session if there are too many. Return whether there is room for a new one.
 
-        An idle session is ended to make room. For a `cancel` or `status` request, any session may be ended.
+        For an `urgent` request, any session may be ended.
         """
-        if len(self._sessions) >= MAX_SESSIONS:
-            sessions = list(self._sessions.values())
-            urgent = isinstance(request.request, Cancel | Status)
-            candidates = [each for each in sessions if each.idle] or (sessions if urgent else [])
-            if not candidates:
-                return None
+        if len(self._sessions) < MAX_SESSIONS:
+            return True
+        sessions = list(self._sessions.values())
+        candidates = [each for each in sessions if each.idle] or (sessions if urgent else [])
+        if candidates:
             oldest = min(candidates, key=lambda each: each.used_at)
             oldest.end("the place was needed for another's cancel or status")
-        session = RemoteSession(self, request.user, request.reply_topic)
-        self._sessions[request.user, request.reply_topic] = session
-        return session
+        return bool(candidates)
 
     # -- from the sessions
 
@@ -257,6 +249,7 @@ class RemoteSession:
         self._watching = False
         #: whether the client has said goodbye
         self._said_goodbye = False
+        self._has_ended = False
 
     # -- from the client
 
@@ -273,9 +266,9 @@ class RemoteSession:
         urgent = isinstance(request.request, Cancel | Status)
         limit = 2 * MAX_WAITING_BYTES if urgent else MAX_WAITING_BYTES
         if len(self.unanswered) >= MAX_WAITING_REQUESTS:
-            self._refuse(request, Busy.code, f"{MAX_WAITING_REQUESTS} requests of yours are waiting already")
+            self.refuse(request, Busy.code, f"{MAX_WAITING_REQUESTS} requests of yours are waiting already")
         elif self._sessions.waiting_bytes() + request.size_bytes > limit:
-            self._refuse(request, Busy.code, f"{MAX_WAITING_BYTES >> 20} MiB of requests are waiting already")
+            self.refuse(request, Busy.code, f"{MAX_WAITING_BYTES >> 20} MiB of requests are waiting already")
         elif self._server:
             self._send_request(request)
         else:
@@ -302,8 +295,8 @@ class RemoteSession:
         """
         if why and not self.idle:
             self._send_gone(why)
-        self._reply_topic = None
-        if self._task:
+        self._has_ended, self._reply_topic = True, None
+        if self._task and self._server:
             self._task.cancel()
         self._clean_up()
 
@@ -365,7 +358,7 @@ class RemoteSession:
         boot, counted = shared.ids.boot_of(goal_id), shared.goals.counts(say)
         if boot not in (None, server.boot):
             words = f"{goal_id} was sent to a server that has ended since: it may have been spoken"
-            self._refuse(remote, "lost", words)
+            self.refuse(remote, "lost", words)
         elif has_room or (shared.goals.has_room(say) and not (counted and shared.waiting)):
             if self._send(_RemoteExchange(remote, remote.say(goal_id, boottime()), is_new=boot is None)):
                 shared.ids.add(goal_id, server.boot, counted=counted)
@@ -397,7 +390,7 @@ class RemoteSession:
         """Send a request to the server. If it is too long, refuse it and return False."""
         assert self._server
         if not self._server.send(exchange):
-            self._refuse(exchange.remote, "line_too_long", f"a request has at most {MAX_LINE_BYTES} bytes")
+            self.refuse(exchange.remote, "line_too_long", f"a request has at most {MAX_LINE_BYTES} bytes")
             return False
         return True
 
@@ -411,20 +404,29 @@ class RemoteSession:
         """Connect to the server, send the queued requests, and publish lines until the connection ends."""
         shared = self._sessions
         try:
-            self._server = await dial(shared.socket, self._name, urgent=urgent, slots=shared.dialing)
+            # A session that ends meanwhile keeps its slot until the server answers. If the server hangs, its backlog
+            # also holds connections that were closed.
+            async with shared.dialing:
+                if self._has_ended:
+                    return
+                server = await dial(shared.socket, self._name, urgent=urgent)
+            if self._has_ended:
+                server.close()
+                return
+            self._server = server
             while self._queue:
                 self._send_request(self._queue.popleft())
             self._end_if_done()
-            while lines := await self._server.read():
+            while lines := await server.read():
                 self._receive(lines)
                 await shared.may_read.wait()
             for request in self._waiting_for_room():
-                self._refuse(request, "no_server", _SERVER_GONE)
+                self.refuse(request, "no_server", _SERVER_GONE)
             self._send_gone(_SERVER_GONE)
         except TalkError as error:  # the connection failed
             code = Busy.code if isinstance(error, Busy) else "no_server"
             while self._queue:
-                self._refuse(self._queue.popleft(), code, " ".join(str(error).split()))
+                self.refuse(self._queue.popleft(), code, " ".join(str(error).split()))
         except Exception as error:  # noqa: BLE001 - a bug in one session must not end the others
             log.write_bug("a session", error)
         self._clean_up()
@@ -488,7 +490,8 @@ class RemoteSession:
 
     # -- to the client
 
-    def _refuse(self, request: RemoteRequest, code: str, words: str) -> None:
+    def refuse(self, request: RemoteRequest, code: str, words: str) -> None:
+        """Send an error to the client in place of an answer."""
         self._publish([(encode(failure(request.seq, code, words)), request.correlation)])
 
     def end_goal(

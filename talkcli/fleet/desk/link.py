@@ -155,7 +155,7 @@ class DeskLink:
                 raise self.failure
             left = end - time.monotonic()
             if left <= 0:
-                raise self.no_answer_error(timeout)
+                raise self._no_answer_error(timeout)
             self.poll(left, interrupt)
 
     def send(
@@ -176,7 +176,7 @@ class DeskLink:
 
         def on_acknowledged(code: int) -> None:
             if code >= REASON_FAILURE:
-                error = self.publish_error(code, f"ask {'the group ' * is_group}{to} for anything")
+                error = self._rejection(code, f"ask {'the group ' * is_group}{to} for anything")
                 self._calls.append(partial(on_refused, error))
 
         line = request_line({"seq": number, **write_request(request)})
@@ -227,26 +227,24 @@ class DeskLink:
         self._wake_reader.close()
         self._wake_writer.close()
 
-    def publish_error(self, code: int, action: str) -> TalkError:
-        """Return the error to raise if the broker has rejected a message.
+    def _rejection(self, code: int, action: str) -> TalkError:
+        """Return the error to raise if the broker has rejected a message or a subscription.
 
         Args:
             code: the reason code from the broker.
             action: words for the error message that say what the user isn't allowed to do.
         """
-        if code == REASON_NOT_AUTHORIZED:
-            return self._access_error(action)
-        return ServerUnavailable(f"nothing was sent: the broker at {self.broker.url} refuses it, reason 0x{code:02x}")
+        url = self.broker.url
+        if code != REASON_NOT_AUTHORIZED:
+            return ServerUnavailable(f"nothing was sent: the broker at {url} refuses it, reason 0x{code:02x}")
+        words = f"the broker at {url} does not let '{self.user}' {action}"
+        return AccessDenied(f"{words}: its ACL needs the lines of an operator, see 'talk bridge --print-acl'")
 
-    def no_answer_error(self, timeout: float) -> TalkError:
+    def _no_answer_error(self, timeout: float) -> TalkError:
         """Return the error to raise if the broker hasn't sent its retained messages within `timeout` seconds."""
         if self.link is None or self.marker_at is not None:
             return ServerUnavailable(f"the broker at {self.broker.url} does not answer within {timeout:g} s")
-        return self._access_error(f"read {topics.reply(self.user, '+', '+')}")
-
-    def _access_error(self, action: str) -> AccessDenied:
-        words = f"the broker at {self.broker.url} does not let '{self.user}' {action}"
-        return AccessDenied(f"{words}: its ACL needs the lines of an operator, see 'talk bridge --print-acl'")
+        return self._rejection(REASON_NOT_AUTHORIZED, f"read {topics.reply(self.user, '+', '+')}")
 
     def _maintain(self, link: Link | None, now: float) -> float:
         """Connect, or keep the connection alive. Return the maximum number of seconds until the next call."""
@@ -284,7 +282,7 @@ class DeskLink:
 
     def _on_marker_acknowledged(self, code: int) -> None:
         if code >= REASON_FAILURE:
-            self.failure = self.publish_error(code, f"write to {topics.reply(self.user, '+', '+')}")
+            self.failure = self._rejection(code, f"write to {topics.reply(self.user, '+', '+')}")
 
     def _disconnect(self, link: Link) -> None:
         link.close()

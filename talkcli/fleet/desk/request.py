@@ -63,6 +63,10 @@ class Selection:
         return fnmatchcase(presence.name, self.text)
 
 
+class RobotOffline(ServerUnavailable):
+    """Raised if a robot is offline."""
+
+
 class NoServer(ServerUnavailable):
     """Raised if a robot is online, but its server is not running."""
 
@@ -100,14 +104,12 @@ class Outcome:
         return {**found, **({} if self.goal is None else {"goal": self.goal.to_json()}), **(self.said or {})}
 
 
-def failure_outcome(robot: str, error: TalkError, state: str | None = None) -> Outcome:
-    """Return the outcome of a failed request.
-
-    By default, its state depends on the class of the error.
-    """
-    states = {UnknownGoal: "UNKNOWN", Lost: State.LOST.name, NoServer: "NO_SERVER", ServerUnavailable: "UNREACHABLE"}
-    default = next((name for kind, name in states.items() if isinstance(error, kind)), "REFUSED")
-    return Outcome(robot, state or default, error.exit_code, error=error)
+def failure_outcome(robot: str, error: TalkError) -> Outcome:
+    """Return the outcome of a failed request. Its state depends on the class of the error."""
+    states: dict[type[TalkError], str] = {UnknownGoal: "UNKNOWN", Lost: State.LOST.name, RobotOffline: "OFFLINE"}
+    states |= {NoServer: "NO_SERVER", ServerUnavailable: "UNREACHABLE"}
+    state = next((name for kind, name in states.items() if isinstance(error, kind)), "REFUSED")
+    return Outcome(robot, state, error.exit_code, error=error)
 
 
 def reply_outcomes(robot: str, request: Request, reply: JsonObject, items: list[JsonObject]) -> list[Outcome]:

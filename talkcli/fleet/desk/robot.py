@@ -19,7 +19,7 @@ from talkcli.client.core import Exchange, identity
 from talkcli.errors import AccessDenied, BadRequest, Lost, ServerUnavailable, TalkError, UnknownGoal, UsageError
 from talkcli.fleet import topics
 from talkcli.fleet.desk.link import ABSENCE_LIMIT_S, DeskLink
-from talkcli.fleet.desk.request import NoServer
+from talkcli.fleet.desk.request import NoServer, RobotOffline
 from talkcli.fleet.link import Link, boottime
 from talkcli.frozen import replace
 from talkcli.goals.options import Cancel, Say, Set
@@ -107,6 +107,8 @@ class RobotConnection(Connection):
         self._bridge_session: object = None
         #: when the robot became absent (monotonic time), or None if requests can be sent
         self.absent_since = self._published_at
+        #: the class of the error to raise while the robot is absent
+        self._absence_error: type[ServerUnavailable] = ServerUnavailable
         #: the ids of canceled goals, which are canceled again after each absence
         self._canceled: set[str] = set()
         #: queued lookups of goals, which are sent when earlier ones have been answered
@@ -215,8 +217,8 @@ class RobotConnection(Connection):
             else:
                 self.receive(message.payload, time.monotonic())
 
-    def _mark_absent(self, why: str) -> None:
-        self.absence = why
+    def _mark_absent(self, why: str, error: type[ServerUnavailable] = ServerUnavailable) -> None:
+        self.absence, self._absence_error = why, error
         if self.absent_since is None:
             self.absent_since = time.monotonic()
 
@@ -232,9 +234,9 @@ class RobotConnection(Connection):
         self._presence = presence
         server = presence.get("server")
         if presence.get("online") is not True:
-            self._mark_absent(f"{self.robot} is offline")
+            self._mark_absent(f"{self.robot} is offline", RobotOffline)
         elif not isinstance(server, dict):
-            self._mark_absent(f"{self.robot} has no talk server at this moment")
+            self._mark_absent(f"{self.robot} has no talk server at this moment", NoServer)
         elif self._bridge_session != presence.get("session") or self.absent_since is not None:
             self.boot, self.pid = identity(server)
             self._bridge_session = presence.get("session")
@@ -262,7 +264,7 @@ class RobotConnection(Connection):
         """Raise ServerUnavailable or ProtocolMismatch if the robot can't receive requests at the moment."""
         check_greeting(self._presence)
         if self.absent_since is not None:
-            raise ServerUnavailable(f"{self.absence}: nothing was sent")
+            raise self._absence_error(f"{self.absence}: nothing was sent")
 
     # -- after an absence
 

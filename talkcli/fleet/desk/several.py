@@ -18,7 +18,7 @@ from talkcli.client.goal import GoalHandle
 from talkcli.errors import EXIT_OK, Lost, ServerUnavailable, TalkError, UnknownGoal, Unreadable, UsageError
 from talkcli.fleet import topics
 from talkcli.fleet.desk.link import DeskLink
-from talkcli.fleet.desk.request import NoServer, Outcome, Selection, cancel_outcomes, failure_outcome, reply_outcomes
+from talkcli.fleet.desk.request import Outcome, Selection, cancel_outcomes, failure_outcome, reply_outcomes
 from talkcli.fleet.desk.robot import RobotConnection, RobotExchange, new_goal_id
 from talkcli.fleet.link import Link, boottime
 from talkcli.fleet.payloads import Message, Presence
@@ -294,13 +294,8 @@ class FleetRequest:
         self._include(name)
         if (goal := self._rejected) is not None:
             self._record(Outcome(name, goal.state.name, goal.exit_code or EXIT_OK, goal))
-        elif not presence.online:
-            self._record(failure_outcome(name, ServerUnavailable(f"{name} is offline: nothing was sent"), "OFFLINE"))
-        elif self._selection.group is not None:
+        elif self._selection.group is not None and presence.online:
             robot.expect_reply(self._number, self._latest)
-        elif presence.server is None:
-            words = f"{name} has no talk server at this moment: nothing was sent"
-            self._record(failure_outcome(name, NoServer(words)))
         else:
             robot.send()
 
@@ -360,7 +355,7 @@ class RobotRequest:
         self._since = time.monotonic()
 
     def send(self) -> None:
-        """Send the request to this robot only, not to its group."""
+        """Send the request to this robot only, not to its group. Record a failure if the robot is absent."""
         try:
             self.connection.check_online()
             self.connection.begin(self._request, self._on_reply, self._on_failure)

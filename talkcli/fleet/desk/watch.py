@@ -187,6 +187,7 @@ class FleetWatch:
             Lost: The connection to the broker was lost later, and the broker wasn't back in time.
         """
         try:
+            self._desk.wait_for_retained(ANSWER_LIMIT_S, lambda: False, interrupt)
             while True:
                 now = time.monotonic()
                 self._check_limits(now)
@@ -238,14 +239,8 @@ class FleetWatch:
         """Check all time limits, and handle those that have passed."""
         if self._retained is not None and self._desk.retained_received:
             self._process_retained(self._retained, now)
-        if not self._has_started and self._desk.failure:
-            raise self._desk.failure
-        if self._away_since is not None:
-            away = now - self._away_since
-            if not self._has_started and away >= ANSWER_LIMIT_S:
-                raise self._desk.no_answer_error(ANSWER_LIMIT_S)
-            if away >= ABSENCE_LIMIT_S:
-                raise Lost(f"the broker at {self._broker.url} was away for {ABSENCE_LIMIT_S:g} s: {self._away_why}")
+        if self._away_since is not None and now - self._away_since >= ABSENCE_LIMIT_S:
+            raise Lost(f"the broker at {self._broker.url} was away for {ABSENCE_LIMIT_S:g} s: {self._away_why}")
         for name in [name for name, until in self._missing.items() if now >= until]:
             del self._missing[name]
             self._set_presence(name, None)
