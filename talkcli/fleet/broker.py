@@ -127,8 +127,7 @@ def client_user(broker: Broker) -> str:
             name = pwd.getpwuid(os.getuid()).pw_name
         except KeyError:
             name = f"uid-{os.getuid()}"
-    fault = topics.name_fault(name)
-    if fault:
+    if fault := topics.name_fault(name):
         raise UsageError(f"the name '{printable(name)}' can't be in a topic, it {fault}: set {USER} to one that can")
     return name
 

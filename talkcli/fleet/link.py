@@ -7,6 +7,7 @@ This module doesn't interpret payloads.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import select
@@ -120,8 +121,7 @@ class Link:
             CallbackAPIVersion.VERSION2, client_id, protocol=paho.MQTTv5, reconnect_on_failure=False
         )
         self._paho.max_inflight_messages_set(_MAX_UNACKNOWLEDGED_MESSAGES)
-        context = broker.ssl_context()
-        if context:
+        if context := broker.ssl_context():
             self._paho.tls_set_context(context)
         if broker.user is not None:
             self._paho.username_pw_set(broker.user, broker.password)
@@ -162,12 +162,11 @@ class Link:
         found = self._paho.socket()
         if isinstance(found, socket.socket):  # there is no socket if the broker has already closed the connection
             self._socket = found
-            try:
+            # On macOS, this fails if the broker has reset the connection. The first read reports that.
+            with contextlib.suppress(OSError):
                 # Nagle's algorithm would delay messages by 40 ms.
                 found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 found.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER_DISCARD)
-            except OSError:
-                pass  # on macOS, this fails if the broker has reset the connection (the first read reports it)
         end = time.monotonic() + LOGIN_LIMIT_S
         while self._answer is None and self.ended is None and (left := end - time.monotonic()) > 0:
             events = select.POLLIN | (select.POLLOUT if self.wants_write else 0)

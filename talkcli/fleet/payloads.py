@@ -167,9 +167,6 @@ def _texts(value: object) -> tuple[str, ...]:
 
 # -- Home Assistant
 
-#: Payload that Home Assistant publishes on its status topic when it starts.
-HOMEASSISTANT_ONLINE = b"online"
-
 #: Template that shows whether the robot can speak, based on the presence payload.
 _AVAILABLE = "{{ 'online' if value_json.online and value_json.server else 'offline' }}"
 # These templates extract values from the status payload. Home Assistant shows `None` as unknown.

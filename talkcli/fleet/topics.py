@@ -31,7 +31,7 @@ PRESENCE, STATUS, EVENT, ECHO = "presence", "status", "event", "echo"
 
 #: Home Assistant's user name at the broker, and also the prefix of its topics.
 HOMEASSISTANT = "homeassistant"
-#: Topic on which Home Assistant publishes whether it is running.
+#: Topic on which Home Assistant publishes `online` when it starts.
 HOMEASSISTANT_STATUS = f"{HOMEASSISTANT}/status"
 
 

@@ -11,7 +11,6 @@ from paho.mqtt import client as paho
 
 from talkcli.fleet import broker as brokers
 from talkcli.fleet.bridge.main import Bridge, BridgeSettings
-from talkcli.fleet.broker import from_environment
 from talkcli.fleet.payloads import Message
 from tests.fleet.conftest import in_loop
 from tests.fleet.remote_client import RemoteClient
@@ -89,8 +88,8 @@ async def test_a_connection_that_breaks_under_an_answer_is_made_again(
             await asyncio.sleep(0.01)
 
     asyncio.get_running_loop().set_exception_handler(lambda _loop, told: bugs.append(told))
-    settings = BridgeSettings("anna", from_environment(broker.env()), ("say",), socket=scripted.socket)
-    bridge = Bridge(settings, lambda: settings.broker)
+    settings = BridgeSettings("anna", ("say",), socket=scripted.socket)
+    bridge = Bridge(settings, lambda: brokers.from_environment(broker.env()))
     work = asyncio.create_task(bridge.run())
     await asyncio.wait_for(until(lambda: bridge._online and bridge._publisher.server is not None), PATIENCE)
     with RemoteClient(broker, "olga") as olga, Listener(broker, "talk/robot/anna/presence") as listener:

@@ -136,8 +136,7 @@ async def run(names: list[str], broker_url: str, directory: str, spoken: TextIO)
 
     servers = [Server(f"{directory}/{name}", lambda *goal, name=name: note(name, *goal), descriptors) for name in names]
     bridges = [
-        Bridge(BridgeSettings(name, broker, ALLOWABLE_REQUESTS, (), f"{directory}/{name}"), lambda: broker)
-        for name in names
+        Bridge(BridgeSettings(name, ALLOWABLE_REQUESTS, (), f"{directory}/{name}"), lambda: broker) for name in names
     ]
 
     look: asyncio.TimerHandle | None = None

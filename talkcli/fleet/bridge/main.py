@@ -22,7 +22,7 @@ from talkcli.fleet.bridge.policy import ECHO_EVERY_S, STALE_CODE, Goodbye, Ignor
 from talkcli.fleet.bridge.publisher import Publisher
 from talkcli.fleet.bridge.session import RemoteSessions
 from talkcli.fleet.link import REASON_NOT_AUTHORIZED, Link, LinkOpener, boottime
-from talkcli.fleet.payloads import HOMEASSISTANT_ONLINE, Message, Presence, bridge_rank, homeassistant_device
+from talkcli.fleet.payloads import Message, Presence, bridge_rank, homeassistant_device
 from talkcli.frozen import frozen, replace
 from talkcli.protocol.events import PROTOCOL
 from talkcli.protocol.lines import MAX_LINE_BYTES, encode
@@ -67,7 +67,6 @@ class BridgeSettings:
 
     #: the robot's name
     name: str
-    broker: Broker
     #: requests that remote clients may send, such as `say`
     allow: tuple[str, ...]
     #: the robot's groups, except the group of all robots
@@ -84,8 +83,8 @@ def run_bridge(settings: BridgeSettings, read_broker: Callable[[], Broker]) -> N
     """Run the bridge until SIGTERM or SIGINT.
 
     Args:
-        settings: the bridge's settings, including the broker for the first connection.
-        read_broker: called before each reconnection to read the broker's settings, because a password may have changed.
+        settings: the bridge's settings.
+        read_broker: called before each connection to read the broker's settings, because a password may have changed.
 
     Raises:
         UsageError: a certificate or key file is unusable.
@@ -121,7 +120,7 @@ class Bridge:
         self._settings = settings
         self._echo_topic = topics.robot(settings.name, topics.ECHO)
         self._presence_topic = topics.robot(settings.name, topics.PRESENCE)
-        self._broker, self._read_broker = settings.broker, read_broker
+        self._broker, self._read_broker = read_broker(), read_broker
         self._loop = asyncio.get_running_loop()
         self._session, self._since = f"{random.getrandbits(64):016x}", time.time()
         groups = tuple(dict.fromkeys((topics.ALL_ROBOTS, *settings.groups)))
@@ -158,7 +157,7 @@ class Bridge:
     async def run(self) -> None:
         """Keep the robot connected until `end` is called."""
         self._broker.ssl_context()  # check the certificate files before anything is started
-        log.write(f"robot {self._settings.name}, by the broker at {self._settings.broker.url}")
+        log.write(f"robot {self._settings.name}, by the broker at {self._broker.url}")
         self._systemd.notify_ready()
         tasks = [asyncio.create_task(each) for each in (self._stay_connected(), self._publisher.run())]
         for task in tasks:
@@ -192,7 +191,7 @@ class Bridge:
         there = "server there" if self._publisher.server else "no server"
         pending = len(self._sessions.goals)
         goals = f"{pending} goal{'' if pending == 1 else 's'} pending"
-        return f"{self._settings.name} at {self._settings.broker.url}: {broker}, {there}, {goals}"
+        return f"{self._settings.name} at {self._broker.url}: {broker}, {there}, {goals}"
 
     # -- the connection
 
@@ -262,7 +261,7 @@ class Bridge:
         self._publish_device()
         self._publisher.schedule_status()
         self._systemd.schedule_status()
-        log.write(f"online, at {self._settings.broker.url}")
+        log.write(f"online, at {self._broker.url}")
 
     def _disconnect(self, link: Link) -> None:
         """Close a connection, and end all sessions that use it."""
@@ -286,8 +285,7 @@ class Bridge:
 
     def _on_ready(self, action: Callable[[Link], None]) -> None:
         """Read from the link, or write to it, when its descriptor is ready."""
-        link = self._link
-        if link:
+        if link := self._link:
             action(link)
             self._check_link(link)
 
@@ -357,7 +355,7 @@ class Bridge:
         if message.topic == self._presence_topic:
             self._handle_presence(message.payload)
             return
-        if message.topic == topics.HOMEASSISTANT_STATUS and message.payload == HOMEASSISTANT_ONLINE:
+        if message.topic == topics.HOMEASSISTANT_STATUS and message.payload == b"online":
             self._loop.call_later(random.uniform(0, _DEVICE_DELAY_S), self._publish_device)
         topic = topics.parse_request(message.topic)
         if topic is None or not self._online:

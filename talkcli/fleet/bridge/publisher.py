@@ -91,7 +91,8 @@ class Publisher:
                 finally:
                     self._connection = None
                     server.close()
-                    self._on_disconnect()
+                    if self.server:
+                        self._set_server(None, ServerStatus({}, None, (), ()), "")
             except TalkError as error:
                 log.write_limited("server", f"no news of the server: {log.sanitize(str(error))}")
             await asyncio.sleep(random.uniform(0, self._retry_s))
@@ -147,26 +148,20 @@ class Publisher:
         self._retry_s = _FIRST_SERVER_RETRY_S
         for each in unfinished(status):
             self._sessions.remember(each, server.boot)
-        self.server = {"boot": server.boot, "pid": server.pid, "version": status.server.get("version")}
+        log.write(f"the server at {log.sanitize(server.path)} is there (pid {server.pid})")
+        about = {"boot": server.boot, "pid": server.pid, "version": status.server.get("version")}
+        self._set_server(about, status, server.boot)
+
+    def _set_server(self, about: JsonObject | None, status: ServerStatus, boot: str) -> None:
+        """Replace the state of the server and its goals. `about` is the new value of `server`."""
+        self.server = about
         self._active = status.active.id if status.active else None
         self._texts = {each.id: _shown_text(each) for each in unfinished(status)}
         self._last = status.recent[-1] if status.recent else self._last
         self._paused = status.server.get("paused") is True
-        self._sessions.reset_pending(status.pending, server.boot)
-        log.write(f"the server at {log.sanitize(server.path)} is there (pid {server.pid})")
+        self._sessions.reset_pending(status.pending, boot)
         self._on_server_change()
         self.schedule_status()
-
-    def _on_disconnect(self) -> None:
-        """Forget the server's state, because the connection has ended."""
-        self._active = None
-        self._texts.clear()
-        self._paused = False
-        self._sessions.reset_pending((), "")
-        if self.server:
-            self.server = None
-            self._on_server_change()
-            self.schedule_status()
 
     def _receive_event(self, server: LocalConnection, message: JsonObject, line: bytes) -> None:
         event = from_json(message)

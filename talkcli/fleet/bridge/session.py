@@ -105,8 +105,7 @@ class RemoteSessions:
 
     def say_goodbye(self, user: str, reply_topic: str) -> None:
         """End a client's session once the server has answered its requests."""
-        session = self._sessions.get((user, reply_topic))
-        if session:
+        if session := self._sessions.get((user, reply_topic)):
             session.say_goodbye()
 
     def end_all(self) -> None:
@@ -296,6 +295,7 @@ class RemoteSession:
         if why and not self.idle:
             self._send_gone(why)
         self._has_ended, self._reply_topic = True, None
+        self._queue.clear()
         if self._task and self._server:
             self._task.cancel()
         self._clean_up()
@@ -325,8 +325,11 @@ class RemoteSession:
         self._sessions.waiting = [each for each in self._sessions.waiting if each[2] is not self]
 
     def _end_if_done(self) -> None:
-        """End the session if the client has said goodbye and its important requests have been answered."""
-        if self._said_goodbye and not any(map(_has_lasting_effect, self.unanswered)):
+        """End the session if the client has said goodbye and its important requests have been answered.
+
+        If `end` was called before the server was connected, close the connection.
+        """
+        if self._has_ended or (self._said_goodbye and not any(map(_has_lasting_effect, self.unanswered))):
             self.end()
 
     # -- to the server
@@ -409,11 +412,7 @@ class RemoteSession:
             async with shared.dialing:
                 if self._has_ended:
                     return
-                server = await dial(shared.socket, self._name, urgent=urgent)
-            if self._has_ended:
-                server.close()
-                return
-            self._server = server
+                self._server = server = await dial(shared.socket, self._name, urgent=urgent)
             while self._queue:
                 self._send_request(self._queue.popleft())
             self._end_if_done()
@@ -456,37 +455,30 @@ class RemoteSession:
         if not isinstance(exchange, _RemoteExchange):
             return []
         del message["seq"]
-        remote = exchange.remote
-        found: list[JsonObject] = []
-        goal = message.get("goal")
+        remote, request, goal = exchange.remote, exchange.remote.request, message.get("goal")
+        state: State | None = None
         if isinstance(goal, dict):
-            self._await_result(remote, goal)
+            state = State.__members__.get(str(goal.get("state")))
+            waits = isinstance(request, Wait) or (isinstance(request, Say) and (request.wait or request.feedback))
+            if waits and state is not None and not state.terminal:
+                self._awaited.add(str(goal.get("id")))
+        found: list[JsonObject] = []
         if "ok" in message:
             self._server.forget(exchange)
-            self._count_goal(exchange, message)
+            self._count_goal(exchange, state, refused=message["ok"] is not True or state is State.REJECTED)
             found = [{"canceled": each.to_json()} for each in exchange.canceled]
             count = message.get("count")
             if found and isinstance(count, int):
                 message["count"] = count + len(found)
         return [(encode(item(remote.seq, **each)), remote.correlation) for each in (*found, message)]
 
-    def _await_result(self, remote: RemoteRequest, goal: JsonObject) -> None:
-        """Record that the client is waiting for a goal's result, if the request asks for it."""
-        request, state = remote.request, State.__members__.get(str(goal.get("state")))
-        waits = isinstance(request, Wait) or (isinstance(request, Say) and (request.wait or request.feedback))
-        if waits and state is not None and not state.terminal:
-            self._awaited.add(str(goal.get("id")))
-
-    def _count_goal(self, exchange: _RemoteExchange, reply: JsonObject) -> None:
+    def _count_goal(self, exchange: _RemoteExchange, state: State | None, *, refused: bool) -> None:
         """Update the number of pending goals after the server has answered a `say` request."""
-        if exchange.goal_id is None:
-            return
-        goal = reply.get("goal")
-        state = goal.get("state") if isinstance(goal, dict) else None
-        self._sessions.goals.answered(exchange.goal_id, pending=state == State.PENDING.name)
-        if exchange.is_new and state in (None, State.REJECTED.name):
-            self._sessions.ids.discard(exchange.goal_id)
-        self._sessions.schedule_release()
+        if exchange.goal_id is not None:
+            self._sessions.goals.answered(exchange.goal_id, pending=state is State.PENDING)
+            if exchange.is_new and refused:
+                self._sessions.ids.discard(exchange.goal_id)
+            self._sessions.schedule_release()
 
     # -- to the client
 

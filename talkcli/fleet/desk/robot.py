@@ -92,8 +92,7 @@ class RobotConnection(Connection):
             UsageError: The name of the robot or the sender is not allowed.
         """
         super().__init__(patience)
-        fault = topics.name_fault(robot)
-        if fault:
+        if fault := topics.name_fault(robot):
             raise UsageError(f"no robot can be called '{printable(robot)}': a name {fault}")
         self._sender = checked_sender_name(name)
         self.robot, self._desk = robot, desk
