@@ -5,6 +5,7 @@ A handler subscribes to topics and processes the messages. While the broker is u
 
 from __future__ import annotations
 
+import contextlib
 import os
 import random
 import select
@@ -203,10 +204,9 @@ class DeskLink:
 
     def wake(self) -> None:
         """Make `poll` return soon if another thread is waiting in it."""
-        try:
+        # Sending fails if the link is closed, or if the buffer is full because `poll` has already been woken.
+        with contextlib.suppress(OSError):
             self._wake_writer.send(b"\0")
-        except OSError:
-            pass  # The buffer is full because `poll` has already been woken, or the link is closed.
 
     def flush(self, timeout: float) -> None:
         """Wait until the broker has acknowledged all messages, but at most `timeout` seconds."""

@@ -144,8 +144,7 @@ def _robots_in(messages: list[Message]) -> list[RobotInfo]:
         payloads.setdefault(name, {})[kind] = message.payload
     robots = []
     for name, found in sorted(payloads.items()):
-        presence = Presence.read(name, found.get(topics.PRESENCE, b""))
-        if presence:
+        if presence := Presence.read(name, found.get(topics.PRESENCE, b"")):
             robots.append(RobotInfo(presence, RobotStatus.read(found.get(topics.STATUS, b""))))
     return robots
 
