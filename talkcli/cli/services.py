@@ -108,19 +108,19 @@ def bridge(options: CommonOptions, print_unit: str | None, print_acl: bool, **gi
     if print_unit:
         words = ["--insecure"] if options.insecure else []
         return _print_unit(options, "bridge", print_unit, given, words, environment=_BRIDGE_ENVIRONMENTS[print_unit])
-    broker = options.broker()
+    options.broker()  # check the settings, and whether the package for the next import is installed
     from talkcli.fleet.bridge.main import BridgeSettings, run_bridge
 
     settings = BridgeSettings(
         given["name"],
-        broker,
         tuple(allow),
         tuple(groups),
         options.socket,
         with_text=not given["no_text"],
         homeassistant=given["homeassistant"],
     )
-    return run_bridge(settings, options.broker)
+    run_bridge(settings, options.broker)
+    return EXIT_OK
 
 
 def _print_unit(
