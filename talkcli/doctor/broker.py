@@ -110,7 +110,7 @@ class BrokerExamination:
             if finding.state == FAILURE:
                 return
         try:
-            link = self._log_in(broker, self._inbox.append)
+            link = self._log_in(broker)
         except TalkError as error:
             yield judge_login(broker, error.message)
             return
@@ -152,9 +152,9 @@ class BrokerExamination:
         if broker.tls or not is_local(broker.host):
             yield judge_certificate(broker, expires_at, time.time())
 
-    def _log_in(self, broker: Broker, on_message: Callable[[Message], None]) -> Link:
+    def _log_in(self, broker: Broker) -> Link:
         """Connect to the broker and log in. Raises the same errors as `Link.open`."""
-        link = Link(broker, f"talk-doctor-{os.urandom(8).hex()}", on_message)
+        link = Link(broker, f"talk-doctor-{os.urandom(8).hex()}", self._inbox.append)
         try:
             self._wait_for(link.open)
         except TimeoutError as error:
@@ -164,7 +164,7 @@ class BrokerExamination:
     def _check_anonymous(self, broker: Broker) -> Finding:
         """Check whether the broker refuses clients without credentials."""
         try:
-            self._log_in(replace(broker, user=None, password=None, cert=None, key=None), lambda _: None).close()
+            self._log_in(replace(broker, user=None, password=None, cert=None, key=None)).close()
         except TalkError:
             return ok("anonymous", "who has no credentials is not let in")
         words = "the broker lets in who has no credentials: anybody on the network can make the robots speak"

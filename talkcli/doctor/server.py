@@ -109,9 +109,8 @@ def _client_message(error: TalkError, found: list[SocketPlace]) -> str | None:
     lines = error.message.splitlines()
     if not lines[0].startswith(_NO_SERVER_PREFIX):
         return lines[0]
-    listening = [f"{each.path}: " for each in found if each.what == PLACE_LISTENING]
-    rest = (line.strip() for line in lines[1:])
-    return next((line.removeprefix(each) for line in rest for each in listening if line.startswith(each)), None)
+    listening = [f"  {each.path}: " for each in found if each.what == PLACE_LISTENING]
+    return next((line.removeprefix(each) for line in lines for each in listening if line.startswith(each)), None)
 
 
 def _find_place(path: str, trusted: Container[str | None]) -> SocketPlace:

@@ -21,15 +21,8 @@ from typing import TYPE_CHECKING
 
 from talkcli import paths
 from talkcli.doctor.report import FAILURE, WARNING, Finding, failure, join_names, ok, warning
-from talkcli.engine.players import (
-    DUMMY_SINK,
-    PACKAGES,
-    PLAYERS,
-    is_silent,
-    on_path,
-    playback_devices,
-    sound_server_sockets,
-)
+from talkcli.engine import players
+from talkcli.engine.players import DUMMY_SINK, PACKAGES, PLAYERS, is_silent, on_path
 from talkcli.frozen import frozen, replace
 from talkcli.peers import command_name, parents, read_proc_file
 from talkcli.processes import kill, signal_name
@@ -82,8 +75,7 @@ class UserSession:
     user: str
     #: the server's process id, or None if this describes the current process
     server_pid: int | None = None
-    #: names of the process's groups, and their ids
-    groups: tuple[str, ...] = ()
+    #: ids of the process's groups
     gids: tuple[int, ...] = ()
     #: id of the user who called sudo, or None if the process isn't root under sudo
     sudo_uid: int | None = None
@@ -136,15 +128,14 @@ def find_session(server_pid: int | None) -> tuple[UserSession, Mapping[str, str]
     if environment is None:
         server_pid, environment = None, dict(os.environ)
     pid = os.getpid() if server_pid is None else server_pid
-    uid, gids = os.getuid(), _group_ids(pid)
+    uid = os.getuid()
     runtime = environment.get("XDG_RUNTIME_DIR") or None
     usual = f"/run/user/{uid}"
     session = UserSession(
         uid=uid,
         user=_name(pwd.getpwuid, uid),
         server_pid=server_pid,
-        groups=tuple(_name(grp.getgrgid, each) for each in gids),
-        gids=gids,
+        gids=_group_ids(pid),
         sudo_uid=paths.sudo_caller(environment),
         origins=tuple(_origins(environment, pid)),
         runtime_dir=runtime,
@@ -228,15 +219,11 @@ def _may_open(found: os.stat_result, entries: list[tuple[int, int, int]], sessio
         entries: the file's access control list, as returned by `_access_list`.
         session: the user.
     """
-    if session.uid == 0:
-        return True
-    if session.uid == found.st_uid:
-        granted = [found.st_mode >> 6]
-    else:
-        own = {(_ACL_USER, session.uid), *((_ACL_GROUP, each) for each in session.gids)}
-        granted = [bits for tag, bits, holder in entries if (tag, holder) in own]  # logind adds the user's entry
-        granted.append(found.st_mode >> 3 if found.st_gid in session.gids else found.st_mode)
-    return any(bits & _ACL_READ_WRITE == _ACL_READ_WRITE for bits in granted)
+    own = {(_ACL_USER, session.uid), *((_ACL_GROUP, each) for each in session.gids)}
+    of_mode = (_ACL_USER, found.st_mode >> 6, found.st_uid), (_ACL_GROUP, found.st_mode >> 3, found.st_gid)
+    # logind adds an entry for the user. The rights of others count if no entry is about the user.
+    granted = [bits for tag, bits, holder in (*of_mode, *entries) if (tag, holder) in own] or [found.st_mode]
+    return session.uid == 0 or any(bits & _ACL_READ_WRITE == _ACL_READ_WRITE for bits in granted)
 
 
 def _access_list(path: str) -> list[tuple[int, int, int]]:
@@ -370,7 +357,7 @@ def find_sound_server(env: Mapping[str, str], session: UserSession) -> SoundServ
     outputs = ("pactl", pulse), ("pw-cli", pipewire)
     error = next((output.error for program, output in outputs if on_path(program, env)), None)
     uids = [each for each in (session.uid, session.sudo_uid) if each is not None]
-    sockets, named = tuple(sound_server_sockets(env, *uids)), env.get("PULSE_SERVER") or None
+    sockets, named = tuple(players.sound_server_sockets(env, *uids)), env.get("PULSE_SERVER") or None
     return SoundServer(sockets=sockets, error=error, hangs=pipewire.timed_out, pulse_server=named)
 
 
@@ -382,7 +369,7 @@ def _pulse_address(env: Mapping[str, str]) -> str | None:
     named = env.get("PULSE_SERVER", "").removeprefix("unix:")
     if named and not named.startswith("/"):
         return named
-    for path in [named] if named else [each for each in sound_server_sockets(env) if each.endswith("/native")]:
+    for path in [named] if named else [each for each in players.sound_server_sockets(env) if each.endswith("/native")]:
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as probe:
             probe.settimeout(PROGRAM_LIMIT_S)
             probe.connect(path)
@@ -565,7 +552,7 @@ def check_cards(cards: tuple[str, ...], server: SoundServer, session: UserSessio
 
 def check_access(server: SoundServer, session: UserSession, directory: str = "/dev/snd") -> Finding:
     """Check whether the user may open the sound cards."""
-    nodes, group, forbidden = playback_devices(directory), _AUDIO_GROUP, []
+    nodes, group, forbidden = players.playback_devices(directory), _AUDIO_GROUP, []
     for each in nodes:
         with contextlib.suppress(OSError):
             found = os.stat(each)
@@ -575,8 +562,9 @@ def check_access(server: SoundServer, session: UserSession, directory: str = "/d
     if not nodes:
         return ok("group", f"nothing in {directory} to open, so the group {group} is not needed")
     if not forbidden:
-        member = "in the group {}" if group in session.groups else "not in the group {}, and needs not to be"
-        return ok("group", f"user {session.user} may open the cards ({member.format(group)})")
+        is_member = group in [_name(grp.getgrgid, each) for each in session.gids]
+        member = f"in the group {group}" if is_member else f"not in the group {group}, and needs not to be"
+        return ok("group", f"user {session.user} may open the cards ({member})")
     words = f"user {session.user} may not open {join_names(tuple(forbidden))}: not in the group {group}"
     if server.name is not None:
         return ok("group", f"{words}; the sound server opens them")

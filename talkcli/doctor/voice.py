@@ -19,7 +19,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
 from talkcli import install
-from talkcli.doctor.report import Finding, failure, join_names, ok, warning
+from talkcli.doctor.report import WARNING, Finding, failure, join_names, ok, warning
 from talkcli.doctor.sound import run_program
 from talkcli.engine import models, protocol
 from talkcli.engine.parent.process import EngineFailed, PrivateEngine
@@ -325,17 +325,11 @@ def judge_server_voices(voices: dict[str, Any]) -> list[Finding]:
 
     `voices` is the server's description of its neural voices.
     """
-    failed = _failed_voices(voices)
-    loaded = tuple(each for each in voices if each not in failed)
-    for voice, why in failed.items():
-        step = f"see whether it still is so: talk set --voice {voice}"
-        return [warning(_NEURAL_CHECK, f"the server cannot speak by {voice}: {why}", step)]
-    return [ok(_NEURAL_CHECK, f"of the server: {join_names(loaded)}")] if loaded else []
-
-
-def _failed_voices(voices: dict[str, Any]) -> dict[str, str]:
-    """Return the voices that the server could not load, with the reason for each."""
-    return {voice: str(each.get("why")) for voice, each in voices.items() if each.get("state") == "failed"}
+    for voice, each in voices.items():
+        if each.get("state") == "failed":
+            step = f"see whether it still is so: talk set --voice {voice}"
+            return [warning(_NEURAL_CHECK, f"the server cannot speak by {voice}: {each.get('why')}", step)]
+    return [ok(_NEURAL_CHECK, f"of the server: {join_names(tuple(voices))}")] if voices else []
 
 
 def judge_trial(used: str, trial: VoiceTrial, *, has_server: bool, server_voices: dict[str, Any]) -> Finding:
@@ -344,8 +338,9 @@ def judge_trial(used: str, trial: VoiceTrial, *, has_server: bool, server_voices
     if trial.speed is None:
         message, step = trial.fault
         return (warning if has_server else failure)(_NEURAL_CHECK, words + message, step)
-    if _failed_voices(server_voices):
-        return judge_server_voices(server_voices)[0]  # the doctor could load the voice, but the server couldn't
+    for found in judge_server_voices(server_voices):
+        if found.state == WARNING:
+            return found  # the doctor could load the voice, but the server couldn't
     facts = [] if trial.load_s is None else [f"loaded in {trial.load_s:.1f} s"]
     facts.append(f"makes a sentence {trial.speed:.1f} times as fast as it is heard")
     facts += [] if trial.memory_bytes is None else [f"takes {trial.memory_bytes / 1e6:.0f} MB with its engine"]

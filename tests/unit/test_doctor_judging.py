@@ -403,7 +403,7 @@ def test_in_a_pipe_a_finding_is_one_line_without_colour() -> None:
 # Sound
 
 
-PI = UserSession(1000, "pi", groups=("pi", "audio"), gids=(1000, 29), runtime_dir="/run/user/1000", runtime_owner=1000)
+PI = UserSession(1000, "pi", gids=(1000, 29), runtime_dir="/run/user/1000", runtime_owner=1000)
 CARDS = ("USB Audio Device",)
 NO_SERVER = SoundServer(error="Connection refused")
 WIRE = SoundServer("PipeWire, without its PulseAudio part", accepts_pulse=False)
