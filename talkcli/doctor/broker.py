@@ -124,7 +124,7 @@ class BrokerExamination:
             presence_finding = ok("name", f"'{self._robot}' is free: no bridge has it, and none had it")
         else:
             privileged = rights_finding.state != FAILURE
-            known = tuple(sorted(presences)) if privileged else ()
+            known = sorted(presences) if privileged else []
             presence_finding = judge_unknown(self._robot, known, name, privileged=privileged)
         yield presence_finding
         yield rights_finding
@@ -370,7 +370,7 @@ def judge_presence(presence: Presence, now: float) -> Finding:
     return ok("name", f"{words}; its server is talk {server.get('version')}, process {server.get('pid')}")
 
 
-def judge_unknown(robot: str, known: tuple[str, ...], name: str, *, privileged: bool) -> Finding:
+def judge_unknown(robot: str, known: list[str], name: str, *, privileged: bool) -> Finding:
     """Return the finding about a robot for which the broker sends no presence message.
 
     Args:
@@ -383,7 +383,7 @@ def judge_unknown(robot: str, known: tuple[str, ...], name: str, *, privileged: 
     by_lower = {each.lower(): each for each in known}
     near = [by_lower[each] for each in difflib.get_close_matches(robot.lower(), by_lower)]
     if near:
-        return failure("name", f"{words}; it knows {join_names(tuple(near))}", f"talk --robot {near[0]} doctor")
+        return failure("name", f"{words}; it knows {join_names(near)}", f"talk --robot {near[0]} doctor")
     step = f"on the robot: talk bridge --name {robot}"
     if known:
         return failure("name", f"{words}; it knows {join_names(known)}", step)

@@ -75,7 +75,7 @@ def failure(check: str, message: str, step: str) -> Finding:
     return Finding(check, FAILURE, printable(message), printable(step))
 
 
-def join_names(names: tuple[str, ...]) -> str:
+def join_names(names: Sequence[str]) -> str:
     """Join names with commas. A long list is shortened."""
     hidden = len(names) - _SHOWN_NAMES_COUNT
     return ", ".join(names) if hidden <= 1 else f"{', '.join(names[:_SHOWN_NAMES_COUNT])} and {hidden} more"

@@ -28,7 +28,7 @@ from talkcli.peers import command_name, parents, read_proc_file
 from talkcli.processes import kill, signal_name
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Iterable, Mapping, Sequence
     from typing import Any
 
 #: The kernel's description of its sound cards. Containers can hide this directory.
@@ -168,8 +168,7 @@ def _environment(pid: int) -> dict[str, str] | None:
     data = read_proc_file(f"/proc/{pid}/environ", -1)
     if data is None or file_owner(f"/proc/{pid}") != os.getuid():
         return None  # root could read it, but can't use another user's sound server
-    pairs = (each.partition("=") for each in os.fsdecode(data).split("\0") if "=" in each)
-    return {name: value for name, _, value in pairs}
+    return dict(each.split("=", 1) for each in os.fsdecode(data).split("\0") if "=" in each)
 
 
 def _name(look_up: Callable[[int], tuple[Any, ...]], number: int) -> str:
@@ -377,9 +376,7 @@ def _pulse_address(env: Mapping[str, str]) -> str | None:
     return None
 
 
-def check_levels(
-    env: Mapping[str, str], server: SoundServer, cards: tuple[str, ...], *, is_used: bool
-) -> list[Finding]:
+def check_levels(env: Mapping[str, str], server: SoundServer, cards: Sequence[str], *, is_used: bool) -> list[Finding]:
     """Check the volume of the default sink, or of the sound cards if there is no sound server.
 
     Args:
@@ -390,12 +387,12 @@ def check_levels(
     """
     levels = [judge_level(*each, is_used=is_used) for each in _find_levels(env, server, cards)]
     bad = [each for state in (FAILURE, WARNING) for each in levels if each.state == state]
-    return bad[:1] or ([ok(_LOUDNESS_CHECK, ", ".join(each.message for each in levels))] if levels else [])
+    if bad or not levels:
+        return bad[:1]
+    return [ok(_LOUDNESS_CHECK, ", ".join(each.message for each in levels))]
 
 
-def _find_levels(
-    env: Mapping[str, str], server: SoundServer, cards: tuple[str, ...]
-) -> Iterable[tuple[str, str, str, str]]:
+def _find_levels(env: Mapping[str, str], server: SoundServer, cards: Sequence[str]) -> Iterable[tuple[str, ...]]:
     """Yield the arguments of `judge_level` for each output."""
     if server.name is not None:
         mute = run_program("pactl", "get-sink-mute", "@DEFAULT_SINK@", env=env)
@@ -523,7 +520,7 @@ def check_device(env: Mapping[str, str], player: str, configured: str | None) ->
         step = f"sudo apt-get install -y {package}"
         return ok("device", words) if configured is None else warning("device", words, step)
     output = run_program(program, *arguments, env=env)
-    names = tuple(parse(output))
+    names = list(parse(output))
     if output.error is not None:
         return warning("device", f"{command}: {output.error}", f"look at what this says: {command}")
     if not names:
@@ -536,7 +533,7 @@ def check_device(env: Mapping[str, str], player: str, configured: str | None) ->
     return warning("device", words, "start the server with --device and one of these names")
 
 
-def check_cards(cards: tuple[str, ...], server: SoundServer, session: UserSession) -> Finding:
+def check_cards(cards: Sequence[str], server: SoundServer, session: UserSession) -> Finding:
     """Check whether the kernel has found sound cards."""
     if cards:
         return ok("cards", join_names(cards))
@@ -565,7 +562,7 @@ def check_access(server: SoundServer, session: UserSession, directory: str = "/d
         is_member = group in [_name(grp.getgrgid, each) for each in session.gids]
         member = f"in the group {group}" if is_member else f"not in the group {group}, and needs not to be"
         return ok("group", f"user {session.user} may open the cards ({member})")
-    words = f"user {session.user} may not open {join_names(tuple(forbidden))}: not in the group {group}"
+    words = f"user {session.user} may not open {join_names(forbidden)}: not in the group {group}"
     if server.name is not None:
         return ok("group", f"{words}; the sound server opens them")
     with contextlib.suppress(KeyError):
@@ -575,7 +572,7 @@ def check_access(server: SoundServer, session: UserSession, directory: str = "/d
     return warning("group", words, f"sudo usermod -aG {group} {session.user}, and log in again")
 
 
-def judge_sound_server(server: SoundServer, cards: tuple[str, ...], session: UserSession) -> Finding:
+def judge_sound_server(server: SoundServer, cards: Sequence[str], session: UserSession) -> Finding:
     """Return the finding about the sound server, which shows whether players can use it."""
     check = _SOUND_SERVER_CHECK
     where = "from here" if session.server_pid is None else f"from the server (process {session.server_pid})"

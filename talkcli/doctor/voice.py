@@ -241,11 +241,11 @@ def _check_files(env: Mapping[str, str] | None) -> Iterator[Finding]:
     if invalid:
         (voice, error_message), *others = invalid
         message, step = _split_step(error_message)
-        names = join_names(tuple(each for each, _ in others))
+        names = join_names([each for each, _ in others])
         more = f"; and something is wrong with {names}" if others else ""
         yield warning(_FILES_CHECK, f"{voice}: {message}{more}", step)
     elif valid:
-        yield ok(_FILES_CHECK, f"as they should be: {join_names(tuple(valid))}")
+        yield ok(_FILES_CHECK, f"as they should be: {join_names(valid)}")
 
 
 def _find_package_fault(env: Mapping[str, str]) -> tuple[str, str] | None:
@@ -329,7 +329,7 @@ def judge_server_voices(voices: dict[str, Any]) -> list[Finding]:
         if each.get("state") == "failed":
             step = f"see whether it still is so: talk set --voice {voice}"
             return [warning(_NEURAL_CHECK, f"the server cannot speak by {voice}: {each.get('why')}", step)]
-    return [ok(_NEURAL_CHECK, f"of the server: {join_names(tuple(voices))}")] if voices else []
+    return [ok(_NEURAL_CHECK, f"of the server: {join_names(list(voices))}")] if voices else []
 
 
 def judge_trial(used: str, trial: VoiceTrial, *, has_server: bool, server_voices: dict[str, Any]) -> Finding:
