@@ -59,7 +59,7 @@ def _environment(home: str, tmp_path: Path, code: str) -> dict[str, str]:
 
 def _found(used: str | None, env: dict[str, str], limit: float = LIMIT) -> dict[str, Finding]:
     """Return the findings about the voices of this environment, by their checks."""
-    found = voice.check_neural(used, EngineOptions(env=env), limit, has_server=False, server_voices={})
+    found = voice.check_neural(used, EngineOptions(env=env), limit, None)
     return {each.check: each for each in found}
 
 
@@ -172,7 +172,7 @@ def test_only_a_voice_that_is_used_is_tried(home: str, monkeypatch: pytest.Monke
     tiny_voice.put(Path(home) / "v", "tiny")
     asked: list[str | None] = []
 
-    def check_neural(used: str | None, *_: object, **__: object) -> list[Finding]:
+    def check_neural(used: str | None, *_: object) -> list[Finding]:
         asked.append(used)
         return []
 
@@ -240,7 +240,7 @@ def test_a_signal_ends_the_trial(alone: dict[str, str]) -> None:
     options = EngineOptions(env=alone, interrupt={readable: 1})
     try:
         with pytest.raises(Interrupted):
-            list(voice.check_neural("piper/tiny", options, LIMIT, has_server=False, server_voices={}))
+            list(voice.check_neural("piper/tiny", options, LIMIT, None))
     finally:
         os.close(readable)
         os.close(writable)
@@ -263,13 +263,13 @@ def test_a_server_s_words_about_its_voices_are_told_if_they_cannot_be_examined()
 
 def test_a_voice_that_speaks_here_and_that_the_server_has_given_up_is_a_warning() -> None:
     trial = VoiceTrial(load_s=0.5, speed=9.0)
-    assert voice.judge_trial("piper/b", trial, has_server=True, server_voices=FAILED_THEN).state == WARNING
-    assert voice.judge_trial("piper/b", trial, has_server=True, server_voices={}).state == OK
+    assert voice.judge_trial("piper/b", trial, FAILED_THEN).state == WARNING
+    assert voice.judge_trial("piper/b", trial, {}).state == OK
 
 
 def _judged(**tried: object) -> Finding:
     trial = VoiceTrial(**tried)  # type: ignore[arg-type]
-    return voice.judge_trial("piper/a", trial, has_server=False, server_voices={})
+    return voice.judge_trial("piper/a", trial, None)
 
 
 def test_on_a_slow_machine_another_voice_is_the_next_step() -> None:
@@ -289,14 +289,13 @@ def test_a_voice_that_fails_is_a_warning_if_a_server_speaks_with_espeak_instead(
     monkeypatch.setattr(voice, "_find_package_fault", lambda _: ("onnxruntime is missing", "install it"))
     trial = VoiceTrial(fault=("x is no model", "get it anew"))
 
-    def packages(used: str | None, *, has_server: bool) -> str:
-        options = EngineOptions(env={})
-        return next(voice.check_neural(used, options, LIMIT, has_server=has_server, server_voices={})).state
+    def packages(used: str | None, server_voices: dict[str, object] | None) -> str:
+        return next(voice.check_neural(used, EngineOptions(env={}), LIMIT, server_voices)).state
 
-    for has_server, state in ((False, FAILURE), (True, WARNING)):
-        assert voice.judge_trial("piper/a", trial, has_server=has_server, server_voices={}).state == state
-        assert packages("piper/a", has_server=has_server) == state
-    assert packages(None, has_server=False) == WARNING
+    for server_voices, state in ((None, FAILURE), ({}, WARNING)):
+        assert voice.judge_trial("piper/a", trial, server_voices).state == state
+        assert packages("piper/a", server_voices) == state
+    assert packages(None, None) == WARNING
 
 
 def test_a_voice_that_needs_a_missing_package_is_cured_by_installing_it() -> None:

@@ -129,8 +129,7 @@ class LocalExamination:
             yield from voice.judge_server_voices(server_voices)
             return
         options = voice.EngineOptions(env=env, interrupt=self._interrupt)
-        given = used, options, SENTENCE_LIMIT_S
-        yield from voice.check_neural(*given, has_server=self._client is not None, server_voices=server_voices)
+        yield from voice.check_neural(used, options, SENTENCE_LIMIT_S, server_voices if self._client else None)
 
     def _check_sound(self) -> Iterator[Finding]:
         """Check everything between the engine and the loudspeaker."""

@@ -205,7 +205,7 @@ def _judge_library(synthesizer: str | None, voices: tuple[str, ...] | None) -> l
 
 
 def check_neural(
-    used: str | None, options: EngineOptions, limit: float, *, has_server: bool, server_voices: dict[str, Any]
+    used: str | None, options: EngineOptions, limit: float, server_voices: dict[str, Any] | None
 ) -> Iterator[Finding]:
     """Check the packages and files of neural voices, and try the voice in use.
 
@@ -213,10 +213,10 @@ def check_neural(
         used: the voice in use, as the user wrote it, or None if no neural voice is in use.
         options: options for the engine process.
         limit: time limit for trying the voice, in seconds.
-        has_server: whether a server runs. It speaks with espeak if a neural voice fails.
-        server_voices: the server's description of its neural voices, which is empty if there is no server.
+        server_voices: the server's description of its neural voices, or None if there is no server. A server speaks
+            with espeak if a neural voice fails.
     """
-    broken = warning if has_server or used is None else failure
+    broken = failure if used is not None and server_voices is None else warning
     fault = _find_package_fault(os.environ if options.env is None else options.env)
     if fault is None:
         yield ok(_PACKAGES_CHECK, ", ".join(map(_with_version, install.NEURAL_PACKAGES)))
@@ -224,8 +224,7 @@ def check_neural(
         yield broken(_PACKAGES_CHECK, *fault)
     yield from _check_files(options.env)
     if used is not None and fault is None:
-        trial = _try_voice(used, options, limit)
-        yield judge_trial(used, trial, has_server=has_server, server_voices=server_voices)
+        yield judge_trial(used, _try_voice(used, options, limit), server_voices)
 
 
 def _check_files(env: Mapping[str, str] | None) -> Iterator[Finding]:
@@ -332,13 +331,14 @@ def judge_server_voices(voices: dict[str, Any]) -> list[Finding]:
     return [ok(_NEURAL_CHECK, f"of the server: {join_names(list(voices))}")] if voices else []
 
 
-def judge_trial(used: str, trial: VoiceTrial, *, has_server: bool, server_voices: dict[str, Any]) -> Finding:
+def judge_trial(used: str, trial: VoiceTrial, server_voices: dict[str, Any] | None) -> Finding:
     """Return the finding about the neural voice in use. The arguments are those of `check_neural`."""
+    broken = failure if server_voices is None else warning
     words = f"{used} is in use: "
     if trial.speed is None:
         message, step = trial.fault
-        return (warning if has_server else failure)(_NEURAL_CHECK, words + message, step)
-    for found in judge_server_voices(server_voices):
+        return broken(_NEURAL_CHECK, words + message, step)
+    for found in judge_server_voices(server_voices or {}):
         if found.state == WARNING:
             return found  # the doctor could load the voice, but the server couldn't
     facts = [] if trial.load_s is None else [f"loaded in {trial.load_s:.1f} s"]
