@@ -71,21 +71,20 @@ def _completion_lines(talk: click.Command, options: CommonOptions) -> list[str]:
         words.append("")
     found = ShellComplete(talk, {"obj": options}, "talk", "_TALK_COMPLETE").get_completions(words[1:-1], words[-1])
     format_line = {"bash": _bash_line, "zsh": _zsh_line, "fish": _fish_line}[shell]
-    return ["file" if each.type == "file" else format_line(line, each.value, each.help) for each in found]
+    return ["file" if each.type == "file" else format_line(words[-1], each.value, each.help) for each in found]
 
 
-def _bash_line(line: str, value: str, _: str | None) -> str:
-    """Return a value as bash inserts it, which doesn't quote it.
+def _bash_line(word: str, value: str, _: str | None) -> str:
+    """Return a value as bash inserts it for an incomplete word. bash doesn't quote the value.
 
     bash replaces the text in COMP_CWORD, which may be only the last part of the word.
     """
-    typed, quote = _last_word(line)
+    typed, quote = _last_word(os.environ["COMP_WORDS"])
     replaced = os.environ["COMP_CWORD"]
     if replaced in {":", "="}:
         replaced = ""  # after `sudo`, bash passes the separator instead of an empty word
-    stays = typed.removesuffix(replaced) if replaced else typed
-    kept = "".join(split_arg_string(stays))
-    return f"plain,{_quote_for_bash(_with_flag(value, typed).removeprefix(kept), quote)}"
+    kept = "".join(split_arg_string(typed.removesuffix(replaced)))
+    return f"plain,{_quote_for_bash(_with_flag(value, word).removeprefix(kept), quote)}"
 
 
 def _zsh_line(_: str, value: str, words: str | None) -> str:
@@ -97,10 +96,9 @@ def _zsh_line(_: str, value: str, words: str | None) -> str:
     return f"described,{value}:{words}"
 
 
-def _fish_line(line: str, value: str, words: str | None) -> str:
+def _fish_line(word: str, value: str, words: str | None) -> str:
     """Return a value and its help text after a tab. fish quotes the value itself."""
-    typed, _ = _last_word(line)
-    return f"plain,{_with_flag(value, typed)}" + (f"\t{words}" if words else "")
+    return f"plain,{_with_flag(value, word)}" + (f"\t{words}" if words else "")
 
 
 def completion(_: CommonOptions, shell: str) -> None:
@@ -128,9 +126,8 @@ def _last_word(line: str) -> tuple[str, str]:
     return word, quote
 
 
-def _with_flag(value: str, typed: str) -> str:
-    """Prefix a value with its flag if the user is typing --option=VALUE."""
-    word = "".join(split_arg_string(typed))
+def _with_flag(value: str, word: str) -> str:
+    """Prefix a value with its flag if the incomplete word is --option=VALUE."""
     option, equals, _ = word.partition("=")
     return f"{option}={value}" if equals and option.startswith("-") else value
 
