@@ -76,20 +76,16 @@ class Client:
         """
         if not timeout > 0:
             raise UsageError(f"the timeout is {timeout!r}: it must be more than 0 seconds")
-        connection: Connection = ReconnectingConnection(socket, name=name, patience=timeout)
-        self._use(connection)
+        self._connection: Connection = ReconnectingConnection(socket, name=name, patience=timeout)
+        #: the first server's boot id, which is prepended to ids that are only numbers
+        self._first_boot = self._connection.boot
 
     @classmethod
     def over(cls, connection: Connection) -> Client:
         """Return a client that uses an existing connection. This method is for internal use."""
         client = cls.__new__(cls)
-        client._use(connection)
+        client._connection, client._first_boot = connection, connection.boot
         return client
-
-    def _use(self, connection: Connection) -> None:
-        self._connection = connection
-        #: the first server's boot id, which is prepended to ids that are only numbers
-        self._first_boot = connection.boot
 
     @property
     def path(self) -> str:

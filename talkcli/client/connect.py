@@ -29,10 +29,8 @@ if TYPE_CHECKING:
 GREETING_START = b'{"talk": 1, "version": '
 #: An idle server sends its greeting within this time. Longer waits must be interruptible.
 GREETING_WAIT_S = 0.2
-#: Maximum time for which `yield_processor` waits.
+#: Maximum time for which `yield_processor` sleeps.
 _LONGEST_YIELD_S = 0.2
-#: If an answer contains one of these, the goal will not be spoken.
-_REFUSALS = (b'"ok": false', b'"state": "REJECTED"')
 #: Time limit for a server's greeting, and for each answer.
 ANSWER_LIMIT_S = 5.0
 #: How long to keep trying if a server has too many clients or a full backlog.
@@ -151,10 +149,8 @@ def send_early(
     return replace(attempt, hello_sent=True, received=received, request_sent=sent)
 
 
-def yield_processor(attempt: ConnectionAttempt, timeout: float | None) -> ConnectionAttempt:
+def yield_processor(timeout: float | None) -> None:
     """Sleep for a moment, so that the server can use the processor.
-
-    Return the connection, with the bytes that were received during the wait.
 
     A client that only waits for the end of its goal calls this before its other imports. The server, the engine, the
     player and the sound server need the processor until the first sound. Together they use about as much processor time
@@ -162,24 +158,10 @@ def yield_processor(attempt: ConnectionAttempt, timeout: float | None) -> Connec
     client went on importing.
 
     Args:
-        attempt: a connection on which a request was sent.
         timeout: time limit of the whole command in seconds; None for no limit.
     """
     longest = _LONGEST_YIELD_S if timeout is None else min(_LONGEST_YIELD_S, timeout)
-    end = time.monotonic() + min(time.process_time(), longest)
-    connected, received = attempt.socket, attempt.received
-    assert connected
-    try:
-        while (left := end - time.monotonic()) > 0:
-            connected.settimeout(left)
-            data = connected.recv(65536)
-            received += data
-            if not data or any(each in data for each in _REFUSALS):
-                break
-    except OSError:  # the time is over, or the connection broke, which the next read reports
-        pass
-    connected.setblocking(False)
-    return replace(attempt, received=received)
+    time.sleep(min(time.process_time(), longest))
 
 
 def sender_name(name: str | None) -> str | None:
@@ -238,7 +220,7 @@ def connect(
             if keep_trying and end is not None:
                 greet_by = min(greet_by, end)
             try:
-                return _greet(attempt, attempt.socket, hello, greet_by, interrupt)
+                return _greet(attempt, hello, greet_by, interrupt)
             except AccessDenied as denied:
                 if attempt.request_sent:
                     raise
@@ -260,16 +242,12 @@ def connect(
 
 def _may_start(attempt: ConnectionAttempt) -> bool:
     """Return whether a server could still be starting at one of the failed places."""
-    found = (paths.describe_place(path, error) for path, error in attempt.failures if isinstance(error, OSError))
-    return any(each in {paths.PLACE_ABSENT, paths.PLACE_STALE} for each in found)
+    found = {paths.describe_place(path, error) for path, error in attempt.failures if isinstance(error, OSError)}
+    return not found.isdisjoint({paths.PLACE_ABSENT, paths.PLACE_STALE})
 
 
 def _greet(
-    attempt: ConnectionAttempt,
-    connected: _socket.socket,
-    hello: JsonObject,
-    end: float,
-    interrupt: Mapping[int, int] | None,
+    attempt: ConnectionAttempt, hello: JsonObject, end: float, interrupt: Mapping[int, int] | None
 ) -> ConnectionAttempt:
     """Send hello if it has not been sent yet, and read the server's greeting.
 
@@ -287,7 +265,8 @@ def _greet(
     from talkcli.errors import ServerUnavailable
     from talkcli.protocol.lines import request_line
 
-    received = attempt.received
+    connected, received = attempt.socket, attempt.received
+    assert connected
     try:
         if not attempt.hello_sent:
             try:

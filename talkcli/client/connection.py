@@ -37,9 +37,6 @@ if TYPE_CHECKING:
 _RECEIVE_BYTES = 256 * 1024
 #: The first and longest pause between attempts to reconnect. The pause doubles after each attempt.
 _FIRST_RECONNECT_PAUSE_S, _LONGEST_RECONNECT_PAUSE_S = 0.02, 0.5
-#: Maximum number of reads before sending a request. Reading shows whether the connection has ended, but some events may
-#: have to be read first.
-_MAX_READS = 4
 #: How often a thread without a socket checks whether another thread has reconnected.
 _RECONNECT_CHECK_S = 0.1
 
@@ -254,11 +251,8 @@ class Connection(ClientCore):
 
     def _read_available(self) -> None:
         """Process the messages that have already arrived, and notice if the connection has ended."""
-        for _ in range(_MAX_READS):
-            heard = self._heard
+        for _ in range(2):  # the end of the connection can only be read after the last messages
             self.wait_until(lambda: False, time.monotonic(), interruptible=False)
-            if heard == self._heard:
-                break
 
     def _cut_off(self) -> None:
         """Break the connection, because a line could only be sent in part. The caller must hold the lock `changed`."""
