@@ -112,13 +112,12 @@ class _TerminalFeedback(Feedback):
         elif isinstance(event, PausedChanged):  # pausing affects all goals
             if line:
                 line.paused = event.paused
-        elif line is None or (line.goal.id != goal.id and _is_spoken(event)):
-            self._line = _GoalLine(goal)
-            self._line.update(event)
-        elif line.goal.id == goal.id:
-            line.update(event)
-        else:  # the line shows another goal until this one is spoken
-            return
+        else:
+            # The line shows another goal until this one is spoken.
+            if line is None or (line.goal.id != goal.id and _is_spoken(event)):
+                line = self._line = _GoalLine(goal)
+            if line.goal.id == goal.id:
+                line.update(event)
         self._paint()
 
     def note(self, words: str) -> None:

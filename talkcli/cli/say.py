@@ -7,7 +7,6 @@ it. Only `-o` imports the engine, because it works without a server.
 from __future__ import annotations
 
 import os
-import time
 
 from talkcli.cli.command import read_value, replace_bad_bytes
 from talkcli.cli.interrupts import Interrupts, discard_unread_output
@@ -86,7 +85,7 @@ def _say_text(
     wait: bool,
     feedback: bool,
 ) -> int:
-    text, end = without_bad_bytes(text, options), options.deadline(timeout)
+    text = without_bad_bytes(text, options)
     with Interrupts(blocked=options.blocked_signals, output=wait) as interrupts:
         try:
             with options.connect(timeout, name=name, interrupt=interrupts.watched) as client:
@@ -99,9 +98,9 @@ def _say_text(
                 return retry_without_output(_report_sent, goal, options, reporter)
         except Lost as error:
             if interrupts.signal_number is None:
-                if end is None or time.monotonic() < end:
-                    raise
-                raise timeout_error(timeout, error.message) from error
+                if seconds_left(options.deadline(timeout)) == 0:
+                    raise timeout_error(timeout, error.message) from error
+                raise
             show_error(error, json=options.json)
     return interrupts.exit_code
 

@@ -111,14 +111,12 @@ def _ask(options: CommonOptions, request: Request, timeout: float | None = None,
         with FleetRequest(
             broker, selection, request, name=name, interrupt=interrupts.watched, patience=patience
         ) as fleet_request:
-            is_late = False
             try:
                 printer.show_outcomes(fleet_request, seconds_left(options.deadline(timeout)))
+                return printer.summarize(fleet_request)
             except (Interrupted, OSError) as error:
                 interrupts.record(error)
                 is_late = isinstance(error, TimeoutError)
-            if not (is_late or interrupts.reader_gone or interrupts.signal_number is not None):
-                return printer.summarize(fleet_request)
             if owns_goals:
                 _cancel(fleet_request, interrupts, printer)
             if is_late:

@@ -41,8 +41,6 @@ if TYPE_CHECKING:
 
 #: The maximum size of one read, which is the capacity of a pipe.
 _STDIN_READ_BYTES = 65_536
-#: The maximum size of a text with its line ending.
-_MAX_STDIN_TEXT_BYTES = MAX_TEXT_BYTES + len("\r\n")
 #: The maximum size of buffered input if a ttl is set.
 _MAX_BUFFERED_BYTES = 1_000_000
 #: The default for --ahead, which limits the number of pending goals.
@@ -70,14 +68,14 @@ def read_text(end: float | None, *, wait: bool = False, whole: bool = False) -> 
 
     Raises:
         TimedOut: the input hasn't ended in time.
-        InputTooLong: the text is too long. The rest of the input isn't read.
+        InputTooLong: the text is too long. The rest of the input may not have been read.
     """
     data = bytearray()
     with Interrupts(output=wait) as interrupts:
-        while whole or len(data) <= _MAX_STDIN_TEXT_BYTES:
+        while whole or len(data) <= MAX_TEXT_BYTES + len("\r\n"):
             if not wait_ready({0: select.POLLIN}, seconds_left(end), interrupts.watched):
                 raise TimedOut("standard input has not ended within the time: nothing was sent")
-            more = _read_available(_STDIN_READ_BYTES if whole else _MAX_STDIN_TEXT_BYTES + 1 - len(data))
+            more = _read_available()
             if more == b"":
                 return _decode(bytes(data))
             data += more or b""
@@ -158,13 +156,10 @@ class LineBuffer:
             yield self.take()
 
 
-def _read_available(count: int) -> bytes | None:
-    """Read up to `count` bytes of standard input.
-
-    The result is empty at the end of the input, and None if no input is available yet.
-    """
+def _read_available() -> bytes | None:
+    """Read from standard input, and return b"" at its end, or None if no input is available yet."""
     try:
-        return os.read(0, count)
+        return os.read(0, _STDIN_READ_BYTES)
     except BlockingIOError:  # another program has made standard input non-blocking
         return None
     except OSError as error:
@@ -415,7 +410,7 @@ class LineSpeaker:
             if watched.pop(0, None) is None:
                 raise
             wait_ready({}, 0, watched)  # raises Interrupted again if there was also a signal or closed output
-            data = _read_available(_STDIN_READ_BYTES)
+            data = _read_available()
             if data is not None:
                 self._buffer.feed(data, time.monotonic())
             if self._unanswered or self._goals:  # read from the server even if there is always more input
