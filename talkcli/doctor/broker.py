@@ -19,9 +19,9 @@ from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
 from talkcli.client.client import Client
-from talkcli.doctor import report
-from talkcli.doctor.report import FAILURE, Finding, failure, join_names, ok, warning
+from talkcli.doctor.report import BRIDGE_QUESTION, FAILURE, ROBOT_QUESTION, Finding, failure, join_names, ok, warning
 from talkcli.doctor.server import format_span, summarize_server
+from talkcli.doctor.voice import WORKING_STATES
 from talkcli.errors import ServerUnavailable, TalkError, UsageError
 from talkcli.fleet import topics
 from talkcli.fleet.broker import CA, URL, USER, client_user, from_environment, is_local
@@ -95,7 +95,7 @@ class BrokerExamination:
         self._is_robot = environment.get(USER) == robot
         self._inbox: list[Message] = []
         #: the question that the report answers
-        self.question = report.BRIDGE_QUESTION if self._is_robot else report.ROBOT_QUESTION
+        self.question = BRIDGE_QUESTION if self._is_robot else ROBOT_QUESTION
 
     def findings(self) -> Iterator[Finding]:
         """Run the checks, and yield their findings. Stop at a failure that makes further checks impossible."""
@@ -173,8 +173,8 @@ class BrokerExamination:
     def _test_rights(self, link: Link, name: str) -> tuple[Finding, dict[str, Presence]]:
         """Find out whether the user has the access rights of an operator, or of this robot's bridge.
 
-        Return the finding about the rights, and the presence messages by the robots' names. Other robots are included
-        only if the broker sent no presence of this robot, and the user isn't the robot.
+        Return the finding about the rights, and the presence of each robot by its name. Other robots are only read if
+        this robot's presence is missing, and the user isn't the robot.
         """
         robot, replies = partial(topics.robot, self._robot), partial(topics.reply, name, os.urandom(8).hex())
         if self._is_robot:
@@ -289,7 +289,13 @@ def judge_unreachable(broker: Broker, trouble: str) -> Finding:
 
 
 def judge_certificate(broker: Broker, expires_at: float | None, now: float) -> Finding:
-    """Return the finding about the broker's certificate. The times are in seconds since 1970, or None without TLS."""
+    """Return the finding about the broker's certificate.
+
+    Args:
+        broker: the broker.
+        expires_at: when the certificate expires, in seconds since 1970; None without TLS.
+        now: the current time in seconds since 1970.
+    """
     if expires_at is None:
         words = f"none: whoever is between here and {broker.host} can read all of it, and change it"
         step = f"give the broker a certificate (listener, certfile, keyfile in mosquitto.conf), and: {URL}=mqtts://…"
@@ -303,7 +309,7 @@ def judge_certificate(broker: Broker, expires_at: float | None, now: float) -> F
 
 
 def judge_tls_error(broker: Broker, message: str, code: int, now: float) -> Finding:
-    """Return the finding about a broker with which TLS failed.
+    """Return the finding about a failed TLS connection.
 
     Args:
         broker: the broker.
@@ -316,7 +322,7 @@ def judge_tls_error(broker: Broker, message: str, code: int, now: float) -> Find
 
 
 def _authority(broker: Broker) -> str:
-    """Return a description of the CAs that the broker's certificate is checked with."""
+    """Return which CAs the broker's certificate is checked against."""
     return f"the CA in {broker.ca}" if broker.ca else "the system's CAs"
 
 
@@ -418,6 +424,6 @@ def judge_bridge(robot: str, server: JsonObject, took: float) -> Finding:
     words = f"{robot} answers in {took * 1000:.0f} ms: {summarize_server(server)}"
     if server.get("paused") is True:
         return warning("bridge", f"speech is paused; {words}", f"talk --robot {robot} resume")
-    if server.get("engine") not in {"ready", "starting"}:
+    if server.get("engine") not in WORKING_STATES:
         return warning("bridge", words, f"on {robot}: talk doctor")
     return ok("bridge", words)

@@ -74,7 +74,7 @@ class LocalExamination:
                 yield finding
 
     def _run_checks(self, client: Client | None, socket: Finding) -> Iterator[Finding]:
-        """Run all checks. The arguments are the results of `connect`."""
+        """Run all checks. The arguments are the results of `server.connect`."""
         of_server: list[Finding] = []
         if client is not None:
             try:
@@ -120,7 +120,7 @@ class LocalExamination:
         if used and not is_neural(used):
             if engine.ready is not None:
                 used = engine.ready.voice
-            elif not find_voice(used, models.installed_names(env)):  # the engine may have failed because of the name
+            elif not find_voice(used, models.installed_names(env)):  # the engine may have failed because of this voice
                 used = None
         needed = used or server_voices or any(map(is_neural, engine.voices or ())) or env.get("TALK_VOICES")
         if not needed or not is_own_driver(self._setting("driver")):

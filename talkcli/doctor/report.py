@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 
 #: The states of a finding. A warning means that speech may be inaudible, and a failure that it certainly is.
 OK, WARNING, FAILURE = "ok", "warning", "failed"
-#: Name of the check that speaks a sentence.
-SENTENCE_CHECK = "sentence"
 #: Number of names that are shown if a list is shortened.
 _SHOWN_NAMES_COUNT = 4
 #: Widths of the columns for the state and the name of a check.

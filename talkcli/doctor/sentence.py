@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 from typing import TYPE_CHECKING
 
-from talkcli.doctor.report import SENTENCE_CHECK, Finding, failure, ok
+from talkcli.doctor.report import Finding, failure, ok
 from talkcli.doctor.sound import is_custom
 from talkcli.doctor.voice import INSTALL_LIBRARY, SENTENCE_RATE_WPM, SENTENCE_TEXT, explain_failure, start_engine
 from talkcli.engine import protocol
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from talkcli.doctor.voice import EngineOptions
     from talkcli.goals.goal import Goal
 
+_SENTENCE_CHECK = "sentence"
 #: The sentence that is played silently beside a running server. It is short and fast, because some devices accept only
 #: one player at a time, but long enough to show whether the player works.
 SILENT_TEXT, _SILENT_RATE_WPM = "talk works well", 450
@@ -54,7 +55,7 @@ ADVICE: dict[str, str] = {
 }
 #: The finding if the server's player can't be tested, because it runs elsewhere.
 SENTENCE_ELSEWHERE = failure(
-    SENTENCE_CHECK,
+    _SENTENCE_CHECK,
     "not played: the server runs on another machine or in a container, and so does its player",
     "run talk doctor --silent there; or here without --silent, so that the server plays",
 )
@@ -214,13 +215,13 @@ def judge_sentence(
         seconds = "" if result.duration is None else f", {result.duration:.1f} s"
         player = f", {result.player}" if result.player else ""
         said = "played to its end without sound" if silent else f'"{SENTENCE_TEXT}" was played to its end'
-        return ok(SENTENCE_CHECK, f"{said} {how}{player}{seconds}")
+        return ok(_SENTENCE_CHECK, f"{said} {how}{player}{seconds}")
     if result.reason in {"late", "paused"}:
-        return failure(SENTENCE_CHECK, f"not spoken: {result.message}", ADVICE[result.reason])
+        return failure(_SENTENCE_CHECK, f"not spoken: {result.message}", ADVICE[result.reason])
     message = (result.message or "it ended without a reason").removeprefix(f"Talk {result.state.name.lower()}: ")
     step = advise(result.reason, message, result.player, device)
     if result.beside_speech and step == _BUSY_STEP:
-        return ok(SENTENCE_CHECK, f"the device is busy with what the server speaks at this moment ({message})")
+        return ok(_SENTENCE_CHECK, f"the device is busy with what the server speaks at this moment ({message})")
     if result.reason == Reason.AUDIO_STALLED and result.suspended:
         message = f"{message}; suspended: {', '.join(result.suspended)}"
         step = f"pactl suspend-sink {result.suspended[0]} 0"
@@ -229,4 +230,4 @@ def judge_sentence(
         causes = {*_PLAYER_REASONS, Reason.NO_PLAYER, *(_START_REASONS if hangs else ())}
         step = playback_step if result.reason in causes else step
     label = f"{result.state.name}, {result.reason}" if result.reason else result.state.name
-    return failure(SENTENCE_CHECK, f"{label}: {message}", step)
+    return failure(_SENTENCE_CHECK, f"{label}: {message}", step)

@@ -220,7 +220,7 @@ def _may_open(found: os.stat_result, entries: list[tuple[int, int, int]], sessio
     """
     own = {(_ACL_USER, session.uid), *((_ACL_GROUP, each) for each in session.gids)}
     of_mode = (_ACL_USER, found.st_mode >> 6, found.st_uid), (_ACL_GROUP, found.st_mode >> 3, found.st_gid)
-    # logind adds an entry for the user. The rights of others count if no entry is about the user.
+    # logind adds an entry for the user. The permissions for others apply only if no entry matches the user.
     granted = [bits for tag, bits, holder in (*of_mode, *entries) if (tag, holder) in own] or [found.st_mode]
     return session.uid == 0 or any(bits & _ACL_READ_WRITE == _ACL_READ_WRITE for bits in granted)
 

@@ -87,7 +87,7 @@ class EngineOptions:
 class EngineReport:
     """What an engine process reported when it started."""
 
-    #: its first message, or None if the engine did not start
+    #: the engine's first message, or None if the engine did not start
     ready: protocol.Ready | None = None
     #: ids of the voices, or None if the engine did not list them
     voices: tuple[str, ...] | None = None
@@ -228,7 +228,7 @@ def check_neural(
 
 
 def _check_files(env: Mapping[str, str] | None) -> Iterator[Finding]:
-    """Check the files of all neural voices that are found."""
+    """Check the files of all installed neural voices."""
     valid, invalid = [], []
     for name, path in models.find_models(env).items():
         try:
