@@ -19,8 +19,6 @@ from tests.support.loop import in_loop
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-HIGH = 100_000
-
 
 class Counted(socket.socket):
     """A socket that counts what is sent with it."""
@@ -69,8 +67,7 @@ class Pair:
         for each in (self.socket, self.client):
             each.setblocking(False)
         self.told = Told()
-        loop = asyncio.get_running_loop()
-        self.stream = ClientStream(ClientStreams(loop), self.socket, self.told, HIGH)
+        self.stream = ClientStream(ClientStreams(), self.socket, self.told)
 
     def receive(self) -> bytes:
         """Return the bytes that the client has received."""
@@ -144,7 +141,7 @@ async def test_congestion_is_told_once_and_all_output_arrives() -> None:
         while not pair.told.congested:
             written += b"%08d" % len(written) * 1_000
             pair.stream.write(written[-8_000:])
-        assert pair.stream.unsent_bytes > HIGH
+        assert pair.stream.unsent_bytes > stream.CONGESTION_BYTES
         written += b"the rest"
         pair.stream.write(b"the rest")
         received = b""
@@ -241,12 +238,12 @@ async def test_bug_in_the_receiver_ends_the_connection() -> None:
 async def test_one_callback_sends_the_output_of_all_streams() -> None:
     loop = asyncio.get_running_loop()
     calls = []
-    streams = ClientStreams(loop)
+    streams = ClientStreams()
     call = loop.call_soon
     async with paired() as first, paired() as second:
         pairs = [first, second]
         for pair in pairs:
-            pair.stream = ClientStream(streams, pair.socket, pair.told, HIGH)
+            pair.stream = ClientStream(streams, pair.socket, pair.told)
         loop.call_soon = lambda *values, **named: calls.append(call(*values, **named))  # type: ignore[assignment, method-assign]
         for _ in range(3):
             for pair in pairs:
@@ -259,12 +256,11 @@ async def test_one_callback_sends_the_output_of_all_streams() -> None:
 
 @in_loop
 async def test_past_the_limit_for_all_output_the_largest_backlog_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
-    loop = asyncio.get_running_loop()
-    streams = ClientStreams(loop)
+    streams = ClientStreams()
     async with contextlib.AsyncExitStack() as stack:
         pairs = [await stack.enter_async_context(paired()) for _ in range(3)]
         for pair in pairs:
-            pair.stream = ClientStream(streams, pair.socket, pair.told, HIGH)
+            pair.stream = ClientStream(streams, pair.socket, pair.told)
             pair.stream.write(b"x" * 1_000_000)  # more than the socket's buffer holds
         taken = 1_000_000 - pairs[0].stream.unsent_bytes
         monkeypatch.setattr(stream, "MAX_TOTAL_OUTPUT_BYTES", streams.unread_bytes + 3_000)

@@ -91,9 +91,9 @@ class Queue:
         if record.say.key is not None:
             del self._by_key[record.say.key]
 
-    def next_expiry(self) -> float | None:
-        """Return the monotonic time at which the next goal expires, or None if no goal can expire."""
-        return self._expiries[0][0] if self._expiries else None
+    def next_expiry(self) -> float:
+        """Return the monotonic time at which the next goal expires, or inf if no goal can expire."""
+        return self._expiries[0][0] if self._expiries else inf
 
     def expired(self, now: float) -> list[Record]:
         """Return the expired goals, earliest first."""
@@ -106,5 +106,5 @@ class Queue:
         yield self._displaceable, (-record.say.priority, record.number, record)
         if record.preempt:
             yield self._preempting, entry
-        if record.expires_at is not None:
+        if record.expires_at < inf:
             yield self._expiries, (record.expires_at, record.number, record)

@@ -37,8 +37,8 @@ class Record:
     sender: Sender
     queued_at: float
     preempt: bool = False
-    #: monotonic time at which the goal expires if it hasn't started
-    expires_at: float | None = None
+    #: monotonic time at which the goal expires if it hasn't started, or inf
+    expires_at: float = inf
     #: hash of the text, or None unless the text was dropped to free memory
     text_hash: int | None = None
     state: State = State.PENDING

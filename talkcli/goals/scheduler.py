@@ -197,12 +197,12 @@ class Scheduler:
             return first, []
         self._count += 1
         ttl = (self.settings.ttl if say.ttl is None else say.ttl) or None
-        expires_at = None if ttl is None else now.monotonic + ttl - waited_s
+        expires_at = inf if ttl is None else now.monotonic + ttl - waited_s
         number, asked = self._count, say if ttl == say.ttl else replace(say, ttl=ttl)
         record = Record(f"{self.boot}-{number}", number, asked, sender, now.wall, self._preempts(say), expires_at)
         by = canceled or self._early_cancels.find(say.id, now.monotonic)
         refused = self._refuse(say, refusal, first) or (None if canceled else self._throttle(say, record, now))
-        expired = expires_at is not None and expires_at <= now.monotonic
+        expired = expires_at <= now.monotonic
         recalled = self._find_room(say)
         if recalled is None and not (by or refused or expired):
             refused = Reason.QUEUE_FULL, f"{len(self.pending)} goals are waiting already (`talk serve --max-queue`)"
@@ -410,10 +410,9 @@ class Scheduler:
 
     # -- time limits
 
-    def deadline(self) -> float | None:
-        """Return the monotonic time at which `tick` must be called, or None if there is no time limit."""
-        due = (self._active_deadline(), self.pending.next_expiry(), self._next_deadline())
-        return min((each for each in due if each is not None), default=None)
+    def deadline(self) -> float:
+        """Return the monotonic time at which `tick` must be called, or inf if there is no time limit."""
+        return min(self._active_deadline(), self.pending.next_expiry(), self._next_deadline())
 
     def tick(self, now: Now) -> list[Effect]:
         """Handle all time limits that have been reached.
@@ -422,8 +421,8 @@ class Scheduler:
         next goal starts if it no longer has to wait for its voice.
         """
         effects: list[Effect] = []
-        record, deadline = self.active, self._active_deadline()
-        if record is not None and deadline is not None and now.monotonic >= deadline:
+        record = self.active
+        if record is not None and now.monotonic >= self._active_deadline():
             if record.stop_requested_at is None:
                 effects = self._stop(record, Reason.EXPIRED, None, now)
             else:
@@ -585,26 +584,25 @@ class Scheduler:
             effects += self._recall(record, Reason.EXPIRED, _expiry_message(record), None, now)
         return effects
 
-    def _active_deadline(self) -> float | None:
-        """Return the monotonic time limit of the active goal, or None if it has no limit.
+    def _active_deadline(self) -> float:
+        """Return the monotonic time limit of the active goal, or inf if it has no limit.
 
         If the goal is being stopped, it must be silent by then. Otherwise, it expires then, but only if the engine was
         lost before anything was heard, because the goal must start again.
         """
         goal = self.active
         if goal is None:
-            return None
+            return inf
         if goal.stop_requested_at is not None:
             return goal.stop_requested_at + CONFIRM_SILENCE_S
-        return None if self.has_engine or goal.spoken_end else goal.expires_at
+        return inf if self.has_engine or goal.spoken_end else goal.expires_at
 
-    def _next_deadline(self) -> float | None:
-        """Return the monotonic time at which the next goal stops waiting for its voice, or None."""
+    def _next_deadline(self) -> float:
+        """Return the monotonic time at which the next goal stops waiting for its voice, or inf."""
         record = None if self.active or self.paused or not self.has_engine else self.pending.first()
         if record is None:
-            return None
-        start = 0.0 if record.next_since == inf else self._start_time(record)
-        return start if start < inf else None
+            return inf
+        return 0.0 if record.next_since == inf else self._start_time(record)
 
     def _start_time(self, record: Record) -> float:
         """Return the earliest monotonic time at which the next goal may start."""

@@ -146,7 +146,7 @@ class VoiceScheduler:
         if record.preempt or record.say.priority > 0:
             return 0.0
         start = (found.loading_since if found.loading_since < inf else record.next_since) + VOICE_PATIENCE_S
-        return start if record.expires_at is None else min(start, record.expires_at - EXPIRY_MARGIN_S)
+        return min(start, record.expires_at - EXPIRY_MARGIN_S)
 
     def failure(self, voice: str) -> str | None:
         """Return the reason why a voice could not be loaded, or None if it didn't fail."""

@@ -20,7 +20,7 @@ from talkcli.goals.options import Cancel
 from talkcli.protocol.events import busy_greeting, failure, item, ok, take_seq
 from talkcli.protocol.lines import MAX_LINE_BYTES, LineSplitter, TruncatedLine, decode, encode
 from talkcli.protocol.requests import Hello, Request, Status, read_request
-from talkcli.server.stream import ClientStream, ClientStreams
+from talkcli.server.stream import CONGESTION_BYTES, ClientStream, ClientStreams
 
 if TYPE_CHECKING:
     import socket
@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     WaitingList = dict["PendingRequest", None]
     Steps = Coroutine[WaitingList, bool | None, None]
 
-#: If a client has more unread output than this, the server drops its feedback and stops reading its requests.
-CONGESTION_BYTES = 256 * 1024
 #: A client with more unread output than this is disconnected.
 MAX_CLIENT_OUTPUT_BYTES = 4 * 1024 * 1024
 #: A client is disconnected if more messages than this have to wait while a list is sent to it.
@@ -196,7 +194,7 @@ class ClientConnection(asyncio.Protocol):
         self.admitted = False
         #: requests that have not been answered yet, oldest first
         self.unanswered: WaitingList = {}
-        self.stream = ClientStream(streams, connected, self, CONGESTION_BYTES)
+        self.stream = ClientStream(streams, connected, self)
         self._handler = handler
         self._loop = streams.loop
         self._splitter = LineSplitter(MAX_LINE_BYTES - 1)

@@ -61,14 +61,14 @@ class Listener:
         _check_directory(os.path.dirname(self.path))
         _refuse_other_file(self.path)
         _refuse_second_server(self._named_path)
-        self._lock = Lock(self.path)
+        self._lock = _acquire_lock(self.path)
         self.socket = _bind(self.path, mode)
         self._identity = _identity(self.path)
 
     def in_place(self) -> bool:
         """Return whether the socket file and the lock file still belong to this server."""
         # A new file can't have the same inode number, because both files are still open.
-        return _identity(self.path) == self._identity and self._lock.in_place(self.path)
+        return _identity(self.path) == self._identity and _is_lock_of(self.path, self._lock)
 
     def bind_again(self) -> socket.socket | None:
         """Recreate a missing socket file or lock file, with the same checks as at the start.
@@ -81,9 +81,9 @@ class Listener:
         """
         path = paths.server_socket(self._named_path)
         _check_directory(os.path.dirname(path))
-        if not self._lock.in_place(path):
-            former_lock, self._lock = self._lock, Lock(path)
-            former_lock.close()
+        if not _is_lock_of(path, self._lock):
+            former_lock, self._lock = self._lock, _acquire_lock(path)
+            os.close(former_lock)
         if _identity(path) == self._identity:
             return None
         _refuse_live_socket(path)
@@ -97,7 +97,7 @@ class Listener:
             with contextlib.suppress(FileNotFoundError):
                 os.unlink(self.path)
         self.socket.close()
-        self._lock.close()
+        os.close(self._lock)
 
 
 class InheritedListener:
@@ -152,39 +152,6 @@ def listen(path: str | None, mode: int) -> Listener | InheritedListener:
 def is_temporary(error: AddressInUse) -> bool:
     """Return whether another attempt to bind the socket may succeed."""
     return isinstance(error.__cause__, OSError) and error.__cause__.errno in _TEMPORARY
-
-
-class Lock:
-    """A lock that reserves a socket's path for this server."""
-
-    def __init__(self, path: str) -> None:
-        """Acquire the lock.
-
-        Raises:
-            AddressInUse: if another server holds the lock.
-        """
-        while True:
-            self._fd = _open_lock(f"{path}.lock")
-            try:
-                fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                holder = _holder(self._fd)
-                raise _already_served(holder, path, here=holder is not None) from None
-            if self.in_place(path):
-                break
-            os.close(self._fd)  # the file was removed before it was locked, so try again
-        os.ftruncate(self._fd, 0)
-        with contextlib.suppress(OSError):  # the process id is only informative, so ignore a full disk
-            os.write(self._fd, f"{os.getpid()}\n".encode())
-
-    def in_place(self, path: str) -> bool:
-        """Return whether the lock file of a path is still the one that this server has locked."""
-        status = os.fstat(self._fd)
-        return _identity(f"{path}.lock") == (status.st_dev, status.st_ino)
-
-    def close(self) -> None:
-        """Release the lock, but keep the lock file."""
-        os.close(self._fd)
 
 
 @contextlib.contextmanager
@@ -318,6 +285,34 @@ def _bind(path: str, mode: int) -> socket.socket:
 
 
 # -- the lock
+
+
+def _acquire_lock(path: str) -> int:
+    """Reserve a socket's path for this server. Return the descriptor of the lock file, which keeps the lock while open.
+
+    Raises:
+        AddressInUse: if another server holds the lock.
+    """
+    while True:
+        fd = _open_lock(f"{path}.lock")
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            holder = _holder(fd)
+            raise _already_served(holder, path, here=holder is not None) from None
+        if _is_lock_of(path, fd):
+            break
+        os.close(fd)  # the file was removed before it was locked, so try again
+    os.ftruncate(fd, 0)
+    with contextlib.suppress(OSError):  # the process id is only informative, so ignore a full disk
+        os.write(fd, f"{os.getpid()}\n".encode())
+    return fd
+
+
+def _is_lock_of(path: str, fd: int) -> bool:
+    """Return whether the lock file of a path is the file with this descriptor."""
+    status = os.fstat(fd)
+    return _identity(f"{path}.lock") == (status.st_dev, status.st_ino)
 
 
 def _open_lock(name: str) -> int:

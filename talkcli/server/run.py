@@ -135,9 +135,7 @@ class Server:
         """Run the server until it is stopped or fails."""
         settings, speech = self._settings, self.speech
         descriptors = raise_descriptor_limit(settings.max_clients + MAX_EXTRA_CLIENTS)
-        self._acceptor = Acceptor(
-            self._loop, lambda each: ClientConnection(self, speech.streams, each).begin(), descriptors
-        )
+        self._acceptor = Acceptor(lambda each: ClientConnection(self, speech.streams, each).begin(), descriptors)
         self._loop.set_exception_handler(log.handle_loop_error)
         for number in self._end_signals:
             self._loop.add_signal_handler(number, self._on_signal, number)

@@ -11,6 +11,7 @@ import contextlib
 import time
 from collections import deque
 from functools import partial
+from math import inf
 from typing import TYPE_CHECKING
 
 from talkcli.daemon import log
@@ -95,8 +96,8 @@ class Speech:
         #: set when an engine is ready or can't be started, and when the server shuts down
         self.engine_known = asyncio.Event()
         self._loop = asyncio.get_running_loop()
-        self.subscribers = Subscribers(self._loop, lambda: (each.connection for each in self.waiting_for_room))
-        self.streams = ClientStreams(self._loop)
+        self.subscribers = Subscribers(lambda: (each.connection for each in self.waiting_for_room))
+        self.streams = ClientStreams()
         self.notifications = Notifications(self.streams)
         self._timer: asyncio.TimerHandle | None = None
         #: requests that are waiting for a goal to become silent or to end
@@ -137,8 +138,7 @@ class Speech:
     def now(self) -> Now:
         """Handle all time limits that have been reached, and return the current time."""
         now = Now(elapsed(), time.time())
-        deadline = self.scheduler.deadline()
-        if deadline is not None and deadline <= now.monotonic:
+        if self.scheduler.deadline() <= now.monotonic:
             self.apply(self.scheduler.tick(now))
         return now
 
@@ -223,7 +223,7 @@ class Speech:
             self._timer.cancel()
         deadline = self.scheduler.deadline()
         self._timer = None
-        if deadline is not None:
+        if deadline < inf:
             self._timer = self._loop.call_later(min(deadline - elapsed(), CLOCK_CHECK_S), self._tick)
 
     def _tick(self) -> None:

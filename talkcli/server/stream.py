@@ -11,6 +11,7 @@ Streams replace asyncio's transports and have a similar interface. There are thr
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import errno
 import resource
@@ -21,7 +22,6 @@ from talkcli.protocol.events import busy_greeting
 from talkcli.protocol.lines import encode
 
 if TYPE_CHECKING:
-    import asyncio
     import socket
     from collections.abc import Callable
 
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 _READ_BYTES = 64 * 1024
 #: When this much output has collected, it is sent without waiting for the end of the iteration.
 _FLUSH_BYTES = 64 * 1024
+#: If a client has more unread output than this, the server drops its feedback and stops reading its requests.
+CONGESTION_BYTES = 256 * 1024
 #: Maximum unread output of all clients together. Without a limit, 250 clients could use a gigabyte.
 MAX_TOTAL_OUTPUT_BYTES = 64 * 1024 * 1024
 
@@ -57,8 +59,8 @@ class ClientStreams:
     words.
     """
 
-    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
-        self.loop = loop
+    def __init__(self) -> None:
+        self.loop = asyncio.get_running_loop()
         self.open: set[ClientStream] = set()
         #: total size of the unread output
         self.unread_bytes = 0
@@ -94,22 +96,18 @@ class ClientStream:
     The socket is closed after `connection_lost` of its receiver has been called.
     """
 
-    def __init__(
-        self, streams: ClientStreams, connected: socket.socket, receiver: asyncio.Protocol, congestion_bytes: int
-    ) -> None:
+    def __init__(self, streams: ClientStreams, connected: socket.socket, receiver: asyncio.Protocol) -> None:
         """Create the stream. Call `begin` or `resume_reading` to start reading.
 
         Args:
             streams: the streams of all clients.
             connected: the client's non-blocking socket.
             receiver: the protocol that gets the data. Its `connection_lost` is called in a later iteration.
-            congestion_bytes: the size of unread output above which `pause_writing` of the receiver is called.
         """
         self.socket = connected
         self._streams = streams
         self._loop = streams.loop
         self._receiver = receiver
-        self._congestion_bytes = congestion_bytes
         self._unread = bytearray()
         #: size of the output that the receiver holds back until the client catches up
         self.held_bytes = 0
@@ -226,10 +224,10 @@ class ClientStream:
             self._report_congestion()
 
     def _report_congestion(self) -> None:
-        if not self.congested and len(self._unread) > self._congestion_bytes:
+        if not self.congested and len(self._unread) > CONGESTION_BYTES:
             self.congested = True
             self._receiver.pause_writing()
-        elif self.congested and len(self._unread) <= self._congestion_bytes // 4:
+        elif self.congested and len(self._unread) <= CONGESTION_BYTES // 4:
             self.congested = False
             self._receiver.resume_writing()
 
@@ -283,17 +281,14 @@ def raise_descriptor_limit(clients: int) -> int:
 class Acceptor:
     """Accepts connections on a listening socket. Some descriptors stay reserved for the engine."""
 
-    def __init__(
-        self, loop: asyncio.AbstractEventLoop, serve: Callable[[socket.socket], None], max_descriptors: int
-    ) -> None:
+    def __init__(self, serve: Callable[[socket.socket], None], max_descriptors: int) -> None:
         """Create the acceptor. Call `open` to start.
 
         Args:
-            loop: the event loop.
             serve: function that is called with each connected socket and has to close it.
             max_descriptors: this process's limit of file descriptors.
         """
-        self._loop = loop
+        self._loop = asyncio.get_running_loop()
         self._serve = serve
         self._max_descriptors = max_descriptors
         self._listening: socket.socket | None = None

@@ -5,6 +5,7 @@ A cancel may end thousands of goals. Therefore, events are sent no faster than c
 
 from __future__ import annotations
 
+import asyncio
 from collections import deque
 from itertools import chain, count
 from typing import TYPE_CHECKING
@@ -16,7 +17,6 @@ from talkcli.protocol.events import PausedChanged, Result, StateChanged, WordHea
 from talkcli.protocol.lines import encode
 
 if TYPE_CHECKING:
-    import asyncio
     from collections.abc import Callable, Iterable
 
     from talkcli.engine.protocol import Word
@@ -44,17 +44,14 @@ _READ_TIME_FACTOR = 0.94
 class Subscribers:
     """The connections that receive events."""
 
-    def __init__(
-        self, loop: asyncio.AbstractEventLoop, waiting_for_room: Callable[[], Iterable[ClientConnection]]
-    ) -> None:
+    def __init__(self, waiting_for_room: Callable[[], Iterable[ClientConnection]]) -> None:
         """Start with no subscribers.
 
         Args:
-            loop: the event loop.
             waiting_for_room: function that returns the connections whose goals wait for room. They also get keep-alive
                 messages.
         """
-        self._loop = loop
+        self._loop = asyncio.get_running_loop()
         self._waiting_for_room = waiting_for_room
         #: event numbers, which let watchers detect dropped feedback
         self._numbers = count(1)

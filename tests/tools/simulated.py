@@ -98,8 +98,7 @@ class Server:
         self._socket.setblocking(False)
         self._socket.bind(path)
         self._socket.listen()
-        loop = asyncio.get_running_loop()
-        self._acceptor = Acceptor(loop, lambda each: ClientConnection(self, speech.streams, each).begin(), descriptors)
+        self._acceptor = Acceptor(lambda each: ClientConnection(self, speech.streams, each).begin(), descriptors)
         self._acceptor.open(self._socket)
 
     def joined(self, connection: ClientConnection) -> None:

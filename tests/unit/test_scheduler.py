@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import inf
+
 import pytest
 
 from talkcli.goals import history
@@ -56,8 +58,8 @@ NEWS = {
 
 #: The scheduler's next deadline after each script, in monotonic seconds. A script starts at 100.
 DEADLINES = {
-    "a; b": None,
-    "a ttl=1": None,
+    "a; b": inf,
+    "a ttl=1": inf,
     "a; b ttl=1": 101,
     "a; b ttl=9; c ttl=2; d ttl=4": 102,
     "a; b ttl=9; c ttl=2; d ttl=4; cancel c": 104,
@@ -65,9 +67,9 @@ DEADLINES = {
     "a; b ttl=5; cancel a": 100 + CONFIRM_SILENCE_S,
     "a; b ttl=1; cancel a": 101,
     "a; cancel a; pass 1; cancel a": 100 + CONFIRM_SILENCE_S,
-    "a; cancel a; wait 2": None,
+    "a; cancel a; wait 2": inf,
     "a ttl=1; lost": 101,
-    "a ttl=1; heard a; lost": None,
+    "a ttl=1; heard a; lost": inf,
     "lost; a; b ttl=3": 103,
     "a; b key=k ttl=1; c key=k ttl=9": 109,
 }

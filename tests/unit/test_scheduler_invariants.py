@@ -116,7 +116,7 @@ class Checked(Robot):
     def waits(self, seconds: float) -> None:
         super().waits(seconds)
         deadline = self.scheduler.deadline()
-        assert deadline is None or deadline > self.seconds, "what was due has not been done"
+        assert deadline > self.seconds, "what was due has not been done"
 
     def tells(self, event: str, goal_id: str) -> None:
         if goal_id == "*":
@@ -168,7 +168,7 @@ class Checked(Robot):
             assert record.id not in self.started, "a goal was spoken twice"
             assert self.scheduler.has_engine
             assert not self.scheduler.paused
-            assert record.expires_at is None or self.seconds < record.expires_at, "a goal started too late"
+            assert self.seconds < record.expires_at, "a goal started too late"
             self.engine, self.orders = record, []
             self.started.add(record.id)
         elif order is Order.GIVE_UP:
@@ -195,7 +195,7 @@ class Checked(Robot):
         if waiting and not (scheduler.active or scheduler.paused) and scheduler.has_engine:
             waits_for_voice = scheduler._start_time(waiting[0]) > self.seconds
             deadline = scheduler.deadline()
-            is_due = deadline is not None and deadline <= self.seconds  # the next tick starts the goal
+            is_due = deadline <= self.seconds  # the next tick starts the goal
             assert waits_for_voice or is_due, "a goal waits without a reason"
 
     def end(self) -> None:

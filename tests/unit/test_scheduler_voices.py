@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import inf
+
 import pytest
 
 from tests.unit.robot import play, rules
@@ -68,19 +70,19 @@ an engine that stays away fails a goal that waited for its voice
 #: The time at which the next goal stops waiting, in monotonic seconds. A script starts at 100.
 DEADLINES = {
     "set voice=piper/joe; wait 4; a voice=piper/joe": 110,
-    "a; b voice=piper/joe; wait 60": None,
+    "a; b voice=piper/joe; wait 60": inf,
     "a; b voice=piper/joe; wait 60; completed a": 170,
     "a; b voice=piper/joe; wait 60; completed a; wait 4; loaded amy": 170,
     "a voice=piper/joe; b voice=piper/amy; wait 3; cancel a": 0,
     "a voice=piper/joe; b voice=piper/amy; wait 3; cancel a; wait 0": 113,
     "a voice=piper/joe ttl=2": 101.5,
     "a voice=piper/joe ttl=99": 110,
-    "a voice=piper/joe voice_only": None,
+    "a voice=piper/joe voice_only": inf,
     "a voice=piper/joe voice_only ttl=3": 103,
-    "a voice=piper/joe; loaded joe": None,
-    "a voice=piper/joe; pause": None,
-    "a voice=piper/joe; lost": None,
-    "set voice=piper/joe; a; pause; set voice=en; resume": None,
+    "a voice=piper/joe; loaded joe": inf,
+    "a voice=piper/joe; pause": inf,
+    "a voice=piper/joe; lost": inf,
+    "set voice=piper/joe; a; pause; set voice=en; resume": inf,
 }
 
 #: Orders to load and to drop voices. The robot's voices may take 10 bytes.

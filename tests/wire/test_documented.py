@@ -72,7 +72,7 @@ def test_limits_are_those_of_the_code() -> None:
     assert f"within {connection.LINE_LIMIT_S:g} s" in limits["a line"]
     assert limits["lines that are no requests"].startswith(f"{connection.MAX_BAD_LINES} ")
     read = limits["a client that doesn't read"]
-    assert f"{connection.CONGESTION_BYTES // 1024} KiB" in read
+    assert f"{stream.CONGESTION_BYTES // 1024} KiB" in read
     assert f"{connection.MAX_CLIENT_OUTPUT_BYTES // 2**20} MiB" in read
     assert f"past {stream.MAX_TOTAL_OUTPUT_BYTES // 2**20} MiB for all" in limits["clients that don't read"]
     assert limits["clients"].startswith(f"{MAX_CLIENTS} ")
