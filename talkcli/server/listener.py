@@ -93,7 +93,7 @@ class Listener:
 
     def close(self) -> None:
         """Close the socket and release the lock. Remove the socket file unless it was replaced."""
-        if self._identity is not None and _identity(self.path) == self._identity:
+        if _identity(self.path) == self._identity:
             with contextlib.suppress(FileNotFoundError):
                 os.unlink(self.path)
         self.socket.close()

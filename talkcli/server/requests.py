@@ -128,9 +128,7 @@ class Requests:
             return True
         if not self._speech.awaits_voices:
             return False
-        if isinstance(request, Set):
-            return request.voice is not None and not options.bad_option(request)
-        return isinstance(request, Voices) or (isinstance(request, Say) and request.voice is not None)
+        return isinstance(request, Voices) or (isinstance(request, Say | Set) and request.voice is not None)
 
     def _stop_awaiting_voices(self, connection: ClientConnection) -> None:
         """Continue the requests of a connection without waiting any longer for the list of voices."""
@@ -166,7 +164,6 @@ class Requests:
         """Submit the waiting goals for which the queue has room now."""
         self._room_check = None
         without_room: set[object] = set()
-        resumed = False
         for each in list(self._speech.waiting_for_room):
             say = each.request
             assert isinstance(say, Say)
@@ -178,10 +175,7 @@ class Requests:
                 if kind:
                     without_room.add(kind)
             elif not each.connection.has_hung_up():
-                each.resume()
-                resumed = True
-        if resumed:
-            self._check_room_soon()  # a submitted goal may have made room for an earlier one
+                each.resume()  # if the goal enters the queue, the check is repeated, because it may have made room
 
     def _select_waiting(self, selection: Cancel) -> list[PendingRequest]:
         """Return the selected goals that are waiting for room or for the list of voices."""

@@ -32,12 +32,6 @@ from talkcli.server.speech import Speech
 from talkcli.server.stream import Acceptor, raise_descriptor_limit
 from talkcli.server.voices import VoiceCatalog
 
-#: Default limit on connected clients. Each client uses a file descriptor, and a process can usually have 1,024 of them.
-MAX_CLIENTS = 256
-#: Default limit on pending goals. Speaking them takes about three minutes, and nobody wants to wait longer.
-USUAL_QUEUE_GOALS = 100
-#: Default memory limit for neural voices, enough for four voices of medium size.
-VOICE_MEMORY_MB = 300
 #: Number of additional clients that a full server accepts. They can only ask for the status or cancel goals.
 MAX_EXTRA_CLIENTS = 16
 #: How often to check that clients can find the socket. A missing socket must be noticed within 30 s, and a check takes
@@ -55,15 +49,18 @@ class ServerSettings:
 
     #: default values for the options of goals
     goals: Set = INITIAL
-    max_queue: int = USUAL_QUEUE_GOALS
+    #: limit on pending goals. Speaking 100 goals takes about three minutes, and nobody wants to wait longer.
+    max_queue: int = 100
     max_text: int = MAX_TEXT_CHARS
-    max_clients: int = MAX_CLIENTS
+    #: limit on connected clients. Each client uses a file descriptor, and a process can usually have 1,024 of them.
+    max_clients: int = 256
     player: str | None = None
     device: str | None = None
     lead_in: int = 0  # milliseconds of silence before a sentence if the device was idle
     audible: bool = False  # whether to abort a sentence if the output is muted
     driver: str | None = None
-    voice_memory: int = VOICE_MEMORY_MB
+    #: memory limit for neural voices in MB, enough for four voices of medium size
+    voice_memory: int = 300
     socket: str | None = None
     socket_mode: int = 0o600
     greeting: str | None = None
@@ -211,7 +208,6 @@ class Server:
         except AddressInUse as error:
             if not (self._listener.passed or is_temporary(error)):
                 # Clients can't reach this server any more, so shut down. A service manager may restart it.
-                self._socket_check.cancel()
                 log.write(log.sanitize(f"ending: {error}"))
                 self._end(error)
             elif str(error) != self._unreachable:
@@ -232,17 +228,15 @@ class Server:
         # Other users may connect only if the socket's mode allows it.
         if uid not in {os.getuid(), 0} and not self._listener.mode & 0o066:
             words = f"this server is uid {os.getuid()}'s; it would have to be started with --socket-mode"
-            refusal = {"talk": PROTOCOL, "error": "permission_denied", "message": words}
+            connection.close_with({"talk": PROTOCOL, "error": "permission_denied", "message": words})
         elif len(self.connections) >= self._settings.max_clients + MAX_EXTRA_CLIENTS:
-            refusal = busy_greeting()
+            connection.close_with(busy_greeting())
         else:
             connection.client = Sender(pid or None, uid, peers.command_name(pid), peers.parent_command_line(pid))
             if len(self.connections) < self._settings.max_clients:
                 connection.admit()
             self.connections.add(connection)
             self._no_clients.clear()
-            return
-        connection.close_with(refusal)
 
     def left(self, connection: ClientConnection) -> None:
         """Remove a client, and admit the next waiting one. The goals of the removed client continue."""

@@ -249,7 +249,6 @@ class ClientStream:
             self._loop.remove_writer(self.socket)
         self._streams.open.discard(self)
         self._streams.unread_bytes -= len(self._unread) + self.held_bytes
-        self.held_bytes = 0
         self._unread.clear()
         self._loop.call_soon(self._report_end, error)
 

@@ -19,7 +19,7 @@ from talkcli.protocol.lines import MAX_LINE_BYTES
 from talkcli.protocol.requests import REQUEST_TYPES
 from talkcli.server import connection, stream
 from talkcli.server.requests import MAX_CLIENT_REQUESTS, MAX_KEPT_REQUEST_BYTES, RECENT_GOALS, REQUEST_BYTES
-from talkcli.server.run import MAX_CLIENTS, USUAL_QUEUE_GOALS
+from talkcli.server.run import ServerSettings
 from tests.support.documents import FLEET, README, ROOT, WIRE, first_column, tables, words
 from tests.support.surroundings import needs_packages
 
@@ -75,8 +75,8 @@ def test_limits_are_those_of_the_code() -> None:
     assert f"{stream.CONGESTION_BYTES // 1024} KiB" in read
     assert f"{connection.MAX_CLIENT_OUTPUT_BYTES // 2**20} MiB" in read
     assert f"past {stream.MAX_TOTAL_OUTPUT_BYTES // 2**20} MiB for all" in limits["clients that don't read"]
-    assert limits["clients"].startswith(f"{MAX_CLIENTS} ")
-    assert limits["queue"].startswith(f"{USUAL_QUEUE_GOALS} ")
+    assert limits["clients"].startswith(f"{ServerSettings().max_clients} ")
+    assert limits["queue"].startswith(f"{ServerSettings().max_queue} ")
     assert limits["requests that wait"].startswith(
         f"{MAX_CLIENT_REQUESTS:,} of one connection, and {MAX_KEPT_REQUEST_BYTES >> 20} MiB for all"
     )
