@@ -272,16 +272,13 @@ def _bind(path: str, mode: int) -> socket.socket:
     _refuse_other_file(path)
     with _refusing(f"the socket {path} of an earlier server can't be removed"), contextlib.suppress(FileNotFoundError):
         os.unlink(path)
-    listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    try:
+    with _refusing(f"cannot listen at {path}"):
+        listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         listening.setblocking(False)
         listening.bind(path)
         os.chmod(path, mode)  # nobody can connect before `listen`, so the file is never too accessible
         listening.listen(MAX_BACKLOG_CONNECTIONS)
-    except OSError as error:
-        listening.close()
-        raise AddressInUse(f"cannot listen at {path}: {error.strerror or error}") from error
-    return listening
+        return listening
 
 
 # -- the lock

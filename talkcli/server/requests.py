@@ -126,9 +126,8 @@ class Requests:
         request = pending.request
         if self._speech.waiting_for_voices and (isinstance(request, Say) or self._awaiting_voices(pending.connection)):
             return True
-        if not self._speech.awaits_voices:
-            return False
-        return isinstance(request, Voices) or (isinstance(request, Say | Set) and request.voice is not None)
+        names_voice = isinstance(request, Say | Set) and request.voice is not None
+        return self._speech.awaits_voices and (names_voice or isinstance(request, Voices))
 
     def _stop_awaiting_voices(self, connection: ClientConnection) -> None:
         """Continue the requests of a connection without waiting any longer for the list of voices."""
@@ -301,13 +300,11 @@ class Requests:
             self._publish_pause(active if active and active.paused else None, pending)
         speech.apply(effects)
         active = scheduler.active
-        if (
-            active
-            and active is not speech.silent_goal
-            and not await pending.wait(speech.waiting_for_silence(active), PAUSE_ANSWER_S)
-        ):
-            words = f"speech is paused, but {active.id} was not known to be silent within {PAUSE_ANSWER_S:g} s"
-            raise RequestRefused(words, Reason.NOT_SILENT)
+        if active and active is not speech.silent_goal:
+            in_time = await pending.wait(speech.waiting_for_silence(active), PAUSE_ANSWER_S)
+            if not in_time:
+                words = f"speech is paused, but {active.id} was not known to be silent within {PAUSE_ANSWER_S:g} s"
+                raise RequestRefused(words, Reason.NOT_SILENT)
         self._answer_pause(pending, active)
 
     async def _resume(self, pending: PendingRequest, _: Resume) -> None:

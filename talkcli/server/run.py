@@ -86,10 +86,8 @@ def serve(settings: ServerSettings) -> int:
     async def run() -> None:
         await Server(settings, listener).run()
 
-    try:
+    with contextlib.closing(listener):
         asyncio.run(run())
-    finally:
-        listener.close()
     return EXIT_OK
 
 

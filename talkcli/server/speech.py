@@ -383,7 +383,10 @@ def _log_end(record: Record, seconds: float) -> None:
     took = "" if record.started_at is None else f" after {seconds:.1f} s"
     how = f"{record.id} {record.state.name}{took}"
     if record.state is not State.SUCCEEDED:
-        how += f" ({record.reason}{_cause(record.by)})"
+        by = record.by or By()
+        ended_by = by.goal or (by.client and describe_sender(by.client))
+        cause = f" by {ended_by}" if ended_by else ""
+        how += f" ({record.reason}{cause})"
     detail = f"; {log.sanitize(record.message)}" if record.state is State.ABORTED and record.message else ""
     log.write(f'{how}: "{log.sanitize(record.say.text)}" from {describe_sender(record.sender)}{detail}')
 
@@ -420,20 +423,11 @@ def _describe_sound(engine: protocol.Ready) -> str:
 
 def describe_sender(sender: Sender) -> str:
     """Return a short description of the program that sent a request."""
-    parts = [] if sender.uid is None else [f"uid {sender.uid}"]
-    if sender.pid is not None:
-        parts.append(f"pid {sender.pid}")
-    if sender.command:
-        parts.append(printable(sender.command, _MAX_LOGGED_COMMAND_CHARS))
-    if sender.parent:
-        parts.append(f"started by {printable(sender.parent, _MAX_LOGGED_COMMAND_CHARS)}")
-    if sender.name:
-        parts.append(f'calls itself "{printable(sender.name)}"')
-    return ", ".join(parts) or "nobody known"
-
-
-def _cause(by: By | None) -> str:
-    """Return a short description of what ended a goal, or an empty string if it is unknown."""
-    if by is None:
-        return ""
-    return f" by {by.goal}" if by.goal else f" by {describe_sender(by.client)}" if by.client else ""
+    parts = (
+        None if sender.uid is None else f"uid {sender.uid}",
+        None if sender.pid is None else f"pid {sender.pid}",
+        sender.command and printable(sender.command, _MAX_LOGGED_COMMAND_CHARS),
+        sender.parent and f"started by {printable(sender.parent, _MAX_LOGGED_COMMAND_CHARS)}",
+        sender.name and f'calls itself "{printable(sender.name)}"',
+    )
+    return ", ".join(filter(None, parts)) or "nobody known"

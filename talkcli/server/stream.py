@@ -253,10 +253,8 @@ class ClientStream:
         self._loop.call_soon(self._report_end, error)
 
     def _report_end(self, error: OSError | None) -> None:
-        try:
+        with self.socket:
             self._receiver.connection_lost(error)
-        finally:
-            self.socket.close()
 
 
 def raise_descriptor_limit(clients: int) -> int:
@@ -314,7 +312,11 @@ class Acceptor:
                 connected, _ = listening.accept()
             except OSError as error:
                 if error.errno not in _NO_CONNECTION:
-                    self._pause(listening, error)
+                    # The event loop would retry at once, so pause. New connections stay in the backlog.
+                    message = f"no connection can be taken up: {error.strerror}; they wait until one can"
+                    log.write_limited("accept", message)
+                    self.close()
+                    self._retry = self._loop.call_later(ACCEPT_RETRY_S, self.open, listening)
                 return
             connected.setblocking(False)
             # New descriptors get the lowest free number, so a high number means that few are left.
@@ -329,19 +331,7 @@ class Acceptor:
 
     def _turn_away(self, connected: socket.socket) -> None:
         """Tell a client that the server has too few file descriptors, and close the connection."""
-        log.write_limited(
-            "descriptors",
-            f"clients are turned away: only {self._max_descriptors} files may be open (raise LimitNOFILE= or ulimit "
-            "-n)",
-        )
+        limit = f"only {self._max_descriptors} files may be open (raise LimitNOFILE= or ulimit -n)"
+        log.write_limited("descriptors", f"clients are turned away: {limit}")
         with connected, contextlib.suppress(OSError):  # the client may have closed the connection
             connected.send(encode(busy_greeting(_TOO_FEW_DESCRIPTORS)))
-
-    def _pause(self, listening: socket.socket, error: OSError) -> None:
-        """Stop accepting connections for a while after an error, usually because of too few descriptors.
-
-        Otherwise, the event loop would retry without a pause. New connections stay in the backlog.
-        """
-        log.write_limited("accept", f"no connection can be taken up: {error.strerror}; they wait until one can")
-        self.close()
-        self._retry = self._loop.call_later(ACCEPT_RETRY_S, self.open, listening)
