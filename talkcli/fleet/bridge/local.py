@@ -91,8 +91,7 @@ class LocalConnection(ClientCore):
             return False
         with contextlib.suppress(ServerUnavailable):  # `read` will report the end of the connection
             self.queue(line, exchange)
-        if len(line) == self.unsent_bytes:  # if earlier lines are unsent, the event loop will send them all
-            self._flush()
+        self._flush()
         return True
 
     def close(self) -> None:

@@ -109,7 +109,7 @@ class Publisher:
             raise ServerUnavailable(f"the server at {server.path} can't be watched: {error}")
 
         # Request the log first, because it contains the goals that an earlier bridge has sent.
-        server.send(Exchange(Log(MAX_LOG_GOALS), remember, lambda _: None))
+        server.send(Exchange(Log(MAX_LOG_GOALS), remember))
         server.send(Exchange(Watch(), partial(self._on_watching, server), refuse))
         while lines := await server.read():
             self._receive(server, lines)

@@ -206,8 +206,6 @@ class RemoteSessions:
 class _RemoteExchange(Exchange):
     """A remote client's request that was sent to the server."""
 
-    __slots__ = ("canceled", "is_new", "remote")
-
     def __init__(self, remote: RemoteRequest, request: Request, *, is_new: bool = False) -> None:
         super().__init__(request)
         self.remote = remote

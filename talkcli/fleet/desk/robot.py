@@ -275,10 +275,11 @@ class RobotConnection(Connection):
         if self._canceled:
             self._post(Cancel(tuple(self._canceled)))
         self._lookups.clear()
-        self.exchanges = {n: each for n, each in self.exchanges.items() if isinstance(each, RobotExchange)}
+        interrupted = [each for each in self.exchanges.values() if isinstance(each, RobotExchange)]
+        self.exchanges = {each.number: each for each in interrupted}
         for goal_id, feedback in self.listeners.goals.items():
             self._follow_again(goal_id, feedback=feedback, now=now)
-        for exchange in [each for each in self.exchanges.values() if isinstance(each, RobotExchange) and not each.over]:
+        for exchange in interrupted:
             if exchange.sent and isinstance(exchange.request, Say):
                 self._look_up(exchange, exchange.request, now)
             elif exchange.sent and isinstance(exchange.request, self.lasting):

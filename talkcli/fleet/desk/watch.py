@@ -169,7 +169,6 @@ class FleetWatch:
         self._maybe_missed: set[str] = set()
         #: the messages on a new connection until all retained ones have arrived, otherwise None
         self._retained: list[Message] | None = None
-        self._has_started = False
         #: when the connection to the broker was lost (monotonic time) and why, or None if the broker is connected
         self._away_since: float | None = time.monotonic()
         self._away_why = ""
@@ -187,6 +186,7 @@ class FleetWatch:
         """
         try:
             self._desk.wait_for_retained(ANSWER_LIMIT_S, lambda: False, interrupt)
+            self._process_retained(self._retained or [], time.monotonic(), first=True)
             while True:
                 now = time.monotonic()
                 self._check_limits(now)
@@ -246,21 +246,20 @@ class FleetWatch:
 
     # -- changes
 
-    def _process_retained(self, messages: list[Message], now: float) -> None:
+    def _process_retained(self, messages: list[Message], now: float, *, first: bool = False) -> None:
         """Report the first snapshot, or the changes that happened while the connection was lost."""
         self._retained = None
         robots = {each.presence.name: each for each in _robots_in(messages) if self._selects(each.presence)}
         events = [event for each in messages if (event := _read_event(each))]
-        if self._has_started:
+        if first:
+            self._presences = {name: each.presence for name, each in robots.items()}
+            self._events.append(FleetSnapshot(tuple(robots.values())))
+        else:
             self._events.append(BrokerBack(now - (self._away_since or now)))
             gone = [name for name, each in self._presences.items() if each.online and name not in robots]
             self._missing = dict.fromkeys(gone, now + BRIDGES_BACK_LIMIT_S)
             for name, robot in robots.items():
                 self._set_presence(name, robot.presence)
-        else:
-            self._has_started = True
-            self._presences = {name: each.presence for name, each in robots.items()}
-            self._events.append(FleetSnapshot(tuple(robots.values())))
         self._away_since = None
         self._maybe_missed = set(self._presences)
         arrived = {each.event.id for each in events}
