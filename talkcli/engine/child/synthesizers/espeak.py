@@ -162,17 +162,12 @@ class Espeak:
         #: the parameters last passed to the library. Setting a parameter can change the sound even if its value stays
         #: the same, so only changed ones are passed.
         self._parameters = {espeak.RATE: _ESPEAK_DEFAULT_WPM, espeak.VOLUME: 100, espeak.PITCH: 50}
-        self._text = ""
-        self._sink: SampleSink | None = None
-        self._fallback_reason: str | None = None
-        self._raised: BaseException | None = None
         #: the last phonemizer, which may still be using the library, or None if it has been stopped
         self._phonemizer: EspeakPhonemizer | None = None
         found = (each for each in _ENGLISH if espeak.SetVoiceByName(each.encode()) == espeak.EE_OK)
         self.voice = next(found, "")
         if not self.voice:
             raise UnknownVoice(_ENGLISH[-1])
-        espeak.SetSynthCallback(self._on_audio)
 
     def voices(self) -> tuple[Voice, ...]:
         """Return the normal voices, the installed MBROLA voices, and the variants."""
@@ -201,12 +196,30 @@ class Espeak:
         sink.begin(self._rate, self.voice, fallback_reason)
         espeak = self._espeak
         self._set_parameters(settings)
-        self._text = guard.guarded(text, self.voice)
-        self._sink, self._fallback_reason = sink, fallback_reason
-        status = espeak.Synth(self._text.encode("utf-8", "replace"), flags=espeak.CHARS_UTF8 | espeak.ENDPAUSE)
-        raised, self._raised, self._sink = self._raised, None, None
-        if raised is not None:
-            raise raised
+        text = guard.guarded(text, self.voice)
+        errors: list[BaseException] = []
+
+        def on_audio(samples: Any, count: int, events: Any) -> int:
+            """Pass samples and events to the sink. Return 0 to continue the synthesis, or 1 to stop it."""
+            if errors:
+                return 1
+            try:
+                for event in _events_of(events):
+                    if event.type == _EVENT_SAMPLERATE and event.id_number != self._rate:
+                        self._rate = event.id_number
+                        sink.begin(self._rate, self.voice, fallback_reason)
+                    elif event.type == espeak.EVENT_WORD and (position := _word_position(event, text)):
+                        sink.word(*position, event.sample / self._rate)
+                if samples and count > 0:
+                    sink.write(ctypes.string_at(samples, count * SAMPLE_BYTES))
+            except BaseException as error:  # noqa: BLE001 - raised again below
+                errors.append(error)
+            return len(errors)
+
+        espeak.SetSynthCallback(on_audio)
+        status = espeak.Synth(text.encode("utf-8", "replace"), flags=espeak.CHARS_UTF8 | espeak.ENDPAUSE)
+        if errors:
+            raise errors.pop()
         if status != espeak.EE_OK:
             raise CannotSpeak(Reason.ENGINE_FAILED, f"espeak_Synth failed with {status}")
 
@@ -253,7 +266,6 @@ class Espeak:
         phonemizer, self._phonemizer = self._phonemizer, None
         if phonemizer is not None:
             phonemizer.wait()
-            self._espeak.SetSynthCallback(self._on_audio)
             self._espeak.SetVoiceByName(self.voice.encode())
             self._parameters.clear()
 
@@ -265,30 +277,6 @@ class Espeak:
             if self._parameters.get(parameter) != value:
                 espeak.SetParameter(parameter, value, 0)
                 self._parameters[parameter] = value
-
-    def _on_audio(self, samples: Any, count: int, events: Any) -> int:
-        """Handle samples and events from the library. Return 1 to stop the synthesis, otherwise 0."""
-        if self._sink is None or self._raised is not None:
-            return 1
-        try:
-            self._pass_on(self._sink, samples, count, events)
-        except BaseException as error:  # noqa: BLE001 - `speak` raises it again
-            self._raised = error
-            return 1
-        return 0
-
-    def _pass_on(self, sink: SampleSink, samples: Any, count: int, events: Any) -> None:
-        for event in _events_of(events):
-            if event.type == _EVENT_SAMPLERATE:
-                if event.id_number != self._rate:
-                    self._rate = event.id_number
-                    sink.begin(self._rate, self.voice, self._fallback_reason)
-            elif event.type == self._espeak.EVENT_WORD:
-                position = _word_position(event, self._text)
-                if position is not None:
-                    sink.word(*position, event.sample / self._rate)
-        if samples and count > 0:
-            sink.write(ctypes.string_at(samples, count * SAMPLE_BYTES))
 
 
 class EspeakPhonemizer:
@@ -307,12 +295,8 @@ class EspeakPhonemizer:
         #: a lock that is held during each call of the library
         self._busy = threading.Lock()
         self._ended = False
-        self._text = ""
-        self._positions: list[tuple[int, int]] = []
-        self._clause_ends: list[int] = []
         self._to_phonemes = espeak.dll.espeak_TextToPhonemes
         self._to_phonemes.restype = ctypes.c_char_p
-        espeak.SetSynthCallback(self._on_audio)
 
     def clauses(self, text: str) -> list[tuple[str, str]]:
         # The library reads ahead, and any other call discards that text. So get all clauses before doing anything else.
@@ -322,7 +306,8 @@ class EspeakPhonemizer:
         found: list[tuple[str, str]] = []
         begin = begin_character = 0
         while at.value:
-            ipa = self._call(self._to_phonemes, ctypes.byref(at), self._espeak.CHARS_UTF8, _IPA) or b""
+            with self._call():
+                ipa = self._to_phonemes(ctypes.byref(at), self._espeak.CHARS_UTF8, _IPA) or b""
             end = len(raw) - 1 if at.value is None else at.value - base
             clause = raw.raw[begin:end].decode("utf-8", "replace")
             if at.value and clause and not clause[-1].isspace():  # the last character belongs to the next clause
@@ -338,14 +323,15 @@ class EspeakPhonemizer:
 
         The library has to speak the clause without output, which takes 1 ms per second of sound.
         """
-        self._speak(clause)
-        return self._positions
+        positions, _ = self._speak(clause)
+        return positions
 
     def ends_with_abbreviation(self, clause: str) -> bool:
         """Return whether a clause ends with an abbreviation such as "Mr.", after which the library makes no pause."""
         word = clause.rsplit(maxsplit=1)[-1]
-        alone = self._speak(word)
-        return self._speak(f"{word} A") - alone < _PAUSE_SAMPLES
+        _, alone = self._speak(word)
+        _, with_pause = self._speak(f"{word} A")
+        return with_pause - alone < _PAUSE_SAMPLES
 
     def end(self) -> None:
         """Make the current call and all later ones raise Stopped. Any thread may call this."""
@@ -356,30 +342,38 @@ class EspeakPhonemizer:
         with self._busy:
             pass
 
-    def _call(self, function: Any, *arguments: Any, **more: Any) -> Any:
+    @contextlib.contextmanager
+    def _call(self) -> Iterator[None]:
+        """Hold the lock in a `with` block that calls the library.
+
+        Raises:
+            Stopped: `end` was called before or during the block. The result of the call may be incomplete.
+        """
         with self._busy:
             if self._ended:
                 raise Stopped
-            result = function(*arguments, **more)
-        if self._ended:  # the call was cut short, so its result may be incomplete
-            raise Stopped
-        return result
-
-    def _speak(self, text: str) -> int:
-        """Speak a text without output, and record its words. Return the length of its first clause in samples."""
-        self._text, self._positions, self._clause_ends = guard.guarded(text, self._voice), [], []
-        self._call(self._espeak.Synth, self._text.encode("utf-8", "replace"), flags=self._espeak.CHARS_UTF8)
-        return self._clause_ends[0] if self._clause_ends else 0
-
-    def _on_audio(self, _samples: Any, _count: int, events: Any) -> int:
+            yield
         if self._ended:
-            return 1  # tells the library to stop
-        for event in _events_of(events):
-            if event.type == self._espeak.EVENT_WORD and (position := _word_position(event, self._text)):
-                self._positions.append(position)
-            elif event.type == self._espeak.EVENT_END:
-                self._clause_ends.append(event.sample)
-        return 0
+            raise Stopped
+
+    def _speak(self, text: str) -> tuple[list[tuple[int, int]], int]:
+        """Speak a text without output. Return the positions of its words, and the samples in its first clause."""
+        text = guard.guarded(text, self._voice)
+        positions: list[tuple[int, int]] = []
+        clause_ends: list[int] = []
+
+        def on_audio(_samples: Any, _count: int, events: Any) -> int:
+            for event in _events_of(events):
+                if event.type == self._espeak.EVENT_WORD and (position := _word_position(event, text)):
+                    positions.append(position)
+                elif event.type == self._espeak.EVENT_END:
+                    clause_ends.append(event.sample)
+            return int(self._ended)  # 1 stops the synthesis
+
+        with self._call():
+            self._espeak.SetSynthCallback(on_audio)
+            self._espeak.Synth(text.encode("utf-8", "replace"), flags=self._espeak.CHARS_UTF8)
+        return positions, next(iter(clause_ends), 0)
 
 
 def _word_position(event: _EspeakEvent, text: str) -> tuple[int, int] | None:
