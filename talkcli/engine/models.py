@@ -8,6 +8,7 @@ file. Nothing is cached, so the next call finds a newly installed voice. This mo
 from __future__ import annotations
 
 import errno
+import glob
 import json
 import os
 import stat
@@ -43,8 +44,6 @@ _MAX_SPEAKERS = 4096
 _MAX_SHOWN_CHARS, _MAX_SPEAKER_CHARS = 40, 64
 #: The sample rates in Hz that players support.
 _RATES_HZ = range(4000, 192001)
-#: The maximum number of symbolic links to follow in a path. Linux has the same limit.
-_MAX_LINKS = 40
 #: The maximum number of ids per phoneme. Piper's voices use one. A model needs memory in proportion to the square of
 #: the number of ids in a sentence.
 _MAX_IDS_PER_PHONEME = 4
@@ -95,14 +94,10 @@ def find_models(environment: Mapping[str, str] | None = None) -> dict[str, str]:
     """
     result: dict[str, str] = {}
     for directory in _model_directories(environment):
-        try:
-            names = sorted(os.listdir(directory))
-        except OSError:  # The directory probably doesn't exist.
-            continue
-        for each in names:
-            name = each.removesuffix(_MODEL_SUFFIX)
-            if name != each and name and not name.startswith(".") and SPEAKER_MARK not in name and name.isprintable():
-                result.setdefault(name, os.path.join(directory, each))
+        for path in _entries(directory, _MODEL_SUFFIX):
+            name = os.path.basename(path).removesuffix(_MODEL_SUFFIX)
+            if SPEAKER_MARK not in name and name.isprintable():
+                result.setdefault(name, path)
     return result
 
 
@@ -160,6 +155,8 @@ def open_checked(path: str, missing: str = "put it there again", model: str | No
 def _check_paths(*paths: str) -> None:
     """Check that no other user can replace these files, or a directory or link in their paths.
 
+    Files that don't exist are ignored, because opening them reports the error later.
+
     In a sticky directory such as /tmp, only the owner of an entry can replace it. Everyone may write to such a
     directory, but it must not directly contain a voice file or a link to one.
 
@@ -167,7 +164,7 @@ def _check_paths(*paths: str) -> None:
         VoiceFileError: Another user could replace a file.
     """
     may_be_sticky: dict[str, bool] = {}
-    for path in paths:
+    for path in filter(os.path.exists, paths):
         for each, leads_on in reversed([*_walk_path(path)]):
             may_be_sticky[each] = may_be_sticky.get(each, True) and leads_on
     wrong = []
@@ -182,13 +179,12 @@ def _check_paths(*paths: str) -> None:
 def _walk_path(path: str) -> Iterator[tuple[str, bool]]:
     """Yield each directory in a file's path and then the file, following symbolic links.
 
-    Each path comes with a flag, which is True if another directory follows. If part of the path doesn't exist, the
-    walk stops there, because opening the file reports the error later.
+    Each path comes with a flag, which is True if another directory follows.
 
     Raises:
         VoiceFileError: A link belongs to another user.
     """
-    at, links = os.sep, 0
+    at = os.sep
     parts = os.path.join("" if os.path.isabs(path) else os.getcwd(), path).split(os.sep)[::-1]
     while parts:
         part = parts.pop()
@@ -199,16 +195,10 @@ def _walk_path(path: str) -> Iterator[tuple[str, bool]]:
             at = os.path.dirname(at)
             continue
         each = os.path.join(at, part)
-        try:
-            status = os.lstat(each)
-        except FileNotFoundError:
-            return
+        status = os.lstat(each)
         if not stat.S_ISLNK(status.st_mode):
             at = each
             continue
-        links += 1
-        if links > _MAX_LINKS:
-            raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), path)
         _check_owner(each, status)
         target = os.readlink(each)
         at = os.sep if os.path.isabs(target) else at
@@ -271,13 +261,17 @@ def _writable_error(*paths: str) -> VoiceFileError:
 
 def _model_directories(environment: Mapping[str, str] | None) -> Iterator[str]:
     yield from voice_directories(environment)
-    for directory in sys.path:
-        try:
-            packages = sorted(each for each in os.listdir(directory) if each.endswith(_PACKAGE_SUFFIX))
-        except OSError:
-            continue
-        for package in packages:
-            yield from (os.path.join(os.path.abspath(directory), package, each).rstrip("/") for each in _PACKAGE_DIRS)
+    for directory in filter(None, sys.path):
+        for package in _entries(os.path.abspath(directory), _PACKAGE_SUFFIX):
+            yield from (os.path.join(package, each).rstrip("/") for each in _PACKAGE_DIRS)
+
+
+def _entries(directory: str, suffix: str) -> list[str]:
+    """Return the sorted paths of a directory's entries with this suffix, except hidden ones.
+
+    If the directory can't be read, return an empty list.
+    """
+    return sorted(glob.glob(os.path.join(glob.escape(directory), f"*{suffix}")))
 
 
 def _described_voice(name: str, path: str) -> Voice:

@@ -164,9 +164,16 @@ def _short_names(neural: str) -> list[str]:
 
 
 def _find_exact(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> Voice | None:
-    """Find a voice by its exact name, ignoring case. Return None if there is none."""
+    """Find a voice by its exact name, ignoring case. Return None if there is none.
+
+    The id of a neural voice may end with "#" and a speaker.
+    """
     if is_neural(wanted):
-        return _find_neural(wanted, voices)
+        name, mark, speaker = wanted.partition(SPEAKER_MARK)
+        found = _by_name(name, [each for each in voices if is_neural(each.id)])
+        if found is None or (mark and not speaker):
+            return None
+        return Voice(found.id + mark + speaker, found.language, found.name)
     if preferred is not None and is_neural(preferred):
         own = find_voice(preferred, voices)
         language = _fold(own.language or "") if own is not None else ""
@@ -209,15 +216,6 @@ def speaker_number(word: str, numbers: Mapping[str, int], count: int) -> int:
         return number
     many = f"it has {count} speakers, 0 to {count - 1}" if count > 1 else "it has one speaker"
     raise UnknownVoice(f'it has no speaker "{word[:40]}": {many}')
-
-
-def _find_neural(wanted: str, voices: tuple[Voice, ...]) -> Voice | None:
-    """Find a neural voice by its id, which may end with "#" and a speaker. Return None if there is none."""
-    name, mark, speaker = wanted.partition(SPEAKER_MARK)
-    found = _by_name(name, [each for each in voices if is_neural(each.id)], by_id=True)
-    if found is None or (mark and not speaker):
-        return None
-    return Voice(found.id + mark + speaker, found.language, found.name)
 
 
 def unknown_voice_message(wanted: str, voices: tuple[Voice, ...], foreign: str | None = None) -> str:
@@ -277,13 +275,13 @@ def _split_variants(voices: Sequence[Voice]) -> tuple[list[Voice], list[Voice]]:
     return plain, [each for each in voices if each.id.startswith(VARIANT_PREFIX)]
 
 
-def _by_name(wanted: str, voices: Sequence[Voice], *, by_id: bool = False) -> Voice | None:
+def _by_name(wanted: str, voices: Sequence[Voice]) -> Voice | None:
     """Find a voice by name, ignoring case. If several match, prefer the one with the same spelling."""
     word = _fold(wanted)
     found = [
         (called != wanted, place, voice)
         for voice in voices
-        for place, called in enumerate(_names_of(voice)[: 1 if by_id else None])
+        for place, called in enumerate(_names_of(voice))
         if called and _fold(called) == word
     ]
     return min(found, key=lambda each: each[:2], default=(False, 0, None))[2]

@@ -6,8 +6,6 @@ synthesizer and the players available through pyttsx3's interface.
 
 from __future__ import annotations
 
-import contextlib
-import os
 import sys
 import types
 from importlib import import_module
@@ -108,7 +106,7 @@ def _start_engine(pyttsx3: Any, name: str, *, named: bool) -> Any:
         engine = pyttsx3.init(name)
     except ModuleNotFoundError as error:
         if error.name == f"pyttsx3.drivers.{name}":
-            message = f'unknown driver "{name}": there are {", ".join(_driver_names(pyttsx3))}'
+            message = f'unknown driver "{name}": there are {", ".join(_driver_names())}'
             raise CannotStart(message, usage_error=named) from error
         raise CannotStart(f'the driver "{name}" cannot be loaded: {error}', usage_error=named) from error
     except Exception as error:
@@ -126,11 +124,12 @@ def _start_error(driver_name: str, error: Exception) -> str:
     return f'the driver "{driver_name}" cannot be started: {type(error).__name__}: {error}'
 
 
-def _driver_names(pyttsx3: Any) -> list[str]:
+def _driver_names() -> list[str]:
     import pkgutil
 
-    folder = os.path.join(os.path.dirname(pyttsx3.__file__), "drivers")
-    found = {module.name for module in pkgutil.iter_modules([folder]) if not module.name.startswith("_")}
+    from pyttsx3 import drivers
+
+    found = {each.name for each in pkgutil.iter_modules(drivers.__path__) if not each.name.startswith("_")}
     return sorted(found | SYNTHESIZERS.keys())
 
 
@@ -179,7 +178,10 @@ class DriverProperties:
             if command.voice_only or not is_neural(command.voice or ""):
                 raise
             fallback_reason = str(error)
-            self._set_language(voices.neural_language(command.voice or ""))
+            try:
+                self.set_voice(voices.neural_language(command.voice or ""))
+            except CannotSpeak:
+                self.set_voice(None)
         wanted = fields(command)
         for name, value in self._values.items():
             if wanted[name] != value:
@@ -199,13 +201,6 @@ class DriverProperties:
             self._default_voice = self._engine.getProperty("voice")
         self._set("voice", self._default_voice if wanted is None else self.voice_id(wanted), f"the voice {wanted}")
         self._voice = wanted
-
-    def _set_language(self, language: str) -> None:
-        for each in (language, language.partition("-")[0]):
-            with contextlib.suppress(CannotSpeak):
-                self.set_voice(each)
-                return
-        self.set_voice(None)
 
     def voice_id(self, wanted: str) -> str:
         """Return the ID of the voice that best matches the user's input.

@@ -125,7 +125,7 @@ class ModelLoader:
         #: the loaded voices that have failed to speak a sentence
         self._suspect: set[str] = set()
         #: error messages by voice, for voices that couldn't be loaded
-        self._errors: dict[str, str] = {}
+        self.errors: dict[str, str] = {}
         self._events: list[VoiceLoaded | VoiceUnloaded | VoiceMemory] = []
         #: the private memory of the process before the first load, and how much it had grown at the last report
         self._initial_bytes: int | None = None
@@ -154,7 +154,7 @@ class ModelLoader:
         if voice in self._models:
             self._events.append(VoiceLoaded(voice, 0.0))
         elif voice not in self._waiting and not (self._load and voice == self._voice):
-            self._errors.pop(voice, None)
+            self.errors.pop(voice, None)
             self._waiting.append(voice)
             self._start_next()
 
@@ -167,10 +167,6 @@ class ModelLoader:
             self._events.append(VoiceUnloaded(voice))
             return None
         return model
-
-    def error(self, voice: str) -> str | None:
-        """Return the error message if a voice couldn't be loaded, otherwise None."""
-        return self._errors.get(voice)
 
     def mark_suspect(self, voice: str) -> None:
         """Record that a loaded voice has failed to speak. It is unloaded once its files have changed."""
@@ -208,10 +204,10 @@ class ModelLoader:
             self._models[voice] = loaded
             self._measure(voice)
         except VoiceFileError as caught:
-            error = self._errors[voice] = str(caught)
+            error = self.errors[voice] = str(caught)
         except Exception as caught:  # noqa: BLE001 - a faulty voice must not stop the engine process
             traceback.print_exception(caught)
-            error = self._errors[voice] = f"{voice} cannot be loaded: {type(caught).__name__}: {caught}"
+            error = self.errors[voice] = f"{voice} cannot be loaded: {type(caught).__name__}: {caught}"
         self._events.append(VoiceLoaded(voice, round(time.monotonic() - self._started_at, 3), error))
         load.close()
         self._load = None

@@ -87,7 +87,7 @@ class Piper:
         """A message saying why the current voice can't speak, or None if it is loaded."""
         if self.loader.model(self._model_id) is not None:
             return None
-        return self.loader.error(self._model_id) or f"{self.voice} is not loaded"
+        return self.loader.errors.get(self._model_id) or f"{self.voice} is not loaded"
 
     @property
     def language(self) -> str:
@@ -153,9 +153,8 @@ class Piper:
         if loader.model(voice) is None:
             loader.start(voice)  # Try again even after an error, because the files may have been repaired.
         while (model := loader.model(voice)) is None:
-            why = loader.error(voice)
-            if why is not None:
-                raise CannotSpeak(Reason.VOICE_FAILED, why)
+            if voice in loader.errors:
+                raise CannotSpeak(Reason.VOICE_FAILED, loader.errors[voice])
             assert loader.descriptor is not None
             sink.wait(loader.descriptor)
         return model
