@@ -335,18 +335,19 @@ def _keep(cache: ModelCache, key: str, content: bytes = b"encoder") -> str | Non
 
 def test_halves_are_found_again_by_their_key_and_half_of_them_is_nothing(home: Path) -> None:
     cache = ModelCache(str(home / "c"))
-    assert cache.find(KEY) is None
+    with pytest.raises(FileNotFoundError):
+        cache.find(KEY)
     _keep(cache, KEY)
     encoder = home / "c" / f"{KEY}.encoder.onnx"
     os.utime(encoder, (1, 1))
     paths = cache.find(KEY)
-    assert paths is not None
     assert time.time() - encoder.stat().st_mtime < 60, "it is marked as used"
     assert [Path(each).read_bytes() for each in paths] == [b"encoder", b"decoder"]
     assert stat.S_IMODE((home / "c").stat().st_mode) == 0o700
     assert _kept(home / "c") == [f"{KEY}.decoder.onnx", f"{KEY}.encoder.onnx"]
     encoder.unlink()
-    assert cache.find(KEY) is None
+    with pytest.raises(FileNotFoundError):
+        cache.find(KEY)
 
 
 def test_the_oldest_halves_go_past_the_limit_and_no_other_file(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -386,7 +387,8 @@ def test_a_writer_that_fails_keeps_nothing_and_a_cache_that_is_gone_is_done_with
     cache = ModelCache(str(home / "c"))
     with pytest.raises(ValueError, match="broken"):
         cache.store(KEY, fails, [])
-    assert cache.find(KEY) is None
+    with pytest.raises(FileNotFoundError):
+        cache.find(KEY)
     assert not [each for each in _kept(home / "c") if each.endswith(".new")]
     os.rename(home / "c", home / "gone")
     assert _keep(cache, KEY) is None

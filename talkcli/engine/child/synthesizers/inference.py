@@ -86,14 +86,15 @@ class ModelCache:
             raise PermissionError(f"{directory} is not this user's alone: chmod 0700, or remove it")
         self._directory = directory
 
-    def find(self, key: str) -> tuple[str, str] | None:
-        """Return the paths of the encoder and the decoder, or None if they aren't cached."""
+    def find(self, key: str) -> tuple[str, str]:
+        """Return the paths of the encoder and the decoder, and mark them as used.
+
+        Raises:
+            OSError: They aren't cached.
+        """
         paths = self._path(key, _ENCODER_SUFFIX), self._path(key, _DECODER_SUFFIX)
-        try:
-            for each in paths:
-                os.utime(each)
-        except OSError:
-            return None
+        for each in paths:
+            os.utime(each)
         return paths
 
     def store(self, key: str, make_encoder: Callable[[str | None], Any], decoder: Iterable[Buffer]) -> Any:
@@ -185,14 +186,11 @@ class Model:
                 raise VoiceFileError(f"{path} is larger than any of Piper's models: get the voice anew")
             content: bytes = file.read(size)
         key = f"{hashlib.sha256(content).hexdigest()}-{_SPLIT_VERSION}-{onnxruntime.__version__}"
-        cached = cache.find(key) if cache is not None else None
-        if cached is not None:
+        if cache is not None:
             try:
-                # The cached encoder has already been optimized.
-                unchanged = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
-                self._set_halves(_session(cached[0], unchanged), _session(cached[1]))
+                self._set_halves(*map(_session, cache.find(key)))
                 return
-            except Exception as error:  # A full disk may have truncated the halves, so split the model again.
+            except Exception as error:  # The halves aren't cached, or a full disk has truncated them.
                 if _is_out_of_memory(error):
                     raise no_memory_error(path) from error
         self._set_halves(*_split(path, content, cache, key))
@@ -354,17 +352,16 @@ def _session_of(half: Sequence[Buffer], optimized_path: str | None = None) -> An
         with open(os.memfd_create("half"), "wb", _WRITE_BYTES) as file:
             file.writelines(half)
             file.flush()
-            return _session(f"/proc/self/fd/{file.fileno()}", optimized_path=optimized_path)
+            return _session(f"/proc/self/fd/{file.fileno()}", optimized_path)
     except (OSError, AttributeError):  # The system doesn't support files in memory, or limits their size.
-        return _session(b"".join(half), optimized_path=optimized_path)
+        return _session(b"".join(half), optimized_path)
 
 
-def _session(model: str | bytes, level: Any = None, optimized_path: str | None = None) -> Any:
+def _session(model: str | bytes, optimized_path: str | None = None) -> Any:
     """Create an onnxruntime session.
 
     Args:
         model: The path or the content of a model.
-        level: The level of optimization, or None for the basic level.
         optimized_path: Where to write the optimized model, or None not to write it.
     """
     import onnxruntime
@@ -376,7 +373,7 @@ def _session(model: str | bytes, level: Any = None, optimized_path: str | None =
     # onnxruntime's memory arena never shrinks, and isn't faster.
     options.enable_cpu_mem_arena = options.enable_mem_pattern = False
     # Higher levels take 0.15 s longer, the model is no faster, and the result fits only one type of processor.
-    options.graph_optimization_level = level or onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
+    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
     if optimized_path is not None:
         options.optimized_model_filepath = optimized_path
     return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
