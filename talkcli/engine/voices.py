@@ -5,7 +5,7 @@ its number or name: "piper/NAME#3". The name of a language selects a voice of li
 language of the server's own neural voice, which selects that voice.
 
 If no voice has the name, similar names are tried: "de" for "de-DE", a language for "german", or
-"piper/en_US-joe-medium" for "joe" (see `_other_forms`).
+"piper/en_US-joe-medium" for "joe" (see `_possible_names`).
 
 A name from a client is never passed to libespeak-ng. The library doesn't look up languages ("en-gb"), silently drops
 unknown variants, and copies a variant of any length into 40 bytes. It only gets ids and variants from its own lists.
@@ -68,7 +68,7 @@ def find_voice(wanted: str, voices: tuple[Voice, ...], preferred: str | None = N
 
     The name is compared with the ids, the last parts of the ids, the names and the languages of the voices, in this
     order, ignoring case. It may end with a variant ("en-us+f3"). The returned voice's id includes the variant. If
-    nothing matches, other forms of the name are tried (see `_other_forms`).
+    nothing matches, similar names are tried (see `_possible_names`).
 
     Args:
         wanted: The name that the user typed.
@@ -96,10 +96,7 @@ def matching_languages(wanted: str, voices: Sequence[Voice]) -> set[str]:
 
 def _matches(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> dict[str, Voice]:
     """Return the voices that a name may refer to, with their unambiguous names as keys."""
-    found = _find_exact(wanted, voices, preferred)
-    if found is not None:
-        return {wanted: found}
-    for words in _other_forms(wanted, voices):
+    for words in _possible_names(wanted, voices):
         fitting: dict[Voice, str] = {}
         for word in words:
             found = _find_exact(word, voices, preferred)
@@ -110,13 +107,13 @@ def _matches(wanted: str, voices: tuple[Voice, ...], preferred: str | None = Non
     return {}
 
 
-def _other_forms(wanted: str, voices: tuple[Voice, ...]) -> Iterator[list[str]]:
-    """Yield guesses at the name that the user meant, as lists from most to least likely."""
+def _possible_names(wanted: str, voices: tuple[Voice, ...]) -> Iterator[list[str]]:
+    """Yield the name that the user typed, and then similar names, as lists from most to least likely."""
+    yield [wanted]
     name, mark, speaker = wanted.partition(SPEAKER_MARK)
     word = _fold(name)
     neural = [each.id for each in voices if is_neural(each.id)]
     if is_neural(wanted):
-        yield [each + mark + speaker for each in neural if each.casefold().startswith(name.casefold())]
         yield [each + mark + speaker for each in neural if _fold(each).startswith(word)]
         short = word.removeprefix(NEURAL_PREFIX)
         yield [each + mark + speaker for each in neural if short in map(_fold, _short_names(each))]

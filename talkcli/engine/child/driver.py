@@ -321,7 +321,6 @@ class Driver:
         runner = self._runner
         self._proxy.notify("started-utterance")
         self._playback = playback = Playback(runner, self._report_word)
-        failure: Exception | None = None
         runner.duration = None
         try:
             self._synthesizer.speak(text, self._sound, playback)
@@ -330,11 +329,9 @@ class Driver:
         except Stopped:
             pass
         except Exception as error:  # noqa: BLE001 - pyttsx3 would drop any exception
-            failure = error
+            self._proxy.notify("error", exception=error)
         playback.silence()
         self._playback = None
-        if failure is not None:
-            self._proxy.notify("error", exception=failure)
         self._proxy.notify("finished-utterance", completed=runner.duration is not None)
 
     def _report_word(self, word: TimedWord) -> None:

@@ -265,8 +265,8 @@ class Espeak:
         """Wait for the last phonemizer to finish, and switch back to the synthesizer's voice."""
         phonemizer, self._phonemizer = self._phonemizer, None
         if phonemizer is not None:
-            phonemizer.wait()
-            self._espeak.SetVoiceByName(self.voice.encode())
+            with phonemizer.busy:  # Its last call may still be running.
+                self._espeak.SetVoiceByName(self.voice.encode())
             self._parameters.clear()
 
     def _set_parameters(self, settings: SpeechSettings) -> None:
@@ -293,7 +293,7 @@ class EspeakPhonemizer:
         self._espeak = espeak
         self._voice = voice
         #: a lock that is held during each call of the library
-        self._busy = threading.Lock()
+        self.busy = threading.Lock()
         self._ended = False
         self._to_phonemes = espeak.dll.espeak_TextToPhonemes
         self._to_phonemes.restype = ctypes.c_char_p
@@ -337,11 +337,6 @@ class EspeakPhonemizer:
         """Make the current call and all later ones raise Stopped. Any thread may call this."""
         self._ended = True
 
-    def wait(self) -> None:
-        """Wait until the current call of the library returns. Call `end` first."""
-        with self._busy:
-            pass
-
     @contextlib.contextmanager
     def _call(self) -> Iterator[None]:
         """Hold the lock in a `with` block that calls the library.
@@ -349,7 +344,7 @@ class EspeakPhonemizer:
         Raises:
             Stopped: `end` was called before or during the block. The result of the call may be incomplete.
         """
-        with self._busy:
+        with self.busy:
             if self._ended:
                 raise Stopped
             yield

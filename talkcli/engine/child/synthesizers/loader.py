@@ -96,12 +96,11 @@ class BackgroundIterator(threading.Thread, Generic[_T]):
         return item
 
     def close(self) -> None:
-        """Tell the thread to discard its current item and end. Return without waiting for it."""
+        """Tell the thread to discard its current item and end. Return without waiting for it. Call this only once."""
         with self._lock:
-            if not self._closed:
-                self._closed = True
-                os.close(self.descriptor)
-                os.close(self._write_end)
+            self._closed = True
+            os.close(self.descriptor)
+            os.close(self._write_end)
         self._room.release()
 
     def _put(self, item: _T | None, error: BaseException | None = None) -> None:
@@ -122,9 +121,7 @@ class ModelLoader:
         #: the voice that is being loaded, and when its load started (monotonic time)
         self._voice = ""
         self._started_at = 0.0
-        #: the loaded voices that have failed to speak a sentence
-        self._suspect: set[str] = set()
-        #: error messages by voice, for voices that couldn't be loaded
+        #: error messages by voice, for voices that couldn't be loaded, or have failed to speak a sentence
         self.errors: dict[str, str] = {}
         self._events: list[VoiceLoaded | VoiceUnloaded | VoiceMemory] = []
         #: the private memory of the process before the first load, and how much it had grown at the last report
@@ -147,7 +144,7 @@ class ModelLoader:
         """Unload a voice. If it is speaking a sentence, its memory is freed after the sentence."""
         if self._models.pop(voice, None):
             self._unmeasured = ""
-        self._suspect.discard(voice)
+        self.errors.pop(voice, None)
 
     def start(self, voice: str) -> None:
         """Load a voice in the background, unless it is already loaded or queued."""
@@ -159,18 +156,17 @@ class ModelLoader:
             self._start_next()
 
     def model(self, voice: str) -> Model | None:
-        """Return the model of a voice, or None if it isn't loaded."""
+        """Return the model of a voice, or None if it isn't loaded.
+
+        If the voice has failed to speak, and its files have changed since it was loaded, it is unloaded.
+        """
         self._check_load()
         model, fingerprints = self._models.get(voice, (None, ()))
-        if model and voice in self._suspect and fingerprints != _fingerprints(model.path):
+        if model and voice in self.errors and fingerprints != _fingerprints(model.path):
             self.drop(voice)
             self._events.append(VoiceUnloaded(voice))
             return None
         return model
-
-    def mark_suspect(self, voice: str) -> None:
-        """Record that a loaded voice has failed to speak. It is unloaded once its files have changed."""
-        self._suspect.add(voice)
 
     def mark_spoken(self, voice: str) -> None:
         """Measure the memory again later, because the first sentences of a voice allocate memory permanently."""

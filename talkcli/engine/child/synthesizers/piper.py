@@ -108,8 +108,7 @@ class Piper:
 
         If a file of the voice is faulty, `speak` reports the error later.
         """
-        missing = models.missing_package()
-        if missing is not None:
+        if missing := models.missing_package():
             raise UnknownVoice(missing)
         model, _, speaker = voice.partition(SPEAKER_MARK)
         path = models.find_models().get(model.removeprefix(NEURAL_PREFIX))
@@ -139,13 +138,15 @@ class Piper:
         try:
             sink.begin(description.rate, self.voice)
             with self._espeak.phonemizer(description.espeak_voice) as phonemizer:
-                self._write(model, speaker, split_text(phonemizer, text), settings, sink)
+                run = ModelRun()
+                parts = _speak_parts(model, split_text(phonemizer, text), speaker, settings, run)
+                self._write(parts, description.rate, run, sink)
         except MemoryError as error:
             raise CannotSpeak(Reason.VOICE_FAILED, str(no_memory_error(self._path))) from error
         except (VoiceFileError, UnknownVoice) as error:
-            self.loader.mark_suspect(voice)
-            known = isinstance(error, VoiceFileError)
-            words = str(error) if known else f"{model.path}.json: {error}: get the voice anew"
+            unknown = isinstance(error, UnknownVoice)
+            words = f"{model.path}.json: {error}: get the voice anew" if unknown else str(error)
+            self.loader.errors[voice] = words
             raise CannotSpeak(Reason.VOICE_FAILED, words) from error
 
     def _wait_for_model(self, voice: str, sink: SampleSink) -> Model:
@@ -159,15 +160,11 @@ class Piper:
             sink.wait(loader.descriptor)
         return model
 
-    def _write(
-        self, model: Model, speaker: int, parts: Iterator[SpeechPart], settings: SpeechSettings, sink: SampleSink
-    ) -> None:
+    def _write(self, parts: Iterator[SpokenPart], rate: int, run: ModelRun, sink: SampleSink) -> None:
         """Synthesize parts of a text in a background thread, and write their sound to the sink."""
-        run = ModelRun()
-        rate = model.description.rate
         write_bytes = int(_WRITE_S * rate) * SAMPLE_BYTES
         seconds = 0.0
-        spoken_parts = BackgroundIterator(_speak_parts(model, parts, speaker, settings, run), _MAX_PARTS_AHEAD)
+        spoken_parts = BackgroundIterator(parts, _MAX_PARTS_AHEAD)
         try:
             while (spoken := spoken_parts.take(sink.wait)) is not None:
                 samples, words = spoken
@@ -192,14 +189,13 @@ def _speak_parts(
         VoiceFileError: The model is faulty, or doesn't know any of the phonemes.
     """
     pause = int(_PAUSE_S * model.description.rate)
-    any_known, unknown = False, ""
+    unknown = ""
     first = True
     for part in parts:
         ids, places = _phoneme_ids(part.phonemes, model.description.phoneme_ids)
         if not places:
             unknown = unknown or "".join(part.phonemes)
             continue
-        any_known = True
         frames = model.encode(ids, speaker, _duration_scale(settings.rate), run)
         begins = [0, *frames.ends]
         # If a word has no known phonemes, it gets the time of the next phoneme. `max` keeps the times from decreasing.
@@ -228,7 +224,7 @@ def _speak_parts(
             raise VoiceFileError(f"{model.path} makes no sound of a text: get the voice anew")
         if part.ends_sentence and quiet < pause:
             yield bytes((pause - quiet) * SAMPLE_BYTES), ()
-    if unknown and not any_known:
+    if unknown and first:
         why = f"has no number for a sound of the text ({unknown[:20]})"
         raise VoiceFileError(f"{model.path}.json {why}: get both files from the same place")
 
@@ -263,8 +259,7 @@ def _cut_leading_silence(samples: Any, levels: Any, words: WordTimes, rate: int)
 
 
 def _to_bytes(samples: Any, volume: float) -> bytes:
-    made: bytes = (samples * (_FULL_SCALE * volume)).clip(-_FULL_SCALE, _FULL_SCALE).astype("<i2").tobytes()
-    return made
+    return bytes((samples * (_FULL_SCALE * volume)).clip(-_FULL_SCALE, _FULL_SCALE).astype("<i2"))
 
 
 def _phoneme_ids(phonemes: Sequence[str], ids: Mapping[str, tuple[int, ...]]) -> tuple[list[int], list[int]]:

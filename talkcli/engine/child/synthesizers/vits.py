@@ -52,7 +52,6 @@ _MAX_NESTED_GRAPHS = 4
 _MAX_FIELDS = 300_000
 #: The maximum length of a name. The longest name in Piper's models has 52 characters.
 _MAX_NAME_BYTES = 1000
-_MAX_INTEGER_BITS = 64
 
 
 class NotSplit(Exception):
@@ -245,7 +244,7 @@ def _names(fields: Iterable[Field], wanted: int) -> list[str]:
 def _parse_integer(raw: Buffer, at: int) -> tuple[int, int]:
     """Decode the integer at an index. Return it with the index of the byte after it."""
     result = shift = 0
-    while at < len(raw) and shift < _MAX_INTEGER_BITS:
+    while at < len(raw) and shift < 64:  # Longer integers aren't valid.
         byte = raw[at]
         at += 1
         result |= (byte & 127) << shift
