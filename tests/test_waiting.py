@@ -184,6 +184,20 @@ async def test_client_that_leaves_while_its_goals_are_cancelled_is_forgotten() -
 
 
 @in_loop
+async def test_server_ends_only_after_every_waiting_goal_was_answered() -> None:
+    server, one, count = Server(), Client(), 3 * subscribers._MAX_PER_TURN
+    server.speech.scheduler.pause()
+    server.fill(1)
+    for number in range(count):
+        server.wait(one, f"{number}")
+    server.requests.shut_down()
+    assert not server.speech.finished.is_set()
+    await all_told(server.speech.notifications)
+    assert len(one.told) == count
+    assert server.speech.finished.is_set()
+
+
+@in_loop
 async def test_bug_in_a_request_that_waited_harms_no_other_request(monkeypatch: pytest.MonkeyPatch) -> None:
     server, client = Server(), Client()
     server.fill()

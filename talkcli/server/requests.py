@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from talkcli.goals.record import Record
-    from talkcli.server.connection import ClientConnection, Steps, WaitingList
+    from talkcli.server.connection import ClientConnection, Steps
     from talkcli.server.speech import Speech
 
 #: Number of ended goals in a reply to `status`.
@@ -64,8 +64,6 @@ class Requests:
         self._speech = speech
         self._scheduler = speech.scheduler
         self._describe = describe
-        #: cancelled goals that were waiting and have not been submitted yet
-        self._canceled: WaitingList = {}
         #: memory counted for all waiting requests
         self._waiting_bytes = 0
         self._room_check: asyncio.Handle | None = None
@@ -178,7 +176,7 @@ class Requests:
 
     def _select_waiting(self, selection: Cancel) -> list[PendingRequest]:
         """Return the selected goals that are waiting for room or for the list of voices."""
-        waiting = (*self._canceled, *self._speech.waiting_for_room, *self._speech.waiting_for_voices)
+        waiting = (*self._speech.canceled_goals, *self._speech.waiting_for_room, *self._speech.waiting_for_voices)
         goals = [(each, each.request) for each in waiting if isinstance(each.request, Say)]
         selected = (goals[index][0] for index in selection.select_waiting([say for _, say in goals]))
         # Waiting goals of a disconnected client are dropped instead of cancelled.
@@ -189,10 +187,10 @@ class Requests:
 
         The scheduler then recalls them like other goals.
         """
-        new = [each for each in goals if each.waiting_list is not self._canceled]
+        new = [each for each in goals if each.waiting_list is not self._speech.canceled_goals]
         for each in new:
             each.canceled_by = by
-            each.move_to(self._canceled)
+            each.move_to(self._speech.canceled_goals)
         return [each.resume for each in new]
 
     async def _await_room(self, pending: PendingRequest, say: Say) -> float:

@@ -91,6 +91,8 @@ class Speech:
         self.waiting_for_voices: WaitingList = {}
         #: goals that are waiting for room in the queue
         self.waiting_for_room: WaitingList = {}
+        #: cancelled goals that were waiting and have not been submitted yet
+        self.canceled_goals: WaitingList = {}
         #: human-readable status of the engine
         self.engine_status = "starting"
         #: set when an engine is ready or can't be started, and when the server shuts down
@@ -371,7 +373,8 @@ class Speech:
 
     def check_finished(self) -> None:
         """After a shutdown, set `finished` when all goals have ended and all notifications were sent."""
-        if self.scheduler.closing and self.scheduler.active is None and self.notifications.done:
+        unfinished = self.scheduler.active or self.canceled_goals or not self.notifications.done
+        if self.scheduler.closing and not unfinished:
             self.finished.set()
 
 
