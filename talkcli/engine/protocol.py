@@ -278,7 +278,7 @@ class Ended:
     duration: float | None = None  # length of the audio in seconds; None unless the goal was completed
     gaps: int = 0  # number of silent gaps caused by audio that was synthesized too late
     gap_seconds: float = 0.0  # total length of the silent gaps, in seconds
-    player: str | None = None  # name of the player, if it was chosen automatically
+    player: str | None = None  # the player that worked last, if it was chosen automatically
 
 
 #: Commands that start a goal. There is one for each kind of goal.

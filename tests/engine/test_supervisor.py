@@ -303,14 +303,6 @@ def test_a_thread_that_stood_still_hears_the_engine_first(start: Start, monkeypa
     assert not standing
 
 
-def test_the_voices_are_listed_by_the_first_process_alone(start: Start) -> None:
-    thread = start()
-    thread.spoken("crash")
-    assert thread.spoken("yes", "g2").outcome == OUTCOME_COMPLETED
-    assert sum(isinstance(each, protocol.Ready) for each in thread.seen) == 2
-    assert sum(isinstance(each, protocol.VoiceList) for each in thread.seen) == 1
-
-
 def test_a_start_that_hangs_is_tried_again_and_fails_a_goal_each_time_after_a_while(
     start: Start, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -383,7 +375,7 @@ def test_a_goal_ends_once_when_its_process_is_gone_or_should_be(monkeypatch: pyt
     monkeypatch.setattr(engine, "_start_process", lambda: None)
     engine._goal = SupervisedGoal(YES, sent=True, started=True)
     engine._lose_process("it hangs", Reason.ENGINE_HUNG)
-    due = process.exit_deadline
+    due = engine._dying[process]
     engine._check_deadlines(due - KILL_LIMIT_S / 2)
     assert [type(each).__name__ for each in posted] == ["EngineDied"]
     assert undying.kills == 1

@@ -280,7 +280,7 @@ class Playback:
             fallback_reason: human-readable reason for a fallback voice, or None for the requested voice.
         """
         if self._feed is not None and rate != self._rate:
-            self._release_player(self._feed, 0)  # the player was started with a different sample rate
+            self._release_player(0)  # the player was started with a different sample rate
         self._rate = rate
         self._runner.report_voice(voice, fallback_reason)
         if self._players.takes_time and not self._runner.hold_number:
@@ -336,9 +336,8 @@ class Playback:
         self._with_player(self._drain)
         self._report_words(self._clock.pop_all())
         if self._feed is not None:
-            name, now = self._feed.player.name, time.monotonic()
-            self._players.last_player = name
-            self._players.handovers.sentence_ended(name, now + self._feed.time_left(self._feed.written, now))
+            feed, now = self._feed, time.monotonic()
+            self._players.handovers.sentence_ended(feed.player.name, now + feed.time_left(feed.written, now))
         return self._seconds(self._sent - self._skipped)
 
     def stop(self) -> None:
@@ -428,18 +427,16 @@ class Playback:
         self._busy_until = self._busy_until or time.monotonic() + DEVICE_BUSY_LIMIT_S
         return time.monotonic() < self._busy_until
 
-    def _release_player(self, feed: PlayerFeed, begin: int) -> None:
+    def _release_player(self, begin: int) -> None:
         """Release the player. The next player continues at the offset `begin`."""
         self._begin = self._sent = begin
-        if feed.player.proven:
-            self._players.last_player = feed.player.name  # the next sentence tries this player first
         self._untried = self._first_error = None
         self.silence()
 
     def _rewind(self, feed: PlayerFeed) -> None:
         """Release a player that still has sound in its buffer. The next player repeats the unheard sound."""
         feed.update(time.monotonic(), complete=False)
-        self._release_player(feed, self._unheard_begin() if feed.player.proven else self._begin)
+        self._release_player(self._unheard_begin() if feed.player.proven else self._begin)
 
     # -- steps
 
@@ -591,7 +588,7 @@ class Playback:
                 release_at = 0.0  # a player that fails during a pause is replaced
             due = min(release_at, feed.progress_at + STALL_LIMIT_S)
             if time.monotonic() >= due:
-                self._release_player(feed, self._sent)  # everything sent so far has been heard
+                self._release_player(self._sent)  # everything sent so far has been heard
                 raise _PlayerReleased
             if not taken:
                 self._wait_for(feed, due)

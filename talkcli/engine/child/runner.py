@@ -370,7 +370,8 @@ class GoalRunner:
         self._report_output()
         goal, self._goal = self._goal, None
         gaps = len(self.gaps), round(sum(self.gaps), 3)
-        self._channel.send(protocol.Ended(goal.id, outcome, reason, message, self.duration, *gaps, self.players.chosen))
+        ended = protocol.Ended(goal.id, outcome, reason, message, self.duration, *gaps, self.players.last_player)
+        self._channel.send(ended)
 
     def _alive_due(self) -> float:
         """Return the time at which to send the next `Alive`, or NEVER if none is needed."""

@@ -74,8 +74,6 @@ class EngineProcess:
         self.had_goal = False
         #: the `StartFailed` message from the process, if any; set by the supervisor
         self.start_failure: protocol.StartFailed | None = None
-        #: monotonic time by which the process must have exited after a kill; set by the supervisor
-        self.exit_deadline = float("inf")
         self._lines = LineSplitter()
         self._stderr_lines = LineSplitter(MAX_STDERR_LINE_BYTES)
         self._last_stderr_line = ""
@@ -198,7 +196,7 @@ class EngineFailed(Exception):
         self.silent_s = silent_s
 
 
-class PrivateEngine:
+class PrivateEngine(contextlib.AbstractContextManager["PrivateEngine"]):
     """A context manager that runs an engine process for a single caller.
 
     It speaks one text at a time, blocks the caller's thread while waiting, and enforces the time limits in `protocol`.
@@ -233,9 +231,6 @@ class PrivateEngine:
         self._last_event_at = time.monotonic()
         #: endless iterator over the events of the process, which raises the same errors as `wait_for`
         self.events = self._receive_events()
-
-    def __enter__(self) -> PrivateEngine:
-        return self
 
     def __exit__(self, *_: object) -> None:
         """Kill the process and wait until it has exited, so that it can't write to its output file any more."""

@@ -20,7 +20,7 @@ from talkcli.daemon.log import RateLimit
 from talkcli.engine import protocol
 from talkcli.engine.parent.process import EngineProcess
 from talkcli.engine.protocol import HANG_LIMIT_S, HOLD_LIMIT_S, KILL_LIMIT_S, START_LIMIT_S, STOP_LIMIT_S
-from talkcli.frozen import frozen, replace
+from talkcli.frozen import frozen
 from talkcli.goals.reasons import Reason
 from talkcli.polling import NEVER, wait_ready
 
@@ -161,12 +161,12 @@ class SupervisedGoal:
     started: bool = False
     #: whether the goal was retried because a process crashed before it started the goal
     retried: bool = False
-    #: time at which a `Stop` was sent
-    stop_sent_at: float | None = None
+    #: time by which the process must confirm a `Stop`; NEVER if none was sent
+    stop_due: float = NEVER
     #: number of the current pause; None if the goal is not paused
     hold_number: int | None = None
-    #: time at which a `Hold` was sent; None after it was confirmed
-    hold_sent_at: float | None = None
+    #: time by which the process must confirm a `Hold`; NEVER if none was sent since the last confirmation
+    hold_due: float = NEVER
     #: event that will be posted once `lost_process` has exited
     end: protocol.Ended | None = None
     #: the killed process that was speaking the goal
@@ -199,8 +199,8 @@ class Supervisor:
         self._loading: str | None = None
         #: time of the last event from the process, or of a later command that the process must answer
         self._last_sign_at = 0.0
-        #: killed processes that may not have exited yet
-        self._dying: list[EngineProcess] = []
+        #: killed processes that may not have exited yet, and the time by which they must have exited
+        self._dying: dict[EngineProcess, float] = {}
         self._stderr_quota = RateLimit(MAX_STDERR_LINES, STDERR_PERIOD_S)
         self._closing = False
 
@@ -278,7 +278,7 @@ class Supervisor:
                 self._handle_ready(process, descriptor)
 
     def _next_deadline(self) -> float:
-        deadlines = [deadline for deadline, _ in self._deadlines()] + [each.exit_deadline for each in self._dying]
+        deadlines = [*(deadline for deadline, _ in self._deadlines()), *self._dying.values()]
         return min([*deadlines, NEVER if self._process else self._restarts.next_start_at])
 
     def _deadlines(self) -> Iterator[tuple[float, str]]:
@@ -286,15 +286,12 @@ class Supervisor:
         goal, no_sign = self._goal, f"the engine gave no sign of life for {HANG_LIMIT_S:g} s"
         if self._process and not self._process.ready:
             yield self._started_at + START_LIMIT_S, f"the engine was not ready after {START_LIMIT_S:g} s"
-        if goal and goal.stop_sent_at is not None:
-            limit_ms = STOP_LIMIT_S * 1000
-            yield goal.stop_sent_at + STOP_LIMIT_S, f"the engine did not confirm a stop within {limit_ms:.0f} ms"
         if goal and goal.sent:
+            yield goal.stop_due, f"the engine did not confirm a stop within {STOP_LIMIT_S * 1000:.0f} ms"
             yield self._last_sign_at + HANG_LIMIT_S, no_sign
+            yield goal.hold_due, f"the engine did not confirm a pause within {HOLD_LIMIT_S:g} s"
         elif self._loading is not None:
             yield self._last_sign_at + HANG_LIMIT_S, f"{no_sign} while it loaded {self._loading}"
-        if goal and goal.hold_sent_at is not None:
-            yield goal.hold_sent_at + HOLD_LIMIT_S, f"the engine did not confirm a pause within {HOLD_LIMIT_S:g} s"
 
     def _check_deadlines(self, now: float) -> None:
         missed = next((message for deadline, message in self._deadlines() if now >= deadline), None)
@@ -302,10 +299,8 @@ class Supervisor:
             self._lose_process(missed, Reason.ENGINE_HUNG)
         elif self._process is None and now >= self._restarts.next_start_at:
             self._start_process()
-        for process in self._dying:
-            if now < process.exit_deadline:
-                continue
-            process.exit_deadline = NEVER  # do this only once; the process is still reaped when it exits
+        for process in [process for process, deadline in self._dying.items() if now >= deadline]:
+            self._dying[process] = NEVER  # do this only once; the process is still reaped when it exits
             process.kill()  # the first kill may have left processes alive if no descriptor was free
             if self._goal and self._goal.lost_process is process:
                 message = f"the player could not be ended within {KILL_LIMIT_S:g} s"
@@ -368,10 +363,10 @@ class Supervisor:
     def _hold_goal(self, goal_id: str, number: int | None) -> None:
         """Pause the goal, or resume it if `number` is None."""
         goal = self._current(goal_id)
-        if goal is None or goal.stop_sent_at is not None or goal.end or goal.hold_number == number:
+        if goal is None or goal.stop_due != NEVER or goal.end or goal.hold_number == number:
             return
         goal.hold_number = number
-        goal.hold_sent_at = time.monotonic() if goal.sent and number is not None else None
+        goal.hold_due = time.monotonic() + HOLD_LIMIT_S if goal.sent and number is not None else NEVER
         if goal.sent:
             self._send(protocol.Continue(goal_id) if number is None else protocol.Hold(goal_id, number))
         elif number is not None:
@@ -381,7 +376,7 @@ class Supervisor:
 
     def _stop_goal(self, goal_id: str) -> None:
         goal = self._current(goal_id)
-        if goal is None or goal.stop_sent_at is not None:
+        if goal is None or goal.stop_due != NEVER:
             return
         stopped = protocol.Ended(goal_id, protocol.OUTCOME_STOPPED)
         if goal.end:
@@ -389,7 +384,7 @@ class Supervisor:
         elif not goal.sent:
             self._end_goal(stopped)
         else:
-            goal.stop_sent_at = time.monotonic()
+            goal.stop_due = time.monotonic() + STOP_LIMIT_S
             self._send(protocol.Stop(goal_id))
 
     def _give_up_goal(self, goal_id: str) -> None:
@@ -455,8 +450,6 @@ class Supervisor:
             process.start_failure = event
         elif isinstance(event, protocol.VoiceLoaded) and event.voice == self._loading:
             self._loading = None
-        elif isinstance(event, protocol.VoiceList):
-            self._configure = replace(self._configure, list_voices=False)  # sending the list once is enough
         self._post(event)
         self._send_goal()
 
@@ -468,7 +461,7 @@ class Supervisor:
         elif isinstance(event, protocol.Word | protocol.OutputChanged | protocol.VoiceChosen):
             self._post(event)
         elif isinstance(event, protocol.Held) and event.number == goal.hold_number:
-            goal.hold_sent_at = None
+            goal.hold_due = NEVER
             self._post(event)
 
     def _lose_process(self, message: str, reason: Reason) -> None:
@@ -484,8 +477,7 @@ class Supervisor:
         self._process = self._loading = None
         process.kill()
         del self._watched[process.socket.fileno()]
-        process.exit_deadline = now + KILL_LIMIT_S
-        self._dying.append(process)
+        self._dying[process] = now + KILL_LIMIT_S
         goal = self._goal if self._goal and self._goal.sent else None
         if goal:
             self._handle_lost_goal(goal, process, message, reason)
@@ -505,16 +497,16 @@ class Supervisor:
         If the process crashed before it started the goal, nothing was heard, so the goal is sent to the next process.
         Each goal is retried only once.
         """
-        if reason == Reason.ENGINE_CRASHED and goal.stop_sent_at is None and not (goal.started or goal.retried):
+        if reason == Reason.ENGINE_CRASHED and goal.stop_due == NEVER and not (goal.started or goal.retried):
             goal.retried = True
             if goal.hold_number is not None:
                 self._post(protocol.Held(goal.command.id, goal.hold_number))
         else:
             goal.end = protocol.Ended(goal.command.id, protocol.OUTCOME_FAILED, reason, message)
-            if goal.stop_sent_at is not None:
+            if goal.stop_due != NEVER:
                 goal.end = protocol.Ended(goal.command.id, protocol.OUTCOME_STOPPED)
             goal.lost_process = process
-        goal.sent, goal.stop_sent_at, goal.hold_sent_at = False, None, None
+        goal.sent, goal.stop_due, goal.hold_due = False, NEVER, NEVER
 
     def _handle_failed_start(self, message: str, *, permanent: bool = False) -> None:
         """Schedule another start. Fail the waiting goal if the error is permanent or the goal has waited too long."""
@@ -531,7 +523,7 @@ class Supervisor:
         if self._watched.pop(process.stderr, None):
             process.read_stderr()
         process.close()
-        self._dying.remove(process)
+        del self._dying[process]
         goal = self._goal
         if goal and goal.end and goal.lost_process is process:
             self._end_goal(goal.end)

@@ -114,10 +114,8 @@ class PlayerChooser:
         self._own_lead_in: int | None = None
         #: whether the current sentence fails if the output is muted
         self._audible = configure.audible
-        #: the player that last played a sentence completely
+        #: the player that worked last, if it was chosen automatically
         self.last_player = configure.last_player
-        #: the player of the current sentence, if it was chosen automatically
-        self.chosen: str | None = None
         self._last_used_at: float | None = None
 
     def candidates(self, rate: int) -> Iterator[Callable[[], Player]]:
@@ -143,13 +141,13 @@ class PlayerChooser:
         """Prepare for a new sentence."""
         self._own_lead_in = command.lead_in
         self._audible = self._configure.audible if command.audible is None else command.audible
-        self.output = self.chosen = None
+        self.output = None
         self.handovers.next_waits, self.handovers.next_is_neural = command.next_waits, command.next_is_neural
 
     def update_output(self, player: Player) -> None:
         """Record the output of the current sentence. If it is ever muted, the whole sentence counts as muted."""
         if player.proven and self._configure.player is None:
-            self.chosen = player.name
+            self.last_player = player.name
         output, before = player.output, self.output
         if before is None:
             self.output = output

@@ -342,8 +342,5 @@ class ProgramPlayer(Player):
 
 
 def _unread_bytes(pipe: io.FileIO) -> int:
-    """Return the number of unread bytes in a pipe, or 0 if the system doesn't report it."""
-    try:
-        return int(struct.unpack("i", fcntl.ioctl(pipe, termios.FIONREAD, b"\0\0\0\0"))[0])
-    except OSError:
-        return 0
+    """Return the number of unread bytes in a pipe."""
+    return int(struct.unpack("i", fcntl.ioctl(pipe, termios.FIONREAD, b"\0\0\0\0"))[0])
