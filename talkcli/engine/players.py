@@ -96,14 +96,13 @@ def _pw_cat(rate: int, device: str | None) -> PlayerCommand:
 
 
 def _au_header(rate: int) -> bytes:
-    """Return the little-endian header of an AU stream of unknown length.
+    """Return the little-endian header of an AU stream.
 
     pw-cat reads standard input through libsndfile, which needs a format that works in a pipe. The pw-cat of Debian 12
     has no option for raw samples, but every version can read AU.
     """
-    unknown_length = 0xFFFFFFFF
-    pcm16 = 3
-    return b"dns." + struct.pack("<5I", 24, unknown_length, pcm16, rate, 1)
+    # the size of the header, an unknown length, the encoding (PCM of 16 bits), the rate, and the number of channels
+    return b"dns." + struct.pack("<5I", 24, 0xFFFFFFFF, 3, rate, 1)
 
 
 #: The players by name. If the user names no player, they are tried in this order, except that classes come before

@@ -163,7 +163,7 @@ def test_a_device_is_idle_some_time_after_it_was_let_go_of(monkeypatch: pytest.M
     monkeypatch.setattr(time, "monotonic", lambda: now)
     found = chooser.PlayerChooser(protocol.Configure(0, None, "null", None, None, lead_in=400))
     assert found.lead_in_seconds() == 0.4
-    found.device_released()
+    found.silent_since = time.monotonic()
     now += chooser.IDLE_AFTER_S - 0.01
     assert found.lead_in_seconds() == 0.0
     now += 0.02

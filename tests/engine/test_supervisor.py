@@ -325,7 +325,7 @@ class Undying:
     """A stand-in for a ready process that survives being killed."""
 
     def __init__(self) -> None:
-        self.ready, self.had_goal, self.start_failure, self.exit_deadline = True, False, None, 0.0
+        self.ready, self.had_goal = True, False
         self.socket, self._other = socket.socketpair()
         self.stderr = self._other.fileno()
         self.liveness = os.dup(self.stderr)

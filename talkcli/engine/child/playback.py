@@ -364,7 +364,7 @@ class Playback:
                 raise CannotEnd(f"{player.name} could not be ended within {PLAYER_KILL_LIMIT_S:g} s")
             self._runner.wait(until=time.monotonic() + PIECE_S)
         if player.real_time and player.proven:
-            self._players.device_released(self._silent_at)
+            self._players.silent_since = self._silent_at or time.monotonic()
         self._feed = None
 
     # -- choosing a player
@@ -484,9 +484,8 @@ class Playback:
                 self._rewind(feed)
                 raise _PlayerReleased
             if now >= deadline:
-                raise CannotSpeak(
-                    Reason.AUDIO_STALLED, f"{player.name} did not end {DRAIN_LIMIT_S:g} s after the sound"
-                )
+                message = f"{player.name} did not end {DRAIN_LIMIT_S:g} s after the sound"
+                raise CannotSpeak(Reason.AUDIO_STALLED, message)
             self._wait_for(feed, deadline)
         missing = feed.missing_seconds(time.monotonic())
         if player.real_time and missing > EARLY_END_LIMIT_S - self._seconds(self._samples.end - self._sent):
@@ -581,12 +580,11 @@ class Playback:
         release_at = self._silent_at + RELEASE_DELAY_S
         while self._runner.hold_number:
             self._runner.confirm_hold()
-            taken = 0
             try:
                 taken = self._offer_silence(feed)
+                due = min(release_at, feed.progress_at + STALL_LIMIT_S)
             except CannotSpeak:
-                release_at = 0.0  # a player that fails during a pause is replaced
-            due = min(release_at, feed.progress_at + STALL_LIMIT_S)
+                due = 0.0  # a player that fails during a pause is replaced
             if time.monotonic() >= due:
                 self._release_player(self._sent)  # everything sent so far has been heard
                 raise _PlayerReleased

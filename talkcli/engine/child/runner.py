@@ -403,8 +403,7 @@ def _with_traceback(callback: Callable[..., None]) -> Callable[..., None]:
     def call(**values: Any) -> None:
         try:
             callback(**values)
-        except Exception:
+        except Exception:  # noqa: BLE001 - pyttsx3 would drop any exception
             traceback.print_exc()
-            raise
 
     return call

@@ -167,6 +167,5 @@ class WordClock:
 
     def pop_all(self) -> list[TimedWord]:
         """Remove and return all remaining words."""
-        words = list(self._waiting)
-        self._waiting.clear()
-        return words
+        words, self._waiting = self._waiting, deque()
+        return list(words)

@@ -68,12 +68,10 @@ class EngineProcess:
         Raises:
             OSError: the process can't be started.
         """
-        #: whether the process has sent `Ready`; set by the caller
+        #: whether the process has sent `Ready`
         self.ready = False
         #: whether the process has sent an event about a goal; set by the supervisor
         self.had_goal = False
-        #: the `StartFailed` message from the process, if any; set by the supervisor
-        self.start_failure: protocol.StartFailed | None = None
         self._lines = LineSplitter()
         self._stderr_lines = LineSplitter(MAX_STDERR_LINE_BYTES)
         self._last_stderr_line = ""
@@ -127,10 +125,12 @@ class EngineProcess:
             yield None
         for line in self._lines.feed(data):
             try:
-                yield protocol.decode(line, protocol.EVENT_CLASSES)
+                event = protocol.decode(line, protocol.EVENT_CLASSES)
             except (ValueError, TypeError, KeyError):
                 yield None
                 return
+            self.ready = self.ready or isinstance(event, protocol.Ready)
+            yield event
 
     def read_stderr(self) -> bool:
         """Read from the standard error of the process, and return whether it is still open."""
@@ -270,8 +270,6 @@ class PrivateEngine(contextlib.AbstractContextManager["PrivateEngine"]):
                     raise EngineFailed(Reason.ENGINE_CRASHED, process.describe_exit())
                 if isinstance(event, protocol.StartFailed):
                     raise EngineFailed(event.reason, event.message)
-                if isinstance(event, protocol.Ready):
-                    process.ready = True
                 yield event
             now = time.monotonic()
             if now >= self._deadline:

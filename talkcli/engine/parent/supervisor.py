@@ -225,10 +225,11 @@ class Supervisor:
     def announce_next(self, goal_id: str, next_waits: bool, next_is_neural: bool) -> None:
         """Tell the process whether another goal is waiting behind this one.
 
-        If so, the process shortens the silence between the two.
+        If so, the process shortens the silence between the two. A message that can't be sent is dropped, because it
+        isn't important.
         """
         command = protocol.NextGoal(goal_id, next_waits, next_is_neural)
-        self._actions.call(lambda: self._send(command))
+        self._actions.call(lambda: self._process and self._process.send(command))
 
     def load(self, voice: str) -> None:
         """Load a neural voice. `VoiceLoaded` is posted when loading has finished or failed."""
@@ -444,13 +445,12 @@ class Supervisor:
                 self._handle_goal_event(goal, event)
             return
         if isinstance(event, protocol.Ready):
-            process.ready = True
             self._restarts.permanent_error = None
-        elif isinstance(event, protocol.StartFailed):
-            process.start_failure = event
         elif isinstance(event, protocol.VoiceLoaded) and event.voice == self._loading:
             self._loading = None
         self._post(event)
+        if isinstance(event, protocol.StartFailed):
+            self._lose_process(event.message, event.reason, event)
         self._send_goal()
 
     def _handle_goal_event(self, goal: SupervisedGoal, event: protocol.GoalEvent) -> None:
@@ -464,12 +464,13 @@ class Supervisor:
             goal.hold_due = NEVER
             self._post(event)
 
-    def _lose_process(self, message: str, reason: Reason) -> None:
+    def _lose_process(self, message: str, reason: Reason, failure: protocol.StartFailed | None = None) -> None:
         """Kill the process, decide what happens to its goal, and schedule the next start.
 
         Args:
             message: a human-readable description of what happened.
             reason: the reason for which the goal fails.
+            failure: the message of the process, if it can't start.
         """
         process, now = self._process, time.monotonic()
         if process is None:
@@ -481,15 +482,13 @@ class Supervisor:
         goal = self._goal if self._goal and self._goal.sent else None
         if goal:
             self._handle_lost_goal(goal, process, message, reason)
-        if not (self._closing or process.start_failure):
+        if not (self._closing or failure):
             self._post(EngineDied(message))
         if process.ready:
             had_goal = goal is not None or process.had_goal
             self._restarts.process_died(now, age_s=now - self._started_at, had_goal=had_goal)
-        elif process.start_failure:
-            self._handle_failed_start(process.start_failure.message, permanent=process.start_failure.permanent)
         else:
-            self._handle_failed_start(message)
+            self._handle_failed_start(message, permanent=failure is not None and failure.permanent)
 
     def _handle_lost_goal(self, goal: SupervisedGoal, process: EngineProcess, message: str, reason: Reason) -> None:
         """Retry or end a goal whose process was killed or has crashed.

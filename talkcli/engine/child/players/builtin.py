@@ -13,7 +13,7 @@ from talkcli.engine.child.players.base import CannotSpeak, Player
 from talkcli.engine.players import FILE_PREFIX, SAMPLE_BYTES
 from talkcli.engine.protocol import OUTPUT_STREAM_NAME
 from talkcli.goals.reasons import Reason
-from talkcli.polling import NEVER
+from talkcli.polling import NEVER, wait_ready
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -171,11 +171,10 @@ class WavStreamPlayer(BuiltInPlayer):
         super().__init__()
         self._output = output
         self._header = _WAV_HEADER.pack(*_header_fields(rate, _UNKNOWN_BYTES)) if first else b""
-        self._poll = select.poll()
-        self._poll.register(output, select.POLLOUT)
 
     def offer(self, data: memoryview) -> int:
-        if not self._poll.poll(0):  # a writable pipe has room for at least a header and a piece of samples
+        # A writable pipe has room for at least a header and a piece of samples.
+        if not wait_ready({self._output: select.POLLOUT}, 0.0):
             return 0
         with _os_errors(Reason.AUDIO_LOST, self.name):
             written = os.write(self._output, self._header + data)

@@ -116,7 +116,8 @@ class PlayerChooser:
         self._audible = configure.audible
         #: the player that worked last, if it was chosen automatically
         self.last_player = configure.last_player
-        self._last_used_at: float | None = None
+        #: monotonic time since which no player has played any sound, or None if none has played yet
+        self.silent_since: float | None = None
 
     def candidates(self, rate: int) -> Iterator[Callable[[], Player]]:
         """Yield functions that open the players to try, best first.
@@ -156,10 +157,6 @@ class PlayerChooser:
         elif player.proven and before.player != player.name and not before.muted:
             self.output = None  # the new player doesn't know its output
 
-    def device_released(self, silent_since: float | None = None) -> None:
-        """Record that the device was released. If `silent_since` is given, it has been silent since that time."""
-        self._last_used_at = time.monotonic() if silent_since is None else silent_since
-
     def lead_in_seconds(self, begins: bool = True) -> float:
         """Return how many seconds of silence a newly opened player has to play first.
 
@@ -167,7 +164,7 @@ class PlayerChooser:
             begins: Whether the player plays the beginning of the sentence. Otherwise, it continues the sentence after a
                 long pause, and a lead-in is needed only if the device is idle.
         """
-        idle = self._last_used_at is None or time.monotonic() - self._last_used_at >= IDLE_AFTER_S
+        idle = self.silent_since is None or time.monotonic() - self.silent_since >= IDLE_AFTER_S
         own = self._own_lead_in
         milliseconds, due = (self._configure.lead_in, idle) if own is None else (own, begins or idle)
         return milliseconds / 1000 if due else 0.0

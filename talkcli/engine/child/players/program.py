@@ -63,9 +63,6 @@ EXIT_CHECK_S = 0.01
 #: hard to read.
 MAX_ERROR_LINE_BYTES = 300
 
-#: Maximum bytes to read from standard error at a time, so that many messages don't delay the samples.
-STDERR_READ_BYTES = 65536
-
 #: Lines that aren't errors or don't help users, such as messages of libraries, underruns and hints.
 _NOISE = (
     r"ALSA lib |underrun|overrun|Playing |Warning:|please, try |Stream (suspended|successfully|started)|^Got signal"
@@ -155,9 +152,8 @@ class PlayerProcess:
 
     def release(self) -> None:
         """Close all descriptors of a program that has been reaped. May be called again."""
-        for each in (self.stdin, self.stderr, self._leash, self.exit):
-            if each is not None:
-                each.close()
+        for each in filter(None, (self.stdin, self.stderr, self._leash, self.exit)):
+            each.close()
 
 
 def _spawn(argv: tuple[str, ...], stdin: int, stderr: int, inherited: Sequence[int]) -> int:
@@ -245,8 +241,8 @@ class ProgramPlayer(Player):
         try:
             self._process = PlayerProcess(command.argv, inherited)
         except OSError as error:
-            text = error.strerror or str(error)
-            raise CannotSpeak(Reason.NO_PLAYER, f"{self.name} cannot be started: {text}") from error
+            message = f"{self.name} cannot be started: {error.strerror or error}"
+            raise CannotSpeak(Reason.NO_PLAYER, message) from error
         #: the number of sample bytes written so far, which is negative until the preamble is written
         self._written = -len(command.preamble)
         self._consumed = 0
@@ -279,14 +275,13 @@ class ProgramPlayer(Player):
         self._process.stdin.close()
 
     def ended(self) -> bool:
-        self._read_stderr()
         status = self._process.status()
+        self._read_stderr()
         if status is None:
             if time.monotonic() >= self._exit_due:
                 line = self._errors.line()
                 raise CannotSpeak(Reason.AUDIO_LOST, line or f"{self.name} closed its input before the sound was over")
             return False
-        self._read_stderr()
         if status == 0 and self._closed:
             return True
         raise self._failure(status)
@@ -334,7 +329,7 @@ class ProgramPlayer(Player):
 
     def _read_stderr(self) -> None:
         stderr = self._process.stderr
-        data = None if stderr.closed else stderr.read(STDERR_READ_BYTES)  # None if there is nothing to read
+        data = None if stderr.closed else stderr.read(65536)  # None if there is nothing to read
         if data:
             self._errors.feed(data)
         elif data == b"":

@@ -225,9 +225,8 @@ class PulsePlayer(Player):
             self._fail()
             return False
         if time.monotonic() >= self._ready_by:
-            self._error = CannotSpeak(
-                Reason.AUDIO_DEVICE, f"the sound server does not answer within {READY_LIMIT_S:g} s"
-            )
+            message = f"the sound server does not answer within {READY_LIMIT_S:g} s"
+            self._error = CannotSpeak(Reason.AUDIO_DEVICE, message)
             return False
         if self._stream is None:
             return state == libpulse.CONTEXT_READY and self._open_stream()
