@@ -179,7 +179,7 @@ class Option:
     form: str = ""
     #: description of the default in the protocol's document, unless it is the server's default
     default_words: str = ""
-    #: command-line flags that don't follow from the name, such as "-w, --wait", or "--preempt/--queue" for yes and no
+    #: command-line flags if `--name` is not enough: "-w, --wait", or "--preempt/--queue" for yes and no
     special_flags: str = ""
     metavar: str = ""
     help: str = ""

@@ -39,7 +39,7 @@ class Record:
     preempt: bool = False
     #: monotonic time at which the goal expires if it hasn't started, or inf
     expires_at: float = inf
-    #: hash of the text, or None unless the text was dropped to free memory
+    #: hash of the text if the text was dropped to free memory, otherwise None
     text_hash: int | None = None
     state: State = State.PENDING
     #: sort position among the pending goals of the same priority, used only by the queue

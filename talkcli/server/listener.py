@@ -175,7 +175,7 @@ def _identity(path: str) -> tuple[int, int] | None:
 def _already_served(pid: int | None, path: str, *, here: bool) -> AddressInUse:
     """Return an error saying that another server uses the path.
 
-    `here` tells whether that server runs on this machine.
+    `here` is true if that server runs on this machine.
     """
     name = "unknown" if pid is None else pid
     how = f" (kill {pid})" if here else ""
@@ -276,7 +276,7 @@ def _bind(path: str, mode: int) -> socket.socket:
         listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         listening.setblocking(False)
         listening.bind(path)
-        os.chmod(path, mode)  # nobody can connect before `listen`, so the file is never too accessible
+        os.chmod(path, mode)  # other users can't connect before `listen`, whatever the mode was
         listening.listen(MAX_BACKLOG_CONNECTIONS)
         return listening
 
@@ -285,7 +285,9 @@ def _bind(path: str, mode: int) -> socket.socket:
 
 
 def _acquire_lock(path: str) -> int:
-    """Reserve a socket's path for this server. Return the descriptor of the lock file, which keeps the lock while open.
+    """Lock a socket's path for this server, and return the descriptor of the lock file.
+
+    The lock lasts until the descriptor is closed.
 
     Raises:
         AddressInUse: if another server holds the lock.

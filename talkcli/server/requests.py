@@ -140,7 +140,7 @@ class Requests:
         if pending.kept_bytes:
             return True  # the request has waited before
         size = REQUEST_BYTES + sum(map(_memory_of, fields(pending.request).values()))
-        if len(pending.connection.unanswered) > MAX_CLIENT_REQUESTS:  # this request is included
+        if len(pending.connection.unanswered) > MAX_CLIENT_REQUESTS:  # the count includes this request
             words = f"{MAX_CLIENT_REQUESTS:,} requests of this connection are waiting already"
         elif self._waiting_bytes + size > MAX_KEPT_REQUEST_BYTES:
             words = f"{MAX_KEPT_REQUEST_BYTES >> 20} MiB of requests are waiting already"
@@ -172,7 +172,8 @@ class Requests:
                 if kind:
                     without_room.add(kind)
             elif not each.connection.has_hung_up():
-                each.resume()  # if the goal enters the queue, the check is repeated, because it may have made room
+                # If the goal enters the queue, another check follows, because it may make room for an earlier goal.
+                each.resume()
 
     def _select_waiting(self, selection: Cancel) -> list[PendingRequest]:
         """Return the selected goals that are waiting for room or for the list of voices."""

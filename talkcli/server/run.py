@@ -49,10 +49,10 @@ class ServerSettings:
 
     #: default values for the options of goals
     goals: Set = INITIAL
-    #: limit on pending goals. Speaking 100 goals takes about three minutes, and nobody wants to wait longer.
+    #: maximum number of pending goals. Speaking 100 goals takes about three minutes, and nobody wants to wait longer.
     max_queue: int = 100
     max_text: int = MAX_TEXT_CHARS
-    #: limit on connected clients. Each client uses a file descriptor, and a process can usually have 1,024 of them.
+    #: maximum number of clients. Each client uses a file descriptor, and a process can usually have 1,024 of them.
     max_clients: int = 256
     player: str | None = None
     device: str | None = None
