@@ -445,7 +445,7 @@ class Bridge:
             return
         link.tick()
         self._check_link(link)
-        # The present time doesn't count. If this process was stopped for a while, it couldn't send and read any echoes.
+        # Compare two sending times, because this process may have been stopped for a while, and have read no echoes.
         if self._echo_at - self._policy.newest_echo_at > _ECHO_TIMEOUT_S:
             log.write_limited("echo", f"nothing that this robot sends itself comes back: {_RIGHTS}")
             self._disconnect(link)

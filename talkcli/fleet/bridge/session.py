@@ -125,7 +125,7 @@ class RemoteSessions:
                 session.send_alive()
 
     def _make_room(self, *, urgent: bool) -> bool:
-        """End an idle session if there are too many. Return whether there is room for a new one.
+        """End an idle session if there are too many sessions. Return whether there is room for a new one.
 
         For an `urgent` request, any session may be ended.
         """
