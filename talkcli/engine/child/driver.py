@@ -97,10 +97,7 @@ def register(name: str, synthesizer: Synthesizer, runner: GoalRunner) -> None:
 def _start_engine(pyttsx3: Any, name: str, *, named: bool) -> Any:
     """Start pyttsx3's engine with a driver, and return the engine.
 
-    Args:
-        pyttsx3: the imported module.
-        name: name of the driver.
-        named: whether an option named the driver, which makes an unknown name a usage error.
+    If an option `named` the driver, a wrong name is a usage error.
     """
     try:
         engine = pyttsx3.init(name)
@@ -220,14 +217,9 @@ class DriverProperties:
         return found.id
 
     def _set(self, name: str, value: Any, shown: str) -> None:
-        """Set a property of the engine.
+        """Set a property of the engine. In error messages, `shown` describes the property and its value.
 
         pyttsx3 reports errors through notifications. This method raises them as exceptions.
-
-        Args:
-            name: name of the property.
-            value: the new value.
-            shown: description of the property and its value for the error message.
 
         Raises:
             CannotSpeak: the property can't be set.

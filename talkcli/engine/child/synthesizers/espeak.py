@@ -172,8 +172,7 @@ class Espeak:
     def voices(self) -> tuple[Voice, ...]:
         """Return the normal voices, the installed MBROLA voices, and the variants."""
         self._stop_phonemizer()
-        espeak = self._espeak
-        return (*_list_voices(espeak, None), *_mbrola_voices(espeak), *_variants(espeak))
+        return (*_list_voices(self._espeak, None), *_mbrola_voices(self._espeak), *_variants(self._espeak))
 
     def load(self, voice: str) -> None:
         """Load a voice by its id, which may end with a variant, or by another name known to the library."""

@@ -307,10 +307,7 @@ class Model:
 def load_libraries(path: str) -> None:
     """Import numpy and onnxruntime.
 
-    This takes 0.25 s, and blocks all other threads for a tenth of that time.
-
-    Args:
-        path: The path of the model for the error message.
+    This takes 0.25 s, and blocks all other threads for a tenth of that time. Error messages name the path of the model.
 
     Raises:
         VoiceFileError: The packages can't be imported, or there is not enough memory.
@@ -358,11 +355,9 @@ def _session_of(half: Sequence[Buffer], optimized_path: str | None = None) -> An
 
 
 def _session(model: str | bytes, optimized_path: str | None = None) -> Any:
-    """Create an onnxruntime session.
+    """Create an onnxruntime session from the path or the content of a model.
 
-    Args:
-        model: The path or the content of a model.
-        optimized_path: Where to write the optimized model, or None not to write it.
+    If `optimized_path` is given, also write the optimized model to this path.
     """
     import onnxruntime
 

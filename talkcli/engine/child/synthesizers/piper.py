@@ -189,8 +189,7 @@ def _speak_parts(
         VoiceFileError: The model is faulty, or doesn't know any of the phonemes.
     """
     pause = int(_PAUSE_S * model.description.rate)
-    unknown = ""
-    first = True
+    first, unknown = True, ""
     for part in parts:
         ids, places = _phoneme_ids(part.phonemes, model.description.phoneme_ids)
         if not places:
