@@ -130,21 +130,22 @@ def read_description(path: str) -> VoiceDescription:
         raise VoiceFileError(f"{json_path} does not describe a voice of Piper's ({why[:200]}): get it anew") from error
 
 
-def open_checked(path: str, missing: str = "put it there again", model: str | None = None) -> Any:
+def open_checked(path: str, missing: str = "put it there again", model: str = "") -> Any:
     """Open a binary file for reading, but only if no other user can change it.
 
     Args:
         path: The path of the file.
         missing: What the error message tells the user to do if the file is missing.
-        model: The path of the model that the file belongs to. It is checked too, so that one error message covers both.
+        model: The path of the model that the file belongs to. If the model exists, it is checked too, so that one error
+            message covers both.
 
     Raises:
         VoiceFileError: A file is missing, unreadable or unsafe.
     """
     try:
-        _check_paths(path, *([] if model is None else [model]))
         if not stat.S_ISREG(os.stat(path).st_mode):  # Opening a pipe would wait for a writer.
             raise VoiceFileError(f"{path} is no file: put the voice's there")
+        _check_paths(path, *filter(os.path.exists, [model]))
         return open(path, "rb")
     except FileNotFoundError as error:
         raise VoiceFileError(f"{path} is not there: {missing}") from error
@@ -155,8 +156,6 @@ def open_checked(path: str, missing: str = "put it there again", model: str | No
 def _check_paths(*paths: str) -> None:
     """Check that no other user can replace these files, or a directory or link in their paths.
 
-    Files that don't exist are ignored, because opening them reports the error later.
-
     In a sticky directory such as /tmp, only the owner of an entry can replace it. Everyone may write to such a
     directory, but it must not directly contain a voice file or a link to one.
 
@@ -164,7 +163,7 @@ def _check_paths(*paths: str) -> None:
         VoiceFileError: Another user could replace a file.
     """
     may_be_sticky: dict[str, bool] = {}
-    for path in filter(os.path.exists, paths):
+    for path in paths:
         for each, leads_on in reversed([*_walk_path(path)]):
             may_be_sticky[each] = may_be_sticky.get(each, True) and leads_on
     wrong = []
