@@ -75,10 +75,10 @@ class Command:
     description: str
     #: example command lines, one per line
     examples: str
-    #: the meanings of the exit codes that the command has besides the usual ones, or describes more precisely
+    #: the meanings of the command's own exit codes, and of usual ones that it describes more precisely
     exit_codes: ExitCodes
-    #: the function that runs the command, as "module:name", or an empty string for the command's function in `ask`; its
-    #: arguments are the common options and the command's own
+    #: the function that runs the command, as "module:name", or an empty string for the function in `ask` with the
+    #: command's name; the arguments of the function are the common options and the command's own
     function: str = ""
     options: tuple[Option, ...] = ()
     #: the positional argument; it accepts any number of words if its metavar ends with "..."

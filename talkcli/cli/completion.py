@@ -75,7 +75,7 @@ def _completion_lines(talk: click.Command, options: CommonOptions) -> list[str]:
 
 
 def _bash_line(word: str, value: str, _: str | None) -> str:
-    """Return a value as bash inserts it for an incomplete word. bash doesn't quote the value.
+    """Format a value for bash, which inserts it without quoting it.
 
     bash replaces the text in COMP_CWORD, which may be only the last part of the word.
     """
@@ -88,7 +88,7 @@ def _bash_line(word: str, value: str, _: str | None) -> str:
 
 
 def _zsh_line(_: str, value: str, words: str | None) -> str:
-    """Return a value and its help text after a colon. zsh quotes the value itself."""
+    """Format a value and its help text for zsh, which quotes the value itself."""
     if not words:
         return f"plain,{value}"
     value, words = (each.replace("\\", "\\\\") for each in (value, words))
@@ -97,7 +97,7 @@ def _zsh_line(_: str, value: str, words: str | None) -> str:
 
 
 def _fish_line(word: str, value: str, words: str | None) -> str:
-    """Return a value and its help text after a tab. fish quotes the value itself."""
+    """Format a value and its help text for fish, which quotes the value itself."""
     return f"plain,{_with_flag(value, word)}" + (f"\t{words}" if words else "")
 
 

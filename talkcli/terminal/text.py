@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 #: The space between two columns of a table.
 COLUMN_GAP = "  "
-#: The room for an id on a narrow terminal. An id can have 64 characters, which would leave no room for the text.
+#: The maximum width of an id on a narrow terminal. An id can have 64 characters, which would leave no room for the text.
 _MIN_ID_COLUMNS = 20
 #: The minimum width to assume for a terminal, because shorter lines would be useless.
 MIN_COLUMNS = 40
@@ -63,12 +63,12 @@ class Screen:
         return None if self.width is None else max(self.width, MIN_COLUMNS) - taken
 
     def fit_name(self, name: str, room: int = _MIN_ID_COLUMNS, share: int = 4) -> str:
-        """Escape a name or an id, and cut it so that it leaves room for other columns.
+        """Escape a name or an id, and cut it to leave room for other columns.
 
         Args:
             name: the name or the id.
-            room: the number of columns that it may always have.
-            share: it may also have this fraction of the line. For example, 4 stands for a quarter.
+            room: its maximum width on a narrow terminal.
+            share: the divisor for its maximum width on a wide terminal. For example, 4 allows a quarter of the line.
         """
         columns = self.columns_left(0)
         return cut(printable(name), None if columns is None else max(room, columns // share))
