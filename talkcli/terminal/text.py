@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 #: The space between two columns of a table.
 COLUMN_GAP = "  "
-#: The maximum width of an id on a narrow terminal. An id can have 64 characters, which would leave no room for the text.
+#: The maximum width of an id on a narrow terminal. An id of 64 characters would leave no room for the text.
 _MIN_ID_COLUMNS = 20
 #: The minimum width to assume for a terminal, because shorter lines would be useless.
 MIN_COLUMNS = 40
