@@ -59,39 +59,18 @@ def say(
         from talkcli.cli.stdin import LineSpeaker
 
         return LineSpeaker(options, name, goal_options, wait, feedback, timeout, ahead).run()
-    sentence: str | int = " ".join(text)
-    if text == ("-",):
-        from talkcli.cli.stdin import InputTooLong, read_text, rejected_goal
-
-        try:
-            sentence = read_text(options.deadline(timeout), wait=wait, whole=output is not None)
-        except InputTooLong as error:
-            reporter = GoalReporter(options, feedback=feedback)
-            return retry_without_output(reporter.report_refused, rejected_goal(str(error)))
-    if isinstance(sentence, int):
-        return sentence  # a signal or closed output has ended the reading
+    found = _read_input(options, timeout, wait, feedback, output) if text == ("-",) else " ".join(text)
+    if isinstance(found, int):
+        return found  # nothing can be spoken
+    sentence = without_bad_bytes(found, options)
     if output is not None:
         return _write_file(output, sentence, goal_options, timeout, options)
-    return _say_text(sentence, goal_options, name, timeout, options, wait=wait, feedback=feedback)
-
-
-def _say_text(
-    text: str,
-    goal_options: dict[str, Any],
-    name: str | None,
-    timeout: float | None,
-    options: CommonOptions,
-    *,
-    wait: bool,
-    feedback: bool,
-) -> int:
-    text = without_bad_bytes(text, options)
     with Interrupts(blocked=options.blocked_signals, output=wait) as interrupts:
         try:
             with options.connect(timeout, name=name, interrupt=interrupts.watched) as client:
                 if interrupts.signal_number is not None and not (options.early and options.early.request_sent):
                     raise Interrupted  # a goal that was sent early is cancelled below, once its id is known
-                goal = client.say(text, follow=wait, feedback=feedback, **goal_options)
+                goal = client.say(sentence, follow=wait, feedback=feedback, **goal_options)
                 reporter = GoalReporter(options, feedback=feedback)
                 if wait and goal.state is not State.REJECTED:
                     return _wait_for_goal(goal, interrupts, timeout, options, reporter)
@@ -103,6 +82,19 @@ def _say_text(
                 raise
             show_error(error, json=options.json)
     return interrupts.exit_code
+
+
+def _read_input(
+    options: CommonOptions, timeout: float | None, wait: bool, feedback: bool, output: str | None
+) -> str | int:
+    """Return the text on standard input, or the exit code if it can't be read or is too long."""
+    from talkcli.cli.stdin import InputTooLong, read_text, rejected_goal
+
+    try:
+        return read_text(options.deadline(timeout), wait=wait, whole=output is not None)
+    except InputTooLong as error:
+        reporter = GoalReporter(options, feedback=feedback)
+        return retry_without_output(reporter.report_refused, rejected_goal(str(error)))
 
 
 def without_bad_bytes(text: str, options: CommonOptions) -> str:
@@ -162,7 +154,6 @@ def _write_file(
         if options.json:
             raise UsageError("--json prints to standard output, where the sound goes: leave one of them out")
         standard_output()
-    text = without_bad_bytes(text, options)
     with Interrupts() as interrupts:
         try:
             seconds = render(text, path, timeout=seconds_at_most, interrupt=interrupts.watched, **settings)

@@ -55,8 +55,8 @@ class Client:
     If the connection breaks, for example because the server was restarted, the next call reconnects. If the server is
     still the same process, its goals are followed again. Otherwise they are LOST.
 
-    While there is no server, calls raise ServerUnavailable at once. There is a pause of up to half a second between two
-    attempts to reconnect, which only a cancel ignores.
+    While there is no server, calls raise ServerUnavailable at once. There is a pause of 0.1 s between two attempts to
+    reconnect, which only a cancel ignores.
 
     Every call that waits for an answer raises ServerUnavailable if there is none in time, or Lost if the request may
     have had an effect.

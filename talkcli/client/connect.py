@@ -31,10 +31,8 @@ GREETING_START = b'{"talk": 1, "version": '
 GREETING_WAIT_S = 0.2
 #: Maximum time for which `yield_processor` sleeps.
 _LONGEST_YIELD_S = 0.2
-#: Time limit for a server's greeting, and for each answer.
+#: Time limit for a server's greeting, and for each answer. A busy server is tried again for as long.
 ANSWER_LIMIT_S = 5.0
-#: How long to keep trying if a server has too many clients or a full backlog.
-BUSY_LIMIT_S = 5.0
 #: The minimum and maximum pause before trying again. The pause is random, so that refused clients don't all try again
 #: at the same moment.
 RETRY_PAUSE_S = (0.02, 0.2)
@@ -197,7 +195,8 @@ def connect(
     Args:
         named: path of the only socket to try; None for the usual places.
         hello: the hello message.
-        patience: seconds in which the server must send its greeting.
+        patience: seconds in which the server must send its greeting. If it has too many clients or a full backlog, this
+            is also how long to try again.
         interrupt: descriptors that interrupt the wait, with their poll events, as in `polling.wait_ready`.
         attempt: a connection that has already been opened.
         keep_trying: seconds for which to try again if there is no server yet. If this time is longer than `patience`,
@@ -210,7 +209,7 @@ def connect(
     """
     from talkcli.errors import AccessDenied, Busy, ServerUnavailable
 
-    give_up = time.monotonic() + (keep_trying or min(BUSY_LIMIT_S, patience))
+    give_up = time.monotonic() + (keep_trying or patience)
     attempt = attempt or reach(named)
     while True:
         error: TalkError | None = None

@@ -35,10 +35,9 @@ if TYPE_CHECKING:
 
 #: Maximum number of bytes to receive at once.
 _RECEIVE_BYTES = 256 * 1024
-#: The first and longest pause between attempts to reconnect. The pause doubles after each attempt.
-_FIRST_RECONNECT_PAUSE_S, _LONGEST_RECONNECT_PAUSE_S = 0.02, 0.5
-#: How often a thread without a socket checks whether another thread has reconnected.
-_RECONNECT_CHECK_S = 0.1
+#: The pause between two attempts to reconnect. A thread without a socket checks as often whether another thread has
+#: reconnected.
+_RECONNECT_PAUSE_S = 0.1
 
 
 def checked_sender_name(name: str | None) -> str | None:
@@ -363,7 +362,7 @@ class SocketConnection(Connection):
             connected = self._socket
             waits = bool(self.outgoing())
         if connected is None:
-            wait_ready({}, min(timeout, _RECONNECT_CHECK_S))
+            wait_ready({}, min(timeout, _RECONNECT_PAUSE_S))
             return
         data, why = b"", "the server went away"
         try:
@@ -410,8 +409,6 @@ class ReconnectingConnection(SocketConnection):
         super().__init__(socket, name=name, patience=patience)
         #: monotonic time of the next attempt to connect. During an attempt, this is the time limit for the greeting.
         self._due = 0.0
-        #: the pause to make after the next failed attempt
-        self._pause_s = _FIRST_RECONNECT_PAUSE_S
 
     def begin(self, request: Request, on_reply: OnReply | None = None, on_failure: OnFailure | None = None) -> Exchange:
         if on_failure is None:
@@ -431,7 +428,7 @@ class ReconnectingConnection(SocketConnection):
         self._give_up_socket()
         if was_greeted:
             self.disconnected(why, now)
-            self._due, self._pause_s = now, _FIRST_RECONNECT_PAUSE_S
+            self._due = now
         else:
             self._not_connected(ServerUnavailable(f"nothing was sent to the server at {self.path}: {why}"), now)
 
@@ -473,7 +470,7 @@ class ReconnectingConnection(SocketConnection):
 
     def _not_connected(self, error: TalkError, now: float) -> None:
         """Record a failed attempt to connect, and schedule the next one."""
-        self._due, self._pause_s = now + self._pause_s, min(2 * self._pause_s, _LONGEST_RECONNECT_PAUSE_S)
+        self._due = now + _RECONNECT_PAUSE_S
         self.not_connected(error)
 
     def _give_up_socket(self) -> None:

@@ -228,10 +228,10 @@ class _EventStream:
     def __init__(self, handles: Sequence[GoalHandle]) -> None:
         #: the unfinished goals, without duplicates
         self.unfinished = list({each.id: each for each in handles}.values())
-        #: the number of each goal's last event, which is also used to sort the goal's Result
+        #: the number of each goal's last event
         self._last_numbers: dict[str, int] = {}
         #: the number of the last pause, which is yielded only once although every goal receives it
-        self._pause_number: int | None = None
+        self._last_pause = 0
 
     def take(self) -> list[tuple[GoalHandle, Event]]:
         """Remove and return the new events of all goals. The caller must hold the connection's lock."""
@@ -239,17 +239,16 @@ class _EventStream:
         for handle in self.unfinished:
             event: Event | None = None
             while not isinstance(event, Result) and (event := handle._take()):
-                number = getattr(event, "n", None)
-                if isinstance(event, PausedChanged) and number is not None:
-                    if number == self._pause_number:
+                # A Result has no number, and is sorted by the number of its goal's last event. It stays behind this
+                # event, because sorting is stable.
+                number = getattr(event, "n", None) or self._last_numbers.get(handle.id, 0)
+                self._last_numbers[handle.id] = number
+                if isinstance(event, PausedChanged):
+                    if number <= self._last_pause:
                         continue
-                    self._pause_number = number
-                if number is not None:
-                    self._last_numbers[handle.id] = number
-                found.append((self._last_numbers.get(handle.id, 0), handle, event))
+                    self._last_pause = number
+                found.append((number, handle, event))
         self.unfinished = [each for each in self.unfinished if not each.state.terminal]
-        # A Result is sorted by the number of its goal's last event. It stays behind this event, because sorting is
-        # stable.
         return [(handle, event) for _, handle, event in sorted(found, key=lambda each: each[0])]
 
 

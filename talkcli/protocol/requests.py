@@ -138,7 +138,6 @@ class Resume:
 Request = Hello | Say | Wait | Cancel | Status | Voices | Watch | Log | Set | Pause | Resume
 
 REQUEST_TYPES: dict[str, type[Request]] = {each.kind: each for each in Request.__args__}
-_OPTIONS_BY_KIND = {kind: {each.name: each for each in request.options} for kind, request in REQUEST_TYPES.items()}
 
 
 def read_request(message: JsonObject) -> Request:
@@ -158,7 +157,7 @@ def read_request(message: JsonObject) -> Request:
             f"this server does not know the request {kind[:MAX_SENDER_NAME_CHARS]!r}, but {known}", "unknown_request"
         )
     for name, value in fields.items():
-        option = _OPTIONS_BY_KIND[kind].get(name)
+        option = next((each for each in request.options if each.name == name), None)
         if option is None:
             raise BadRequest(
                 f"this server does not know the field {name[:MAX_SENDER_NAME_CHARS]!r} of {kind}", "unknown_field"

@@ -161,7 +161,7 @@ async def test_a_connection_on_which_a_line_can_not_be_sent_has_ended(listening:
 async def test_a_refused_connection_raises_busy_or_unavailable(
     listening: socket.socket, said: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("talkcli.client.connect.BUSY_LIMIT_S", 0.3)
+    monkeypatch.setattr("talkcli.client.connect.ANSWER_LIMIT_S", 0.3)
     dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
     with contextlib.suppress(TimeoutError):
         while not dialing.done():  # a busy server is tried again

@@ -139,7 +139,7 @@ async def dial(socket: str | None, name: str, *, urgent: bool = False) -> LocalC
         ServerUnavailable, AccessDenied, ProtocolMismatch, Busy: no usable server was found.
     """
     place, hello, loop = paths.named_socket(socket), connect.hello(name, urgent=urgent), asyncio.get_running_loop()
-    give_up = loop.time() + connect.BUSY_LIMIT_S
+    give_up = loop.time() + connect.ANSWER_LIMIT_S
     failures: tuple[tuple[str, Exception], ...] = ()
     while True:
         attempt = connect.reach(place, failures)
