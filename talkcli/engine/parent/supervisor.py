@@ -87,7 +87,7 @@ class ActionQueue:
         return self._receiver.fileno()
 
     def call(self, action: Callable[[], object]) -> None:
-        """Run an action in the engine thread. If the queue is closed, do nothing."""
+        """Run an action in the engine thread. After `close`, it never runs."""
         self._actions.append(action)
         with contextlib.suppress(OSError):  # the queue is closed, or its buffer is full
             self._sender.send(b"\0")
@@ -165,7 +165,7 @@ class SupervisedGoal:
     stop_due: float = NEVER
     #: number of the current pause; None if the goal is not paused
     hold_number: int | None = None
-    #: time by which the process must confirm a `Hold`; NEVER if none was sent since the last confirmation
+    #: time by which the process must confirm a `Hold`; NEVER if none is unconfirmed
     hold_due: float = NEVER
     #: event that will be posted once `lost_process` has exited
     end: protocol.Ended | None = None

@@ -116,7 +116,7 @@ class PlayerChooser:
         self._audible = configure.audible
         #: the player that worked last, if it was chosen automatically
         self.last_player = configure.last_player
-        #: monotonic time since which no player has played any sound, or None if none has played yet
+        #: monotonic time at which the last player became silent, or None if no player has played yet
         self.silent_since: float | None = None
 
     def candidates(self, rate: int) -> Iterator[Callable[[], Player]]:

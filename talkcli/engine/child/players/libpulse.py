@@ -191,7 +191,7 @@ class MainLoop:
 
     def iterate(self) -> bool:
         """Run one iteration without waiting, and return whether it did any work."""
-        # libpulse counts this as a wait, and so gives `_poll` the time of its next timer.
+        # The 1 asks libpulse to wait, so it passes the time until its next timer to `_poll`.
         return not self.freed and bool(self._library.mainloop_iterate(self._pointer, 1, None) > 0)
 
     def free(self) -> None:
@@ -202,7 +202,7 @@ class MainLoop:
     def _poll(self, wanted: Any, count: int, timeout: int, _: object) -> int:
         self.interests = [(wanted[number].fd, wanted[number].events) for number in range(count)]
         self.wake_at = NEVER if timeout < 0 else time.monotonic() + timeout / 1000
-        return max(0, int(self._library.poll(wanted, count, 0)))  # libpulse aborts the process after an error
+        return max(0, int(self._library.poll(wanted, count, 0)))  # libpulse would abort the process after an error
 
 
 def loudest(volume: Volume) -> float:
