@@ -139,23 +139,6 @@ def _serve_rule(given: Mapping[str, Any], _: frozenset[str]) -> str | None:
     return None
 
 
-_BRIDGE_OPTIONS = (
-    option("--name", WORD, "The robot's name, which no other robot has.", metavar="NAME"),
-    option("--group", WORD, "Groups that it is in besides 'all'; several with commas.", metavar="GROUP"),
-    option(
-        "--allow",
-        WORD,
-        "Requests that are taken from afar.",
-        default="say,cancel,status,wait,log,voices,pause,resume",
-        metavar="LIST",
-    ),
-    option("--no-text", FLAG, "Leave what is said out of status and events."),
-    option("--homeassistant", FLAG, "Be a device of Home Assistant's as well."),
-    _print_unit_option("user", "system"),
-    option("--print-acl", FLAG, "Print who may do what on the broker; for mosquitto's acl_file."),
-)
-
-
 def _bridge_rule(given: Mapping[str, Any], _: frozenset[str]) -> str | None:
     if given["name"] is None and not given["print_acl"]:
         return "--name is missing: what the robot is called on the broker"
@@ -455,7 +438,21 @@ _ROWS = (
             2: "usage: a setting that is wrong or missing, or paho-mqtt is",
             11: "another bridge of this name is there already",
         },
-        options=_BRIDGE_OPTIONS,
+        options=(
+            option("--name", WORD, "The robot's name, which no other robot has.", metavar="NAME"),
+            option("--group", WORD, "Groups that it is in besides 'all'; several with commas.", metavar="GROUP"),
+            option(
+                "--allow",
+                WORD,
+                "Requests that are taken from afar.",
+                default="say,cancel,status,wait,log,voices,pause,resume",
+                metavar="LIST",
+            ),
+            option("--no-text", FLAG, "Leave what is said out of status and events."),
+            option("--homeassistant", FLAG, "Be a device of Home Assistant's as well."),
+            _print_unit_option("user", "system"),
+            option("--print-acl", FLAG, "Print who may do what on the broker; for mosquitto's acl_file."),
+        ),
         rule=_bridge_rule,
     ),
     Command(

@@ -36,8 +36,7 @@ def fleet(options: CommonOptions, what: str) -> int | None:
     selected = [each for each in found if selection is None or selection.includes(each.presence)]
     if not selected:
         raise _no_robot_error(broker, selection)
-    objects = (each.to_json() for each in selected)
-    show_result(options, objects, lambda: robot_lines(selected, screen(), time.time()))
+    show_result(options, [each.to_json() for each in selected], lambda: robot_lines(selected, screen(), time.time()))
     return None
 
 

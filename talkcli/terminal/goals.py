@@ -175,9 +175,8 @@ def format_duration(seconds: float) -> str:
 
 def _goal_table(label: str, goals: Sequence[Goal], id_columns: int, screen: Screen, now: float) -> list[str]:
     """Return one line for each goal, cut to the width of the terminal."""
-    heads = [
-        _label("" if number else label) + _head_columns(goal, id_columns, screen) for number, goal in enumerate(goals)
-    ]
+    labels = [label, *[""] * (len(goals) - 1)]
+    heads = [_label(name) + _head_columns(goal, id_columns, screen) for name, goal in zip(labels, goals, strict=True)]
     tails = [_tail_forms(goal, now) for goal in goals]
     texts = [quoted_text(goal, _LISTED_TEXT_CHARS) for goal in goals]
     fitted = fit_columns(texts, tails, weights=(1, 1), columns=screen.columns_left(max(map(width, heads))))
