@@ -15,14 +15,14 @@ import _socket  # importing `socket` takes longer (see `peers`)
 import os
 import time
 
-from talkcli import paths
+from talkcli import paths, peers
+from talkcli.errors import AccessDenied, Busy, ServerUnavailable, TalkError
 from talkcli.frozen import TYPE_CHECKING, frozen, replace
 from talkcli.polling import wait_ready
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from talkcli.errors import AccessDenied, TalkError
     from talkcli.goals.goal import JsonObject
 
 #: The beginning of the greeting of a server with the same protocol. A test compares it with a real greeting.
@@ -83,31 +83,25 @@ def reach(
         connected = _socket.socket(_socket.AF_UNIX, _socket.SOCK_STREAM)
         # Don't block, because a stopped server with a full backlog would block the client for ever.
         connected.setblocking(False)
-        error: Exception | None
         try:
             connected.connect(path)
-            error = None if named or path == paths.SYSTEM_SOCKET else _foreign(connected)
-        except OSError as failed:
-            error = failed
-        if error is None:
+            if not named and path != paths.SYSTEM_SOCKET:
+                _check_owner(connected)
+        except (OSError, AccessDenied) as error:
+            connected.close()
+            failures = (*failures, (path, error))
+            if isinstance(error, BlockingIOError):  # this is the right server, but its backlog is full
+                break
+        else:
             return ConnectionAttempt(connected, path, failures)
-        connected.close()
-        failures = (*failures, (path, error))
-        if isinstance(error, BlockingIOError):  # this is the right server, but its backlog is full
-            break
     return ConnectionAttempt(None, failures=failures)
 
 
-def _foreign(connected: _socket.socket) -> AccessDenied | None:
-    """Return an error if the server belongs to another user, who could read all requests."""
-    from talkcli import peers
-
+def _check_owner(connected: _socket.socket) -> None:
+    """Raise AccessDenied if the server belongs to another user, who could read all requests."""
     _, uid = peers.credentials(connected)
-    if uid in {os.getuid(), 0}:
-        return None
-    from talkcli.errors import AccessDenied
-
-    return AccessDenied(f"belongs to uid {uid}; to use it all the same, name it with --socket")
+    if uid not in {os.getuid(), 0}:
+        raise AccessDenied(f"belongs to uid {uid}; to use it all the same, name it with --socket")
 
 
 def send_early(
@@ -207,8 +201,6 @@ def connect(
         ServerUnavailable, AccessDenied, ProtocolMismatch, Busy: there is no server that can be used.
         Interrupted: one of the interrupting descriptors is ready.
     """
-    from talkcli.errors import AccessDenied, Busy, ServerUnavailable
-
     give_up = time.monotonic() + (keep_trying or patience)
     attempt = attempt or reach(named)
     while True:
@@ -259,9 +251,7 @@ def _greet(
     """
     from select import POLLIN
 
-    from talkcli import peers
     from talkcli.client.core import read_greeting
-    from talkcli.errors import ServerUnavailable
     from talkcli.protocol.lines import request_line
 
     connected, received = attempt.socket, attempt.received
@@ -291,8 +281,6 @@ def _greet(
 
 def unreachable(attempt: ConnectionAttempt, named: str | None) -> TalkError:
     """Return an error that lists the failed places and advises the user."""
-    from talkcli.errors import AccessDenied, ServerUnavailable
-
     if attempt.backlog_full:
         path = attempt.failures[-1][0]
         return ServerUnavailable(f"the server at {path} does not take up connections: restart it if it hangs")
