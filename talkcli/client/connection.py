@@ -157,7 +157,7 @@ class Connection(ClientCore):
     def begin(self, request: Request, on_reply: OnReply | None = None, on_failure: OnFailure | None = None) -> Exchange:
         """Send a request without waiting for the answer. The arguments are those of `Exchange`.
 
-        If `on_failure` is None, and the caller stops waiting for the answer, the caller must call `forget`.
+        A caller without `on_failure` must call `forget` if it stops waiting for the answer.
         """
         exchange = self.exchange_type(request, on_reply, on_failure)
         with self.changed:

@@ -284,7 +284,7 @@ class Exchange:
             request: the request.
             on_reply: called if the server accepts the request.
             on_failure: called if the server refuses the request or doesn't answer. Without this function, the caller
-                must wait for the answer, and the request isn't kept until the client has reconnected.
+                must wait for the answer. Such a request fails at once if the client can't reconnect.
         """
         self.request = request
         self.on_reply, self.on_failure = on_reply, on_failure
