@@ -43,8 +43,12 @@ def nobody_serves() -> None:
 
 
 def pytest_configure() -> None:
-    """Time the control of limits while the machine is quiet; the workers of a run inherit the result."""
+    """Time the control of limits while the machine is quiet; the workers of a run inherit the result.
+
+    They also inherit that numpy starts no threads, which would only wait.
+    """
     calibrate()
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 
 @pytest.hookimpl(wrapper=True)

@@ -1,8 +1,9 @@
 """Starts `talk` as a fork of a process that has imported it: a few ms of processor instead of 45, or 90 for a server.
 
-It is a process with its own environment, descriptors and session, killed with the tests, ended as Python ends. Only its
-command line and first environment in /proc are different, and it has nothing to import. A test of these, of signals or
-limits at a start, of closed streams or of another interpreter starts a program of its own; see also `forks()`.
+It is a process with its own environment, descriptors and session, killed with the tests. Only its command line and
+first environment in /proc are different, it has nothing to import, and its interpreter isn't cleaned up at the end. A
+test of these, of signals or limits at a start, of closed streams or of another interpreter starts a program of its own;
+see also `forks()`.
 """
 
 from __future__ import annotations
