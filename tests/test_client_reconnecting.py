@@ -346,7 +346,7 @@ print(json.dumps(robot.lateness))
 
 def test_loop_of_the_readme_is_never_late_and_speaks_again(scripted: Talk) -> None:
     """The server is stopped for 7 s and killed once, beside the same loop without `talk`."""
-    (example,) = [each for each in README.examples("python", "A tour") if "robot.drives" in each]
+    (example,) = [each for each in README.examples("python", "Use it from Python") if "robot.drives" in each]
     programs = [ROBOT.format(loop=example), ROBOT.format(loop="while robot.drives():\n    pass")]
     with limits(), contextlib.ExitStack() as stack:
         loops = []

@@ -12,8 +12,8 @@ from tests.support.documents import ROOT
 
 #: Examples that tests elsewhere run.
 ELSEWHERE = {
-    "A tour: From Python": "tests/wire/test_examples.py::test_first_example_of_the_library",
-    "A tour: From Python #2": "tests/wire/test_examples.py::test_loop_of_a_robot",
+    "Use it from Python": "tests/wire/test_examples.py::test_first_example_of_the_library",
+    "Use it from Python: In a robot's loop": "tests/wire/test_examples.py::test_loop_of_a_robot",
     "The wire": "tests/wire/test_examples.py::test_line_of_socat_says_a_sentence",
     "Two clients": "tests/wire/test_examples.py::test_client_in_shell",
     "Two clients #2": "tests/wire/test_examples.py::test_client_in_plain_python",

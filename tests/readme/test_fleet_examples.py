@@ -130,7 +130,7 @@ def site(make_talk: MakeTalk, tmp_path: Path, place: str) -> Iterator[Site]:
             assert bridge.terminate() == 0
 
 
-@runs("A fleet: A robot", "A fleet: A desk", "A fleet: Home Assistant, cron")
+@runs("Speak on many robots: On each robot", "Speak on many robots: On your machine")
 def test_readmes_robot_and_its_desk(tmp_path: Path, place: str) -> None:
     """Two commands set up a robot with logins and the broker's rules. A desk and a plain text make it speak."""
     needs_packages("paho")
@@ -145,22 +145,22 @@ def test_readmes_robot_and_its_desk(tmp_path: Path, place: str) -> None:
         shell.program("talk", _TALK)
         _set_up_clients(shell, broker, "ha")
         listener = stack.enter_context(Listener(broker, "talk/robot/anna/#", user="olga"))
-        shell.start(f"{block('A fleet: A robot')}wait\nwait\n")
+        shell.start(f"{block('Speak on many robots: On each robot')}wait\nwait\n")
         listener.await_message(_online, LIMIT)
-        done = shell.run(block("A fleet: A desk"), TALK_SOCKET="/nowhere")
+        done = shell.run(block("Speak on many robots: On your machine"), TALK_SOCKET="/nowhere")
         assert (done.returncode, done.stderr) == (0, ""), done
         assert "exit code" not in done.stdout
         listener.await_message(lambda each: _says(each, "the shift is over"), LIMIT)
-        done = shell.run(block("A fleet: Home Assistant, cron"))
+        done = shell.run(commands("Topics")[0])
         assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
         found = listener.await_message(lambda each: _says(each, "the washing is done"), LIMIT)
         assert found.json["goal"]["client"]["name"] == "mqtt:ha"
 
 
-@runs("A fleet: Several", "A fleet: Several #2")
+@runs("Speak on many robots: Several robots", "Several robots: In Python")
 def test_several_robots(tmp_path: Path, place: str) -> None:
     needs_packages("paho")
-    say, cancel, status, table, follow = commands("A fleet: Several")
+    say, cancel, status, table, follow = commands("Speak on many robots: Several robots")
     with contextlib.ExitStack() as stack:
         broker = stack.enter_context(Broker())
         robots = stack.enter_context(RealRobots(broker, ["bert", "wh-1", "wh-2"], ["warehouse"]))
@@ -175,7 +175,7 @@ def test_several_robots(tmp_path: Path, place: str) -> None:
         assert '"the shift is over"' in watching.stdout.readline()
         done = shell.run(cancel)
         assert (done.returncode, done.stderr) == (0, "talk: 3 of 3 as asked\n")
-        code = block("A fleet: Several #2").replace("mqtts://broker", broker.url)
+        code = block("Several robots: In Python").replace("mqtts://broker", broker.url)
         python = shell.directory / "several.py"
         python.write_text(code, encoding="utf-8")
         done = shell.run(f"{sys.executable} several.py", PYTHONPATH=str(ROOT))
@@ -190,7 +190,7 @@ def test_several_robots(tmp_path: Path, place: str) -> None:
         assert listed == [["bert", "OFFLINE"], ["wh-1", "yes"], ["wh-2", "yes"]]
 
 
-@runs("A site")
+@runs("Set up a site")
 def test_broker_is_set_up(make_talk: MakeTalk, tmp_path: Path, place: str) -> None:
     """The broker lets in those logins alone, by TLS, each for its own rights."""
     needs_packages("paho")
@@ -199,7 +199,7 @@ def test_broker_is_set_up(make_talk: MakeTalk, tmp_path: Path, place: str) -> No
     (etc / "conf.d").mkdir(parents=True)
     with contextlib.closing(Shell(tmp_path, clean_environment(place))) as shell:
         shell.stand_in("sudo", _SUDO.replace("ETC", str(etc)).replace("PROGRAM", str(find_program("mosquitto_passwd"))))
-        done = shell.run(block("A site"))
+        done = shell.run(block("Set up a site"))
         assert done.returncode == 0, done
         called = [each[0] for each in shell.calls("sudo")]
     assert called == ["apt-get", "mosquitto_passwd", "mosquitto_passwd", "tee", "tee", "systemctl"]
@@ -255,14 +255,14 @@ def _part(whole: Any, like: Any) -> Any:
 
 
 @runs(
-    *(f"What a robot tells everybody: Presence{each}" for each in ("", " #2", " #3")),
-    "What a robot tells everybody: Status",
-    "What a robot tells everybody: Status #2",
-    "What a robot tells everybody: Events",
+    *(f"What a robot publishes: Presence{each}" for each in ("", " #2", " #3")),
+    "What a robot publishes: Status",
+    "What a robot publishes: Status #2",
+    "What a robot publishes: Events",
 )
 def test_events_status_and_presence(site: Site) -> None:
     before = site.broker.log.count("SUBACK")
-    following = site.shell.start(block("What a robot tells everybody: Events"))
+    following = site.shell.start(block("What a robot publishes: Events"))
     wait_until(lambda: site.broker.log.count("SUBACK") > before)
     site.run("Requests and replies: A request")
     goal = site.goal("the door is open", "SUCCEEDED")
@@ -272,14 +272,14 @@ def test_events_status_and_presence(site: Site) -> None:
     states = [json.loads(each.partition(" ")[2])["state"] for each in events]
     assert states == ["PENDING", "ACTIVE", "SUCCEEDED"]
 
-    example = json.loads(block("What a robot tells everybody: Status #2"))
+    example = json.loads(block("What a robot publishes: Status #2"))
     example["last"]["at"] = goal["ended_at"]
-    wait_until(lambda: bool(json.loads(site.run("What a robot tells everybody: Status")) == example))  # one per second
+    wait_until(lambda: bool(json.loads(site.run("What a robot publishes: Status")) == example))  # one per second
 
-    there, gone = (json.loads(block(f"What a robot tells everybody: Presence #{each}")) for each in (2, 3))
-    found = json.loads(site.run("What a robot tells everybody: Presence"))
+    there, gone = (json.loads(block(f"What a robot publishes: Presence #{each}")) for each in (2, 3))
+    found = json.loads(site.run("What a robot publishes: Presence"))
     vary = dict.fromkeys(("server", "session", "since", "version"))
     assert (found.keys(), found["server"].keys()) == (there.keys(), there["server"].keys())
     assert {**found, **vary} == {**there, **vary}
     site.bridge.terminate()
-    assert json.loads(site.run("What a robot tells everybody: Presence")) == {**gone, "session": found["session"]}
+    assert json.loads(site.run("What a robot publishes: Presence")) == {**gone, "session": found["session"]}

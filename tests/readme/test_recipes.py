@@ -58,21 +58,21 @@ def test_battery_guard(scripted: Talk, scripted_shell: Shell) -> None:
     assert [each for each in said(scripted) if "stop" in each] == ["battery at 4 percent, I have to stop"]
 
 
-@runs("Recipes: Log to speech")
+@runs("Recipes: Speak a log")
 def test_log_to_speech(scripted: Talk, scripted_shell: Shell) -> None:
     scripted_shell.stand_in("tail", "printf 'INFO fine\\n12:00 ERROR -5 degrees\\nINFO\\nERROR arm blocked\\n'")
-    done = scripted_shell.run(block("Recipes: Log to speech"))
+    done = scripted_shell.run(block("Recipes: Speak a log"))
     assert done.returncode == 0, done
     assert scripted_shell.calls("tail") == [["-n", "0", "-F", "/var/log/robot.log"]]
     assert said(scripted) == ["ERROR -5 degrees", "ERROR arm blocked"]
 
 
-@runs("Recipes: Microphone mute")
+@runs("More recipes: Mute the microphone")
 def test_microphone_mute(scripted: Talk, scripted_shell: Shell) -> None:
     scripted_shell.stand_in("wpctl")
     heard = scripted_shell.directory / "heard"
     scripted_shell.program("talk", f'{sys.executable} -m talkcli "$@" | tee {heard}')
-    scripted_shell.start(block("Recipes: Microphone mute"))
+    scripted_shell.start(block("More recipes: Mute the microphone"))
     wait_until(lambda: heard.exists() and heard.stat().st_size > 0)  # it begins with what there is now
     for number, text in enumerate(("one", "fail=audio_lost"), 1):
         scripted.run("say", "--wait", "--", text)
@@ -84,10 +84,10 @@ def test_microphone_mute(scripted: Talk, scripted_shell: Shell) -> None:
     assert [each[-1] for each in scripted_shell.wait_for_call("wpctl", 6)[-2:]] == ["1", "0"]
 
 
-@runs("Recipes: Watchdog")
+@runs("More recipes: Watchdog")
 def test_watchdog(scripted: Talk, scripted_shell: Shell) -> None:
     for words, code in ((["true"], 0), (["sh", "-c", "exit 3"], 3), (["/bin/sh", "-c", "kill -9 $$"], 137)):
-        assert scripted_shell.run(block("Recipes: Watchdog"), *words).returncode == code
+        assert scripted_shell.run(block("More recipes: Watchdog"), *words).returncode == code
     ends = ("true is done", "sh failed with code 3", "sh was killed by signal 9")
     assert said(scripted) == [f"I have stopped: {each}" for each in ends]
 
@@ -115,13 +115,13 @@ def test_cron(speaking: Talk, shell: Shell) -> None:
     assert shell.calls("logger") == [["-t", "talk", "the robot is mute"]]  # its player is a file
 
 
-@runs("Recipes: ssh", "Recipes: The socket, forwarded")
+@runs("Recipes: ssh", "More recipes: Forward the socket")
 def test_ssh(speaking: Talk, shell: Shell) -> None:
     shell.ssh()
     done = shell.run(block("Recipes: ssh"), text=AWKWARD)
     assert (done.returncode, done.stderr, "not heard" in done.stdout) == (0, "", False)
     with short_directory() as home:
-        done = shell.run(block("Recipes: The socket, forwarded"), HOME=home)
+        done = shell.run(block("More recipes: Forward the socket"), HOME=home)
         assert (done.returncode, done.stderr) == (0, "")
         assert shell.calls("ssh")[-1][-3:] == ["-L", f"{home}/.robot.sock:{speaking.socket}", "robot"]
     assert said(speaking) == ["hello from the office", AWKWARD, "hello from the office"]
@@ -129,14 +129,14 @@ def test_ssh(speaking: Talk, shell: Shell) -> None:
     assert "not heard\n" in shell.run(block("Recipes: ssh"), text=AWKWARD).stdout
 
 
-@runs("Recipes: ROS 2")
+@runs("In a ROS 2 launch file")
 def test_launch_file(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     launch, actions = types.ModuleType("launch"), types.ModuleType("launch.actions")
     launch.__dict__["LaunchDescription"], actions.__dict__["ExecuteProcess"] = list, types.SimpleNamespace
     for each in (launch, actions):
         monkeypatch.setitem(sys.modules, each.__name__, each)
     file: dict[str, Any] = {}
-    exec(block("Recipes: ROS 2"), file)
+    exec(block("In a ROS 2 launch file"), file)
     (process,) = file["generate_launch_description"]()
     with short_directory() as place:
         env = {**shell.env, "TALK_SOCKET": f"{place}/s", "TALK_PLAYER": "null"}
@@ -145,10 +145,10 @@ def test_launch_file(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
             assert server.end(signal.SIGINT) == 0  # as launch does
 
 
-@runs("Recipes: Simulation and CI")
+@runs("In simulation and CI")
 def test_simulation(tmp_path: Path, speaking: Talk) -> None:
     with short_directory() as place, contextlib.closing(Shell(tmp_path, speaking.env)) as shell:
-        done = shell.run(block("Recipes: Simulation and CI"), TALK_SOCKET=f"{place}/s")
+        done = shell.run(block("In simulation and CI"), TALK_SOCKET=f"{place}/s")
     assert done.returncode == 0, done
     assert done.stdout.splitlines()[1:] == ["as on the robot"]
 
@@ -182,11 +182,11 @@ def test_containers(speaking: Talk, shell: Shell) -> None:
     assert run[-5:] == ["talk", "talk", "serve", "--player", "pacat"]
 
 
-@runs("As a service")
+@runs("Run it as a service")
 def test_services(shell: Shell) -> None:
     for name, then in {"sudo": _SUDO, "systemctl": "exit 0", "loginctl": "exit 0"}.items():
         shell.stand_in(name, then)
-    done = shell.run(block("As a service"))
+    done = shell.run(block("Run it as a service"))
     assert done.returncode == 0, done
     units = {".config/systemd/user/talk.service": "--rate", "system/talk.service": "--socket-mode"}
     for unit, option in units.items():

@@ -127,7 +127,7 @@ def test_first_command_without_sound_leaves_something_to_listen_to(tmp_path: pat
 
 
 @pytest.mark.slow
-@runs("Debian, Ubuntu, Raspberry Pi OS: For one user", "Debian, Ubuntu, Raspberry Pi OS: For all users")
+@runs("Install: For one user", "Install: For all users")
 def test_installations(newcomer: Shell) -> None:
     """With the real pipx and pip. A message that names a missing package gives the command that installs it."""
     needs("bash")
@@ -139,7 +139,7 @@ def test_installations(newcomer: Shell) -> None:
     done = newcomer.run("registry/bin/pip install -q pipx && ln -s ../registry/bin/pipx bin/pipx", limit=LIMIT)
     assert done.returncode == 0, done
     for users, talk in (("one user", ".local/bin/talk"), ("all users", "system/usr/local/bin/talk")):
-        example = block(f"Debian, Ubuntu, Raspberry Pi OS: For {users}")
+        example = block(f"Install: For {users}")
         done = newcomer.run(f"set -e; cd talk\n{example}", limit=LIMIT)
         assert done.returncode == 0, done
         assert newcomer.run(f"{newcomer.directory}/{talk} --version").stdout.startswith("talk ")
@@ -169,10 +169,10 @@ def test_ci_runs_the_second_command() -> None:
     assert steps[-2:] == ['eval "$test_command"', '"$bin/pytest" -n 4 -m slow']
 
 
-@runs("Neural voices")
+@runs("Choose a voice: Neural voices")
 def test_two_commands_speak_by_a_neural_voice(tmp_path: pathlib.Path) -> None:
     needs_packages(*NEURAL_PACKAGES, REAL_PACKAGE)
-    install, serve = commands("Neural voices")
+    install, serve = commands("Choose a voice: Neural voices")
     assert install.split()[-1].replace("-", "_") == REAL_PACKAGE
     with short_directory() as place:
         env = clean_environment(place, {"TALK_SOCKET": f"{place}/s", "TALK_PLAYER": f"file:{place}/said.wav"})

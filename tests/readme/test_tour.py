@@ -1,4 +1,4 @@
-"""The examples of "A tour" and of the first page, as they stand there."""
+"""The README's examples of saying, waiting, stopping and asking, as they stand there."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ def without_servers(name: str, talk: Talk) -> str:
     return "\n".join(each for each in commands(name) if each not in servers)
 
 
-@runs("talk", "A tour: Speak", "A tour: Wait", "A tour: Preempt", "A tour: Sound")
+@runs("talk", "Say something", "Wait for the result", "Say something: Interrupt", "Choose a voice")
 def test_speak_wait_preempt_and_sound(speaking: Talk, shell: Shell) -> None:
     shell.program("dmesg", "printf 'first\\nusb 1-1: new device\\n'")
     for each in ("move_arm", "close_door"):
         shell.stand_in(each)
-    for name in ("talk", "A tour: Speak", "A tour: Wait", "A tour: Preempt", "A tour: Sound"):
+    for name in ("talk", "Say something", "Wait for the result", "Say something: Interrupt", "Choose a voice"):
         done = shell.run(without_servers(name, speaking), text="-5 degrees")
         assert (done.returncode, done.stderr) == (0, ""), name
     assert (len(shell.calls("move_arm")), len(shell.calls("close_door"))) == (1, 1)
@@ -38,19 +38,21 @@ def test_speak_wait_preempt_and_sound(speaking: Talk, shell: Shell) -> None:
     assert texts[:5] == ["battery low", "stop", "moving to the charger", "-5 degrees", "usb 1-1: new device"]
     assert texts[5:7] == ["please step back", "the door is closing"]
     speaking.watcher.wait_until(lambda _: "emergency stop" in speaking.watcher.texts("SUCCEEDED"))
+    (door,) = [each for each in map(speaking.goal, speaking.watcher.goals()) if each["text"].endswith("at the door")]
+    assert door["priority"] == 10
     settings = speaking.request("set")["settings"]
     assert (settings["rate"], settings["voice"], "German" in done.stdout) == (140, "german", True)
 
 
-@runs("A tour: Priority and time", "A tour: Cancel and pause")
+@runs("Say something: Keep it true", "Stop")
 def test_options_of_a_goal_and_cancelling(speaking: Talk, shell: Shell) -> None:
-    *cancels, pause, resume = commands("A tour: Cancel and pause")
+    *cancels, pause, resume = commands("Stop")
     assert shell.run(pause).returncode == 0
     assert speaking.request("status")["server"]["paused"]
-    done = shell.run("\n".join(commands("A tour: Priority and time")))
+    done = shell.run("\n".join(commands("Say something: Keep it true")))
     assert done.returncode == 0
-    first, second, third, _, fifth = map(speaking.goal, done.stdout.split())
-    assert (first["priority"], second["ttl"], third["key"], fifth["id"]) == (10, 5, "eta", "docking-17")
+    first, second, _, fourth = map(speaking.goal, done.stdout.split())
+    assert (first["ttl"], second["key"], fourth["id"]) == (5, "eta", "docking-17")
     speaking.request("cancel")
     while speaking.request("say", text="before")["goal"]["id"].rpartition("-")[2] != "11":
         pass
@@ -67,11 +69,11 @@ def test_options_of_a_goal_and_cancelling(speaking: Talk, shell: Shell) -> None:
     assert not speaking.request("status")["server"]["paused"]
 
 
-@runs("A tour: Look", "A tour: Feedback")
+@runs("Ask what it says", "Wait for the result: Follow the words")
 def test_look_and_feedback(scripted: Talk, scripted_shell: Shell) -> None:
     for number in range(1, 13):
         scripted.watcher.wait_for_terminal(scripted.request("say", text=f"length=0 number {number}")["goal"]["id"])
-    for line in commands("A tour: Look"):
+    for line in commands("Ask what it says"):
         if line == "talk watch":
             scripted_shell.start(f"{line} > watched")
             wait_for_watcher(scripted)
@@ -84,16 +86,16 @@ def test_look_and_feedback(scripted: Talk, scripted_shell: Shell) -> None:
             else:
                 assert (done.returncode, "number 12" in done.stdout) == (0, True), done
     scripted_shell.stand_in("lips", where=scripted_shell.directory)
-    done = scripted_shell.run("\n".join(commands("A tour: Feedback")), text="follow me")
+    done = scripted_shell.run("\n".join(commands("Wait for the result: Follow the words")), text="follow me")
     assert (done.returncode, done.stderr) == (0, "")
     assert [each for (each,) in scripted_shell.calls("lips")] == ["follow", "me"]
 
 
-@runs("A tour: Files")
+@runs("Say something: Write a WAV file")
 def test_files(shell: Shell) -> None:
     needs("aplay")
     (shell.directory / ".asoundrc").write_text("pcm.!default { type null }\n", encoding="utf-8")
-    done = shell.run("set -e\n" + "\n".join(commands("A tour: Files")))
+    done = shell.run("set -e\n" + "\n".join(commands("Say something: Write a WAV file")))
     assert (done.returncode, "22050" in done.stderr) == (0, True)  # aplay names the rate that it plays
     with wave.open(str(shell.directory / "welcome.wav")) as file:
         assert file.getnframes() > file.getframerate() / 4

@@ -46,13 +46,15 @@ class Document:
 README = Document("README.md")
 COMMAND_LINE = Document("talkcli/cli/README.md")
 WIRE = Document("talkcli/protocol/README.md")
+DOCTOR = Document("talkcli/doctor/README.md")
+SERVICES = Document("talkcli/daemon/README.md")
 FLEET = Document("talkcli/fleet/README.md")
 HOUSE = Document("talkcli/README.md")
 SPEED = Document("tests/tools/bench/README.md")
 CONTRIBUTING = Document(".github/CONTRIBUTING.md")
 #: All of them.
 DOCUMENTS = (
-    *(README, COMMAND_LINE, WIRE, FLEET, HOUSE, SPEED, CONTRIBUTING),
+    *(README, COMMAND_LINE, DOCTOR, SERVICES, WIRE, FLEET, HOUSE, SPEED, CONTRIBUTING),
     *(Document(each) for each in ("tests/faults/README.md", "tests/fleet/README.md", "tests/fresh/README.md")),
 )
 

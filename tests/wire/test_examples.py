@@ -117,13 +117,13 @@ def test_client_in_plain_python(scripted: Talk) -> None:
 
 
 def test_first_example_of_the_library(scripted: Talk) -> None:
-    done = run(scripted, sys.executable, "-c", only(README, "python", "A tour", "battery low"))
+    done = run(scripted, sys.executable, "-c", only(README, "python", "Use it from Python", "battery low"))
     assert done.returncode == 0, done
     assert [each.split(": ")[1] for each in done.stdout.splitlines()] == ["follow", "me", "to", "the", "charger"]
 
 
 def test_loop_of_a_robot(scripted: Talk) -> None:
-    example = only(README, "python", "A tour", "robot.drives")
+    example = only(README, "python", "Use it from Python", "robot.drives")
     done = run(scripted, sys.executable, "-c", ROBOT.format(example=example))
     assert (done.returncode, done.stdout, done.stderr) == (0, "please let me pass\n", "")
 
@@ -140,7 +140,7 @@ def test_loop_of_a_robot_whose_goal_is_cut_short(
     scripted: Talk, on_word: str, lights: str, shown: str, state: str | None
 ) -> None:
     """The loop cancels a goal that has become needless, and flashes the lights if the goal is lost."""
-    example = only(README, "python", "A tour", "robot.drives").replace("please let me pass", "never-ends")
+    example = only(README, "python", "Use it from Python", "robot.drives").replace("please let me pass", "never-ends")
     robot = ROBOT.replace("self.lips.append(word)", on_word.format(pid=scripted.pid))
     robot = robot.replace('raise SystemExit("nobody heard it")', lights)
     scripted.unfinished = state is None
