@@ -70,17 +70,17 @@ def test_limits_are_those_of_the_code() -> None:
     assert limits["a request"].startswith(f"{MAX_LINE_BYTES:,} bytes")
     assert f"within {connection.FIRST_REQUEST_S:g} s" in limits["the first request"]
     assert f"within {connection.LINE_LIMIT_S:g} s" in limits["a line"]
-    assert limits["lines that are no requests"].startswith(f"{connection.MAX_BAD_LINES} ")
+    assert limits["invalid lines"].startswith(f"{connection.MAX_BAD_LINES} ")
     read = limits["a client that doesn't read"]
     assert f"{connection.CONGESTION_BYTES // 1024} KiB" in read
     assert f"{connection.MAX_CLIENT_OUTPUT_BYTES // 2**20} MiB" in read
     assert f"past {stream.MAX_TOTAL_OUTPUT_BYTES // 2**20} MiB for all" in limits["clients that don't read"]
     assert limits["clients"].startswith(f"{MAX_CLIENTS} ")
     assert limits["queue"].startswith(f"{USUAL_QUEUE_GOALS} ")
-    assert limits["requests that wait"].startswith(
+    assert limits["waiting requests"].startswith(
         f"{MAX_CLIENT_REQUESTS:,} of one connection, and {MAX_KEPT_REQUEST_BYTES >> 20} MiB for all"
     )
-    assert f"and {REQUEST_BYTES >> 10} KiB)" in limits["requests that wait"]
+    assert f"and {REQUEST_BYTES >> 10} KiB each)" in limits["waiting requests"]
 
 
 def test_limits_of_a_fleet_are_those_of_the_code() -> None:
@@ -95,7 +95,8 @@ def test_limits_of_a_fleet_are_those_of_the_code() -> None:
     assert f"past {policy.MAX_CORRELATION_BYTES} bytes the request" in FLEET.section("Requests and replies")
     assert f"at most {(link.MAX_PACKET_BYTES - link.MAX_HEADER_BYTES) // 1024} KiB" in limits["a reply's payload"]
     assert limits["pending goals of all remote clients"] == str(policy.MAX_REMOTE_GOALS)
-    assert limits["remote clients"].startswith(f"{session.MAX_SESSIONS}, and {session.MAX_WAITING_REQUESTS} requests of each")
+    clients = f"{session.MAX_SESSIONS}, and {session.MAX_WAITING_REQUESTS} requests of each"
+    assert limits["remote clients"].startswith(clients)
     assert limits["waiting requests"].startswith(f"{session.MAX_WAITING_BYTES >> 20} MiB for all remote clients")
     assert limits["a silent remote client"] == f"{session.CLIENT_SILENCE_LIMIT_S:g} s"
     assert limits["remembered ids"] == f"{policy.MAX_REMEMBERED_IDS:,}"
