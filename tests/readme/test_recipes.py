@@ -92,11 +92,11 @@ def test_watchdog(scripted: Talk, scripted_shell: Shell) -> None:
     assert said(scripted) == [f"I have stopped: {each}" for each in ends]
 
 
-@runs("Recipes: cron")
+@runs("More recipes: cron")
 def test_cron(speaking: Talk, shell: Shell) -> None:
     """Like cron: its own PATH, hardly any variables, and a percent sign is a newline unless it is escaped."""
     shell.stand_in("logger")
-    path, *jobs = block("Recipes: cron").splitlines()
+    path, *jobs = block("More recipes: cron").splitlines()
     assert path.startswith("PATH=/usr/local/bin:")
     kept = {name: value for name, value in shell.env.items() if not name.startswith(("PULSE", "PIPEWIRE", "LANG"))}
     for job in jobs:
