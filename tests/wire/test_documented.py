@@ -19,7 +19,7 @@ from talkcli.protocol.lines import MAX_LINE_BYTES
 from talkcli.protocol.requests import REQUEST_TYPES
 from talkcli.server import connection, stream
 from talkcli.server.requests import MAX_CLIENT_REQUESTS, MAX_KEPT_REQUEST_BYTES, RECENT_GOALS, REQUEST_BYTES
-from talkcli.server.run import MAX_CLIENTS, USUAL_QUEUE_GOALS
+from talkcli.server.run import ServerSettings
 from tests.support.documents import FLEET, README, ROOT, WIRE, first_column, tables, words
 from tests.support.surroundings import needs_packages
 
@@ -72,11 +72,11 @@ def test_limits_are_those_of_the_code() -> None:
     assert f"within {connection.LINE_LIMIT_S:g} s" in limits["a line"]
     assert limits["invalid lines"].startswith(f"{connection.MAX_BAD_LINES} ")
     read = limits["a client that doesn't read"]
-    assert f"{connection.CONGESTION_BYTES // 1024} KiB" in read
+    assert f"{stream.CONGESTION_BYTES // 1024} KiB" in read
     assert f"{connection.MAX_CLIENT_OUTPUT_BYTES // 2**20} MiB" in read
     assert f"past {stream.MAX_TOTAL_OUTPUT_BYTES // 2**20} MiB for all" in limits["clients that don't read"]
-    assert limits["clients"].startswith(f"{MAX_CLIENTS} ")
-    assert limits["queue"].startswith(f"{USUAL_QUEUE_GOALS} ")
+    assert limits["clients"].startswith(f"{ServerSettings().max_clients} ")
+    assert limits["queue"].startswith(f"{ServerSettings().max_queue} ")
     assert limits["waiting requests"].startswith(
         f"{MAX_CLIENT_REQUESTS:,} of one connection, and {MAX_KEPT_REQUEST_BYTES >> 20} MiB for all"
     )
@@ -96,8 +96,9 @@ def test_limits_of_a_fleet_are_those_of_the_code() -> None:
     assert f"with more than {policy.MAX_CORRELATION_BYTES} bytes of correlation data" in requests
     assert f"at most {(link.MAX_PACKET_BYTES - link.MAX_HEADER_BYTES) // 1024} KiB" in limits["a reply's payload"]
     assert limits["pending goals of all remote clients"] == str(policy.MAX_REMOTE_GOALS)
-    clients = f"{session.MAX_SESSIONS}, and {session.MAX_WAITING_REQUESTS} requests of each"
-    assert limits["remote clients"].startswith(clients)
+    assert limits["remote clients"].startswith(
+        f"{session.MAX_SESSIONS}, and {session.MAX_WAITING_REQUESTS} requests of each"
+    )
     assert limits["waiting requests"].startswith(f"{session.MAX_WAITING_BYTES >> 20} MiB for all remote clients")
     assert limits["a silent remote client"] == f"{session.CLIENT_SILENCE_LIMIT_S:g} s"
     assert limits["remembered ids"] == f"{policy.MAX_REMEMBERED_IDS:,}"
