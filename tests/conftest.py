@@ -6,7 +6,6 @@ import contextlib
 import gc
 import os
 import signal
-import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -53,8 +52,7 @@ def pytest_configure() -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
-    """Import the tests without looking for garbage, keep them compiled, and never look for garbage among them."""
-    sys.dont_write_bytecode = False
+    """Import the tests without looking for garbage, and never look for garbage among them."""
     gc.disable()
     result = yield
     gc.freeze()
