@@ -198,6 +198,21 @@ async def test_server_ends_only_after_every_waiting_goal_was_answered() -> None:
 
 
 @in_loop
+async def test_server_ends_although_a_request_came_while_it_told_clients_about_the_end() -> None:
+    count = 3 * subscribers._MAX_PER_TURN
+    server, late = Server(count), Client()
+    server.speech.scheduler.pause()
+    server.fill(count)
+    server.requests.shut_down()
+    server.ask(late, Wait())
+    assert late.told == []
+    assert not server.speech.finished.is_set()
+    await all_told(server.speech.notifications)
+    assert late.told == [{"ok": True, "count": 0}]
+    assert server.speech.finished.is_set()
+
+
+@in_loop
 async def test_bug_in_a_request_that_waited_harms_no_other_request(monkeypatch: pytest.MonkeyPatch) -> None:
     server, client = Server(), Client()
     server.fill()

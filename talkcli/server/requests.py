@@ -90,7 +90,7 @@ class Requests:
         notifications = self._cancel_waiting(self._select_waiting(Cancel()), None)
         self._speech.shut_down()
         resume_all(self._speech.waiting_for_voices)
-        self._speech.notifications.add([*notifications, self._speech.check_finished])
+        self._speech.notifications.add(notifications)
 
     async def _carry_out(self, pending: PendingRequest) -> None:
         request = pending.request

@@ -101,6 +101,7 @@ class Speech:
         self.subscribers = Subscribers(lambda: (each.connection for each in self.waiting_for_room))
         self.streams = ClientStreams()
         self.notifications = Notifications(self.streams)
+        self.notifications.on_done = self._check_finished
         self._timer: asyncio.TimerHandle | None = None
         #: requests that are waiting for a goal to become silent or to end
         self._waiting_for_silence: dict[Record, WaitingList] = {}
@@ -162,7 +163,6 @@ class Speech:
         self._announce_next()
         self._set_timer()
         self.on_status_change()
-        self.check_finished()
 
     def _carry_out(self, effect: EngineOrder | VoiceLoadOrder | VoiceDropOrder | VoiceWarning) -> None:
         match effect:
@@ -218,7 +218,6 @@ class Speech:
         if state.terminal:
             _log_end(record, elapsed() - record.began_at)
             resume_all(self._waiting_for_silence.pop(record, {}))
-            self.check_finished()
 
     def _set_timer(self) -> None:
         if self._timer:
@@ -371,10 +370,9 @@ class Speech:
         self.engine_known.set()
         self.apply(self.scheduler.shutdown(self.now()))
 
-    def check_finished(self) -> None:
-        """After a shutdown, set `finished` when all goals have ended and all notifications were sent."""
-        unfinished = self.scheduler.active or self.canceled_goals or not self.notifications.done
-        if self.scheduler.closing and not unfinished:
+    def _check_finished(self) -> None:
+        """After all notifications were sent, set `finished` if the server shuts down and all goals have ended."""
+        if self.scheduler.closing and not (self.scheduler.active or self.canceled_goals):
             self.finished.set()
 
 

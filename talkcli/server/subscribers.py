@@ -156,6 +156,8 @@ class Notifications:
         self._working = False
         self._turn: asyncio.Handle | None = None
         self._read_time_s = _READ_TIME_S
+        #: called when the queue has become empty
+        self.on_done: Callable[[], None] = lambda: None
 
     @property
     def done(self) -> bool:
@@ -193,6 +195,7 @@ class Notifications:
         self._working = False
         if not self._pending:
             self._read_time_s = _READ_TIME_S
+            self.on_done()
         elif self._streams.unread_bytes > unread_before + _UNREAD_LIMIT_BYTES:
             until = self._loop.time() + self._read_time_s
             self._turn = self._loop.call_later(_READ_CHECK_S, self._await_readers, unread_before, until)
