@@ -1,4 +1,8 @@
-"""A full server admits waiting clients when others leave, and refuses them only if no place becomes free."""
+"""Clients come and go.
+
+A full server admits waiting clients when others leave, and refuses them only if no place becomes free. A server that
+ends answers what clients have sent.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,7 @@ import json
 import socket
 from typing import TYPE_CHECKING, Any, cast
 
-from talkcli.server.connection import ClientConnection
+from talkcli.server.connection import LINES_PER_TURN, ClientConnection
 from talkcli.server.run import Server, ServerSettings
 from tests.support.loop import in_loop
 
@@ -16,6 +20,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 HELLO = b'{"request": "hello"}\n'
+SAY = b'{"request": "say", "text": "hello"}\n'
+STATUS = b'{"request": "status"}\n'
 URGENT = b'{"request": "hello", "urgent": true}\n'
 
 
@@ -44,7 +50,7 @@ class Unused:
 
 
 def _word(line: dict[str, Any]) -> str:
-    return "greeting" if "boot" in line else str(line.get("error") or line["ok"])
+    return "greeting" if "boot" in line else str(line.get("error") or line.get("ok", "goal"))
 
 
 @contextlib.contextmanager
@@ -104,3 +110,16 @@ async def test_silent_client_waits_and_urgent_client_is_let_in() -> None:
         await turns()
         assert late.heard() == []
     await turns()
+
+
+@in_loop
+async def test_server_that_ends_answers_what_clients_have_sent_with_whole_lists() -> None:
+    served, count = Server(ServerSettings(), cast("Any", Unused())), 3 * LINES_PER_TURN
+    client, idle = Client(SAY * count + STATUS), Client()
+    for each in (client, idle):
+        ClientConnection(served, served.speech.streams, each.theirs).begin()
+    await served._close_connections()
+    assert client.heard() == ["greeting", *["True"] * count, *["goal"] * count, "True"]
+    for each in (client, idle):
+        assert each.theirs.fileno() == -1
+        each.socket.close()

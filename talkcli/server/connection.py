@@ -203,7 +203,7 @@ class ClientConnection(asyncio.Protocol):
         self._outbox: deque[Iterator[JsonObject] | bytes] = deque()
         #: latest feedback, held back because the client reads too slowly
         self._held_feedback = b""
-        self._half_closed = self._turn_is_due = False
+        self._half_closed = self._finishing = self._turn_is_due = False
         self._bad_lines = 0
         self._first_limit = self._close_after(FIRST_REQUEST_S, f"no request came within {FIRST_REQUEST_S:g} s")
         self._line_limit: asyncio.TimerHandle | None = None
@@ -290,6 +290,11 @@ class ClientConnection(asyncio.Protocol):
         self._write(encode(message))
         self.stream.close()
 
+    def finish(self) -> None:
+        """Answer the lines that have arrived, send the rest of all lists, and close the connection."""
+        self._finishing = True
+        self._ask_for_turn()
+
     # -- internals
 
     def _close_after(self, seconds: float, words: str) -> asyncio.TimerHandle:
@@ -303,7 +308,7 @@ class ClientConnection(asyncio.Protocol):
         """
         if self.stream.closing:
             return
-        reading = not self.stream.congested and len(self._lines) <= READ_AHEAD_LINES
+        reading = not (self._finishing or self.stream.congested) and len(self._lines) <= READ_AHEAD_LINES
         if reading:
             self.stream.resume_reading()
         else:
@@ -342,7 +347,7 @@ class ClientConnection(asyncio.Protocol):
         else:
             self._ask_for_turn()
         idle = not (self._outbox or self._lines or self.stream.congested)
-        if self._half_closed and idle and not self._handler.is_waiting(self):
+        if idle and (self._finishing or (self._half_closed and not self._handler.is_waiting(self))):
             self.stream.close()
         self._set_reading()
 

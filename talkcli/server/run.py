@@ -290,7 +290,7 @@ class Server:
     async def _close_connections(self) -> None:
         """Close all connections, after giving clients a short time to read their last replies."""
         for connection in list(self.connections):
-            connection.stream.close()
+            connection.finish()
         with contextlib.suppress(asyncio.TimeoutError):
             await asyncio.wait_for(self._no_clients.wait(), _CLIENT_CLOSE_S)
         for connection in list(self.connections):
