@@ -26,7 +26,7 @@ from talkcli.errors import ServerUnavailable, TalkError, UsageError
 from talkcli.fleet import topics
 from talkcli.fleet.broker import CA, URL, USER, client_user, from_environment, is_local
 from talkcli.fleet.desk.robot import connect_robot
-from talkcli.fleet.link import LOGIN_LIMIT_S, REASON_NOT_AUTHORIZED, Link
+from talkcli.fleet.link import LOGIN_LIMIT_S, MAX_RECEIVE_COUNT, REASON_NOT_AUTHORIZED, Link
 from talkcli.fleet.payloads import Message, Presence
 from talkcli.frozen import replace
 from talkcli.polling import wait_ready
@@ -154,7 +154,8 @@ class BrokerExamination:
 
     def _log_in(self, broker: Broker) -> Link:
         """Connect to the broker and log in. Raises the same errors as `Link.open`."""
-        link = Link(broker, f"talk-doctor-{os.urandom(8).hex()}", self._inbox.append)
+        name = f"talk-doctor-{os.urandom(8).hex()}"
+        link = Link(broker, name, self._inbox.append, receive_maximum=MAX_RECEIVE_COUNT)
         try:
             self._wait_for(link.open)
         except TimeoutError as error:

@@ -53,10 +53,9 @@ MAX_HEADER_BYTES = 1024
 #: Maximum number of unacknowledged QoS 1 messages. paho queues further messages. A broker announces its own limit, but
 #: paho ignores that. HiveMQ Cloud accepts 10 messages, and other brokers accept more.
 _MAX_UNACKNOWLEDGED_MESSAGES = 10
-#: Maximum number of received QoS 1 messages that aren't acknowledged yet. This is the highest value that MQTT allows.
-#: Clients that receive messages from all robots need it. By default, mosquitto queues only 1,000 messages for a client,
-#: and silently drops the rest, even retained messages.
-_MAX_RECEIVED_MESSAGES = 65_535
+#: The highest receive maximum that MQTT allows. A client that receives messages from all robots needs it. By default,
+#: mosquitto queues only 1,000 messages for a client, and silently drops the rest, even retained messages.
+MAX_RECEIVE_COUNT = 65_535
 # MQTT 5 reason codes. All codes from REASON_FAILURE upwards are failures.
 _REASONS_DENIED = (0x86, 0x87, 0x8A, 0x8C)
 _REASON_UNSUPPORTED_PROTOCOL = 0x84
@@ -83,6 +82,7 @@ class Link:
         on_message: Callable[[Message], None],
         will: Message | None = None,
         max_packet_bytes: int = MAX_PACKET_BYTES,
+        receive_maximum: int | None = None,
     ) -> None:
         """Create a link that isn't connected yet.
 
@@ -92,13 +92,15 @@ class Link:
             on_message: called with each received message.
             will: retained message that the broker publishes if the connection breaks.
             max_packet_bytes: largest packet that the broker may send.
+            receive_maximum: how many unacknowledged QoS 1 messages the broker may send. None for the broker's default,
+                with which a flood can't stop mosquitto from delivering later messages.
 
         Raises:
             UsageError: a certificate or key file is unusable.
         """
         self._broker = broker
         self._deliver = on_message
-        self._max_packet_bytes = max_packet_bytes
+        self._max_packet_bytes, self._receive_maximum = max_packet_bytes, receive_maximum
         #: why the connection has ended; None if it hasn't
         self.ended: str | None = None
         #: total size of the unsent and unacknowledged messages
@@ -145,7 +147,8 @@ class Link:
         properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
         properties.SessionExpiryInterval = 0
         properties.MaximumPacketSize = self._max_packet_bytes
-        properties.ReceiveMaximum = _MAX_RECEIVED_MESSAGES
+        if self._receive_maximum is not None:
+            properties.ReceiveMaximum = self._receive_maximum
         self._paho.connect_timeout = LOGIN_LIMIT_S
         try:
             self._paho.connect(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import select
+import time
 from typing import TYPE_CHECKING
 
 import pytest
@@ -105,6 +106,20 @@ async def test_a_connection_that_breaks_under_an_answer_is_made_again(
     bridge.end()
     await work
     assert not bugs
+
+
+def test_a_cancel_arrives_after_a_flood(robot: Robot) -> None:
+    """With a higher receive maximum, mosquitto 2.0.11 would deliver nothing more on this connection."""
+    with RemoteClient(robot.broker, "olga") as olga:
+        robot.bridge.stop_process()
+        for _ in range(1500):
+            olga.send("flood " * 3333, kind="say", response=None)
+        robot.bridge.go_on()
+        end = time.monotonic() + PATIENCE
+        while not olga.lines:  # the broker drops messages until its queue has room again
+            assert time.monotonic() < end, "no cancel is answered"
+            olga.post("cancel")
+            olga.listener.find(lambda _: bool(olga.lines), 0.1)
 
 
 def test_a_goal_that_comes_several_times_is_spoken_once(robot: Robot) -> None:

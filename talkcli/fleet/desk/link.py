@@ -18,7 +18,15 @@ from typing import TYPE_CHECKING, Protocol
 from talkcli.errors import AccessDenied, RequestRefused, ServerUnavailable, TalkError
 from talkcli.fleet import topics
 from talkcli.fleet.broker import Broker, client_user
-from talkcli.fleet.link import KEEPALIVE_S, REASON_FAILURE, REASON_NOT_AUTHORIZED, TICK_EVERY_S, Link, LinkOpener
+from talkcli.fleet.link import (
+    KEEPALIVE_S,
+    MAX_RECEIVE_COUNT,
+    REASON_FAILURE,
+    REASON_NOT_AUTHORIZED,
+    TICK_EVERY_S,
+    Link,
+    LinkOpener,
+)
 from talkcli.fleet.payloads import Message
 from talkcli.goals.options import Say
 from talkcli.polling import wait_ready
@@ -258,7 +266,12 @@ class DeskLink:
             return 0.0
         if self._opening is None and now >= self._next_attempt_at:
             name = f"talk-desk-{self.user}-{self.session}"
-            new = Link(self.broker, name, lambda message: self._calls.append(partial(self._receive, message)))
+            new = Link(
+                self.broker,
+                name,
+                lambda message: self._calls.append(partial(self._receive, message)),
+                receive_maximum=MAX_RECEIVE_COUNT,
+            )
             self._opening = LinkOpener(new, self.wake)
         return TICK_EVERY_S if self._opening else max(0.0, self._next_attempt_at - now)
 
