@@ -136,7 +136,7 @@ class BrokerExamination:
         began = time.monotonic()
         try:
             connection = self._wait_for(partial(socket.create_connection, (broker.host, broker.port), LOGIN_LIMIT_S))
-        except OSError as error:
+        except (OSError, UnicodeError) as error:  # UnicodeError means that the host name is invalid
             yield judge_unreachable(broker, _describe_error(error))
             return
         yield ok("broker", f"{broker.url} takes connections, in {(time.monotonic() - began) * 1000:.0f} ms")
@@ -259,14 +259,14 @@ def _read_expiry(connection: socket.socket, context: ssl.SSLContext, host: str) 
         return ssl.cert_time_to_seconds(str((secured.getpeercert() or {})["notAfter"]))
 
 
-def _describe_error(error: OSError) -> str:
+def _describe_error(error: OSError | UnicodeError) -> str:
     if isinstance(error, ssl.SSLCertVerificationError):
         return error.verify_message
     if isinstance(error, ssl.SSLError):
         return error.reason or str(error)
     if isinstance(error, ConnectionRefusedError):
         return "connection refused"
-    if isinstance(error, socket.gaierror):
+    if isinstance(error, socket.gaierror | UnicodeError):
         return "no such host"
     return _NO_ANSWER if isinstance(error, TimeoutError) else error.strerror or str(error)
 

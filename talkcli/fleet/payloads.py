@@ -72,7 +72,9 @@ class Presence:
 
     def to_json(self) -> JsonObject:
         """Return the presence as a JSON object, without the robot's name."""
-        return {name: value for name, value in fields(self).items() if name != "name"}
+        said = {**fields(self), "groups": list(self.groups), "allow": list(self.allow)}
+        del said["name"]
+        return said
 
 
 def bridge_rank(presence: Presence | None) -> tuple[float, str] | None:

@@ -190,6 +190,7 @@ def test_topics_that_a_robot_may_not_write_or_read_are_named() -> None:
         ({"TALK_BROKER": "mqtts://x", "TALK_MQTT_CA": "/no/ca"}, "TALK_MQTT_CA: /no/ca: No such file", "mend it"),
         ({"TALK_MQTT_USER": "a/b"}, "the name 'a/b' can't be in a topic", "mend it where it is set"),
         ({"TALK_BROKER": "mqtt://no-such.invalid"}, ":1883: no such host", "spell the host in TALK_BROKER rightly"),
+        ({"TALK_BROKER": "mqtt://no..such"}, ":1883: no such host", "spell the host in TALK_BROKER rightly"),
     ],
 )
 def test_variables_that_name_no_broker_are_told(changed: dict[str, str], words: str, step: str) -> None:
