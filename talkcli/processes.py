@@ -5,10 +5,10 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
+import select
 import signal
 
 from talkcli.frozen import TYPE_CHECKING
-from talkcli.polling import wait_ready
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -37,7 +37,10 @@ def close(*descriptors: int) -> None:
 
 def is_held(pipe: int, seconds: float = 0.0) -> bool:
     """Wait up to `seconds` for the other end of the pipe to close, and return whether it is still open."""
-    return not wait_ready({pipe: 0}, seconds)  # a closed end is always reported
+    # Don't use `wait_ready` here. A player may be killed while the interpreter exits, when modules can't be imported.
+    poll = select.poll()
+    poll.register(pipe, 0)  # Linux always reports a closed end
+    return not poll.poll(seconds * 1000)
 
 
 def kill_holders(pipe: int) -> bool:

@@ -6,6 +6,7 @@ import os
 import re
 import select
 import signal
+import subprocess
 import sys
 import time
 from typing import TYPE_CHECKING
@@ -315,6 +316,21 @@ def test_a_failed_start_leaves_nothing_open(tmp_path: Path, monkeypatch: pytest.
     with pytest.raises(PermissionError):
         PlayerProcess((str(plain),))
     assert os.listdir("/proc/self/fd") == before
+
+
+def test_a_child_that_is_killed_while_the_interpreter_exits_causes_no_error() -> None:
+    """pyttsx3 stops its driver at that time. An error would hide the one that has ended the process."""
+    script = """
+import sys
+from talkcli.engine.child.players.program import ProgramPlayer
+from talkcli.engine.players import PlayerCommand
+class Driver:
+    player = ProgramPlayer(PlayerCommand("sleep", ("sleep", "100")))
+    def __del__(self):
+        self.player.kill()
+sys.modules["driver"] = Driver()
+"""
+    assert subprocess.run([sys.executable, "-c", script], capture_output=True, check=True).stderr == b""
 
 
 def test_a_child_has_three_streams_the_inherited_descriptors_and_its_leash() -> None:

@@ -23,7 +23,7 @@ from talkcli.engine import protocol
 from talkcli.engine.protocol import HANG_LIMIT_S, KILL_LIMIT_S, START_LIMIT_S
 from talkcli.goals.reasons import Reason
 from talkcli.polling import wait_ready
-from talkcli.processes import close, is_held, kill, kill_holders, open_pipes, processes, signal_name
+from talkcli.processes import close, kill, kill_holders, open_pipes, processes, signal_name
 from talkcli.protocol.lines import LineSplitter
 
 if TYPE_CHECKING:
@@ -163,7 +163,7 @@ class EngineProcess:
 
     def describe_exit(self) -> str:
         """Return a human-readable description of how the process exited. Kill it if it is still running."""
-        is_held(self.liveness, _EXIT_WAIT_S)
+        wait_ready({self.liveness: select.POLLIN}, _EXIT_WAIT_S)  # macOS doesn't report a closed end without POLLIN
         self.kill()  # must happen before the process is reaped, because its group ID may be reused afterwards
         try:
             status = self._process.wait(_EXIT_WAIT_S)
