@@ -62,7 +62,7 @@ def test_say_and_wait(scripted: Talk, client: Client) -> None:
     assert client.goal(handle.id) == goal
     assert (client.path, client.server_pid) == (scripted.socket, scripted.pid)
     aborted = client.say("fail=audio_lost message=no_cable").wait()
-    assert (aborted.state, aborted.reason, aborted.message) == (State.ABORTED, "audio_lost", "Talk aborted: no cable")
+    assert (aborted.state, aborted.reason, aborted.message) == (State.ABORTED, "audio_lost", "speech failed: no cable")
     assert aborted.client == goal.client
 
 

@@ -126,7 +126,7 @@ def test_json_shapes(scripted: Talk) -> None:
 def test_standard_output_carries_data_only(scripted: Talk) -> None:
     failed = scripted.run("say", "--wait", "fail=audio_lost message=no_cable")
     assert re.fullmatch(r"\w{4}-\d+\n", failed.out)
-    assert failed.err == f"talk: {failed.id}: Talk aborted: no cable; see 'talk doctor'\n"
+    assert failed.err == f"talk: {failed.id}: speech failed: no cable; see 'talk doctor'\n"
     quiet = scripted.run("-q", "say", "--wait", "fail=audio_lost")
     assert (quiet.code, quiet.out, quiet.err) == (4, "", "")
     assert scripted.run("say", "-q", "length=0").out == ""

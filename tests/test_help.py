@@ -171,7 +171,7 @@ def test_a_missing_sound_device_is_told_at_the_start_and_found_when_it_comes(mak
         assert "--player file:PATH.wav" in first
         done = talk.run("say", "--wait", "hello")
         assert done.code == 4
-        assert re.fullmatch(r"talk: \S+: Talk aborted: aplay: .*; see 'talk doctor'\n", done.err)
+        assert re.fullmatch(r"talk: \S+: speech failed: aplay: .*; see 'talk doctor'\n", done.err)
     shutil.copy(f"{sink.directory}/.asoundrc", talk.directory)  # as a loudspeaker that is plugged in
     assert talk.run("say", "--wait", "hello").code == 0
 

@@ -224,7 +224,7 @@ def test_espeak_speaks_instead_of_a_broken_voice_until_it_is_mended(env: dict[st
         assert f"voice {BROKEN} cannot be loaded, espeak speaks where it may: {why}" in robot.server.log
         done = run([*TALK, "--json", "say", "--wait", "--voice-only", "hello"], env)
         goal = json.loads(done.out)
-        assert (done.code, goal["reason"], goal["message"]) == (4, "voice_failed", f"Talk aborted: {why}")
+        assert (done.code, goal["reason"], goal["message"]) == (4, "voice_failed", f"speech failed: {why}")
         assert robot.heard(robot.say()) == ("SUCCEEDED", TINY)
         tiny_voice.put(tmp_path / "voices", "broken")
         assert run([*TALK, "set", "--voice", BROKEN], env).code == 0
@@ -296,7 +296,7 @@ def test_a_voice_that_kills_the_engine_twice_is_left_alone(env: dict[str, str], 
         robot.until(lambda: robot.neural()["state"] == "failed")
         assert robot.neural()["why"] == why
         ended = robot.say("hello", None, voice_only=True).wait(LIMIT)
-        assert (ended.reason, ended.message) == ("voice_failed", f"Talk aborted: {why}")
+        assert (ended.reason, ended.message) == ("voice_failed", f"speech failed: {why}")
         assert f"voice piper/tiny is left alone: {why}" in robot.server.log
         assert robot.server.log.count("the engine crashed") == 2
         assert robot.heard(robot.say("hello", None)) == ("SUCCEEDED", INSTEAD)
@@ -349,7 +349,7 @@ def test_gaps_on_a_slow_machine_are_told(env: dict[str, str], tmp_path: Path) ->
     goal = json.loads(done.out)
     assert (goal["state"], goal["voice"]) == ("SUCCEEDED", "piper/tiny")
     assert re.fullmatch(
-        r"Talk completed successfully, but with \d gaps? of \d\.\d s in all: this machine is too slow for the voice",
+        r"Talk completed successfully, but with \d gaps? \(\d\.\d s in total\): this machine is too slow for the voice",
         goal["message"],
     )
 

@@ -115,7 +115,7 @@ def test_a_goal_is_waited_for_though_its_output_was_closed_from_the_start(script
             scripted.watcher.wait_for_terminal(goal)
         assert scripted.goal(goal)["state"] == "SUCCEEDED"  # so it had ended when the command did
     code, err = unread(scripted, *words.split(), "fail=audio_lost")
-    assert (code, "Talk aborted" in err) == ((0, False) if words == "say" else (4, words != "say -wq"))
+    assert (code, "speech failed" in err) == ((0, False) if words == "say" else (4, words != "say -wq"))
 
 
 def test_a_wait_waits_though_its_output_was_closed_from_the_start(scripted: Talk) -> None:
@@ -134,7 +134,9 @@ def test_a_goal_is_waited_for_though_the_disk_is_full(scripted: Talk, words: str
         goal = scripted.watcher.goals()[-1]
         assert scripted.goal(goal)["state"] == state  # so it was waited for
         notes = [] if words == "wait" else [FULL]
-        notes += [f"talk: {goal}: Talk aborted: scripted audio_lost; see 'talk doctor'\n"] if state == "ABORTED" else []
+        notes += (
+            [f"talk: {goal}: speech failed: scripted audio_lost; see 'talk doctor'\n"] if state == "ABORTED" else []
+        )
         assert sorted(err.splitlines(True)) == sorted(notes)
         assert ended == (0 if words == "wait" and code == 1 else code)  # `wait` shows nothing
 

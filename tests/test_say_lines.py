@@ -139,7 +139,7 @@ def test_wait_tells_how_each_ended_and_the_first_failure(scripted: Talk) -> None
     done = scripted.run("say", "--lines", "--wait", stdin=text)
     assert done.code == 4
     ids = done.out.split()
-    assert f"talk: {ids[1]}: Talk aborted: no cable; see 'talk doctor'" in done.err.splitlines()
+    assert f"talk: {ids[1]}: speech failed: no cable; see 'talk doctor'" in done.err.splitlines()
     refused_first = scripted.run("say", "--lines", "--wait", stdin="\0\nfail=audio_lost\n")
     assert refused_first.code == 5
     throttled = scripted.run("say", "--lines", "-w", "--key", "k", "--throttle", "60", stdin="length=0 a\nlength=0 b\n")
@@ -294,7 +294,7 @@ def test_a_line_without_an_end_is_read_in_bounded_memory(scripted: Talk) -> None
         client.stdin.write(b"x" * 1_000_000)
     out, err = client.communicate(b"\nlength=0 next\n", timeout=60)
     assert client.returncode == 5, err
-    assert b"line 1: Talk rejected: the line has 450,000,000 bytes" in err
+    assert b"line 1: not spoken: the line has 450,000,000 bytes" in err
     assert len(out.split()) == 1
 
 

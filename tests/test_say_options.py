@@ -161,7 +161,7 @@ def test_own_id_is_printed_and_spoken_once(scripted: Talk) -> None:
     for words, out in (([], "dock-17a\n"), (["--wait", "-f"], "dock-17a ABORTED\n")):
         done = scripted.run("say", "--id", "dock-17a", *words, text)  # its end is told without waiting
         assert (done.code, done.out) == (4, out)
-        assert done.err == "talk: dock-17a: Talk aborted: no cable; see 'talk doctor'\n"
+        assert done.err == "talk: dock-17a: speech failed: no cable; see 'talk doctor'\n"
     goal = json.loads(scripted.run("--json", "say", "--id", "dock-17a", text).out)
     assert (goal["id"], goal["state"]) == ("dock-17a", "ABORTED")
     assert scripted.watcher.states("dock-17a") == ["PENDING", "ACTIVE", "ABORTED"]

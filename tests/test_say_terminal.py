@@ -152,7 +152,7 @@ def test_a_failure_leaves_the_words_that_were_heard_and_its_reason(in_terminal: 
     first, second, last = terminal.screen.lines
     assert "  ABORTED    length=0.4 " in first
     assert terminal.screen.marked(AHEAD, 0).endswith("never heard")
-    assert second.endswith("Talk aborted: no cable; see 'talk doctor'")
+    assert second.endswith("speech failed: no cable; see 'talk doctor'")
     assert last == ""
 
 

@@ -90,7 +90,7 @@ def read_text(end: float | None, *, wait: bool = False, whole: bool = False) -> 
 
 def rejected_goal(words: str) -> Goal:
     """Return a rejected goal for a text that is too long to be sent."""
-    return Goal("", State.REJECTED, reason="text_too_long", message=f"Talk rejected: {words}")
+    return Goal("", State.REJECTED, reason="text_too_long", message=f"not spoken: {words}")
 
 
 @frozen

@@ -478,5 +478,5 @@ def too_long(request: Say) -> Goal | None:
         return None
     from talkcli.goals.reasons import Reason  # rarely needed, and slow to import
 
-    message = f"Talk rejected: the text has {len(request.text):,} characters, more than a request can hold"
+    message = f"not spoken: the text is too long for a request ({len(request.text):,} characters)"
     return Goal("", State.REJECTED, request.text, reason=Reason.TEXT_TOO_LONG.value, message=message)

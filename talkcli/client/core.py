@@ -203,14 +203,14 @@ class TrackedGoal:
             self._mark_lost(error.message)
         else:
             reason = Reason.NOT_SENT.value if isinstance(error, ServerUnavailable) else error.code
-            message = f"Talk rejected: {error.message}"
+            message = f"not spoken: {error.message}"
             self._update(replace(self.goal, state=State.REJECTED, reason=reason, message=message))
 
     def _mark_lost(self, why: str) -> None:
         """End the goal as LOST. `why` is a human-readable reason."""
         from talkcli.goals.reasons import Reason  # rarely needed, and slow to import
 
-        self._update(replace(self.goal, state=State.LOST, reason=Reason.LOST.value, message=f"Talk lost: {why}"))
+        self._update(replace(self.goal, state=State.LOST, reason=Reason.LOST.value, message=f"result unknown: {why}"))
 
     def _update(self, goal: Goal) -> None:
         """Update the goal, unless it has already ended."""

@@ -15,6 +15,7 @@ from talkcli.engine import protocol
 from talkcli.engine.parent.process import EngineFailed
 from talkcli.errors import TalkError
 from talkcli.frozen import frozen, replace
+from talkcli.goals.goal import message_details
 from talkcli.goals.reasons import Reason
 from talkcli.goals.states import State
 from talkcli.polling import Interrupted
@@ -218,7 +219,7 @@ def judge_sentence(
         return ok(_SENTENCE_CHECK, f"{said} {how}{player}{seconds}")
     if result.reason in {"late", "paused"}:
         return failure(_SENTENCE_CHECK, f"not spoken: {result.message}", ADVICE[result.reason])
-    message = (result.message or "it ended without a reason").removeprefix(f"Talk {result.state.name.lower()}: ")
+    message = message_details(result.message) or "no reason was given"
     step = advise(result.reason, message, result.player, device)
     if result.beside_speech and step == _BUSY_STEP:
         return ok(_SENTENCE_CHECK, f"the device is busy with what the server speaks at this moment ({message})")

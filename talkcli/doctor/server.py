@@ -19,6 +19,7 @@ from talkcli.doctor.sound import file_owner
 from talkcli.doctor.voice import WORKING_STATES
 from talkcli.errors import TalkError
 from talkcli.frozen import TYPE_CHECKING, fields, frozen
+from talkcli.goals.goal import message_details
 from talkcli.goals.options import describe_settings
 from talkcli.goals.reasons import Reason
 from talkcli.goals.states import State
@@ -272,7 +273,7 @@ def _judge_recent(log: Sequence[Goal], now: float, server: JsonObject) -> Findin
     if not aborted:
         return ok(_RECENT_CHECK, f"none of {many} failed" if len(log) > 1 else f"{many} did not fail")
     last = aborted[-1]
-    message = (last.message or "").removeprefix("Talk aborted: ")
+    message = message_details(last.message)
     when = "" if last.ended_at is None else f", {format_span(now - last.ended_at)} ago ({clock_time(last.ended_at)})"
     which = f"{many} ABORTED, {last.id}" if len(log) == 1 else f"{len(aborted)} of {many} ABORTED, last {last.id}"
     words = f"{which}{when}: {last.reason}: {message}"

@@ -19,6 +19,11 @@ JsonObject = dict[str, object]
 
 #: Largest accepted time, about 30 million years.
 _MAX_TIME_S = 1e15
+#: Beginnings of messages that only repeat the goal's state. Those with "Talk" come from older servers.
+_STATE_WORDS = (
+    *("not spoken", "speech failed", "result unknown"),
+    *("Talk rejected", "Talk recalled", "Talk aborted", "Talk lost"),
+)
 
 
 @frozen
@@ -152,7 +157,7 @@ class Goal:
         """
         found = read_fields(cls, value)
         if not str(found.get("id", "\n")).isprintable() or "state" not in found:  # ids are printed unescaped
-            raise Unreadable("what the server sent for a goal has no id that can be one, or an unknown state")
+            raise Unreadable("the server sent a goal with an invalid id or an unknown state")
         return cls(**found)
 
 
@@ -165,6 +170,12 @@ def read_fields(cls: type, message: object) -> dict[str, Any]:
         if value is not None and (read := _READERS[annotation.partition(" ")[0]](value)) is not None:
             found[name] = read
     return found
+
+
+def message_details(message: str | None) -> str:
+    """Return a goal's message without a beginning that only repeats the state, such as "speech failed: "."""
+    head, _, details = (message or "").partition(": ")
+    return details if head in _STATE_WORDS else message or ""
 
 
 def _reader(kind: type) -> Callable[[object], object]:

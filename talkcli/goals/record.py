@@ -78,7 +78,7 @@ class Record:
             IllegalTransition: if the change isn't allowed.
         """
         if state not in TRANSITIONS[self.state]:
-            raise IllegalTransition(f"a goal that is {self.state.name} can't become {state.name}")
+            raise IllegalTransition(f"a goal can't change from {self.state.name} to {state.name}")
         self.state = state
 
     def drop_text(self) -> None:

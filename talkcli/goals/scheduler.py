@@ -205,17 +205,17 @@ class Scheduler:
         expired = expires_at <= now.monotonic
         recalled = self._find_room(say)
         if recalled is None and not (by or refused or expired):
-            refused = Reason.QUEUE_FULL, f"{len(self.pending)} goals are waiting already (`talk serve --max-queue`)"
+            refused = Reason.QUEUE_FULL, f"the queue is full ({len(self.pending)} goals)"
         if refused:
             record.reason, words = refused
-            record.state, record.message, record.ended_at = State.REJECTED, f"Talk rejected: {words}", now.wall
+            record.state, record.message, record.ended_at = State.REJECTED, f"not spoken: {words}", now.wall
             self.history.add(record)
             return record, [StateChange(record, State.REJECTED)]
         record.id = say.id or record.id
         self._by_id[record.id] = record
         effects: list[Effect] = [StateChange(record, State.PENDING)]
         if by:
-            words = "canceled before it was spoken" if canceled else "canceled before it arrived"
+            words = "it was cancelled first" if canceled else "it was cancelled before it arrived"
             return record, effects + self._end_unqueued(record, Reason.CANCELED, words, by, now)
         if expired:
             words = _expiry_message(record)
@@ -242,7 +242,7 @@ class Scheduler:
             self._early_cancels.add(goal_id, by, now.monotonic)
         for record in chosen:
             if record.state is State.PENDING:
-                result.effects += self._recall(record, Reason.CANCELED, "canceled before it was spoken", by, now)
+                result.effects += self._recall(record, Reason.CANCELED, "it was cancelled first", by, now)
                 result.recalled.append(record)
             else:
                 result.effects += self._stop(record, Reason.CANCELED, by, now)
@@ -357,7 +357,7 @@ class Scheduler:
         if record.output and record.output.muted:
             words += f", but the output was muted: {record.output.device}"
         if gaps:
-            many = f"{gaps} gap{'s' if gaps > 1 else ''} of {gap_seconds:.1f} s in all"
+            many = f"{gaps} gap{'s' if gaps > 1 else ''} ({gap_seconds:.1f} s in total)"
             words += f", but with {many}: this machine is too slow for the voice"
         # The reason for a stop doesn't apply if the goal was played to the end anyway.
         return self._end(record, State.SUCCEEDED, None, words, None, now)
@@ -372,7 +372,7 @@ class Scheduler:
         record.duration = duration
         if record.state is State.PREEMPTING and reason is not Reason.NOT_SILENT:
             return self.stopped(goal_id, now)
-        return self._end(record, State.ABORTED, reason, f"Talk aborted: {message}", record.by, now)
+        return self._end(record, State.ABORTED, reason, f"speech failed: {message}", record.by, now)
 
     def stopped(self, goal_id: str, now: Now) -> list[Effect]:
         """End the active goal, because it was stopped and the engine is silent."""
@@ -426,7 +426,7 @@ class Scheduler:
             if record.stop_requested_at is None:
                 effects = self._stop(record, Reason.EXPIRED, None, now)
             else:
-                words = f"Talk aborted: silence could not be confirmed within {CONFIRM_SILENCE_S:g} s"
+                words = f"speech failed: it was stopped, but silence was not confirmed within {CONFIRM_SILENCE_S:g} s"
                 effects = [EngineOrder(record, Order.GIVE_UP)]
                 effects += self._end(record, State.ABORTED, Reason.NOT_SILENT, words, record.by, now)
         return effects + self._expire(now) + self._start_next(now) + self._load_next(now)
@@ -470,11 +470,11 @@ class Scheduler:
             first: an earlier goal with the same id and another text, or None.
         """
         if self.closing:
-            return Reason.SHUTDOWN, "the server is being stopped"
+            return Reason.SHUTDOWN, "the server is stopping"
         if words := options.bad_option(say):
             return Reason.BAD_OPTION, words
         if first is not None:
-            return Reason.ID_CONFLICT, f"the id {say.id} is that of another text already"
+            return Reason.ID_CONFLICT, f"the id {say.id} was already used for another text"
         return options.bad_text(say.text, self.max_text) or refusal
 
     def _throttle(self, say: Say, record: Record, now: Now) -> Refusal | None:
@@ -487,16 +487,17 @@ class Scheduler:
         active = self.active
         waiting = self.pending.with_text(say.text) if say.key is None else None
         if active and (active.say.text == say.text if say.key is None else active.say.key == say.key):
-            first, words = active.id, "is being said"
+            first, words = active.id, "is being spoken"
         elif waiting:
-            first, words = waiting.id, "is waiting already"
+            first, words = waiting.id, "is already waiting"
         else:
             last = self._speech_times.find(now.monotonic - say.throttle, say.key, say.text)
             if last is None:
                 return None
-            first, words = last, f"was said less than {options.format_number(say.throttle)} s ago"
+            first, words = last, f"was spoken less than {options.format_number(say.throttle)} s ago"
         record.by = By(goal=first)
-        return Reason.THROTTLED, f"the same {words}"
+        what = "the same text" if say.key is None else "a goal with this key"
+        return Reason.THROTTLED, f"{what} {words}"
 
     def _preempts(self, say: Say) -> bool:
         return say.flush or bool(self.settings.preempt if say.preempt is None else say.preempt)
@@ -530,7 +531,7 @@ class Scheduler:
         for each, reason in recalled:
             if reason is Reason.REPLACED and each.say.priority == record.say.priority and not record.preempt:
                 replaced = each
-            effects += self._recall(each, reason, f"{reason} by {record.id}", by, now)
+            effects += self._recall(each, reason, f"it was {reason} by goal {record.id}", by, now)
         if record.preempt and self.active and self.active.say.priority <= record.say.priority:
             effects += self._stop(self.active, Reason.PREEMPTED, by, now)
         self.pending.add(record, replaced)
@@ -643,7 +644,7 @@ class Scheduler:
     def _end_unqueued(self, record: Record, reason: Reason, words: str, by: By | None, now: Now) -> list[Effect]:
         """End a pending goal that is not in the queue with the state RECALLED."""
         record.change_state(State.RECALLING)
-        return self._end(record, State.RECALLED, reason, f"Talk recalled: {words}", by, now)
+        return self._end(record, State.RECALLED, reason, f"not spoken: {words}", by, now)
 
     def _stop(self, record: Record, reason: Reason, by: By | None, now: Now) -> list[Effect]:
         """Tell the engine to stop the active goal."""
@@ -661,7 +662,7 @@ class Scheduler:
             IllegalTransition: if another goal or no goal is active.
         """
         if self.active is None or self.active.id != goal_id:
-            raise IllegalTransition(f"{goal_id} is not being spoken")
+            raise IllegalTransition(f"goal {goal_id} is not being spoken")
         return self.active
 
     def _end(
@@ -682,4 +683,4 @@ class Scheduler:
 
 
 def _expiry_message(record: Record) -> str:
-    return f"its time to live of {options.format_number(record.say.ttl)} s was over before it was spoken"
+    return f"its ttl of {options.format_number(record.say.ttl)} s was over"

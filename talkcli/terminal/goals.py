@@ -10,6 +10,7 @@ import re
 import time
 
 from talkcli.frozen import TYPE_CHECKING
+from talkcli.goals.goal import message_details
 from talkcli.goals.options import format_number
 from talkcli.goals.states import State
 from talkcli.protocol.lines import encode
@@ -76,7 +77,7 @@ _DESCRIPTOR_PATH = re.compile(r"/dev/(fd/\d+|stdin)|/proc/(self|\d+)/fd/\d+")
 def describe_end(goal: Goal) -> str:
     """Return a one-line description of how a goal ended."""
     words = printable(goal.message or goal.state.name)
-    if goal.by:
+    if goal.by and f"by goal {goal.by.goal}" not in words:  # a server may have named the goal already
         words += f" ({_describe_cause(goal.by)})"
     return f"{printable(goal.id)}: {words}" if goal.id else words
 
@@ -286,8 +287,8 @@ def _message_details(goal: Goal) -> str:
     """Return the part of a goal's message that adds to its reason, or an empty string."""
     if goal.state not in {State.ABORTED, State.REJECTED} and goal.by is not None:
         return ""
-    head, colon, words = (goal.message or "").partition(": ")
-    return printable(words) if colon and head.startswith("Talk ") else ""
+    details = message_details(goal.message)
+    return "" if details == goal.message else printable(details)
 
 
 def _describe_output(output: Output) -> str:

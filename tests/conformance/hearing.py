@@ -90,7 +90,7 @@ def assert_same(samples: Samples, reference: Samples) -> Comparison:
 def assert_aborted(goal: Message, reason: str, *words: str) -> None:
     """Assert that a goal was ABORTED for that reason, with these words in its message."""
     assert (goal["state"], goal["reason"]) == ("ABORTED", reason), goal
-    assert goal["message"].startswith("Talk aborted: "), goal
+    assert goal["message"].startswith("speech failed: "), goal
     for each in words:
         assert each in goal["message"], goal
 

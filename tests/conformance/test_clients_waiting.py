@@ -48,7 +48,7 @@ def test_row_07_server_that_is_killed_loses_the_goal(scripted: Talk) -> None:
         assert "it may still be spoken" in done.err
     goal = json.loads(done.out)
     assert (goal["id"], goal["state"], goal["status"], goal["reason"]) == (pending_id, "LOST", 9, "lost")
-    assert goal["message"].startswith("Talk lost: ")
+    assert goal["message"].startswith("result unknown: ")
 
 
 def _until_connected(wire: Wire, clients: int) -> None:

@@ -32,7 +32,7 @@ def test_row_02_engine_that_fails_in_the_middle_aborts_its_goal_alone(scripted: 
     done = scripted.run("--json", "say", "--wait", "--", text)
     goal = json.loads(done.out)
     assert (done.code, goal["state"], goal["reason"]) == (4, "ABORTED", "audio_lost")
-    assert goal["message"] == "Talk aborted: the cable is out"
+    assert goal["message"] == "speech failed: the cable is out"
     assert "the cable is out" in done.err
     assert states(scripted, goal["id"]) == ["PENDING", "ACTIVE", "ABORTED"]
     assert 0 < len(goal["spoken"]) < len(text)
@@ -109,7 +109,7 @@ def test_row_09_each_message_belongs_to_its_own_goal(scripted: Talk) -> None:
         results = {(each := wire.receive_event("result")["goal"])["id"]: each for _ in range(2)}
     assert list(results) == [good, bad]
     assert (results[good]["state"], results[good]["message"]) == ("SUCCEEDED", "Talk completed successfully")
-    assert (results[bad]["state"], results[bad]["message"]) == ("ABORTED", "Talk aborted: no such card")
+    assert (results[bad]["state"], results[bad]["message"]) == ("ABORTED", "speech failed: no such card")
     assert results[good]["text"] == "length=0.2 all is well"
 
 

@@ -70,7 +70,7 @@ def test_row_47_in_a_full_queue_the_newest_of_the_lowest_priority_gives_way(make
     assert high["state"] == "PENDING"
     assert_recalled(talk, third, "displaced", by=high["id"])
     low = talk.run("say", "--wait", "--", "length=0 not now")
-    assert (low.code, "Talk rejected: " in low.err, "--max-queue" in low.err) == (5, True, True)
+    assert (low.code, "not spoken: " in low.err, "the queue is full (3 goals)" in low.err) == (5, True, True)
     assert pending(talk) == [high["id"], first, second]
     assert talk.request("cancel", ids=[active])["ok"]
     assert states(talk, second)[-1] == "SUCCEEDED"

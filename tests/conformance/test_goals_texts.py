@@ -44,7 +44,7 @@ def assert_rejected(done: Finished, reason: str) -> None:
     """Assert what a client says whose goal was REJECTED."""
     goal = json.loads(done.out)
     assert (done.code, goal["state"], goal["reason"]) == (5, "REJECTED", reason), done
-    assert "Talk rejected: " in done.err
+    assert "not spoken: " in done.err
 
 
 def test_row_13_text_that_cannot_be_spoken_is_rejected_on_the_wire(scripted: Talk) -> None:
@@ -61,7 +61,7 @@ def test_row_13_text_that_cannot_be_spoken_is_rejected_on_the_wire(scripted: Tal
             assert reply["ok"], name
             for goal in (reply["goal"], result["goal"]):
                 assert (goal["state"], goal["reason"]) == ("REJECTED", reason), name
-                assert goal["message"].startswith("Talk rejected: "), name
+                assert goal["message"].startswith("not spoken: "), name
                 assert goal["started_at"] is None
                 assert goal["text"] == text
             assert (state["event"], state["state"]) == ("state", "REJECTED")
@@ -79,7 +79,7 @@ def test_row_13_text_that_cannot_be_spoken_is_rejected_on_the_command_line(scrip
         assert_rejected(scripted.run("--json", "say", "--preempt", text), "text_too_long")
     plain = scripted.run("say", "--preempt", "--wait", "--", "")
     assert (plain.code, plain.out) == (5, "")  # no id: there is nothing to wait for
-    assert plain.err.endswith("Talk rejected: the text is empty\n")
+    assert plain.err.endswith("not spoken: the text is empty\n")
     bystanders.assert_untouched()
 
 
@@ -90,7 +90,7 @@ def test_error_for_an_oversized_input_is_accurate(scripted: Talk) -> None:
     for text in (f"{longest}\nand more", "a" * 300_000):
         done = scripted.run("say", "-", stdin=text)
         assert (done.code, done.out) == (5, "")
-        assert "Talk rejected: standard input has more than 40,000 bytes, and a text at most 10,000 char" in done.err
+        assert "not spoken: standard input has more than 40,000 bytes, and a text at most 10,000 char" in done.err
     done = scripted.run("--json", "say", "-f", "-", stdin="a" * 300_000)
     (event,) = map(json.loads, done.out.splitlines())
     assert (event["event"], event["goal"]["reason"], done.code) == ("result", "text_too_long", 5)

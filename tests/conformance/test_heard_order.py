@@ -95,7 +95,7 @@ def test_row_36_a_goal_whose_time_is_over_is_never_heard(talk: Talk, voice: Voic
     assert talk.watcher.states(long) == ["PENDING", "ACTIVE"]
     expired = talk.goal(goal)
     assert expired["ended_at"] - expired["queued_at"] == pytest.approx(1, abs=0.1)
-    assert (expired["ttl"], expired["message"].startswith("Talk recalled: ")) == (1, True)
+    assert (expired["ttl"], expired["message"].startswith("not spoken: ")) == (1, True)
     end(talk, long, after)
     assert_heard(heard(talk), voice.render([Sentence(LONG, rate=200), LOW]))
     assert_told_in_order(talk)

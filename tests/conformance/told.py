@@ -38,7 +38,7 @@ def submit(talk: Talk, text: str, **fields: Any) -> Message:
 def assert_rejected(goal: Message, reason: str, *words: str) -> None:
     """Assert that a goal was REJECTED for that reason, with these words in its message."""
     assert (goal["state"], goal["reason"]) == ("REJECTED", reason), goal
-    assert goal["message"].startswith("Talk rejected: "), goal
+    assert goal["message"].startswith("not spoken: "), goal
     for each in words:
         assert each in goal["message"], goal
 

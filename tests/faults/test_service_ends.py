@@ -122,7 +122,7 @@ def test_a_server_sets_the_signals_that_it_needs_whoever_starts_it(make_talk: Ma
     goal = begin(talk, "a sentence that is long enough to be in the middle of it", number=1)
     os.kill(engine_process(talk), signal.SIGKILL)
     assert talk.watcher.wait_for_terminal(goal) == "ABORTED"
-    assert talk.goal(goal)["message"] == "Talk aborted: the engine crashed: it was killed by SIGKILL"
+    assert talk.goal(goal)["message"] == "speech failed: the engine crashed: it was killed by SIGKILL"
     following = send(talk, "yes", rate=450)
     assert talk.watcher.wait_for_terminal(following) == "SUCCEEDED"
     talk.stop()

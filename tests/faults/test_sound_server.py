@@ -153,7 +153,7 @@ def _assert_ended(talk: Talk, goal_id: str, end: End, since: float) -> float:
     assert await_end(talk, goal_id, NEVER_TAKEN + 2) == "ABORTED"
     goal = talk.goal(goal_id)
     assert_aborted(goal, end.reason, end.words)
-    assert goal["message"] != "Talk aborted: "
+    assert goal["message"] != "speech failed: "
     return talk.watcher.arrived(talk.watcher.wait_for(goal_id, "ABORTED")) - since
 
 

@@ -341,7 +341,7 @@ def test_a_refused_goal_is_rejected_with_the_servers_code(core: ClientCore) -> N
     sent(core)
     hear(core, {"seq": 1, "ok": False, "error": {"code": "unknown_field", "message": "no melody"}})
     assert (tracked.goal.state, tracked.goal.reason) == (State.REJECTED, "unknown_field")
-    assert (tracked.goal.message, core.exchanges) == ("Talk rejected: no melody", {})
+    assert (tracked.goal.message, core.exchanges) == ("not spoken: no melody", {})
 
 
 # A break, and another connection
@@ -388,7 +388,7 @@ def test_goals_of_a_server_that_was_restarted_are_lost(reconnecting: ClientCore)
     reconnecting.disconnected("it is gone", 1.0)
     greet(reconnecting, "5m8g")
     assert (tracked.goal.state, sent(reconnecting), reconnecting.boot) == (State.LOST, [], "5m8g")
-    assert tracked.goal.message == "Talk lost: it is gone; it may still be spoken"
+    assert tracked.goal.message == "result unknown: it is gone; it may still be spoken"
 
 
 def test_a_goal_that_the_same_server_has_forgotten_is_lost(reconnecting: ClientCore) -> None:
@@ -402,7 +402,7 @@ def test_a_goal_that_the_same_server_has_forgotten_is_lost(reconnecting: ClientC
     assert tracked.goal.state is State.PENDING
     greet(reconnecting)
     hear(reconnecting, {"seq": 3, "ok": False, "error": {"code": "unknown_goal", "message": "no g"}})
-    assert (tracked.goal.state, tracked.goal.message) == (State.LOST, "Talk lost: no g; it may have been spoken")
+    assert (tracked.goal.state, tracked.goal.message) == (State.LOST, "result unknown: no g; it may have been spoken")
 
 
 def test_goals_are_lost_if_no_connection_is_made_in_time(reconnecting: ClientCore) -> None:
@@ -415,7 +415,10 @@ def test_goals_are_lost_if_no_connection_is_made_in_time(reconnecting: ClientCor
     reconnecting.expire(5.9)
     assert tracked.goal.state is State.PENDING
     reconnecting.expire(6.0)
-    assert (tracked.goal.state, tracked.goal.message) == (State.LOST, "Talk lost: it is gone; it may still be spoken")
+    assert (tracked.goal.state, tracked.goal.message) == (
+        State.LOST,
+        "result unknown: it is gone; it may still be spoken",
+    )
 
 
 def test_a_goal_that_is_said_without_a_connection_waits_for_one(reconnecting: ClientCore) -> None:
@@ -443,7 +446,7 @@ def test_a_goal_that_is_said_without_a_connection_is_rejected_in_time(reconnecti
     reconnecting.not_connected(ServerUnavailable("no server, tried:\n  /s"))
     assert reconnecting.next_expiry() == 2.0 + PATIENCE
     assert reconnecting.expire(7.0)
-    message = "Talk rejected: nothing was sent to the server at /s: no server, tried: /s"
+    message = "not spoken: nothing was sent to the server at /s: no server, tried: /s"
     assert (tracked.goal.reason, tracked.goal.message) == ("not_sent", message)
 
 

@@ -309,8 +309,9 @@ def test_a_client_loads_nothing_heavy(statement: str, without: list[str]) -> Non
 JUDGING = ["voice", "sound", "server", "sentence", "broker", "report"]
 #: Modules that the doctor's judgements may call besides each other; a clock's format is all that they read.
 FOR_JUDGING = {
-    *("talkcli.engine.players", "talkcli.fleet.payloads", "talkcli.goals.options", "talkcli.goals.states"),
-    *("talkcli.goals.reasons", "talkcli.terminal.goals", "talkcli.terminal.text", "talkcli.frozen"),
+    *("talkcli.engine.players", "talkcli.fleet.payloads", "talkcli.goals.goal", "talkcli.goals.options"),
+    *("talkcli.goals.states", "talkcli.goals.reasons", "talkcli.terminal.goals", "talkcli.terminal.text"),
+    "talkcli.frozen",
 }
 
 

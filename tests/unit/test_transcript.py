@@ -47,7 +47,7 @@ GOALS = st.builds(
     text=NAMES,
     reason=st.sampled_from([None, "canceled", "audio_device"]),
     by=BYS,
-    message=st.none() | TEXTS.map("Talk aborted: {}".format),
+    message=st.none() | TEXTS.map("speech failed: {}".format),
     client=SENDERS,
     ended_at=st.none() | st.sampled_from([NOON, NOON - 1e6]),
     duration=st.none() | st.just(12.3),
@@ -226,10 +226,11 @@ def test_why_a_goal_ended() -> None:
     assert why(State.PREEMPTED, "preempted", By("4k7f-8"), "Talk preempted")[0] == "preempted by 4k7f-8"
     canceled = why(State.PREEMPTED, "canceled", By(client=PATROL), "Talk preempted")
     assert canceled[-2:] == ['canceled by "night watch"', 'by "night watch"']
-    expired = why(State.RECALLED, "expired", None, "Talk recalled: its time was over")
+    expired = why(State.RECALLED, "expired", None, "not spoken: its time was over")
     assert expired == ["expired: its time was over", "expired"]
-    assert why(State.ABORTED, "audio_device", None, "Talk aborted: no: device") == ["audio_device: no: device"]
-    throttled = why(State.REJECTED, "throttled", By("4k7f-1"), "Talk rejected: the same text")
+    assert why(State.ABORTED, "audio_device", None, "speech failed: no: device") == ["audio_device: no: device"]
+    assert why(State.ABORTED, "audio_device", None, "Talk aborted: no: device") == ["audio_device: no: device"]  # older
+    throttled = why(State.REJECTED, "throttled", By("4k7f-1"), "not spoken: the same text")
     assert throttled == ["throttled by 4k7f-1: the same text"]
     assert why(State.PREEMPTED, None) == ["preempted", "preempted"]
 

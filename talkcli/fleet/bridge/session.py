@@ -152,7 +152,7 @@ class RemoteSessions:
         """Cancel the waiting goals that match a `cancel` request, and return them."""
         selected = [self.waiting[each] for each in selection.select_waiting([say for _, say, _ in self.waiting])]
         self.waiting = [each for each in self.waiting if not any(each is other for other in selected)]
-        ending = State.RECALLED, "canceled", "canceled before it was spoken", by
+        ending = State.RECALLED, "canceled", "not spoken: it was cancelled first", by
         return [session.end_goal(request, say, *ending) for request, say, session in selected]
 
     def schedule_release(self) -> None:
@@ -370,7 +370,7 @@ class RemoteSession:
         else:
             words = f"{policy.MAX_REMOTE_GOALS} goals from afar are waiting already"
             # As at the server, a rejected goal doesn't get the id that its client has chosen.
-            self.end_goal(remote, replace(say, id=None), State.REJECTED, "queue_full", words)
+            self.end_goal(remote, replace(say, id=None), State.REJECTED, "queue_full", f"not spoken: {words}")
 
     def _send_cancel(self, remote: RemoteRequest, cancel: Cancel) -> None:
         """Cancel waiting goals, and then send the `cancel` request to the server.
