@@ -268,7 +268,7 @@ class Connection(ClientCore):
         raise NotImplementedError
 
     def _step(self, timeout: float, interruptible: bool) -> None:
-        """Wait up to `timeout` seconds for messages, and process them. Only one thread may call this at a time.
+        """Send what is due, wait up to `timeout` seconds for messages, and process them. Only one thread may call this.
 
         Raises:
             Interrupted: the wait is `interruptible`, and one of the interrupting descriptors is ready.

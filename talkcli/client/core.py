@@ -436,7 +436,7 @@ class ClientCore:
             self.fail(exchange, self.unanswered(exchange))
 
     def answer(self, exchange: Exchange) -> tuple[JsonObject, list[JsonObject]]:
-        """Return the reply to a request, and its list items.
+        """Return the reply to a request, and the items that came before it.
 
         Raises:
             RequestRefused: the server refused the request.
@@ -463,7 +463,7 @@ class ClientCore:
         return Lost(words) if isinstance(request, self.lasting) else ServerUnavailable(words)
 
     def refusal(self, reply: JsonObject, items: list[JsonObject]) -> TalkError:
-        """Return the error for a reply that refuses a request. The list items become the error's `items`."""
+        """Return the error that a refusing reply reports. Its `items` are the items that came before the reply."""
         from talkcli.terminal.text import printable  # rarely needed, and slow to import
 
         error = reply.get("error")

@@ -1,4 +1,4 @@
-"""The server checks: socket, state, settings, and goals that failed recently.
+"""Checks of the server: its socket, its state, its settings and its recent failures.
 
 The doctor connects like any client, with time limits.
 """

@@ -206,7 +206,7 @@ def _walk_path(path: str) -> Iterator[tuple[str, bool]]:
 
 
 def _others_can_write(path: str, status: os.stat_result) -> bool:
-    """Return whether anyone except root and this user can write to a file with this status.
+    """Return whether a file is writable by anyone except root and this user.
 
     Raises:
         VoiceFileError: The file belongs to another user.

@@ -148,7 +148,7 @@ class LoadVoice:
 
 @frozen
 class DropVoice:
-    """Unload a neural voice as soon as no sentence is using it. The reply is `VoiceMemory`."""
+    """Unload a neural voice as soon as no sentence is using it. The reply is `VoiceMemory`, if the voice was loaded."""
 
     voice: str  # ID of the voice, without a speaker
 

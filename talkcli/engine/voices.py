@@ -243,7 +243,7 @@ def unknown_voice_message(wanted: str, voices: tuple[Voice, ...], foreign: str |
 
 
 def _suggestions(wanted: str, voices: tuple[Voice, ...]) -> list[str]:
-    """Return names similar to an unknown one, written so that a user can type them."""
+    """Return known names that are similar to an unknown name, in the form that a user types."""
     plain, variants = _split_variants(voices)
     neural = [each for each in voices if is_neural(each.id)]
     if is_neural(wanted):

@@ -208,7 +208,7 @@ def greeting(version: str, pid: int, boot: str) -> JsonObject:
 
 
 def busy_greeting(message: str | None = None) -> JsonObject:
-    """Return the greeting that refuses a client, because the server has too many clients.
+    """Return the greeting for a client that is refused because the server is full.
 
     `message` gives the reason and the next step. It is None if the server has reached `--max-clients`.
     """

@@ -303,7 +303,7 @@ def _acquire_lock(path: str) -> int:
             break
         os.close(fd)  # the file was removed before it was locked, so try again
     os.ftruncate(fd, 0)
-    with contextlib.suppress(OSError):  # the process id is only informative, so ignore a full disk
+    with contextlib.suppress(OSError):  # the disk may be full, but nothing depends on this number
         os.write(fd, f"{os.getpid()}\n".encode())
     return fd
 

@@ -619,6 +619,7 @@ class Playback:
         return taken
 
     def _has_enough_silence(self, feed: PlayerFeed) -> bool:
+        """Return whether the sentence is paused and the player has enough zeros for now."""
         return bool(self._runner.hold_number) and feed.buffered(time.monotonic()) >= HOLD_SILENCE_LIMIT_S
 
     # -- waiting

@@ -209,7 +209,7 @@ class RobotConnection(Connection):
             self._mark_absent(why)
 
     def on_message(self, message: Message) -> None:
-        """Process the robot's presence, or lines from its server."""
+        """Handle a message from the broker: the robot's presence, or lines from its server."""
         with self.changed:
             if message.topic == topics.robot(self.robot, topics.PRESENCE):
                 self._update_presence(message.payload)
@@ -397,5 +397,5 @@ def connect_robot(robot: str, broker: Broker, *, keep_trying: float = 0.0, **opt
 
 
 def new_goal_id(desk: DeskLink) -> str:
-    """Create a goal id. It contains a colon, which the ids from servers don't."""
+    """Create a goal id. The colon keeps it different from the ids of servers."""
     return f"{desk.user[:_ID_USER_CHARS]}:{os.urandom(5).hex()}"

@@ -279,7 +279,7 @@ class FleetWatch:
             self._events.append(RobotChanged(name, before, now))
 
     def _report_missed(self, name: str, status: RobotStatus | None, arrived: Container[str | None] = ()) -> None:
-        """Report those missed events of a robot that can be derived from its status.
+        """Report missed events of a robot, if its status shows that they happened.
 
         Args:
             name: the name of the robot.

@@ -68,7 +68,7 @@ class HandoverTimes:
 
     @property
     def follows(self) -> bool:
-        """Whether the new sentence directly follows another one."""
+        """Whether another goal was waiting when the previous sentence ended."""
         return self._previous is not None
 
     def silence_to_cut(self, player: str) -> float:

@@ -156,7 +156,7 @@ def _locate_words(phonemizer: Phonemizer, clause: str, groups: Sequence[str]) ->
 
 
 def _increasing(positions: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return the positions in ascending order. Omit those that don't come after all earlier ones."""
+    """Return the positions without those that go back in the text."""
     found: list[tuple[int, int]] = []
     for position in positions:
         if not found or position[0] > found[-1][0]:
