@@ -151,8 +151,8 @@ def test_a_client_that_waits_imports_nothing_until_the_server_has_had_its_time(s
         "import sys\n"
         "from talkcli.client import connect\n"
         "yield_processor = connect.yield_processor\n"
-        "def spy(timeout):\n"
-        "    yield_processor(timeout)\n"
+        "def spy(*attempt):\n"
+        "    yield_processor(*attempt)\n"
         "    print('stood back', {{'json', 'talkcli.client.client'}} & {{*sys.modules}})\n"
         "connect.yield_processor = spy\n"
         "from talkcli.cli import run\n"
@@ -168,16 +168,32 @@ def test_a_client_that_waits_imports_nothing_until_the_server_has_had_its_time(s
         assert ("stood back set()" in done.out.splitlines()) == stands_back, (words, done)
 
 
-def test_a_client_stands_back_for_as_long_as_it_has_worked(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("talkcli.client.connect.time.process_time", lambda: 0.1)
-    began = time.monotonic()
-    yield_processor(None)
-    assert time.monotonic() - began >= 0.1
-    monkeypatch.setattr("talkcli.client.connect.time.process_time", lambda: PATIENCE)
-    began = time.monotonic()
-    yield_processor(0.05)  # its own limit comes first
-    yield_processor(None)  # and a slow machine's client waits for a moment only
-    assert time.monotonic() - began < PATIENCE
+def test_a_client_stands_back_for_as_long_as_it_has_worked_and_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, theirs = socket.socketpair()
+    attempt = ConnectionAttempt(ours, "s", hello_sent=True, request_sent=b"request\n")
+    with ours, theirs:
+        for answer in (b"", b"reply\n"):
+            theirs.sendall(answer)
+            monkeypatch.setattr("talkcli.client.connect.time.process_time", lambda: 0.1)
+            began = time.monotonic()
+            yield_processor(attempt, None)
+            assert time.monotonic() - began >= 0.1
+            monkeypatch.setattr("talkcli.client.connect.time.process_time", lambda: PATIENCE)
+            began = time.monotonic()
+            yield_processor(attempt, 0.05)  # its own limit comes first
+            yield_processor(attempt, None)  # and a slow machine's client waits for a moment only
+            assert time.monotonic() - began < PATIENCE
+        monkeypatch.setattr("talkcli.client.connect._LONGEST_YIELD_S", PATIENCE)
+        assert ours.recv(100) == b"reply\n"
+        began = time.monotonic()
+        for refused in (b'{"seq": 1, "ok": false}\n', b'{"goal": {"state": "REJECTED"}}\n'):
+            theirs.sendall(refused)
+            yield_processor(attempt, None)  # there is nothing to wait for
+            assert (os.get_blocking(ours.fileno()), ours.recv(100)) == (False, refused)
+        theirs.close()
+        yield_processor(attempt, None)  # nor is there when the server is gone
+        assert time.monotonic() - began < PATIENCE
+        assert (os.get_blocking(ours.fileno()), ours.recv(1)) == (False, b"")
 
 
 def test_plain_commands_import_neither_click_nor_anything_heavy(scripted: Talk) -> None:

@@ -133,7 +133,7 @@ def run(plain: PlainCommand) -> int:
 
     early = _connect_early(plain, block_signals) if may_send_early(plain) else None
     if early and early.request_sent and given.get("wait") and not given.get("feedback"):
-        yield_processor(given["timeout"])
+        yield_processor(early, given["timeout"])
     from talkcli.cli.show import CommonOptions, run_command
 
     options = CommonOptions(

@@ -29,8 +29,10 @@ if TYPE_CHECKING:
 GREETING_START = b'{"talk": 1, "version": '
 #: An idle server sends its greeting within this time. Longer waits must be interruptible.
 GREETING_WAIT_S = 0.2
-#: Maximum time for which `yield_processor` sleeps.
+#: Maximum time for which `yield_processor` waits.
 _LONGEST_YIELD_S = 0.2
+#: If an answer contains one of these, the goal will not be spoken.
+_REFUSALS = (b'"ok": false', b'"state": "REJECTED"')
 #: Time limit for a server's greeting, and for each answer. A busy server is tried again for as long.
 ANSWER_LIMIT_S = 5.0
 #: The minimum and maximum pause before trying again. The pause is random, so that refused clients don't all try again
@@ -141,8 +143,8 @@ def send_early(
     return replace(attempt, hello_sent=True, received=received, request_sent=sent)
 
 
-def yield_processor(timeout: float | None) -> None:
-    """Sleep for a moment, so that the server can use the processor.
+def yield_processor(attempt: ConnectionAttempt, timeout: float | None) -> None:
+    """Sleep for a moment, so that the server can use the processor. Return early if the goal will not be spoken.
 
     A client that only waits for the end of its goal calls this before its other imports. The server, the engine, the
     player and the sound server need the processor until the first sound. Together they use about as much processor time
@@ -150,10 +152,21 @@ def yield_processor(timeout: float | None) -> None:
     client went on importing.
 
     Args:
+        attempt: a connection on which a request was sent. Received bytes can still be read afterwards.
         timeout: time limit of the whole command in seconds; None for no limit.
     """
     longest = _LONGEST_YIELD_S if timeout is None else min(_LONGEST_YIELD_S, timeout)
-    time.sleep(min(time.process_time(), longest))
+    pause = min(time.process_time(), longest)
+    connected, end = attempt.socket, time.monotonic() + pause
+    assert connected
+    connected.settimeout(pause)
+    try:
+        answer = connected.recv(65536, _socket.MSG_PEEK)
+    except OSError:  # there is no answer yet, or the connection broke, which the next read reports
+        answer = b""
+    connected.setblocking(False)
+    if answer and not any(each in answer for each in _REFUSALS):
+        time.sleep(max(0.0, end - time.monotonic()))
 
 
 def sender_name(name: str | None) -> str | None:
