@@ -47,6 +47,8 @@ _MAX_BUFFERED_BYTES = 1_000_000
 _DEFAULT_PENDING_GOALS = 10
 #: The maximum number of started or ended goals that haven't been reported yet.
 _MAX_UNREPORTED_GOALS = 1_000
+#: The maximum number of expired lines to drop before signals and the server are checked again.
+_MAX_LATE_LINES = 1_000
 #: The deadline that is used if there is no time limit.
 _NO_LIMIT = float("inf")
 
@@ -151,8 +153,10 @@ class LineBuffer:
         return self._lines.popleft()
 
     def take_late(self, now: float) -> Iterator[InputLine]:
-        """Remove and yield all expired lines."""
-        while (line := self.first) and line.end <= now:
+        """Remove and yield the expired lines, but no more than the caller may process without checking for signals."""
+        for _ in range(_MAX_LATE_LINES):
+            if not self.first or self.first.end > now:
+                break
             yield self.take()
 
 
@@ -244,6 +248,8 @@ class LineSpeaker:
                 try:
                     self._step()
                 except TalkError as error:
+                    if time.monotonic() >= self._end:  # a robot's connection has the same limit, and reports it as lost
+                        raise TimeoutError from error
                     if self._error is not None:
                         raise
                     self._error = error
@@ -301,9 +307,10 @@ class LineSpeaker:
             TimeoutError: the time limit of the command is over.
         """
         if self._error is None:
-            for line in self._buffer.take_late(time.monotonic()):
+            now = time.monotonic()
+            for line in self._buffer.take_late(now):
                 self._report_expired(line)
-            while self._buffer.first and not (self._unanswered or self._full):
+            while self._buffer.first and self._buffer.first.end > now and not (self._unanswered or self._full):
                 self._send(self._buffer.take())
             if self._done:
                 return

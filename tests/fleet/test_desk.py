@@ -136,6 +136,17 @@ def test_lines_are_spoken_in_their_order_also_if_there_are_more_than_may_wait(ro
     assert robot.talk.watcher.texts("SUCCEEDED") == lines * 2
 
 
+def test_lines_time_out_while_the_queue_is_full(robot: Robot) -> None:
+    lines = [LONG, *(f"{n}" for n in range(100))]
+    assert robot.talk.run("say", "--lines", "--ahead", "101", stdin="\n".join(lines)).code == 0
+    with Desk(robot.broker) as somebody:
+        done = somebody.run("--robot", "anna", "say", "--lines", "--wait", "--timeout", "2", stdin="one\ntwo\n")
+    assert done.code == 124, done
+    assert "line 1 may not have been accepted" in done.err
+    assert "timed out after 2 s" in done.err
+    robot.talk.run("cancel")
+
+
 def test_ctrl_c_cancels_the_lines_that_were_sent_however_long_ago_the_command_began(robot: Robot) -> None:
     with Desk(robot.broker) as somebody:
         client = somebody.start("--robot", "anna", "say", "--lines", "--wait", stdin=subprocess.PIPE)

@@ -18,6 +18,12 @@ def test_a_line_has_its_ttl_from_when_its_newline_was_read() -> None:
     assert buffer.ended
 
 
+def test_no_more_late_lines_are_taken_at_once_than_a_signal_can_wait_for() -> None:
+    buffer = LineBuffer(ttl=10)
+    buffer.feed(b"a\n" * 2_500, 0.0)
+    assert [len(list(buffer.take_late(10.0))) for _ in range(4)] == [1_000, 1_000, 500, 0]
+
+
 def test_without_a_ttl_no_line_is_ever_late() -> None:
     for ttl in (None, 0.0):
         buffer = LineBuffer(ttl)
