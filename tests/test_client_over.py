@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,7 @@ from talkcli.client.goal import GoalHandle, merged
 from talkcli.errors import Lost, ServerUnavailable
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import Cancel, Say
-from talkcli.protocol.events import Result, StateChanged, from_json
+from talkcli.protocol.events import PausedChanged, Result, StateChanged, from_json
 from talkcli.protocol.lines import encode
 from talkcli.protocol.requests import Log, Status, Wait, Watch
 from tests.support.connection import PATIENCE
@@ -114,6 +115,21 @@ def test_goals_are_followed_as_one_stream(scripted: Scripted) -> None:
     (handle,) = Client.over(scripted).follow(["g"])
     scripted.coming = [state("PREEMPTING", 1), result("PREEMPTED")]
     assert [(each, type(event)) for each, event in merged([handle])] == [(handle, StateChanged), (handle, Result)]
+
+
+def test_each_pause_is_in_the_stream_once_also_if_only_some_goals_were_followed_by_then(scripted: Scripted) -> None:
+    late, early = (GoalHandle(scripted, Goal(each, State.PENDING)) for each in ("late", "early"))
+    pauses = [PausedChanged(paused, None, None, 0.0, n) for n, paused in ((3, True), (5, False), (7, True))]
+    early._listen_to(scripted.listeners, feedback=True, now=0.0)
+    scripted.listeners.publish(pauses[0])
+    late._listen_to(scripted.listeners, feedback=True, now=0.0)
+    for each in pauses[1:]:
+        scripted.listeners.publish(each)
+    stream = merged([late, early])
+    assert [event for _, event in itertools.islice(stream, 3)] == pauses
+    scripted.listeners.publish(PausedChanged(False, None, None, 0.0, 9))
+    found = [event for _, event in stream]
+    assert [each.n for each in found if isinstance(each, PausedChanged)] == [9]
 
 
 def test_a_goal_and_a_watch_are_lost_if_the_connection_ends(scripted: Scripted) -> None:

@@ -235,7 +235,7 @@ class _EventStream:
 
     def take(self) -> list[tuple[GoalHandle, Event]]:
         """Remove and return the new events of all goals. The caller must hold the connection's lock."""
-        found = []
+        found: list[tuple[int, GoalHandle, Event]] = []
         for handle in self.unfinished:
             event: Event | None = None
             while not isinstance(event, Result) and (event := handle._take()):
@@ -243,13 +243,16 @@ class _EventStream:
                 # event, because sorting is stable.
                 number = getattr(event, "n", None) or self._last_numbers.get(handle.id, 0)
                 self._last_numbers[handle.id] = number
-                if isinstance(event, PausedChanged):
-                    if number <= self._last_pause:
-                        continue
-                    self._last_pause = number
                 found.append((number, handle, event))
         self.unfinished = [each for each in self.unfinished if not each.state.terminal]
-        return [(handle, event) for _, handle, event in sorted(found, key=lambda each: each[0])]
+        merged_events = []
+        for number, handle, event in sorted(found, key=lambda each: each[0]):
+            if isinstance(event, PausedChanged):
+                if number <= self._last_pause:
+                    continue
+                self._last_pause = number
+            merged_events.append((handle, event))
+        return merged_events
 
 
 def _end(timeout: float | None) -> float | None:
