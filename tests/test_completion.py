@@ -6,6 +6,7 @@ import contextlib
 import os
 import re
 import select
+import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -179,6 +180,13 @@ def test_the_server_on_the_line_is_asked(busy: tuple[Talk, list[str]]) -> None:
         f"talk --json --socket '{talk.socket}' cancel -q ",
     ):
         assert [value for value, _ in offered(line, env)] == [active, pending]
+
+
+def test_no_error_is_printed_if_the_offers_cannot_be_written(tmp_path: pathlib.Path) -> None:
+    env = environment(str(tmp_path), _TALK_COMPLETE="bash_complete", COMP_WORDS="talk ", COMP_CWORD="")
+    with open("/dev/full", "wb") as full:
+        done = subprocess.run(TALK, env=env, stdout=full, stderr=subprocess.PIPE, check=False)
+    assert (done.returncode, done.stderr) == (1, b"")
 
 
 @pytest.mark.parametrize("says", [b"", GREETING, b'{"talk": 9}\n', b"no server of ours\n", None])

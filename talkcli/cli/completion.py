@@ -53,12 +53,11 @@ _BASH_SPECIAL = re.compile(r"[^\w@%+=:,./-]")
 def print_completions(talk: click.Command, options: CommonOptions) -> int:
     """Print the completions of the line that a shell's script has passed, and return the exit code."""
     try:
-        lines = _completion_lines(talk, options)
+        click.echo("\n".join(_completion_lines(talk, options)).encode())
     except Exception:
         if os.environ.get("TALK_DEBUG"):
             raise
         return EXIT_ERROR
-    click.echo("\n".join(lines).encode())
     return EXIT_OK
 
 
