@@ -157,7 +157,7 @@ class Goal:
         """
         found = read_fields(cls, value)
         if not str(found.get("id", "\n")).isprintable() or "state" not in found:  # ids are printed unescaped
-            raise Unreadable("the server sent a goal with an invalid id or an unknown state")
+            raise Unreadable("received a goal with an invalid id or an unknown state")
         return cls(**found)
 
 

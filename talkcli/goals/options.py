@@ -95,7 +95,7 @@ def is_clients_id(goal_id: str) -> bool:
 
 
 def _id_error(value: str) -> str | None:
-    return None if 0 < len(value) <= MAX_ID_CHARS else f"must be an id of 1 to {MAX_ID_CHARS} characters"
+    return None if 0 < len(value) <= MAX_ID_CHARS else f"must have 1 to {MAX_ID_CHARS} characters"
 
 
 def _ids_error(value: list[object]) -> str | None:
@@ -213,9 +213,7 @@ class Option:
         if value is None:
             return None
         if self.limits != (None, None) and self.is_out_of_range(value):
-            wanted = "no number of seconds" if self.kind is SECONDS else "not"
-            wanted = wanted if self.limits[1] is None else "not within"
-            return f"the {self.name} {value} is {wanted} {self.range}{self.unit}"
+            return f"the {self.name} must be {self.range}{self.unit}, got {value}"
         return self.check(value) if self.check else None
 
     def is_out_of_range(self, value: float) -> bool:
@@ -235,7 +233,7 @@ class Option:
             return ""
         if high is not None:
             return f"{low:g} to {high:g}"
-        return f"above {low:g}" if self.excludes_minimum else f"from {low:g} on"
+        return f"more than {low:g}" if self.excludes_minimum else f"{low:g} or more"
 
     def for_set(self) -> Option:
         """Return the option for `talk set`. It has no default, because omitted settings don't change."""
@@ -254,34 +252,34 @@ class Option:
 def _priority_error(value: int) -> str | None:
     if -MAX_PRIORITY <= value <= MAX_PRIORITY:
         return None
-    return f"the priority {value} is not within {-MAX_PRIORITY} to {MAX_PRIORITY}"
+    return f"the priority must be {-MAX_PRIORITY:,} to {MAX_PRIORITY:,}, got {value}"
 
 
 def key_error(value: str) -> str | None:
     """Return an error message if a string is not a valid key."""
     if 0 < len(value) <= MAX_KEY_CHARS:
         return None
-    return f"a key has 1 to {MAX_KEY_CHARS} characters, this one has {len(value)}"
+    return f"the key must have 1 to {MAX_KEY_CHARS} characters, got {len(value)}"
 
 
 def _own_id_error(value: str) -> str | None:
     if is_clients_id(value):
         return None
     return (
-        f"the id {value[:MAX_ID_CHARS]!a} is not one that a sender may choose: 1 to {MAX_ID_CHARS} of A-Z a-z 0-9 . _ "
-        ": / -, no '-' in front, not digits alone, and not of the form of a server's own, 4k7f-12"
+        f"the id {value[:MAX_ID_CHARS]!a} is not allowed: use 1 to {MAX_ID_CHARS} of A-Z a-z 0-9 . _ : / -, but not "
+        "only digits, no '-' at the beginning, and not the form of the server's own ids, such as 4k7f-12"
     )
 
 
 def _format_error(value: str) -> str | None:
-    return None if value == "text" else f"the format {value[:MAX_ID_CHARS]!r} is not known, only 'text'"
+    return None if value == "text" else f"the format must be 'text', got {value[:MAX_ID_CHARS]!r}"
 
 
 def _voice_error(value: str) -> str | None:
-    return None if value else "the voice is empty"
+    return None if value else "the voice must not be empty"
 
 
-_EXPIRY_HELP = "A goal that has not begun after SEC seconds is recalled; "
+_EXPIRY_HELP = "Drop sentences that can't start within SEC seconds; 0 means no limit."
 
 #: All options of a goal, in the order of the help text and the protocol's document.
 OPTIONS = (
@@ -290,77 +288,77 @@ OPTIONS = (
         TEXT,
         "the sentence",
         default="",
-        form=f"to {MAX_TEXT_CHARS:,} characters and {MAX_TEXT_BYTES:,} bytes",
-        default_words="needed",
+        form=f"up to {MAX_TEXT_CHARS:,} characters and {MAX_TEXT_BYTES:,} bytes",
+        default_words="required",
     ),
     Option(
         "wait",
         FLAG,
-        "send this connection the goal's states, and its result",
+        "send the goal's states and its result to this connection",
         default=False,
         special_flags="-w, --wait",
-        help="Wait until it has ended; the exit code tells how.",
+        help="Wait until the goal has ended. The exit code is the result.",
     ),
     Option(
         "feedback",
         FLAG,
-        "… and each word as it is heard; implies `wait`",
+        "also send each word when it is heard; implies `wait`",
         default=False,
         special_flags="-f, --feedback",
-        help="Show each word as it is heard; implies --wait.",
+        help="Show each word when it is heard. Implies --wait.",
     ),
     Option(
         "patient",
         FLAG,
-        "where the queue is full, answer when there is room, instead of REJECTED, `queue_full`; `ttl` counts meanwhile",
+        "if the queue is full, wait for room instead of rejecting the goal (`queue_full`); `ttl` includes this time",
         default=False,
     ),
     Option(
         "preempt",
         FLAG,
-        "stop what is being spoken, if its priority is not higher, and go first",
+        "interrupt the current goal, unless its priority is higher, and go first",
         special_flags="--preempt/--queue",
-        help="Stop what is spoken and go first, or wait in the queue. [default: as 'talk serve' was told]",
+        help="Interrupt the current sentence and go first, or wait in the queue. [default: the server's setting]",
         setting=Setting(
             False,
-            meaning="whether a goal preempts that says nothing else",
-            set_help="Every goal stops the one before it, or goals queue; one that says --queue stops none.",
-            serve_help="Every goal stops the one before it, unless it says --queue.",
+            meaning="whether goals without `preempt` interrupt the current goal",
+            set_help="Let new sentences interrupt the current one, or let them wait. 'talk say --queue' always waits.",
+            serve_help="Let new sentences interrupt the current one, unless they are sent with --queue.",
             flags="--preempt/--no-preempt",
-            words="goals preempt",
-            none_words="goals queue",
+            words="new goals interrupt",
+            none_words="new goals wait",
         ),
     ),
     Option(
         "flush",
         FLAG,
-        "as `preempt`, and recall all that is pending of the same or a lower priority",
+        "like `preempt`, and recall all waiting goals with the same or a lower priority",
         default=False,
-        help="As --preempt, and drop what is in the queue.",
+        help="Interrupt the current sentence, and empty the queue.",
     ),
     Option(
         "priority",
         INTEGER,
-        "higher goes first; first in first out among equals",
+        "goals with a higher priority go first. Goals with the same priority are spoken in the order of their arrival",
         default=0,
         # The range is not in `limits`, because the help text would then show it.
         check=_priority_error,
         form=f"{-MAX_PRIORITY:,} to {MAX_PRIORITY:,}",
-        help="Higher goes first; what has a higher one is neither stopped nor dropped.",
+        help="Go before sentences with a lower priority. Sentences with a higher one are never interrupted or removed.",
         in_goal=True,
     ),
     Option(
         "ttl",
         SECONDS,
-        "seconds from now in which it must begin, else RECALLED; 0 for no limit",
+        "seconds in which the goal must start, otherwise it is RECALLED; 0 for no limit",
         limits=(0, None),
-        help="Drop it if it has not begun within SEC seconds; 0: no limit.",
+        help="Drop the sentence if it can't start within SEC seconds; 0 means no limit.",
         setting=Setting(
             0,
             none_value=0,
-            meaning="for goals that have none of their own; 0 for no limit",
-            set_help=_EXPIRY_HELP + "0: no limit.",
-            serve_help=_EXPIRY_HELP + "it may bring its own --ttl; 0: no limit.",
+            meaning="the `ttl` of goals that don't have one; 0 for no limit",
+            set_help=_EXPIRY_HELP,
+            serve_help=_EXPIRY_HELP + " 'talk say --ttl' sets another limit.",
             words="ttl {} s",
             none_words="no ttl",
         ),
@@ -369,29 +367,29 @@ OPTIONS = (
     Option(
         "key",
         WORD,
-        "replaces the pending goal that has the same key",
+        "replace the waiting goal that has the same key",
         check=key_error,
         form=f"1 to {MAX_KEY_CHARS} characters",
-        help=f"A label of up to {MAX_KEY_CHARS} characters; replaces what waits under the same one.",
+        help=f"Replace the waiting sentence that has the same KEY, a label of up to {MAX_KEY_CHARS} characters.",
         completion="keys",
         in_goal=True,
     ),
     Option(
         "throttle",
         SECONDS,
-        "REJECTED where a goal of this key, or else of this text, is being spoken or began less than so many seconds "
-        "ago",
+        "reject the goal if the same text is waiting, is being spoken, or started less than this many seconds ago. If "
+        "the goal has a key, only the current and earlier goals with the same key count",
         limits=(0, None),
-        help="Don't say the same again within SEC seconds; what is the same, --key says, or else the text.",
+        help="Skip the sentence if the same text (or with --key, the same key) was spoken less than SEC seconds ago.",
     ),
     Option(
         "id",
         WORD,
-        "the sender's own id, see below",
+        "an id that the sender chooses, see *Ids* below",
         check=_own_id_error,
-        form=f"1 to {MAX_ID_CHARS} of `A-Z a-z 0-9 . _ : / -`",
-        default_words="the server's",
-        help="An id of your own: sent twice, it is spoken once.",
+        form=f"1 to {MAX_ID_CHARS} characters of `A-Z a-z 0-9 . _ : / -`",
+        default_words="set by the server",
+        help="Choose the goal's id. A goal that is sent again with the same id is not spoken again.",
     ),
     Option(
         "rate",
@@ -400,7 +398,7 @@ OPTIONS = (
         # libespeak-ng accepts no other rates.
         limits=(80, 450),
         unit=" words per minute",
-        help="Words per minute.",
+        help="Speak N words per minute.",
         env="TALK_RATE",
         setting=Setting(200, words="rate {}"),
         for_engine=True,
@@ -408,9 +406,9 @@ OPTIONS = (
     Option(
         "volume",
         NUMBER,
-        "loudness",
+        "loudness; 1 is the loudest",
         limits=(0.0, 1.0),
-        help="Loudness.",
+        help="Set the loudness; 1 is the loudest.",
         env="TALK_VOLUME",
         setting=Setting(1.0, words="volume {}"),
         for_engine=True,
@@ -418,64 +416,64 @@ OPTIONS = (
     Option(
         "voice",
         WORD,
-        f"id, name or language; `{DEFAULT_VOICE}` for the driver's own",
+        f"id, name or language of the voice; `{DEFAULT_VOICE}` for the driver's default voice",
         check=_voice_error,
-        help="Voice by id, name or language: see 'talk voices'.",
+        help="Use this voice (id, name or language; see 'talk voices').",
         env="TALK_VOICE",
         completion="voices",
         setting=Setting(
             None,
             none_value=DEFAULT_VOICE,
-            set_help="Voice by id, name or language: see 'talk voices'; 'default' is the engine's own.",
+            set_help="Use this voice (id, name or language; see 'talk voices'), or 'default' for the engine's own.",
             words="voice {}",
-            none_words="voice the driver's own",
+            none_words="default voice",
         ),
         for_engine=True,
     ),
     Option(
         "voice_only",
         FLAG,
-        "whether it waits for its voice while that is loaded, and is ABORTED, `voice_failed`, where it can't be had; "
-        "else espeak speaks then",
+        "wait until the voice is loaded, and abort the goal (`voice_failed`) if the voice can't be used, instead of "
+        "speaking with espeak",
         default=False,
-        help="Insist on the voice: wait until it is loaded, or be aborted.",
+        help="Never use another voice. Wait until the voice is loaded, and fail if it can't be used.",
         for_engine=True,
     ),
     Option(
         "pitch",
         INTEGER,
-        "50 is the voice's own; a neural voice has no other",
+        "50 is the voice's normal pitch; neural voices don't support other values",
         limits=(0, 100),
-        help="Pitch of the voice; 50 is its own, and a neural voice has no other.",
+        help="Set the pitch; 50 is normal. Neural voices don't support this option.",
         setting=Setting(50, words="pitch {}"),
         for_engine=True,
     ),
     Option(
         "lead_in",
         INTEGER,
-        "milliseconds of silence before it, also where the output was not idle; 0 for none",
+        "milliseconds of silence before the sentence, even directly after another one; 0 for none",
         limits=(0, MAX_LEAD_IN_MS),
         unit=" milliseconds",
         metavar="MS",
-        help="Milliseconds of silence before it; also where the output was not idle; 0: none. [default: as 'talk "
-        "serve' was told]",
+        help="Play MS milliseconds of silence first, even directly after another sentence; 0 means none. [default: the "
+        "server's setting]",
         for_engine=True,
     ),
     Option(
         "audible",
         FLAG,
-        "whether it is ABORTED, `muted`, where its output is muted; where that can't be known it is spoken",
-        help="Abort it where its output is muted. [default: as 'talk serve' was told]",
+        "abort the goal (`muted`) if its output is muted. If this can't be known, the goal is spoken",
+        help="Fail if the output is muted. [default: the server's setting]",
         for_engine=True,
     ),
     Option(
         "data",
         DATA,
-        "travels with the goal, untouched",
-        form=f"to {MAX_DATA_BYTES:,} bytes of JSON in ASCII (`é` is `\\u00e9`)",
+        "the sender's own data, returned unchanged with the goal",
+        form=f"up to {MAX_DATA_BYTES:,} bytes of JSON in ASCII (`é` is `\\u00e9`)",
         in_goal=True,
     ),
-    Option("format", TEXT, "anything else is REJECTED", "text", check=_format_error, in_goal=True),
+    Option("format", TEXT, "only `text` is supported", "text", check=_format_error, in_goal=True),
 )
 
 #: Names of the options that are sent to the engine.
@@ -494,7 +492,7 @@ class Say:
     """A request to speak a text. If a value is out of range, the goal is rejected."""
 
     kind: ClassVar[str] = "say"
-    meaning: ClassVar[str] = "A goal: speak this"
+    meaning: ClassVar[str] = "Speak a sentence"
     options: ClassVar[tuple[Option, ...]] = OPTIONS
     text: str
     wait: bool = False
@@ -523,7 +521,7 @@ class Set:
     """A request to change the server's settings for goals that haven't started. None leaves a setting unchanged."""
 
     kind: ClassVar[str] = "set"
-    meaning: ClassVar[str] = "Change the running server's settings, for goals that have not begun; those not given stay"
+    meaning: ClassVar[str] = "Change the server's settings for goals that haven't started. Omit a setting to keep it"
     options: ClassVar[tuple[Option, ...]] = SETTINGS
     rate: int | None = None
     volume: float | None = None
@@ -542,29 +540,30 @@ class Cancel:
 
     kind: ClassVar[str] = "cancel"
     meaning: ClassVar[str] = (
-        "End what these fields select, goals that wait for room (`patient`) too; they add up; without any: everything"
+        "Cancel the goals that match any of the fields, even `patient` goals that wait for room. Without "
+        "fields, cancel all goals"
     )
     options: ClassVar[tuple[Option, ...]] = (
-        Option("ids", IDS, "these goals; an empty list selects none", form=f"of to {MAX_IDS:,} ids"),
+        Option("ids", IDS, "these goals; an empty list selects no goal", form=f"of up to {MAX_IDS:,} ids"),
         Option(
             "current",
             FLAG,
-            "the goal being spoken",
+            "the goal that is being spoken",
             default=False,
-            help="The goal that is being spoken.",
+            help="Cancel the current sentence. The next one follows.",
         ),
         Option(
             "before",
             ID,
-            "this goal, and all accepted before it",
-            help="This goal, and all that were accepted before it.",
+            "this goal, and all goals that were accepted before it",
+            help="Cancel this goal and all goals that were accepted before it.",
             completion="goal_ids",
         ),
         Option(
             "key",
             WORD,
-            "the goals with this key, spoken or pending",
-            help="The goals with this key, spoken or waiting.",
+            "the current and the waiting goals with this key",
+            help="Cancel the current and the waiting sentences with this key.",
             completion="unfinished_keys",
         ),
     )
@@ -600,7 +599,7 @@ def require_fields(cls: type, options: Iterable[str]) -> None:
     """
     for name in options:
         if name not in cls.__annotations__:
-            raise TypeError(f"the option {name!r} has a row but {cls.__name__} has no such field")
+            raise TypeError(f"{cls.__name__} has no field for the option {name!r}")
 
 
 for _request in (Say, Set, Cancel):
@@ -613,7 +612,7 @@ INITIAL = Set(**{each.name: each.setting.initial for each in SETTINGS if each.se
 def bad_option(asked: Say | Set) -> str | None:
     """Return an error message if a request contains a value that is not allowed."""
     if isinstance(asked, Say) and asked.flush and asked.preempt is False:
-        return "flush preempts: it can't be had together with preempt false"
+        return "flush can't be combined with preempt false, because it always interrupts"
     for option in asked.options:
         value = getattr(asked, option.name)
         if value != option.default and (words := option.value_error(value)):
@@ -633,18 +632,18 @@ def bad_text(text: str, max_chars: int | None = MAX_TEXT_CHARS) -> Refusal | Non
     from talkcli.goals.reasons import Reason
 
     if max_chars is not None and len(text) > max_chars:
-        return Reason.TEXT_TOO_LONG, f"the text has {len(text):,} characters, the longest allowed is {max_chars:,}"
+        return Reason.TEXT_TOO_LONG, f"the text is too long: {len(text):,} characters (at most {max_chars:,})"
     try:
         size = len(text.encode())
     except UnicodeEncodeError as error:
-        words = f"character {error.start + 1} of the text is half of a surrogate pair: it is not valid UTF-8"
+        words = f"the text is not valid Unicode: character {error.start + 1} is half of a surrogate pair"
         return Reason.INVALID_TEXT, words
     if max_chars is not None and size > MAX_TEXT_BYTES:
-        return Reason.TEXT_TOO_LONG, f"the text has {size:,} bytes, the longest allowed is {MAX_TEXT_BYTES:,}"
+        return Reason.TEXT_TOO_LONG, f"the text is too long: {size:,} bytes (at most {MAX_TEXT_BYTES:,})"
     if "\0" in text:
-        return Reason.INVALID_TEXT, f"character {text.index(chr(0)) + 1} of the text is NUL"
+        return Reason.INVALID_TEXT, f"the text contains a NUL character (character {text.index(chr(0)) + 1})"
     if all(unicodedata.category(each) in _SILENT_CATEGORIES for each in text):
-        return Reason.INVALID_TEXT, "the text is empty" if not text.strip() else "the text has nothing that can be seen"
+        return Reason.INVALID_TEXT, "the text is empty" if not text.strip() else "the text has no visible characters"
     return None
 
 

@@ -29,54 +29,46 @@ class Reason(str, Enum):
         reason._value_, reason.states, reason.meaning = code, states, meaning
         return reason
 
-    CANCELED = "canceled", (_RECALLED, _PREEMPTED), "`cancel`"
-    PREEMPTED = "preempted", (_RECALLED, _PREEMPTED), "a goal with `preempt` or `flush`"
-    REPLACED = "replaced", (_RECALLED,), "a newer goal with its key"
+    CANCELED = "canceled", (_RECALLED, _PREEMPTED), "a client cancelled the goal"
+    PREEMPTED = "preempted", (_RECALLED, _PREEMPTED), "another goal with `preempt` or `flush` interrupted or removed it"
+    REPLACED = "replaced", (_RECALLED,), "a newer goal had the same key"
     EXPIRED = (
         "expired",
         (_RECALLED,),
-        "it had not begun when its `ttl` was over; PREEMPTED where an engine had died over it before it began",
+        "the `ttl` was over before the goal started. If an engine crashed before the first word, the goal is PREEMPTED",
     )
     DISPLACED = (
         "displaced",
         (_RECALLED,),
-        "the queue was full, and a goal of a higher priority came, or a goal of the same priority with `preempt`. "
-        "The newest goal of the lowest priority is displaced",
+        "the queue was full, and a goal with a higher priority arrived, or with the same priority and `preempt`. The "
+        "newest goal with the lowest priority is removed",
     )
-    SHUTDOWN = "shutdown", (_RECALLED, _PREEMPTED, _REJECTED), "the server is ending"
-    THROTTLED = "throttled", (_REJECTED,), "the same was said, or is waiting: `throttle`"
-    QUEUE_FULL = "queue_full", (_REJECTED,), "the queue was full, and the goal could displace none"
-    INVALID_TEXT = "invalid_text", (_REJECTED,), "empty, no valid Unicode, or nothing in it that can be seen"
-    TEXT_TOO_LONG = "text_too_long", (_REJECTED,), "more than 10,000 characters (`--max-text`) or 40,000 bytes"
-    BAD_OPTION = "bad_option", (_REJECTED, _ABORTED), "an option out of its range, or one that the driver refuses"
+    SHUTDOWN = "shutdown", (_RECALLED, _PREEMPTED, _REJECTED), "the server was stopped"
+    THROTTLED = "throttled", (_REJECTED,), "the goal repeats another goal too soon (`throttle`)"
+    QUEUE_FULL = "queue_full", (_REJECTED,), "the queue was full, and the goal could not displace another one"
+    INVALID_TEXT = "invalid_text", (_REJECTED,), "the text is empty or invisible, contains NUL, or is not valid Unicode"
+    TEXT_TOO_LONG = "text_too_long", (_REJECTED,), "the text exceeds 10,000 characters (`--max-text`) or 40,000 bytes"
+    BAD_OPTION = "bad_option", (_REJECTED, _ABORTED), "an option is out of its range, or the driver refuses it"
     UNKNOWN_VOICE = (
         "unknown_voice",
         (_REJECTED, _ABORTED),
-        "the engine has no such voice, or lacks what it takes: the message says what to install",
+        "the engine doesn't have the voice, or a package is missing; `message` says what to install",
     )
-    ID_CONFLICT = "id_conflict", (_REJECTED,), "another text has this id already"
-    NO_PLAYER = "no_player", (_ABORTED,), "no program to play with, and no sound server that answers"
-    AUDIO_DEVICE = (
-        "audio_device",
-        (_ABORTED,),
-        "the player could not begin, or the sound server has only a dummy output",
-    )
-    AUDIO_LOST = "audio_lost", (_ABORTED,), "the player ended before the sound did, or only a dummy output was left"
-    AUDIO_STALLED = "audio_stalled", (_ABORTED,), "the player took no sound any more, or its device was suspended"
-    MUTED = "muted", (_ABORTED,), "its output is muted, and it was to be `audible`"
-    VOICE_FAILED = (
-        "voice_failed",
-        (_ABORTED,),
-        "a neural voice's files are not as they should be: the message names the file, and what to do",
-    )
-    ENGINE_FAILED = "engine_failed", (_ABORTED,), "the engine cannot start, or the synthesiser reported an error"
+    ID_CONFLICT = "id_conflict", (_REJECTED,), "the id was already used for another text"
+    NO_PLAYER = "no_player", (_ABORTED,), "no player is installed, and no sound server responds"
+    AUDIO_DEVICE = "audio_device", (_ABORTED,), "the player can't start, or the sound server has only a dummy output"
+    AUDIO_LOST = "audio_lost", (_ABORTED,), "the player exited too early, or only a dummy output was left"
+    AUDIO_STALLED = "audio_stalled", (_ABORTED,), "the player stopped accepting sound, or its device was suspended"
+    MUTED = "muted", (_ABORTED,), "the output is muted, and the goal was sent with `audible`"
+    VOICE_FAILED = "voice_failed", (_ABORTED,), "a neural voice can't be loaded; `message` says why, and what to do"
+    ENGINE_FAILED = "engine_failed", (_ABORTED,), "the engine can't start, or the synthesizer reported an error"
     ENGINE_CRASHED = "engine_crashed", (_ABORTED,), "the engine process died"
-    ENGINE_HUNG = "engine_hung", (_ABORTED,), "the engine process said nothing any more"
+    ENGINE_HUNG = "engine_hung", (_ABORTED,), "the engine process stopped responding"
     NOTHING_TO_SAY = "nothing_to_say", (_ABORTED,), "nothing in the text can be spoken"
-    NOT_SILENT = "not_silent", (_ABORTED,), "it was stopped, and silence was not confirmed within 2 s"
+    NOT_SILENT = "not_silent", (_ABORTED,), "the goal was stopped, but silence was not confirmed within 2 s"
     # The next two reasons are set only by clients.
-    NOT_SENT = "not_sent", (_REJECTED,), "the client could not send it: it never reached a server"
-    LOST = "lost", (_LOST,), "the connection ended first"
+    NOT_SENT = "not_sent", (_REJECTED,), "the client could not send the goal, so it never reached a server"
+    LOST = "lost", (_LOST,), "the connection to the server was lost before the goal ended"
 
     # Print members as plain strings in every Python version.
     __str__ = str.__str__

@@ -258,13 +258,13 @@ class VoiceScheduler:
         self._reported_bytes = self._used_bytes = 0
         for voice, found in list(self._voices.items()):
             if voice == suspect and found.failures + 1 >= MAX_ENGINE_DEATHS:
-                found.fail("the engine process ended while it was being loaded", now)
+                found.fail("the engine process died while loading it", now)
             elif voice == suspect:
                 self._voices[voice] = NeuralVoice(found.size_bytes, failures=found.failures + 1)
             elif found.state is not VoiceState.FAILED:
                 del self._voices[voice]
         why = self.failure(suspect) if suspect else None
-        return [VoiceWarning(f"voice {suspect} is left alone: {why}")] if why else []
+        return [VoiceWarning(f"voice {suspect} is not used: {why}")] if why else []
 
     def is_loaded(self, voice: str) -> bool:
         """Return whether a voice is loaded."""
@@ -304,7 +304,7 @@ class VoiceScheduler:
         taken = self._total_bytes()
         if self._loading or len(loaded) != 1 or not 0 < self._limit_bytes < taken or self._voices[voice].why:
             return []
-        why = f"it takes {taken / 1e6:.0f} MB, more than --voice-memory {self._limit_bytes / 1e6:.0f}"
+        why = f"it uses {taken / 1e6:.0f} MB, more than --voice-memory {self._limit_bytes / 1e6:.0f} allows"
         self._voices[voice].why = why
         return [VoiceWarning(f"voice {voice}: {why}")]
 

@@ -182,7 +182,7 @@ def from_json(message: JsonObject) -> Event | None:
         # A time outside the calendar's range is treated as missing, because the rest of the event is still valid.
         missing = value is None or (annotation.startswith("float") and type(value) in (int, float))
         if name not in found and not (missing and annotation.endswith(" | None")):
-            raise Unreadable(f"the {name!r} of a {kind!a} event is {value!a}")
+            raise Unreadable(f"received a {kind!a} event with an invalid {name!r}: {value!a}")
     return event(**found)
 
 
@@ -223,13 +223,13 @@ def check_greeting(message: JsonObject) -> None:
         older = isinstance(theirs, int) and theirs < PROTOCOL
         side = "restart the server with the newer version" if older else "upgrade this command"
         raise ProtocolMismatch(
-            f"this command (version {__version__}) speaks protocol {PROTOCOL}, the server (version {server}) speaks "
-            f"{theirs!a}: {side}"
+            f"the server (version {server}) uses protocol {theirs!a}, but this command (version {__version__}) uses "
+            f"protocol {PROTOCOL}: {side}"
         )
     if message.get("error") == "busy":
         words = message.get("message")
         if not (isinstance(words, str) and words and words.isprintable()):  # not safe to show on a terminal
-            words = "the server has as many clients as it takes (`talk serve --max-clients`)"
+            words = "the server has too many clients; try again later, or raise 'talk serve --max-clients'"
         raise Busy(words, "busy")
 
 

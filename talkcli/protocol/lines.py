@@ -130,17 +130,17 @@ def decode(line: bytes) -> JsonObject:
     from talkcli.errors import BadRequest, LineTooLong
 
     if isinstance(line, TruncatedLine):
-        raise LineTooLong(f"a line has at most {MAX_LINE_BYTES} bytes")
+        raise LineTooLong(f"the line is too long (at most {MAX_LINE_BYTES:,} bytes)")
     try:
         value = _json("decode")(line.decode())
     except UnicodeDecodeError as error:
-        raise BadRequest(f"a line is UTF-8, but byte {error.start} of this one is not", "bad_encoding") from None
+        raise BadRequest(f"the line is not valid UTF-8 (byte {error.start})", "bad_encoding") from None
     except RecursionError:
-        raise BadRequest("this JSON is nested too deep", "bad_json") from None
+        raise BadRequest("the JSON is nested too deeply", "bad_json") from None
     except ValueError as error:
-        raise BadRequest(f"a line is one JSON object: {error}", "bad_json") from None
+        raise BadRequest(f"the line is not a JSON object: {error}", "bad_json") from None
     if not isinstance(value, dict):
-        raise BadRequest(f"a line is one JSON object, not {type(value).__name__}", "bad_json")
+        raise BadRequest(f"the line must be a JSON object, got {type(value).__name__}", "bad_json")
     return value
 
 
@@ -165,24 +165,24 @@ def _json(name: str) -> Callable[[Any], Any]:
 def _no_duplicates(pairs: list[tuple[str, object]]) -> JsonObject:
     fields = dict(pairs)
     if len(fields) != len(pairs):
-        raise ValueError("the same key twice")
+        raise ValueError("a key appears twice")
     return fields
 
 
 def _no_constant(name: str) -> object:
-    raise ValueError(f"{name} is no JSON")
+    raise ValueError(f"{name} is not allowed")
 
 
 def _short_integer(digits: str) -> int:
     if len(digits) > MAX_DIGITS:
-        raise ValueError(f"an integer of {len(digits)} digits")
+        raise ValueError(f"an integer has {len(digits):,} digits (at most {MAX_DIGITS})")
     return int(digits)
 
 
 def _number(digits: str) -> float:
     number = float(digits)
     if not _finite(number):
-        raise ValueError("a number past every float")
+        raise ValueError("a number is too large")
     return number
 
 

@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 
 
 def _bad_name(value: str) -> str | None:
-    return None if 0 < len(value) <= MAX_SENDER_NAME_CHARS else f"must be 1 to {MAX_SENDER_NAME_CHARS} characters"
+    return None if 0 < len(value) <= MAX_SENDER_NAME_CHARS else f"must have 1 to {MAX_SENDER_NAME_CHARS} characters"
 
 
 def _bad_count(value: int) -> str | None:
-    return None if 0 < value <= MAX_LOG_GOALS else f"must be 1 to {MAX_LOG_GOALS}"
+    return None if 0 < value <= MAX_LOG_GOALS else f"must be 1 to {MAX_LOG_GOALS:,}"
 
 
 _NAME_TYPE = Kind("string", (str,), "must be a string", check=_bad_name)
@@ -47,13 +47,13 @@ class Hello:
     """The first message of a client."""
 
     kind: ClassVar[str] = "hello"
-    meaning: ClassVar[str] = "Who connects; send it at once, and the server knows that you are alive"
+    meaning: ClassVar[str] = "Identify the client. Send this first"
     options: ClassVar[tuple[Option, ...]] = (
-        Option("name", _NAME_TYPE, "what the sender calls itself", form=f"1 to {MAX_SENDER_NAME_CHARS} characters"),
+        Option("name", _NAME_TYPE, "the client's name, for the log", form=f"1 to {MAX_SENDER_NAME_CHARS} characters"),
         Option(
             "urgent",
             FLAG,
-            "only `status` and `cancel` will follow: a full server keeps places for these",
+            "only `status` and `cancel` will follow; a full server keeps some places for such clients",
             default=False,
         ),
     )
@@ -69,9 +69,9 @@ class Wait:
     meaning: ClassVar[str] = "Send the results of these goals, whoever sent them"
     options: ClassVar[tuple[Option, ...]] = (
         Option(
-            "ids", IDS, "null: all that are active or pending now", form=f"of to {MAX_IDS:,} ids", default_words="all"
+            "ids", IDS, "null for all goals that have not ended", form=f"of up to {MAX_IDS:,} ids", default_words="all"
         ),
-        Option("feedback", FLAG, "each word as it is heard, too", default=False),
+        Option("feedback", FLAG, "also send each word when it is heard", default=False),
     )
     ids: tuple[str, ...] | None = None
     feedback: bool = False
@@ -82,8 +82,8 @@ class Status:
     """A request for the state of the server and its goals, or of one goal."""
 
     kind: ClassVar[str] = "status"
-    meaning: ClassVar[str] = "The server, and what it says, will say and said; or one goal"
-    options: ClassVar[tuple[Option, ...]] = (Option("id", ID, "this goal alone"),)
+    meaning: ClassVar[str] = "Return the state of the server and its goals, or of one goal"
+    options: ClassVar[tuple[Option, ...]] = (Option("id", ID, "only this goal"),)
     id: str | None = None
 
 
@@ -92,7 +92,7 @@ class Voices:
     """A request for the list of the engine's voices."""
 
     kind: ClassVar[str] = "voices"
-    meaning: ClassVar[str] = "The engine's voices"
+    meaning: ClassVar[str] = "List the engine's voices"
     options: ClassVar[tuple[Option, ...]] = ()
 
 
@@ -101,7 +101,7 @@ class Watch:
     """A request for the state of the server, and then for the events of all goals."""
 
     kind: ClassVar[str] = "watch"
-    meaning: ClassVar[str] = "Everything as it is now, and then all that happens to any goal"
+    meaning: ClassVar[str] = "Return the current state, and then send the events of all goals"
     options: ClassVar[tuple[Option, ...]] = ()
 
 
@@ -110,9 +110,9 @@ class Log:
     """A request for the most recently ended goals, oldest first."""
 
     kind: ClassVar[str] = "log"
-    meaning: ClassVar[str] = "The last goals that ended, REJECTED ones too, oldest first"
+    meaning: ClassVar[str] = "List the last goals that ended, including REJECTED ones, oldest first"
     options: ClassVar[tuple[Option, ...]] = (
-        Option("count", _COUNT_TYPE, "so many", 20, form=f"1 to {MAX_LOG_GOALS:,}"),
+        Option("count", _COUNT_TYPE, "the maximum number of goals", 20, form=f"1 to {MAX_LOG_GOALS:,}"),
     )
     count: int = 20
 
@@ -122,7 +122,7 @@ class Pause:
     """A request to pause all speech. The reply comes when the speech has stopped."""
 
     kind: ClassVar[str] = "pause"
-    meaning: ClassVar[str] = "Hold speech where it is"
+    meaning: ClassVar[str] = "Pause all speech"
     options: ClassVar[tuple[Option, ...]] = ()
 
 
@@ -131,7 +131,7 @@ class Resume:
     """A request to resume speech after a pause."""
 
     kind: ClassVar[str] = "resume"
-    meaning: ClassVar[str] = "Go on where speech was held"
+    meaning: ClassVar[str] = "Continue speech after a pause"
     options: ClassVar[tuple[Option, ...]] = ()
 
 
@@ -149,24 +149,24 @@ def read_request(message: JsonObject) -> Request:
     fields = dict(message)
     kind = fields.pop("request", None)
     if not isinstance(kind, str):
-        raise BadRequest('a request is an object with a "request"', "bad_request")
+        raise BadRequest('the field "request" is missing or not a string', "bad_request")
     request = REQUEST_TYPES.get(kind)
     if request is None:
         known = ", ".join(REQUEST_TYPES)
         raise BadRequest(
-            f"this server does not know the request {kind[:MAX_SENDER_NAME_CHARS]!r}, but {known}", "unknown_request"
+            f"unknown request {kind[:MAX_SENDER_NAME_CHARS]!r}; this server supports {known}", "unknown_request"
         )
     for name, value in fields.items():
         option = next((each for each in request.options if each.name == name), None)
         if option is None:
             raise BadRequest(
-                f"this server does not know the field {name[:MAX_SENDER_NAME_CHARS]!r} of {kind}", "unknown_field"
+                f"{kind}: this server doesn't support the field {name[:MAX_SENDER_NAME_CHARS]!r}", "unknown_field"
             )
         fault = option.type_error(value)
         if fault:
-            raise BadRequest(f"{name!r} of {kind} {fault}", "bad_field")
+            raise BadRequest(f"{kind}: {name!r} {fault}", "bad_field")
         if isinstance(value, list):
             fields[name] = tuple(value)
     if request is Say and "text" not in fields:
-        raise BadRequest("say needs a text", "bad_field")
+        raise BadRequest("say: 'text' is missing", "bad_field")
     return request(**fields)  # type: ignore[arg-type]

@@ -12,7 +12,7 @@ import click
 
 from talkcli.cli.click_app import talk
 from talkcli.cli.commands import COMMANDS
-from talkcli.goals.options import IDS, SECONDS, Option, Set
+from talkcli.goals.options import IDS, Option, Set
 from talkcli.goals.reasons import Reason
 from talkcli.protocol.requests import REQUEST_TYPES
 from tests.support.documents import COMMAND_LINE, WIRE
@@ -63,12 +63,9 @@ def _field(option: Option, *, changes: bool) -> str:
 
 
 def _values(option: Option) -> str:
-    low, high = option.limits
-    if option.kind is SECONDS:
-        return f"{option.kind.name} from 0 on, or null"
     if option.kind is IDS:
         return f"{option.kind.name} {option.form}, or null"
-    form = option.form if low is None else f"{low:g} to {high:g}"
+    form = option.range or option.form
     return option.kind.name + (" or null" if option.default is None else "") + (f", {form}" if form else "")
 
 
@@ -104,4 +101,5 @@ def _cell(text: str) -> str:
 
 if __name__ == "__main__":
     for _name, (_document, _) in MADE.items():
-        _document.path.write_text(current(_name), encoding="utf-8")
+        _document.text = current(_name)  # the wire's document has two of the tables
+        _document.path.write_text(_document.text, encoding="utf-8")
