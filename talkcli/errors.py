@@ -159,5 +159,5 @@ def memory_limits() -> str:
     ):
         allowed = resource.getrlimit(number)[0]
         if allowed != resource.RLIM_INFINITY:
-            return f"it is limited to {allowed:,} {what} ({where})"
-    return "see 'free', 'ulimit -u', and MemoryMax= and TasksMax= of its unit"
+            return f"the limit is {allowed:,} {what} ({where})"
+    return "check 'free', 'ulimit -u', and MemoryMax= and TasksMax= of its unit"

@@ -79,7 +79,7 @@ class _Methods:
             put(self, name, value)
 
     def __setattr__(self, name: str, *_: object) -> None:
-        raise AttributeError(f"{type(self).__name__} is a value: its {name} can't be changed")
+        raise AttributeError(f"{type(self).__name__} is immutable: {name} can't be changed")
 
     __delattr__ = __setattr__
 

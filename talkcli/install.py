@@ -50,7 +50,7 @@ def neural(*more: str, again: bool = False) -> str:
     On a 32-bit system, return advice to use an espeak voice instead.
     """
     if not IS_64_BIT:
-        return "neural voices need a 64-bit system: choose one of espeak's voices, such as en"
+        return "neural voices need a 64-bit system; use an espeak voice, such as en"
     return command(*NEURAL_PACKAGES, *more, again=again)
 
 

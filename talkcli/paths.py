@@ -21,11 +21,11 @@ SOCKET_NAME = "talk.sock"
 SYSTEM_SOCKET = f"/run/talk/{SOCKET_NAME}"
 
 #: Descriptions of paths to which no client can connect.
-PLACE_ABSENT = "not there"
-PLACE_FILE = "a file, and no socket"
-PLACE_DIRECTORY = "a directory, and no socket"
-PLACE_STALE = "nobody answers: left over from a server that ended"
-PLACE_FORBIDDEN = "no permission"
+PLACE_ABSENT = "not found"
+PLACE_FILE = "a file, not a socket"
+PLACE_DIRECTORY = "a directory, not a socket"
+PLACE_STALE = "no server responds (left over from an earlier server)"
+PLACE_FORBIDDEN = "permission denied"
 
 
 def named_socket(option: str | None) -> str | None:
@@ -106,7 +106,7 @@ def server_socket(named: str | None) -> str:
         try:
             return os.path.abspath(named)
         except FileNotFoundError as error:
-            words = f"the working directory is gone, and the socket {named} would be in it: name its whole path"
+            words = f"the current directory was removed, so the socket {named} needs an absolute path"
             raise AddressInUse(words) from error
     given = os.environ.get("RUNTIME_DIRECTORY")
     if given:
@@ -121,7 +121,7 @@ def server_socket(named: str | None) -> str:
         try:
             return str(platformdirs.PlatformDirs("talk", appauthor=False).place_runtime_file(SOCKET_NAME))
         except OSError as error:
-            raise AddressInUse(f"no directory for the socket: {error}; name a socket with --socket PATH") from error
+            raise AddressInUse(f"can't create a directory for the socket: {error}; use --socket PATH") from error
 
 
 def voice_directories(environment: Mapping[str, str] | None = None) -> list[str]:

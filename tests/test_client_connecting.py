@@ -130,7 +130,7 @@ def test_a_server_that_says_no_is_asked_once(
 def test_a_place_where_no_server_can_come_is_tried_once(path: str, monkeypatch: pytest.MonkeyPatch) -> None:
     waits = Waits(monkeypatch)
     os.makedirs(path)
-    with pytest.raises(ServerUnavailable, match="a directory, and no socket"):
+    with pytest.raises(ServerUnavailable, match="a directory, not a socket"):
         connect.connect(path, HELLO, keep_trying=60)
     monkeypatch.setattr("talkcli.paths.client_sockets", lambda _: [f"{path}/s"])
     monkeypatch.setattr("talkcli.peers.credentials", lambda _: (1, os.getuid() + 1))

@@ -321,7 +321,7 @@ def test_cancel_by_key(client: Client) -> None:
     goal = client.say("never-ends")
     wrong: list[dict[str, Any]] = [{"key": ""}, {"key": "k" * 65}, {"ids": [""]}, {"before": ""}]
     for selection in wrong:
-        with pytest.raises(UsageError, match="key" if "key" in selection else "an id is empty"):
+        with pytest.raises(UsageError, match="key" if "key" in selection else "id is empty"):
             client.cancel(**selection)
     assert not goal.state.terminal
     goal.cancel()

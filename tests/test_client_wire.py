@@ -174,7 +174,7 @@ def test_malformed_message_breaks_the_connection_and_blocks_no_caller() -> None:
     with serving(play) as path, Client(path, timeout=0.3) as client:
         goal = client.say("a", feedback=True).wait(5)
         assert goal.state is State.LOST
-        assert "what is no message" in str(goal.message)
+        assert "the server sent a malformed message" in str(goal.message)
 
 
 @pytest.fixture

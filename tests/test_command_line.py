@@ -309,9 +309,9 @@ def test_a_place_that_is_no_socket_is_told_from_a_socket_that_a_server_left(tmp_
     os.mkfifo(pipe)
     inside = f"{place}/talk.sock"
     steps = [f"set TALK_SOCKET to {inside}", f"start one with: talk serve --socket {inside}"]
-    others = ["name a socket", "name a socket, or leave out --socket"]
+    others = ["set TALK_SOCKET to a socket", "choose a socket, or leave out --socket"]
     for named, words, (by_variable, by_option) in (
-        (place, f"a directory, and no socket: name the one in it, {inside}", steps),
+        (place, f"a directory, not a socket; use {inside}", steps),
         (file, "a file", others),
         (pipe, "a file", others),
     ):

@@ -119,7 +119,7 @@ def test_silent_makes_no_sound_and_shows_one_finding_per_line(robot: Talk, sink:
     assert [line[9:23].strip() for line in done.out.splitlines()] == CHECKS
     assert "\x1b" not in done.out
     assert "played to its end without sound by an engine of this command's own, pulse, 0." in done.out
-    assert "volume 0.1, voice the driver's own" in done.out
+    assert "volume 0.1, default voice" in done.out
     assert "-> talk set --volume 1" in done.out
     # The server's environment doesn't tell of the runtime directory that its user may have.
     warned = ["session", "settings"] if os.path.isdir(f"/run/user/{os.getuid()}") else ["settings"]

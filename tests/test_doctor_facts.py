@@ -79,23 +79,25 @@ def test_each_usual_place_is_described(home: str) -> None:
         assert [each for each in (f"{path}: {words}", *others) if each not in found.message] == []
         assert found.next == step
 
-    check("not there", "talk serve")
+    check("not found", "talk serve")
     with socket.socket(socket.AF_UNIX) as left:
         left.bind(path)
-    check("nobody answers: left over from a server", "talk serve (it takes the place of what was left over)")
+    check(
+        "no server responds (left over from an earlier server)", "talk serve (it takes the place of what was left over)"
+    )
     os.unlink(path)
     write(Path(path), "")
-    check("a file, and no socket", f"remove {path}, and: talk serve")
+    check("a file, not a socket", f"remove {path}, and: talk serve")
 
 
 @pytest.mark.usefixtures("nobody_serves")
 def test_a_named_place_that_is_no_socket_is_told(home: str) -> None:
     found = no_server(f"{home}/run")
-    assert f"{home}/run: a directory, and" in found.message
+    assert f"{home}/run: a directory, not" in found.message
     assert found.next == f"name the socket in it: TALK_SOCKET={home}/run/talk.sock"
     write(Path(home, "file"), "")
     found = no_server(f"{home}/file")
-    assert f"{home}/file: a file, and no" in found.message
+    assert f"{home}/file: a file, not a" in found.message
     assert found.next == "unset TALK_SOCKET, or name a socket"
 
 
@@ -103,9 +105,9 @@ def test_a_named_place_that_is_no_socket_is_told(home: str) -> None:
 @pytest.mark.parametrize(
     ("greeting", "words", "step"),
     [
-        ("220 mail ready", "is no talk server", "restart the server on"),
+        ("220 mail ready", "is not a talk server", "restart the server on"),
         ('{"talk": 2, "version": "9"}', "upgrade", "install the same talk on both sides"),
-        ('{"talk": 1, "error": "permission_denied"}', "refuses", "--socket-mode 0660"),
+        ('{"talk": 1, "error": "permission_denied"}', "refused", "--socket-mode 0660"),
     ],
 )
 def test_a_process_that_answers_and_takes_no_client_is_named(home: str, greeting: str, words: str, step: str) -> None:

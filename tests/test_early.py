@@ -275,7 +275,7 @@ def test_a_server_that_refuses_this_client_is_passed_over_for_the_next_place(ear
         assert line.socket
         line.socket.close()
         os.unlink(second)
-        with pytest.raises(AccessDenied, match=f"(?s)tried:\n  {first}: the server refuses: not you\n"):
+        with pytest.raises(AccessDenied, match=f"(?s)tried:\n  {first}: the server refused the connection: not you\n"):
             connect(None, hello(None, urgent=False), attempt=attempt())
     assert set(heard) == {b'{"request": "hello"}\n'}, "what was asked is for the server that takes it"
 

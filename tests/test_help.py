@@ -186,10 +186,10 @@ def test_a_missing_sound_device_is_not_told_if_none_is_needed(make_talk: MakeTal
 
 
 def test_a_player_is_told_to_have_no_effect_with_a_driver_that_plays_by_itself(make_talk: MakeTalk) -> None:
-    for options, told in (("--player aply --lead-in 100", ": --player and --lead-in have no effect"), ("", "")):
+    for options, told in (("--player aply --lead-in 100", "; --player and --lead-in have no effect"), ("", "")):
         talk = make_talk(*options.split(), env={"PULSE_SERVER": ""}, driver="dummy")
         assert talk.run("say", "--wait", "hello").code == 0
-        assert f"driver dummy, which plays by itself{told}\n" in talk.log
+        assert f"driver dummy, no player needed{told}\n" in talk.log
         assert "not found" not in talk.log
         assert "no sound device" not in talk.log
 

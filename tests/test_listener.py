@@ -82,12 +82,12 @@ def test_file_in_the_place_of_the_socket_is_not_removed(home: str) -> None:
     path = f"{home}/s"
     with open(path, "w", encoding="utf-8") as file:
         file.write("precious")
-    assert "is no socket: remove it" in refused(home, "--socket", path)
+    assert "is not a socket; remove it" in refused(home, "--socket", path)
     with open(path, encoding="utf-8") as file:
         assert file.read() == "precious"
-    assert f"a directory: name one in it, --socket {home}/talk.sock" in refused(home, "--socket", home)
+    assert f"a directory, not a socket; use --socket {home}/talk.sock" in refused(home, "--socket", home)
     os.mkfifo(f"{home}/pipe")
-    assert "is no socket: name another one" in refused(home, TALK_SOCKET=f"{home}/pipe")
+    assert "is not a socket; choose another path" in refused(home, TALK_SOCKET=f"{home}/pipe")
 
 
 def test_server_that_is_refused_leaves_no_lock(home: str) -> None:
@@ -96,10 +96,10 @@ def test_server_that_is_refused_leaves_no_lock(home: str) -> None:
     for name in ("directory", "pipe"):
         refused(home, "--socket", f"{home}/{name}")
     assert sorted(os.listdir(home)) == ["directory", "pipe"]
-    assert "cannot listen at" in refused(home, "--socket", f"{home}/{'s' * (120 - len(home))}")
+    assert "can't listen at" in refused(home, "--socket", f"{home}/{'s' * (120 - len(home))}")
 
 
-@pytest.mark.parametrize("words", ["is no regular file", "is a symbolic link", "is a hard link"])
+@pytest.mark.parametrize("words", ["is not a regular file", "is a symbolic link", "is a hard link"])
 def test_file_that_is_no_lock_is_reported_and_left_unchanged(home: str, words: str) -> None:
     with open(f"{home}/precious", "w", encoding="utf-8") as file:
         file.write("precious")
@@ -108,7 +108,7 @@ def test_file_that_is_no_lock_is_reported_and_left_unchanged(home: str, words: s
     else:
         (os.symlink if "symbolic" in words else os.link)(f"{home}/precious", f"{home}/s.lock")
     said = refused(home, "--socket", f"{home}/s")
-    assert f"the lock {home}/s.lock {words}" in said
+    assert f"the lock file {home}/s.lock {words}" in said
     assert "remove it" in said
     with open(f"{home}/precious", encoding="utf-8") as file:
         assert file.read() == "precious"
@@ -119,7 +119,7 @@ def test_relative_socket_is_refused_if_the_working_directory_is_gone(home: str) 
     command = ["sh", "-c", 'mkdir gone && cd gone && rmdir ../gone && exec "$@"', "sh", *SERVE, "--socket", "s"]
     done = run(command, environment(home), cwd=home)
     assert (done.code, done.out) == (11, "")
-    assert "the working directory is gone" in done.err
+    assert "the current directory was removed" in done.err
     assert "Traceback" not in done.err
 
 
@@ -133,7 +133,7 @@ def test_directory_that_is_not_safe_is_refused(home: str) -> None:
     os.mkdir(f"{home}/real", 0o700)
     os.symlink("real", f"{home}/link")
     assert "symbolic link" in refused(home, "--socket", f"{home}/link/s")
-    assert "can't be made" in refused(home, "--socket", f"{home}/none/none/s")
+    assert "can't create" in refused(home, "--socket", f"{home}/none/none/s")
     assert "not a directory" in refused(home, "--socket", f"{__file__}/s").lower()
     assert "too long" in refused(home, "--socket", f"{home}/{'s' * 100}").lower()
     os.symlink("/etc/passwd", f"{home}/real/s.lock")
@@ -157,10 +157,10 @@ def test_client_of_another_user_ends_with_10(home: str) -> None:
             done = run([*client, "--socket", path, *words], theirs)
             assert (done.code, done.out) == (10, ""), done
             assert "Traceback" not in done.err
-            assert "have its owner let you in, with `talk serve --socket-mode 0660`" in done.err
-            assert done.err.endswith("or start your own with: talk serve\n")
+            assert "its owner can let you in with: talk serve --socket-mode 0660" in done.err
+            assert done.err.endswith("or start your own server with: talk serve\n")
         done = run([*client, "status"], {**theirs, "TALK_SOCKET": path})
-        assert done.err.endswith("or unset TALK_SOCKET, which names this place: no other was tried\n")
+        assert done.err.endswith("or unset TALK_SOCKET to try the usual places\n")
         assert "talk serve\n" not in done.err, "it would listen at that place, too"
     with serving(environment(home), "--socket", path, "--socket-mode", "0666"):
         assert run([*client, "--socket", path, "say", "--wait", "hi"], theirs).code == 0

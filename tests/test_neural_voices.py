@@ -221,7 +221,7 @@ def test_espeak_speaks_instead_of_a_broken_voice_until_it_is_mended(env: dict[st
         assert robot.heard(robot.say("hello", None)) == ("SUCCEEDED", INSTEAD)
         assert robot.neural(BROKEN) == {"state": "failed", "why": why}
         assert f"{BROKEN} failed: " in run([*TALK, "status"], env).out
-        assert f"voice {BROKEN} cannot be loaded, espeak speaks where it may: {why}" in robot.server.log
+        assert f"voice {BROKEN} can't be loaded, so espeak speaks (except with --voice-only): {why}" in robot.server.log
         done = run([*TALK, "--json", "say", "--wait", "--voice-only", "hello"], env)
         goal = json.loads(done.out)
         assert (done.code, goal["reason"], goal["message"]) == (4, "voice_failed", f"speech failed: {why}")
@@ -237,7 +237,7 @@ def test_two_voices_that_do_not_fit_together_speak_in_turn(env: dict[str, str], 
         names = (TINY, "piper/second", TINY)
         goals = [robot.say(voice=each) for each in names]
         assert [robot.heard(each) for each in goals] == [("SUCCEEDED", each) for each in names]
-        assert "voice piper/tiny dropped, to make room" in robot.server.log
+        assert "unloaded voice piper/tiny to make room" in robot.server.log
 
 
 def test_a_voice_that_is_dropped_while_it_speaks_is_not_counted_twice(env: dict[str, str], tmp_path: Path) -> None:
@@ -249,18 +249,18 @@ def test_a_voice_that_is_dropped_while_it_speaks_is_not_counted_twice(env: dict[
         second = robot.say(voice="piper/second")
         assert robot.heard(first) == ("SUCCEEDED", TINY)
         assert robot.heard(second) == ("SUCCEEDED", "piper/second")
-        robot.until(lambda: f"voice {TINY} dropped: the voices take more" in robot.server.log)
+        robot.until(lambda: f"unloaded voice {TINY}, because the voices exceed --voice-memory" in robot.server.log)
         assert (robot.neural(TINY)["state"], robot.neural("piper/second")["why"]) == (None, None)
         assert robot.server.log.count("voice piper/second loaded") == 1
-        assert "it takes" not in robot.server.log
+        assert "it uses" not in robot.server.log
 
 
 def test_a_voice_that_alone_takes_too_much_memory_speaks_and_is_told(env: dict[str, str]) -> None:
     env["BALLAST_BYTES"] = "100000000"
     with _robot(env, "--voice-memory", "50") as robot:
         assert robot.heard(robot.say()) == ("SUCCEEDED", TINY)
-        assert re.search(rf"voice {TINY}: it takes 1\d\d MB, more than --voice-memory 50\n", robot.server.log)
-        assert re.search(rf"{TINY} loaded: it takes 1\d\d MB, more than", run([*TALK, "status"], env).out)
+        assert re.search(rf"voice {TINY}: it uses 1\d\d MB, more than --voice-memory 50 allows\n", robot.server.log)
+        assert re.search(rf"{TINY} loaded: it uses 1\d\d MB, more than", run([*TALK, "status"], env).out)
 
 
 def test_a_pitch_is_refused_with_a_voice_that_has_none(env: dict[str, str]) -> None:
@@ -287,7 +287,7 @@ def test_an_engine_that_dies_costs_one_goal_and_loads_its_voice_again(env: dict[
 
 
 def test_a_voice_that_kills_the_engine_twice_is_left_alone(env: dict[str, str], hold: Path) -> None:
-    why = "the engine process ended while it was being loaded"
+    why = "the engine process died while loading the voice"
     with _robot(env, "--voice", TINY) as robot:
         for crashes in (1, 2):
             robot.until(lambda: robot.neural()["state"] == "loading")

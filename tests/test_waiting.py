@@ -390,7 +390,7 @@ async def test_bug_in_a_report_harms_no_other_report(monkeypatch: pytest.MonkeyP
         served.report(protocol.Alive(f"4k7f-{number}"))
     await asyncio.sleep(0)
     assert len(taken) == 3
-    assert failed == [("a report of the engine", ZeroDivisionError)]
+    assert failed == [("a report from the engine", ZeroDivisionError)]
 
 
 @in_loop

@@ -75,7 +75,7 @@ class Client:
             ServerUnavailable, AccessDenied, Busy, ProtocolMismatch: there is no server that can be used.
         """
         if not timeout > 0:
-            raise UsageError(f"the timeout is {timeout!r}: it must be more than 0 seconds")
+            raise UsageError(f"the timeout must be more than 0, got {timeout!r}")
         self._connection: Connection = ReconnectingConnection(socket, name=name, patience=timeout)
         #: the first server's boot id, which is prepended to ids that are only numbers
         self._first_boot = self._connection.boot
@@ -291,7 +291,7 @@ class Client:
             UsageError: the count is out of its range.
         """
         if not 0 < count <= MAX_LOG_GOALS:
-            raise UsageError(f"a log has 1 to {MAX_LOG_GOALS} goals, not {count}")
+            raise UsageError(f"the count must be 1 to {MAX_LOG_GOALS:,}, got {count}")
         _, items = self._connection.request(Log(count))
         return list(goals(items, "goal"))
 
@@ -415,7 +415,7 @@ class Client:
             if event is None or isinstance(event, str):
                 break
             yield event
-        why = f"nothing more is heard of the server at {self.path}: {self._connection.ended}"
+        why = f"no more events from the server at {self.path}: {self._connection.ended}"
         raise Lost(buffer.closed or why)
 
 
@@ -427,9 +427,9 @@ def check_id(goal_id: str) -> None:
         UnknownGoal: the id is too long for any goal.
     """
     if not goal_id:
-        raise UsageError("an id is empty: is the variable set that it comes from?")
+        raise UsageError("the goal's id is empty; check the variable that should contain it")
     if len(goal_id) > MAX_ID_CHARS:
-        raise UnknownGoal(f"no goal {goal_id[:MAX_ID_CHARS]!a}… is known: an id has at most {MAX_ID_CHARS} characters")
+        raise UnknownGoal(f"unknown goal {goal_id[:MAX_ID_CHARS]!a}…: an id has at most {MAX_ID_CHARS} characters")
 
 
 def batches(ids: Iterable[str]) -> list[tuple[str, ...]]:
@@ -457,7 +457,7 @@ def check(request: Say | Set) -> None:
         try:
             fault = option.type_error(getattr(request, option.name))
         except (TypeError, ValueError) as error:  # `data` contains a value that JSON can't represent
-            fault = f"is no JSON: {error}"
+            fault = f"can't be sent as JSON: {error}"
         if fault:
             raise UsageError(f"{option.name!r} {fault}")
     if words := bad_option(request):
@@ -473,7 +473,7 @@ def too_long(request: Say) -> Goal | None:
     try:
         line = request_line({"seq": _LONG_SEQ, **write_request(request)})
     except ValueError as error:  # `data` contains NaN or an infinite number
-        raise UsageError(f"'data' is no JSON: {error}") from None
+        raise UsageError(f"'data' can't be sent as JSON: {error}") from None
     if len(line) <= MAX_LINE_BYTES:
         return None
     from talkcli.goals.reasons import Reason  # rarely needed, and slow to import

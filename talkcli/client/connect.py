@@ -40,8 +40,8 @@ ANSWER_LIMIT_S = 5.0
 RETRY_PAUSE_S = (0.02, 0.2)
 #: Advice for users who can't connect to a server.
 _START_STEP = "start one with: talk serve"
-_LET_IN_STEP = "have its owner let you in, with `talk serve --socket-mode 0660` and the socket's group"
-_START_OWN_STEP = "or start your own with: talk serve"
+_LET_IN_STEP = "its owner can let you in with: talk serve --socket-mode 0660 (if you are in the socket's group)"
+_START_OWN_STEP = "or start your own server with: talk serve"
 
 
 @frozen
@@ -103,7 +103,7 @@ def _check_owner(connected: _socket.socket) -> None:
     """Raise AccessDenied if the server belongs to another user, who could read all requests."""
     _, uid = peers.credentials(connected)
     if uid not in {os.getuid(), 0}:
-        raise AccessDenied(f"belongs to uid {uid}; to use it all the same, name it with --socket")
+        raise AccessDenied(f"belongs to uid {uid}; to use it anyway, add --socket")
 
 
 def send_early(
@@ -278,8 +278,8 @@ def _greet(
         while b"\n" not in received:
             if not wait_ready({connected.fileno(): POLLIN}, end - time.monotonic(), interrupt):
                 listener, _ = peers.credentials(connected)
-                hint = f"look at process {listener}, and restart it if it hangs"
-                raise ServerUnavailable(f"the server at {attempt.path} does not answer; {hint}")
+                hint = f"check process {listener}, and restart it if it hangs"
+                raise ServerUnavailable(f"the server at {attempt.path} doesn't respond; {hint}")
             data = connected.recv(65536)
             if not data:
                 raise ConnectionResetError
@@ -296,7 +296,7 @@ def unreachable(attempt: ConnectionAttempt, named: str | None) -> TalkError:
     """Return an error that lists the failed places and advises the user."""
     if attempt.backlog_full:
         path = attempt.failures[-1][0]
-        return ServerUnavailable(f"the server at {path} does not take up connections: restart it if it hangs")
+        return ServerUnavailable(f"the server at {path} doesn't accept connections; restart it if it hangs")
     tried = ""
     found = ""  # description of the last place
     denied = False
@@ -305,7 +305,7 @@ def unreachable(attempt: ConnectionAttempt, named: str | None) -> TalkError:
         if isinstance(error, OSError):
             words = found = paths.describe_place(path, error)
             if found == paths.PLACE_DIRECTORY:
-                words += f": name the one in it, {_inside(path)}"
+                words += f"; use {_inside(path)}"
         denied = denied or isinstance(error, AccessDenied) or found == paths.PLACE_FORBIDDEN
         tried += f"  {path}: {words}\n"
     step = f"{_LET_IN_STEP}\n{_START_OWN_STEP}" if denied else _START_STEP
@@ -313,10 +313,10 @@ def unreachable(attempt: ConnectionAttempt, named: str | None) -> TalkError:
         step = _named_step(named, found, denied=denied)
     hint = paths.sudo_hint()
     if hint and not os.environ.get("TALK_SOCKET"):
-        step += f"\nthe server of the user who called sudo would be reached with: talk --socket {hint}"
+        step += f"\nto use the server of the user who called sudo, run: talk --socket {hint}"
     if denied:
-        return AccessDenied(f"no server that may be used, tried:\n{tried}{step}")
-    return ServerUnavailable(f"no server, tried:\n{tried}{step}")
+        return AccessDenied(f"no server that you may use; tried:\n{tried}{step}")
+    return ServerUnavailable(f"no server found; tried:\n{tried}{step}")
 
 
 def _named_step(named: str, found: str, *, denied: bool) -> str:
@@ -336,12 +336,12 @@ def _named_step(named: str, found: str, *, denied: bool) -> str:
     if denied:
         step = _LET_IN_STEP if by_variable else f"{_LET_IN_STEP}\n{_START_OWN_STEP}"
     elif found == paths.PLACE_FILE:
-        step = "name a socket" if by_variable else "name a socket, or leave out --socket"
+        step = "set TALK_SOCKET to a socket" if by_variable else "choose a socket, or leave out --socket"
     elif by_variable:
         step = f"set TALK_SOCKET to {place}" if found == paths.PLACE_DIRECTORY else _START_STEP
     else:
         step = f"{_START_STEP} --socket {place}"
-    return f"{step}\nor unset TALK_SOCKET, which names this place: no other was tried" if by_variable else step
+    return f"{step}\nor unset TALK_SOCKET to try the usual places" if by_variable else step
 
 
 def _inside(directory: str) -> str:

@@ -44,9 +44,7 @@ def checked_sender_name(name: str | None) -> str | None:
     """Return the same as `sender_name`. Raises UsageError if the name is too long."""
     name = sender_name(name)
     if name and len(name) > MAX_SENDER_NAME_CHARS:
-        raise UsageError(
-            f"the name of the sender has {len(name)} characters, the longest allowed is {MAX_SENDER_NAME_CHARS}"
-        )
+        raise UsageError(f"the sender's name is too long: {len(name)} characters (at most {MAX_SENDER_NAME_CHARS})")
     return name
 
 
@@ -255,7 +253,7 @@ class Connection(ClientCore):
 
     def _cut_off(self) -> None:
         """Break the connection, because a line could only be sent in part. The caller must hold the lock `changed`."""
-        self.break_off(f"it took nothing for {self._patience:g} s", time.monotonic())
+        self.break_off(f"the server accepted no data for {self._patience:g} s", time.monotonic())
 
     # -- methods that each transport implements. Callers of `_send` and `_hang_up` hold the lock `changed`.
 
@@ -336,7 +334,7 @@ class SocketConnection(Connection):
     def _send(self, exchange: Exchange) -> None:
         line = self.line(exchange)
         if exchange.on_failure and self.unsent_bytes + len(line) > MAX_UNSENT_BYTES:
-            words = f"{MAX_UNSENT_BYTES >> 10} KiB wait to be sent to the server at {self.path} already"
+            words = f"{MAX_UNSENT_BYTES >> 10} KiB are already waiting for the server at {self.path}"
             raise ServerUnavailable(f"nothing was sent: {words}")
         self.queue(line, exchange)
         self._flush()
@@ -350,7 +348,7 @@ class SocketConnection(Connection):
             pass
         except OSError as error:  # keep the connection, because the server's last messages can still be read
             if self.greeted:
-                self.stop_sending(f"the server went away: {error.strerror}")
+                self.stop_sending(f"the connection to the server was lost: {error.strerror}")
 
     def _step(self, timeout: float, interruptible: bool) -> None:
         with self.changed:
@@ -364,7 +362,7 @@ class SocketConnection(Connection):
         if connected is None:
             wait_ready({}, min(timeout, _RECONNECT_PAUSE_S))
             return
-        data, why = b"", "the server went away"
+        data, why = b"", "the connection to the server was lost"
         try:
             watched = {connected.fileno(): select.POLLIN | (select.POLLOUT if waits else 0)}
             if not wait_ready(watched, timeout, self._interrupt if interruptible else None):
@@ -375,7 +373,7 @@ class SocketConnection(Connection):
         except ConnectionResetError:  # the server closed the connection without reading all requests
             pass
         except (OSError, ValueError) as error:  # ValueError: another thread has closed the socket
-            why = f"the connection broke: {error}"
+            why = f"the connection to the server was lost: {error}"
         with self.changed:
             if connected is not self._socket:
                 return  # another thread has disconnected
@@ -438,7 +436,7 @@ class ReconnectingConnection(SocketConnection):
             if self._socket is not None and not self.greeted and now >= self._due:
                 self._drop()
                 self._give_up_socket()
-                self._not_connected(ServerUnavailable(f"the server at {self.path} does not answer"), now)
+                self._not_connected(ServerUnavailable(f"the server at {self.path} doesn't respond"), now)
             if self.ended is None:
                 self._connect_again(now)
             if not self.greeted:

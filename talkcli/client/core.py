@@ -87,9 +87,7 @@ class EventBuffer:
         elif len(self._states) < MAX_STATE_EVENTS:
             self._states.append((self._count, event))
         else:
-            self.closed = (
-                f"more than {MAX_STATE_EVENTS} events waited and none was taken: watch again, and take them faster"
-            )
+            self.closed = f"events were read too slowly (more than {MAX_STATE_EVENTS:,} were waiting); watch again"
 
     def __len__(self) -> int:
         return len(self._states) + len(self._feedback)
@@ -259,12 +257,13 @@ def read_greeting(line: bytes, path: str) -> tuple[str, int | None]:
     except BadRequest:
         greeting = {}
     if "talk" not in greeting:
-        raise ServerUnavailable(f"what answers at {path} is no talk server")
+        raise ServerUnavailable(f"the program that listens at {path} is not a talk server")
     events.check_greeting(greeting)
     if "error" in greeting:
         from talkcli.terminal.text import printable  # rarely needed, and slow to import
 
-        raise AccessDenied(f"the server refuses: {printable(str(greeting.get('message') or greeting['error']))}")
+        reason = printable(str(greeting.get("message") or greeting["error"]))
+        raise AccessDenied(f"the server refused the connection: {reason}")
     return identity(greeting)
 
 
@@ -454,12 +453,12 @@ class ClientCore:
         if not exchange.sent:
             if self.connect_error and not self.ended:
                 why = " ".join(self.connect_error.message.split())
-            why = why or self._sending_ended or "it does not answer"
+            why = why or self._sending_ended or "the server doesn't respond"
             return ServerUnavailable(f"nothing was sent to the server at {self.path}: {why}")
         why = why or f"it did not reply within {self._patience:g} s"
-        words = f"{request.kind} was sent to the server at {self.path}, but {why}"
+        words = f"the {request.kind} request was sent to the server at {self.path}, but {why}"
         if isinstance(request, Say):
-            return Lost(f"{words}; it may still be spoken")
+            return Lost(f"{words}; the sentence may still be spoken")
         return Lost(words) if isinstance(request, self.lasting) else ServerUnavailable(words)
 
     def refusal(self, reply: JsonObject, items: list[JsonObject]) -> TalkError:
@@ -468,7 +467,7 @@ class ClientCore:
 
         error = reply.get("error")
         code, message = (error.get("code"), error.get("message")) if isinstance(error, dict) else (None, None)
-        return refusal(str(code), printable(str(message or "refused: the server gives no reason")), items)
+        return refusal(str(code), printable(str(message or "the server refused the request without a reason")), items)
 
     # -- time limits
 
@@ -487,7 +486,7 @@ class ClientCore:
         """
         if self.absent_since is not None:
             return float("inf"), ""
-        return max(began, self._heard) + SILENCE_LIMIT_S, f"it has said nothing for {SILENCE_LIMIT_S:g} s"
+        return max(began, self._heard) + SILENCE_LIMIT_S, f"the server sent nothing for {SILENCE_LIMIT_S:g} s"
 
     def goals_lost_at(self) -> float:
         """Return the time at which followed goals become LOST if the client hasn't reconnected."""
@@ -544,7 +543,7 @@ class ClientCore:
             try:
                 self.dispatch(decode(line), now)
             except (BadRequest, ValueError) as error:  # ValueError: a malformed goal or event
-                self.break_off(f"it sent what is no message: {error}", now)
+                self.break_off(f"the server sent a malformed message: {error}", now)
 
     def match(self, message: JsonObject) -> Exchange | None:
         """Return the exchange to which a message belongs, or None if there is none."""
@@ -564,7 +563,7 @@ class ClientCore:
             self.listeners.publish(events.from_json(message))
             return None
         if message.get("seq") is None and message.get("ok") is False:
-            self._last_error = f"the server closed it: {self.refusal(message, [])}"
+            self._last_error = f"the server closed the connection: {self.refusal(message, [])}"
         exchange = self.match(message)
         if exchange is None:
             return None
@@ -615,7 +614,7 @@ class ClientCore:
         self.greeted = False
         self.begin_stream()
         self._fail_all()
-        why = f"nothing more is heard of the server at {self.path}: {self.absence}"
+        why = f"no more events from the server at {self.path}: {self.absence}"
         self.listeners.end_watches(why, include_reconnecting=False)
 
     def connecting(self, hello: bytes) -> None:
@@ -674,7 +673,7 @@ class ClientCore:
 
         def on_failure(error: TalkError) -> None:
             if self.absent_since is None:  # if the connection broke again, the goal is followed on the next one
-                self.listeners.lose(goal_id, f"{error.message}; it may have been spoken")
+                self.listeners.lose(goal_id, f"{error.message}; the sentence may have been spoken")
 
         self._begin(Exchange(Wait((goal_id,), feedback), on_reply, on_failure), now)
 
@@ -713,7 +712,7 @@ class ClientCore:
     def _lose_goals(self) -> None:
         """End all followed goals as LOST."""
         for goal_id in self.listeners.goals:
-            self.listeners.lose(goal_id, f"{self.absence}; it may still be spoken")
+            self.listeners.lose(goal_id, f"{self.absence}; the sentence may still be spoken")
 
     def _drop_lines(self) -> None:
         self._unsent.clear()

@@ -111,7 +111,7 @@ class GoalHandle(TrackedGoal):
             UsageError: the goal was sent with `follow=False`, and neither `wait` nor `events` has been called.
         """
         if self._followed_at is None and not self.state.terminal:
-            raise UsageError(f"nothing is heard of {self.id}, which was sent with follow=False: leave that out")
+            raise UsageError(f"goal {self.id} has no events, because it was sent with follow=False")
         since = None if self.state.terminal else self._followed_at
         self._connection.wait_until(lambda: False, time.monotonic(), since=since, interruptible=False)
         if not self._has_event():
@@ -183,14 +183,14 @@ class GoalHandle(TrackedGoal):
     def _give_up(self, timeout: float | None) -> None:
         """End the goal as LOST if the connection has ended, or else raise TimeoutError."""
         if not self._lose():
-            raise TimeoutError(f"{self.id} has not ended after {0 if timeout is None else round(timeout, 1):g} s")
+            raise TimeoutError(f"goal {self.id} has not ended after {0 if timeout is None else round(timeout, 1):g} s")
 
     def _lose(self) -> bool:
         """End the goal as LOST if the connection has ended. Return whether the connection has ended."""
         ended = self._connection.ended
         if ended is not None:
             with self._connection.changed:
-                self._mark_lost(f"{ended}; it may still be spoken")
+                self._mark_lost(f"{ended}; the sentence may still be spoken")
         return ended is not None
 
 

@@ -83,14 +83,14 @@ def write_limited(kind: str, message: str) -> None:
     """
     suppressed = _rate_limits.setdefault(kind, RateLimit(1, _REPEAT_AFTER_S)).allow(time.monotonic())
     if suppressed is not None:
-        write(f"{message} ({suppressed} more of these were not logged)" if suppressed else message)
+        write(f"{message} ({suppressed} similar lines were not logged)" if suppressed else message)
 
 
 def write_bug(what: str, error: Exception) -> None:
     """Log an unexpected exception, with the file and line that raised it."""
     frames = traceback.extract_tb(error.__traceback__)
     place = f" at {os.path.basename(frames[-1].filename)}:{frames[-1].lineno}" if frames else ""
-    write(f"a bug in {what}{place}: {sanitize(f'{type(error).__name__}: {error}')}")
+    write(f"internal error in {what}{place}: {sanitize(f'{type(error).__name__}: {error}')}")
 
 
 def handle_loop_error(_loop: object, context: Mapping[str, Any]) -> None:

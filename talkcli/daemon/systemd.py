@@ -66,8 +66,8 @@ class ServiceManager:
 
     def notify_stopping(self) -> None:
         """Report that the process is stopping. Watchdog notifications continue until `close`."""
-        if self._status != "ending":
-            self._send(STOPPING="1", STATUS="ending")
+        if self._status != "stopping":
+            self._send(STOPPING="1", STATUS="stopping")
 
     def close(self) -> None:
         """Stop all notifications."""
@@ -80,7 +80,7 @@ class ServiceManager:
 
     def _notify_status(self) -> None:
         status = self._describe_status()
-        if self._status not in {status, "ending"}:
+        if self._status not in {status, "stopping"}:
             self._send(STATUS=status)
 
     def _notify_watchdog(self) -> None:
@@ -108,9 +108,7 @@ class ServiceManager:
             self._socket.sendto(data, self._address)
         except OSError as error:
             if not isinstance(error, BlockingIOError):  # BlockingIOError: the queue is full
-                log.write_limited(
-                    "supervisor", f"the supervisor (NOTIFY_SOCKET) can't be told anything: {error.strerror}"
-                )
+                log.write_limited("supervisor", f"can't notify the service manager (NOTIFY_SOCKET): {error.strerror}")
             self._schedule("retry", NOTIFY_RETRY_DELAY_S, self._send)
         else:
             self._unsent.clear()

@@ -258,7 +258,7 @@ class VoiceScheduler:
         self._reported_bytes = self._used_bytes = 0
         for voice, found in list(self._voices.items()):
             if voice == suspect and found.failures + 1 >= MAX_ENGINE_DEATHS:
-                found.fail("the engine process died while loading it", now)
+                found.fail("the engine process died while loading the voice", now)
             elif voice == suspect:
                 self._voices[voice] = NeuralVoice(found.size_bytes, failures=found.failures + 1)
             elif found.state is not VoiceState.FAILED:

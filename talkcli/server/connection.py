@@ -205,7 +205,7 @@ class ClientConnection(asyncio.Protocol):
         self._held_feedback = b""
         self._half_closed = self._finishing = self._turn_is_due = False
         self._bad_lines = 0
-        self._first_limit = self._close_after(FIRST_REQUEST_S, f"no request came within {FIRST_REQUEST_S:g} s")
+        self._first_limit = self._close_after(FIRST_REQUEST_S, f"no request arrived within {FIRST_REQUEST_S:g} s")
         self._line_limit: asyncio.TimerHandle | None = None
 
     def begin(self) -> None:
@@ -316,7 +316,7 @@ class ClientConnection(asyncio.Protocol):
         if not reading or not self._splitter.size:
             self._stop_line_limit()
         elif self._line_limit is None:
-            self._line_limit = self._close_after(LINE_LIMIT_S, f"a line took more than {LINE_LIMIT_S:g} s")
+            self._line_limit = self._close_after(LINE_LIMIT_S, f"a line was not complete within {LINE_LIMIT_S:g} s")
 
     def _stop_line_limit(self) -> None:
         if self._line_limit:

@@ -33,7 +33,7 @@ MAX_BACKLOG_CONNECTIONS = 1024
 HOLDER_ID_S = 1.0
 #: The first file descriptor passed by systemd (SD_LISTEN_FDS_START).
 _FIRST_PASSED = 3
-_RESTART_SOCKET = "restart the socket's unit (systemctl restart talk.socket)"
+_RESTART_SOCKET = "restart it with: systemctl restart talk.socket"
 #: Errors that may be temporary: not enough memory, disk space or file descriptors, or a read-only file system.
 _TEMPORARY = {errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOBUFS, errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 
@@ -112,7 +112,7 @@ class InheritedListener:
         self.path = _path_of(self.socket)
         self._identity = _identity(self.path)
         if self._identity is None:
-            raise AddressInUse(f"the passed socket's file {self.path} is gone: {_RESTART_SOCKET}")
+            raise AddressInUse(f"the socket {self.path} was removed; {_RESTART_SOCKET}")
         self.mode = stat.S_IMODE(os.lstat(self.path).st_mode)
 
     def in_place(self) -> bool:
@@ -124,7 +124,7 @@ class InheritedListener:
 
         If only the server were restarted, systemd would pass the old socket again.
         """
-        raise AddressInUse(f"the file of the socket {self.path} was removed or replaced: {_RESTART_SOCKET}")
+        raise AddressInUse(f"the socket {self.path} was removed or replaced; {_RESTART_SOCKET}")
 
     def close(self) -> None:
         """Close the socket. The socket file stays."""
@@ -141,7 +141,7 @@ def listen(path: str | None, mode: int) -> Listener | InheritedListener:
     passed = os.environ.get("LISTEN_FDS")
     if passed and os.environ.get("LISTEN_PID") == str(os.getpid()):
         if passed != "1":
-            raise UsageError(f"{passed} sockets were passed (LISTEN_FDS), talk serves one")
+            raise UsageError(f"systemd passed {passed} sockets (LISTEN_FDS), but talk can serve only one")
         inherited = InheritedListener(_FIRST_PASSED)
         if not path or paths.server_socket(path) == inherited.path:
             return inherited
@@ -178,8 +178,8 @@ def _already_served(pid: int | None, path: str, *, here: bool) -> AddressInUse:
     `here` is true if that server runs on this machine.
     """
     name = "unknown" if pid is None else pid
-    how = f" (kill {pid})" if here else ""
-    return AddressInUse(f"a server (pid {name}) serves {path} already: use it, or end it first{how}")
+    stop = f"with: kill {pid}" if here else "first"
+    return AddressInUse(f"a server (pid {name}) is already running at {path}; use it, or stop it {stop}")
 
 
 # -- the socket
@@ -192,12 +192,12 @@ def _path_of(passed: socket.socket) -> str:
         UsageError: if the socket is of another type, or has no path.
     """
     if passed.family != socket.AF_UNIX:
-        raise UsageError("the socket that was passed (LISTEN_FDS) is not a Unix socket: use ListenStream=/path")
+        raise UsageError("the socket passed by systemd (LISTEN_FDS) is not a Unix socket; use ListenStream=/path")
     if passed.type != socket.SOCK_STREAM or not passed.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):
-        raise UsageError("the socket that was passed (LISTEN_FDS) doesn't listen: use ListenStream= and Accept=no")
+        raise UsageError("the socket passed by systemd (LISTEN_FDS) doesn't listen; use ListenStream= and Accept=no")
     name = passed.getsockname()
     if not isinstance(name, str) or not os.path.isabs(name):
-        raise UsageError("the socket that was passed (LISTEN_FDS) has no file: use ListenStream=/path")
+        raise UsageError("the socket passed by systemd (LISTEN_FDS) has no path; use ListenStream=/path")
     return name
 
 
@@ -208,7 +208,7 @@ def _refuse_second_server(path: str | None) -> None:
     except (ServerUnavailable, AccessDenied):
         return  # no server answers clients of this user
     except TalkError as error:
-        raise AddressInUse(f"a server is there already: {error}") from error
+        raise AddressInUse(f"a server is already running: {error}") from error
     assert found.socket
     here, _ = peers.credentials(found.socket)  # this is the process id of ssh if ssh forwards the socket
     found.socket.close()
@@ -228,7 +228,7 @@ def _refuse_live_socket(path: str) -> None:
             pass  # a program listens, but its backlog is full
         except OSError:
             return
-    raise AddressInUse(f"another program listens at {path} now")
+    raise AddressInUse(f"another program now listens at {path}")
 
 
 def _check_directory(directory: str) -> None:
@@ -237,19 +237,19 @@ def _check_directory(directory: str) -> None:
     Raises:
         AddressInUse: if the directory can't be created, or if other users could replace the socket in it.
     """
-    with _refusing(f"the socket's directory {directory} can't be made"), contextlib.suppress(FileExistsError):
+    with _refusing(f"can't create the socket's directory {directory}"), contextlib.suppress(FileExistsError):
         os.mkdir(directory, 0o700)
     status = os.lstat(directory)
     if stat.S_ISLNK(status.st_mode):
-        raise AddressInUse(f"the socket's directory {directory} is a symbolic link: name the directory itself")
+        raise AddressInUse(f"the socket's directory {directory} is a symbolic link; use the directory it points to")
     if not stat.S_ISDIR(status.st_mode):
-        raise AddressInUse(f"{directory} is not a directory")
+        raise AddressInUse(f"{directory} is not a directory; choose another path for the socket")
     if status.st_uid not in {os.getuid(), 0}:
-        raise AddressInUse(f"the socket's directory {directory} belongs to uid {status.st_uid}: name another one")
+        raise AddressInUse(f"the socket's directory {directory} belongs to uid {status.st_uid}; choose another one")
     if status.st_mode & 0o022 and not status.st_mode & stat.S_ISVTX:
         raise AddressInUse(
-            f"others may write to the socket's directory {directory} (mode {stat.S_IMODE(status.st_mode):04o}): "
-            f"chmod go-w {directory}"
+            f"other users can write to the socket's directory {directory} (mode {stat.S_IMODE(status.st_mode):04o}); "
+            f"run: chmod go-w {directory}"
         )
 
 
@@ -261,18 +261,18 @@ def _refuse_other_file(path: str) -> None:
         return
     if stat.S_ISDIR(mode):
         inside = os.path.join(path, paths.SOCKET_NAME)
-        raise AddressInUse(f"{path} exists and is no socket but a directory: name one in it, --socket {inside}")
+        raise AddressInUse(f"{path} is a directory, not a socket; use --socket {inside}")
     if not stat.S_ISSOCK(mode):
-        step = "remove it, or name another one" if stat.S_ISREG(mode) or stat.S_ISLNK(mode) else "name another one"
-        raise AddressInUse(f"{path} exists and is no socket: {step}")
+        remove = "remove it, or " if stat.S_ISREG(mode) or stat.S_ISLNK(mode) else ""
+        raise AddressInUse(f"{path} exists, but is not a socket; {remove}choose another path")
 
 
 def _bind(path: str, mode: int) -> socket.socket:
     """Create a socket that listens at this path. The caller must hold the lock."""
     _refuse_other_file(path)
-    with _refusing(f"the socket {path} of an earlier server can't be removed"), contextlib.suppress(FileNotFoundError):
+    with _refusing(f"can't remove the old socket {path}"), contextlib.suppress(FileNotFoundError):
         os.unlink(path)
-    with _refusing(f"cannot listen at {path}"):
+    with _refusing(f"can't listen at {path}"):
         listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         listening.setblocking(False)
         listening.bind(path)
@@ -318,7 +318,7 @@ def _open_lock(name: str) -> int:
     """Open or create a lock file, and return its descriptor."""
     flags = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
     while True:
-        with _refusing(f"the lock {name} can't be opened"):
+        with _refusing(f"can't open the lock file {name}"):
             with contextlib.suppress(FileExistsError):
                 return os.open(name, flags | os.O_CREAT | os.O_EXCL, 0o600)
             with contextlib.suppress(FileNotFoundError):  # the file has just been removed, so try again
@@ -333,12 +333,12 @@ def _refuse_other_lock(name: str, status: os.stat_result) -> None:
     if stat.S_ISLNK(status.st_mode):
         what = "a symbolic link"
     elif not stat.S_ISREG(status.st_mode):
-        what = "no regular file"
+        what = "not a regular file"
     elif status.st_nlink > 1:
-        what = "a hard link, another name of some file"
+        what = "a hard link to another file"
     else:
         return
-    raise AddressInUse(f"the lock {name} is {what}: remove it, or name another socket with --socket")
+    raise AddressInUse(f"the lock file {name} is {what}; remove it, or choose another socket with --socket")
 
 
 def _exists(pid: int) -> bool:

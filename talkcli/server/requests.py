@@ -108,7 +108,7 @@ class Requests:
             pending.refuse(error.code, str(error))
         except Exception as error:  # noqa: BLE001 - other clients must not be affected
             log.write_bug(request.kind, error)
-            pending.refuse("internal_error", f"{request.kind} failed: a bug of talk's, see its log")
+            pending.refuse("internal_error", f"{request.kind} failed because of a bug in talk; see the server's log")
         finally:
             self._waiting_bytes -= pending.kept_bytes
             del pending.connection.unanswered[pending]
@@ -141,9 +141,9 @@ class Requests:
             return True  # the request has waited before
         size = REQUEST_BYTES + sum(map(_memory_of, fields(pending.request).values()))
         if len(pending.connection.unanswered) > MAX_CLIENT_REQUESTS:  # the count includes this request
-            words = f"{MAX_CLIENT_REQUESTS:,} requests of this connection are waiting already"
+            words = f"too many requests are waiting ({MAX_CLIENT_REQUESTS:,} of this connection)"
         elif self._waiting_bytes + size > MAX_KEPT_REQUEST_BYTES:
-            words = f"{MAX_KEPT_REQUEST_BYTES >> 20} MiB of requests are waiting already"
+            words = f"too many requests are waiting ({MAX_KEPT_REQUEST_BYTES >> 20} MiB)"
         else:
             pending.kept_bytes = size
             self._waiting_bytes += size
@@ -246,7 +246,7 @@ class Requests:
         voice, refusal = self._speech.voices.look_up(say.voice, self._scheduler.settings.voice)
         say = replace(say, voice=voice)
         if say.pitch not in {None, options.INITIAL.pitch} and options.is_neural(voice or ""):
-            words = f"the voice {voice} has no pitch but its own: leave the pitch out, or take one of espeak's"
+            words = f"the voice {voice} has a fixed pitch; leave out the pitch, or use an espeak voice"
             refusal = refusal or (Reason.BAD_OPTION, words)
         return say, pending.refusal or refusal
 
@@ -302,7 +302,7 @@ class Requests:
         if active and active is not speech.silent_goal:
             in_time = await pending.wait(speech.waiting_for_silence(active), PAUSE_ANSWER_S)
             if not in_time:
-                words = f"speech is paused, but {active.id} was not known to be silent within {PAUSE_ANSWER_S:g} s"
+                words = f"speech is paused, but silence of {active.id} was not confirmed within {PAUSE_ANSWER_S:g} s"
                 raise RequestRefused(words, Reason.NOT_SILENT)
         self._answer_pause(pending, active)
 
@@ -354,9 +354,9 @@ class Requests:
         self._speech.voices.find_new_files()
         voices = self._speech.voices.listed
         if voices is None:
-            words = f"the engine can't list its voices now: it is {self._speech.engine_status}"
+            words = f"the engine hasn't listed its voices yet ({self._speech.engine_status})"
             if self._scheduler.active:
-                words += ", and busy with its first sentence: ask again after that"
+                words += "; try again after the first sentence"
             raise RequestRefused(words, Reason.ENGINE_FAILED)
         pending.answer(({"voice": fields(each)} for each in voices), count=len(voices))
 
@@ -378,7 +378,7 @@ class Requests:
         speech.apply(effects)
         if changes:
             values = ", ".join(f"{name} {options.format_number(value)}" for name, value in changes.items())
-            log.write(f"set to {log.sanitize(values)} by {describe_sender(pending.connection.client)}")
+            log.write(f"settings changed to {log.sanitize(values)} by {describe_sender(pending.connection.client)}")
         pending.answer(settings=options.shown_settings(scheduler.settings))
 
     def _find(self, goal_id: str) -> Record:
@@ -389,7 +389,7 @@ class Requests:
 
 
 def _unknown_message(*ids: str) -> str:
-    return f"no goal {', '.join(map(repr, ids))} is known: see `talk status`"
+    return f"unknown goal{'s' * (len(ids) > 1)} {', '.join(map(repr, ids))}; list the goals with: talk status"
 
 
 def _goal_lines(name: str, records: Iterable[Record]) -> Iterator[JsonObject]:

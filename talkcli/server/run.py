@@ -152,7 +152,7 @@ class Server:
         try:
             speech.engine.thread.start()
         except RuntimeError as error:  # there is no more specific exception
-            raise TalkError(f"the engine's thread cannot be started: {memory_limits()}") from error
+            raise TalkError(f"can't start the engine's thread: {memory_limits()}") from error
         try:
             self._acceptor.open(self._listener.socket)
             self._socket_check = self._loop.call_later(SOCKET_CHECK_S, self._check_socket)
@@ -206,14 +206,14 @@ class Server:
         except AddressInUse as error:
             if not (self._listener.passed or is_temporary(error)):
                 # Clients can't reach this server any more, so shut down. A service manager may restart it.
-                log.write(log.sanitize(f"ending: {error}"))
+                log.write(log.sanitize(f"stopping: {error}"))
                 self._end(error)
             elif str(error) != self._unreachable:
                 self._unreachable = str(error)
                 log.write(log.sanitize(f"clients can't reach this server: {error}"))
             return
         self._unreachable = ""
-        log.write(f"the socket's file or its lock was gone or another: bound again at {self._listener.path}")
+        log.write(f"created the socket {self._listener.path} again, because it or its lock was removed or replaced")
         self._acceptor.open(self._listener.socket)
         if former:
             former.close()
@@ -225,7 +225,7 @@ class Server:
         pid, uid = peers.credentials(connection.stream.socket)
         # Other users may connect only if the socket's mode allows it.
         if uid not in {os.getuid(), 0} and not self._listener.mode & 0o066:
-            words = f"this server is uid {os.getuid()}'s; it would have to be started with --socket-mode"
+            words = f"this server belongs to uid {os.getuid()}, who can let you in with: talk serve --socket-mode 0660"
             connection.close_with({"talk": PROTOCOL, "error": "permission_denied", "message": words})
         elif len(self.connections) >= self._settings.max_clients + MAX_EXTRA_CLIENTS:
             connection.close_with(busy_greeting())
@@ -297,7 +297,7 @@ class Server:
             connection.stream.abort()
 
     def _on_signal(self, number: signal.Signals) -> None:
-        log.write(f"{signal.Signals(number).name}: ending")
+        log.write(f"stopping after {signal.Signals(number).name}")
         for each in self._end_signals:
             # A second signal ends the server immediately, without the event loop, which may be busy.
             signal.signal(each, self._on_second_signal)

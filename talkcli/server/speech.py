@@ -52,7 +52,7 @@ READY = "ready"
 REPORTS_PER_TURN = 8
 #: Maximum length of a program's name or command line in the log.
 _MAX_LOGGED_COMMAND_CHARS = 80
-_NO_PLAYER_NEEDED = "which plays by itself"
+_NO_PLAYER_NEEDED = "no player needed"
 
 require_fields(protocol.Speak, ENGINE_OPTIONS)
 
@@ -178,11 +178,11 @@ class Speech:
                 self.engine.resume(record.id)
             case VoiceLoadOrder(voice=voice, dropped=dropped):
                 for each in dropped:
-                    log.write(f"voice {log.sanitize(each)} dropped, to make room for {log.sanitize(voice)}")
+                    log.write(f"unloaded voice {log.sanitize(each)} to make room for {log.sanitize(voice)}")
                     self.engine.drop(each)
                 self.engine.load(voice)
             case VoiceDropOrder(voice=voice):
-                log.write(f"voice {log.sanitize(voice)} dropped: the voices take more than --voice-memory allows")
+                log.write(f"unloaded voice {log.sanitize(voice)}, because the voices exceed --voice-memory")
                 self.engine.drop(voice)
             case VoiceWarning(message=message):
                 log.write(log.sanitize(message))
@@ -255,7 +255,7 @@ class Speech:
             try:
                 self._process_report(report)
             except Exception as error:  # noqa: BLE001 - the other reports must not be lost
-                log.write_bug("a report of the engine", error)
+                log.write_bug("a report from the engine", error)
         self._reports_due = True
         self._loop.call_soon(self._process_reports)
 
@@ -283,7 +283,7 @@ class Speech:
                 scheduler.output_changed(event.id, Output.from_json(event.output))
             case protocol.VoiceChosen():
                 if event.fallback_reason:
-                    log.write(log.sanitize(f"{event.id} is spoken by {event.voice}: {event.fallback_reason}"))
+                    log.write(log.sanitize(f"{event.id} is spoken by {event.voice} instead: {event.fallback_reason}"))
                 self.apply(scheduler.voice_chosen(event.id, event.voice, now))
             case protocol.Held():
                 if active.paused and active.pause_count == event.number:
@@ -334,7 +334,7 @@ class Speech:
         elif ended.outcome == protocol.OUTCOME_STOPPED and active.stop_requested_at is not None:
             effects = scheduler.stopped(ended.id, now)
         else:
-            reason, words = ended.reason or Reason.ENGINE_FAILED, ended.message or "the engine stopped by itself"
+            reason, words = ended.reason or Reason.ENGINE_FAILED, ended.message or "the engine stopped unexpectedly"
             effects = scheduler.failed(ended.id, reason, words, ended.duration, now)
         self.apply(effects)
 
@@ -403,7 +403,7 @@ def _log_engine(engine: protocol.Ready, player_options: Sequence[str]) -> None:
     sound = _describe_sound(engine)
     words = f"engine ready: driver {engine.driver}{version}, {sound}"
     if player_options and sound == _NO_PLAYER_NEEDED:
-        words += f": {' and '.join(player_options)} {'has' if len(player_options) == 1 else 'have'} no effect"
+        words += f"; {' and '.join(player_options)} {'has' if len(player_options) == 1 else 'have'} no effect"
     log.write(words)
 
 
@@ -411,7 +411,7 @@ def _log_voice_load(voice: protocol.VoiceLoaded) -> None:
     """Log that a neural voice was loaded, or that loading it failed."""
     how = f"loaded in {voice.seconds:.1f} s"
     if voice.error is not None:
-        how = f"cannot be loaded, espeak speaks where it may: {log.sanitize(voice.error)}"
+        how = f"can't be loaded, so espeak speaks (except with --voice-only): {log.sanitize(voice.error)}"
     log.write(f"voice {log.sanitize(voice.voice)} {how}")
 
 
@@ -429,6 +429,6 @@ def describe_sender(sender: Sender) -> str:
         None if sender.pid is None else f"pid {sender.pid}",
         sender.command and printable(sender.command, _MAX_LOGGED_COMMAND_CHARS),
         sender.parent and f"started by {printable(sender.parent, _MAX_LOGGED_COMMAND_CHARS)}",
-        sender.name and f'calls itself "{printable(sender.name)}"',
+        sender.name and f'named "{printable(sender.name)}"',
     )
-    return ", ".join(filter(None, parts)) or "nobody known"
+    return ", ".join(filter(None, parts)) or "an unknown client"

@@ -42,7 +42,7 @@ RESERVED_DESCRIPTORS = 16
 #: File descriptors used by a server without clients: fourteen of its own, and two for libraries.
 OWN_DESCRIPTORS = 16
 _TOO_FEW_DESCRIPTORS = (
-    "the server has too few file descriptors for more clients: raise LimitNOFILE= of its unit, or ulimit -n before "
+    "the server has too few file descriptors for more clients; raise LimitNOFILE= of its unit, or ulimit -n before "
     "talk serve"
 )
 #: How long to wait after an error before accepting connections again.
@@ -72,7 +72,7 @@ class ClientStreams:
         while self.unread_bytes > MAX_TOTAL_OUTPUT_BYTES and self.open:
             max(self.open, key=lambda each: each.unsent_bytes + each.held_bytes).abort()
             total = MAX_TOTAL_OUTPUT_BYTES >> 20
-            log.write_limited("output", f"a client that doesn't read is let go: {total} MiB wait for all together")
+            log.write_limited("output", f"disconnected a client that doesn't read ({total} MiB are unread in total)")
 
     def flush_later(self, stream: ClientStream) -> None:
         """Send a stream's output at the end of this iteration of the event loop."""
@@ -87,7 +87,7 @@ class ClientStreams:
                 stream.flush()
             except Exception as error:  # noqa: BLE001 - the output of other clients must still be sent
                 stream.abort()
-                log.write_bug("sending to a client", error)
+                log.write_bug("the output to a client", error)
 
 
 class ClientStream:
@@ -269,7 +269,7 @@ def raise_descriptor_limit(clients: int) -> int:
     if allowed < wanted:
         fitting = max(0, allowed - RESERVED_DESCRIPTORS - OWN_DESCRIPTORS)
         log.write(
-            f"{allowed} files may be open: {fitting} clients fit, not {clients}; "
+            f"the limit of {allowed} open files allows only {fitting} clients instead of {clients}; "
             f"raise LimitNOFILE= or ulimit -n to {wanted}"
         )
     return allowed
@@ -313,7 +313,7 @@ class Acceptor:
             except OSError as error:
                 if error.errno not in _NO_CONNECTION:
                     # The event loop would retry at once, so pause. New connections stay in the backlog.
-                    message = f"no connection can be taken up: {error.strerror}; they wait until one can"
+                    message = f"can't accept connections: {error.strerror}; trying again every second"
                     log.write_limited("accept", message)
                     self.close()
                     self._retry = self._loop.call_later(ACCEPT_RETRY_S, self.open, listening)
@@ -326,12 +326,12 @@ class Acceptor:
             try:
                 self._serve(connected)
             except Exception as error:  # noqa: BLE001 - other connections must not be affected
-                log.write_bug("making a connection", error)
+                log.write_bug("a new connection", error)
                 connected.close()
 
     def _turn_away(self, connected: socket.socket) -> None:
         """Tell a client that the server has too few file descriptors, and close the connection."""
-        limit = f"only {self._max_descriptors} files may be open (raise LimitNOFILE= or ulimit -n)"
-        log.write_limited("descriptors", f"clients are turned away: {limit}")
+        limit = f"only {self._max_descriptors} files may be open; raise LimitNOFILE= or ulimit -n"
+        log.write_limited("descriptors", f"refused a client: {limit}")
         with connected, contextlib.suppress(OSError):  # the client may have closed the connection
             connected.send(encode(busy_greeting(_TOO_FEW_DESCRIPTORS)))

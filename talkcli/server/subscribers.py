@@ -216,4 +216,4 @@ class Notifications:
         try:
             notification()
         except Exception as error:  # noqa: BLE001 - the other functions must still be called
-            log.write_bug("telling clients", error)
+            log.write_bug("a notification", error)

@@ -45,7 +45,7 @@ class VoiceCatalog:
         if not is_neural(found.id):
             return voice, None
         missing = self._missing(found.id)
-        words = f"the voice {voice[:60]} cannot be spoken: {missing}"
+        words = f"the voice {voice[:60]} can't be used: {missing}"
         return found.id, (Reason.UNKNOWN_VOICE, words) if missing else None
 
     def find_new_files(self) -> None:

@@ -28,7 +28,7 @@ def test_row_45_of_two_servers_started_at_once_exactly_one_serves(times: int) ->
                 assert sorted(each.serves() for each in servers) == [False, True], f"attempt {attempt}"
                 loser, winner = sorted(servers, key=BareServe.serves)
                 assert loser.end() == 11, loser.log
-                assert f"(pid {winner.process.pid}) serves {home}/s already" in loser.log
+                assert f"(pid {winner.process.pid}) is already running at {home}/s;" in loser.log
                 with Wire(f"{home}/s") as wire:
                     assert wire.greeting["pid"] == winner.process.pid
                 assert winner.end(signal.SIGTERM) == 0, f"attempt {attempt}: {winner.log}"

@@ -133,8 +133,8 @@ def test_too_little_memory_for_a_server_is_told_in_words_that_name_the_limit(hom
     kib = 22_000
     command = ["sh", "-c", f'ulimit -d {kib}; exec "$@"', "sh", *TALK, "serve", "--player", "null"]
     done = run(command, environment(home, TALK_SOCKET=f"{home}/s"))
-    what = "(the engine's thread cannot be started|there is not enough memory for talk)"
-    limit = re.escape(f"it is limited to {kib * 1024:,} bytes of memory (ulimit -d, LimitDATA=)")
+    what = "(can't start the engine's thread|there is not enough memory for talk)"
+    limit = re.escape(f"the limit is {kib * 1024:,} bytes of memory (ulimit -d, LimitDATA=)")
     assert (done.code, bool(re.fullmatch(f"talk: {what}: {limit}\n", done.err))) == (1, True), done
 
 
@@ -238,5 +238,5 @@ def test_storm_of_the_same_message_is_a_line_a_minute_with_a_number(
     lines = capfd.readouterr().err.splitlines()
     assert len(lines) == 11
     assert lines[0] == "talk: no descriptor 0"
-    assert lines[1] == "talk: no descriptor 0 (599 more of these were not logged)"
+    assert lines[1] == "talk: no descriptor 0 (599 similar lines were not logged)"
     assert lines[-1] == "talk: of another kind"

@@ -299,7 +299,7 @@ def test_socket_that_cannot_be_served_is_refused_in_words(home: str) -> None:
         assert "doesn't listen" in refused(near)  # Accept=yes
     if sys.platform.startswith("linux"):
         with listening_at(f"\0talk-{os.getpid()}") as passed:
-            assert "has no file" in refused(passed)
+            assert "has no path" in refused(passed)
 
 
 def test_named_socket_wins_and_descriptors_of_another_process_are_not_taken(home: str) -> None:

@@ -157,7 +157,9 @@ def test_server_whose_place_another_one_took_ends_for_its_supervisor(home: str) 
             result = wire.receive_event("result")["goal"]
             assert (result["state"], result["reason"]) == ("PREEMPTED", "shutdown")
             pid = second.process.pid
-            ends_with_11(first, f"a server (pid {pid}) serves {path} already: use it, or end it first (kill {pid})")
+            ends_with_11(
+                first, f"a server (pid {pid}) is already running at {path}; use it, or stop it with: kill {pid}"
+            )
             found_again(path, second.process.pid)  # which lost nothing
 
 

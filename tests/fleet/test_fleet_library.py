@@ -193,12 +193,12 @@ def test_a_failure_at_a_robot_is_an_outcome_with_its_error(fleet: Fleet) -> None
 @pytest.mark.parametrize(
     ("ask", "words"),
     [
-        (lambda fleet: fleet.say("@all", "hello", rate=9), "the rate 9 is not within 80 to 450"),
+        (lambda fleet: fleet.say("@all", "hello", rate=9), "the rate must be 80 to 450 words per minute, got 9"),
         (lambda fleet: fleet.say("@all", b"hello"), "'text' must be a string"),
         (lambda fleet: fleet.set("@all", rate="fast"), "'rate' must be an integer"),
         (lambda fleet: fleet.wait("@all", ["12"]), "a number is a goal of one server"),
-        (lambda fleet: fleet.cancel("@all", [""]), "an id is empty"),
-        (lambda fleet: fleet.cancel("@all", key=""), "a key has 1 to 64 characters"),
+        (lambda fleet: fleet.cancel("@all", [""]), "the goal's id is empty"),
+        (lambda fleet: fleet.cancel("@all", key=""), "the key must have 1 to 64 characters"),
         (lambda fleet: fleet.say("", "hello"), "no robot can be called ''"),
         (lambda fleet: fleet.say("a/b", "hello"), "no robot can be called 'a/b'"),
         (lambda fleet: fleet.say("@", "hello"), "no group can be called ''"),

@@ -91,7 +91,7 @@ def test_equal_failures_are_the_exit_code_and_different_ones_make_it_13(desk: De
 #: A pick, one of its robots, and the reason why that does nothing.
 WHY = [
     ("off-1*", "off-1", "no_server", "off-1 is offline: nothing was sent"),
-    ("@lonely", "wh-4", "no_server", "wh-4: no server, tried: "),
+    ("@lonely", "wh-4", "no_server", "wh-4: no server found; tried: "),
     ("wh-[4]", "wh-4", "no_server", "wh-4 has no talk server at this moment: nothing was sent"),
     ("wh-[3]", "wh-3", "permission_denied", "wh-3: this robot takes no pause from afar: see its --allow"),
     ("@day", "wh-3", "permission_denied", "wh-3: this robot takes no pause from afar: see its --allow"),

@@ -160,7 +160,7 @@ def test_a_refusal_is_an_error_with_the_lines_of_its_list(core: ClientCore) -> N
 def test_a_refusal_without_a_reason_says_so(core: ClientCore, error: object) -> None:
     exchange = begin(core, Pause())
     hear(core, {"seq": 1, "ok": False, "error": error})
-    with pytest.raises(RequestRefused, match=r"^refused: the server gives no reason$"):
+    with pytest.raises(RequestRefused, match=r"^the server refused the request without a reason$"):
         core.answer(exchange)
 
 
@@ -260,7 +260,7 @@ def test_the_end_loses_what_was_sent(
 def test_the_servers_last_words_are_the_reason_of_the_end(core: ClientCore) -> None:
     hear(core, {"ok": False, "error": {"code": "too_slow", "message": "you are too slow"}})
     core.end("the server went away")
-    assert core.ended == "the server closed it: you are too slow"
+    assert core.ended == "the server closed the connection: you are too slow"
 
 
 MALFORMED = [
@@ -276,7 +276,7 @@ MALFORMED = [
 def test_a_malformed_line_ends_the_connection_and_nothing_after_it_counts(core: ClientCore, line: bytes) -> None:
     exchange = begin(core, Status())
     core.receive(line + b"\n" + encode({"seq": 1, "ok": True}), 0.0)
-    assert (core.ended or "").startswith("it sent what is no message")
+    assert (core.ended or "").startswith("the server sent a malformed message")
     assert exchange.reply is None
 
 
@@ -303,7 +303,7 @@ def test_an_answer_must_come_in_time_and_each_line_of_it_counts(core: ClientCore
 
 
 def test_a_silent_server_counts_as_gone(core: ClientCore) -> None:
-    assert core.silent_by(2.0) == (2.0 + SILENCE_LIMIT_S, "it has said nothing for 15 s")
+    assert core.silent_by(2.0) == (2.0 + SILENCE_LIMIT_S, "the server sent nothing for 15 s")
     hear(core, {"event": "alive"}, now=7.0)
     assert core.silent_by(2.0)[0] == 7.0 + SILENCE_LIMIT_S
 
@@ -388,7 +388,7 @@ def test_goals_of_a_server_that_was_restarted_are_lost(reconnecting: ClientCore)
     reconnecting.disconnected("it is gone", 1.0)
     greet(reconnecting, "5m8g")
     assert (tracked.goal.state, sent(reconnecting), reconnecting.boot) == (State.LOST, [], "5m8g")
-    assert tracked.goal.message == "result unknown: it is gone; it may still be spoken"
+    assert tracked.goal.message == "result unknown: it is gone; the sentence may still be spoken"
 
 
 def test_a_goal_that_the_same_server_has_forgotten_is_lost(reconnecting: ClientCore) -> None:
@@ -402,7 +402,10 @@ def test_a_goal_that_the_same_server_has_forgotten_is_lost(reconnecting: ClientC
     assert tracked.goal.state is State.PENDING
     greet(reconnecting)
     hear(reconnecting, {"seq": 3, "ok": False, "error": {"code": "unknown_goal", "message": "no g"}})
-    assert (tracked.goal.state, tracked.goal.message) == (State.LOST, "result unknown: no g; it may have been spoken")
+    assert (tracked.goal.state, tracked.goal.message) == (
+        State.LOST,
+        "result unknown: no g; the sentence may have been spoken",
+    )
 
 
 def test_goals_are_lost_if_no_connection_is_made_in_time(reconnecting: ClientCore) -> None:
@@ -417,7 +420,7 @@ def test_goals_are_lost_if_no_connection_is_made_in_time(reconnecting: ClientCor
     reconnecting.expire(6.0)
     assert (tracked.goal.state, tracked.goal.message) == (
         State.LOST,
-        "result unknown: it is gone; it may still be spoken",
+        "result unknown: it is gone; the sentence may still be spoken",
     )
 
 
@@ -443,10 +446,10 @@ def test_a_goal_that_is_said_without_a_connection_waits_for_one(reconnecting: Cl
 def test_a_goal_that_is_said_without_a_connection_is_rejected_in_time(reconnecting: ClientCore) -> None:
     reconnecting.disconnected("it is gone", 1.0)
     tracked = say(reconnecting, now=2.0)
-    reconnecting.not_connected(ServerUnavailable("no server, tried:\n  /s"))
+    reconnecting.not_connected(ServerUnavailable("no server found; tried:\n  /s"))
     assert reconnecting.next_expiry() == 2.0 + PATIENCE
     assert reconnecting.expire(7.0)
-    message = "not spoken: nothing was sent to the server at /s: no server, tried: /s"
+    message = "not spoken: nothing was sent to the server at /s: no server found; tried: /s"
     assert (tracked.goal.reason, tracked.goal.message) == ("not_sent", message)
 
 
@@ -480,7 +483,7 @@ def test_watching_ends_with_a_break_or_goes_on_with_another_snapshot(reconnectin
     greet(reconnecting, "5m8g")
     assert sent(reconnecting) == [{"seq": 1, "request": "watch"}]
     hear(reconnecting, {"seq": 1, "ok": True, "server": {"pid": 7}, "active": None}, state("ACTIVE", 5))
-    assert ending.closed == "nothing more is heard of the server at /s: it is gone"
+    assert ending.closed == "no more events from the server at /s: it is gone"
     assert taken(ending) == [StateChanged]
     assert (lasting.closed, taken(lasting)) == (None, [StateChanged, Snapshot, StateChanged])
     del lasting
@@ -521,7 +524,7 @@ def test_buffer_hands_out_in_order_and_drops_the_oldest_feedback() -> None:
     assert buffer.closed is None
     buffer.add(changed)
     buffer.add(heard)
-    assert "take them faster" in (buffer.closed or "")
+    assert "read too slowly" in (buffer.closed or "")
     assert len(taken(buffer)) == MAX_STATE_EVENTS  # nothing that came after what is missing
 
 

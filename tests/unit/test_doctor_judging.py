@@ -259,11 +259,11 @@ OTHER_SOCKET = "/run/user/7/talk/talk.sock"
 @pytest.mark.parametrize(
     ("place", "named_by", "error", "others", "words", "step"),
     [
-        (SocketPlace(PATH, PLACE_FORBIDDEN, 7), None, NONE, [], "no permission (uid 7)", "have uid 7 let you in"),
+        (SocketPlace(PATH, PLACE_FORBIDDEN, 7), None, NONE, [], "permission denied (uid 7)", "have uid 7 let you in"),
         (SocketPlace(PATH, PLACE_ABSENT), "--socket", NONE, [], "named by --socket", "leave --socket out, or"),
         (SocketPlace(PATH, server.PLACE_LISTENING), None, NO_ANSWER, [], "it does not answer", "restart"),
         (SocketPlace(PATH, server.PLACE_LISTENING), None, FULL, [], "too many", "--max-clients"),
-        (SocketPlace(PATH, PLACE_ABSENT), None, NONE, [OTHER_SOCKET], "not there", f"talk --socket {OTHER_SOCKET}"),
+        (SocketPlace(PATH, PLACE_ABSENT), None, NONE, [OTHER_SOCKET], "not found", f"talk --socket {OTHER_SOCKET}"),
     ],
 )
 def test_without_a_server_each_place_is_described(

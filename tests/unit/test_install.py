@@ -63,7 +63,7 @@ def test_the_command_names_the_python_that_runs() -> None:
 def test_on_a_32_bit_system_no_package_is_named_that_has_no_build_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(install, "IS_64_BIT", False)
     assert install.espeak_library() == "sudo apt-get install -y libespeak-ng1"
-    step = "neural voices need a 64-bit system: choose one of espeak's voices, such as en"
+    step = "neural voices need a 64-bit system; use an espeak voice, such as en"
     monkeypatch.setattr(install, "NEURAL_PACKAGES", ["no_such_package"])
     assert missing_package() == f"no_such_package is missing: {step}"
     assert unknown_voice_message("piper/joe", ()) == f'unknown voice "piper/joe": {step}'

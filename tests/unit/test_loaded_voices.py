@@ -178,7 +178,7 @@ def test_a_voice_that_is_too_large_alone_stays_and_that_is_told_once() -> None:
     voices = Asked(100_000_000).play("load a; grown a 99000000; excess a : a")
     assert voices.warnings == []
     voices.play("grown a 120000000; excess a : a")
-    why = "it takes 120 MB, more than --voice-memory 100"
+    why = "it uses 120 MB, more than --voice-memory 100 allows"
     assert (voices.answer, voices.warnings) == ("nothing", [f"voice a: {why}"])
     assert voices.play("excess a : a").warnings == []
     assert voices.to_json() == {"a": {"state": "loaded", "why": why}}
@@ -220,7 +220,7 @@ def test_a_voice_that_no_goal_needs_any_more_keeps_nobody_looking() -> None:
 def test_an_engine_that_dies_twice_has_its_cause() -> None:
     assert MAX_ENGINE_DEATHS == 2
     voices = Asked().play("want a; next a; lost; want a; next a")
-    why = "the engine process ended while it was being loaded"
-    assert voices.engine_lost(0.0) == [VoiceWarning(f"voice a is left alone: {why}")]
+    why = "the engine process died while loading the voice"
+    assert voices.engine_lost(0.0) == [VoiceWarning(f"voice a is not used: {why}")]
     assert voices.engine_lost(0.0) == []
     assert voices.failure("a") == why

@@ -218,7 +218,7 @@ def test_every_option_is_obeyed(option: Option) -> None:
 
 
 def test_a_row_without_its_field_is_named() -> None:
-    with pytest.raises(TypeError, match="the option 'loudness' has a row but Say has no such field"):
+    with pytest.raises(TypeError, match="Say has no field for the option 'loudness'"):
         require_fields(Say, ["text", "loudness"])
 
 
@@ -232,13 +232,13 @@ def test_settings_are_given_whole_at_the_start_and_shown_with_null_for_what_ther
     assert describe_settings(shown) == [
         "rate 200",
         "volume 1",
-        "voice the driver's own",
+        "default voice",
         "pitch 50",
-        "goals queue",
+        "new goals wait",
         "no ttl",
     ]
     changed = shown_settings(replace(INITIAL, voice="de", ttl=2.5, preempt=True))
-    assert describe_settings(changed)[2:] == ["voice de", "pitch 50", "goals preempt", "ttl 2.5 s"]
+    assert describe_settings(changed)[2:] == ["voice de", "pitch 50", "new goals interrupt", "ttl 2.5 s"]
 
 
 def test_a_setting_is_typed_and_helped_as_its_command_wants_it() -> None:
@@ -277,16 +277,16 @@ def test_a_server_that_is_told_nothing_is_what_its_command_says() -> None:
 @pytest.mark.parametrize(
     ("option", "value", "words"),
     [
-        (Option("x", NUMBER, limits=(0, 1), unit=" m"), 2, "the x 2 is not within 0 to 1 m"),
-        (Option("x", INTEGER, limits=(1, None)), 0, "the x 0 is not from 1 on"),
-        (Option("x", NUMBER, limits=(0, None), excludes_minimum=True), 0, "the x 0 is not above 0"),
-        (Option("x", SECONDS, limits=(0, None)), -1, "the x -1 is no number of seconds from 0 on"),
-        (Option("x", SECONDS, limits=(0, 9)), 10, "the x 10 is not within 0 to 9"),
+        (Option("x", NUMBER, limits=(0, 1), unit=" m"), 2, "the x must be 0 to 1 m, got 2"),
+        (Option("x", INTEGER, limits=(1, None)), 0, "the x must be 1 or more, got 0"),
+        (Option("x", NUMBER, limits=(0, None), excludes_minimum=True), 0, "the x must be more than 0, got 0"),
+        (Option("x", SECONDS, limits=(0, None)), -1, "the x must be 0 or more, got -1"),
+        (Option("x", SECONDS, limits=(0, 9)), 10, "the x must be 0 to 9, got 10"),
         (Option("x", NUMBER), 10, None),
-        (ROWS["priority"], 1_000_001, "the priority 1000001 is not within -1000000 to 1000000"),
-        (ROWS["key"], "", "a key has 1 to 64 characters, this one has 0"),
-        (ROWS["voice"], "", "the voice is empty"),
-        (ROWS["format"], "x" * 99, f"the format '{'x' * 64}' is not known, only 'text'"),
+        (ROWS["priority"], 1_000_001, "the priority must be -1,000,000 to 1,000,000, got 1000001"),
+        (ROWS["key"], "", "the key must have 1 to 64 characters, got 0"),
+        (ROWS["voice"], "", "the voice must not be empty"),
+        (ROWS["format"], "x" * 99, f"the format must be 'text', got '{'x' * 64}'"),
     ],
     ids=lambda each: getattr(each, "name", None) or str(each)[:24],
 )
