@@ -285,10 +285,10 @@ def test_the_installed_script_is_this_one_and_imports_only_main() -> None:
         (b'{"talk": 0, "version": "0.0"}\n', 9, "protocol_mismatch", "restart the server"),
         (b'{"talk": "1"}\n', 9, "protocol_mismatch", "protocol 1"),
         (b'{"talk": 1, "error": "permission_denied", "message": "not you"}\n', 10, "permission_denied", "not you"),
-        (b"220 mail.example.org ESMTP\r\n", 3, "no_server", "no talk server"),
-        (b"[]\n", 3, "no_server", "no talk server"),
+        (b"220 mail.example.org ESMTP\r\n", 3, "no_server", "not a talk server"),
+        (b"[]\n", 3, "no_server", "not a talk server"),
         (b"", 3, "no_server", "closed the connection"),
-        (GREETING, 3, "no_server", "went away"),
+        (GREETING, 3, "no_server", "connection to the server was lost"),
     ],
 )
 def test_a_process_that_is_no_server_of_this_protocol_is_told(says: bytes, code: int, error: str, words: str) -> None:

@@ -313,7 +313,7 @@ def test_a_server_that_goes_away_is_named(home: str) -> None:
     with FakeServer(f"{home}/s", [greeting], closes=True):
         found = doctor(quick(home), "--silent")["server"]
     assert found["state"] == "failed"
-    assert "went away" in found["message"]
+    assert "connection to the server was lost" in found["message"]
     assert "start it again" in found["next"]
 
 

@@ -155,7 +155,7 @@ def test_a_server_that_goes_away_is_told(scripted: Talk) -> None:
     scripted.stop()
     assert watch.next("PREEMPTED").endswith("  shutdown")
     done = scripted.finish(watch.process)
-    assert (done.code, done.out, "went away" in done.err) == (12, "", True), done
+    assert (done.code, done.out, "connection to the server was lost" in done.err) == (12, "", True), done
 
 
 def test_it_ends_when_its_reader_has_gone_though_nothing_happens(scripted: Talk) -> None:

@@ -324,7 +324,7 @@ def test_limits_hold_on_the_wire_and_on_the_command_line_alike() -> None:
             assert f"{value}" in str(option.value_error(value))
             with pytest.raises(ValueError, match=f"'{value}' is not a"):
                 read_value(option, str(value))
-    wanted = ["a number from 0 to 1", "a whole number from 1 on", "a valid integer"]
+    wanted = ["a number from 0 to 1", "a whole number 1 or more", "a valid integer"]
     for option, words in zip(LIMITED, wanted, strict=True):
         with pytest.raises(ValueError, match=f"'abc' is not {words}$"):
             read_value(option, "abc")

@@ -44,7 +44,7 @@ def test_what_is_no_greeting_is_a_mismatch(message: JsonObject) -> None:
 @pytest.mark.parametrize(
     ("greeting", "words"),
     [
-        (busy_greeting(), "as many clients as it takes .*--max-clients"),
+        (busy_greeting(), "too many clients; .*--max-clients"),
         (busy_greeting("too few descriptors"), "^too few descriptors$"),
         ({"talk": 1, "error": "busy", "message": ["none"]}, "--max-clients"),
         ({"talk": 1, "error": "busy", "message": ""}, "--max-clients"),
