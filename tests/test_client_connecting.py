@@ -217,4 +217,4 @@ def test_the_shorter_time_ends_the_waiting(path: str, line: str, code: int) -> N
     client = start_talk(line.split(), clean_environment(os.path.dirname(path), {"TALK_SOCKET": path}))
     out, err = client.communicate(timeout=PATIENCE)
     assert (client.wait(), out) == (code, ""), err
-    assert "--lines" in line or f"  {path}: not there" in err
+    assert "--lines" in line or f"  {path}: not found" in err

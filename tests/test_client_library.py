@@ -345,7 +345,7 @@ def test_log_is_what_was_said_oldest_first(client: Client) -> None:
     assert client.log() == [*goals, rejected]
     assert client.log(2) == [goals[2], rejected]
     for count in (0, -1, 2_201):
-        with pytest.raises(UsageError, match="1 to 2200"):
+        with pytest.raises(UsageError, match="1 to 2,200"):
             client.log(count)
 
 

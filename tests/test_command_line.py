@@ -62,7 +62,7 @@ def error_of(err: str) -> dict[str, Any]:
         ),
         (["say", "-5"], "no such option '-5'. To speak a text that starts with '-', write: talk say -- TEXT"),
         (["say", "-t", "nan", "-w", "hello"], "-t / --timeout: nan is not a number"),
-        (["wait", "-t", "0"], "-t / --timeout: '0' is not a number above 0"),
+        (["wait", "-t", "0"], "-t / --timeout: '0' is not a number more than 0"),
         (["cancel", "--key", "k\udcff"], "--key: the byte 0xff in it is not UTF-8"),
         (["set", "--voice", "k\udcff"], "--voice: the byte 0xff in it is not UTF-8"),
         (["serve", "--voice", "\udcfek"], "--voice: the byte 0xfe in it is not UTF-8"),

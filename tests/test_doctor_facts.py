@@ -75,7 +75,7 @@ def test_each_usual_place_is_described(home: str) -> None:
 
     def check(words: str, step: str) -> None:
         found = no_server()
-        others = ("/run/talk/talk.sock: not there", f"{home}/runtime-{os.getuid()}/talk/talk.sock: not there")
+        others = ("/run/talk/talk.sock: not found", f"{home}/runtime-{os.getuid()}/talk/talk.sock: not found")
         assert [each for each in (f"{path}: {words}", *others) if each not in found.message] == []
         assert found.next == step
 
@@ -136,7 +136,7 @@ def test_a_wrong_variable_is_told_from_the_server_that_runs_elsewhere(home: str)
     os.chmod(f"{home}/run", 0o700)
     with serving(environment(home, XDG_RUNTIME_DIR=f"{home}/run")):
         found = no_server(f"{home}/wrong")
-    assert f"named by TALK_SOCKET: {home}/wrong: not there" in found.message
+    assert f"named by TALK_SOCKET: {home}/wrong: not found" in found.message
     assert found.next == f"unset TALK_SOCKET: a server is on {home}/run/talk/talk.sock"
 
 

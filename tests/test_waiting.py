@@ -146,7 +146,7 @@ async def test_waiting_requests_of_all_connections_have_a_limit_in_bytes() -> No
     assert 0.9 * MAX_KEPT_REQUEST_BYTES < (count - 1) * (39_000 + REQUEST_BYTES) < MAX_KEPT_REQUEST_BYTES
     (refused,) = cast("Any", other.told)
     assert refused["goal"]["reason"] == "queue_full"
-    assert "64 MiB of requests are waiting already" in refused["goal"]["message"]
+    assert "too many requests are waiting (64 MiB)" in refused["goal"]["message"]
     server.requests.left(cast("Any", other))
     assert not server.requests.is_waiting(cast("Any", other))
     third = Client()
