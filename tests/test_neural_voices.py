@@ -176,7 +176,7 @@ def test_espeak_speaks_instead_if_a_goal_cannot_wait_and_does_not_insist(env: di
         for urgent in ({"preempt": True}, {"flush": True}, {"priority": 1}, {"ttl": 0.2}):
             goal = robot.say("hello", **urgent)
             assert robot.heard(goal) == ("SUCCEEDED", INSTEAD)
-            assert f"{goal.id} is spoken by {INSTEAD}: piper/tiny is not loaded" in robot.server.log
+            assert f"{goal.id} is spoken by {INSTEAD} instead: piper/tiny is not loaded" in robot.server.log
         assert f"voice    {INSTEAD}" in run([*TALK, "status", goal.id], env).out
         late, insists = robot.say(voice_only=True, ttl=0.5), robot.say("x", voice_only=True, priority=1)
         assert late.wait(LIMIT).reason == "expired"
@@ -267,7 +267,7 @@ def test_a_pitch_is_refused_with_a_voice_that_has_none(env: dict[str, str]) -> N
     with _robot(env, "--voice", TINY, "--pitch", "60") as robot:
         refused = robot.say(pitch=70).goal
         assert (refused.reason, refused.state.name) == ("bad_option", "REJECTED")
-        assert "has no pitch but its own" in str(refused.message)
+        assert "has a fixed pitch" in str(refused.message)
         for options in ({}, {"pitch": 70}, {"voice_only": True}):  # the server's pitch is for other voices
             assert robot.heard(robot.say("hello", None, **options)) == ("SUCCEEDED", TINY)
 
@@ -297,7 +297,7 @@ def test_a_voice_that_kills_the_engine_twice_is_left_alone(env: dict[str, str], 
         assert robot.neural()["why"] == why
         ended = robot.say("hello", None, voice_only=True).wait(LIMIT)
         assert (ended.reason, ended.message) == ("voice_failed", f"speech failed: {why}")
-        assert f"voice piper/tiny is left alone: {why}" in robot.server.log
+        assert f"voice piper/tiny is not used: {why}" in robot.server.log
         assert robot.server.log.count("the engine crashed") == 2
         assert robot.heard(robot.say("hello", None)) == ("SUCCEEDED", INSTEAD)
         hold.unlink()
@@ -314,7 +314,7 @@ def test_espeak_speaks_if_the_files_of_a_voice_are_gone(env: dict[str, str], tmp
         goal = robot.say("hello", None)
         state, voice = robot.heard(goal)
         assert state == "SUCCEEDED"
-        assert f'{goal.id} is spoken by {voice}: unknown voice "piper/tiny"' in robot.server.log
+        assert f'{goal.id} is spoken by {voice} instead: unknown voice "piper/tiny"' in robot.server.log
 
 
 def test_goals_end_at_once_if_the_engine_cannot_start(env: dict[str, str], tmp_path: Path) -> None:
