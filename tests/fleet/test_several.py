@@ -170,7 +170,7 @@ NUMBER, ONE_ROBOT = "a number is a goal of one server", "is of one robot: name i
         ("say -wf hello", f"'talk say --feedback' {ONE_ROBOT}"),
         ("say -o - hello", "'talk say --output' is of this machine alone"),
         ("say", "TEXT is missing"),
-        ("say --id 12 hello", "the id '12' is not one that a sender may choose"),
+        ("say --id 12 hello", "the id '12' is not allowed"),
         ("say --rate 9 hello", "'9' is not a whole number from 80 to 450"),
         ("wait -f", f"'talk wait --feedback' {ONE_ROBOT}"),
         ("wait old 3", NUMBER),
@@ -196,7 +196,7 @@ def test_a_request_that_several_robots_cannot_be_asked_is_a_usage_error(desk: De
 @pytest.mark.parametrize(
     ("line", "code", "words"),
     [
-        (["status", ""], 2, "an id is empty"),
+        (["status", ""], 2, "the goal's id is empty"),
         (["wait", *(f"{'é' * 60}{number}" for number in range(500))], 2, "500 ids do not fit into one request"),
         (["status", "x" * 70], 8, "an id has at most 64 characters"),
     ],
