@@ -90,7 +90,7 @@ def write_bug(what: str, error: Exception) -> None:
     """Log an unexpected exception, with the file and line that raised it."""
     frames = traceback.extract_tb(error.__traceback__)
     place = f" at {os.path.basename(frames[-1].filename)}:{frames[-1].lineno}" if frames else ""
-    write(f"internal error in {what}{place}: {sanitize(f'{type(error).__name__}: {error}')}")
+    write(f"a bug in talk ({what}{place}): {sanitize(f'{type(error).__name__}: {error}')}")
 
 
 def handle_loop_error(_loop: object, context: Mapping[str, Any]) -> None:

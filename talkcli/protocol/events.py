@@ -229,7 +229,7 @@ def check_greeting(message: JsonObject) -> None:
     if message.get("error") == "busy":
         words = message.get("message")
         if not (isinstance(words, str) and words and words.isprintable()):  # not safe to show on a terminal
-            words = "the server has too many clients; try again later, or raise 'talk serve --max-clients'"
+            words = "the server has too many clients; try again later, or start it with a higher --max-clients"
         raise Busy(words, "busy")
 
 

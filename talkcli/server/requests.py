@@ -302,7 +302,7 @@ class Requests:
         if active and active is not speech.silent_goal:
             in_time = await pending.wait(speech.waiting_for_silence(active), PAUSE_ANSWER_S)
             if not in_time:
-                words = f"speech is paused, but silence of {active.id} was not confirmed within {PAUSE_ANSWER_S:g} s"
+                words = f"speech is paused, but {active.id} was not confirmed to be silent within {PAUSE_ANSWER_S:g} s"
                 raise RequestRefused(words, Reason.NOT_SILENT)
         self._answer_pause(pending, active)
 

@@ -269,7 +269,7 @@ def raise_descriptor_limit(clients: int) -> int:
     if allowed < wanted:
         fitting = max(0, allowed - RESERVED_DESCRIPTORS - OWN_DESCRIPTORS)
         log.write(
-            f"the limit of {allowed} open files allows only {fitting} clients instead of {clients}; "
+            f"only {allowed} files may be open, enough for {fitting} clients instead of {clients}; "
             f"raise LimitNOFILE= or ulimit -n to {wanted}"
         )
     return allowed

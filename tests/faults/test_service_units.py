@@ -285,7 +285,7 @@ def test_socket_that_cannot_be_served_is_refused_in_words(home: str) -> None:
         return done.err
 
     with listening_at(f"{home}/s") as passed:
-        assert "2 sockets were passed" in refused(passed, count="2")
+        assert "systemd passed 2 sockets" in refused(passed, count="2")
         os.unlink(f"{home}/s")  # its file is gone: the supervisor has to restart the socket's unit
         assert "systemctl restart talk.socket" in refused(passed, code=11)
     with listening_at(f"{home}/d", socket.SOCK_DGRAM) as passed:
