@@ -252,5 +252,5 @@ def take_seq(message: JsonObject) -> int | None:
     """Remove the `seq` number from a request, and return it. Raises BadRequest if it isn't an integer."""
     seq = message.pop("seq", None)
     if seq is not None and (isinstance(seq, bool) or not isinstance(seq, int)):
-        raise BadRequest('"seq" must be an integer', "bad_field")
+        raise BadRequest("'seq' must be an integer", "bad_field")
     return seq

@@ -149,7 +149,7 @@ def read_request(message: JsonObject) -> Request:
     fields = dict(message)
     kind = fields.pop("request", None)
     if not isinstance(kind, str):
-        raise BadRequest('the field "request" is missing or not a string', "bad_request")
+        raise BadRequest("the field 'request' is missing or not a string", "bad_request")
     request = REQUEST_TYPES.get(kind)
     if request is None:
         known = ", ".join(REQUEST_TYPES)

@@ -212,8 +212,8 @@ def open_directory(path: str) -> None:
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
-        (link_in_its_place, "talk/s exists and is no socket"),
-        (directory_in_its_place, "talk/s exists and is no socket"),
+        (link_in_its_place, "talk/s exists, but is not a socket"),
+        (directory_in_its_place, "talk/s is a directory, not a socket"),
         (open_directory, "chmod go-w "),
     ],
 )

@@ -202,4 +202,4 @@ def test_user_s_server_lets_root_in_and_no_third_user(home: str) -> None:
         os.chmod(path, 0o666)
         (told,) = replies(stranger(path, {"request": "status"}))
         assert told["error"] == "permission_denied"
-        assert "uid 4141's" in told["message"]
+        assert "uid 4141, who can let you in" in told["message"]
