@@ -43,12 +43,15 @@ def test_it_shows_the_settings_and_all_that_is_known_of_each_goal(busy: Talk) ->
     lines = done.out.splitlines()
     assert (done.code, done.err) == (0, "")
     assert [each[:9].rstrip() for each in lines] == ["server", "engine", "settings", "now", "queue", "", "said", ""]
-    assert re.match(r'now      \w{4}-\d+ +ACTIVE     "never-ends please .*"  from \S.*, for \d+\.\d s$', lines[3])
-    assert re.search(r'"battery low"  from \S.*, priority 7, key "battery, low", (1 min )?\d+ s left$', lines[4])
-    assert re.search(r'door:open +PENDING    "the door is open"  from "patrol" \(\S.*, pid \d+\)$', lines[5])
+    assert re.match(r'now      \d+ +ACTIVE     "never-ends please .*"  from \S.*, for \d+\.\d s$', lines[3])
+    assert re.search(r'"battery low" +from \S.*, priority 7, key "battery, low", (1 min )?\d+ s left$', lines[4])
+    assert re.search(r'door:open +PENDING    "the door is open"  from "patrol"$', lines[5])
     assert "SUCCEEDED" in lines[6]
     assert lines[7].endswith("audio_lost: scripted audio_lost")
     assert LONG in lines[7]  # in a pipe no text is cut that has fewer than 200 characters
+    long = busy.run("status", "-l").out.splitlines()
+    assert re.match(r"now      \w{4}-\d+ +ACTIVE ", long[3])
+    assert re.search(r'"the door is open" +from "patrol" \(\S.*, pid \d+\)$', long[5])
 
 
 @pytest.mark.parametrize("columns", [60, 120])
@@ -61,7 +64,7 @@ def test_it_fits_the_terminal(busy: Talk, columns: int) -> None:
     for each in (f"pid {busy.pid} on {busy.socket}", "256 clients", "driver scripted", "voice default", "audio_l"):
         assert each in words
     assert 'from "patrol"' in words
-    assert columns < 120 or "priority" in words  # a line that does not fit is cut at its end
+    assert columns < 120 or "priority" in words  # details that do not fit are left out
     goals = [each for each in lines if "PENDING" in each]
     assert goals[0].index('"') == goals[1].index('"')
     assert b"\x1b[1;32mACTIVE" in shown.raw

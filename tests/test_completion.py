@@ -130,7 +130,7 @@ def test_every_command_and_option_is_offered_with_its_help(tmp_path: pathlib.Pat
         assert {"--socket", "--json", "--quiet", "--help"} <= options.keys()
         # A shell shows it on the line of the option, and cuts it if it does not fit.
         assert [each for each in options.values() if len(each) > 60 or not re.fullmatch(r"[A-Z].*[^.]\.", each)] == []
-        shown = (surface.HERE / f"help-{command}.txt").read_text("utf-8")
+        shown = "".join((surface.HERE / f"help-{each}.txt").read_text("utf-8") for each in (command, "talk"))
         assert not [each for each in options if each not in shown]
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 TALK = f"{shlex.quote(sys.executable)} -m talkcli"
 CLOSED = 141
-FULL = "talk: standard output can't be written: No space left on device\n"
+FULL = "talk: can't write to standard output: No space left on device\n"
 
 
 def bash(talk: Talk, script: str) -> subprocess.CompletedProcess[str]:
@@ -86,7 +86,7 @@ def test_full_disk_is_told_in_plain_words(scripted: Talk, command: str) -> None:
 def test_a_broken_disk_is_not_a_reader_that_went_away(scripted: Talk) -> None:
     with open("/proc/self/mem", "r+b") as broken:  # nothing can be written at 0
         found = to(scripted, os.dup(broken.fileno()), "status")
-    assert found == (1, "talk: standard output can't be written: Input/output error\n")
+    assert found == (1, "talk: can't write to standard output: Input/output error\n")
 
 
 def test_closed_standard_error_changes_no_exit_code(scripted: Talk) -> None:
@@ -135,7 +135,9 @@ def test_a_goal_is_waited_for_though_the_disk_is_full(scripted: Talk, words: str
         assert scripted.goal(goal)["state"] == state  # so it was waited for
         notes = [] if words == "wait" else [FULL]
         notes += (
-            [f"talk: {goal}: speech failed: scripted audio_lost; see 'talk doctor'\n"] if state == "ABORTED" else []
+            [f"talk: {goal}: speech failed: scripted audio_lost; find out why with: talk doctor\n"]
+            if state == "ABORTED"
+            else []
         )
         assert sorted(err.splitlines(True)) == sorted(notes)
         assert ended == (0 if words == "wait" and code == 1 else code)  # `wait` shows nothing
@@ -149,7 +151,7 @@ def test_lines_are_spoken_though_the_disk_is_full(scripted: Talk, words: str) ->
         goal = scripted.watcher.goals()[-1]
         assert scripted.watcher.wait_for_terminal(goal) == "SUCCEEDED"
         assert scripted.goal(goal)["text"] == "length=0 b"
-        assert (ended, err.count("standard output can't be written")) == (code, 1)
+        assert (ended, err.count("can't write to standard output")) == (code, 1)
 
 
 # A reader that goes away meanwhile

@@ -28,17 +28,17 @@ def held(scripted: Talk) -> str:
 def test_pause_tells_what_is_held_and_resume_what_goes_on(scripted: Talk, held: str) -> None:
     done = scripted.run("pause")
     assert (done.code, done.out) == (0, "")
-    assert done.err.startswith(f'talk: {held} is held, after "never-ends')
-    assert done.err.endswith("\"; 'talk resume' goes on\n")
+    assert done.err.startswith(f'talk: goal {held} is paused after "never-ends')
+    assert done.err.endswith('"; continue with: talk resume\n')
     assert ("\x1b" in done.err, r"\x1b[31m\u202e" in done.err) == (False, True)
     assert scripted.goal(held)["paused"] is True
     again = scripted.run("pause")
-    assert (again.code, f"{held} is held" in again.err) == (0, True)
+    assert (again.code, f"goal {held} is paused" in again.err) == (0, True)
     resumed = scripted.run("resume")
-    assert (resumed.code, resumed.out, resumed.err) == (0, "", f"talk: speech goes on with {held}\n")
+    assert (resumed.code, resumed.out, resumed.err) == (0, "", f"talk: speech continues with goal {held}\n")
     assert scripted.goal(held)["paused"] is False
     again = scripted.run("resume")
-    assert (again.code, again.out, again.err) == (0, "", f"talk: speech goes on with {held}\n")
+    assert (again.code, again.out, again.err) == (0, "", f"talk: speech continues with goal {held}\n")
     told = json.loads(scripted.run("pause", "--json").out)
     assert (told["paused"], told["goal"]["id"], told["goal"]["paused"]) == (True, held, True)
     told = json.loads(scripted.run("resume", "--json").out)
@@ -52,13 +52,13 @@ def test_pause_tells_what_is_held_and_resume_what_goes_on(scripted: Talk, held: 
 def test_status_shows_what_is_held(scripted: Talk, held: str) -> None:
     scripted.run("pause")
     status = scripted.run("status").out
-    assert "paused   speech is held: talk resume\n" in status
-    assert f"now      {held}  ACTIVE" in status
-    assert ", held, for " in status
+    assert "paused   speech is paused; continue with: talk resume\n" in status
+    assert f"now      {held.partition('-')[2]}  ACTIVE" in status
+    assert ", paused, for " in status
     assert "state    ACTIVE, paused\n" in scripted.run("status", held).out
     assert json.loads(scripted.run("--json", "status").out)["server"]["paused"] is True
     scripted.run("resume")
-    assert "speech is held" not in scripted.run("status").out
+    assert "speech is paused" not in scripted.run("status").out
     scripted.run("cancel")
 
 
@@ -113,11 +113,11 @@ def test_each_pause_that_is_not_confirmed_is_answered_in_its_own_time(make_talk:
 def test_pause_and_resume_succeed_if_nothing_is_spoken(make_talk: MakeTalk) -> None:
     talk = make_talk(scripted=True, watched=False)
     done = talk.run("pause")
-    assert (done.code, done.out, "nothing is being spoken" in done.err) == (0, "", True)
+    assert (done.code, done.out, "talk: speech is paused; " in done.err) == (0, "", True)
     assert json.loads(talk.run("--json", "pause").out) == {"paused": True, "goal": None}
     waiting = talk.run("say", "length=0").id
     assert talk.goal(waiting)["state"] == "PENDING"
     done = talk.run("resume")
-    assert (done.code, done.out, done.err.startswith("talk: speech goes on")) == (0, "", True)
+    assert (done.code, done.out, done.err.startswith("talk: speech continues")) == (0, "", True)
     assert talk.run("wait", waiting).code == 0
     assert json.loads(talk.run("--json", "resume").out) == {"paused": False, "goal": None}

@@ -141,7 +141,7 @@ def test_a_lead_in_of_its_own_takes_its_time_and_is_no_part_of_the_goal(make_tal
 def test_speech_that_is_paused_is_noted(scripted: Talk) -> None:
     held = busy(scripted)
     assert scripted.run("pause").code == 0
-    note = "talk: speech is paused: talk resume\n"
+    note = "talk: speech is paused; continue with: talk resume\n"
     assert scripted.run("say", "length=0").err == note
     assert scripted.run("say", "-q", "length=0").err == ""
     waiting = scripted.start("say", "-w", "length=0")
@@ -161,7 +161,7 @@ def test_own_id_is_printed_and_spoken_once(scripted: Talk) -> None:
     for words, out in (([], "dock-17a\n"), (["--wait", "-f"], "dock-17a ABORTED\n")):
         done = scripted.run("say", "--id", "dock-17a", *words, text)  # its end is told without waiting
         assert (done.code, done.out) == (4, out)
-        assert done.err == "talk: dock-17a: speech failed: no cable; see 'talk doctor'\n"
+        assert done.err == "talk: dock-17a: speech failed: no cable; find out why with: talk doctor\n"
     goal = json.loads(scripted.run("--json", "say", "--id", "dock-17a", text).out)
     assert (goal["id"], goal["state"]) == ("dock-17a", "ABORTED")
     assert scripted.watcher.states("dock-17a") == ["PENDING", "ACTIVE", "ABORTED"]
@@ -176,7 +176,7 @@ def test_client_that_attached_cancels_nothing(scripted: Talk, feedback: list[str
     scripted.watcher.wait_for_word("mine")
     late = scripted.run("say", "--wait", *feedback, "-t", "0.3", "--id", "mine", text)
     assert late.code == 124
-    assert late.err == "talk: timed out after 0.3 s: mine goes on: it was sent before\n"
+    assert late.err == "talk: timed out after 0.3 s: mine was sent earlier and continues\n"
     attached = scripted.start("say", "--wait", *feedback, "--id", "mine", text)
     assert attached.stdout
     assert attached.stdout.readline().startswith("mine word " if feedback else "mine\n")
@@ -211,7 +211,9 @@ def test_output_leaves_out_bytes_that_are_no_utf8_and_names_them(tmp_path: Path)
     for name, text in (("said.wav", "battery \udcfflow"), (hidden, "battery  low")):
         done = alone("say", "-o", str(tmp_path / name), "--", text, TALK_NAME="patrol")
         assert (done.code, done.out) == (0, "")
-        assert ("line 1, column 9: the byte 0xff is not UTF-8, and is not spoken\n" in done.err) == ("said" in name)
+        assert ("line 1, column 9: the byte 0xff is not valid UTF-8, so it is not spoken\n" in done.err) == (
+            "said" in name
+        )
     assert (tmp_path / "said.wav").read_bytes() == (tmp_path / hidden).read_bytes()
 
 

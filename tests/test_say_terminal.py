@@ -152,7 +152,7 @@ def test_a_failure_leaves_the_words_that_were_heard_and_its_reason(in_terminal: 
     first, second, last = terminal.screen.lines
     assert "  ABORTED    length=0.4 " in first
     assert terminal.screen.marked(AHEAD, 0).endswith("never heard")
-    assert second.endswith("speech failed: no cable; see 'talk doctor'")
+    assert second.endswith("speech failed: no cable; find out why with: talk doctor")
     assert last == ""
 
 
@@ -200,7 +200,7 @@ def test_lines_that_are_typed_light_up_one_after_the_other(scripted: Talk, in_te
 
 def test_the_doctor_is_named_when_a_goal_was_aborted_unless_its_text_has_no_words(scripted: Talk) -> None:
     for text, told in (("fail=audio_lost", True), ("fail=nothing_to_say", False), ("length=0", False)):
-        assert scripted.run("say", "--wait", "--", text).err.endswith("; see 'talk doctor'\n") == told
+        assert scripted.run("say", "--wait", "--", text).err.endswith("; find out why with: talk doctor\n") == told
 
 
 # How a sentence is cut to the terminal

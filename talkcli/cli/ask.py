@@ -46,7 +46,7 @@ def cancel(options: CommonOptions, ids: tuple[str, ...], current: bool, before: 
             raise
 
 
-def status(options: CommonOptions, goal_id: str | None) -> None:
+def status(options: CommonOptions, goal_id: str | None, long: bool) -> None:
     """Show the status of the server or the details of a goal."""
     from talkcli.goals.goal import Goal
     from talkcli.terminal.goals import goal_lines, status_lines
@@ -55,13 +55,13 @@ def status(options: CommonOptions, goal_id: str | None) -> None:
         found = client.status() if goal_id is None else client.goal(goal_id)
 
     def lines() -> Iterable[str]:
-        now = time.time()
-        return goal_lines(found, screen(), now) if isinstance(found, Goal) else status_lines(found, screen(), now)
+        now, output = time.time(), screen(long=long)
+        return goal_lines(found, output, now) if isinstance(found, Goal) else status_lines(found, output, now)
 
     show_result(options, [found.to_json()], lines)
 
 
-def watch(options: CommonOptions, words: bool) -> int:
+def watch(options: CommonOptions, words: bool, long: bool) -> int:
     """Show the events of all goals until interrupted, and return the exit code."""
     from talkcli.cli.interrupts import Interrupts, has_reader
     from talkcli.terminal.transcript import Transcript
@@ -72,17 +72,18 @@ def watch(options: CommonOptions, words: bool) -> int:
     # `talk watch | head` must end as soon as `head` does, even if the next event is hours away.
     with Interrupts(output=True) as interrupts, options.connect(interrupt=interrupts.watched) as client:
         for event in client.events():
-            show_result(options, [event.to_json()], partial(transcript.lines, event, screen(), time.time()))
+            show_result(options, [event.to_json()], partial(transcript.lines, event, screen(long=long), time.time()))
     return interrupts.exit_code
 
 
-def log(options: CommonOptions, count: int) -> None:
+def log(options: CommonOptions, count: int, long: bool) -> None:
     """Show the goals that have ended most recently."""
     from talkcli.terminal.transcript import log_lines
 
     with options.connect() as client:
         goals = client.log(count)
-    show_result(options, (each.to_json() for each in goals), lambda: log_lines(goals, screen(), time.time()))
+        output = screen(long=long, boot=client._connection.boot)
+    show_result(options, (each.to_json() for each in goals), lambda: log_lines(goals, output, time.time()))
 
 
 def voices(options: CommonOptions, language: str | None) -> None:
@@ -120,9 +121,9 @@ def pause(options: CommonOptions) -> None:
     from talkcli.terminal.text import printable
 
     heard = goal.spoken[-_PAUSED_TEXT_CHARS:] if goal and goal.spoken else ""
-    place = f', after "{printable(heard)}"' if heard else ""
-    words = f"{printable(goal.id)} is held{place}" if goal else "nothing is being spoken, and nothing will be"
-    _show_paused(options, goal, paused=True, words=f"{words}; 'talk resume' goes on")
+    place = f' after "{printable(heard)}"' if heard else ""
+    words = f"goal {printable(goal.id)} is paused{place}" if goal else "speech is paused"
+    _show_paused(options, goal, paused=True, words=f"{words}; continue with: talk resume")
 
 
 def resume(options: CommonOptions) -> None:
@@ -131,7 +132,7 @@ def resume(options: CommonOptions) -> None:
         goal = client.resume()
     from talkcli.terminal.text import printable
 
-    words = f"speech goes on with {printable(goal.id)}" if goal else "speech goes on"
+    words = f"speech continues with goal {printable(goal.id)}" if goal else "speech continues"
     _show_paused(options, goal, paused=False, words=words)
 
 
@@ -190,7 +191,7 @@ def _show_canceled(done: Canceled, options: CommonOptions) -> None:
             show(goal.id)
     for goal in done.ended:
         if not options.quiet:
-            note(f"{goal.id} had ended already: {goal.state.name}")
+            note(f"goal {goal.id} had already ended: {goal.state.name}")
 
 
 def _suggest_key(key: str, client: Client) -> None:
@@ -203,7 +204,7 @@ def _suggest_key(key: str, client: Client) -> None:
         return  # the suggestion is optional, so this isn't an error
     near = nearest(key, {each.key for each in unfinished(status) if each.key})
     if near:
-        note(f"no goal has the key '{printable(key)}': did you mean '{printable(near)}'?")
+        note(f"no goal has the key '{printable(key)}'; did you mean '{printable(near)}'?")
 
 
 def _no_voice(language: str, voices: Iterable[JsonObject]) -> str:
@@ -220,8 +221,8 @@ def _no_voice(language: str, voices: Iterable[JsonObject]) -> str:
         if not is_neural(str(each.get("id")))
     }
     near = nearest(language, names) or nearest(language, codes)
-    hint = f"did you mean '{printable({**codes, **names}[near])}'?" if near else "'talk voices' lists all"
-    return f"no voice speaks '{printable(language)}': {hint}"
+    hint = f"did you mean '{printable({**codes, **names}[near])}'?" if near else "list all voices with: talk voices"
+    return f"no voice speaks '{printable(language)}'; {hint}"
 
 
 def _language_code(voice: JsonObject) -> str:

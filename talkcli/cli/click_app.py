@@ -16,14 +16,14 @@ import click
 from click.core import ParameterSource
 
 from talkcli import __version__
-from talkcli.cli.command import ALL_EXIT_CODES, COMMON_OPTIONS, OUTPUT_FILE, nearest, range_help, read_value, spelling
+from talkcli.cli.command import ALL_EXIT_CODES, COMMON_OPTIONS, OUTPUT_FILE, nearest, read_value, spelling
 from talkcli.cli.commands import COMMANDS
 from talkcli.cli.show import CommonOptions, note, run_command, show_error, write_error_line
 from talkcli.errors import UsageError
 from talkcli.goals.options import FLAG, INTEGER, NUMBER, SECONDS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
     from click.shell_completion import CompletionItem
 
@@ -31,10 +31,10 @@ if TYPE_CHECKING:
     from talkcli.goals.options import Option
 
 _EXAMPLES = """
-    talk serve &                      one server on the robot
-    talk say --wait -- "battery low"  the exit code tells whether it was heard
-    talk cancel                       silence, now
-    talk doctor                       silent? what to do next
+    talk serve &                      start the server
+    talk say --wait -- "battery low"  speak; the exit code is the result
+    talk cancel                       be silent, now
+    talk doctor                       find out why nothing is heard
 """
 #: Command names that users may know from other programs, with the equivalent commands of `talk`.
 _FOREIGN_NAMES = {
@@ -69,11 +69,11 @@ class _OptionType(click.FloatRange):
             elif ctx and ctx.get_parameter_source(self._option.name) is not ParameterSource.ENVIRONMENT:
                 source = spelling(self._option)
             else:
-                source = f"{self._option.env} in the environment"
+                source = f"environment variable {self._option.env}"
             raise click.BadParameter(str(error), ctx, param, source) from error
 
     def _describe_range(self) -> str:
-        return range_help(self._option)
+        return self._option.range
 
 
 def _click_option(option: Option, *, common: bool = False) -> click.Option:
@@ -128,12 +128,10 @@ def _store_common(context: click.Context, parameter: click.Parameter, value: obj
 
 
 class _HelpfulCommand(click.Command):
-    """A click command whose help includes examples, common options and exit codes."""
+    """A click command whose help includes examples and exit codes."""
 
     examples: str
-    exit_codes: ExitCodes
-    #: the heading above the common options in help
-    common_heading = "Options of every command"
+    exit_codes: ExitCodes | None
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
         """Return the completions with shortened help texts.
@@ -150,21 +148,19 @@ class _HelpfulCommand(click.Command):
         with formatter.section("Examples"):
             _write_lines(self.examples, formatter)
 
-    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        sections: dict[str, list[tuple[str, str]]] = {"Options": [], self.common_heading: []}
-        for parameter in self.get_params(ctx):
-            record = parameter.get_help_record(ctx)
-            if record and isinstance(parameter, click.Option):
-                sections["Options" if parameter.expose_value else self.common_heading].append(record)
-        for heading, records in sections.items():
-            if records:
-                with formatter.section(heading):
-                    formatter.write_dl(records)
-
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
-        rows = sorted(self.exit_codes.items(), key=lambda row: row[0] if isinstance(row[0], int) else 128)
-        with formatter.section("Exit codes"):
-            formatter.write_dl([(str(code), words) for code, words in rows])
+        if self.exit_codes:
+            with formatter.section("Exit codes"):
+                formatter.write_dl([(str(code), words) for code, words in self.exit_codes.items()])
+
+    def write_options(
+        self, heading: str, parameters: Iterable[click.Parameter], ctx: click.Context, formatter: click.HelpFormatter
+    ) -> None:
+        """Write the help of some options, if there are any."""
+        records = [each.get_help_record(ctx) for each in parameters if isinstance(each, click.Option)]
+        if records:
+            with formatter.section(heading):
+                formatter.write_dl([each for each in records if each])
 
 
 class ClickCommand(_HelpfulCommand):
@@ -172,7 +168,7 @@ class ClickCommand(_HelpfulCommand):
 
     def __init__(self, row: Command) -> None:
         self.row = row
-        self.examples, self.exit_codes = row.examples, row.all_exit_codes
+        self.examples, self.exit_codes = row.examples, row.exit_codes
         arguments: list[click.Parameter] = [_click_argument(row.argument)] if row.argument else []
         own, common = map(_click_option, row.options), [_click_option(each, common=True) for each in COMMON_OPTIONS]
         super().__init__(
@@ -182,6 +178,13 @@ class ClickCommand(_HelpfulCommand):
             short_help=row.summary,
             callback=self._run,
         )
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        self.write_options("Options", (each for each in self.params if each.expose_value), ctx, formatter)
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        super().format_epilog(ctx, formatter)
+        formatter.write("\nCommon options and exit codes: talk --help\n")
 
     def _run(self, **given: Any) -> int | None:
         context = click.get_current_context()
@@ -201,8 +204,8 @@ class ClickCommand(_HelpfulCommand):
             error.ctx = error.ctx or ctx  # lets the error message refer to this command's help
             raise
         if rest and not ctx.resilient_parsing:
-            takes = f"nothing after {self.row.argument.metavar}" if self.row.argument else "options alone"
-            raise click.UsageError(f"'{ctx.command_path}' takes {takes}: what is '{' '.join(rest)}'?", ctx)
+            takes = f"nothing after {self.row.argument.metavar.strip('[]')}" if self.row.argument else "no arguments"
+            raise click.UsageError(f"'{ctx.command_path}' takes {takes} (got '{' '.join(rest)}')", ctx)
         return rest
 
 
@@ -210,7 +213,6 @@ class _CommandGroup(_HelpfulCommand, click.Group):
     """The group of all commands, which are created when they are first needed."""
 
     examples, exit_codes = _EXAMPLES, ALL_EXIT_CODES
-    common_heading = "Options, before or after the command"
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
         return list(COMMANDS)
@@ -228,7 +230,7 @@ class _CommandGroup(_HelpfulCommand, click.Group):
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         self.format_commands(ctx, formatter)
-        super().format_options(ctx, formatter)
+        self.write_options("Common options, before or after the command", self.get_params(ctx), ctx, formatter)
 
 
 @click.group(
@@ -241,7 +243,7 @@ class _CommandGroup(_HelpfulCommand, click.Group):
 @click.version_option(__version__, prog_name="talk", message="%(prog)s %(version)s")
 @click.pass_context
 def talk(context: click.Context) -> None:
-    """Speech for robots: sentences that can be awaited, cancelled and preempted."""
+    """Let a robot speak. Sentences can be awaited, cancelled and interrupted."""
     if context.invoked_subcommand is None:
         click.echo(_first_screen(context))
 
@@ -256,7 +258,7 @@ def _first_screen(context: click.Context) -> str:
     with formatter.indentation():
         _write_lines(_EXAMPLES, formatter)
     talk.format_commands(context, formatter)
-    formatter.write("'talk COMMAND --help' says more of each, 'talk --help' has the exit codes.")
+    formatter.write("'talk COMMAND --help' explains a command, 'talk --help' lists the exit codes.")
     return formatter.getvalue()
 
 
@@ -303,10 +305,10 @@ def _unknown_command(words: list[str]) -> str:
     name = words[0]
     if name.lower() == "help":
         meant = next((each for each in words[1:] if each in COMMANDS), None)
-        return f"no such command '{name}': write 'talk{f' {meant}' if meant else ''} --help'"
+        return f"unknown command '{name}'; try 'talk{f' {meant}' if meant else ''} --help'"
     near = _FOREIGN_NAMES.get(name.lower()) or nearest(name, COMMANDS)
-    return f"no such command '{name}': " + (
-        f"did you mean '{near}'?" if near else f"to speak it, write: talk say {_quote_for_shell(' '.join(words))}"
+    return f"unknown command '{name}'; " + (
+        f"did you mean '{near}'?" if near else f"to speak this text, type: talk say {_quote_for_shell(' '.join(words))}"
     )
 
 
@@ -322,13 +324,13 @@ def _describe_error(error: click.ClickException) -> str:
     if isinstance(error, click.NoSuchOption):
         # Leading dashes would make unrelated options look similar.
         near = nearest(error.option_name.lstrip("-"), [each.lstrip("-") for each in error.possibilities or ()])
-        words = f"no such option '{error.option_name}'" + (f": did you mean '--{near}'?" if near else "")
+        words = f"unknown option '{error.option_name}'" + (f"; did you mean '--{near}'?" if near else "")
         command = error.ctx.command if error.ctx else None
         hint = command.row.unknown_option_hint if isinstance(command, ClickCommand) else ""
         stop = "." * (not near)
         return f"{words}{stop} {hint}" if hint else words
     if isinstance(error, click.MissingParameter) and error.param and isinstance(error.param.type, click.Choice):
-        return f"{error.param.metavar} is missing: one of {', '.join(error.param.type.choices)}"
+        return f"{error.param.metavar} is missing; choose one of {', '.join(error.param.type.choices)}"
     words = error.format_message().rstrip(".")
     if isinstance(error, click.BadParameter):
         option, colon, wrong = words.removeprefix("Invalid value for ").partition(": ")

@@ -31,36 +31,24 @@ FILE_MODE = Kind("string", (str,), "must be a string", "MODE")
 #: Options that can't be used with several robots.
 _SINGLE_ROBOT_OPTIONS = ("lines", "ahead", "feedback", "output")
 
-#: The exit codes shared by all commands that connect to a server. A command can override their descriptions.
-_SERVER_EXIT_CODES: ExitCodes = {
-    2: "usage: what is wrong stands on standard error",
-    3: "no server: nothing was sent, so it is safe to try again",
-    5: "the server has as many clients as it takes",
-    9: "this command and the server speak different versions of the protocol",
-    10: "permission denied",
-    12: "lost: it was sent, then nothing more was heard; it may have an effect all the same",
-}
-#: The exit codes shared by all commands that can be sent to several robots.
-_FLEET_EXIT_CODES: ExitCodes = {
-    **_SERVER_EXIT_CODES,
-    13: "robots differ: those that did not do it failed in more than one way",
-}
-#: All exit codes, for `talk --help` and the README. Each command's own help is more specific.
+#: All exit codes, for `talk --help`. The help of some commands describes them more specifically.
 ALL_EXIT_CODES: ExitCodes = {
-    **_FLEET_EXIT_CODES,
-    0: "accepted; with --wait succeeded: all of it was played",
-    1: "anything not named here; a bug says so, and TALK_DEBUG=1 where",
-    2: "usage",
-    4: "aborted: engine or audio failed, or nothing in the text can be spoken",
-    5: "rejected: never queued",
-    6: "recalled: taken out of the queue before it was spoken",
-    7: "preempted: stopped while it was spoken",
+    0: "the goal was accepted; with --wait: all of it was played",
+    1: "any other error; if it is a bug in talk, TALK_DEBUG=1 prints a traceback",
+    2: "wrong usage",
+    3: "no server, no broker, or the robot is offline; nothing was spoken, so you can try again",
+    4: "aborted: the engine or the sound failed, or the text can't be spoken",
+    5: "rejected: the goal was never queued (bad text, full queue, too many clients)",
+    6: "recalled: the goal was removed from the queue before it was spoken",
+    7: "preempted: the goal was stopped while it was spoken",
     8: "unknown goal",
-    9: "client and server speak different versions of the protocol",
-    11: "the socket is served already, or its directory is not safe",
-    12: "lost: it was sent, then the server went away; it may still be spoken",
+    9: "client and server use different versions of the protocol",
+    10: "permission denied",
+    11: "serve: the socket is in use or its directory isn't safe; bridge: another robot has this name",
+    12: "lost: the connection was lost after the goal was sent, so it may still be spoken",
+    13: "several robots failed with different exit codes",
     124: "timed out",
-    "128+n": "ended by signal n; 141: standard output is closed, or its reader went away",
+    "128+n": "ended by signal n; 141 means that standard output was closed",
 }
 
 
@@ -75,8 +63,6 @@ class Command:
     description: str
     #: example command lines, one per line
     examples: str
-    #: the meanings of the command's own exit codes, and of usual ones that it describes more precisely
-    exit_codes: ExitCodes
     #: the function that runs the command, as "module:name", or an empty string for the function in `ask` with the
     #: command's name; the arguments of the function are the common options and the command's own
     function: str = ""
@@ -94,14 +80,8 @@ class Command:
     #: the function that sends the command to several robots, as "module:name", or an empty string
     fleet_function: str = ""
     rule: Rule | None = None
-
-    @property
-    def all_exit_codes(self) -> ExitCodes:
-        """The meanings of all exit codes of the command."""
-        usual: ExitCodes = {}
-        if self.uses_server and self.connects:
-            usual = _FLEET_EXIT_CODES if self.fleet_function else _SERVER_EXIT_CODES
-        return {1: "anything not named here; a bug says so", 2: "usage", **usual, **self.exit_codes}
+    #: the meanings of the exit codes that help shows, or None if it shows none
+    exit_codes: ExitCodes | None = None
 
     def usage_fault(self, given: Mapping[str, Any], typed: frozenset[str], common: Mapping[str, Any]) -> str | None:
         """Return an error message if the options can't be combined, otherwise None.
@@ -113,13 +93,15 @@ class Command:
         """
         robot, socket, connect_timeout = (common.get(each) for each in ("robot", "socket", "connect_timeout"))
         if robot is not None and socket:
-            return "--robot is a robot of a fleet, --socket a server of this machine: leave out one of them"
+            return (
+                "--robot names a robot of a fleet, but --socket names a server of this machine; leave out one of them"
+            )
         is_local = self._is_local(given)
         local_name = f"{self.name}{' --output' * (given.get('output') is not None)}"
         if is_local and robot is not None:
-            return f"'talk {local_name}' is of this machine alone: leave out --robot"
+            return f"'talk {local_name}' only works on this machine; leave out --robot"
         if connect_timeout is not None and (is_local or not self.connects):
-            return f"'talk {local_name}' does not wait for a server: leave out --connect-timeout"
+            return f"'talk {local_name}' does not wait for a server; leave out --connect-timeout"
         robot = None if is_local else named_robot(robot, socket)
         if robot and (fault := self._robot_fault(robot, given, connect_timeout)):
             return fault
@@ -140,11 +122,9 @@ class Command:
             single = [f"--{each}" for each in _SINGLE_ROBOT_OPTIONS if given.get(each)]
             if single or not self.fleet_function:
                 what = " ".join([self.name, *single])
-                return (
-                    f"'talk {what}' is of one robot: name it; 'talk fleet status' and 'talk fleet watch' show several"
-                )
+                return f"'talk {what}' only works with one robot; name it, or try 'talk fleet status' for several"
             if connect_timeout is not None:
-                return "--connect-timeout waits for one robot: name it, or leave out --connect-timeout"
+                return "--connect-timeout only works with one robot; name it, or leave out --connect-timeout"
         return Selection(robot).fault
 
     def run(self, options: CommonOptions, given: Mapping[str, Any]) -> int | None:
@@ -181,27 +161,28 @@ COMMON_OPTIONS = (
     option(
         "--socket",
         PATH,
-        "Socket of the server.  [env var: TALK_SOCKET; default: the usual places, as 'talk doctor' lists]",
+        "Set the path of the server's socket.  [env var: TALK_SOCKET; default: the usual places, see 'talk doctor']",
         completion="files",
     ),
     option(
         "--robot",
         WORD,
-        "A robot of a fleet, by its broker (TALK_BROKER); or several: a glob, @GROUP, @all.  [env var: TALK_ROBOT]",
+        "Use a robot of a fleet, through the broker TALK_BROKER. A pattern, @GROUP or @all selects several robots.  "
+        "[env var: TALK_ROBOT]",
         metavar="NAME",
         completion="robots",
     ),
     option(
         "--connect-timeout",
         NUMBER,
-        "Keep trying to reach the server for SEC seconds; with --robot, until the robot is online.",
+        "Keep trying to reach the server for SEC seconds. With --robot, also wait until the robot is online.",
         limits=(0, None),
         excludes_minimum=True,
         metavar="SEC",
     ),
     option("--insecure", FLAG, "Send the password to the broker without TLS."),
-    option("--json", FLAG, "For programs: one JSON object a line; errors, too."),
-    option("-q, --quiet", FLAG, "No ids, no notes."),
+    option("--json", FLAG, "Print JSON objects, one per line, also for errors."),
+    option("-q, --quiet", FLAG, "Print errors only."),
 )
 
 
@@ -229,33 +210,26 @@ def read_value(option: Option, text: str) -> Any:
         text = _as_utf8(text)
         bad = next(filter(_is_bad_byte, text), None)
         if bad:
-            raise ValueError(f"the byte {_format_byte(bad)} in it is not UTF-8")
+            raise ValueError(f"the byte {_format_byte(bad)} is not valid UTF-8")
     if option.choices and text not in option.choices:
-        raise ValueError(f"'{text}' is not one of {', '.join(option.choices)}")
+        raise ValueError(f"must be one of {', '.join(option.choices)}, got '{text}'")
     if not text and kind in (WORD, ID, PATH):  # an empty value usually comes from an unset variable
-        raise ValueError("empty; is the variable set that it comes from?")
+        raise ValueError("must not be empty; check the variable that it comes from")
     return text
-
-
-def range_help(option: Option) -> str:
-    """Return the range of a numeric option for help, or an empty string if it has no limits."""
-    return f"from {option.range}" if option.limits[1] is not None else option.range
 
 
 def _read_number(option: Option, text: str) -> float:
     whole = option.kind is INTEGER
-    what = "a whole number" if whole else "a number"
-    wanted = f"{what} {range_help(option)}" if option.range else "a valid integer" if whole else what
     try:
         value = int(text) if whole else float(text)
     except ValueError:
-        raise ValueError(f"'{text}' is not {wanted}") from None
+        raise ValueError(f"must be a {'whole ' * whole}number, got '{text}'") from None
     if value != value:  # NaN is the only value that differs from itself
-        raise ValueError(f"{value!r} is not a number")
+        raise ValueError(f"must be a number, got '{text}'")
     if option.kind is SECONDS and value == float("inf"):
-        raise ValueError("no limit is 0")
+        raise ValueError("must not be infinite; 0 means no limit")
     if option.is_out_of_range(value):
-        raise ValueError(f"'{text}' is not {wanted}")
+        raise ValueError(f"must be {option.range}, got {text}")
     return value
 
 
@@ -267,7 +241,7 @@ def _read_mode(text: str) -> int:
     digits = 3 <= len(text) <= 4 and set(text) <= set("01234567")
     mode = int(text, 8) if digits else 0
     if mode & ~0o666 or mode & 0o600 != 0o600:
-        raise ValueError(f"{text!r} is not a mode such as 0600 (mine alone), 0660 (my group's) or 0666")
+        raise ValueError(f"must be a mode such as 0600 (only you), 0660 (your group) or 0666 (everybody), got {text!r}")
     return mode
 
 
@@ -304,9 +278,11 @@ def replace_bad_bytes(text: str, line: int = 1) -> tuple[str, str | None]:
     first = found[0]
     line += text.count("\n", 0, first)
     column = first - text.rfind("\n", 0, first)
-    words = f"line {line}, column {column}: the byte {_format_byte(text[first])} is not UTF-8, and is not spoken"
+    words = (
+        f"line {line}, column {column}: the byte {_format_byte(text[first])} is not valid UTF-8, so it is not spoken"
+    )
     if len(found) > 1:
-        words += f" (the first of {len(found):,})"
+        words += f" ({len(found) - 1:,} more like it)"
     # The engine treats the replacement character U+FFFD as a space.
     return "".join("\ufffd" if _is_bad_byte(each) else each for each in text), words
 

@@ -18,9 +18,10 @@ if TYPE_CHECKING:
     from talkcli.fleet.broker import Broker
     from talkcli.fleet.desk.watch import FleetEvent
     from talkcli.goals.goal import JsonObject
+    from talkcli.terminal.text import Screen
 
 
-def fleet(options: CommonOptions, what: str) -> int | None:
+def fleet(options: CommonOptions, what: str, long: bool) -> int | None:
     """Show the state of each robot, or watch the robots until interrupted.
 
     Return the exit code, or None for success.
@@ -29,28 +30,32 @@ def fleet(options: CommonOptions, what: str) -> int | None:
     text = paths.named_robot(options.robot, options.socket)
     selection = None if text is None else Selection(text)
     if what == "watch":
-        return _watch(options, broker, selection)
+        return _watch(options, broker, selection, long=long)
     from talkcli.fleet.desk.watch import read_robots
 
     found = read_robots(broker, ANSWER_LIMIT_S, selection.name if selection else None)
     selected = [each for each in found if selection is None or selection.includes(each.presence)]
     if not selected:
         raise _no_robot_error(broker, selection)
-    show_result(options, [each.to_json() for each in selected], lambda: robot_lines(selected, screen(), time.time()))
+    output = screen(long=long)
+    show_result(options, [each.to_json() for each in selected], lambda: robot_lines(selected, output, time.time()))
     return None
 
 
 def _no_robot_error(broker: Broker, selection: Selection | None) -> ServerUnavailable:
     """Return the error to raise if no robot matches the selection."""
     if selection is None:
-        return ServerUnavailable(f"no robot is known at {broker.url}; on each robot: talk bridge --name NAME")
+        return ServerUnavailable(
+            f"no robot has connected to {broker.url} yet; start on each robot: talk bridge --name NAME"
+        )
     if selection.group is not None:
-        words = f"no robot of the group '{selection.group}' is known at {broker.url}"
-        return ServerUnavailable(f"{words}; on a robot of it: talk bridge --group {selection.group}")
-    return ServerUnavailable(f"no robot '{selection.text}' is known at {broker.url}: 'talk fleet status' lists all")
+        words = f"the group '{selection.group}' has no robots at {broker.url}"
+        return ServerUnavailable(f"{words}; add robots to it with 'talk bridge --group {selection.group}'")
+    words = f"no robot at {broker.url} matches '{selection.text}'"
+    return ServerUnavailable(f"{words}; list all robots with: talk fleet status")
 
 
-def _watch(options: CommonOptions, broker: Broker, selection: Selection | None) -> int:
+def _watch(options: CommonOptions, broker: Broker, selection: Selection | None, *, long: bool) -> int:
     """Show events until the command is interrupted, and return the exit code."""
     from talkcli.cli.interrupts import Interrupts, has_reader
     from talkcli.fleet.desk.watch import FleetWatch
@@ -61,11 +66,13 @@ def _watch(options: CommonOptions, broker: Broker, selection: Selection | None) 
     # Watch the output, too. Otherwise, a closed pipe would only be noticed at the next event.
     with Interrupts(output=True) as interrupts:
         for event in FleetWatch(broker, selection).events(interrupts.watched):
-            _show_event(options, broker, transcript, event)
+            _show_event(options, broker, transcript, event, screen(long=long))
     return interrupts.exit_code
 
 
-def _show_event(options: CommonOptions, broker: Broker, transcript: FleetTranscript, event: FleetEvent) -> None:
+def _show_event(
+    options: CommonOptions, broker: Broker, transcript: FleetTranscript, event: FleetEvent, output: Screen
+) -> None:
     """Print an event. Messages about a lost or recovered broker go to standard error."""
     from talkcli.fleet.desk.watch import BrokerAway, EventsMissed, FleetSnapshot, RobotChanged, RobotEvent
 
@@ -73,23 +80,23 @@ def _show_event(options: CommonOptions, broker: Broker, transcript: FleetTranscr
     if isinstance(event, FleetSnapshot):
         robots = [each.presence for each in event.robots]
         objects = (_snapshot_object(each) for each in event.robots)
-        show_result(options, objects, lambda: transcript.begin(robots, broker.url, screen(), now))
+        show_result(options, objects, lambda: transcript.begin(robots, broker.url, output, now))
     elif isinstance(event, RobotChanged):
         message: JsonObject = {"robot": event.name, "event": "presence", "presence": event.now and event.now.to_json()}
         robot = event.now or Presence(event.name, online=False)
-        show_result(options, [message], lambda: transcript.change(event.before, robot, screen(), now))
+        show_result(options, [message], lambda: transcript.change(event.before, robot, output, now))
     elif isinstance(event, RobotEvent):
         message = {"robot": event.name, **event.message}
-        show_result(options, [message], lambda: transcript.lines(event.name, event.event, screen(), now))
+        show_result(options, [message], lambda: transcript.lines(event.name, event.event, output, now))
     elif isinstance(event, EventsMissed):
         name = event.robot.presence.name
-        lines = (line for each in event.events for line in transcript.lines(name, each, screen(), now))
+        lines = (line for each in event.events for line in transcript.lines(name, each, output, now))
         show_result(options, [_snapshot_object(event.robot)], lambda: lines)
     elif not options.quiet:
         if isinstance(event, BrokerAway):
-            note(f"{event.why}; it is tried again for {event.limit:g} s")
+            note(f"{event.why}; trying again for {event.limit:g} s")
         else:
-            note(f"the broker at {broker.url} is back, after {event.after:.1f} s")
+            note(f"the broker at {broker.url} is back after {event.after:.1f} s")
 
 
 def _snapshot_object(robot: RobotInfo) -> JsonObject:

@@ -110,7 +110,7 @@ def _report_sent(goal: GoalHandle, options: CommonOptions, reporter: GoalReporte
     if goal.state is State.REJECTED:
         code = reporter.report_refused(goal.goal)
         if goal.goal.reason == "text_too_long" and not options.quiet:
-            note("'talk say --lines' speaks standard input line by line, each line a goal of its own")
+            note("to speak a long text line by line, pipe it into: talk say --lines")
         return code
     reporter.show_accepted(goal)
     code = reporter.report(goal.goal)
@@ -137,7 +137,7 @@ def _wait_for_goal(
             return interrupts.exit_code
         if goal.state is State.SUCCEEDED:
             return EXIT_OK
-        raise timeout_error(timeout, f"{goal.id} goes on: it was sent before" if goal.attached else "") from None
+        raise timeout_error(timeout, f"{goal.id} was sent earlier and continues" if goal.attached else "") from None
     finally:
         retry_without_output(reporter.feedback.close)
     return reporter.report(goal.goal)
@@ -152,7 +152,7 @@ def _write_file(
     settings, seconds_at_most = _sound_settings(goal_options), seconds_left(options.deadline(timeout))
     if path in STANDARD_OUTPUT:
         if options.json:
-            raise UsageError("--json prints to standard output, where the sound goes: leave one of them out")
+            raise UsageError("--json and -o - both write to standard output; leave out one of them")
         standard_output()
     with Interrupts() as interrupts:
         try:
@@ -176,7 +176,7 @@ def _sound_settings(goal_options: Mapping[str, Any]) -> dict[str, Any]:
             try:
                 value = read_value(option, text)
             except ValueError as error:
-                words = f"{option.env} in the environment: {error}"
+                words = f"the environment variable {option.env} {error}"
                 raise click.UsageError(words, click.get_current_context()) from error
         if value is not None:
             found[option.name] = value

@@ -34,9 +34,8 @@ if TYPE_CHECKING:
 
 #: The warning that is printed at startup if there is no sound device.
 _NO_DEVICE = (
-    "no sound device is here, and no PulseAudio or PipeWire: plug in a loudspeaker, or hand it to the container ('talk "
-    "doctor' says more); it is looked for with each sentence, which ends ABORTED until it is there; to speak without "
-    "one: '--player file:PATH.wav', '--player null'"
+    "no sound device or sound server found, so sentences will be ABORTED until there is one; see 'talk doctor', or run "
+    "without sound with '--player file:PATH.wav' or '--player null'"
 )
 #: The environment files that contain the broker's address and login.
 _BRIDGE_ENVIRONMENTS = {"user": "%h/.config/talk/bridge.env", "system": "/etc/talk/bridge.env"}
@@ -82,8 +81,8 @@ def _warn_about_sound(player: str, driver: str | None) -> None:
         player_commands(player, None, 0)
     except PlayerMissing as error:
         near = nearest(player, PLAYERS.keys() - {player})
-        hint = f"did you mean '{near}'? " if near else ""
-        note(f"{printable(str(error))}: {hint}nothing can be heard until it is there")
+        hint = f"; did you mean '{near}'?" if near else ""
+        note(f"{printable(str(error))}; nothing can be heard{hint}")
 
 
 def bridge(options: CommonOptions, print_unit: str | None, print_acl: bool, **given: Any) -> int:
@@ -96,15 +95,15 @@ def bridge(options: CommonOptions, print_unit: str | None, print_acl: bool, **gi
     for flag, name in (("--name", given["name"]), *(("--group", each) for each in groups)):
         fault = None if name is None else topics.name_fault(name)
         if fault:
-            raise UsageError(f"{flag}: the name '{printable(name)}' can't be in a topic, it {fault}")
+            raise UsageError(f"{flag}: '{printable(name)}' is not a valid name; it {fault}")
     if print_acl:
         show(topics.access_rules(homeassistant=given["homeassistant"], name=given["name"]))
         return EXIT_OK
     for each in allow:
         if each not in ALLOWABLE_REQUESTS:
             near = nearest(each, ALLOWABLE_REQUESTS)
-            hint = f"did you mean '{near}'?" if near else f"there are {', '.join(ALLOWABLE_REQUESTS)}"
-            raise UsageError(f"--allow: no request is called '{printable(each)}': {hint}")
+            hint = f"did you mean '{near}'?" if near else f"choose from {', '.join(ALLOWABLE_REQUESTS)}"
+            raise UsageError(f"--allow: unknown request '{printable(each)}'; {hint}")
     if print_unit:
         words = ["--insecure"] if options.insecure else []
         return _print_unit(options, "bridge", print_unit, given, words, environment=_BRIDGE_ENVIRONMENTS[print_unit])
@@ -156,9 +155,9 @@ def _print_unit(
     if hidden:
         file, directory = hidden
         note(
-            f"this talk needs {printable(file)}, and the service's own user can't pass {printable(directory)}: install "
-            "it for all, as with 'sudo /usr/bin/python3 -m venv /opt/talk && sudo /opt/talk/bin/pip install .' in a "
-            "checkout, then print the unit"
+            f"the service's user can't enter {printable(directory)}, but this talk needs {printable(file)}; install "
+            "talk for all users with 'sudo /usr/bin/python3 -m venv /opt/talk && sudo /opt/talk/bin/pip install .' in "
+            "a checkout, and print the unit with that talk"
         )
     return EXIT_OK
 
@@ -217,5 +216,7 @@ def _escape_path(path: str) -> str:
         UsageError: systemd would misread the path.
     """
     if re.search(_UNSAFE_CHARACTERS, path) or path.endswith(("\\", " ")):
-        raise UsageError(f"a socket's unit can't name {printable(path)}: name a path without such signs")
+        raise UsageError(
+            f"a socket unit can't contain the path {printable(path)}; choose one without control characters"
+        )
     return path.replace("%", "%%")  # systemd would expand specifiers

@@ -70,7 +70,7 @@ def cancel(options: CommonOptions, ids: tuple[str, ...], current: bool, before: 
     return _ask(options, Cancel(ids or None, current, before, key))
 
 
-def status(options: CommonOptions, goal_id: str | None) -> int:
+def status(options: CommonOptions, goal_id: str | None, long: bool) -> int:  # noqa: ARG001 - ids are always whole
     """Show the status of each robot, or the state of one goal on each robot. Return the exit code."""
     return _ask(options, Status(goal_id))
 
@@ -121,7 +121,7 @@ def _ask(options: CommonOptions, request: Request, timeout: float | None = None,
                 _cancel(fleet_request, interrupts, printer)
             if is_late:
                 show_error(timeout_error(timeout), json=options.json)
-            printer.summarize(fleet_request, "not known to be silent" if owns_goals else "not done")
+            printer.summarize(fleet_request, "may still be speaking" if owns_goals else "not done")
             return EXIT_TIMEOUT if is_late else interrupts.exit_code
     return interrupts.exit_code
 
@@ -136,7 +136,7 @@ def _cancel(fleet_request: FleetRequest, interrupts: Interrupts, printer: _Outco
     except (Interrupted, TimeoutError):
         pass  # the summary names the robots that haven't answered
     except TalkError as error:
-        note(f"could not be cancelled: {error}")
+        note(f"the goals could not be cancelled: {error}")
 
 
 class _OutcomePrinter:
@@ -187,7 +187,7 @@ class _OutcomePrinter:
             if fleet_request.unfinished_robots:
                 why = f": {fleet_request.why_disconnected}" if fleet_request.why_disconnected else ""
                 note(f"{unknown}: {_join_names(fleet_request.unfinished_robots)}{why}")
-            note(f"{done} of {len(fleet_request)} as asked")
+            note(f"{done} of {len(fleet_request)} robots succeeded")
         codes = {each.exit_code for each in failures}
         return EXIT_DIFFER if len(codes) > 1 else next(iter(codes), EXIT_OK)
 
@@ -206,7 +206,7 @@ class _OutcomePrinter:
         """Show the number of finished robots if standard error is a terminal."""
         if self._terminal:
             finished = sum(each.last for each in self._outcomes.values())
-            self._terminal.write(f"\r{finished} of {len(fleet_request)}")
+            self._terminal.write(f"\r{finished} of {len(fleet_request)} robots")
             self._terminal.flush()
 
     def _clear_count(self) -> None:

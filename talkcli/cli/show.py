@@ -95,7 +95,7 @@ class CommonOptions:
             now = time.monotonic()
             if connect_timeout is None or now < began + seconds:  # retrying wasn't requested or can't help
                 raise
-            words = f"waited for {round(seconds, 1):g} s: {error.message}"
+            words = f"waited {round(seconds, 1):g} s: {error.message}"
             if end is not None and now >= end:
                 raise TimeoutError(words) from None
             raise ServerUnavailable(words) from None
@@ -140,7 +140,7 @@ def run_command(command: Callable[[], object], options: CommonOptions) -> int:
     except KeyboardInterrupt:
         return EXIT_SIGINT
     except MemoryError:
-        note(f"there is not enough memory for talk: {memory_limits()}")
+        note(f"not enough memory for talk: {memory_limits()}")
         return EXIT_ERROR
     except Exception as error:
         output_code = handle_output_error(error)
@@ -148,7 +148,7 @@ def run_command(command: Callable[[], object], options: CommonOptions) -> int:
             return output_code
         if os.environ.get("TALK_DEBUG"):
             raise
-        note(f"a bug in talk {__version__}: {type(error).__name__}: {error} (TALK_DEBUG=1 shows where)")
+        note(f"this is a bug in talk {__version__}: {type(error).__name__}: {error}; for details, set TALK_DEBUG=1")
         return EXIT_ERROR
     return (code if isinstance(code, int) else 0) or (EXIT_ERROR if _output_lost else 0)
 
@@ -192,7 +192,7 @@ def handle_output_error(error: Exception) -> int | None:
         return None
     _output_lost = True
     discard_output()
-    note(f"standard output can't be written: {error.strerror}")
+    note(f"can't write to standard output: {error.strerror}")
     return EXIT_ERROR
 
 
@@ -370,10 +370,10 @@ def has_colour() -> bool:
     return sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
 
 
-def screen() -> Screen:
-    """Return the width and the colour support of standard output."""
+def screen(*, long: bool = False, boot: str = "") -> Screen:
+    """Return the properties of standard output, with these details to show."""
     from talkcli.terminal.text import Screen
 
     if sys.stdout is None or not sys.stdout.isatty():
-        return Screen()
-    return Screen(terminal_columns(sys.stdout), has_colour())
+        return Screen(long=long, boot=boot)
+    return Screen(terminal_columns(sys.stdout), has_colour(), long, boot)

@@ -76,14 +76,14 @@ def read_text(end: float | None, *, wait: bool = False, whole: bool = False) -> 
     with Interrupts(output=wait) as interrupts:
         while whole or len(data) <= MAX_TEXT_BYTES + len("\r\n"):
             if not wait_ready({0: select.POLLIN}, seconds_left(end), interrupts.watched):
-                raise TimedOut("standard input has not ended within the time: nothing was sent")
+                raise TimedOut("standard input did not end in time; nothing was sent")
             more = _read_available()
             if more == b"":
                 return _decode(bytes(data))
             data += more or b""
         raise InputTooLong(
-            f"standard input has more than {MAX_TEXT_BYTES:,} bytes, and a text at most {MAX_TEXT_CHARS:,} characters: "
-            "'talk say --lines' speaks it line by line"
+            f"standard input is too long (more than {MAX_TEXT_BYTES:,} bytes; a text has at most {MAX_TEXT_CHARS:,} "
+            "characters); to speak it line by line, use: talk say --lines"
         )
     if interrupts.signal_number == signal.SIGINT:
         write_error_line()  # start a new line after the ^C that the terminal has shown
@@ -167,7 +167,7 @@ def _read_available() -> bytes | None:
     except BlockingIOError:  # another program has made standard input non-blocking
         return None
     except OSError as error:
-        raise UsageError(f"standard input cannot be read: {error.strerror}") from error
+        raise UsageError(f"can't read standard input: {error.strerror}") from error
 
 
 def _decode(data: bytes) -> str:
@@ -321,13 +321,13 @@ class LineSpeaker:
         self._report_goals()
         if self._connection.ended is not None and self._error is None and self._has_lines:
             path = self._connection.path
-            raise ServerUnavailable(f"nothing more can be sent to the server at {path}: {self._connection.ended}")
+            raise ServerUnavailable(f"lost the connection to the server at {path}: {self._connection.ended}")
 
     # Sending lines
 
     def _send(self, line: InputLine) -> None:
         if line.oversize_bytes:
-            words = f"the line has {line.oversize_bytes:,} bytes, the longest text allowed has {MAX_TEXT_BYTES:,}"
+            words = f"the line has {line.oversize_bytes:,} bytes, but at most {MAX_TEXT_BYTES:,} are allowed"
             self._report_refused(line.number, rejected_goal(words))
             return
         self._sending = line.number
@@ -462,7 +462,7 @@ class LineSpeaker:
                 ids = list(dict.fromkeys([*ids, *_own_goals(client)]))
                 done = client.cancel(ids)
         except (TalkError, Interrupted) as error:
-            self._feedback.note(f"cancelled, but it is not known whether it is silent: {str(error) or 'interrupted'}")
+            self._feedback.note(f"the goals were cancelled, but may still be spoken: {str(error) or 'interrupted'}")
             return
         ended = sorted((*done.ended, *done.canceled), key=lambda each: ids.index(each.id))
         for goal in ended:
@@ -472,16 +472,18 @@ class LineSpeaker:
                 retry_without_output(self._reporter.report, goal)
         recalled = sum(each.state is State.RECALLED for each in ended)
         if recalled and not (self._feedback.shows_events or self._options.json or self._options.quiet):
-            note(f"{recalled} that waited: recalled")
+            note(f"removed {recalled} waiting line{'s' * (recalled > 1)} from the queue")
 
     def _report_unsent(self) -> None:
         """Print a message about the first line that wasn't sent or accepted, if there is one."""
         if self._options.quiet:
             return
         if self._sending is not None:
-            self._feedback.note(f"line {self._sending} may not have been accepted; what follows it was not sent")
+            self._feedback.note(
+                f"line {self._sending} may not have been accepted, and the lines after it were not sent"
+            )
         elif self._buffer.first:
-            self._feedback.note(f"line {self._buffer.first.number} was not sent, and what follows it was not either")
+            self._feedback.note(f"line {self._buffer.first.number} and the lines after it were not sent")
 
 
 def _own_goals(client: Client) -> list[str]:

@@ -60,7 +60,7 @@ class GoalReporter:
         if not self._options.json and not self.feedback.shows_events:
             show_if_possible(show, goal.id)
         if goal.speech_paused and not (pause_known or goal.state.terminal):
-            self.feedback.note("speech is paused: talk resume")
+            self.feedback.note("speech is paused; continue with: talk resume")
 
     def follow(self, goals: Sequence[GoalHandle], timeout: float | None) -> None:
         """Wait until these goals have ended, and show their events.
@@ -97,7 +97,7 @@ class GoalReporter:
 
             words = describe_end(goal)
             if goal.state is State.ABORTED and goal.reason != "nothing_to_say":
-                words += "; see 'talk doctor'"
+                words += "; find out why with: talk doctor"
             self.feedback.note(f"{prefix}{words}")
         return EXIT_TIMEOUT if goal.exit_code is None else goal.exit_code
 
@@ -111,15 +111,15 @@ class GoalReporter:
         problem = "could not be cancelled"
         try:
             goal.request_cancel()
-            problem = "cancelled, but it is not known whether it is silent"
+            problem = "was cancelled, but may still be spoken"
             retry_without_output(self.follow, [goal], CANCEL_TIMEOUT_S)
             problem = ""
         except TimeoutError:
-            problem = f"cancelled, but the server did not confirm within {CANCEL_TIMEOUT_S:g} s that it is silent"
+            problem = f"was cancelled, but the server did not confirm silence within {CANCEL_TIMEOUT_S:g} s"
         except (Interrupted, ServerUnavailable) as error:
             problem += f": {error or 'interrupted'}"
         if problem:
-            retry_without_output(self.feedback.note, f"{goal.id}: {problem}")
+            retry_without_output(self.feedback.note, f"goal {goal.id} {problem}")
         retry_without_output(self.report, goal.goal)
 
 
@@ -147,5 +147,5 @@ def wait(options: CommonOptions, ids: tuple[str, ...], timeout: float | None, fe
             return first_failure
         except TimeoutError:
             late = next(each.id for each in goals if not each.state.terminal)
-            raise timeout_error(timeout, f"{late} has not ended") from None
+            raise timeout_error(timeout, f"goal {late} has not ended") from None
     return interrupts.exit_code

@@ -9,12 +9,12 @@ from __future__ import annotations
 import re
 import time
 
-from talkcli.frozen import TYPE_CHECKING
+from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.goal import message_details
 from talkcli.goals.options import format_number
 from talkcli.goals.states import State
 from talkcli.protocol.lines import encode
-from talkcli.terminal.text import COLUMN_GAP, Screen, fit_columns, pad, printable, width, wrap
+from talkcli.terminal.text import COLUMN_GAP, TEXT_COLUMNS, Screen, fit_row, pad, printable, width, wrap
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -38,14 +38,14 @@ _FIELD_FORMATS = {
     "engine": "{}",
     "synthesizer": "{}",
     "lead_in": "lead-in {} ms",
-    "rate": "{} words a minute",
+    "rate": "{} words per minute",
     "ttl": "ttl {} s",
-    "preempt": "preempts",
+    "preempt": "every goal interrupts",
 }
 #: Fields of the server status that are only shown if they have a value.
 _OPTIONAL_FIELDS = frozenset({"synthesizer", "device", "lead_in", "ttl", "preempt"})
 
-_UNKNOWN_SENDER = "nobody known"
+_UNKNOWN_SENDER = "unknown"
 #: Programs that run a script or another program, by name without version number. Each value consists of the options
 #: that take a value, the options that replace the script, and the number of arguments before the script.
 _LAUNCHERS = {
@@ -116,6 +116,7 @@ def goal_lines(goal: Goal, screen: Screen, now: float) -> list[str]:
 def status_lines(status: ServerStatus, screen: Screen, now: float) -> list[str]:
     """Return the lines of `talk status`. `now` is a Unix timestamp."""
     server = status.server
+    screen = replace(screen, boot=str(server.get("boot")))
     uptime = server.get("uptime")
     identity = [
         f"pid {_format_field(server, 'pid')} on {_format_field(server, 'socket')}",
@@ -124,7 +125,7 @@ def status_lines(status: ServerStatus, screen: Screen, now: float) -> list[str]:
     ]
     engine = _format_fields(server, "engine", "driver", "synthesizer", "player", "device", "lead_in")
     settings = _format_fields(server, "rate", "volume", "pitch", "voice", "ttl", "preempt")
-    lines = []
+    lines: list[str] = []
     for label, parts in (("server", identity), ("engine", engine), ("settings", settings)):
         lines += wrap([*(f"{each}," for each in parts[:-1]), parts[-1]], _label(label), screen)
     neural = server.get("neural_voices")
@@ -132,10 +133,11 @@ def status_lines(status: ServerStatus, screen: Screen, now: float) -> list[str]:
         state, why = (found.get(each) for each in ("state", "why"))
         lines += wrap(printable(f"{voice} {state}{f': {why}' if why else ''}").split(" "), _label("voice"), screen)
     if server.get("paused"):
-        lines.append(f"{_label('paused')}{screen.coloured('speech is held', State.PREEMPTING)}: talk resume")
+        paused = screen.coloured("speech is paused", State.PREEMPTING)
+        lines.append(f"{_label('paused')}{paused}; continue with: talk resume")
     active = [status.active] if status.active else []
     tables = (("now", active, "silent"), ("queue", status.pending, "nothing"), ("said", status.recent, "nothing"))
-    id_columns = max((width(screen.fit_name(goal.id)) for _, goals, _ in tables for goal in goals), default=0)
+    id_columns = max((width(screen.goal_id(goal.id)) for _, goals, _ in tables for goal in goals), default=0)
     for label, goals, without in tables:
         lines += _goal_table(label, goals, id_columns, screen, now) if goals else [_label(label) + without]
     return lines
@@ -178,25 +180,28 @@ def _goal_table(label: str, goals: Sequence[Goal], id_columns: int, screen: Scre
     """Return one line for each goal, cut to the width of the terminal."""
     labels = [label, *[""] * (len(goals) - 1)]
     heads = [_label(name) + _head_columns(goal, id_columns, screen) for name, goal in zip(labels, goals, strict=True)]
-    tails = [_tail_forms(goal, now) for goal in goals]
+    tails = [_tail_forms(goal, screen, now) for goal in goals]
     texts = [quoted_text(goal, _LISTED_TEXT_CHARS) for goal in goals]
-    fitted = fit_columns(texts, tails, weights=(1, 1), columns=screen.columns_left(max(map(width, heads))))
-    return [head + words for head, words in zip(heads, fitted, strict=True)]
+    text_columns = min(TEXT_COLUMNS, max(map(width, texts)))
+    rows = zip(heads, texts, tails, strict=True)
+    return [fit_row(head, text, forms, text_columns, screen) for head, text, forms in rows]
 
 
 def _head_columns(goal: Goal, id_columns: int, screen: Screen) -> str:
     """Return the columns before a goal's text: its end time, id and state."""
-    goal_id = pad(screen.fit_name(goal.id), id_columns)
+    goal_id = pad(screen.goal_id(goal.id), id_columns)
     head = f"{goal_id}{COLUMN_GAP}{screen.coloured(pad(goal.state.name, 9), goal.state)}{COLUMN_GAP}"
     return f"{clock_time(goal.ended_at)}{COLUMN_GAP}{head}" if goal.state.terminal else head
 
 
-def _tail_forms(goal: Goal, now: float) -> list[str]:
+def _tail_forms(goal: Goal, screen: Screen, now: float) -> list[str]:
     """Return alternative texts for the last column of a goal's line, longest first."""
     if goal.state.terminal:
-        return (_muted_note(goal) or [""]) if goal.state is State.SUCCEEDED else reason_forms(goal)
-    # The sender comes first, because text that doesn't fit is cut off at the end.
-    return [", ".join([f"from {each}", *_unfinished_details(goal, now)]) for each in sender_forms(goal.client)]
+        return listed_reason_forms(goal, screen)
+    # The sender is the most important detail. The others are left out, beginning with the last one, if they don't fit.
+    senders, details = sender_forms(goal.client, screen), _unfinished_details(goal, now)
+    kept = range(len(details), -1, -1)
+    return [", ".join([f"from {sender}", *details[:count]]) for count in kept for sender in senders]
 
 
 def quoted_text(goal: Goal, limit: int | None = None) -> str:
@@ -210,9 +215,9 @@ def _quote(text: str | None, limit: int | None = None) -> str | None:
 
 def _unfinished_details(goal: Goal, now: float) -> list[str]:
     """Return details of an unfinished goal, such as its priority and key."""
-    held = "held, " if goal.paused else ""
+    paused = "paused, " if goal.paused else ""
     notes = [
-        None if goal.started_at is None else f"{held}for {max(0.0, now - goal.started_at):.1f} s",
+        None if goal.started_at is None else f"{paused}for {max(0.0, now - goal.started_at):.1f} s",
         f"priority {goal.priority}" if goal.priority else None,
         None if goal.key is None else f'key "{printable(goal.key)}"',
         _time_left(goal, now),
@@ -236,27 +241,26 @@ def _describe_sender(sender: Sender | None) -> str:
         _sender_command(sender),
         None if sender.pid is None else f"pid {sender.pid}",
         None if sender.uid is None else f"uid {sender.uid}",
-        f"calls itself {_quote(sender.name)}" if sender.name else None,
+        f"named {_quote(sender.name)}" if sender.name else None,
     ]
     return ", ".join(filter(None, parts))
 
 
-def sender_forms(sender: Sender | None) -> list[str]:
+def sender_forms(sender: Sender | None, screen: Screen) -> list[str]:
     """Return several descriptions of a sender, longest first.
 
-    A column shows the first one that fits.
+    A column shows the first one that fits. Only with `screen.long`, they contain the command and the process id.
 
     The name that the sender has chosen comes first. It is in quotes because it isn't verified.
     """
     if sender is None:
         return [_UNKNOWN_SENDER]
-    script = _script_name(sender)
+    name, script = _quote(sender.name or None), _script_name(sender)
+    if not screen.long:
+        return [name or script]
     number = "" if sender.pid is None else f", pid {sender.pid}"
-    forms = [f"{_sender_command(sender)}{number}", f"{script}{number}", script]
-    if sender.name:
-        name = f'"{printable(sender.name)}"'
-        forms = [*(f"{name} ({each})" for each in forms), name]
-    return list(dict.fromkeys(forms))
+    forms = dict.fromkeys(f"{each}{number}" for each in (_sender_command(sender), script))
+    return [f"{name} ({each})" if name else each for each in forms]
 
 
 def _describe_cause(by: By) -> str:
@@ -264,14 +268,21 @@ def _describe_cause(by: By) -> str:
     return f"by {_describe_sender(by.client) if by.goal is None else printable(by.goal)}"
 
 
-def reason_forms(goal: Goal) -> list[str]:
+def listed_reason_forms(goal: Goal, screen: Screen) -> list[str]:
+    """Return the descriptions to show in a list of goals. A success has none, unless the output was muted."""
+    if goal.state is State.SUCCEEDED and not screen.long:
+        return _muted_note(goal) or [""]
+    return reason_forms(goal, screen)
+
+
+def reason_forms(goal: Goal, screen: Screen) -> list[str]:
     """Return several descriptions of why a goal ended and who ended it, longest first."""
     if goal.state is State.SUCCEEDED:
         return [", ".join([*([] if goal.duration is None else [f"{goal.duration:.1f} s"]), *_muted_note(goal)])]
     reason = printable(goal.reason or goal.state.name.lower())
     by = []
     if goal.by is not None:
-        by = [printable(goal.by.goal)] if goal.by.goal is not None else sender_forms(goal.by.client)
+        by = [screen.goal_id(goal.by.goal)] if goal.by.goal is not None else sender_forms(goal.by.client, screen)
     forms = [f"{reason} by {each}" for each in by] or [reason]
     words = _message_details(goal)
     # The shortest description only says who ended the goal, because the state suggests the reason.

@@ -18,10 +18,16 @@ if TYPE_CHECKING:
 
 #: The space between two columns of a table.
 COLUMN_GAP = "  "
+#: The maximum width of a name on a narrow terminal.
+_MIN_NAME_COLUMNS = 18
 #: The maximum width of an id on a narrow terminal. An id of 64 characters would leave no room for the text.
-_MIN_ID_COLUMNS = 20
+_MIN_ID_COLUMNS = 12
 #: The minimum width to assume for a terminal, because shorter lines would be useless.
 MIN_COLUMNS = 40
+#: The maximum width of the text column if lines can have any length. A longer text moves the columns after it.
+TEXT_COLUMNS = 40
+#: The minimum width of a text if whole ids and process ids are shown.
+_MIN_TEXT_COLUMNS = 16
 #: Marks the place where text was cut off.
 ELLIPSIS = "…"
 
@@ -52,17 +58,21 @@ _STATE_COLOURS = {
 
 @frozen
 class Screen:
-    """The width and the colour support of the output."""
+    """The width and the colour support of the output, and how much detail to show."""
 
     #: the number of columns, or None if the output isn't a terminal and lines can have any length
     width: int | None = None
     colour: bool = False
+    #: whether to show whole ids, and the commands and process ids of senders
+    long: bool = False
+    #: the server's boot id; goals with this id are shown by their numbers
+    boot: str = ""
 
     def columns_left(self, taken: int) -> int | None:
         """Return how many columns remain if `taken` columns are used, or None if there is no limit."""
         return None if self.width is None else max(self.width, MIN_COLUMNS) - taken
 
-    def fit_name(self, name: str, room: int = _MIN_ID_COLUMNS, share: int = 4) -> str:
+    def fit_name(self, name: str, room: int = _MIN_NAME_COLUMNS, share: int = 4) -> str:
         """Escape a name or an id, and cut it to leave room for other columns.
 
         Args:
@@ -72,6 +82,13 @@ class Screen:
         """
         columns = self.columns_left(0)
         return cut(printable(name), None if columns is None else max(room, columns // share))
+
+    def goal_id(self, goal_id: str) -> str:
+        """Return a goal's id for display, such as `12` for a goal of the running server."""
+        if self.long:
+            return printable(goal_id)
+        number = goal_id.removeprefix(f"{self.boot}-")
+        return self.fit_name(number if number.isdecimal() else goal_id, _MIN_ID_COLUMNS, 8)
 
     def coloured(self, text: str, state: State | None) -> str:
         """Return the text in the colour of a state, or in bold if the state is None."""
@@ -136,50 +153,28 @@ def longest_fitting(forms: Sequence[str], columns: int | None) -> str:
     return next((each for each in forms if columns is None or width(each) <= columns), cut(forms[-1], columns))
 
 
-def share_columns(wanted: Sequence[int], weights: Sequence[int], columns: int) -> list[int]:
-    """Divide the columns of a line among several parts, and return the width of each part.
-
-    Each part gets the width that it wants if there is enough space. Otherwise, the remaining columns are divided by
-    weight.
-    """
-    given = [0] * len(wanted)
-    left, weight_left = columns, sum(weights)
-    for part in sorted(range(len(wanted)), key=lambda part: wanted[part] / weights[part]):
-        given[part] = max(0, min(wanted[part], left * weights[part] // weight_left))
-        left -= given[part]
-        weight_left -= weights[part]
-    return given
+def room_beside(text: str, columns: int, screen: Screen) -> int:
+    """Return how many columns the details beside a text may take. They leave at least half of the line to the text."""
+    return columns - len(COLUMN_GAP) - min(width(text), _MIN_TEXT_COLUMNS if screen.long else columns // 2)
 
 
-def fit_columns(
-    texts: Sequence[str],
-    *others: Sequence[Sequence[str]],
-    weights: Sequence[int],
-    columns: int | None,
-    min_columns: int = 0,
-) -> list[str]:
-    """Format a table so that each row fits into this many columns.
+def fit_row(head: str, text: str, details: Sequence[str], text_columns: int, screen: Screen) -> str:
+    """Format a row of a table so that it fits the screen and shows as much of the text as possible.
 
     Args:
-        texts: the cells of the first column.
-        others: the other columns. Each cell is a list of possible texts, longest first.
-        weights: the share of each column. Space that the other columns don't need goes to the first column.
-        columns: the width of the whole table. If it is None, nothing is cut.
-        min_columns: the minimum width of each column if nothing is cut. A longer text moves the columns after it.
+        head: the columns before the text.
+        text: the text.
+        details: possible texts for the column after it, longest first.
+        text_columns: the usual width of the text column. A longer text moves the details to the right.
+        screen: the properties of the output.
     """
-    if columns is None:
-        rows = zip(texts, *([forms[0] for forms in column] for column in others), strict=True)
-        return [COLUMN_GAP.join(pad(cell, min_columns) for cell in row).rstrip() for row in rows]
-    columns -= len(COLUMN_GAP) * len(others)
-    longest = [max(map(width, texts)), *(max(width(forms[0]) for forms in column) for column in others)]
-    shares = share_columns(longest, weights, columns)[1:]
-    chosen = [[longest_fitting(forms, room) for forms in column] for column, room in zip(others, shares, strict=True)]
-    widths = [max(map(width, column)) for column in chosen]
-    left = min(longest[0], columns - sum(widths))
-    return [
-        COLUMN_GAP.join(map(pad, (shorten(text, left), *beside), (left, *widths))).rstrip()
-        for text, *beside in zip(texts, *chosen, strict=True)
-    ]
+    columns = screen.columns_left(width(head))
+    shown = details[0]
+    if columns is not None:
+        shown = longest_fitting(details, room_beside(text, columns, screen))
+        columns -= len(COLUMN_GAP) + width(shown) if shown else 0
+        text, text_columns = shorten(text, columns), min(text_columns, columns)
+    return (head + pad(text, text_columns) + COLUMN_GAP + shown).rstrip()
 
 
 def wrap(pieces: Sequence[str], first: str, screen: Screen) -> list[str]:

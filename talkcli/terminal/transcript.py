@@ -8,11 +8,23 @@ from __future__ import annotations
 
 import time
 
-from talkcli.frozen import TYPE_CHECKING
+from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.states import State
 from talkcli.protocol.events import PausedChanged, Snapshot, StateChanged, WordHeard, unfinished
-from talkcli.terminal.goals import clock_time, quoted_text, reason_forms, sender_forms
-from talkcli.terminal.text import COLUMN_GAP, Screen, cut, fit_columns, longest_fitting, pad, printable, shorten, width
+from talkcli.terminal.goals import clock_time, listed_reason_forms, quoted_text, reason_forms, sender_forms
+from talkcli.terminal.text import (
+    COLUMN_GAP,
+    TEXT_COLUMNS,
+    Screen,
+    cut,
+    fit_row,
+    longest_fitting,
+    pad,
+    printable,
+    room_beside,
+    shorten,
+    width,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -20,12 +32,10 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import Goal
     from talkcli.protocol.events import Event
 
-#: The minimum width of the text column if lines can have any length. Most texts fit, so the next columns line up.
-_TEXT_COLUMNS = 40
-#: The minimum width of the text if a long reason is shown beside it.
-_MIN_TEXT_COLUMNS = 16
-#: The initial width of the robot and id columns, which is enough for the ids of a server's first 999 goals.
+#: The initial width of the robot column, and of the id column if it shows whole ids.
 _FIRST_NAME_COLUMNS = 8
+#: The initial width of the id column, which is enough for a server's first 999 goals.
+_FIRST_ID_COLUMNS = 3
 #: The width up to which the robot and id columns grow.
 _MAX_NAME_COLUMNS = 20
 #: The indentation of continuation lines, which is the width of the time column.
@@ -41,7 +51,7 @@ class ColumnWidths:
     """
 
     def __init__(self) -> None:
-        self._ids = self._robots = _FIRST_NAME_COLUMNS
+        self._ids, self._robots = _FIRST_ID_COLUMNS, _FIRST_NAME_COLUMNS
 
     def robot(self, name: str, screen: Screen) -> str:
         """Pad a robot's name to the width of its column, which is widened if necessary.
@@ -54,8 +64,8 @@ class ColumnWidths:
 
     def goal_id(self, goal_id: str, screen: Screen) -> str:
         """Pad a goal id to the width of its column, which is widened if necessary."""
-        shown = screen.fit_name(goal_id)
-        self._ids = max(self._ids, min(width(shown), _MAX_NAME_COLUMNS))
+        shown = screen.goal_id(goal_id)
+        self._ids = max(self._ids, _FIRST_NAME_COLUMNS * screen.long, min(width(shown), _MAX_NAME_COLUMNS))
         return pad(shown, self._ids)
 
 
@@ -63,7 +73,13 @@ class Transcript:
     """Formats the events of one server as lines of text."""
 
     def __init__(
-        self, *, full: bool, words: bool, robot: str | None = None, widths: ColumnWidths | None = None
+        self,
+        *,
+        full: bool,
+        words: bool,
+        robot: str | None = None,
+        boot: str = "",
+        widths: ColumnWidths | None = None,
     ) -> None:
         """Create an empty transcript.
 
@@ -72,17 +88,21 @@ class Transcript:
                 once.
             words: whether to show each word as it is spoken.
             robot: the robot's name, if the events of several robots are shown.
+            boot: the server's boot id, if it is known before the first snapshot.
             widths: column widths shared with other transcripts.
         """
         self._full = full
         self._with_words = words
         self._goals: dict[str, Goal] = {}
         self._paused = False
-        self._robot = robot
+        self._robot, self._boot = robot, boot
         self._widths = widths or ColumnWidths()
 
     def lines(self, event: Event, screen: Screen, now: float) -> list[str]:
         """Return the lines for an event. `now` is the time to show if the event has none."""
+        if isinstance(event, Snapshot):
+            self._boot = str(event.status.server.get("boot"))
+        screen = replace(screen, boot=self._boot)
         if isinstance(event, Snapshot):
             return self._snapshot_lines(event, screen, now)
         if isinstance(event, StateChanged):
@@ -133,40 +153,25 @@ class Transcript:
         name = "paused" if event.paused else "resumed"
         head = self._head_columns(event.at or now, name, State.PREEMPTING, event.id or "", screen)
         by = event.by.client if event.by else None
-        forms = [f"by {each}" for each in sender_forms(by)] if by else [""]
+        forms = [f"by {each}" for each in sender_forms(by, screen)] if by else [""]
         return (head + longest_fitting(forms, screen.columns_left(width(head)))).rstrip()
 
     def _goal_lines(self, goal: Goal, state: State, at: float, screen: Screen) -> list[str]:
         head = self._head_columns(at, state.name, state, goal.id, screen)
         ended = state.terminal
-        forms = reason_forms(goal) if ended else sender_forms(goal.client)
+        forms = reason_forms(goal, screen) if ended else sender_forms(goal.client, screen)
         if state is State.REJECTED:  # no earlier line has shown the goal's sender
-            forms = [f"{forms[0]}, from {each}" for each in sender_forms(goal.client)] + forms
-        columns = screen.columns_left(width(head))
+            forms = [f"{forms[0]}, from {each}" for each in sender_forms(goal.client, screen)] + forms
+        if ended and goal.by is not None and len(forms) > 1:
+            forms = forms[:-1]  # the last description lacks the reason
+        text, columns = quoted_text(goal), screen.columns_left(width(head))
         if columns is None:
-            return [(head + pad(quoted_text(goal), _TEXT_COLUMNS) + COLUMN_GAP + forms[0]).rstrip()]
-        tail_columns = columns // 3
-        # The last description lacks the reason. If none of the others fit, `_long_end_lines` gives them more room.
-        complete = forms[:-1] if ended and goal.by is not None and len(forms) > 1 else forms
-        if ended and all(width(each) > tail_columns for each in complete):
-            return self._long_end_lines(head, goal, complete, screen)
-        tail = longest_fitting(complete, tail_columns)
-        text_columns = columns - tail_columns - len(COLUMN_GAP)
-        return [(head + pad(shorten(quoted_text(goal), text_columns), text_columns) + COLUMN_GAP + tail).rstrip()]
-
-    def _long_end_lines(self, head: str, goal: Goal, forms: list[str], screen: Screen) -> list[str]:
-        """Format the end of a goal whose reason is too long for its column.
-
-        The reason is shown beside a shortened text if it fits there, otherwise below the text.
-        """
-        text = quoted_text(goal)
-        columns = screen.columns_left(width(head)) or 0
-        beside = columns - len(COLUMN_GAP) - min(width(text), _MIN_TEXT_COLUMNS)
-        tail = next((each for each in forms if width(each) <= beside), None)
-        if tail is not None:
-            return [head + shorten(text, columns - len(COLUMN_GAP) - width(tail)) + COLUMN_GAP + tail]
-        tail = longest_fitting(forms, screen.columns_left(_INDENT_COLUMNS))
-        return [head + shorten(text, columns), " " * _INDENT_COLUMNS + tail]
+            return [fit_row(head, text, forms, TEXT_COLUMNS, screen)]
+        if ended and all(width(each) > room_beside(text, columns, screen) for each in forms):
+            # The reason doesn't fit beside the text, so it gets a line of its own.
+            below = longest_fitting(forms, screen.columns_left(_INDENT_COLUMNS))
+            return [head + shorten(text, columns), " " * _INDENT_COLUMNS + below]
+        return [fit_row(head, text, forms, columns * 3 // 4, screen)]
 
     def _head_columns(self, at: float, word: str, state: State | None, goal_id: str, screen: Screen) -> str:
         robot = [] if self._robot is None else [self._widths.robot(self._robot, screen)]
@@ -179,19 +184,29 @@ def log_lines(goals: Sequence[Goal], screen: Screen, now: float) -> list[str]:
     if not goals:
         return []
     today = time.localtime(now)[:3]
-    heads = [(_log_time(goal.ended_at, today), goal.state.name, screen.fit_name(goal.id)) for goal in goals]
-    widths = [max(map(width, column)) for column in zip(*heads, strict=True)]
+    cells = [(_log_time(goal.ended_at, today), goal.state.name, screen.goal_id(goal.id)) for goal in goals]
+    widths = [max(map(width, column)) for column in zip(*cells, strict=True)]
+    heads = []
+    for goal, (when, state, goal_id) in zip(goals, cells, strict=True):
+        coloured = screen.coloured(pad(state, widths[1]), goal.state)
+        heads.append(COLUMN_GAP.join((f"{when:>{widths[0]}}", coloured, pad(goal_id, widths[2]), "")))
+    columns = screen.columns_left(width(heads[0]))
+    # A sender that has chosen a long name must not leave too little room for the texts.
+    max_columns = None if columns is None or screen.long else columns // 4
+    senders = [[shorten(each, max_columns) for each in sender_forms(goal.client, screen)] for goal in goals]
+    sender_columns = min(TEXT_COLUMNS, max(width(forms[-1]) for forms in senders))
     texts = [quoted_text(goal) for goal in goals]
-    senders = [sender_forms(goal.client) for goal in goals]
-    reasons = [reason_forms(goal) for goal in goals]
-    columns = screen.columns_left(sum(widths) + 3 * len(COLUMN_GAP))
-    details = fit_columns(texts, senders, reasons, weights=(4, 2, 3), columns=columns, min_columns=_TEXT_COLUMNS)
-    return [
-        COLUMN_GAP.join(
-            (f"{when:>{widths[0]}}", screen.coloured(pad(state, widths[1]), goal.state), pad(goal_id, widths[2]), words)
-        )
-        for goal, (when, state, goal_id), words in zip(goals, heads, details, strict=True)
-    ]
+    left = TEXT_COLUMNS if columns is None else columns - len(COLUMN_GAP) - sender_columns
+    text_columns = min(left, max(map(width, texts)))
+    lines = []
+    for goal, head, text, forms in zip(goals, heads, texts, senders, strict=True):
+        reasons = listed_reason_forms(goal, screen)
+        # On a terminal, only goals without a reason are aligned, so that there is more room for the texts.
+        padding = 0 if columns is not None and reasons[0] else sender_columns
+        details = [pad(sender, padding) + COLUMN_GAP * bool(each) + each for sender in forms for each in reasons]
+        details.sort(key=width, reverse=True)
+        lines.append(fit_row(head, text, details, text_columns, screen))
+    return lines
 
 
 def _log_time(seconds: float | None, today: tuple[int, ...]) -> str:

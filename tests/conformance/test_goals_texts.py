@@ -90,7 +90,9 @@ def test_error_for_an_oversized_input_is_accurate(scripted: Talk) -> None:
     for text in (f"{longest}\nand more", "a" * 300_000):
         done = scripted.run("say", "-", stdin=text)
         assert (done.code, done.out) == (5, "")
-        assert "not spoken: standard input has more than 40,000 bytes, and a text at most 10,000 char" in done.err
+        assert (
+            "not spoken: standard input is too long (more than 40,000 bytes; a text has at most 10,000 char" in done.err
+        )
     done = scripted.run("--json", "say", "-f", "-", stdin="a" * 300_000)
     (event,) = map(json.loads, done.out.splitlines())
     assert (event["event"], event["goal"]["reason"], done.code) == ("result", "text_too_long", 5)
@@ -99,7 +101,7 @@ def test_error_for_an_oversized_input_is_accurate(scripted: Talk) -> None:
 def test_bytes_that_are_no_utf8_are_left_out_and_named(scripted: Talk) -> None:
     data = "length=0 Grüße:\n日本\n".encode() + "Grüße".encode("latin-1") + b" \xed\xa0\x80!"
     text = "length=0 Grüße:\n日本\nGr\ufffd\ufffde \ufffd\ufffd\ufffd!"
-    note = "talk: line 3, column 3: the byte 0xfc is not UTF-8, and is not spoken (the first of 5)\n"
+    note = "talk: line 3, column 3: the byte 0xfc is not valid UTF-8, so it is not spoken (4 more like it)\n"
     for options, told in ((["--json"], note), (["--json", "-q"], "")):
         for words, typed in (([b"--", data], b""), ([b"-"], data)):
             line: list[str | bytes] = [*TALK, *options, "say", "--wait", *words]

@@ -133,7 +133,7 @@ def test_too_little_memory_for_a_server_is_told_in_words_that_name_the_limit(hom
     kib = 22_000
     command = ["sh", "-c", f'ulimit -d {kib}; exec "$@"', "sh", *TALK, "serve", "--player", "null"]
     done = run(command, environment(home, TALK_SOCKET=f"{home}/s"))
-    what = "(can't start the engine's thread|there is not enough memory for talk)"
+    what = "(can't start the engine's thread|not enough memory for talk)"
     limit = re.escape(f"the limit is {kib * 1024:,} bytes of memory (ulimit -d, LimitDATA=)")
     assert (done.code, bool(re.fullmatch(f"talk: {what}: {limit}\n", done.err))) == (1, True), done
 

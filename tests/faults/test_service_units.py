@@ -166,7 +166,7 @@ def test_socket_s_unit_has_the_place_where_clients_look(home: str) -> None:
 def test_units_that_cannot_be_printed_are_usage_errors(home: str) -> None:
     cases = [(words, "--print-unit") for words in (["--print-unit"], ["--print-unit", "launchd"], ["--print-unit="])]
     cases += [
-        (["--print-unit", name, "--socket", f"{home}/{path}"], "a socket's unit can't name")
+        (["--print-unit", name, "--socket", f"{home}/{path}"], "a socket unit can't contain the path")
         for path in ("a\nb", "a\rb", "a ", "a\\")
         for name in ("user-socket", "system-socket")
     ]
@@ -193,7 +193,7 @@ def test_system_s_unit_warns_if_the_service_s_user_can_t_read_the_program(home: 
     for command in (script, f"{home}/bin/talk"):
         done = run([command, "serve", "--print-unit", "system"], environment(home))
         assert done.code == 0
-        warning = f"this talk needs {script}, and the service's own user can't pass {private}: install it for all"
+        warning = f"the service's user can't enter {private}, but this talk needs {script}; install talk for all users"
         assert warning in done.err
         assert done.out.count("[Service]") == 1  # the unit alone is printed
     assert run([script, "serve", "--print-unit", "user"], environment(home)).err == ""

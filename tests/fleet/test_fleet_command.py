@@ -54,8 +54,15 @@ def test_the_table_and_the_objects_show_each_robot(broker: Broker) -> None:
     done = run(broker, "fleet", "status")
     assert (done.code, done.err) == (0, "")
     assert [each.split() for each in done.out.splitlines()] == [
+        ["ROBOT", "ONLINE", "SPEAKING", "QUEUE", "LAST"],
+        ["anna", "no", "server", "-", "-", "-"],
+        ["wh-1", "yes", '"please', "step", 'back"', "2", "SUCCEEDED", "1", "h"],
+        ["wh-2", "OFFLINE", "-", "-", "-"],
+    ]
+    done = run(broker, "fleet", "status", "--long")
+    assert [each.split() for each in done.out.splitlines()] == [
         ["ROBOT", "ONLINE", "SERVER", "SPEAKING", "QUEUE", "LAST", "SINCE"],
-        ["anna", "yes", "none", "-", "-", "-", "2", "h"],
+        ["anna", "no", "server", "-", "-", "-", "-", "2", "h"],
         ["wh-1", "yes", "0.1.0", '"please', "step", 'back"', "2", "SUCCEEDED", "1", "h", "2", "h"],
         ["wh-2", "OFFLINE", "-", "-", "-", "-", "-"],
     ]
@@ -89,10 +96,10 @@ def test_a_name_a_glob_or_a_group_picks(broker: Broker) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("bert", "no robot 'bert' is known at"),
-        ("x*", "no robot 'x*' is known at"),
-        ("@night", "no robot of the group 'night' is known at"),
-        ("", "no robot is known at {broker.url}; on each robot: talk bridge --name NAME"),
+        ("bert", "matches 'bert'; list all robots with: talk fleet status"),
+        ("x*", "matches 'x*'; list all robots with: talk fleet status"),
+        ("@night", "the group 'night' has no robots at"),
+        ("", "no robot has connected to {broker.url} yet; start on each robot: talk bridge --name NAME"),
     ],
 )
 def test_a_pick_of_no_robot_ends_it_with_3(broker: Broker, text: str, words: str) -> None:
@@ -113,7 +120,7 @@ def test_without_a_broker_or_rights_it_ends_with_3_or_10(secure_broker: Broker, 
 @pytest.mark.parametrize(
     ("words", "env", "said"),
     [
-        (["fleet"], {}, "WHAT is missing: one of status, watch"),
+        (["fleet"], {}, "WHAT is missing; choose one of status, watch"),
         (["fleet", "list"], {}, "'list' is not one of 'status', 'watch'"),
         (["--robot", "@", "fleet", "status"], {}, "no group can be called ''"),
         (["--robot", "a b*", "fleet", "watch"], {}, "the glob 'a b*' matches no robot's name"),
@@ -224,8 +231,8 @@ def test_a_break_is_told_on_standard_error_and_then_what_has_changed(broker: Bro
     done = watching.end()
     assert done.code == 130
     gone, back = done.err.splitlines()
-    assert gone == f"talk: the broker at {broker.url} went away; it is tried again for 30 s"
-    assert back.startswith(f"talk: the broker at {broker.url} is back, after ")
+    assert gone == f"talk: the broker at {broker.url} went away; trying again for 30 s"
+    assert back.startswith(f"talk: the broker at {broker.url} is back after ")
 
 
 @pytest.mark.usefixtures("robots")

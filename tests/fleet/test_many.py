@@ -89,12 +89,12 @@ def test_robots_that_come_and_go_are_told_as_they_are(robots: RealRobots, desk: 
         robots[gone].bridge.start()
         done = desk.finish(waiting, timeout=BACK + 10)
         wanted = alike(there, "come-and-go", "SUCCEEDED", 0) | {gone: ("-", "OFFLINE", 3)}
-        assert_told(done, 3, wanted, "4 of 5 as asked")
+        assert_told(done, 3, wanted, "4 of 5 robots succeeded")
     with Roll(broker) as roll:
         roll.await_there(FIVE)
     assert counts(robots, text) == Counter(there)
     done = desk.run("say", "--wait", "--id", "all-again", "--", "all are here again")
-    assert_told(done, 0, alike(FIVE, "all-again", "SUCCEEDED", 0), "5 of 5 as asked")
+    assert_told(done, 0, alike(FIVE, "all-again", "SUCCEEDED", 0), "5 of 5 robots succeeded")
 
 
 @pytest.mark.slow
@@ -109,7 +109,7 @@ def test_a_robot_that_goes_in_mid_sentence_and_stays_away_is_lost(
     robots[killed].bridge.kill()
     done = desk.finish(waiting, timeout=ABSENCE + 10)
     wanted = alike(others, "stays-away", "SUCCEEDED", 0) | {killed: ("stays-away", "LOST", 12)}
-    assert_told(done, 12, wanted, "4 of 5 as asked")
+    assert_told(done, 12, wanted, "4 of 5 robots succeeded")
     robots[killed].bridge.start()
     with Roll(broker) as roll:
         roll.await_there(FIVE)
@@ -125,11 +125,11 @@ def test_a_hundred_simulated_robots_beside_three_real_ones() -> None:
             await_active(real, "long")
             simulated.await_spoken("long")
             cancelled = desk.run("cancel")
-            assert_told(cancelled, 0, alike(everybody, "long", "PREEMPTED", 0), "103 of 103 as asked")
+            assert_told(cancelled, 0, alike(everybody, "long", "PREEMPTED", 0), "103 of 103 robots succeeded")
             assert_within(cancelled.seconds, CANCEL, "a cancel of 103 robots")
-            assert_told(desk.finish(waiting), 7, alike(everybody, "long", "PREEMPTED", 7), "0 of 103 as asked")
+            assert_told(desk.finish(waiting), 7, alike(everybody, "long", "PREEMPTED", 7), "0 of 103 robots succeeded")
             said = desk.run("say", "--wait", "--id", "short", "--", "length=1 short")
-            assert_told(said, 0, alike(everybody, "short", "SUCCEEDED", 0), "103 of 103 as asked")
+            assert_told(said, 0, alike(everybody, "short", "SUCCEEDED", 0), "103 of 103 robots succeeded")
             assert_within(said.seconds, SENTENCE, "a sentence of a second by 103 robots")
             waiting = desk.start("say", "--wait", "--id", "meanwhile", "--", "length=2 meanwhile")
             await_active(real, "meanwhile")
@@ -140,7 +140,7 @@ def test_a_hundred_simulated_robots_beside_three_real_ones() -> None:
             with Roll(broker) as roll:
                 assert_within(roll.await_there(everybody) - up, BACK, "103 robots after the broker was back")
             done = desk.finish(waiting, timeout=BACK + 10)
-            assert_told(done, 0, alike(everybody, "meanwhile", "SUCCEEDED", 0), "103 of 103 as asked")
+            assert_told(done, 0, alike(everybody, "meanwhile", "SUCCEEDED", 0), "103 of 103 robots succeeded")
         for goal_id in ("long", "short", "meanwhile"):
             simulated.assert_spoken_once(goal_id)
         spoken = ["length=60 long", "length=1 short", "length=2 meanwhile"]

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from tests.fleet.robot import Robot
 
 PAIR = ["wh-1", "wh-2"]
-AS_ASKED = "talk: 2 of 2 as asked\n"
+ALL_SUCCEEDED = "talk: 2 of 2 robots succeeded\n"
 
 
 #: Requests to both robots before a command, by name; {} is a goal of the command's own.
@@ -76,14 +76,14 @@ def test_each_robot_has_a_line_or_an_object(
     plain, for_programs, quiet = at_once(desk, *lines)
     shown = [goal.format(each, first=goals[0]) for each in goals]
     assert told(plain) == alike(PAIR, shown[0], state, 0)
-    assert (plain.code, plain.err) == (0, AS_ASKED)
+    assert (plain.code, plain.err) == (0, ALL_SUCCEEDED)
     assert (quiet.code, quiet.err) == (0, "")
     if command.startswith("status"):  # which was asked for nothing else
         assert told(quiet) == alike(PAIR, shown[2], state, 0)
     else:
         assert quiet.out == ""
     found = objects(for_programs)
-    assert (for_programs.code, for_programs.err, sorted(found)) == (0, AS_ASKED, PAIR)
+    assert (for_programs.code, for_programs.err, sorted(found)) == (0, ALL_SUCCEEDED, PAIR)
     for answer in found.values():
         assert (answer["exit_code"], answer["state"]) == (0, state)
         if answer.get("goal"):
@@ -98,7 +98,7 @@ def test_the_settings_of_each_robot_are_listed_under_its_name(pair: RealRobots, 
     assert sorted(line.split() for line in done.out.splitlines() if "rate" in line) == [
         [name, "rate", "180"] for name in PAIR
     ]
-    assert (done.code, done.err) == (0, AS_ASKED)
+    assert (done.code, done.err) == (0, ALL_SUCCEEDED)
 
 
 def test_each_goal_that_a_command_selects_has_a_line(pair: RealRobots, desk: Desk) -> None:
@@ -110,15 +110,15 @@ def test_each_goal_that_a_command_selects_has_a_line(pair: RealRobots, desk: Des
     assert sorted(done.out.splitlines()) == [
         f"{name} {rest}" for name in PAIR for rest in ("a-goal RECALLED 0", "before-a-goal PREEMPTED 0")
     ]
-    assert (done.code, done.err) == (0, AS_ASKED)
+    assert (done.code, done.err) == (0, ALL_SUCCEEDED)
     waited = desk.finish(named)
     assert sorted(waited.out.splitlines()) == [
         f"{name} {rest}" for name in PAIR for rest in ("a-goal RECALLED 6", "before-a-goal PREEMPTED 7")
     ]
     # Of a robot with several failures the first counts, in the order in which its goals were named.
-    assert (waited.code, waited.err.splitlines()[-1]) == (7, "talk: 0 of 2 as asked")
+    assert (waited.code, waited.err.splitlines()[-1]) == (7, "talk: 0 of 2 robots succeeded")
     waited = desk.finish(unnamed)  # how goals ended that were not named is no failure
-    assert (waited.code, waited.err, len(waited.out.splitlines())) == (0, AS_ASKED, 4)
+    assert (waited.code, waited.err, len(waited.out.splitlines())) == (0, ALL_SUCCEEDED, 4)
 
 
 def test_options_of_a_sentence_go_along(pair: RealRobots, desk: Desk) -> None:
@@ -140,17 +140,17 @@ def test_options_of_a_sentence_go_along(pair: RealRobots, desk: Desk) -> None:
     assert [each["ttl"] for each in pair.each(lambda each: each.talk.goal("no-ttl"))] == [None, None]
     throttled = desk.run("say", "--wait", "--throttle", "60", "--key", "charge", "I have to charge")
     assert {(state, code) for _, state, code in told(throttled).values()} == {("REJECTED", 0)}
-    assert (throttled.code, throttled.err) == (0, AS_ASKED)
+    assert (throttled.code, throttled.err) == (0, ALL_SUCCEEDED)
 
 
 def test_a_text_is_read_as_for_one_robot(pair: RealRobots, desk: Desk) -> None:
     text = "the door opens\nplease step back\n"
     done = desk.run("say", "--wait", "--id", "from-input", "-", stdin=text)
-    assert_told(done, 0, alike(PAIR, "from-input", "SUCCEEDED", 0), "2 of 2 as asked")
+    assert_told(done, 0, alike(PAIR, "from-input", "SUCCEEDED", 0), "2 of 2 robots succeeded")
     assert {each["text"] for each in pair.each(lambda each: each.talk.goal("from-input"))} == {text.rstrip()}
     done = desk.run("say", "--wait", "--id", "bytes", "caf\udce9 au lait")
-    assert_told(done, 0, alike(PAIR, "bytes", "SUCCEEDED", 0), "2 of 2 as asked")
-    assert done.err.splitlines()[0] == "talk: line 1, column 4: the byte 0xe9 is not UTF-8, and is not spoken"
+    assert_told(done, 0, alike(PAIR, "bytes", "SUCCEEDED", 0), "2 of 2 robots succeeded")
+    assert done.err.splitlines()[0] == "talk: line 1, column 4: the byte 0xe9 is not valid UTF-8, so it is not spoken"
     assert {each["text"] for each in pair.each(lambda each: each.talk.goal("bytes"))} == {"caf\ufffd au lait"}
     for done in (desk.run("say", "  "), desk.run("say", "-", stdin="\n")):
         assert {(state, code) for _, state, code in told(done).values()} == {("REJECTED", 5)}
@@ -159,7 +159,7 @@ def test_a_text_is_read_as_for_one_robot(pair: RealRobots, desk: Desk) -> None:
 
 # Requests that are refused before anything is sent
 
-NUMBER, ONE_ROBOT = "a number is a goal of one server", "is of one robot: name it"
+NUMBER, ONE_ROBOT = "a number is a goal of one server", "only works with one robot; name it"
 
 
 @pytest.mark.parametrize(
@@ -168,21 +168,21 @@ NUMBER, ONE_ROBOT = "a number is a goal of one server", "is of one robot: name i
         ("say --lines", f"'talk say --lines' {ONE_ROBOT}"),
         ("say -f hello", f"'talk say --feedback' {ONE_ROBOT}"),
         ("say -wf hello", f"'talk say --feedback' {ONE_ROBOT}"),
-        ("say -o - hello", "'talk say --output' is of this machine alone"),
+        ("say -o - hello", "'talk say --output' only works on this machine"),
         ("say", "TEXT is missing"),
         ("say --id 12 hello", "the id '12' is not allowed"),
-        ("say --rate 9 hello", "'9' is not a whole number from 80 to 450"),
+        ("say --rate 9 hello", "must be 80 to 450, got 9"),
         ("wait -f", f"'talk wait --feedback' {ONE_ROBOT}"),
         ("wait old 3", NUMBER),
         ("cancel 12", NUMBER),
         ("cancel --before 12", NUMBER),
         ("status 4", NUMBER),
-        ("log", f"'talk log' {ONE_ROBOT}; 'talk fleet status' and 'talk fleet watch' show several"),
+        ("log", f"'talk log' {ONE_ROBOT}, or try 'talk fleet status' for several"),
         ("watch", f"'talk watch' {ONE_ROBOT}"),
         ("voices", f"'talk voices' {ONE_ROBOT}"),
         ("doctor", f"'talk doctor' {ONE_ROBOT}"),
-        ("serve", "'talk serve' is of this machine alone"),
-        ("set --rate 9999", "'9999' is not a whole number from 80 to 450"),
+        ("serve", "'talk serve' only works on this machine"),
+        ("set --rate 9999", "must be 80 to 450, got 9999"),
         ("--socket /tmp/s --robot wh-* status", "leave out one of them"),
         ("--robot @a/b status", "no group can be called 'a/b'"),
         ("--robot a#* status", "the glob 'a#*' matches no robot's name"),
@@ -238,7 +238,7 @@ def test_ctrl_c_cancels_it_at_all_robots(pair: RealRobots, desk: Desk, to: str) 
     waiting.send_signal(signal.SIGINT)
     done = desk.finish(waiting)
     wanted = {"wh-1": (goal, "PREEMPTED", 7), "wh-2": (goal, "RECALLED", 6)}
-    assert_told(done, 130, wanted, "0 of 2 as asked")
+    assert_told(done, 130, wanted, "0 of 2 robots succeeded")
     assert done.seconds < 1, "it waited for more than the silence of both"
     assert states(pair, goal) == ["PREEMPTED", "RECALLED"]
     assert pair["wh-2"].talk.goal(before)["state"] == "ACTIVE"
@@ -252,7 +252,7 @@ def test_ctrl_c_takes_nothing_from_a_robot_that_is_done(pair: RealRobots, desk: 
     waiting.send_signal(signal.SIGINT)
     done = desk.finish(waiting)
     assert (done.code, done.out) == (130, "wh-2 done-on-one RECALLED 6\n")
-    assert done.err.splitlines()[-1] == "talk: 1 of 2 as asked"
+    assert done.err.splitlines()[-1] == "talk: 1 of 2 robots succeeded"
     assert states(pair, "done-on-one") == ["SUCCEEDED", "RECALLED"]
 
 
@@ -268,11 +268,11 @@ def test_a_sentence_that_is_not_done_in_time_is_cancelled_with_124(pair: RealRob
         *(["--robot", to, "say", "--wait", *late, "--id", f"late-{PICKS.index(to)}", "hello"] for to in PICKS),
     )
     for done, goal in ((by_glob, "late-0"), (by_group, "late-1")):
-        assert_told(done, 124, alike(PAIR, goal, "RECALLED", 6), "0 of 2 as asked")
+        assert_told(done, 124, alike(PAIR, goal, "RECALLED", 6), "0 of 2 robots succeeded")
         assert "talk: timed out after 0.6 s\n" in done.err
         assert states(pair, goal) == ["RECALLED"] * 2
     assert (waited.code, sorted(waited.out.splitlines())) == (124, [f"{name} over SUCCEEDED 0" for name in PAIR])
-    assert waited.err == "talk: timed out after 0.6 s\ntalk: not done: wh-1, wh-2\ntalk: 0 of 2 as asked\n"
+    assert waited.err == "talk: timed out after 0.6 s\ntalk: not done: wh-1, wh-2\ntalk: 0 of 2 robots succeeded\n"
     assert states(pair, "in-front") == ["ACTIVE"] * 2
 
 
@@ -283,7 +283,7 @@ def test_an_interrupted_wait_leaves_the_goals_of_others_alone(pair: RealRobots, 
         assert answers.find(lambda _: sum(b'"ok": true' in each.payload for each in answers.messages) == 2, PATIENCE)
     waiting.send_signal(signal.SIGINT)
     done = desk.finish(waiting)
-    assert (done.code, done.out, done.err) == (130, "", "talk: not done: wh-1, wh-2\ntalk: 0 of 2 as asked\n")
+    assert (done.code, done.out, done.err) == (130, "", "talk: not done: wh-1, wh-2\ntalk: 0 of 2 robots succeeded\n")
     assert states(pair, "others") == ["ACTIVE", "ACTIVE"]
 
 
@@ -294,7 +294,7 @@ def test_a_reader_that_goes_away_cancels_it_with_141(pair: RealRobots, desk: Des
     assert waiting.stderr
     waiting.stdout.close()
     assert waiting.wait(PATIENCE) == 141
-    assert waiting.stderr.read().splitlines()[-1] == "talk: 0 of 2 as asked"
+    assert waiting.stderr.read().splitlines()[-1] == "talk: 0 of 2 robots succeeded"
     assert states(pair, "unread") == ["PREEMPTED", "PREEMPTED"]
 
 
@@ -339,7 +339,7 @@ def test_a_terminal_counts_the_robots_that_are_done_and_is_left_clean(pair: Real
     with Terminal(command, desk.env) as terminal:
         terminal.wait_for("\r0 of 2")
         terminal.wait_for("counted SUCCEEDED 0\n")
-        terminal.wait_until(lambda screen: screen.last == "1 of 2")
+        terminal.wait_until(lambda screen: screen.last == "1 of 2 robots")
         request(pair, "cancel")
         assert terminal.finish() == 6
     written = terminal.raw.decode()
@@ -348,7 +348,7 @@ def test_a_terminal_counts_the_robots_that_are_done_and_is_left_clean(pair: Real
     first, second, why, *_, summary, last = terminal.screen.lines
     assert (first, second) == ("wh-1 counted SUCCEEDED 0", "wh-2 counted RECALLED 6")
     assert why.startswith("talk: RECALLED: wh-2: counted: ")
-    assert (summary, last) == ("talk: 1 of 2 as asked", "")
+    assert (summary, last) == ("talk: 1 of 2 robots succeeded", "")
 
 
 @pytest.mark.usefixtures("pair")
@@ -364,7 +364,7 @@ def test_the_count_is_shown_only_if_standard_error_is_a_terminal(desk: Desk, tmp
         assert terminal.finish() == 0
         assert (b"\r0 of" in terminal.raw, WIPED.encode() in terminal.raw) == (counts, counts)
     assert sorted((tmp_path / "out").read_text().splitlines()) == ["wh-1 - IDLE 0", "wh-2 - IDLE 0"]
-    assert (tmp_path / "err").read_text() == "talk: 2 of 2 as asked\n"
+    assert (tmp_path / "err").read_text() == "talk: 2 of 2 robots succeeded\n"
 
 
 def test_ctrl_c_on_a_terminal_leaves_no_count_behind(pair: RealRobots, desk: Desk) -> None:
@@ -373,5 +373,5 @@ def test_ctrl_c_on_a_terminal_leaves_no_count_behind(pair: RealRobots, desk: Des
         terminal.wait_for("\r0 of 2")
         terminal.type(b"\x03")
         assert terminal.finish() == 130
-    assert terminal.screen.lines[-2:] == ["talk: 0 of 2 as asked", ""]
-    assert not [each for each in terminal.screen.lines if re.search(r"\d of 2$", each)]
+    assert terminal.screen.lines[-2:] == ["talk: 0 of 2 robots succeeded", ""]
+    assert not [each for each in terminal.screen.lines if re.search(r"\d of 2 robots$", each)]

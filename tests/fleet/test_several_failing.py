@@ -82,7 +82,7 @@ def test_equal_failures_are_the_exit_code_and_different_ones_make_it_13(desk: De
         *(["--robot", "@all", form, "cancel"] for form in ("--json", "-q")),
     )
     for done, (_, names, code, count) in zip(plain, MIXED, strict=True):
-        assert_told(done, code, idle_or_failed(*names), f"{count} of {len(names)} as asked")
+        assert_told(done, code, idle_or_failed(*names), f"{count} of {len(names)} robots succeeded")
     found = {name: ("-", each["state"], each["exit_code"]) for name, each in objects(for_programs).items()}
     assert (for_programs.code, found) == (13, idle_or_failed(*MIXED[-1][1]))
     assert (quiet.code, quiet.out, quiet.err) == (13, "", "")
@@ -145,15 +145,15 @@ def test_an_unknown_goal_makes_it_8(robots: RealRobots, desk: Desk) -> None:
         ["--robot", PICKS[0], "cancel", "known", "nobodys"],
     )
     for done in unknown:
-        assert_told(done, 8, alike(BOTH, "-", "UNKNOWN", 8), "0 of 2 as asked")
+        assert_told(done, 8, alike(BOTH, "-", "UNKNOWN", 8), "0 of 2 robots succeeded")
     codes = [each["error"]["code"] for each in objects(for_programs).values()]
     assert (for_programs.code, codes) == (8, ["unknown_goal"] * 2)
     wanted = {"wh-1": ("mine-alone", "SUCCEEDED", 0), "wh-2": ("-", "UNKNOWN", 8)}
-    assert_told(known_to_one, 8, wanted, "1 of 2 as asked")
+    assert_told(known_to_one, 8, wanted, "1 of 2 robots succeeded")
     assert sorted(known.out.splitlines()) == [
         f"{name} {rest}" for name in BOTH for rest in ("- UNKNOWN 8", "known PREEMPTED 0")
     ]
-    assert (known.code, known.err.splitlines()[-1]) == (8, "talk: 0 of 2 as asked")
+    assert (known.code, known.err.splitlines()[-1]) == (8, "talk: 0 of 2 robots succeeded")
 
 
 def test_the_end_of_a_sentence_is_the_exit_code(robots: RealRobots, desk: Desk) -> None:
@@ -167,8 +167,8 @@ def test_the_end_of_a_sentence_is_the_exit_code(robots: RealRobots, desk: Desk) 
         ["--robot", PICKS[1], "say", "--wait", "--id", "fails", "--", "fail=engine_failed"],
         ["--robot", PICKS[1], "wait", "fails-on-one"],
     )
-    assert_told(desk.finish(waiting), 7, alike(BOTH, "cancelled", "PREEMPTED", 7), "0 of 2 as asked")
-    assert_told(fails, 4, alike(BOTH, "fails", "ABORTED", 4), "0 of 2 as asked")
+    assert_told(desk.finish(waiting), 7, alike(BOTH, "cancelled", "PREEMPTED", 7), "0 of 2 robots succeeded")
+    assert_told(fails, 4, alike(BOTH, "fails", "ABORTED", 4), "0 of 2 robots succeeded")
     assert "talk: ABORTED: " in fails.err
     wanted = {"wh-1": ("fails-on-one", "SUCCEEDED", 0), "wh-2": ("fails-on-one", "ABORTED", 4)}
-    assert_told(differs, 4, wanted, "1 of 2 as asked")
+    assert_told(differs, 4, wanted, "1 of 2 robots succeeded")

@@ -89,8 +89,8 @@ def _rows(parameters: list[click.Parameter], context: click.Context) -> list[str
 
 def _words(text: str) -> str:
     """Return help as it stands in a table: what is typed, and names of variables, as code; no link made of brackets."""
-    text = re.sub(r"(?<![\w`'-])(--[a-z][a-z-]*)", r"`\1`", _cell(text))
-    text = re.sub(r"'(-|default|talk [^']*|aplay [^']*|pactl [^']*|pw-cli [^']*)'", r"`\1`", text)
+    quoted = r"'(-|default|talk [^']*|aplay [^']*|pactl [^']*|pw-cli [^']*)'"
+    text = re.sub(rf"{quoted}|(?<![\w`'-])(--[a-z][a-z-]*)", lambda found: f"`{found[1] or found[2]}`", _cell(text))
     text = re.sub(r"\b(TALK_[A-Z]+)\b", r"`\1`", text)
     return re.sub(r"\s+", " ", text).replace("<", "&lt;").replace("*", "\\*")
 

@@ -171,10 +171,10 @@ def test_several_robots(tmp_path: Path, place: str) -> None:
         assert "  3 robots; mqtt://" in watching.stdout.readline()
 
         done = shell.run(say)
-        assert (done.returncode, done.stderr) == (0, "talk: 2 of 2 as asked\n")
+        assert (done.returncode, done.stderr) == (0, "talk: 2 of 2 robots succeeded\n")
         assert '"the shift is over"' in watching.stdout.readline()
         done = shell.run(cancel)
-        assert (done.returncode, done.stderr) == (0, "talk: 3 of 3 as asked\n")
+        assert (done.returncode, done.stderr) == (0, "talk: 3 of 3 robots succeeded\n")
         code = block("Several robots: In Python").replace("mqtts://broker", broker.url)
         python = shell.directory / "several.py"
         python.write_text(code, encoding="utf-8")

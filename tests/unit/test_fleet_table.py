@@ -29,6 +29,9 @@ GONE = RobotInfo(
     RobotStatus("b-1", "said long ago", 3, last=LastGoal("b-0", State.ABORTED, at=NOW - 7200)),
 )
 
+#: The columns that are shown without --long.
+SHORT_NAMES = ("ROBOT", "ONLINE", "SPEAKING", "QUEUE", "LAST")
+
 TEXTS = st.text(st.characters(exclude_categories=["Cs"]), max_size=60)
 TIMES = st.none() | st.floats(-1e9, 2 * NOW)
 PRESENCES = st.builds(
@@ -49,7 +52,7 @@ def anna(**changes: Any) -> RobotInfo:
 
 def cells(robot: RobotInfo) -> list[str]:
     """Return a robot's line, cut at the heads; it has all the room that it needs."""
-    head, line = robot_lines([robot], Screen(), NOW)
+    head, line = robot_lines([robot], Screen(long=True), NOW)
     places = [*(head.index(each) for each in COLUMN_NAMES), None]
     return [line[start:end].strip() for start, end in pairwise(places)]
 
@@ -60,7 +63,7 @@ def test_no_line_is_wider_than_its_terminal(robots: list[RobotInfo], columns: in
     assert len(lines) == len(robots) + 1
     assert max(map(width, lines)) <= max(columns, MIN_COLUMNS)
     head, *lines = robot_lines(robots, Screen(), NOW)  # in a pipe nothing is cut
-    assert head.split() == list(COLUMN_NAMES)
+    assert head.split() == list(SHORT_NAMES)
     for robot, line in zip(robots, lines, strict=True):
         presence, status = robot.presence, robot.status or RobotStatus()
         assert line.startswith(f"{presence.name} ")
@@ -75,7 +78,7 @@ def test_no_line_is_wider_than_its_terminal(robots: list[RobotInfo], columns: in
         (GONE, ["bert", "OFFLINE", "-", "-", "-", "ABORTED 2 h", "-"]),
         (
             RobotInfo(replace(ANNA.presence, server=None), replace(ANNA.status, last=None)),
-            ["anna", "yes", "none", "-", "-", "-", "15 min"],
+            ["anna", "no server", "-", "-", "-", "-", "15 min"],
         ),
         (RobotInfo(ANNA.presence, None), ["anna", "yes", "0.1.0", "-", "0", "-", "15 min"]),
     ],
@@ -109,20 +112,23 @@ def test_a_time_is_shown_by_its_age(seconds: float, shown: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("columns", "heads"),
+    ("columns", "long", "heads"),
     [
-        (120, COLUMN_NAMES),
-        (80, COLUMN_NAMES),
-        (64, COLUMN_NAMES[:-1]),
-        (48, COLUMN_NAMES[:-2]),
-        (40, ("ROBOT", "ONLINE", "SPEAKING", "QUEUE")),
+        (120, True, COLUMN_NAMES),
+        (80, True, COLUMN_NAMES),
+        (64, True, COLUMN_NAMES[:-1]),
+        (48, True, COLUMN_NAMES[:-2]),
+        (120, False, SHORT_NAMES),
+        (80, False, SHORT_NAMES),
+        (56, False, SHORT_NAMES),
+        (40, False, ("ROBOT", "ONLINE", "SPEAKING", "QUEUE")),
     ],
 )
-def test_the_text_gives_way_first_and_then_whole_columns(columns: int, heads: tuple[str, ...]) -> None:
-    head, first, bert = robot_lines([ANNA, GONE], Screen(columns), NOW)
+def test_the_text_gives_way_first_and_then_whole_columns(columns: int, long: bool, heads: tuple[str, ...]) -> None:
+    head, first, bert = robot_lines([ANNA, GONE], Screen(columns, long=long), NOW)
     assert tuple(head.split()) == heads
     assert '"please ste' in first
-    assert ("closing" in first) == (columns > 100)
+    assert ("doors are" in first) == (columns > 100 or (columns == 80 and not long))
     assert "OFFLINE" in bert
 
 
@@ -149,7 +155,7 @@ def test_a_robot_with_an_impossible_time_is_shown_all_the_same(moment: float) ->
     assert status
     assert status.last
     assert isinstance(event, StateChanged)
-    assert robot_lines([RobotInfo(presence, status)], Screen(), NOW)[1].split()[:2] == ["anna", "yes"]
+    assert robot_lines([RobotInfo(presence, status)], Screen(), NOW)[1].split()[:3] == ["anna", "no", "server"]
     transcript = FleetTranscript(full=True)
     assert "SUCCEEDED" in transcript.lines("anna", event, Screen(), NOW)[0]
     assert transcript.change(None, presence, Screen(), NOW)

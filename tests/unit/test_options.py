@@ -322,11 +322,11 @@ def test_limits_hold_on_the_wire_and_on_the_command_line_alike() -> None:
             assert (option.value_error(value), read_value(option, str(value))) == (None, value)
         for value in bad:
             assert f"{value}" in str(option.value_error(value))
-            with pytest.raises(ValueError, match=f"'{value}' is not a"):
+            with pytest.raises(ValueError, match=f"got '?{value}'?$"):
                 read_value(option, str(value))
-    wanted = ["a number from 0 to 1", "a whole number 1 or more", "a valid integer"]
+    wanted = ["a number", "a whole number", "a whole number"]
     for option, words in zip(LIMITED, wanted, strict=True):
-        with pytest.raises(ValueError, match=f"'abc' is not {words}$"):
+        with pytest.raises(ValueError, match=f"must be {words}, got 'abc'$"):
             read_value(option, "abc")
 
 

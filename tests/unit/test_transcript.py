@@ -14,7 +14,7 @@ from talkcli.goals.goal import By, Goal, Sender
 from talkcli.goals.states import State
 from talkcli.protocol.events import Event, PausedChanged, ServerStatus, Snapshot, StateChanged, WordHeard
 from talkcli.terminal.goals import reason_forms, sender_forms, setting_lines, status_lines
-from talkcli.terminal.text import Screen, cut, share_columns, width
+from talkcli.terminal.text import Screen, cut, fit_row, width
 from talkcli.terminal.transcript import Transcript, log_lines
 
 PATROL = Sender(812, 1000, "talk", "/bin/bash /home/robot/bin/patrol.sh --fast", "night watch")
@@ -74,14 +74,21 @@ def test_cut_fits_and_is_no_shorter_than_it_must_be(text: str, room: int) -> Non
         assert width(shown) >= room - 1  # the one that did not fit may have taken two columns
 
 
-@given(st.lists(st.tuples(st.integers(0, 200), st.integers(1, 5)), min_size=1, max_size=5), st.integers(0, 200))
-def test_shares_are_within_what_is_wanted_and_what_is_there(asked: list[tuple[int, int]], room: int) -> None:
-    wanted, weights = zip(*asked, strict=True)
-    given_out = share_columns(wanted, weights, room)
-    assert all(0 <= got <= each for got, each in zip(given_out, wanted, strict=True))
-    assert sum(given_out) <= room
-    if sum(wanted) <= room:
-        assert given_out == list(wanted)
+@given(
+    st.text("ab日", max_size=90), st.lists(st.text("ab日", min_size=1, max_size=90), min_size=1), WIDTHS, st.booleans()
+)
+def test_a_row_fits_and_leaves_half_of_it_to_the_text(text: str, details: list[str], room: int, long: bool) -> None:
+    text, details = f'"{text}"', sorted(details, key=width, reverse=True)
+    row = fit_row("", text, details, 0, Screen(room, long=long))
+    assert width(row) <= room
+    shown = row[: row.index('"', 1) + 1]
+    assert shown == text or "…" in shown
+    if shown != text:
+        assert width(shown) >= (16 if long else room // 2) - 2  # a character of two columns may not have fitted
+        assert width(row) >= room - 2
+    if width(text) + 2 + width(details[0]) <= room and width(details[0]) <= room // 2 - 2:
+        assert row == f"{text}  {details[0]}"
+    assert fit_row("", text, details, 0, Screen()) == f"{text}  {details[0]}"
 
 
 @given(st.lists(GOALS, max_size=5), WIDTHS)
@@ -100,8 +107,40 @@ def test_a_log_fits_and_lines_up(goals: list[Goal], room: int) -> None:
 def test_a_log_without_a_terminal_is_whole(goals: list[Goal]) -> None:
     for line, goal in zip(log_lines(goals, Screen(), NOON), goals, strict=True):
         assert goal.id in line
-        assert sender_forms(goal.client)[0].rstrip() in line
-        assert reason_forms(goal)[0].rstrip() in line
+        assert sender_forms(goal.client, Screen())[0].rstrip() in line
+        assert goal.state is State.SUCCEEDED or reason_forms(goal, Screen())[0].rstrip() in line
+    long = Screen(long=True)
+    for line, goal in zip(log_lines(goals, long, NOON), goals, strict=True):
+        assert goal.id in line
+        assert sender_forms(goal.client, long)[0].rstrip() in line
+        assert reason_forms(goal, long)[0].rstrip() in line
+
+
+def test_goals_of_the_running_server_are_shown_by_their_numbers() -> None:
+    goals = [
+        replace(GOAL, state=State.SUCCEEDED, ended_at=NOON),
+        replace(GOAL, id="9a9a-3", state=State.RECALLED, reason="replaced", by=By("4k7f-7"), ended_at=NOON),
+        replace(GOAL, id="4k7f-b", state=State.RECALLED, reason="replaced", by=By("9a9a-4"), ended_at=NOON),
+    ]
+    assert [each.split()[2] for each in log_lines(goals, Screen(boot="4k7f"), NOON)] == ["7", "9a9a-3", "4k7f-b"]
+    assert [each.split("replaced by ")[-1] for each in log_lines(goals, Screen(boot="4k7f"), NOON)[1:]] == [
+        "7",
+        "9a9a-4",
+    ]
+    for screen in (Screen(long=True, boot="4k7f"), Screen()):
+        assert [each.split()[2] for each in log_lines(goals, screen, NOON)] == [each.id for each in goals]
+    lines = status_lines(ServerStatus(SERVER, None, (), tuple(goals)), Screen(), NOON)
+    assert [each[9:].split()[1] for each in lines[-3:]] == ["7", "9a9a-3", "4k7f-b"]
+
+
+def test_most_of_a_line_belongs_to_the_text() -> None:
+    ended = replace(GOAL, text="please step back " * 9, state=State.SUCCEEDED, client=replace(PATROL, name=None))
+    preempted = replace(ended, state=State.PREEMPTED, reason="canceled", by=By(client=PATROL))
+    first, second = log_lines([ended, preempted], Screen(80, boot="4k7f"), NOON)
+    assert first == '--:--:--  SUCCEEDED  7  "please step back please step back please s…"  patrol.sh'
+    assert second == '--:--:--  PREEMPTED  7  "please step back please s…"  patrol.sh  by "night watc…'
+    (long,) = log_lines([ended], Screen(100, long=True), NOON)
+    assert long.endswith('"please step bac…"  /bin/bash /home/robot/bin/patrol.sh --fast, pid 812')
 
 
 @given(st.lists(GOALS, max_size=4), GOALS, WIDTHS, st.booleans())
@@ -165,18 +204,21 @@ def test_what_waits_behind_another_is_shown() -> None:
 def test_words_are_lines_where_they_are_wanted(words: bool, count: int) -> None:
     event = WordHeard("4k7f-7", "low", 8, 11, 2, 0.51, NOON)
     lines = Transcript(full=False, words=words).lines(event, Screen(80), NOON)
-    assert lines == ["12:00:00  word        4k7f-7    low  0.51 s"] * count
+    assert lines == ["12:00:00  word        4k7f-7  low  0.51 s"] * count
+    lines = Transcript(full=False, words=words, boot="4k7f").lines(event, Screen(80), NOON)
+    assert lines == ["12:00:00  word        7    low  0.51 s"] * count
 
 
 def test_forms_of_a_sender_get_shorter_and_keep_the_script() -> None:
-    assert sender_forms(PATROL) == [
+    long = Screen(long=True)
+    assert sender_forms(PATROL, long) == [
         '"night watch" (/bin/bash /home/robot/bin/patrol.sh --fast, pid 812)',
         '"night watch" (patrol.sh, pid 812)',
-        '"night watch" (patrol.sh)',
-        '"night watch"',
     ]
-    assert sender_forms(replace(PATROL, name=None))[1:] == ["patrol.sh, pid 812", "patrol.sh"]
-    assert sender_forms(None) == ["nobody known"]
+    assert sender_forms(PATROL, Screen()) == ['"night watch"']
+    assert sender_forms(replace(PATROL, name=None), long)[1:] == ["patrol.sh, pid 812"]
+    assert sender_forms(replace(PATROL, name=None), Screen()) == ["patrol.sh"]
+    assert sender_forms(None, long) == sender_forms(None, Screen()) == ["unknown"]
 
 
 @pytest.mark.parametrize(
@@ -215,12 +257,13 @@ def test_forms_of_a_sender_get_shorter_and_keep_the_script() -> None:
     ],
 )
 def test_a_sender_is_shown_by_the_script_that_it_runs(parent: str | None, script: str) -> None:
-    assert sender_forms(Sender(parent=parent))[-1] == script
+    assert sender_forms(Sender(parent=parent), Screen()) == [script]
 
 
 def test_why_a_goal_ended() -> None:
     def why(state: State, reason: str | None = None, by: By | None = None, message: str | None = None) -> list[str]:
-        return reason_forms(replace(GOAL, state=state, reason=reason, by=by, message=message, duration=2.04))
+        goal = replace(GOAL, state=state, reason=reason, by=by, message=message, duration=2.04)
+        return reason_forms(goal, Screen())
 
     assert why(State.SUCCEEDED) == ["2.0 s"]
     assert why(State.PREEMPTED, "preempted", By("4k7f-8"), "Talk preempted")[0] == "preempted by 4k7f-8"

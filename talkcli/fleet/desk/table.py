@@ -6,7 +6,7 @@ The module is pure. The caller passes the time and the properties of the termina
 from __future__ import annotations
 
 from talkcli.fleet.payloads import LastGoal, Presence, RobotInfo, RobotStatus
-from talkcli.frozen import TYPE_CHECKING
+from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.states import State
 from talkcli.terminal.goals import clock_time
 from talkcli.terminal.text import COLUMN_GAP, Screen, cut, pad, printable, shorten, width
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     Cell = tuple[str, State | None]
 
 COLUMN_NAMES = ("ROBOT", "ONLINE", "SERVER", "SPEAKING", "QUEUE", "LAST", "SINCE")
+#: Columns that are only shown with `Screen.long`.
+_LONG_COLUMNS = ("SERVER", "SINCE")
 #: If a terminal is too narrow, these columns are omitted one by one until the column SPEAKING has its minimum width.
 _OPTIONAL_COLUMNS = ("SINCE", "LAST", "SERVER", "QUEUE")
 _MIN_TEXT_CHARS = 12
@@ -42,7 +44,8 @@ def robot_lines(robots: Sequence[RobotInfo], screen: Screen, now: float) -> list
         now: the current time in seconds since 1970.
     """
     rows = [_cells(each, screen, now) for each in robots]
-    widths = {name: max(map(width, (name, *(cells[name][0] for cells in rows)))) for name in COLUMN_NAMES}
+    names = [each for each in COLUMN_NAMES if screen.long or each not in _LONG_COLUMNS]
+    widths = {name: max(map(width, (name, *(cells[name][0] for cells in rows)))) for name in names}
     _fit_columns(widths, screen.columns_left(0))
     heading = _format_row({name: (name, None) for name in COLUMN_NAMES}, widths, Screen())
     return [screen.coloured(heading, None), *(_format_row(cells, widths, screen) for cells in rows)]
@@ -57,11 +60,11 @@ def _cells(robot: RobotInfo, screen: Screen, now: float) -> dict[str, Cell]:
     if presence.online:
         version = _server_version(presence)
         if version is None:
-            cells["SERVER"] = "none", State.LOST
+            cells["ONLINE"] = "no server", State.LOST
         else:
             cells |= {
                 "SERVER": (version, None),
-                "SPEAKING": _speaking_cell(status),
+                "SPEAKING": _speaking_cell(status, replace(screen, boot=_boot(presence))),
                 "QUEUE": (str(status.pending), None),
             }
         if presence.since is not None:
@@ -77,10 +80,15 @@ def _server_version(presence: Presence) -> str | None:
     return None if server is None else printable(str(server.get("version") or "?"), _MAX_VERSION_CHARS)
 
 
-def _speaking_cell(status: RobotStatus) -> Cell:
+def _boot(presence: Presence) -> str:
+    """Return the boot id of the robot's server, or an empty string if the robot has no server."""
+    return str((presence.server or {}).get("boot") or "")
+
+
+def _speaking_cell(status: RobotStatus, screen: Screen) -> Cell:
     if status.active is None:
         return ("PAUSED", State.PREEMPTING) if status.paused else _EMPTY_CELL
-    words = printable(status.active) if status.text is None else f'"{printable(status.text)}"'
+    words = screen.goal_id(status.active) if status.text is None else f'"{printable(status.text)}"'
     return (f"PAUSED {words}", State.PREEMPTING) if status.paused else (words, State.ACTIVE)
 
 
@@ -107,9 +115,8 @@ def _fit_columns(widths: dict[str, int], room: int | None) -> None:
     if room is None:
         widths["SPEAKING"] = min(longest, _USUAL_TEXT_CHARS)
         return
-    for omitted in (None, *_OPTIONAL_COLUMNS):
-        if omitted is not None:
-            del widths[omitted]
+    for omitted in ("", *_OPTIONAL_COLUMNS):
+        widths.pop(omitted, None)
         left = room - len(COLUMN_GAP) * (len(widths) - 1) - (sum(widths.values()) - widths["SPEAKING"])
         widths["SPEAKING"] = max(0, min(longest, left))
         if left >= min(longest, _MIN_TEXT_CHARS):
@@ -135,11 +142,14 @@ class FleetTranscript:
         self._full = full
         self._columns = ColumnWidths()
         self._transcripts: dict[str, Transcript] = {}
+        #: the boot ids of the robots' servers, by robot name
+        self._boots: dict[str, str] = {}
 
     def begin(self, robots: Sequence[Presence], broker: str, screen: Screen, now: float) -> list[str]:
         """Return the first line, which shows the number of robots and the URL of the broker."""
         for each in robots:
             self._columns.robot(each.name, screen)  # All names must be known first, so that all lines are aligned.
+            self._boots[each.name] = _boot(each)
         offline = sum(not each.online for each in robots)
         serverless = sum(each.online and each.server is None for each in robots)
         parts = [f"{len(robots)} robot{'' if len(robots) == 1 else 's'}"]
@@ -150,7 +160,9 @@ class FleetTranscript:
     def lines(self, name: str, event: Event, screen: Screen, now: float) -> list[str]:
         """Format an event of a robot as lines. For details, see `Transcript.lines`."""
         if name not in self._transcripts:
-            self._transcripts[name] = Transcript(full=self._full, words=False, robot=name, widths=self._columns)
+            self._transcripts[name] = Transcript(
+                full=self._full, words=False, robot=name, boot=self._boots.get(name, ""), widths=self._columns
+            )
         return self._transcripts[name].lines(event, screen, now)
 
     def change(self, before: Presence | None, robot: Presence, screen: Screen, now: float) -> list[str]:
@@ -163,6 +175,7 @@ class FleetTranscript:
             now: the current time in seconds since 1970.
         """
         self._transcripts.pop(robot.name, None)
+        self._boots[robot.name] = _boot(robot)
         server = "no server" if robot.server is None else f"talk {_server_version(robot)}"
         if not robot.online:
             word, state, more = "OFFLINE", State.LOST, ""
