@@ -123,7 +123,7 @@ _SERVE_OPTIONS = (
     option(
         "--voice-memory",
         INTEGER,
-        "Let neural voices use about MB megabytes of memory. Above that, unload the one not used for longest.",
+        "Let neural voices use about MB megabytes of memory. Above that, unload the least recently used voice.",
         default=300,
         limits=(0, 100_000),
         metavar="MB",
