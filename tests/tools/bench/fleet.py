@@ -65,16 +65,16 @@ def fleet(stage: Stage) -> list[Row]:
     where = f"idle for {seconds:.0f} s"
     return [
         row("`Client.say()` at a desk → accepted", said, _ON_ROBOT, Limit("median", 10)),
-        Row("result at one who waits on the robot → at the desk", "ms", later, limits=(Limit("median", 5),)),
+        Row("result at a client on the robot → at the desk", "ms", later, limits=(Limit("median", 5),)),
         row("`Client.status()` at a desk", asked, _ON_ROBOT),
-        row("`GoalHandle.cancel()` at a desk, of what is spoken", ended, _ON_ROBOT),
+        row("`GoalHandle.cancel()` at a desk, of the active goal", ended, _ON_ROBOT),
         row(f"`talk --robot {_ROBOT} say hi`", whole, "`talk say hi`"),
-        Row(f"{where}: context switches of the bridge a second", "/s", [switches], limits=(Limit("median", 2),)),
+        Row(f"{where}: context switches of the bridge per second", "/s", [switches], limits=(Limit("median", 2),)),
         Row("memory of the bridge (Pss)", "MB", [memory["Pss"]], limits=(Limit("median", 25),)),
         # With what it shares with other programs: libssl, libpython.
-        Row("… with all that it shares (Rss)", "MB", [memory["Rss"]]),
-        row("`Client.say()` at a desk by TLS → accepted", said_by_tls, "without"),
-        row("`Client.status()` at a desk by TLS", asked_by_tls, "without"),
+        Row("… with shared memory (Rss)", "MB", [memory["Rss"]]),
+        row("`Client.say()` at a desk with TLS → accepted", said_by_tls, "without"),
+        row("`Client.status()` at a desk with TLS", asked_by_tls, "without"),
     ]
 
 

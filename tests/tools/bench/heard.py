@@ -73,7 +73,7 @@ def recorder(stage: Stage) -> list[Row]:
         return int
 
     times = stage.in_turn({"killed": partial(stage.until_silence, play, kill)})
-    return [Row("SIGKILL of an `aplay` of a tone → silence", "ms", times["killed"])]
+    return [Row("SIGKILL of `aplay`, which plays a tone → silence", "ms", times["killed"])]
 
 
 def onset(stage: Stage) -> list[Row]:
@@ -100,7 +100,7 @@ def onset(stage: Stage) -> list[Row]:
         row("start of `talk say -w`", "talk say -w", "espeak-ng"),
         row("line into a running `talk say --lines`", "--lines", "spd-say -w", Limit("ratio", 0.6)),
         row("`Client.say()`", "Client.say", "spd-say -w", Limit("ratio", 0.25), Limit("median", 5)),
-        row("start of `aplay` of a ready file", "aplay", "spd-say -w"),
+        row("start of `aplay` with a finished file", "aplay", "spd-say -w"),
     ]
 
 
@@ -146,7 +146,7 @@ def connection(stage: Stage) -> list[Row]:
     times = stage.in_turn({"silent": silent}, stage.options.rounds * _MORE_ROUNDS)
     times |= stage.in_turn({each: partial(_cancel_returns, stage, each) for each in ("running", "stopped")})
     limits = Limit("median", 2), Limit("p99", 20)
-    name = "`Client.cancel()` → its return, while the sound server is stopped"
+    name = "`Client.cancel()` → return, while the sound server is stopped"
     return [
         Row("cancel on an open connection → silence", "ms", times["silent"], limits=limits),
         Row(name, "ms", times["stopped"], "running", times["running"], (Limit("above", 5),)),
@@ -171,7 +171,7 @@ def pause(stage: Stage) -> list[Row]:
 def preempt(stage: Stage) -> list[Row]:
     """Measure a goal that preempts, on an open connection."""
     times = stage.in_turn({"preempt": stage.until_preempted}, stage.options.rounds * 2)
-    name = "request of a goal that preempts → first sound of its sentence"
+    name = "request of a preempting goal → first sound of its sentence"
     return [Row(name, "ms", times["preempt"], limits=(Limit("median", 10),))]
 
 
@@ -193,7 +193,7 @@ def gap(stage: Stage) -> list[Row]:
             if number:  # the first warms up
                 ours += found
                 theirs += peer
-    name = "end of a queued sentence → start of the next, above espeak-ng's own pause"
+    name = "end of a sentence → start of the next one, without espeak-ng's own pause"
     limits = Limit("median", 5), Limit("median", -5, at_least=True), Limit("least", -10, at_least=True)
     return [Row(name, "ms", ours, "spd-say", theirs, limits)]
 

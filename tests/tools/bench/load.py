@@ -131,9 +131,9 @@ def throughput(stage: Stage) -> list[Row]:
         ours, floor, alone = (rates[name, connections] for name in servers)
         over = f"{connections} connection{'s' * (connections > 1)}"
         limit = Limit("median", bound, at_least=True)
-        name = "… the bare server, alone or with an engine process"
+        name = "… the bare server, without or with an engine process"
         rows += [
-            Row(f"goals accepted, queued and finished: {over}", "/s", ours, "bare server", floor, (limit,)),
+            Row(f"goals accepted, queued and ended: {over}", "/s", ours, "bare server", floor, (limit,)),
             Row(f"{name}: {over}", "/s", alone, "bare", floor),
         ]
     return rows
@@ -197,11 +197,11 @@ def queue(stage: Stage) -> list[Row]:
         gc.enable()
     rows = []
     for step in turns[0][0]:
-        name, limit = f"{step}, {MANY:,} goals pending", Limit("ratio", 1.5)
+        name, limit = f"{step}, {MANY:,} waiting goals", Limit("ratio", 1.5)
         with_few, with_many = ([turn[place][step] for turn in turns] for place in (0, 1))
-        rows.append(Row(name, "µs", with_many, f"{FEW:,} pending", with_few, (limit,)))
+        rows.append(Row(name, "µs", with_many, f"{FEW:,} waiting", with_few, (limit,)))
     size, limit = _memory_of_a_goal(), Limit("median", 1024)
-    return [*rows, Row("memory of a pending goal, in the server", "B", [size], limits=(limit,))]
+    return [*rows, Row("memory of a waiting goal, in the server", "B", [size], limits=(limit,))]
 
 
 def _memory_of_a_goal() -> float:
@@ -219,7 +219,7 @@ def crowd(stage: Stage) -> list[Row]:
     """Measure how soon the last of many waiting clients knows that their goal has ended."""
     with serving("--max-clients", str(CLIENTS + 100), scripted=True) as talk:
         times = stage.in_turn({"all": partial(_last_to_know, talk.socket)}, min(10, stage.options.rounds))
-    name, limit = f"{CLIENTS:,} waiting clients: cancel → result at the last of them", Limit("median", 50)
+    name, limit = f"{CLIENTS:,} waiting clients: cancel → result at the last client", Limit("median", 50)
     return [Row(name, "ms", times["all"], limits=(limit,))]
 
 

@@ -57,7 +57,9 @@ def idle(stage: Stage) -> list[Row]:
     where = f"idle for {seconds:.0f} s"
     switches, share = found.switches / seconds, 100 * found.processor / seconds
     return [
-        Row(f"{where}: context switches of server and engine a second", "/s", [switches], limits=(Limit("median", 1),)),
+        Row(
+            f"{where}: context switches of server and engine per second", "/s", [switches], limits=(Limit("median", 1),)
+        ),
         # `top` shows this as 0.0.
         Row(f"{where}: processor time of server and engine", "%", [share], limits=(Limit("median", 0.05),)),
         Row("memory of server and engine process (Pss)", "MB", [memory], limits=(Limit("median", 28),)),

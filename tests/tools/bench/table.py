@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 Figure = Literal["median", "p99", "least", "ratio", "above"]
-HEADINGS = ("from → to", "n", "median", "99th", "peer", "its median", "ratio", "goal", "met")
+HEADINGS = ("from → to", "n", "median", "99th", "peer", "peer's median", "ratio", "goal", "met")
 
 
 @dataclass(frozen=True, slots=True)
