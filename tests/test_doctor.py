@@ -118,7 +118,7 @@ def test_silent_makes_no_sound_and_shows_one_finding_per_line(robot: Talk, sink:
     assert done.code == 0
     assert [line[9:23].strip() for line in done.out.splitlines()] == CHECKS
     assert "\x1b" not in done.out
-    assert "played to its end without sound by an engine of this command's own, pulse, 0." in done.out
+    assert "a sentence was played without sound by talk doctor's own engine, pulse, 0." in done.out
     assert "volume 0.1, default voice" in done.out
     assert "-> talk set --volume 1" in done.out
     # The server's environment doesn't tell of the runtime directory that its user may have.
@@ -164,7 +164,9 @@ def test_the_sound_behind_a_forwarded_socket_is_not_looked_for_here(robot: Talk,
     finally:
         forwarder.kill()
         forwarder.wait()
-    assert "on another machine or in a container: run talk doctor there" in found["session"]["message"]
+    assert (
+        "on another machine or in a container: to check its sound, run talk doctor there" in found["session"]["message"]
+    )
     assert not found.keys() & {"player", "device", "cards", "group", "sound server", "loudness"}
     assert "through the server, pulse" in found["sentence"]["message"]
     assert extent(recording.samples)
@@ -189,7 +191,7 @@ tee -a {tmp_path}/played | aplay -q -t raw -f S16_LE -c 1 -r "$1"
 def test_a_custom_player_that_fails_is_to_be_tried_by_hand(make_talk: MakeTalk) -> None:
     player = "sh -c 'echo no such card >&2; exit 1'"
     talk = make_talk("--player", player, forked=False)
-    step = f"try the player by hand, with a second of silence: head -c 44100 /dev/zero | {player}"
+    step = f"test the player with a second of silence: head -c 44100 /dev/zero | {player}"
     done = talk.run("-q", "doctor", timeout=LIMIT)
     assert (done.code, done.err) == (4, "")
     shown = done.out.splitlines()[-1]
@@ -198,7 +200,7 @@ def test_a_custom_player_that_fails_is_to_be_tried_by_hand(make_talk: MakeTalk) 
     found = doctor(talk.env, "--silent")
     assert found["sentence"]["next"] == step
     assert found["recent goals"]["state"] == "warning"
-    assert "the last goal ABORTED, " in found["recent goals"]["message"]
+    assert "ABORTED: the last goal, " in found["recent goals"]["message"]
 
 
 @pytest.mark.slow
@@ -221,7 +223,7 @@ def test_a_paused_server_leaves_no_sentence_behind(scripted: Talk) -> None:
     assert scripted.run("pause").code == 0
     with Client(scripted.socket) as client:
         played = sentence.speak_by_server(client, SENTENCE_TEXT, 10)
-        assert (played.reason, played.message) == ("paused", "speech is paused")
+        assert (played.reason, played.message) == ("paused", "not spoken: speech is paused")
         assert client.status().pending == ()
 
 
@@ -232,12 +234,12 @@ def test_a_sentence_that_waits_too_long_is_taken_back(scripted: Talk) -> None:
         played = sentence.speak_by_server(client, SENTENCE_TEXT, 0.3)
         assert time.monotonic() - began < 8
         assert (played.state, played.reason) == (State.RECALLED, "late")
-        assert played.message == "it still waited behind 4 goals after 0.3 s, and was taken back"
+        assert played.message == "not spoken: it was still waiting behind 4 goals after 0.3 s"
         assert (goals[0].state, len(client.status().pending)) == (State.ACTIVE, 3)
         client.cancel()
         played = sentence.speak_by_server(client, "sentence never-ends", 0.5)
         assert (played.state, played.reason) == (State.PREEMPTED, "late")
-        assert "begun and not over after 0.5 s" in str(played.message)
+        assert "it had not ended after 0.5 s" in str(played.message)
         assert client.status().active is None
 
 
@@ -288,7 +290,7 @@ def test_its_own_engine_is_heard_and_the_server_is_missing(home: str, sink: Sink
     assert extent(recording.samples)
     assert {each["check"] for each in found.values() if each["state"] == "failed"} == {"socket"}
     assert found["socket"]["next"] == "unset TALK_SOCKET, or start a server there: talk serve"
-    assert "by an engine of this command's own, pulse" in found["sentence"]["message"]
+    assert "by talk doctor's own engine, pulse" in found["sentence"]["message"]
     assert "server" not in found
 
 
@@ -314,7 +316,7 @@ def test_a_server_that_goes_away_is_named(home: str) -> None:
         found = doctor(quick(home), "--silent")["server"]
     assert found["state"] == "failed"
     assert "connection to the server was lost" in found["message"]
-    assert "start it again" in found["next"]
+    assert "restart it" in found["next"]
 
 
 def test_programs_that_hang_delay_it_and_no_more(home: str, monkeypatch: pytest.MonkeyPatch) -> None:

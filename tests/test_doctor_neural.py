@@ -36,7 +36,7 @@ import importlib, sys
 from talkcli.engine import models
 models._PACKAGE_SUFFIX = "no such package"
 """
-TRIED = r"is in use: loaded in \d+\.\d s, makes a sentence \d+\.\d times as fast as it is heard, takes \d+ MB"
+TRIED = r"is in use: loaded in \d+\.\d s, speaks \d+\.\d times as fast as real time, uses \d+ MB"
 LIMIT = 20.0
 
 
@@ -68,7 +68,7 @@ def test_the_voice_in_use_is_loaded_and_timed(alone: dict[str, str]) -> None:
     assert checks["neural"]["state"] == "ok"
     assert re.search(r"onnxruntime \d+\.\d+.*, numpy \d+\.\d+", checks["neural"]["message"])
     assert checks["voice files"] == {
-        "check": "voice files", "state": "ok", "message": "as they should be: piper/tiny", "next": None
+        "check": "voice files", "state": "ok", "message": "complete and safe: piper/tiny", "next": None
     }  # fmt: skip
     assert checks["neural voice"]["state"] == "ok"
     assert re.match(f"piper/ti {TRIED}", checks["neural voice"]["message"]), checks
@@ -87,20 +87,20 @@ def test_wrong_files_are_named_one_after_the_other_with_the_next_step(alone: dic
     files = _found(None, alone)["voice files"]
     assert files.state == WARNING
     json, model = f"{place}/a.onnx.json", f"{place}/a.onnx"
-    words = f"piper/a: {json} and {model} can be written by others, who could change the voice"
-    assert files.message == f"{words}; and something is wrong with piper/b, piper/c"
+    words = f"piper/a: {json} and {model} can be changed by other users, which is unsafe"
+    assert files.message == f"{words}; also faulty: piper/b, piper/c"
     subprocess.run(["/bin/sh", "-c", str(files.next)], check=True)
     found = _found(None, alone)
-    assert found["voice files"].message.startswith(f"piper/b: {place}/b.onnx.json is not there")
-    assert found["voice files"].next == "get it from where that came from"
+    assert found["voice files"].message.startswith(f"piper/b: {place}/b.onnx.json does not exist")
+    assert found["voice files"].next == "download it from the source of the model"
     assert "neural voice" not in found, "no voice is in use"
 
 
 @pytest.mark.parametrize(
     ("model", "speakers", "words", "step"),
     [
-        (b"no model", 1, "is no ONNX model", "get the voice anew, from a source that you trust"),
-        (None, 2, "one has several speakers", "get both from the same place"),
+        (b"no model", 1, "is not an ONNX model", "download the voice again, from a source that you trust"),
+        (None, 2, "only one of them has several speakers", "download both again"),
     ],
     ids=["garbage", "another's json"],
 )
@@ -188,7 +188,7 @@ def test_only_a_voice_that_is_used_is_tried(home: str, monkeypatch: pytest.Monke
         examination._engine, examination._session, examination._env = engine, here, env
         asked.clear()
         found = list(examination._check_neural())
-        assert not found or found[0].message == "of the server: piper/a"
+        assert not found or found[0].message == "the server's neural voices: piper/a"
         return [*asked]
 
     assert tried(None, ESPEAK) == tried("de", ESPEAK) == []
@@ -221,7 +221,7 @@ assert not {"onnxruntime", "numpy"} & {*sys.modules}, sys.modules.keys()
 
 def test_a_voice_that_takes_too_long_is_given_up(alone: dict[str, str]) -> None:
     found = _found("piper/tiny", alone, 0.01)["neural voice"]
-    assert found.message == "piper/tiny is in use: it was not loaded, and had not spoken, after 0.01 s"
+    assert found.message == "piper/tiny is in use: loading and speaking took more than 0.01 s"
 
 
 def test_a_voice_that_kills_the_engine_process_is_a_fact(home: str, tmp_path: Path) -> None:
@@ -254,10 +254,10 @@ FAILED_THEN = {"piper/a": {"state": "loaded", "why": None}, "piper/b": {"state":
 
 def test_a_server_s_words_about_its_voices_are_told_if_they_cannot_be_examined() -> None:
     (found,) = voice.judge_server_voices(FAILED_THEN)
-    assert (found.state, found.message) == (WARNING, "the server cannot speak by piper/b: x is no model")
-    assert found.next == "see whether it still is so: talk set --voice piper/b"
+    assert (found.state, found.message) == (WARNING, "the server cannot speak with the voice piper/b: x is no model")
+    assert found.next == "check whether this is still true: talk set --voice piper/b"
     (found,) = voice.judge_server_voices({"piper/a": FAILED_THEN["piper/a"]})
-    assert (found.state, found.message) == (OK, "of the server: piper/a")
+    assert (found.state, found.message) == (OK, "the server's neural voices: piper/a")
     assert voice.judge_server_voices({}) == []
 
 
@@ -276,9 +276,9 @@ def test_on_a_slow_machine_another_voice_is_the_next_step() -> None:
     slow = _judged(load_s=3.04, speed=1.29, memory_bytes=250_400_000)
     assert slow.state == WARNING
     assert slow.message.startswith(
-        "piper/a is in use: loaded in 3.0 s, makes a sentence 1.3 times as fast as it is heard, takes 250 MB"
+        "piper/a is in use: loaded in 3.0 s, speaks 1.3 times as fast as real time, uses 250 MB"
     )
-    assert "quality is low" in (slow.next or "")
+    assert "the quality low" in (slow.next or "")
     assert _judged(load_s=3.04, speed=1.31).state == OK
     assert "MB" not in _judged(speed=2.0).message
 
@@ -287,7 +287,7 @@ def test_a_voice_that_fails_is_a_warning_if_a_server_speaks_with_espeak_instead(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(voice, "_find_package_fault", lambda _: ("onnxruntime is missing", "install it"))
-    trial = VoiceTrial(fault=("x is no model", "get it anew"))
+    trial = VoiceTrial(fault=("x is no model", "download it again"))
 
     def packages(used: str | None, server_voices: dict[str, object] | None) -> str:
         return next(voice.check_neural(used, EngineOptions(env={}), LIMIT, server_voices)).state
@@ -299,6 +299,6 @@ def test_a_voice_that_fails_is_a_warning_if_a_server_speaks_with_espeak_instead(
 
 
 def test_a_voice_that_needs_a_missing_package_is_cured_by_installing_it() -> None:
-    words = f"the voice piper/a is listed, but it cannot be loaded: numpy is missing: {install.neural()}"
+    words = f"the voice piper/a cannot be loaded: numpy is missing; install it with: {install.neural()}"
     found = voice.judge_engine("2.99", EngineReport(reason="unknown_voice", message=words), server=None)[-1]
     assert (found.check, found.next) == ("voices", install.neural())

@@ -203,7 +203,7 @@ def test_a_player_is_told_to_have_no_effect_with_a_driver_that_plays_by_itself(m
 def test_without_any_player_the_packages_to_install_are_told(make_talk: MakeTalk, tmp_path: pathlib.Path) -> None:
     talk = make_talk(env={"PATH": str(tmp_path)}, watched=False)
     talk.run("voices")  # the engine is ready before it lists them
-    said = "no player found: install alsa-utils (aplay), pulseaudio-utils (pacat) or pipewire-bin (pw-cat)\n"
+    said = "no player found; install alsa-utils (aplay), pulseaudio-utils (pacat) or pipewire-bin (pw-cat)\n"
     assert next(each for each in talk.log.splitlines(True) if "engine ready" in each).endswith(f", {said}")
 
 

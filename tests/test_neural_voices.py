@@ -216,7 +216,7 @@ def test_the_first_voice_is_loaded_in_silence_and_others_during_the_speech(env: 
 
 
 def test_espeak_speaks_instead_of_a_broken_voice_until_it_is_mended(env: dict[str, str], tmp_path: Path) -> None:
-    why = f"{tmp_path}/voices/broken.onnx is no ONNX model: get the voice anew, from a source that you trust"
+    why = f"{tmp_path}/voices/broken.onnx is not an ONNX model; download the voice again, from a source that you trust"
     with _robot(env, "--voice", BROKEN) as robot:
         assert robot.heard(robot.say("hello", None)) == ("SUCCEEDED", INSTEAD)
         assert robot.neural(BROKEN) == {"state": "failed", "why": why}
@@ -331,7 +331,7 @@ def test_an_engine_that_hangs_while_it_loads_is_replaced(env: dict[str, str], ho
         robot.until(lambda: robot.neural()["state"] == "loading")
         for engine in children(robot.server.process.pid):
             os.kill(engine, signal.SIGSTOP)
-        robot.until(lambda: "no sign of life for 3 s while it loaded piper/tiny" in robot.server.log)
+        robot.until(lambda: "did not respond for 3 s while loading piper/tiny" in robot.server.log)
         hold.unlink()
         assert robot.heard(goal) == ("SUCCEEDED", TINY)
 
@@ -379,7 +379,7 @@ def test_a_file_is_rendered_with_a_neural_voice(env: dict[str, str], tmp_path: P
     assert target.stat().st_size > 10_000
     done = run([*TALK, "say", "-o", str(target), "--voice", "piper/broken", "hello"], env)
     assert done.code == 4
-    assert "get the voice anew" in done.err
+    assert "download the voice again" in done.err
 
 
 def test_voices_are_listed_with_quality_and_speakers_and_by_language(env: dict[str, str], tmp_path: Path) -> None:
@@ -444,7 +444,7 @@ def test_the_voices_that_completion_offers_are_found(env: dict[str, str]) -> Non
 
 
 def test_with_another_driver_a_neural_voice_is_refused(env: dict[str, str]) -> None:
-    words = '"piper/tiny" is a neural voice, and the driver "dummy" has none: leave --driver out'
+    words = '"piper/tiny" is a neural voice, which the driver "dummy" does not support; leave out --driver'
     done = run([*TALK, "serve", "--driver", "dummy", "--voice", "piper/tiny"], env)
     assert (done.code, words in done.err) == (2, True), done
     with serving(env, "--driver", "dummy"):
@@ -457,7 +457,7 @@ def test_with_another_driver_a_neural_voice_is_refused(env: dict[str, str]) -> N
 def test_without_the_extra_they_are_listed_and_refused(env: dict[str, str], tmp_path: Path) -> None:
     (tmp_path / "site" / "sitecustomize.py").write_text(WITHOUT.format(names=["onnxruntime"]))
     bare = {**env, "PYTHONPATH": str(tmp_path / "site")}
-    words = f"onnxruntime is missing: {install.neural()}"
+    words = f"onnxruntime is missing; install it with: {install.neural()}"
     done = run([*TALK, "serve", "--player", "null", "--voice", "piper/tiny"], bare)
     assert (done.code, words in done.err) == (2, True), done
     with serving(bare):
@@ -490,15 +490,15 @@ def test_an_unknown_voice_or_speaker_is_refused(env: dict[str, str], tmp_path: P
     tiny_voice.put(tmp_path / "voices", "two", tiny_voice.model(speakers=2), several)
     with serving(env, "--rate", "450"):
         for voice, words in (
-            ("piper/tiny#1", 'it has no speaker "1": it has one speaker'),
-            ("piper/two#2", 'it has no speaker "2": it has 2 speakers, 0 to 1'),
-            ("piper/two#nobody", 'it has no speaker "nobody"'),
+            ("piper/tiny#1", 'no speaker "1"; the voice has one speaker'),
+            ("piper/two#2", 'no speaker "2"; the voice has 2 speakers, 0 to 1'),
+            ("piper/two#nobody", 'no speaker "nobody"'),
         ):
             done = run([*TALK, "say", "--voice", voice, "hello"], env)
             assert (done.code, words in done.err) == (5, True), done
         for voice in ("piper/tiny#0", "piper/two#1", "piper/two#p1"):
             assert heard(env, "--voice-only", "--voice", voice) == voice
-    for voice, words in (("piper/tiny#4", "it has one speaker"), ("piper/none", 'unknown voice "piper/none"')):
+    for voice, words in (("piper/tiny#4", "the voice has one speaker"), ("piper/none", 'unknown voice "piper/none"')):
         done = run([*TALK, "serve", "--player", "null", "--voice", voice], env)
         assert (done.code, words in done.err) == (2, True), done
 

@@ -54,7 +54,7 @@ def test_without_the_extra_a_fleet_tells_what_to_install(words: list[str], tmp_p
     env = spied(tmp_path, environment(str(tmp_path), TALK_ROBOT="anna", TALK_BROKER="mqtt://127.0.0.1"), ["paho"])
     done = run([*TALK, *words], env)
     assert (done.code, done.out) == (2, "")
-    assert done.err == f"talk: a fleet needs paho-mqtt: {install.command('paho-mqtt')}\n"
+    assert done.err == f"talk: a fleet needs paho-mqtt; install it with: {install.command('paho-mqtt')}\n"
 
 
 # Neural voices

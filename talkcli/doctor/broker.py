@@ -53,14 +53,14 @@ _RENEWAL_LIMIT_S = 14 * 86400
 _NO_ANSWER = "no answer"
 #: Advice for each reason why the broker can't be reached.
 _UNREACHABLE_STEPS = {
-    "connection refused": "on {host}: systemctl status mosquitto; others than {host} reach it where its mosquitto.conf "
-    "has a line 'listener {port}'",
-    "no such host": "spell the host in TALK_BROKER rightly: getent hosts {host}",
-    _NO_ANSWER: "see whether {host} is up, and no firewall is between: ping {host}",
+    "connection refused": "check the broker on {host}: systemctl status mosquitto; to accept connections from other "
+    "machines, its mosquitto.conf needs the line 'listener {port}'",
+    "no such host": "correct the host in TALK_BROKER, and check it: getent hosts {host}",
+    _NO_ANSWER: "check that {host} is up and that no firewall blocks it: ping {host}",
 }
 #: OpenSSL's error codes for a certificate with an invalid date, and for a certificate of another host.
 _DATE_CODES, _HOST_CODES = (9, 10), (62, 64)
-_LOG_STEP = "see what the broker's log says: journalctl -u mosquitto"
+_LOG_STEP = "read the broker's log: journalctl -u mosquitto"
 
 
 class BrokerExamination:
@@ -87,7 +87,7 @@ class BrokerExamination:
         """
         fault = topics.name_fault(robot)
         if fault:
-            raise UsageError(f"no robot can be called '{printable(robot)}': a name {fault}")
+            raise UsageError(f"invalid robot name '{printable(robot)}': it {fault}")
         self._robot = robot
         self._environment, self._insecure = environment, insecure
         self._interrupt = interrupt
@@ -121,7 +121,7 @@ class BrokerExamination:
         if self._robot in presences:
             presence_finding = judge_presence(presences[self._robot], time.time())
         elif self._is_robot:
-            presence_finding = ok("name", f"'{self._robot}' is free: no bridge has it, and none had it")
+            presence_finding = ok("name", f"the name '{self._robot}' is free: no bridge has used it")
         else:
             privileged = rights_finding.state != FAILURE
             known = sorted(presences) if privileged else []
@@ -139,7 +139,7 @@ class BrokerExamination:
         except (OSError, UnicodeError) as error:  # UnicodeError means that the host name is invalid
             yield judge_unreachable(broker, _describe_error(error))
             return
-        yield ok("broker", f"{broker.url} takes connections, in {(time.monotonic() - began) * 1000:.0f} ms")
+        yield ok("broker", f"connected to {broker.url} in {(time.monotonic() - began) * 1000:.0f} ms")
         expires_at = None
         with connection:
             if context is not None:
@@ -159,7 +159,7 @@ class BrokerExamination:
         try:
             self._wait_for(link.open)
         except TimeoutError as error:
-            raise ServerUnavailable(f"the broker at {broker.url} does not answer within {_STEP_LIMIT_S:g} s") from error
+            raise ServerUnavailable(f"the broker at {broker.url} did not answer within {_STEP_LIMIT_S:g} s") from error
         return link
 
     def _check_anonymous(self, broker: Broker) -> Finding:
@@ -167,9 +167,9 @@ class BrokerExamination:
         try:
             self._log_in(replace(broker, user=None, password=None, cert=None, key=None)).close()
         except TalkError:
-            return ok("anonymous", "who has no credentials is not let in")
-        words = "the broker lets in who has no credentials: anybody on the network can make the robots speak"
-        return warning("anonymous", words, "allow_anonymous false in mosquitto.conf, and: talk bridge --print-acl")
+            return ok("anonymous", "the broker rejects clients without credentials")
+        words = "the broker accepts clients without credentials: anybody on the network can make the robots speak"
+        return warning("anonymous", words, "allow_anonymous false in mosquitto.conf; then: talk bridge --print-acl")
 
     def _test_rights(self, link: Link, name: str) -> tuple[Finding, dict[str, Presence]]:
         """Find out whether the user has the access rights of an operator, or of this robot's bridge.
@@ -209,7 +209,7 @@ class BrokerExamination:
                     link.subscribe(topics.robot(topics.ANY, topics.PRESENCE), retained=True)
         unwritable = tuple(each for each in tested if codes.get(each) == REASON_NOT_AUTHORIZED)
         missing = [each for each in tested if each not in codes]
-        trouble = link.ended or (f"it has acknowledged nothing of {missing[0]}" if missing else None)
+        trouble = link.ended or (f"the broker did not acknowledge a message to {missing[0]}" if missing else None)
         unreadable = () if is_back or echo in unwritable else (echo,)
         return judge_rights(name, unwritable, unreadable, trouble), presences
 
@@ -226,7 +226,7 @@ class BrokerExamination:
                 return judge_bridge(self._robot, server, time.monotonic() - began)
         except TalkError as error:
             wrong, _, remedy = error.message.partition("; ")
-            step = f"see what the bridge's log says, on {self._robot}: journalctl -u talk-bridge"
+            step = f"read the bridge's log on {self._robot}: journalctl -u talk-bridge"
             return failure("bridge", wrong, remedy or step)
 
     def _wait_for(self, work: Callable[[], _Result]) -> _Result:
@@ -280,7 +280,7 @@ def judge_settings(words: str, *, named: bool) -> Finding:
     """
     if not named:
         return failure("broker", f"{URL} is not set", f"export {URL}=mqtts://broker.example")
-    return failure("broker", words, "mend it where it is set: the shell's start file, or EnvironmentFile= of a unit")
+    return failure("broker", words, "correct it in the shell's start file, or in the unit's EnvironmentFile=")
 
 
 def judge_unreachable(broker: Broker, trouble: str) -> Finding:
@@ -298,15 +298,15 @@ def judge_certificate(broker: Broker, expires_at: float | None, now: float) -> F
         now: the current time in seconds since 1970.
     """
     if expires_at is None:
-        words = f"none: whoever is between here and {broker.host} can read all of it, and change it"
-        step = f"give the broker a certificate (listener, certfile, keyfile in mosquitto.conf), and: {URL}=mqtts://…"
+        words = f"no TLS: anybody on the network between here and {broker.host} can read and change the messages"
+        step = f"give the broker a certificate (listener, certfile, keyfile in mosquitto.conf), and set {URL}=mqtts://…"
         return warning("certificate", words, step)
     date = time.strftime("%Y-%m-%d", time.gmtime(expires_at))
     if expires_at - now < _RENEWAL_LIMIT_S:
-        words = f"good until {date}, {format_span(expires_at - now)} from now; trusted by {_authority(broker)}"
-        step = f"renew the certificate of {broker.host}, and have mosquitto read it: SIGHUP"
+        words = f"valid until {date}, {format_span(expires_at - now)} from now; trusted by {_authority(broker)}"
+        step = f"renew the certificate of {broker.host}, and send SIGHUP to mosquitto, so that it reads the new one"
         return warning("certificate", words, step)
-    return ok("certificate", f"trusted by {_authority(broker)}; good until {date}")
+    return ok("certificate", f"trusted by {_authority(broker)}; valid until {date}")
 
 
 def judge_tls_error(broker: Broker, message: str, code: int, now: float) -> Finding:
@@ -319,7 +319,7 @@ def judge_tls_error(broker: Broker, message: str, code: int, now: float) -> Find
         now: the current time in seconds since 1970.
     """
     step = _trust_step(broker, message, code, now)
-    return failure("certificate", f"{message} (by {_authority(broker)})", step)
+    return failure("certificate", f"{message} (checked against {_authority(broker)})", step)
 
 
 def _authority(broker: Broker) -> str:
@@ -331,15 +331,15 @@ def _trust_step(broker: Broker, message: str, code: int, now: float) -> str:
     """Return advice on how to fix a TLS error. The arguments are those of `judge_tls_error`."""
     if code in _DATE_CODES:
         clock = time.strftime("%Y-%m-%d %H:%M", time.gmtime(now))
-        return f"renew the certificate of {broker.host}; or set this machine's clock: it says {clock} UTC"
+        return f"renew the certificate of {broker.host}; or set this machine's clock, which shows {clock} UTC"
     if code in _HOST_CODES:
-        return f"name the host in {URL} as its certificate does, or have it certified as {broker.host}"
+        return f"use the host name of its certificate in {URL}, or get a certificate for {broker.host}"
     if "ALERT" in message:
-        return "log in with a certificate that the broker takes: TALK_MQTT_CERT and TALK_MQTT_KEY name it"
+        return "log in with a certificate that the broker accepts: set TALK_MQTT_CERT and TALK_MQTT_KEY"
     if not code:
-        return f"name the port that has TLS in {URL}, if {broker.port} of {broker.host} has none; or {_LOG_STEP}"
-    other = "another file" if broker.ca else "the file"
-    return f"name {other} of the CA that the certificate of {broker.host} is of: {CA}=FILE"
+        return f"if port {broker.port} of {broker.host} has no TLS, use its TLS port in {URL}; otherwise, {_LOG_STEP}"
+    other = "another file," if broker.ca else "the file"
+    return f"name {other} of the CA that issued the certificate of {broker.host}: {CA}=FILE"
 
 
 def judge_login(broker: Broker, refusal: str | None) -> Finding:
@@ -348,29 +348,29 @@ def judge_login(broker: Broker, refusal: str | None) -> Finding:
         wrong, _, remedy = refusal.partition("; ")
         step = _LOG_STEP
         if remedy:
-            step = f"log in as somebody whom it knows: {remedy}"
+            step = remedy
         elif broker.tls and broker.cert is None:  # the broker disconnects at once, so the reason may be missing
-            step += "; where it wants a certificate, TALK_MQTT_CERT and TALK_MQTT_KEY name it"
+            step += "; if it requires a certificate, set TALK_MQTT_CERT and TALK_MQTT_KEY"
         elif not broker.tls:
-            step += f"; where port {broker.port} is for TLS: {URL}=mqtts://{broker.host}:{broker.port}"
+            step += f"; if port {broker.port} is for TLS, set {URL}=mqtts://{broker.host}:{broker.port}"
         return failure("login", wrong, step)
     how = [words for words, given in (("a password", broker.password), ("a certificate", broker.cert)) if given]
-    who = "nobody" if broker.user is None else f"'{broker.user}'"
-    return ok("login", f"as {who}, with {' and '.join(how) or 'neither password nor certificate'}")
+    who = "an anonymous user" if broker.user is None else f"'{broker.user}'"
+    return ok("login", f"as {who}, with {' and '.join(how) or 'no password or certificate'}")
 
 
 def judge_presence(presence: Presence, now: float) -> Finding:
     """Return the finding about the robot's presence."""
     robot = presence.name
     if not presence.online:
-        step = f"see on {robot}: systemctl status talk-bridge; it has lost its network, its power, or its bridge"
+        step = f"check its network and power; on {robot}, run: systemctl status talk-bridge"
         return failure("name", f"{robot} is offline", step)
     words = f"{robot} is online"
     if presence.since is not None:
         words += f" for {format_span(now - presence.since)}"
     words += f", session {presence.session}"
     if presence.groups:
-        words += f", of {join_names(presence.groups)}"
+        words += f", groups: {join_names(presence.groups)}"
     server = presence.server
     if server is None:
         return failure("name", f"{words}; it has no talk server", f"on {robot}: systemctl status talk; talk doctor")
@@ -386,18 +386,18 @@ def judge_unknown(robot: str, known: list[str], name: str, *, privileged: bool) 
         name: the user's name.
         privileged: whether the user has all other access rights.
     """
-    words = f"the broker knows no robot '{robot}'"
+    words = f"the broker knows no robot named '{robot}'"
     by_lower = {each.lower(): each for each in known}
     near = [by_lower[each] for each in difflib.get_close_matches(robot.lower(), by_lower)]
     if near:
-        return failure("name", f"{words}; it knows {join_names(near)}", f"talk --robot {near[0]} doctor")
-    step = f"on the robot: talk bridge --name {robot}"
+        return failure("name", f"{words}; known robots: {join_names(near)}", f"talk --robot {near[0]} doctor")
+    step = f"on the robot, run: talk bridge --name {robot}"
     if known:
-        return failure("name", f"{words}; it knows {join_names(known)}", step)
-    words += f", or does not tell '{name}'"
+        return failure("name", f"{words}; known robots: {join_names(known)}", step)
+    words += f", or '{name}' is not allowed to see it"
     if not privileged:
-        return warning("name", words, f"let '{name}' do what an operator does, and ask again")
-    return failure("name", words, f"{step}; or let '{name}' read presence: talk bridge --print-acl")
+        return warning("name", words, f"give '{name}' the rights of an operator, and run talk doctor again")
+    return failure("name", words, f"{step}; or add the access rules for '{name}': talk bridge --print-acl")
 
 
 def judge_rights(name: str, unwritable: tuple[str, ...], unreadable: tuple[str, ...], trouble: str | None) -> Finding:
@@ -409,22 +409,22 @@ def judge_rights(name: str, unwritable: tuple[str, ...], unreadable: tuple[str, 
         unreadable: topics that the user can't read, because no message came back.
         trouble: why the rights could not be tested, or None if they could.
     """
-    parts = [f"write {' and '.join(unwritable)}"] if unwritable else []
+    parts = [f"write to {' and '.join(unwritable)}"] if unwritable else []
     # If the connection broke, a missing message doesn't prove that reading is forbidden.
     parts += [f"read {' and '.join(unreadable)}"] if unreadable and trouble is None else []
     if parts:
-        words = f"the broker does not let '{name}' {', nor '.join(parts)}"
-        return failure("rights", words, "give the broker's acl_file the lines for that: talk bridge --print-acl")
+        words = f"the broker does not allow '{name}' to {', or to '.join(parts)}"
+        return failure("rights", words, "add the missing lines to the broker's acl_file: talk bridge --print-acl")
     if trouble is not None:
-        return failure("rights", f"what '{name}' may do can't be found out: {trouble}", _LOG_STEP)
-    return ok("rights", f"the broker lets '{name}' do what is needed")
+        return failure("rights", f"the rights of '{name}' could not be tested: {trouble}", _LOG_STEP)
+    return ok("rights", f"the broker allows '{name}' everything that is needed")
 
 
 def judge_bridge(robot: str, server: JsonObject, took: float) -> Finding:
     """Return the finding about the robot's answer, which arrived after `took` seconds."""
-    words = f"{robot} answers in {took * 1000:.0f} ms: {summarize_server(server)}"
+    words = f"{robot} answered in {took * 1000:.0f} ms: {summarize_server(server)}"
     if server.get("paused") is True:
         return warning("bridge", f"speech is paused; {words}", f"talk --robot {robot} resume")
     if server.get("engine") not in WORKING_STATES:
-        return warning("bridge", words, f"on {robot}: talk doctor")
+        return warning("bridge", words, f"on {robot}, run: talk doctor")
     return ok("bridge", words)

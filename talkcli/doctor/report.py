@@ -53,9 +53,9 @@ class Question:
 SENTENCE_QUESTION = Question(
     "a sentence is heard, unless the loudspeaker itself is off", "a sentence would not be heard"
 )
-ROBOT_QUESTION = Question("the robot answers", "the robot would not answer")
+ROBOT_QUESTION = Question("the robot answers", "the robot can't be reached")
 #: The question for a robot that checks its own access to the broker.
-BRIDGE_QUESTION = Question("the broker takes what this robot's bridge says", "this robot's bridge would not be heard")
+BRIDGE_QUESTION = Question("the broker accepts this robot's messages", "the broker would not accept these messages")
 
 
 def ok(check: str, message: str) -> Finding:

@@ -36,33 +36,32 @@ SILENT_TEXT, _SILENT_RATE_WPM = "talk works well", 450
 #: that no reason for aborting a goal is missing.
 ADVICE: dict[str, str] = {
     Reason.NO_PLAYER: "sudo apt-get install -y alsa-utils",
-    Reason.AUDIO_DEVICE: "plug in and switch on the loudspeaker, close what else plays, and try: aplay -l",
-    Reason.AUDIO_LOST: "look whether the loudspeaker was unplugged, and try another: talk serve --device NAME",
+    Reason.AUDIO_DEVICE: "connect the loudspeaker, close other programs that play sound, and list the cards: aplay -l",
+    Reason.AUDIO_LOST: "check whether the loudspeaker was unplugged, or use another one: talk serve --device NAME",
     Reason.AUDIO_STALLED: "wake the device (pactl suspend-sink @DEFAULT_SINK@ 0), or restart the sound server",
-    Reason.MUTED: "undo it: pactl set-sink-mute @DEFAULT_SINK@ 0; pactl set-sink-volume @DEFAULT_SINK@ 70%",
-    Reason.VOICE_FAILED: "do what the message says, or choose another voice: talk set --voice en",
-    Reason.ENGINE_FAILED: "install what the message names, into the Python that serves",
-    Reason.ENGINE_CRASHED: "run talk doctor again; if it comes back, try another voice: talk set --voice en",
-    Reason.ENGINE_HUNG: "run talk doctor again on a machine that is less busy",
-    Reason.NOT_SILENT: "start the server again: one of its players could not be killed",
-    Reason.UNKNOWN_VOICE: "choose one that 'talk voices' lists: talk set --voice NAME",
-    Reason.NOTHING_TO_SAY: "send words of the voice's language, or choose a voice for the text's: "
-    "talk set --voice NAME",
+    Reason.MUTED: "unmute the output: pactl set-sink-mute @DEFAULT_SINK@ 0; pactl set-sink-volume @DEFAULT_SINK@ 70%",
+    Reason.VOICE_FAILED: "follow the message's advice, or choose another voice: talk set --voice en",
+    Reason.ENGINE_FAILED: "install the missing part that the message names, in the server's Python environment",
+    Reason.ENGINE_CRASHED: "run talk doctor again; if it fails again, try another voice: talk set --voice en",
+    Reason.ENGINE_HUNG: "run talk doctor again when this machine is less busy",
+    Reason.NOT_SILENT: "restart the server, because one of its players could not be killed",
+    Reason.UNKNOWN_VOICE: "choose a voice that 'talk voices' lists: talk set --voice NAME",
+    Reason.NOTHING_TO_SAY: "send a text in the voice's language, or choose a voice for the text: talk set --voice NAME",
     Reason.QUEUE_FULL: "empty the queue: talk cancel",
     Reason.SHUTDOWN: "start the server again: talk serve",
     Reason.LOST: "start the server again: talk serve",
-    "late": "see what is in the way with 'talk status', or end it with 'talk cancel'",
+    "late": "see what is being spoken with 'talk status', or cancel it with 'talk cancel'",
     "paused": "talk resume",
 }
 #: The finding if the server's player can't be tested, because it runs elsewhere.
 SENTENCE_ELSEWHERE = failure(
     _SENTENCE_CHECK,
-    "not played: the server runs on another machine or in a container, and so does its player",
-    "run talk doctor --silent there; or here without --silent, so that the server plays",
+    "not played: the server and its player run on another machine or in a container",
+    "run talk doctor --silent there, or run it here without --silent, so that the server plays",
 )
 #: Advice if the player of another user's server failed. The doctor can't use that server's environment.
-RUN_AS_OWNER = "play as the server's own user, who may have another sound: sudo -u '#{}' talk doctor --silent"
-_BUSY_STEP = "another program holds the device: close it, or play through a sound server (PipeWire, PulseAudio)"
+RUN_AS_OWNER = "run it as the server's user, whose sound settings may differ: sudo -u '#{}' talk doctor --silent"
+_BUSY_STEP = "another program uses the device: close it, or play through a sound server (PipeWire, PulseAudio)"
 _PLAYER_REASONS = {Reason.AUDIO_DEVICE, Reason.AUDIO_LOST, Reason.AUDIO_STALLED}
 _START_REASONS = {Reason.ENGINE_FAILED, Reason.ENGINE_HUNG}
 #: The checks that can explain why a player failed, with the most likely cause first.
@@ -94,7 +93,7 @@ def speak_by_server(client: Client, text: str, limit: float) -> SentenceResult:
         goal = client.say(text, preempt=False, ttl=0)
         try:
             if goal.speech_paused:
-                return SentenceResult(goal.cancel().state, "paused", "speech is paused")
+                return SentenceResult(goal.cancel().state, "paused", "not spoken: speech is paused")
             result = _goal_result(goal.wait(limit))
             with contextlib.suppress(TalkError):  # the result is valid even if the server ends now
                 result = replace(result, player=client.status().server.get("player"))
@@ -116,12 +115,12 @@ def _cancel_late(client: Client, goal: GoalHandle, limit: float) -> SentenceResu
         return _goal_result(ended)
     pending = [each.id for each in before.pending]
     if before.server.get("paused") is True:
-        return SentenceResult(ended.state, "paused", "speech is paused")
+        return SentenceResult(ended.state, "paused", "not spoken: speech is paused")
     if goal.id not in pending:
-        return SentenceResult(ended.state, "late", f"it was begun and not over after {limit:g} s, and was cancelled")
+        return SentenceResult(ended.state, "late", f"cancelled, because it had not ended after {limit:g} s")
     ahead = pending.index(goal.id) + bool(before.active)
     goals = "1 goal" if ahead == 1 else f"{ahead} goals"
-    return SentenceResult(ended.state, "late", f"it still waited behind {goals} after {limit:g} s, and was taken back")
+    return SentenceResult(ended.state, "late", f"not spoken: it was still waiting behind {goals} after {limit:g} s")
 
 
 def _goal_result(goal: Goal) -> SentenceResult:
@@ -156,7 +155,7 @@ def speak_by_engine(text: str, options: EngineOptions, volume: float, limit: flo
     except EngineFailed as error:
         return SentenceResult(State.ABORTED, *explain_failure(error))
     except TimeoutError:
-        return SentenceResult(State.ABORTED, Reason.ENGINE_HUNG, f"it was not over after {limit:g} s")
+        return SentenceResult(State.ABORTED, Reason.ENGINE_HUNG, f"it did not end within {limit:g} s")
 
 
 def find_playback_step(findings: Sequence[Finding], *, custom: bool = False) -> str | None:
@@ -186,17 +185,17 @@ def advise(
     message = message or ""
     said = message.lower()
     if reason == Reason.NOTHING_TO_SAY and text is not None and not any(map(str.isalnum, text)):
-        return "send a text with words: this one has no letters and no digits"
+        return "send a text with words: this one has no letters or digits"
     if reason == Reason.AUDIO_DEVICE and "busy" in said:
         return _BUSY_STEP
     if reason == Reason.AUDIO_DEVICE and ("denied" in said or "not permitted" in said):
-        return "sudo usermod -aG audio USER for the user who serves, log in again, and start the server again"
+        return "for the server's user: sudo usermod -aG audio USER; then log in again, and restart the server"
     if reason == Reason.ENGINE_FAILED and "libespeak-ng is missing" in message:
         return INSTALL_LIBRARY
     if reason in _PLAYER_REASONS and isinstance(player, str) and is_custom(player):
         command = player.replace("{rate}", "22050").replace("{device}", str(device or "default"))
-        return f"try the player by hand, with a second of silence: head -c 44100 /dev/zero | {command}"
-    return ADVICE.get(reason or "", "somebody else ended it: run talk doctor again")
+        return f"test the player with a second of silence: head -c 44100 /dev/zero | {command}"
+    return ADVICE.get(reason or "", "another client ended it: run talk doctor again")
 
 
 def judge_sentence(
@@ -212,17 +211,17 @@ def judge_sentence(
         hangs: whether the sound server hangs, which also blocks engines when they start.
     """
     if result.state is State.SUCCEEDED:
-        how = "through the server" if result.by_server else "by an engine of this command's own"
+        how = "through the server" if result.by_server else "by talk doctor's own engine"
         seconds = "" if result.duration is None else f", {result.duration:.1f} s"
         player = f", {result.player}" if result.player else ""
-        said = "played to its end without sound" if silent else f'"{SENTENCE_TEXT}" was played to its end'
+        said = "a sentence was played without sound" if silent else f'"{SENTENCE_TEXT}" was played to its end'
         return ok(_SENTENCE_CHECK, f"{said} {how}{player}{seconds}")
     if result.reason in {"late", "paused"}:
-        return failure(_SENTENCE_CHECK, f"not spoken: {result.message}", ADVICE[result.reason])
+        return failure(_SENTENCE_CHECK, result.message or "", ADVICE[result.reason])
     message = message_details(result.message) or "no reason was given"
     step = advise(result.reason, message, result.player, device)
     if result.beside_speech and step == _BUSY_STEP:
-        return ok(_SENTENCE_CHECK, f"the device is busy with what the server speaks at this moment ({message})")
+        return ok(_SENTENCE_CHECK, f"the device is busy, because the server is speaking ({message})")
     if result.reason == Reason.AUDIO_STALLED and result.suspended:
         message = f"{message}; suspended: {', '.join(result.suspended)}"
         step = f"pactl suspend-sink {result.suspended[0]} 0"

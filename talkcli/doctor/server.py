@@ -43,28 +43,28 @@ _ENGINE_START_LIMIT_S, _ENGINE_POLL_S = 1.0, 0.05
 #: Descriptions of paths to which a client can connect. The kernel accepts connections even if the process never
 #: answers. `paths` describes failed connections.
 PLACE_FOREIGN = "another user's server"
-PLACE_LISTENING = "something listens"
-PLACE_STOPPED = "a process listens that is stopped"
+PLACE_LISTENING = "a process is listening"
+PLACE_STOPPED = "a stopped process is listening"
 #: Advice if the server refuses the client, by error code.
 _REFUSAL_ADVICE = {
-    "protocol_mismatch": "install the same talk on both sides, and start the server again",
-    "busy": "end some of its clients, or raise the limit that is named: talk serve --max-clients 512, or LimitNOFILE=",
-    "permission_denied": "have its owner let you in: talk serve --socket-mode 0660, and join the socket's group",
+    "protocol_mismatch": "install the same version of talk for the server and its clients, and restart the server",
+    "busy": "end some of its clients, or raise the limit in the message: talk serve --max-clients 512, or LimitNOFILE=",
+    "permission_denied": "ask its owner for access: talk serve --socket-mode 0660, and join the socket's group",
 }
 #: Advice for each kind of place. If several kinds were found, the first one in this table counts.
 _PLACE_ADVICE = {
-    PLACE_FORBIDDEN: "have {whose} let you in: talk serve --socket-mode 0660, and join the socket's group; "
-    "or start your own",
-    PLACE_FOREIGN: "remove it, and: talk serve; or if you trust uid {uid}: talk --socket {path} doctor",
-    PLACE_STOPPED: "let it go on: kill -CONT {pid}",
-    PLACE_LISTENING: "restart the server on {path}; if it is none of talk's, remove that",
-    PLACE_FILE: "remove {path}, and: talk serve",
-    PLACE_DIRECTORY: "remove {path}, and: talk serve",
-    PLACE_STALE: "talk serve (it takes the place of what was left over)",
+    PLACE_FORBIDDEN: "ask {whose} for access: talk serve --socket-mode 0660, and join the socket's group; "
+    "or start your own server",
+    PLACE_FOREIGN: "remove it, and run: talk serve; or if you trust uid {uid}, run: talk --socket {path} doctor",
+    PLACE_STOPPED: "continue the process: kill -CONT {pid}",
+    PLACE_LISTENING: "restart the server on {path}; if the socket isn't talk's, remove it",
+    PLACE_FILE: "remove {path}, and run: talk serve",
+    PLACE_DIRECTORY: "remove {path}, and run: talk serve",
+    PLACE_STALE: "talk serve (it replaces the old socket)",
 }
 #: How to set and unset the option or variable that names a socket.
 _NAMING = {"TALK_SOCKET": "TALK_SOCKET=", "--socket": "--socket "}
-_UNNAMING: dict[str | None, str] = {"TALK_SOCKET": "unset TALK_SOCKET", "--socket": "leave --socket out"}
+_UNNAMING: dict[str | None, str] = {"TALK_SOCKET": "unset TALK_SOCKET", "--socket": "leave out --socket"}
 #: Speech may be inaudible if the volume setting is lower than this. The maximum is 1.
 _FAINT_VOLUME = 0.2
 
@@ -168,8 +168,8 @@ def judge_found(words: str, before: list[SocketPlace]) -> Finding:
     obstacles = [each for each in before if each.what != PLACE_ABSENT]
     if not obstacles:
         return ok("socket", words)
-    words = f"{words}; before it: {'; '.join(map(_format_place, obstacles))}"
-    return warning("socket", words, f"remove what is in the way: {obstacles[0].path}")
+    words = f"{words}; clients first try {'; '.join(map(_format_place, obstacles))}"
+    return warning("socket", words, f"remove {obstacles[0].path}")
 
 
 def explain_missing(places: list[SocketPlace], named_by: str | None, error: TalkError) -> Finding:
@@ -180,8 +180,8 @@ def explain_missing(places: list[SocketPlace], named_by: str | None, error: Talk
         named_by: the option or variable that named the only place to try, or None if the usual places were tried.
         error: why the client could not connect.
     """
-    tried = f"named by {named_by}" if named_by else "tried"
-    words = f"no server; {tried}: {'; '.join(map(_format_place, places))}"
+    tried = f"{named_by} names" if named_by else "tried:"
+    words = f"no server found; {tried} {'; '.join(map(_format_place, places))}"
     message = _client_message(error, places)
     if message is not None and not any(each.what == PLACE_STOPPED for each in places):
         words = f"{words}; {message}"
@@ -197,7 +197,7 @@ def _missing_step(places: list[SocketPlace], named_by: str | None, code: str) ->
     """Return advice for the user if no server was found. `code` is the code of the client's error."""
     for each in paths.client_sockets(None) if named_by else []:
         if _find_place(each, set()).what == PLACE_LISTENING:
-            return f"{_UNNAMING[named_by]}: a server is on {each}"
+            return f"{_UNNAMING[named_by]}: a server is running on {each}"
     place = next((each for what in _PLACE_ADVICE for each in places if each.what == what), None)
     if place is None:  # a new server could start at any of the places
         # Only root can see the sockets of all users.
@@ -211,16 +211,16 @@ def _missing_step(places: list[SocketPlace], named_by: str | None, code: str) ->
     if place.what == PLACE_LISTENING and code in _REFUSAL_ADVICE:
         return _REFUSAL_ADVICE[code]
     if named_by is not None and place.what == PLACE_DIRECTORY:
-        return f"name the socket in it: {_NAMING[named_by]}{place.path.rstrip('/')}/talk.sock"
+        return f"name the socket in this directory: {_NAMING[named_by]}{place.path.rstrip('/')}/talk.sock"
     if named_by is not None and place.what == PLACE_FILE:
-        return f"{_UNNAMING[named_by]}, or name a socket"
+        return f"{_UNNAMING[named_by]}, or name a socket instead of a file"
     whose = "its owner" if place.uid is None else f"uid {place.uid}"
     return _PLACE_ADVICE[place.what].format(whose=whose, **fields(place))
 
 
 def judge_gone(message: str) -> Finding:
     """Return the finding about a server that accepted the connection, but didn't answer."""
-    return failure("server", message, "look at its log, and start it again: talk serve")
+    return failure("server", message, "read its log, and restart it: talk serve")
 
 
 def judge_server(server: JsonObject, log: Sequence[Goal], now: float) -> list[Finding]:
@@ -241,8 +241,8 @@ def _judge_state(server: JsonObject) -> Finding:
     if server.get("engine") not in WORKING_STATES:
         return warning("server", words, advise(Reason.ENGINE_FAILED, words))
     if version != __version__:
-        step = "start the server again, with the talk that is installed now"
-        return warning("server", f"{words}; this is talk {__version__}", step)
+        step = "restart the server, so that it runs the installed version"
+        return warning("server", f"{words}; the installed version is {__version__}", step)
     return ok("server", words)
 
 
@@ -267,7 +267,7 @@ def _judge_settings(server: JsonObject) -> Finding:
 
 def _judge_recent(log: Sequence[Goal], now: float, server: JsonObject) -> Finding:
     if not log:
-        return ok(_RECENT_CHECK, "none yet")
+        return ok(_RECENT_CHECK, "no goals yet")
     aborted = [each for each in log if each.state is State.ABORTED]
     many = "the last goal" if len(log) == 1 else f"the last {len(log)} goals"
     if not aborted:
@@ -275,11 +275,11 @@ def _judge_recent(log: Sequence[Goal], now: float, server: JsonObject) -> Findin
     last = aborted[-1]
     message = message_details(last.message)
     when = "" if last.ended_at is None else f", {format_span(now - last.ended_at)} ago ({clock_time(last.ended_at)})"
-    which = f"{many} ABORTED, {last.id}" if len(log) == 1 else f"{len(aborted)} of {many} ABORTED, last {last.id}"
-    words = f"{which}{when}: {last.reason}: {message}"
+    which = f"{many}, {last.id}" if len(log) == 1 else f"{len(aborted)} of {many}, most recently {last.id}"
+    words = f"ABORTED: {which}{when}: {last.reason}: {message}"
     succeeded = sum(each.state is State.SUCCEEDED for each in log[log.index(last) + 1 :])
     if succeeded:
-        return ok(_RECENT_CHECK, f"{words}; {succeeded} succeeded since")
+        return ok(_RECENT_CHECK, f"{words}; {succeeded} succeeded since then")
     step = advise(last.reason, message, server.get("player"), server.get("device"), last.text)
     return warning(_RECENT_CHECK, words, step)
 

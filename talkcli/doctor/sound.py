@@ -42,7 +42,7 @@ _SSH_PROGRAMS = frozenset({"ssh", "sshd"})
 _CONTAINER, _CRON_JOB, _SYSTEM_SERVICE = "a container", "a cron job", "a system service"
 #: The finding if the server runs on another machine.
 SESSION_ELSEWHERE = ok(
-    "session", "the server runs on another machine or in a container: run talk doctor there to look at its sound"
+    "session", "the server runs on another machine or in a container: to check its sound, run talk doctor there"
 )
 #: Tags and permission bits of access control lists, from <linux/posix_acl.h>.
 _ACL_USER, _ACL_GROUP, _ACL_READ_WRITE = 2, 8, 6
@@ -273,7 +273,7 @@ def run_program(program: str, *arguments: str, env: Mapping[str, str], limit: fl
     if code < 0:
         return ProgramOutput(f"it was killed by {signal_name(-code)}", stdout)
     lines = filter(None, map(str.strip, (stderr or stdout).splitlines()))
-    return ProgramOutput(next(lines, "it said nothing") if code else None, stdout)
+    return ProgramOutput(next(lines, "it printed no message") if code else None, stdout)
 
 
 def is_custom(player: str | None) -> bool:
@@ -330,7 +330,7 @@ def add_pactl_package(finding: Finding, env: Mapping[str, str]) -> Finding:
     """Add advice on how to install pactl to a finding that mentions pactl, if pactl isn't installed."""
     if finding.next is None or "pactl " not in finding.next or on_path("pactl", env):
         return finding
-    return replace(finding, next=f"{finding.next} (for pactl: sudo apt-get install -y {PACKAGES['pacat']})")
+    return replace(finding, next=f"{finding.next} (to install pactl: sudo apt-get install -y {PACKAGES['pacat']})")
 
 
 def suspended_sinks(env: Mapping[str, str]) -> tuple[str, ...]:
@@ -349,10 +349,10 @@ def find_sound_server(env: Mapping[str, str], session: UserSession) -> SoundServ
     # If pactl isn't installed, connecting to the socket is the only way to test whether PulseAudio clients can connect.
     native = None if on_path("pactl", env) else _pulse_address(env)
     if pipewire.error is None:
-        name = "PipeWire" if native else "PipeWire, without its PulseAudio part"
+        name = "PipeWire" if native else "PipeWire without PulseAudio support"
         return SoundServer(name, accepts_pulse=native is not None)
     if native and native.startswith("/"):
-        return SoundServer(f"one listens on {native}")
+        return SoundServer(f"a sound server listens on {native}")
     outputs = ("pactl", pulse), ("pw-cli", pipewire)
     error = next((output.error for program, output in outputs if on_path(program, env)), None)
     uids = [each for each in (session.uid, session.sudo_uid) if each is not None]
@@ -429,52 +429,52 @@ def judge_level(name: str, text: str, unmute_command: str, louder_command: str, 
     percents = [int(each) for each in re.findall(r"(\d+)%", text)]
     percents += [round(float(each) * 100) for each in re.findall(r"Volume: (\d+(?:\.\d+)?)", text)]
     if not percents:
-        return ok(_LOUDNESS_CHECK, f"{name} on")
+        return ok(_LOUDNESS_CHECK, f"{name} is not muted")
     percent = max(percents)
     if percent == 0:
         return broken(_LOUDNESS_CHECK, f"{name} is at 0%", louder_command)
     if percent < _FAINT_PERCENT:
-        return warning(_LOUDNESS_CHECK, f"{name} is at {percent}%: few will hear it", louder_command)
-    return ok(_LOUDNESS_CHECK, f"{name} at {percent}%")
+        return warning(_LOUDNESS_CHECK, f"{name} is at {percent}%, which may be too quiet", louder_command)
+    return ok(_LOUDNESS_CHECK, f"{name} is at {percent}%")
 
 
 def judge_session(session: UserSession) -> Finding:
     """Return the finding about the session, which shows whether players can find the user's sound server."""
-    who = "" if session.server_pid is None else "the server's: "
+    who = "" if session.server_pid is None else "the server runs as "
     who += f"user {session.user} (uid {session.uid})"
-    who += "" if session.sudo_uid is None else f" by sudo from uid {session.sudo_uid}"
+    who += "" if session.sudo_uid is None else f" through sudo by uid {session.sudo_uid}"
     who += f", in {' and '.join(session.origins)}" if session.origins else ""
     if session.runtime_dir is None:
         if session.usual_runtime_dir is None:
             # This is normal on robots without logind, which would create the directory.
-            return ok("session", f"{who}; no XDG_RUNTIME_DIR, as there is no session of this user")
-        again = "" if session.server_pid is None else " where the server is started, and start it again"
+            return ok("session", f"{who}; no XDG_RUNTIME_DIR, because this user has no login session")
+        again = "" if session.server_pid is None else " for the server, and restart it"
         return warning(
             "session",
-            f"{who}; XDG_RUNTIME_DIR is not set, as under cron, sudo, su and in system services: players find no "
-            "PipeWire or PulseAudio of this user",
+            f"{who}; XDG_RUNTIME_DIR is not set, so players can't find this user's PipeWire or PulseAudio "
+            "(usual under cron, sudo and su, and in system services)",
             f"export XDG_RUNTIME_DIR={session.usual_runtime_dir}{again}",
         )
     words = f"{who}; XDG_RUNTIME_DIR is {session.runtime_dir}"
     if session.runtime_owner is None:
-        step = "log in as this user (not by su or sudo), or unset XDG_RUNTIME_DIR"
-        return warning("session", f"{words}, which is not there", step)
+        step = "log in as this user (without su or sudo), or unset XDG_RUNTIME_DIR"
+        return warning("session", f"{words}, which does not exist", step)
     if session.runtime_owner != session.uid:
         step = f"run this as the user who owns it: sudo -u '#{session.runtime_owner}' talk doctor"
-        words = f"{words}, which is uid {session.runtime_owner}'s: its sound server takes nobody else"
+        words = f"{words}, which belongs to uid {session.runtime_owner}, whose sound server accepts no other user"
         return warning("session", words, step)
     return ok("session", words)
 
 
 def judge_silent_player(player: str | None, *, by_server: bool) -> Finding:
     """Return the finding about a configured player that makes no sound."""
-    step = "start the server without --player" if by_server else "unset TALK_PLAYER"
-    return failure("player", f"{player} ({_set_by(by_server)}): it keeps the time and makes no sound", step)
+    step = "restart the server without --player" if by_server else "unset TALK_PLAYER"
+    return failure("player", f"{player} ({_set_by(by_server)}) makes no sound", step)
 
 
 def _set_by(by_server: bool) -> str:
     """Return a description of what configured the player."""
-    return "the server's" if by_server else "TALK_PLAYER"
+    return "set by the server" if by_server else "set by TALK_PLAYER"
 
 
 def check_player(env: Mapping[str, str], configured: str | None, used: str | None, *, by_server: bool) -> Finding:
@@ -490,17 +490,17 @@ def check_player(env: Mapping[str, str], configured: str | None, used: str | Non
     broken = warning if by_server else failure
     if used is None:
         package = next(iter(PACKAGES.values()))
-        return broken("player", f"none is on the PATH: {', '.join(PACKAGES)}", f"sudo apt-get install -y {package}")
+        return broken("player", f"none is on the PATH ({', '.join(PACKAGES)})", f"sudo apt-get install -y {package}")
     if configured is None:
-        how = ", by the sound server" if used == "pulse" else ""
-        return ok("player", f"{used} is used{how}" + (f"; then {', '.join(others)}" if others else ""))
+        how = " to play through the sound server" if used == "pulse" else ""
+        return ok("player", f"{used} is used{how}" + (f"; other players: {', '.join(others)}" if others else ""))
     words = f"{configured} ({_set_by(by_server)})"
     program = _program_of(configured)
     if program is None or not (program == "pulse" or on_path(program, env)):
         known = PACKAGES.get(configured)
-        step = f"sudo apt-get install -y {known}" if known else "name a program that is there, with --player"
-        return broken("player", f"{words} is not there", step)
-    also = f"; there {'is' if len(others) == 1 else 'are'} also {', '.join(others)}" if others else ""
+        step = f"sudo apt-get install -y {known}" if known else "name an installed program with --player"
+        return broken("player", f"{words} is not installed", step)
+    also = f"; other players: {', '.join(others)}" if others else ""
     return ok("player", words + also)
 
 
@@ -514,23 +514,23 @@ def check_device(env: Mapping[str, str], player: str, configured: str | None) ->
     """
     command, parse, package = DEVICE_LISTS[player]
     program, *arguments = command.split()
-    used = configured or "the default"
+    used = configured or "the default device"
     if not on_path(program, env):
-        words = f"{used}; others cannot be listed: {program} is not installed"
+        words = f"{used}; devices can't be listed, because {program} is not installed"
         step = f"sudo apt-get install -y {package}"
         return ok("device", words) if configured is None else warning("device", words, step)
     output = run_program(program, *arguments, env=env)
     names = list(parse(output))
     if output.error is not None:
-        return warning("device", f"{command}: {output.error}", f"look at what this says: {command}")
+        return warning("device", f"{command}: {output.error}", f"run this command to see the whole error: {command}")
     if not names:
-        step = "plug in a loudspeaker; in a container, hand the device in"
-        return warning("device", f"{command} lists none", step)
+        step = "connect a loudspeaker; in a container, pass the device to it"
+        return warning("device", f"{command} lists no devices", step)
     # A device such as plughw:1,0 may work even if ALSA doesn't list it. The sentence will show whether it does.
     if configured is None or configured in names or ":" in configured:
         return ok("device", f"{used}; {command} lists {join_names(names)}")
-    words = f"{configured} is not among those that {command} lists: {join_names(names)}"
-    return warning("device", words, "start the server with --device and one of these names")
+    words = f"{configured} is not in the list of {command}: {join_names(names)}"
+    return warning("device", words, "restart the server with --device and one of these names")
 
 
 def check_cards(cards: Sequence[str], server: SoundServer, session: UserSession) -> Finding:
@@ -538,13 +538,13 @@ def check_cards(cards: Sequence[str], server: SoundServer, session: UserSession)
     if cards:
         return ok("cards", join_names(cards))
     if server.name is not None:
-        return ok("cards", "none of this machine's own; the sound server has what is needed")
+        return ok("cards", "this machine has none, but the sound server has an output")
     if _CONTAINER in session.origins:
-        step = "start the container with --device /dev/snd, or with the sound server's socket: see the README"
-        return warning("cards", "none in this container", step)
+        step = "start the container with --device /dev/snd, or with the sound server's socket (see the README)"
+        return warning("cards", "this container has none", step)
     has_sound = os.path.isdir(_KERNEL_SOUND)
-    words = "the kernel knows none" if has_sound else f"the kernel has no sound (no {_KERNEL_SOUND})"
-    return warning("cards", words, "plug in a loudspeaker or sound card, and look with: aplay -l")
+    words = "the kernel found none" if has_sound else f"the kernel has no sound support (no {_KERNEL_SOUND})"
+    return warning("cards", words, "connect a loudspeaker or a sound card, and check with: aplay -l")
 
 
 def check_access(server: SoundServer, session: UserSession, directory: str = "/dev/snd") -> Finding:
@@ -557,18 +557,18 @@ def check_access(server: SoundServer, session: UserSession, directory: str = "/d
             if not _may_open(found, _access_list(each), session):
                 forbidden.append(each)
     if not nodes:
-        return ok("group", f"nothing in {directory} to open, so the group {group} is not needed")
+        return ok("group", f"{directory} has no playback devices, so the group {group} is not needed")
     if not forbidden:
         is_member = group in [_name(grp.getgrgid, each) for each in session.gids]
-        member = f"in the group {group}" if is_member else f"not in the group {group}, and needs not to be"
+        member = f"in the group {group}" if is_member else f"not in the group {group}, which is not needed"
         return ok("group", f"user {session.user} may open the cards ({member})")
-    words = f"user {session.user} may not open {join_names(forbidden)}: not in the group {group}"
+    words = f"user {session.user} may not open {join_names(forbidden)}, and is not in the group {group}"
     if server.name is not None:
-        return ok("group", f"{words}; the sound server opens them")
+        return ok("group", f"{words}; the sound server opens the cards")
     with contextlib.suppress(KeyError):
         if session.user in grp.getgrnam(group).gr_mem:
-            step = "log out and in again" if session.server_pid is None else "start the server again, from a new login"
-            return warning("group", f"{words} yet, though it is to be from the next login on", step)
+            step = "log out and in again" if session.server_pid is None else "restart the server from a new login"
+            return warning("group", f"{words} yet, but will be after the next login", step)
     return warning("group", words, f"sudo usermod -aG {group} {session.user}, and log in again")
 
 
@@ -577,23 +577,23 @@ def judge_sound_server(server: SoundServer, cards: Sequence[str], session: UserS
     check = _SOUND_SERVER_CHECK
     where = "from here" if session.server_pid is None else f"from the server (process {session.server_pid})"
     if server.name is not None and server.sink == DUMMY_SINK:
-        step = "plug in a loudspeaker, and look whether it is there: pactl list short sinks"
-        return warning(check, f"{server.name} has only a dummy output, {DUMMY_SINK}: nobody hears it", step)
+        step = "connect a loudspeaker, and check that it is listed: pactl list short sinks"
+        return warning(check, f"{server.name} has only the dummy output {DUMMY_SINK}, which nobody can hear", step)
     if server.name is not None:
         return ok(check, server.name + (f", plays to {server.sink}" if server.sink else ""))
     if server.hangs:
-        step = "restart it: systemctl --user restart pipewire pipewire-pulse (or: pulseaudio -k)"
-        return warning(check, f"there is one, but it does not answer {where}", step)
+        step = "restart the sound server: systemctl --user restart pipewire pipewire-pulse (or: pulseaudio -k)"
+        return warning(check, f"a sound server is running, but does not answer {where}", step)
     if not server.sockets and server.pulse_server is None:
         if session.origins and not cards:
-            return _judge_unreachable(server, session, f"none can be reached {where}")
+            return _judge_unreachable(server, session, f"no sound server can be reached {where}")
         alone = "; players use ALSA" if cards else ""
-        return ok(check, f"no PulseAudio or PipeWire runs for user {session.user}{alone}")
+        return ok(check, f"no PulseAudio or PipeWire is running for user {session.user}{alone}")
     at = f"{server.pulse_server} (PULSE_SERVER)" if server.pulse_server else join_names(server.sockets)
     if server.error is None:
         step = "sudo apt-get install -y pulseaudio-utils"
-        return warning(check, f"there is one at {at}, but no program to ask it: pactl, pw-cli", step)
-    return _judge_unreachable(server, session, f"the one at {at} cannot be reached {where}: {server.error}")
+        return warning(check, f"found one at {at}, but no program to check it (pactl or pw-cli)", step)
+    return _judge_unreachable(server, session, f"the sound server at {at} cannot be reached {where}: {server.error}")
 
 
 def _judge_unreachable(server: SoundServer, session: UserSession, words: str) -> Finding:
@@ -602,14 +602,14 @@ def _judge_unreachable(server: SoundServer, session: UserSession, words: str) ->
     if server.pulse_server is not None:
         step = "unset PULSE_SERVER, or start the sound server that it names"
     elif _CONTAINER in session.origins:
-        hint = "; a container sees only what it is given"
-        step = "start the container with the host's socket and PULSE_SERVER: see the README"
+        hint = "; a container can't use the host's sound server by default"
+        step = "start the container with the host's socket and PULSE_SERVER (see the README)"
     elif _SYSTEM_SERVICE in session.origins:
-        hint = "; a system service is in no user's session"
-        step = "serve as the user whose sound it is: talk serve --print-unit user"
+        hint = "; a system service doesn't belong to a user's session"
+        step = "run the server as a service of your user: talk serve --print-unit user"
     elif session.sudo_uid is not None:
-        hint = "; a sound server takes its own user only, not root"
-        step = "leave sudo out: run this as the user whose sound it is"
+        hint = "; a sound server accepts only its own user, not root"
+        step = "run this without sudo, as the user of the sound server"
     elif session.runtime_dir is None and session.usual_runtime_dir is not None:
         step = f"export XDG_RUNTIME_DIR={session.usual_runtime_dir}"
     return warning(_SOUND_SERVER_CHECK, words + hint, step)

@@ -40,13 +40,14 @@ WORKING_STATES = ("ready", "starting")
 INSTALL_LIBRARY = install.espeak_library()
 _INSTALL_PYTTSX3 = install.command("pyttsx3")
 _INSTALL_NEURAL = install.neural()
+
 #: Advice if libespeak-ng can't be used. The key is a part of the engine's message, or the reason for the failure.
 _LIBRARY_ADVICE = {
     "espeak-ng data": "sudo apt-get install -y espeak-ng-data",
     "libespeak-ng": INSTALL_LIBRARY,
     Reason.ENGINE_CRASHED: "install it again: sudo apt-get install --reinstall -y libespeak-ng1 espeak-ng-data",
     # libespeak-ng connects to PulseAudio when it starts, even if it doesn't play anything.
-    Reason.ENGINE_HUNG: "restart the sound server if that hangs (see below): libespeak-ng waits for it at its start",
+    Reason.ENGINE_HUNG: "if the sound server hangs (see below), restart it, because libespeak-ng waits for it",
 }
 _PACKAGES_CHECK, _FILES_CHECK, _NEURAL_CHECK = "neural", "voice files", "neural voice"
 #: The minimum speed of a neural voice, as a multiple of real time. If a voice is slower, other programs on the machine
@@ -61,10 +62,10 @@ _IMPORT_TIMED_OUT = f"it takes more than {_IMPORT_LIMIT_S:g} s"
 #: Advice if a package can't be imported. The key is a part of the error message, and "" is the default.
 _IMPORT_ADVICE = {
     _IMPORT_TIMED_OUT: "run talk doctor again when this machine is less busy",
-    "SIGILL": "this processor is too old for that version: install an older one, or use an espeak voice",
+    "SIGILL": "this processor is too old for that version: install an older version, or use an espeak voice",
     "": f"install it again: {install.neural(again=True)}",
 }
-_CHOOSE_ESPEAK = "choose one of espeak's: talk set --voice en, or talk serve --voice en"
+_CHOOSE_ESPEAK = "choose an espeak voice: talk set --voice en, or talk serve --voice en"
 
 
 @frozen
@@ -154,7 +155,7 @@ def explain_failure(error: EngineFailed) -> tuple[str, str]:
     The reason is `engine_hung` if the engine stopped responding.
     """
     if error.silent_s is not None:
-        return Reason.ENGINE_HUNG, f"the engine process said nothing for {error.silent_s:g} s"
+        return Reason.ENGINE_HUNG, f"the engine process did not respond for {error.silent_s:g} s"
     return error.reason, str(error)
 
 
@@ -176,32 +177,31 @@ def judge_engine(pyttsx3: str | None, engine: EngineReport, *, server: str | Non
     if engine.ready is not None and server not in {None, *WORKING_STATES}:
         engine = EngineReport(reason=Reason.ENGINE_FAILED, message=f"the server's engine: {server}")
     if engine.ready is not None:
-        words = f"{pyttsx3 or 'of an unknown version'}, driver {engine.ready.driver}"
+        words = f"{pyttsx3 or 'unknown version'}, driver {engine.ready.driver}"
         return [ok("pyttsx3", words), *_judge_library(engine.ready.version, engine.voices)]
-    # Remove the advice, which the finding shows separately.
-    message = engine.message.removesuffix(f": {_INSTALL_PYTTSX3}").removesuffix(f": {INSTALL_LIBRARY}")
+    message = engine.message.partition("; install it with: ")[0]  # the finding shows the advice separately
     if "pyttsx3 is missing" in message or pyttsx3 is None:
         return [broken("pyttsx3", message or "pyttsx3 is missing", _INSTALL_PYTTSX3)]
     found = ok("pyttsx3", pyttsx3)
     if engine.reason == Reason.UNKNOWN_VOICE:
-        step = "choose one that 'talk voices' lists, in TALK_VOICE or --voice"
-        step = _INSTALL_NEURAL if _INSTALL_NEURAL in message else step
+        step = "set TALK_VOICE or --voice to a voice that 'talk voices' lists"
+        step = _INSTALL_NEURAL if _INSTALL_NEURAL in engine.message else step
         return [found, ok("libespeak-ng", "loaded"), broken("voices", message, step)]
     clue = next((each for each in _LIBRARY_ADVICE if each in message or each == engine.reason), "")
     if clue == Reason.ENGINE_CRASHED:
-        message = f"the engine process died while it loaded the library: {message}"
-    step = _LIBRARY_ADVICE.get(clue, "read what the engine said in the log of talk serve")
+        message = f"the engine process crashed while it loaded the library: {message}"
+    step = _LIBRARY_ADVICE.get(clue, "read the engine's error messages in the log of talk serve")
     return [found, broken("libespeak-ng", message, step)]
 
 
 def _judge_library(synthesizer: str | None, voices: tuple[str, ...] | None) -> list[Finding]:
     found = [] if synthesizer is None else [ok("libespeak-ng", f"{synthesizer}, with its data")]
     if voices is None:
-        return [*found, warning("voices", "the engine listed none in time", "run talk doctor again")]
+        return [*found, warning("voices", "the engine did not list its voices in time", "run talk doctor again")]
     if not voices:
         step = "sudo apt-get install --reinstall -y espeak-ng-data"
-        return [*found, warning("voices", "the engine has none", step)]
-    return [*found, ok("voices", f"{len(voices)}, listed by 'talk voices'")]
+        return [*found, warning("voices", "the engine has no voices", step)]
+    return [*found, ok("voices", f"{len(voices)} voices; list them with: talk voices")]
 
 
 def check_neural(
@@ -241,10 +241,10 @@ def _check_files(env: Mapping[str, str] | None) -> Iterator[Finding]:
         (voice, error_message), *others = invalid
         message, step = _split_step(error_message)
         names = join_names([each for each, _ in others])
-        more = f"; and something is wrong with {names}" if others else ""
+        more = f"; also faulty: {names}" if others else ""
         yield warning(_FILES_CHECK, f"{voice}: {message}{more}", step)
     elif valid:
-        yield ok(_FILES_CHECK, f"as they should be: {join_names(valid)}")
+        yield ok(_FILES_CHECK, f"complete and safe: {join_names(valid)}")
 
 
 def _find_package_fault(env: Mapping[str, str]) -> tuple[str, str] | None:
@@ -266,16 +266,16 @@ def _find_package_fault(env: Mapping[str, str]) -> tuple[str, str] | None:
 
 def _with_version(package: str) -> str:
     """Return the name and version of an installed package."""
-    return f"{package} {installed_version(package) or 'of an unknown version'}"
+    return f"{package} {installed_version(package) or '(unknown version)'}"
 
 
 def _split_step(message: str) -> tuple[str, str]:
-    """Split an error message into the fault and the advice, which follows the last colon.
+    """Split an error message into the fault and the advice, which follows the last semicolon.
 
     The default advice is to choose another voice.
     """
-    what, colon, step = message.rpartition(": ")
-    return (what, step) if colon else (message, _CHOOSE_ESPEAK)
+    what, semicolon, step = message.rpartition("; ")
+    return (what, step.partition("it with: ")[2] or step) if semicolon else (message, _CHOOSE_ESPEAK)
 
 
 def _try_voice(used: str, options: EngineOptions, limit: float) -> VoiceTrial:
@@ -288,13 +288,13 @@ def _try_voice(used: str, options: EngineOptions, limit: float) -> VoiceTrial:
             if ended.outcome == protocol.OUTCOME_COMPLETED:
                 ended, _ = _speak(engine, used, SENTENCE_TEXT)
             if ended.outcome != protocol.OUTCOME_COMPLETED or ended.duration is None:
-                return VoiceTrial(fault=_split_step(ended.message or f"the sentence ended {ended.outcome}"))
+                return VoiceTrial(fault=_split_step(ended.message or "the sentence was not completed"))
             speed = ended.duration / (time.monotonic() - began)
             return VoiceTrial(load_s, speed, _memory_of(engine._process.pid))
     except EngineFailed as error:
         return VoiceTrial(fault=(explain_failure(error)[1], _CHOOSE_ESPEAK))
     except TimeoutError:
-        return VoiceTrial(fault=(f"it was not loaded, and had not spoken, after {limit:g} s", _CHOOSE_ESPEAK))
+        return VoiceTrial(fault=(f"loading and speaking took more than {limit:g} s", _CHOOSE_ESPEAK))
 
 
 def _speak(engine: PrivateEngine, voice: str, text: str) -> tuple[protocol.Ended, float | None]:
@@ -326,9 +326,9 @@ def judge_server_voices(voices: dict[str, Any]) -> list[Finding]:
     """
     for voice, each in voices.items():
         if each.get("state") == "failed":
-            step = f"see whether it still is so: talk set --voice {voice}"
-            return [warning(_NEURAL_CHECK, f"the server cannot speak by {voice}: {each.get('why')}", step)]
-    return [ok(_NEURAL_CHECK, f"of the server: {join_names(list(voices))}")] if voices else []
+            step = f"check whether this is still true: talk set --voice {voice}"
+            return [warning(_NEURAL_CHECK, f"the server cannot speak with the voice {voice}: {each.get('why')}", step)]
+    return [ok(_NEURAL_CHECK, f"the server's neural voices: {join_names(list(voices))}")] if voices else []
 
 
 def judge_trial(used: str, trial: VoiceTrial, server_voices: dict[str, Any] | None) -> Finding:
@@ -342,10 +342,10 @@ def judge_trial(used: str, trial: VoiceTrial, server_voices: dict[str, Any] | No
         if found.state == WARNING:
             return found  # the doctor could load the voice, but the server couldn't
     facts = [] if trial.load_s is None else [f"loaded in {trial.load_s:.1f} s"]
-    facts.append(f"makes a sentence {trial.speed:.1f} times as fast as it is heard")
-    facts += [] if trial.memory_bytes is None else [f"takes {trial.memory_bytes / 1e6:.0f} MB with its engine"]
+    facts.append(f"speaks {trial.speed:.1f} times as fast as real time")
+    facts += [] if trial.memory_bytes is None else [f"uses {trial.memory_bytes / 1e6:.0f} MB of memory"]
     words += ", ".join(facts)
     if trial.speed < _MIN_REAL_TIME_FACTOR:
-        step = "choose a voice whose quality is low or x_low, or one of espeak's: talk set --voice en"
-        return warning(_NEURAL_CHECK, f"{words}: this machine is too slow for it, or too busy", step)
+        step = "choose a voice with the quality low or x_low, or an espeak voice: talk set --voice en"
+        return warning(_NEURAL_CHECK, f"{words}; this machine is too slow or too busy for this voice", step)
     return ok(_NEURAL_CHECK, words)

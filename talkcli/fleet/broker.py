@@ -88,21 +88,21 @@ def from_environment(environment: Mapping[str, str], *, insecure: bool = False) 
     """
     url = environment.get(URL, "")
     if not url:
-        raise UsageError(f"which broker? {URL} is not set: export {URL}=mqtts://broker.example")
+        raise UsageError(f"{URL} is not set; name your broker: export {URL}=mqtts://broker.example")
     host, port, tls = _parse_url(url)
     user, file, ca, cert, key = (environment.get(each) or None for each in (USER, PASSWORD_FILE, CA, CERT, KEY))
     password = _read_password(file) if file else None
     if password is not None and user is None:
-        raise UsageError(f"{PASSWORD_FILE} is set, and {USER} is not: whose password is it?")
+        raise UsageError(f"{PASSWORD_FILE} is set, but {USER} is not; set {USER} to the name of the user")
     for name, value in ((CA, ca), (CERT, cert), (KEY, key)):
         if value and not tls:
-            raise UsageError(f"{name} means nothing without TLS: {URL} begins with mqtts:// then")
+            raise UsageError(f"{name} needs TLS; change {URL} to an address that begins with mqtts://")
     if key and not cert:
-        raise UsageError(f"{KEY} is set, and {CERT} is not: name the certificate, too")
+        raise UsageError(f"{KEY} is set, but {CERT} is not; set {CERT} to the file of the certificate")
     if password is not None and not (tls or insecure or is_local(host)):
         raise UsageError(
-            f"the password would go to {printable(host)} in clear text: write {URL}=mqtts://…, or give "
-            "--insecure where nobody can listen"
+            f"the password would be sent to {printable(host)} in clear text; use {URL}=mqtts://…, or add "
+            "--insecure if you trust the network"
         )
     return Broker(host, port, tls, user, password, ca, cert, key)
 
@@ -110,7 +110,7 @@ def from_environment(environment: Mapping[str, str], *, insecure: bool = False) 
 def require_paho() -> None:
     """Raise UsageError if paho-mqtt is not installed."""
     if find_spec("paho") is None:
-        raise UsageError(f"a fleet needs paho-mqtt: {install.command('paho-mqtt')}")
+        raise UsageError(f"a fleet needs paho-mqtt; install it with: {install.command('paho-mqtt')}")
 
 
 def client_user(broker: Broker) -> str:
@@ -128,7 +128,7 @@ def client_user(broker: Broker) -> str:
         except KeyError:
             name = f"uid-{os.getuid()}"
     if fault := topics.name_fault(name):
-        raise UsageError(f"the name '{printable(name)}' can't be in a topic, it {fault}: set {USER} to one that can")
+        raise UsageError(f"invalid user name '{printable(name)}': it {fault}; set {USER} to another name")
     return name
 
 
@@ -143,22 +143,22 @@ def _parse_url(url: str) -> tuple[str, int, bool]:
     try:
         parts = urlsplit(url)
     except ValueError:  # the original message shows the URL, which may contain a password
-        raise UsageError(f"{URL} is no URL: write mqtts://HOST or mqtt://HOST") from None
+        raise UsageError(f"{URL} is not a valid URL; use mqtts://HOST or mqtt://HOST") from None
     if parts.scheme not in _SCHEMES:
         raise UsageError(
-            f"{URL} is no broker's URL: write mqtts://HOST or mqtt://HOST, with :PORT if it is not the usual"
+            f"{URL} is not the URL of a broker; use mqtts://HOST or mqtt://HOST, with :PORT if it isn't the default"
         )
     if parts.username is not None or parts.password is not None:
-        raise UsageError(f"{URL} holds a user or a password: set {USER} and {PASSWORD_FILE}, and leave them out there")
+        raise UsageError(f"{URL} must not contain a user or a password; set {USER} and {PASSWORD_FILE} instead")
     tls, default_port = _SCHEMES[parts.scheme]
     try:
         port = parts.port
     except ValueError:
-        raise UsageError(f"{URL} has a port that is none: a number from 1 to 65535") from None
+        raise UsageError(f"{URL} has an invalid port; it must be a number from 1 to 65535") from None
     if not parts.hostname or port == 0:
-        raise UsageError(f"{URL} names no host and port: write {parts.scheme}://HOST or {parts.scheme}://HOST:PORT")
+        raise UsageError(f"{URL} has no valid host or port; use {parts.scheme}://HOST or {parts.scheme}://HOST:PORT")
     if parts.path not in ("", "/") or parts.query or parts.fragment:
-        raise UsageError(f"{URL} has more than a host and a port: write {parts.scheme}://{printable(parts.netloc)}")
+        raise UsageError(f"{URL} must only have a host and a port; use {parts.scheme}://{printable(parts.netloc)}")
     return parts.hostname, port or default_port, tls
 
 
@@ -170,7 +170,7 @@ def _read_password(path: str) -> str:
         raise UsageError(f"{PASSWORD_FILE}: {_file_error(path, error)}") from error
     if not password or len(password) > _MAX_PASSWORD_BYTES:
         raise UsageError(
-            f"{PASSWORD_FILE}: {printable(path)} is {'too long' if password else 'empty'}: it holds the password alone"
+            f"{PASSWORD_FILE}: {printable(path)} is {'too long' if password else 'empty'}; put only the password in it"
         )
     try:
         return password.decode()
@@ -189,12 +189,12 @@ def is_local(host: str) -> bool:
 
 
 def _no_passphrase() -> str:
-    raise UsageError("the key has a passphrase, and nobody is there to type it: take a key without one")
+    raise UsageError("the key has a passphrase, which talk can't ask for; use a key without one")
 
 
 def _file_error(path: str | None, error: Exception) -> str:
     """Return a message that explains why a file can't be used."""
     if isinstance(error, ssl.SSLError):
-        return f"{printable(str(path))} is not what it should be: {error.reason or error}"
+        return f"{printable(str(path))} is not a valid certificate or key: {error.reason or error}"
     words = error.strerror if isinstance(error, OSError) else str(error)
     return f"{printable(str(path))}: {words}"

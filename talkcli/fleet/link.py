@@ -155,13 +155,13 @@ class Link:
                 self._broker.host, self._broker.port, KEEPALIVE_S, clean_start=True, properties=properties
             )
         except ssl.SSLCertVerificationError as error:
-            words = f"the broker's certificate is not to be trusted: {error.verify_message} ({url})"
-            raise AccessDenied(f"{words}; TALK_MQTT_CA names the file of the CA that it is of") from error
+            words = f"the broker's certificate is not trusted: {error.verify_message} ({url})"
+            raise AccessDenied(f"{words}; set TALK_MQTT_CA to the file of the CA that issued it") from error
         except ssl.SSLError as error:
-            raise ServerUnavailable(f"no TLS with the broker at {url}: {error.reason or error}") from error
+            raise ServerUnavailable(f"TLS with the broker at {url} failed: {error.reason or error}") from error
         except (OSError, ValueError) as error:  # ValueError means that the host name is invalid
             why = error.strerror if isinstance(error, OSError) else None
-            raise ServerUnavailable(f"no broker at {url}: {why or error}") from error
+            raise ServerUnavailable(f"can't connect to the broker at {url}: {why or error}") from error
         found = self._paho.socket()
         if isinstance(found, socket.socket):  # there is no socket if the broker has already closed the connection
             self._socket = found
@@ -290,21 +290,21 @@ class Link:
         if answer is None and self._broker.tls and (self._alert or self.ended):
             # With TLS 1.3, the client finishes its handshake before the broker checks the client's certificate. If the
             # broker then closes the connection, its alert may get lost.
-            why = self._alert or "it ends the connection before it answers"
+            why = self._alert or "it closed the connection without an answer"
             which = "the certificate of this client" if self._broker.cert else "a client without a certificate"
-            words = f"the broker at {url} does not let {which} in: {why}"
-            return AccessDenied(f"{words}; TALK_MQTT_CERT and TALK_MQTT_KEY name one that it takes")
+            words = f"the broker at {url} rejected {which}: {why}"
+            return AccessDenied(f"{words}; set TALK_MQTT_CERT and TALK_MQTT_KEY to a certificate that it accepts")
         if answer is None:
-            why = self.ended or f"nothing in {LOGIN_LIMIT_S:g} s"
-            return ServerUnavailable(f"the broker at {url} does not answer: {why}")
+            why = f": {self.ended}" if self.ended else f" within {LOGIN_LIMIT_S:g} s"
+            return ServerUnavailable(f"the broker at {url} did not answer{why}")
         if answer.value in _REASONS_DENIED:
-            who = "a client without a user" if self._broker.user is None else f"'{printable(self._broker.user)}'"
-            words = f"the broker at {url} does not let {who} in: {answer}"
-            return AccessDenied(f"{words}; TALK_MQTT_USER and TALK_MQTT_PASSWORD_FILE say who you are")
+            who = "an anonymous user" if self._broker.user is None else f"'{printable(self._broker.user)}'"
+            words = f"the broker at {url} rejected the login of {who}: {answer}"
+            return AccessDenied(f"{words}; set TALK_MQTT_USER and TALK_MQTT_PASSWORD_FILE for your login")
         if answer.value == _REASON_UNSUPPORTED_PROTOCOL:
-            return ProtocolMismatch(f"the broker at {url} does not speak MQTT 5: mosquitto does from 1.6 on")
+            return ProtocolMismatch(f"the broker at {url} does not support MQTT 5; use mosquitto 1.6 or newer")
         if answer.is_failure or self.ended:
-            return ServerUnavailable(f"the broker at {url} refuses: {answer if answer.is_failure else self.ended}")
+            return ServerUnavailable(f"the broker at {url} refused: {answer if answer.is_failure else self.ended}")
         return None
 
     def _on_connect(
@@ -318,7 +318,7 @@ class Link:
 
     def _on_disconnect(self, _client: paho.Client, _data: object, flags: object, code: ReasonCode, _: object) -> None:
         said = getattr(flags, "is_disconnect_packet_from_server", False)
-        self.ended = self.ended or (f"the broker ended the connection: {code}" if said else "the broker went away")
+        self.ended = self.ended or (f"the broker disconnected: {code}" if said else "the connection was lost")
         self._socket = None  # paho closes it
 
     def _on_message(self, _client: paho.Client, _data: object, message: paho.MQTTMessage) -> None:

@@ -39,7 +39,7 @@ def name_fault(name: str) -> str | None:
     """Return the reason why a robot, group or user name is invalid, or None if it is valid."""
     if _NAME_PATTERN.fullmatch(name):
         return None
-    return f"must be 1 to {MAX_NAME_CHARS} of A-Z a-z 0-9 . _ -, the first of them a letter or a digit"
+    return f"must have 1 to {MAX_NAME_CHARS} characters (A-Z a-z 0-9 . _ -), and begin with a letter or a digit"
 
 
 def robot(name: str, *levels: str) -> str:
@@ -114,7 +114,7 @@ def access_rules(
             other robots doesn't match its topic.
     """
     lines = [
-        "# Robots: each logs in by its own name, %u, and is heard under that alone.",
+        "# Robots: each robot logs in with its own name (%u), and may only publish under this name.",
         *(f"pattern read {robot('%u', level, '+')}" for level in REQUEST_LEVELS),
         f"pattern read {group('+', REQUEST, '+')}",
         f"pattern readwrite {robot('%u', PRESENCE)}",
@@ -128,7 +128,7 @@ def access_rules(
     for each in operators:
         lines += [
             "",
-            "# An operator, who may ask every robot, and hear what each says: such lines for each login.",
+            "# An operator may send requests to all robots and read their messages. Add these lines for each operator.",
             f"user {each}",
             *(f"topic write {robot('+', level, each)}" for level in REQUEST_LEVELS),
             f"topic write {group('+', REQUEST, each)}",
@@ -140,7 +140,7 @@ def access_rules(
     if homeassistant:
         lines += [
             "",
-            "# Home Assistant, which may have every robot speak and be silent; its own topics are its own.",
+            "# Home Assistant may let each robot speak, cancel its sentences, and use all of its own topics.",
             f"user {HOMEASSISTANT}",
             f"topic write {robot('+', PLAIN_SAY, HOMEASSISTANT)}",
             f"topic write {robot('+', PLAIN_CANCEL, HOMEASSISTANT)}",
@@ -149,6 +149,6 @@ def access_rules(
             f"topic readwrite {HOMEASSISTANT}/#",
         ]
     if homeassistant and name is not None and "." in name:
-        words = "# A robot of which Home Assistant is told elsewhere: no level of a topic there may have a dot."
+        words = "# This robot has another topic for Home Assistant, which allows no dot in a name."
         lines += ["", words, f"user {name}", f"topic write {homeassistant_device(name)}"]
     return "\n".join(lines)

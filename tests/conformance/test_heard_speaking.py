@@ -145,7 +145,7 @@ def test_row_41_without_a_player_a_goal_is_aborted_until_one_is_installed(
 ) -> None:
     env = {"PATH": str(tmp_path), "PULSE_SERVER": f"unix:{tmp_path}/none"}  # aplay does not use it here
     talk = voice.serve(make_talk, sink, env=env)
-    _assert_aborted(talk, "no_player", "no player found: install alsa-utils (aplay)", "pulseaudio-utils (pacat)")
+    _assert_aborted(talk, "no_player", "no player found; install alsa-utils (aplay)", "pulseaudio-utils (pacat)")
     aplay = shutil.which("aplay")
     assert aplay
     (tmp_path / "aplay").symlink_to(aplay)
@@ -174,7 +174,7 @@ def test_row_41_without_a_device_the_players_line_is_told_within_a_second(
     [
         ("aplay", "aplay: audio open error: No such file or directory"),
         ("pacat", "No such entity"),
-        ("pulse", 'the sound server has no sink "nonesuch": see pactl list short sinks'),
+        ("pulse", 'the sound server has no sink "nonesuch"; list them with: pactl list short sinks'),
     ],
 )
 def test_row_41_a_device_of_another_name_is_told(make_talk: MakeTalk, sink: Sink, player: str, line: str) -> None:

@@ -134,9 +134,13 @@ def test_a_driver_is_stepped_to_the_end_of_each_sentence_and_reports_words(drive
     ("more", "reason", "message"),
     [
         ({"pitch": 80}, "bad_option", "the driver dummy cannot set pitch to 80: unknown property pitch"),
-        ({"lead_in": 400}, "bad_option", "this driver plays by itself: it can't be given a lead-in"),
+        ({"lead_in": 400}, "bad_option", "this driver plays the sound itself, so lead_in can't be used"),
         ({"voice": "dummy.voice9"}, "unknown_voice", "'dummy.voice2'"),
-        ({"voice": "piper/en_US-joe-medium"}, "unknown_voice", '"piper/en_US-joe-medium" is a neural voice, and the'),
+        (
+            {"voice": "piper/en_US-joe-medium"},
+            "unknown_voice",
+            '"piper/en_US-joe-medium" is a neural voice, which the driver',
+        ),
     ],
 )
 def test_an_option_that_the_driver_lacks_fails_the_goal(
@@ -240,7 +244,7 @@ def test_a_driver_that_never_ends_shows_no_sign_of_life_after_a_while() -> None:
         assert alive == 1
         assert _processor(engine.process.pid) < 0.5, "it spins"
         engine.process.kill()
-        assert engine.errors() == "the driver did not end what takes less than 1 s\n"
+        assert engine.errors() == "the driver did not finish a text that takes less than 1 s\n"
 
 
 def _processor(pid: int) -> float:
@@ -275,24 +279,28 @@ espeak.load_library = without_english
     [
         (
             {"before": NO_LIBRARY + "sys.modules['espeakng_loader'] = None"},
-            ["libespeak-ng is missing (libespeak-ng.so.1: ", f"): {install.espeak_library()}"],
+            ["libespeak-ng is missing (libespeak-ng.so.1: ", f"); install it with: {install.espeak_library()}"],
             {"permanent": True},
         ),
         (
             {"before": WITHOUT_ENGLISH},
-            ['the driver "talk_espeak" cannot be started: UnknownVoice: en'],
+            ['the driver "talk_espeak" could not be started: UnknownVoice: en'],
             {"permanent": False},
         ),
         (
             {"before": "sys.modules['pyttsx3'] = None"},
-            ["pyttsx3 is missing (", f"): {install.command('pyttsx3')}"],
+            ["pyttsx3 is missing (", f"); install it with: {install.command('pyttsx3')}"],
             {"permanent": True},
         ),
-        ({"driver": "parrot"}, ['unknown driver "parrot": there are ', "dummy"], {"usage_error": True}),
-        ({"driver": "nsss"}, ["the driver \"nsss\" cannot be loaded: No module named 'objc'"], {"usage_error": True}),
+        ({"driver": "parrot"}, ['unknown driver "parrot"; available drivers: ', "dummy"], {"usage_error": True}),
+        (
+            {"driver": "nsss"},
+            ["the driver \"nsss\" could not be loaded: No module named 'objc'"],
+            {"usage_error": True},
+        ),
         (
             {"driver": "slow", "before": SLOW_DRIVER + "\nDriver.iterate = lambda self: None"},
-            ['the driver "slow" cannot be stepped', "leave --driver out"],
+            ['the driver "slow" cannot be used', "leave out --driver"],
             {"usage_error": True},
         ),
         (
@@ -302,7 +310,7 @@ espeak.load_library = without_english
         ),
         (
             {"driver": "dummy", "voice": "piper/en_US-joe-medium"},
-            ['"piper/en_US-joe-medium" is a neural voice, and the driver "dummy" has none: leave --driver out'],
+            ['is a neural voice, which the driver "dummy" does not support; leave out --driver'],
             {"reason": "unknown_voice", "permanent": True, "usage_error": True},
         ),
     ],

@@ -157,19 +157,19 @@ def test_kept_halves_that_are_damaged_are_made_anew(tmp_path: Path, damage: byte
 @pytest.mark.parametrize(
     ("content", "beside", "why"),
     [
-        (b"", {}, "is no ONNX model"),
-        (tiny_voice.model()[:-200], {}, "is cut short"),
-        (tiny_voice.model(nodes=tiny_voice.node("Evil", ["input"], "x", domain="evil")), {}, "operators of its own"),
+        (b"", {}, "is not an ONNX model"),
+        (tiny_voice.model()[:-200], {}, "is truncated"),
+        (tiny_voice.model(nodes=tiny_voice.node("Evil", ["input"], "x", domain="evil")), {}, "custom operators"),
         (tiny_voice.model(weights=tiny_voice.weight("w", [1], 1, more=OUTSIDE)), {}, "its weights in another file"),
-        (tiny_voice.model(loud=float("nan")), {}, "what is no number"),
-        (tiny_voice.model(lasting=1e4), {}, "more than 200 frames of 5 sounds"),
-        (tiny_voice.model(lasting=1e12), {}, "there is no memory for it; end another program"),
-        (tiny_voice.model(hop=5000), {}, "none of Piper's models .it makes [0-9]+ samples of"),
+        (tiny_voice.model(loud=float("nan")), {}, "not numbers"),
+        (tiny_voice.model(lasting=1e4), {}, "more than 200 frames for 5 phonemes"),
+        (tiny_voice.model(lasting=1e12), {}, "there is not enough memory; end another program"),
+        (tiny_voice.model(hop=5000), {}, "not a Piper model .it makes [0-9]+ samples for"),
         (tiny_voice.model(sounds=5), {}, "do not belong together"),
-        (tiny_voice.model(speakers=3), {}, "do not belong together .one has several speakers"),
-        (tiny_voice.model(), {"speakers": 3}, "do not belong together .one has several speakers"),
-        (tiny_voice.model(nodes=tiny_voice.node("NoSuchThing", ["pre"], "x")), {}, "cannot be loaded"),
-        (tiny_voice.model(weights=tiny_voice.field(12, b"\x0a\x01x")), {}, "cannot be loaded|cannot be run"),
+        (tiny_voice.model(speakers=3), {}, "do not belong together .only one of them has several speakers"),
+        (tiny_voice.model(), {"speakers": 3}, "do not belong together .only one of them has several speakers"),
+        (tiny_voice.model(nodes=tiny_voice.node("NoSuchThing", ["pre"], "x")), {}, "could not be loaded"),
+        (tiny_voice.model(weights=tiny_voice.field(12, b"\x0a\x01x")), {}, "could not be loaded|cannot be run"),
     ],
 )
 def test_a_bad_model_says_why_and_what_to_do(tmp_path: Path, content: bytes, beside: dict[str, Any], why: str) -> None:
@@ -177,14 +177,14 @@ def test_a_bad_model_says_why_and_what_to_do(tmp_path: Path, content: bytes, bes
     with pytest.raises(VoiceFileError, match=why) as caught:
         _loaded(path)
     assert str(path) in str(caught.value)
-    assert "get" in str(caught.value) or "end another program" in str(caught.value)
+    assert "download" in str(caught.value) or "end another program" in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_a_file_that_is_larger_than_any_model_is_not_read(tmp_path: Path) -> None:
     path = tiny_voice.put(tmp_path / "v", "a")
     os.truncate(path, 1 << 40)  # a hole: it takes no room on the disk
-    with pytest.raises(VoiceFileError, match="larger than any of Piper's models: get the voice anew"):
+    with pytest.raises(VoiceFileError, match="larger than any Piper model; download the voice again"):
         _loaded(path)
 
 
@@ -212,7 +212,7 @@ def test_inference_without_memory_says_so_and_the_model_can_be_run_again() -> No
     path = str(real_voice())
     code = _WITH_LITTLE_MEMORY.format(arguments=[path])
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
-    words = f"{path} cannot be spoken with: there is no memory for it; end another program"
+    words = f"{path} cannot be used: there is not enough memory; end another program"
     assert done.stdout.splitlines() == [words, "5"]
 
 

@@ -134,9 +134,9 @@ def test_a_speaker_is_named_behind_the_voice(place: Path, engine: Spawned) -> No
     for number, voice in enumerate(["piper/many", "piper/many#2", "piper/many#p1"]):
         assert engine.spoken("a", f"g{number}", voice=voice).outcome == protocol.OUTCOME_COMPLETED
     message = _failed(engine.spoken("a", "g8", voice="piper/many#3"), "unknown_voice")
-    assert 'it has no speaker "3": it has 3 speakers, 0 to 2' in message
+    assert 'no speaker "3"; the voice has 3 speakers, 0 to 2' in message
     message = _failed(engine.spoken("a", "g9", voice=f"{VOICE}#1"), "unknown_voice")
-    assert 'it has no speaker "1": it has one speaker' in message
+    assert 'no speaker "1"; the voice has one speaker' in message
 
 
 def test_a_voice_that_is_put_there_while_it_runs_is_found(place: Path, engine: Spawned) -> None:
@@ -160,7 +160,7 @@ def test_the_json_of_a_voice_is_read_again_with_each_load(place: Path, engine: S
     (place / "changes.onnx.json").write_text(json.dumps({"audio": {}}))
     assert engine.spoken("a", "g2", voice="piper/changes").outcome == protocol.OUTCOME_COMPLETED
     engine.send(protocol.DropVoice("piper/changes"))
-    assert "does not describe a voice" in _failed(engine.spoken("a", "g3", voice="piper/changes"))
+    assert "does not describe a Piper voice" in _failed(engine.spoken("a", "g3", voice="piper/changes"))
 
 
 def test_unknown_sounds_are_left_out_and_a_text_of_nothing_else_fails(place: Path, engine: Spawned) -> None:
@@ -177,7 +177,7 @@ def test_unknown_sounds_are_left_out_and_a_text_of_nothing_else_fails(place: Pat
     assert len(told) == 4
     assert told == sorted(told)
     message = _failed(engine.spoken("See! " * 12, "g2", voice="piper/few"))
-    assert "few.onnx.json has no number for a sound of the text (" in message
+    assert "few.onnx.json has no id for a phoneme of the text (" in message
 
 
 # -- without the extra
@@ -201,7 +201,7 @@ def test_without_the_extra_a_voice_says_what_to_install(tmp_path: Path, package:
     before = WITHOUT.format(names=[package])
     with _engine(tmp_path / "voices", before=before) as engine:
         message = _failed(engine.spoken(TEXT, voice=VOICE), "unknown_voice")
-        assert f"{VOICE} is listed, but it cannot be loaded" in message
+        assert f"{VOICE} cannot be loaded" in message
         assert install.neural() in message
         assert engine.spoken("yes", "g2").outcome == protocol.OUTCOME_COMPLETED
     with _engine(tmp_path / "voices", before=before, voice=VOICE) as engine:
@@ -216,11 +216,19 @@ def test_without_the_extra_a_voice_says_what_to_install(tmp_path: Path, package:
 #: Faults of a voice's files: the model, the entries of its JSON, and the words of the error. Models that are refused
 #: when they are loaded are in `test_inference.py`.
 WRONG: dict[str, tuple[bytes, dict[str, Any], str]] = {
-    "no json": (tiny_voice.model(), {}, "wrong.onnx.json is not there: it belongs to the model"),
-    "cut short": (tiny_voice.model()[:-300], {}, "is cut short, or no ONNX model: get the voice anew"),
-    "silent": (tiny_voice.model(loud=0.0), {}, "makes no sound of a text: get the voice anew"),
-    "unknown language": (tiny_voice.model(), {"voice": "tlh"}, 'no voice "tlh", which knows its sounds: get the voice'),
-    "writable": (tiny_voice.model(), {}, "wrong.onnx can be written by others, who could change the voice: chmod go-w"),
+    "no json": (tiny_voice.model(), {}, "wrong.onnx.json does not exist; download it from the source of the model"),
+    "truncated": (tiny_voice.model()[:-300], {}, "is truncated, or not an ONNX model; download the voice again"),
+    "silent": (tiny_voice.model(loud=0.0), {}, "made no sound from a text; download the voice again"),
+    "unknown language": (
+        tiny_voice.model(),
+        {"voice": "tlh"},
+        'no voice "tlh", which this voice needs for its phonemes; download the voice',
+    ),
+    "writable": (
+        tiny_voice.model(),
+        {},
+        "wrong.onnx can be changed by other users, which is unsafe; fix it with: chmod go-w",
+    ),
 }
 
 
@@ -276,7 +284,7 @@ def test_a_machine_without_memory_for_a_model_says_so_and_speaks_on(real: dict[s
     with Spawned(target, environment=real) as engine:
         with _little_memory(engine, 280 << 20):
             message = _failed(engine.spoken(TEXT, "g1", voice=REAL_VOICE))
-            assert "there is no memory for it; end another program" in message
+            assert "there is not enough memory; end another program" in message
             assert "en_US-joe-medium.onnx" in message
             assert engine.spoken("yes", "g2").outcome == protocol.OUTCOME_COMPLETED
         assert engine.spoken("a", "g3", voice=REAL_VOICE).outcome == protocol.OUTCOME_COMPLETED
@@ -317,7 +325,7 @@ def test_little_memory_ends_a_sentence_once_and_the_next_is_espeaks(tmp_path: Pa
             assert megabytes > 300, "so much it takes"
         else:
             message = _failed(ended)
-            assert "there is no memory for it; end another program" in message or install.neural() in message
+            assert "there is not enough memory; end another program" in message or install.neural() in message
         assert engine.spoken(TEXT, "g2").outcome == protocol.OUTCOME_COMPLETED
 
 
@@ -509,7 +517,7 @@ def test_voices_are_loaded_one_at_a_time_beside_the_speech_and_told_once_each(pl
         loaded = [engine.until(protocol.VoiceLoaded) for _ in range(3 - len(_loaded(engine)))]
         assert len(loaded) < 3, "some came while it spoke"
     assert [each.voice for each in _loaded(engine)] == ["piper/second", VOICE, "piper/nobody"]
-    assert [each.error for each in _loaded(engine)] == [None, None, "piper/nobody: its file is not there any more"]
+    assert [each.error for each in _loaded(engine)] == [None, None, "piper/nobody: its file no longer exists"]
 
 
 def test_a_voice_that_is_not_loaded_or_was_dropped_is_spoken_by_espeak_in_its_language(place: Path) -> None:
@@ -575,7 +583,7 @@ def test_a_load_that_hangs_is_given_up_and_the_next_voice_is_loaded(place: Path)
         engine.send(protocol.LoadVoice("piper/other"))
         engine.send(protocol.LoadVoice(VOICE))
         hung, loaded = engine.until(protocol.VoiceLoaded), engine.until(protocol.VoiceLoaded)
-        assert hung.error == "piper/other was not loaded within 0.6 s: are its files on a slow disk?"
+        assert hung.error == "piper/other was not loaded within 0.6 s; use a faster disk"
         assert (loaded.voice, loaded.error) == (VOICE, None)
         engine.leave()
         assert engine.process.wait(5) == 0, "a load that hangs keeps no process"

@@ -74,21 +74,21 @@ def test_a_good_player_gets_every_sample_and_underruns_are_no_error(player: Play
     [
         ("raise SystemExit(1)", None, "audio_device", "player exited with status 1"),
         (NO_MIXER, None, "audio_device", "aplay: audio open error: No such file or directory"),
-        ("", None, "audio_lost", "player ended before the sound did"),
-        (_plays("if taken > 8000: sys.exit(0)"), None, "audio_lost", "player ended before the sound did"),
+        ("", None, "audio_lost", "player exited too early"),
+        (_plays("if taken > 8000: sys.exit(0)"), None, "audio_lost", "player exited too early"),
         (_plays("if taken > 8000: sys.exit(3)"), None, "audio_lost", "player exited with status 3"),
         (_plays("if taken > 8000: os.kill(os.getpid(), 9)"), None, "audio_lost", "player was killed by SIGKILL"),
         (_plays(UNDERRUNS), None, "audio_lost", "aplay: write error: No such device"),
-        (SWALLOWS, None, "audio_lost", r"player ended \d\.\d s before the sound did"),
+        (SWALLOWS, None, "audio_lost", r"player ended \d\.\d s before the end of the sound"),
         (_plays(after='sys.exit("drain failed: Broken pipe")'), None, "audio_lost", "drain failed: Broken pipe"),
         (
             _plays("if taken > 8000: os.close(0); time.sleep(100)"),
-            *(None, "audio_lost", "player closed its input before the sound was over"),
+            *(None, "audio_lost", "player closed its input too early"),
         ),
-        (NEVER_READS, "FIRST_SOUND_LIMIT_S", "audio_stalled", "player took no sound for 0.4 s"),
+        (NEVER_READS, "FIRST_SOUND_LIMIT_S", "audio_stalled", "player accepted no sound for 0.4 s"),
         (
             _plays("if taken > 8000: time.sleep(100)"),
-            *("STALL_LIMIT_S", "audio_stalled", "player took no sound for 0.4 s"),
+            *("STALL_LIMIT_S", "audio_stalled", "player accepted no sound for 0.4 s"),
         ),
     ],
 )
@@ -102,7 +102,7 @@ def test_a_player_that_fails_fails_the_sentence_in_words(
 
 def test_hangs_in_drain(player: Player) -> None:
     reason, message = _failure(player.plays(after="time.sleep(100)"), DRAIN_LIMIT_S=0.3)
-    assert (reason, message) == ("audio_stalled", "player did not end 0.3 s after the sound")
+    assert (reason, message) == ("audio_stalled", "player did not exit within 0.3 s after the sound")
 
 
 #: Finds the device held by another, so many times.
@@ -167,14 +167,14 @@ def test_no_word_is_reported_while_the_player_stands_still(player: Player) -> No
 
 def test_a_program_that_cannot_be_run_is_named(tmp_path: Path) -> None:
     assert _failure("/nonexistent/player --rate {rate}") == ("no_player", 'player "/nonexistent/player" not found')
-    assert _failure("'unbalanced") == ("no_player", 'player command "\'unbalanced": no closing quotation')
+    assert _failure("'unbalanced") == ("no_player", 'invalid player command "\'unbalanced": no closing quotation')
     path = tmp_path / "garbage"
     path.write_bytes(b"\x7fELF garbage")
     path.chmod(0o755)
     reason, message = _failure(str(path))
     assert reason == "no_player"
     assert message is not None
-    assert message.startswith("garbage cannot be started: ")
+    assert message.startswith("garbage could not be started: ")
 
 
 def test_rate_and_device_reach_the_command(player: Player) -> None:
@@ -231,7 +231,7 @@ def test_no_player_at_all_says_what_to_install(tmp_path: Path) -> None:
         assert engine.until(protocol.Ready).player is None
         ended = engine.spoken(TEXT)
         assert ended.reason == "no_player"
-        wanted = "no player found: install alsa-utils (aplay), pulseaudio-utils (pacat) or pipewire-bin (pw-cat)"
+        wanted = "no player found; install alsa-utils (aplay), pulseaudio-utils (pacat) or pipewire-bin (pw-cat)"
         assert ended.message == wanted
 
 

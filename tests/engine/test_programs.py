@@ -88,7 +88,7 @@ def test_a_command_line_is_split_without_a_shell(there: There) -> None:
 @pytest.mark.parametrize(
     ("player", "words"),
     [
-        ("pacat", 'player "pacat" not found: install pulseaudio-utils'),
+        ("pacat", 'player "pacat" not found; install pulseaudio-utils'),
         ("sox -", 'player "sox" not found'),
         ("", "player command is empty"),
         ("  ", "player command is empty"),

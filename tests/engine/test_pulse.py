@@ -303,7 +303,7 @@ def test_a_server_is_reached_over_the_network_by_its_cookie(
         end = Rig().end()
         if cookie == "another":
             assert end is not None
-            assert (end.reason, str(end)) == ("audio_device", "the sound server lets nobody in: Access denied")
+            assert (end.reason, str(end)) == ("audio_device", "the sound server rejected the connection: Access denied")
         else:
             assert end is None
     finally:

@@ -149,13 +149,13 @@ def test_the_target_of_a_link_is_replaced_and_the_link_stays(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("", "'' is no name of a file"),
-        ("{0}/", "is no name of a file"),
-        ("{0}/a\0b", "is no name of a file"),
-        ("{0}", "{0} is a directory: name a file in it"),
-        ("{0}/missing/x.wav", "{0}/missing/x.wav cannot be written: there is no directory {0}/missing"),
+        ("", "'' is not a file name"),
+        ("{0}/", "is not a file name"),
+        ("{0}/a\0b", "is not a file name"),
+        ("{0}", "{0} is a directory; name a file in it"),
+        ("{0}/missing/x.wav", "{0}/missing/x.wav cannot be written: the directory {0}/missing does not exist"),
         ("{0}/file/x.wav", "{0}/file/x.wav cannot be written: Not a directory"),
-        ("{0}/socket", "{0}/socket is no file that can be replaced"),
+        ("{0}/socket", "{0}/socket is not a file that can be replaced"),
         ("{0}/loop", "{0}/loop cannot be written: Too many levels of symbolic links"),
         ("{0}/" + "n" * 256, "cannot be written: File name too long"),
     ],
@@ -256,7 +256,7 @@ def interrupt() -> Iterator[dict[int, int]]:
 def test_a_pipe_without_a_reader_is_waited_for_as_long_as_is_asked(tmp_path: Path, interrupt: dict[int, int]) -> None:
     path = tmp_path / "pipe"
     os.mkfifo(path)
-    with pytest.raises(TimeoutError, match="nobody has opened"):
+    with pytest.raises(TimeoutError, match="no program opened"):
         render("yes", str(path), timeout=0.1)
     with pytest.raises(Interrupted):
         render("yes", str(path), interrupt=interrupt)
@@ -301,7 +301,7 @@ def test_a_file_that_the_shell_has_open_for_our_output_is_not_replaced(tmp_path:
     with path.open("wb") as out, renders(str(path), out) as process:
         _, err = process.communicate(timeout=60)
     assert process.returncode == 1
-    assert f"{path} is no file that can be replaced" in err.decode()
+    assert f"{path} is not a file that can be replaced" in err.decode()
     assert path.read_bytes() == b""
 
 
@@ -376,7 +376,7 @@ def test_a_text_that_fails_leaves_the_file_as_it_was(
 def test_a_driver_that_plays_by_itself_is_refused(tmp_path: Path) -> None:
     error = failed("yes", tmp_path / "x.wav", driver="dummy")
     assert isinstance(error, UsageError)
-    assert str(error).startswith('the driver "dummy" cannot write a file')
+    assert str(error).startswith('the driver "dummy" cannot write files')
 
 
 def test_a_timeout_and_an_interrupt_end_it_at_once(tmp_path: Path, interrupt: dict[int, int]) -> None:
@@ -394,7 +394,7 @@ def test_a_timeout_and_an_interrupt_end_it_at_once(tmp_path: Path, interrupt: di
 @pytest.mark.parametrize(
     ("before", "reason", "words"),
     [
-        ("import time; time.sleep(60)", "engine_failed", "the engine was not ready after 0.3 s"),
+        ("import time; time.sleep(60)", "engine_failed", "the engine was not ready within 0.3 s"),
         ("raise RuntimeError('no tongue')", "engine_crashed", "RuntimeError: no tongue"),
         (
             "import os; from talkcli.engine.child import runner; runner.GoalRunner._speak = lambda *_: os.abort()",
@@ -404,7 +404,7 @@ def test_a_timeout_and_an_interrupt_end_it_at_once(tmp_path: Path, interrupt: di
         (
             "import time; from talkcli.engine.child import runner; runner.GoalRunner._speak = lambda *_: time.sleep(9)",
             "engine_hung",
-            'the engine gave no sign of life for 0.5 s while it spoke with the voice "en-us"',
+            'the engine did not respond for 0.5 s while it spoke with the voice "en-us"',
         ),
     ],
 )
@@ -497,13 +497,13 @@ def test_a_deadline_ends_a_conversation_in_which_there_is_much_to_hear() -> None
 @pytest.mark.usefixtures("scripted_process")
 def test_doctor_tells_silence_alike_before_and_after_the_start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(process, "HANG_LIMIT_S", 0.4)
-    hung = SentenceResult(State.ABORTED, "engine_hung", "the engine process said nothing for 0.4 s")
+    hung = SentenceResult(State.ABORTED, "engine_hung", "the engine process did not respond for 0.4 s")
     assert sentence.speak_by_engine("hang", EngineOptions(), 1.0, 20.0) == hung
     behaviour = tmp_path / "start"
     behaviour.write_text("hang")
     monkeypatch.setenv("SCRIPTED_START_FILE", str(behaviour))
     monkeypatch.setattr(process, "START_LIMIT_S", 0.3)
-    words = "the engine process said nothing for 0.3 s"
+    words = "the engine process did not respond for 0.3 s"
     assert voice.find_engine(EngineOptions()) == EngineReport(reason="engine_hung", message=words)
 
 
@@ -511,5 +511,5 @@ def test_doctor_tells_silence_alike_before_and_after_the_start(monkeypatch: pyte
 def test_doctor_tells_how_an_engine_process_died_and_that_a_sentence_takes_too_long() -> None:
     died = SentenceResult(State.ABORTED, "engine_crashed", "it was killed by SIGSEGV")
     assert sentence.speak_by_engine("silent-start crash", EngineOptions(), 1.0, 20.0) == died
-    late = SentenceResult(State.ABORTED, "engine_hung", "it was not over after 0.5 s")
+    late = SentenceResult(State.ABORTED, "engine_hung", "it did not end within 0.5 s")
     assert sentence.speak_by_engine("never-ends", EngineOptions(), 1.0, 0.5) == late

@@ -210,7 +210,7 @@ def test_a_process_that_takes_no_goal_is_ended(start: Start, monkeypatch: pytest
     thread = start()
     monkeypatch.setattr(_process(thread), "send", lambda _: False)
     thread.say("yes")
-    assert thread.until(EngineDied).message == "the engine takes no commands"
+    assert thread.until(EngineDied).message == "the engine does not accept commands"
     assert thread.until(protocol.Ended) == SPOKEN
 
 
@@ -311,7 +311,7 @@ def test_a_start_that_hangs_is_tried_again_and_fails_a_goal_each_time_after_a_wh
     monkeypatch.setenv("SCRIPTED_START_FILE", str(behaviour))
     thread = start(START_LIMIT_S=0.3, ENGINE_WAIT_LIMIT_S=0.5, RESTART_DELAYS_S=(0.0,))
     began = time.monotonic()
-    words = "the engine was not ready after 0.3 s"
+    words = "the engine was not ready within 0.3 s"
     assert thread.spoken("battery low") == protocol.Ended("g1", OUTCOME_FAILED, Reason.ENGINE_FAILED, words)
     assert time.monotonic() - began >= 3 * 0.3, "only a start that began after the time of patience costs a goal"
     assert thread.until(EngineMissing) == EngineMissing(words), "no goal is in hand: who hands them in has to end one"
@@ -476,7 +476,7 @@ def test_lines_that_are_too_many_are_counted_and_told_with_the_next(monkeypatch:
         now = 1000.0 + later
         engine._report_stderr(f"{later}")
     told = [
-        f"({100 + 1 - MAX_STDERR_LINES} lines were left out)",
+        f"({100 + 1 - MAX_STDERR_LINES} lines were omitted)",
         f"{STDERR_PERIOD_S}",
         f"{2 * STDERR_PERIOD_S}",
     ]

@@ -127,7 +127,9 @@ def test_a_file_that_everybody_may_write_is_refused(home: Path, where: str) -> N
     path = tiny_voice.put(home / "up" / "v", "a")
     wrong = {"model": path, "json": beside(path), "directory": path.parent, "above": path.parent.parent}[where]
     wrong.chmod(0o646 if wrong.is_file() else 0o757)
-    with pytest.raises(VoiceFileError, match=f"^{wrong} can be written by others, .*: chmod go-w {wrong}$"):
+    with pytest.raises(
+        VoiceFileError, match=f"^{wrong} can be changed by other users, .*; fix it with: chmod go-w {wrong}$"
+    ):
         open_checked(str(beside(path)), model=str(path))
     wrong.chmod(0o755)
     open_checked(str(beside(path)), model=str(path)).close()
@@ -140,7 +142,7 @@ def test_all_that_others_may_write_is_named_with_one_command_that_mends_it(home:
         each.chmod(0o777)
     with pytest.raises(VoiceFileError) as caught:
         read_description(str(path))
-    names, _, command = str(caught.value).partition(" can be written by others, who could change the voice: ")
+    names, _, command = str(caught.value).partition(" can be changed by other users, which is unsafe; fix it with: ")
     assert names == f"{wrong[0]}, {wrong[1]} and {wrong[2]}"
     subprocess.run(["/bin/sh", "-c", command], check=True)
     assert read_description(str(path)).rate == 22050
@@ -194,7 +196,7 @@ def test_a_file_that_only_the_users_own_group_may_write_is_the_users(
     if safe:
         open_checked(str(path)).close()
     else:
-        with pytest.raises(VoiceFileError, match=f"{path} and {path.parent} can be written by others"):
+        with pytest.raises(VoiceFileError, match=f"{path} and {path.parent} can be changed by other users"):
             open_checked(str(path))
 
 
@@ -213,7 +215,7 @@ def test_an_access_list_is_seen_behind_the_users_own_group(home: Path, monkeypat
         if error.errno != errno.ENOTSUP:
             raise
         pytest.skip("this file system has no access control lists")
-    with pytest.raises(VoiceFileError, match=f"{path} can be written by others"):
+    with pytest.raises(VoiceFileError, match=f"{path} can be changed by other users"):
         open_checked(str(path))
 
 
@@ -222,7 +224,7 @@ def test_a_directory_that_is_everybodys_may_be_above_if_it_is_sticky_but_not_hol
     (home / "up").chmod(0o1777)
     open_checked(str(path)).close()
     (home / "up" / "v").chmod(0o1777)
-    with pytest.raises(VoiceFileError, match="can be written by others"):
+    with pytest.raises(VoiceFileError, match="can be changed by other users"):
         open_checked(str(path))
 
 
@@ -240,7 +242,9 @@ def test_no_link_on_the_way_may_be_where_everybody_may_write(home: Path, what: s
     open_checked(str(way)).close()
     wrong = home / where
     wrong.chmod(0o777)
-    with pytest.raises(VoiceFileError, match=f"^{wrong} can be written by others, .*: chmod go-w {wrong}$"):
+    with pytest.raises(
+        VoiceFileError, match=f"^{wrong} can be changed by other users, .*; fix it with: chmod go-w {wrong}$"
+    ):
         open_checked(str(way))
 
 
@@ -252,7 +256,7 @@ def test_a_link_to_itself_and_a_pipe_are_refused_and_not_waited_for(home: Path) 
         open_checked(str(path))
     path.unlink()
     os.mkfifo(path, 0o600)
-    with pytest.raises(VoiceFileError, match="is no file"):
+    with pytest.raises(VoiceFileError, match="is not a regular file"):
         open_checked(str(path))
 
 
@@ -266,10 +270,10 @@ def test_another_users_file_or_link_is_refused(home: Path) -> None:
     link.symlink_to(path.parent)
     open_checked(str(link / path.name)).close()
     os.chown(link, 4711, -1, follow_symlinks=False)
-    with pytest.raises(VoiceFileError, match=rf"^{link} is another user's \(#4711\)"):
+    with pytest.raises(VoiceFileError, match=rf"^{link} belongs to another user \(#4711\)"):
         open_checked(str(link / path.name))
     os.chown(path, 4711, -1)
-    with pytest.raises(VoiceFileError, match=r"is another user's \(#4711\)"):
+    with pytest.raises(VoiceFileError, match=r"belongs to another user \(#4711\)"):
         open_checked(str(path))
 
 
@@ -277,19 +281,19 @@ def test_another_users_file_or_link_is_refused(home: Path) -> None:
     ("beside", "why"),
     [
         (b"", "Expecting value"),
-        (b"[" * 100_000, "does not describe"),
-        (b"[]", "does not describe"),
-        (b"{}", "it has no 'phoneme_id_map'"),
-        (b" " * (1 << 20) + b"{}", "it is too long"),
-        ({"phoneme_id_map": {"_": [0], "^": [1], "$": [2], "a": [3] * 5}}, "more than 4 numbers for a sound"),
-        ({"phoneme_type": "text"}, "its sounds are not libespeak-ng's, but 'text'"),
+        (b"[" * 100_000, "does not describe a Piper voice"),
+        (b"[]", "does not describe a Piper voice"),
+        (b"{}", "'phoneme_id_map' is missing"),
+        (b" " * (1 << 20) + b"{}", "the file is too long"),
+        ({"phoneme_id_map": {"_": [0], "^": [1], "$": [2], "a": [3] * 5}}, "more than 4 ids for a phoneme"),
+        ({"phoneme_type": "text"}, "its phoneme_type must be 'espeak', got 'text'"),
         ({"phoneme_id_map": {"a": [1]}}, "phoneme_id_map has no _"),
-        ({"phoneme_id_map": {"_": [0], "^": [-1], "$": [2]}}, "-1 is no number"),
-        ({"audio": {"sample_rate": 0}}, "0 samples a second"),
-        ({"audio": {"sample_rate": "22050"}}, "is no number"),
-        ({"num_speakers": 1 << 20}, "1048576 speakers"),
-        ({"inference": {"noise_scale": float("nan")}}, "nan is no factor"),
-        ({"inference": {"length_scale": 1e9}}, "is no factor"),
+        ({"phoneme_id_map": {"_": [0], "^": [-1], "$": [2]}}, "-1 is not a valid integer"),
+        ({"audio": {"sample_rate": 0}}, "unsupported sample rate: 0"),
+        ({"audio": {"sample_rate": "22050"}}, "is not a valid integer"),
+        ({"num_speakers": 1 << 20}, "too many speakers: 1048576"),
+        ({"inference": {"noise_scale": float("nan")}}, "nan is not a valid factor"),
+        ({"inference": {"length_scale": 1e9}}, "is not a valid factor"),
     ],
 )
 def test_a_json_of_no_voice_is_refused_in_words(home: Path, beside: bytes | dict[str, Any], why: str) -> None:
@@ -299,9 +303,9 @@ def test_a_json_of_no_voice_is_refused_in_words(home: Path, beside: bytes | dict
     with pytest.raises(VoiceFileError, match=why) as caught:
         read_description(str(path))
     assert str(told) in str(caught.value)
-    assert "get it anew" in str(caught.value)
+    assert "download it again" in str(caught.value)
     told.unlink()
-    with pytest.raises(VoiceFileError, match=r"a\.onnx\.json is not there: it belongs to the model"):
+    with pytest.raises(VoiceFileError, match=r"a\.onnx\.json does not exist; download it from the source of the model"):
         read_description(str(path))
 
 
@@ -398,5 +402,5 @@ def test_a_writer_that_fails_keeps_nothing_and_a_cache_that_is_gone_is_done_with
 def test_a_cache_that_others_may_read_or_write_is_none(home: Path, mode: int) -> None:
     (home / "c").mkdir()
     (home / "c").chmod(mode)
-    with pytest.raises(PermissionError, match="is not this user's alone"):
+    with pytest.raises(PermissionError, match="other users can access"):
         ModelCache(str(home / "c"))

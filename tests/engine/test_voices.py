@@ -226,19 +226,19 @@ def test_the_languages_that_a_code_or_an_english_name_means(wanted: str, expecte
 @pytest.mark.parametrize(
     ("wanted", "words"),
     [
-        ("piper/de", 'the voice "piper/de" could be piper/de_DE-eva-low or piper/de_DE-eva: name one of them'),
-        ("eva#2", 'the voice "eva#2" could be piper/de_DE-eva-low#2 or piper/de_DE-eva#2: name one of them'),
-        ("chinese", 'the voice "chinese" could be cmn or yue: name one of them'),
-        ("chinese+f3", 'the voice "chinese+f3" could be cmn+f3 or yue+f3: name one of them'),
+        ("piper/de", 'the voice "piper/de" could be piper/de_DE-eva-low or piper/de_DE-eva; write the whole name'),
+        ("eva#2", 'the voice "eva#2" could be piper/de_DE-eva-low#2 or piper/de_DE-eva#2; write the whole name'),
+        ("chinese", 'the voice "chinese" could be cmn or yue; write the whole name'),
+        ("chinese+f3", 'the voice "chinese+f3" could be cmn+f3 or yue+f3; write the whole name'),
         (
             "piper/",
-            'the voice "piper/" could be piper/de_DE-eva-low or piper/de_DE-eva or piper/en_US-joe-medium or 2 ',
+            'the voice "piper/" could be piper/de_DE-eva-low or piper/de_DE-eva or piper/en_US-joe-medium, or 2 ',
         ),
-        ("piper/en_US-jo-medium", "unknown voice \"piper/en_US-jo-medium\": did you mean 'piper/en_US-joe-medium'?"),
-        ("en_US-jo-medium", "unknown voice \"en_US-jo-medium\": did you mean 'en_US-joe-medium'?"),
-        ("piper/zzzzzzzzzzz", 'unknown voice "piper/zzzzzzzzzzz": put NAME.onnx and NAME.onnx.json into '),
-        ("nosuch", 'unknown voice "nosuch": "talk voices" lists them'),
-        ("joe+f3", "unknown voice \"joe+f3\": did you mean 'joe'?"),
+        ("piper/en_US-jo-medium", "unknown voice \"piper/en_US-jo-medium\"; did you mean 'piper/en_US-joe-medium'?"),
+        ("en_US-jo-medium", "unknown voice \"en_US-jo-medium\"; did you mean 'en_US-joe-medium'?"),
+        ("piper/zzzzzzzzzzz", 'unknown voice "piper/zzzzzzzzzzz"; put NAME.onnx and NAME.onnx.json into '),
+        ("nosuch", 'unknown voice "nosuch"; list all voices with: talk voices'),
+        ("joe+f3", "unknown voice \"joe+f3\"; did you mean 'joe'?"),
     ],
 )
 def test_a_voice_that_is_not_found_says_which_ones_it_could_be(wanted: str, words: str) -> None:
@@ -261,8 +261,8 @@ def test_a_voice_that_is_not_found_says_which_ones_it_could_be(wanted: str, word
 )
 def test_an_unknown_voice_is_told_what_comes_near(wanted: str, near: str) -> None:
     told = unknown_voice_message(wanted, listed())
-    assert told.startswith(f'unknown voice "{wanted}": did you mean ')
-    assert told.endswith('? "talk voices" lists them')
+    assert told.startswith(f'unknown voice "{wanted}"; did you mean ')
+    assert told.endswith("? list all voices with: talk voices")
     assert told.count(" or ") < 3
     assert repr(near) in told
 
@@ -278,10 +278,12 @@ def test_a_word_of_any_length_is_answered_shortly() -> None:
 
 def test_of_another_driver_and_another_system_no_neural_voice_is_proposed(monkeypatch: pytest.MonkeyPatch) -> None:
     told = unknown_voice_message("piper/en", (*listed(), *NEURAL), "dummy")
-    assert told == '"piper/en" is a neural voice, and the driver "dummy" has none: leave --driver out'
+    assert told == '"piper/en" is a neural voice, which the driver "dummy" does not support; leave out --driver'
     monkeypatch.setattr(sys, "platform", "darwin")
     told = unknown_voice_message("piper/en", (), "nsss")
-    assert told == '"piper/en" is a neural voice, which only talk on Linux has: choose one that "talk voices" lists'
+    assert (
+        told == '"piper/en" is a neural voice, which talk only supports on Linux; list other voices with: talk voices'
+    )
     assert "unknown voice" in unknown_voice_message("anna", (), "nsss")
 
 

@@ -350,7 +350,7 @@ def test_descriptors_that_something_else_has_used_up(home: str) -> None:
                 assert_within(time.monotonic() - began, 0.1, "status without descriptors")
             goal = wire.request("say", text="length=0", wait=True)["goal"]
             assert goal["state"] == "PENDING"
-            assert "cannot be started" in wire.request("status")["server"]["engine"]
+            assert "could not be started" in wire.request("status")["server"]["engine"]
             assert server.log.count("\n") - lines < 8, server.log
             resource.prlimit(pid, resource.RLIMIT_NOFILE, (most, most))
             assert len(greeted(clients)) == CLIENTS  # those that waited are let in, all of them

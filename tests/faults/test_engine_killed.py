@@ -49,7 +49,7 @@ CRASH, HANG = 0.5, 6.0
 SIGNALS = {
     KILL: ("engine_crashed", "the engine crashed: it was killed by SIGKILL", CRASH),
     SEGV: ("engine_crashed", "the engine crashed: it was killed by SIGSEGV", CRASH),
-    STOP: ("engine_hung", "the engine gave no sign of life for 3 s", HANG),
+    STOP: ("engine_hung", "the engine did not respond for 3 s", HANG),
 }
 #: A player that takes a sentence sooner than it plays it: the synthesis ends while the pipes hold the rest of the
 #: sound. If the engine process dies, only the server can end the processes that the shell has started.
@@ -257,7 +257,7 @@ def test_synthesis_without_progress(make_talk: MakeTalk, sink: Sink, tmp_path: P
             goal = send(talk, "this takes forever")
             following = send(talk, LOW, rate=RATE)
             assert await_end(talk, goal, limit + SLACK + 2) == "ABORTED"
-            assert_aborted(talk.goal(goal), "engine_hung", f"the engine gave no sign of life for {limit:g} s")
+            assert_aborted(talk.goal(goal), "engine_hung", f"the engine did not respond for {limit:g} s")
             assert talk.watcher.wait_for_terminal(following) == "SUCCEEDED"
         talk.stop()
         seconds = began(recording, render([LOW], rate=RATE)[0]) - asked
@@ -293,7 +293,8 @@ def test_process_that_cannot_be_reaped(make_talk: MakeTalk, sink: Sink, tmp_path
             talk, goal, limit = talks[what], goals[what], STUCK[what][1]
             assert await_end(talk, goal, limit + 2) == "ABORTED"
             ended = talk.watcher.arrived(talk.watcher.wait_for(goal, "ABORTED")) - hits[what]
-            assert_aborted(talk.goal(goal), "not_silent", "could not be")
+            words = "silence was not confirmed" if what == "stopped" else "the player could not be stopped"
+            assert_aborted(talk.goal(goal), "not_silent", words)
             assert_within(ended, limit, f"the end of a goal that was {what}")
         for what, talk in talks.items():
             player = players[what]

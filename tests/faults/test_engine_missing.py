@@ -62,7 +62,7 @@ MISSING = {
     "data": (
         "espeakng_loader",
         EMPTY,
-        "there is no espeak-ng data: sudo apt-get install -y libespeak-ng1 espeak-ng-data",
+        "espeak-ng data is missing; install it with: sudo apt-get install -y libespeak-ng1 espeak-ng-data",
     ),
 }
 
@@ -174,12 +174,12 @@ def test_a_moment_without_descriptors_costs_the_goal_whose_engine_was_killed_and
         with too_few_descriptors(talk):
             os.kill(engine_process(talk), signal.SIGKILL)
             assert talk.watcher.wait_for_terminal(first) == "ABORTED"
-            _await_engine(wire, "the engine process cannot be started: Too many open files")
+            _await_engine(wire, "the engine process could not be started: Too many open files")
             assert talk.watcher.wait_for_terminal(brief) == "RECALLED"  # a goal that waits for an engine has its time
             assert [wire.request("status", id=each)["goal"]["state"] for each in goals] == ["PENDING"] * len(goals)
         assert _ends(talk, goals) == [("SUCCEEDED", None)] * len(goals)
     assert (talk.goal(first)["reason"], talk.goal(brief)["reason"]) == ("engine_crashed", "expired")
-    assert talk.log.count("cannot be started") == 1, talk.log
+    assert talk.log.count("could not be started") == 1, talk.log
 
 
 def test_a_kill_in_a_goal_and_two_in_the_starts_behind_it_cost_one_goal(scripted: Talk) -> None:

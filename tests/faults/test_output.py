@@ -221,7 +221,7 @@ def test_a_muted_sentence_is_told_and_not_begun_if_it_must_be_audible(
     assert f"output   {card.name}, by pulse, volume " in talk.run("status", done.id).out
     done = talk.run("say", "--wait", "--audible", "--", LOW)
     goal = talk.goal(done.id)
-    assert_aborted(goal, "muted", f"the output is muted: {card.name}")
+    assert_aborted(goal, "muted", f"the output {card.name} is muted")
     assert (done.code, goal["spoken"], goal["duration"]) == (4, "", None)
 
 
@@ -254,7 +254,7 @@ def test_a_server_that_takes_no_more_clients_ends_the_sentence_in_words(make_tal
             each = crowd.enter_context(socket.socket(socket.AF_UNIX))
             each.connect(server.socket)
         done = talk.run("say", "--wait", "--", LOW)
-        assert_aborted(talk.goal(done.id), "audio_device", "the sound server lets nobody in")
+        assert_aborted(talk.goal(done.id), "audio_device", "the sound server rejected the connection")
     assert talk.run("say", "--wait", "--", LOW).code == 0
 
 

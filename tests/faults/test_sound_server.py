@@ -82,7 +82,7 @@ FAULTS = {
     "sink suspended": Fault(
         Sink.suspend,
         Sink.resume,
-        (End("audio_stalled", STALLED, "took no sound for 3 s"), End("audio_stalled", NEVER_TAKEN)),
+        (End("audio_stalled", STALLED, "accepted no sound for 3 s"), End("audio_stalled", NEVER_TAKEN)),
         (End("audio_stalled", SUSPENDED, "has suspended null"), End("audio_stalled", SUSPENDED)),
     ),
     "sink unloaded": Fault(
@@ -94,8 +94,8 @@ FAULTS = {
     "sound server SIGSTOP": Fault(
         Sink.freeze,
         Sink.thaw,
-        (End("audio_stalled", STALLED, "took no sound for 3 s"), End("audio_stalled", NEVER_TAKEN)),
-        (End("audio_stalled", STALLED, "pulse took no sound for 3 s"), End("audio_device", NO_ANSWER)),
+        (End("audio_stalled", STALLED, "accepted no sound for 3 s"), End("audio_stalled", NEVER_TAKEN)),
+        (End("audio_stalled", STALLED, "pulse accepted no sound for 3 s"), End("audio_device", NO_ANSWER)),
     ),
     "sound server SIGKILL": Fault(
         Sink.kill_server,
@@ -206,18 +206,18 @@ BROKEN = {
         f"(sleep 0.6; kill -KILL $$) & exec {PLAY}",
         End("audio_lost", LENGTH + SLACK, "player was killed by SIGKILL"),
     ),
-    "exits 0 too early": ("cat > /dev/null", End("audio_lost", SLACK, " s before the sound did")),
+    "exits 0 too early": ("cat > /dev/null", End("audio_lost", SLACK, " s before the end of the sound")),
     "never reads": (
         "exec sleep 100",
-        End("audio_stalled", FIRST_SOUND_LIMIT_S + SLACK, "player took no sound for 5 s"),
+        End("audio_stalled", FIRST_SOUND_LIMIT_S + SLACK, "player accepted no sound for 5 s"),
     ),
     "reads a byte at a time": (
         "while dd bs=1 count=1 of=/dev/null; do sleep 0.3; done 2> /dev/null",
-        End("audio_stalled", STALL_LIMIT_S + SLACK, "player took no sound for 3 s"),
+        End("audio_stalled", STALL_LIMIT_S + SLACK, "player accepted no sound for 3 s"),
     ),
     "hangs in drain": (
         f"{PLAY}; exec sleep 100",
-        End("audio_stalled", LENGTH + DRAIN_LIMIT_S + SLACK, "player did not end 3 s after the sound"),
+        End("audio_stalled", LENGTH + DRAIN_LIMIT_S + SLACK, "player did not exit within 3 s after the sound"),
     ),
 }
 #: The slowest of the players. The others are tested side by side, as the engine waits for some until a limit.

@@ -135,7 +135,7 @@ def test_path_without_players_is_a_clear_error_and_no_silence(home: str) -> None
         began = time.monotonic()
         done = run([*TALK, "say", "--wait", "--", "battery low"], env)
         assert done.code == 4
-        assert "no player found: install alsa-utils (aplay)" in done.err
+        assert "no player found; install alsa-utils (aplay)" in done.err
         assert time.monotonic() - began < 5
         assert run([*TALK, "status"], env).code == 0
 

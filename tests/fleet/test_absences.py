@@ -81,7 +81,7 @@ def test_a_broker_that_is_killed_in_mid_sentence_costs_no_result(robot: Robot) -
         robot.talk.watcher.wait_for("mine", "ACTIVE")
         robot.broker.kill()
         assert robot.talk.run("say", "one of its own").code == 0
-        robot.bridge.await_log("no broker")  # it has tried to come back
+        robot.bridge.await_log("can't connect to the broker")  # it has tried to come back
         robot.broker.start()
         with limits():
             up = time.monotonic()
@@ -131,7 +131,7 @@ def test_a_server_that_is_killed_is_told_at_once_and_so_is_the_next(robot: Robot
         assert without.arrived - killed < KILLED
         done = robot.desk("say", "hello")
         assert (done.code, done.out) == (3, ""), done
-        assert "anna has no talk server at this moment: nothing was sent" in done.err
+        assert "anna has no running talk server, so nothing was sent" in done.err
         robot.talk.start_server()
         listener.await_message(lambda each: robot.is_online(each) and each.json["server"]["pid"] == robot.talk.pid)
     assert robot.desk("say", "--wait", "back").code == 0
@@ -218,7 +218,7 @@ def test_a_robot_is_waited_for_no_longer(broker: Broker, robot: str, line: str, 
 
 def assert_ends(younger: Robot) -> None:
     log = younger.bridge.log if younger.bridge.wait(BACK) == 11 else "it did not end with 11"
-    assert "another bridge is 'anna' already" in log
+    assert "another bridge already uses the name 'anna'" in log
     assert "Traceback" not in log
 
 
@@ -242,7 +242,7 @@ def test_the_younger_of_two_bridges_ends_and_the_older_goes_on(robot: Robot, mak
 def test_of_two_bridges_that_find_the_broker_together_the_younger_ends(robot: Robot, make_robot: MakeRobot) -> None:
     robot.broker.kill()
     another = make_robot("anna", online=False)
-    another.bridge.await_log("no broker")  # so it has started
+    another.bridge.await_log("can't connect to the broker")  # so it has started
     robot.broker.start()
     assert_ends(another)
     robot.bridge.await_online(BACK)

@@ -321,7 +321,7 @@ def test_a_hung_server_counts_as_missing_until_it_responds(robot: Robot) -> None
     kept(robot.broker, f"{ANNA}/presence", lambda each: each["server"] is None, 25)
     robot.talk.thaw()
     kept(robot.broker, f"{ANNA}/presence", lambda each: each["server"] is not None, BACK)
-    assert "says nothing: restart it if it hangs" in robot.bridge.log
+    assert "does not respond; restart it if it hangs" in robot.bridge.log
 
 
 # Status and events

@@ -36,16 +36,16 @@ def bridge(home: str, *words: str, **extra: str) -> tuple[int, str, str]:
     ("words", "env", "said"),
     [
         ("", {}, "--name is missing"),
-        ("--name a/b", {}, "--name: 'a/b' is not a valid name; it must be 1 to 59 of A-Z"),
+        ("--name a/b", {}, "--name: 'a/b' is not a valid name; it must have 1 to 59 characters"),
         ("--name anna --group day,#", {}, "--group: '#' is not a valid name"),
         ("--name anna --group day,", {}, "--group: '' is not a valid name"),
         ("--name anna --allow say,cancle", {}, "--allow: unknown request 'cancle'; did you mean 'cancel'?"),
         ("--name anna --allow xyz", {}, "--allow: unknown request 'xyz'; choose from say, wait, cancel"),
         ("--name anna --print-unit launchd", {}, "--print-unit: 'launchd' is not one of"),
-        ("--name anna", {}, "which broker? TALK_BROKER is not set"),
+        ("--name anna", {}, "TALK_BROKER is not set; name your broker"),
         ("anna", {}, "'talk bridge' takes no arguments (got 'anna')"),
-        ("--name anna", {"TALK_BROKER": "http://broker"}, "TALK_BROKER is no broker's URL"),
-        ("--name anna", {"TALK_BROKER": "mqtts://x:hunter2@broker"}, "holds a user or a password"),
+        ("--name anna", {"TALK_BROKER": "http://broker"}, "TALK_BROKER is not the URL of a broker"),
+        ("--name anna", {"TALK_BROKER": "mqtts://x:hunter2@broker"}, "must not contain a user or a password"),
         ("--name anna", {"TALK_BROKER": "mqtts://b", "TALK_MQTT_CA": "/no"}, "TALK_MQTT_CA: /no: No such file"),
     ],
 )
@@ -58,7 +58,7 @@ def test_without_paho_it_says_what_to_install_but_prints_all_the_same(home: str,
     env = spied(tmp_path, environment(home, TALK_BROKER="mqtt://127.0.0.1:1"), ["paho"])
     done = run([*TALK, "bridge", "--name", "anna"], env)
     assert (done.code, done.out) == (2, "")
-    assert done.err == f"talk: a fleet needs paho-mqtt: {install.command('paho-mqtt')}\n"
+    assert done.err == f"talk: a fleet needs paho-mqtt; install it with: {install.command('paho-mqtt')}\n"
     done = run([*TALK, "bridge", "--name", "anna", "--print-unit", "user"], env)
     assert (done.code, done.err, "[Unit]" in done.out) == (0, "", True), done
 
@@ -142,15 +142,15 @@ def test_a_supervisor_is_told_the_state_with_and_without_a_broker(home: str, scr
         ) as process:
             try:
                 ready = supervisor.wait_for("READY", "1")
-                supervisor.wait_for("STATUS", "OFFLINE, server there, 0 goals pending")
+                supervisor.wait_for("STATUS", "OFFLINE, server running, 0 goals waiting")
                 broker.start()
-                supervisor.wait_for("STATUS", f"anna at {broker.url}: online, server there", since=ready)
+                supervisor.wait_for("STATUS", f"anna at {broker.url}: online, server running", since=ready)
                 scripted.request("pause")
                 with RemoteClient(broker) as client:
                     client.say("a secret")
-                    pending = supervisor.wait_for("STATUS", "1 goal pending")
+                    pending = supervisor.wait_for("STATUS", "1 goal waiting")
                     client.ask("cancel")
-                supervisor.wait_for("STATUS", "0 goals pending", since=pending)
+                supervisor.wait_for("STATUS", "0 goals waiting", since=pending)
                 supervisor.wait_for("WATCHDOG", "1", since=pending)
                 assert not any("secret" in value for _, value, _ in supervisor.told)
                 process.send_signal(signal.SIGINT)

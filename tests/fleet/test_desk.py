@@ -253,7 +253,7 @@ def test_a_sentence_that_the_broker_does_not_take_is_refused_before_it_is_sent(m
         bridge.await_online()
         done = desk(broker, "anna", "say", "--wait", "--", TOO_LONG)
         assert (done.code, done.out) == (1, "")
-        assert "the broker takes 3,072: nothing was sent" in done.err
+        assert "the broker accepts at most 3,072; nothing was sent" in done.err
         with Desk(broker, env={"TALK_MQTT_USER": "o" * 59}) as somebody:  # a name as long as may be
             assert somebody.run("--robot", "anna", "say", "--wait", "--rate", "450", "--", "short").code == 0
 
@@ -297,7 +297,7 @@ def test_a_login_that_may_not_read_answers_is_told_before_anything_is_sent(make_
     ):
         bridge.await_online()
         done = desk(broker, "anna", "say", "--", "hello", user="olga")
-        assert (done.code, "does not let 'olga' read talk/reply/olga" in done.err) == (10, True), done
+        assert (done.code, "does not allow 'olga' to read talk/reply/olga" in done.err) == (10, True), done
         log = desk(broker, "anna", "--json", "log", user="anna")
         assert (log.code, log.out) == (0, "")
 

@@ -50,7 +50,7 @@ def assert_spoken(robot: Robot, *texts: str) -> None:
 def test_a_robot_that_is_offline_is_told_at_once_and_speaks_nothing_of_it_when_it_comes(robot: Robot) -> None:
     assert robot.bridge.terminate() == 0
     with limits():
-        for name, words in (("anna", "anna is offline: nothing was sent"), ("nobody", "no robot 'nobody' is known")):
+        for name, words in (("anna", "anna is offline, so nothing was sent"), ("nobody", "no robot 'nobody' is known")):
             done = desk(robot.broker, name, "say", "--wait", "nobody hears this")
             assert_within(done.seconds, AT_ONCE, "a say to a robot that is not there")
             assert_refused(done, 3, words)
@@ -65,7 +65,7 @@ def test_a_robot_that_is_offline_is_told_at_once_and_speaks_nothing_of_it_when_i
 
 def test_a_broker_that_is_not_there_is_told_and_nothing_is_spoken_when_it_is_back(robot: Robot) -> None:
     robot.broker.kill()
-    assert_refused(robot.desk("say", "hello"), 3, f"no broker at {robot.broker.url}")
+    assert_refused(robot.desk("say", "hello"), 3, f"can't connect to the broker at {robot.broker.url}")
     robot.broker.start()
     robot.bridge.await_online(within=15)
     assert_spoken(robot)
@@ -201,13 +201,13 @@ def test_a_malformed_request_is_answered_with_the_error_of_the_wire(lasting_robo
 
 def test_a_desk_may_do_what_the_robot_allows_and_nothing_else(make_robot: MakeRobot) -> None:
     anna = make_robot("anna")
-    assert_refused(anna.desk("set", "--rate", "300"), 10, "anna: this robot takes no set from afar")
+    assert_refused(anna.desk("set", "--rate", "300"), 10, "anna: remote clients may not use set on this robot")
     bert = make_robot("bert", "--allow", "say,set")
     assert bert.bridge.await_online()["allow"] == ["say", "set"]
     assert bert.desk("set", "--rate", "300").code == 0
     assert bert.talk.request("set")["settings"]["rate"] == 300
     for each in ("cancel", "status"):
-        assert_refused(bert.desk(each), 10, f"bert: this robot takes no {each} from afar")
+        assert_refused(bert.desk(each), 10, f"bert: remote clients may not use {each} on this robot")
     assert bert.desk("say", "hello").code == 0
 
 
@@ -310,4 +310,4 @@ def test_broker_that_dies_while_it_is_answered_ends_the_connection(broker: Broke
         assert select.select([link.fileno()], [], [], 10)[0], "the broker tells nothing"
         link.read()
     assert heard == [b"question"]
-    assert link.ended == "the broker went away"
+    assert link.ended == "the connection was lost"

@@ -111,10 +111,10 @@ def test_a_pick_of_no_robot_ends_it_with_3(broker: Broker, text: str, words: str
 @pytest.mark.parametrize("what", ["status", "watch"])
 def test_without_a_broker_or_rights_it_ends_with_3_or_10(secure_broker: Broker, what: str) -> None:
     done = run(secure_broker, "fleet", what, user="otto")
-    assert (done.code, done.out, "does not let 'otto'" in done.err) == (10, "", True), done
+    assert (done.code, done.out, "does not allow 'otto'" in done.err) == (10, "", True), done
     with Port() as port:
         done = run(secure_broker, "fleet", what, TALK_BROKER=f"mqtts://127.0.0.1:{port.number}")
-    assert (done.code, done.out, "talk: no broker at mqtts://" in done.err) == (3, "", True), done
+    assert (done.code, done.out, "talk: can't connect to the broker at mqtts://" in done.err) == (3, "", True), done
 
 
 @pytest.mark.parametrize(
@@ -122,10 +122,10 @@ def test_without_a_broker_or_rights_it_ends_with_3_or_10(secure_broker: Broker, 
     [
         (["fleet"], {}, "WHAT is missing; choose one of status, watch"),
         (["fleet", "list"], {}, "'list' is not one of 'status', 'watch'"),
-        (["--robot", "@", "fleet", "status"], {}, "no group can be called ''"),
-        (["--robot", "a b*", "fleet", "watch"], {}, "the glob 'a b*' matches no robot's name"),
-        (["fleet", "status"], {"TALK_ROBOT": "a/b"}, "no robot can be called 'a/b'"),
-        (["fleet", "status"], {"TALK_BROKER": ""}, "which broker? TALK_BROKER is not set"),
+        (["--robot", "@", "fleet", "status"], {}, "invalid group name ''"),
+        (["--robot", "a b*", "fleet", "watch"], {}, "the pattern 'a b*' can't match any robot"),
+        (["fleet", "status"], {"TALK_ROBOT": "a/b"}, "invalid robot name 'a/b'"),
+        (["fleet", "status"], {"TALK_BROKER": ""}, "TALK_BROKER is not set; name your broker"),
     ],
 )
 def test_a_usage_error_names_the_mistake(broker: Broker, words: list[str], env: dict[str, str], said: str) -> None:
@@ -231,7 +231,7 @@ def test_a_break_is_told_on_standard_error_and_then_what_has_changed(broker: Bro
     done = watching.end()
     assert done.code == 130
     gone, back = done.err.splitlines()
-    assert gone == f"talk: the broker at {broker.url} went away; trying again for 30 s"
+    assert gone == f"talk: the connection to the broker at {broker.url} was lost; trying again for 30 s"
     assert back.startswith(f"talk: the broker at {broker.url} is back after ")
 
 

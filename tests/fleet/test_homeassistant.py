@@ -116,4 +116,4 @@ def test_a_robot_that_may_not_announce_itself_says_so(
 ) -> None:
     talk = make_talk(scripted=True)
     bridge = make_bridge(talk, secure_broker, "anna", "--homeassistant", user="anna", observer="olga")
-    bridge.await_log("'talk bridge --print-acl' has for these options")
+    bridge.await_log("'talk bridge --print-acl' (with the same options)")

@@ -86,7 +86,7 @@ async def test_a_remote_client_that_is_silent_for_90_s_is_gone_whatever_it_waits
     assert not [each for each in anna.lines() if each.get("event") == "gone"]
     pass_time(GONE - 88 + 0.1)
     anna.sessions.tick()
-    assert "says hello every 30 s" in anna.lines()[-1]["message"]
+    assert "must send hello every 30 s" in anna.lines()[-1]["message"]
     assert anna.sessions.waiting == []
     before = len(anna.lines())
     await anna.ask({"seq": 1, "request": "cancel"}, "s4")

@@ -159,7 +159,7 @@ def test_a_text_is_read_as_for_one_robot(pair: RealRobots, desk: Desk) -> None:
 
 # Requests that are refused before anything is sent
 
-NUMBER, ONE_ROBOT = "a number is a goal of one server", "only works with one robot; name it"
+NUMBER, ONE_ROBOT = "a goal's number is only valid on one server", "only works with one robot; name it"
 
 
 @pytest.mark.parametrize(
@@ -184,8 +184,8 @@ NUMBER, ONE_ROBOT = "a number is a goal of one server", "only works with one rob
         ("serve", "'talk serve' only works on this machine"),
         ("set --rate 9999", "must be 80 to 450, got 9999"),
         ("--socket /tmp/s --robot wh-* status", "leave out one of them"),
-        ("--robot @a/b status", "no group can be called 'a/b'"),
-        ("--robot a#* status", "the glob 'a#*' matches no robot's name"),
+        ("--robot @a/b status", "invalid group name 'a/b'"),
+        ("--robot a#* status", "the pattern 'a#*' can't match any robot"),
     ],
 )
 def test_a_request_that_several_robots_cannot_be_asked_is_a_usage_error(desk: Desk, line: str, words: str) -> None:

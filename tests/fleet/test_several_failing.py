@@ -90,11 +90,21 @@ def test_equal_failures_are_the_exit_code_and_different_ones_make_it_13(desk: De
 
 #: A pick, one of its robots, and the reason why that does nothing.
 WHY = [
-    ("off-1*", "off-1", "no_server", "off-1 is offline: nothing was sent"),
+    ("off-1*", "off-1", "no_server", "off-1 is offline, so nothing was sent"),
     ("@lonely", "wh-4", "no_server", "wh-4: no server found; tried: "),
-    ("wh-[4]", "wh-4", "no_server", "wh-4 has no talk server at this moment: nothing was sent"),
-    ("wh-[3]", "wh-3", "permission_denied", "wh-3: this robot takes no pause from afar: see its --allow"),
-    ("@day", "wh-3", "permission_denied", "wh-3: this robot takes no pause from afar: see its --allow"),
+    ("wh-[4]", "wh-4", "no_server", "wh-4 has no running talk server, so nothing was sent"),
+    (
+        "wh-[3]",
+        "wh-3",
+        "permission_denied",
+        "wh-3: remote clients may not use pause on this robot; add it to --allow of its bridge",
+    ),
+    (
+        "@day",
+        "wh-3",
+        "permission_denied",
+        "wh-3: remote clients may not use pause on this robot; add it to --allow of its bridge",
+    ),
 ]
 
 
@@ -107,7 +117,9 @@ def test_the_reason_is_told_in_words_and_as_a_code(robots: RealRobots, desk: Des
         assert f": {name}: {words.removeprefix(f'{name}: ')}" in told_so.err
         assert f"{name}: {name}: " not in told_so.err
     reason, _ = desk.run("--robot", "off-*", "status").err.splitlines()
-    assert re.fullmatch(r"talk: OFFLINE: (off-\d, ){4}off-\d and 2 more: off-\d is offline: nothing was sent", reason)
+    assert re.fullmatch(
+        r"talk: OFFLINE: (off-\d, ){4}off-\d and 2 more: off-\d is offline, so nothing was sent", reason
+    )
 
 
 def test_a_pick_of_no_robot_is_3_and_so_is_no_broker(desk: Desk, broker: Broker) -> None:
@@ -116,12 +128,12 @@ def test_a_pick_of_no_robot_is_3_and_so_is_no_broker(desk: Desk, broker: Broker)
     *plain, for_programs = at_once(desk, *lines, ["--robot", "@nobody", "--json", "cancel"])
     for line, done in zip(lines, plain, strict=True):
         assert (done.code, done.out) == (3, "")
-        assert done.err.startswith(f"talk: {picks[line[1]]} at {broker.url}: nothing was sent")
+        assert done.err.startswith(f"talk: {picks[line[1]]} at {broker.url}, so nothing was sent")
     error = json.loads(for_programs.err)["error"]
     assert (for_programs.code, for_programs.out, error["code"]) == (3, "", "no_server")
     with Port() as port, Desk(broker, port=port.number) as somebody:
         done = somebody.run("--robot", "*", "cancel")
-    assert (done.code, done.out, "talk: no broker at mqtt://" in done.err) == (3, "", True), done
+    assert (done.code, done.out, "talk: can't connect to the broker at mqtt://" in done.err) == (3, "", True), done
 
 
 def test_a_text_that_is_too_long_is_rejected_by_each(robots: RealRobots, desk: Desk) -> None:

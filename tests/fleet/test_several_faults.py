@@ -116,7 +116,7 @@ def test_robots_may_speak_on_if_the_broker_is_back_too_late_for_a_cancel(broker:
             done = desk.finish(each)
             assert (done.code, done.out) == (130, "")
             assert done.err == (
-                f"talk: may still be speaking: wh-1, wh-2: the broker at {broker.url} went away\n"
+                f"talk: may still be speaking: wh-1, wh-2: the connection to the broker at {broker.url} was lost\n"
                 "talk: 0 of 2 robots succeeded\n"
             )
         broker.start()
@@ -287,7 +287,7 @@ def test_a_sentence_can_be_cancelled_until_all_outcomes_were_taken(fleet: Fleet,
         else:
             assert (each.robot, each.state) == ("wh-2", "RECALLED")
     assert states(pair, goal) == ["SUCCEEDED", "RECALLED"]
-    with pytest.raises(UsageError, match="all outcomes have been taken: cancel the goal by its id"):
+    with pytest.raises(UsageError, match="all outcomes have already been returned; cancel the goal by its id"):
         outcomes.cancel()
 
 

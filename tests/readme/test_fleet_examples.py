@@ -185,7 +185,7 @@ def test_several_robots(tmp_path: Path, place: str) -> None:
 
         assert robots["bert"].bridge.terminate() == 0
         done = shell.run(status)
-        assert (done.returncode, done.stdout) == (0, "bert bert is offline: nothing was sent\n")
+        assert (done.returncode, done.stdout) == (0, "bert bert is offline, so nothing was sent\n")
         listed = [line.split()[:2] for line in shell.run(table).stdout.splitlines()[1:]]
         assert listed == [["bert", "OFFLINE"], ["wh-1", "yes"], ["wh-2", "yes"]]
 

@@ -79,8 +79,8 @@ def test_a_custom_player_is_to_be_tried_by_hand_unless_it_names_a_cause() -> Non
     missing = warning("player", "it is not there", "name a program that is there")
     assert find_playback_step([cards], custom=True) is None
     assert find_playback_step([cards, missing], custom=True) == "name a program that is there"
-    stalled = ("audio_stalled", "it took no sound for 5 s")
-    by_hand = "try the player by hand, with a second of silence: head -c 44100 /dev/zero | sox -r 22050 -d usb"
+    stalled = ("audio_stalled", "it accepted no sound for 5 s")
+    by_hand = "test the player with a second of silence: head -c 44100 /dev/zero | sox -r 22050 -d usb"
     assert cured(*stalled, "sox -r {rate} -d {device}") == by_hand
     assert cured(*stalled, "aplay -r {rate}") == sentence.ADVICE["audio_stalled"]
     assert "another program" in cured("audio_device", "Device or resource busy", "sox")
@@ -91,9 +91,9 @@ BUSY = SentenceResult(State.ABORTED, "audio_device", "aplay: audio open error: D
 
 def test_a_device_that_is_busy_with_the_server_s_speech_is_well() -> None:
     found = sentence.judge_sentence(replace(BUSY, beside_speech=True), silent=True, device=None)
-    assert (found.state, "busy with what the server speaks" in found.message) == (OK, True)
+    assert (found.state, "busy, because the server is speaking" in found.message) == (OK, True)
     found = sentence.judge_sentence(BUSY, silent=True, device=None)
-    assert (found.state, "another program holds the device" in str(found.next)) == (FAILURE, True)
+    assert (found.state, "another program uses the device" in str(found.next)) == (FAILURE, True)
     gone = SentenceResult(State.ABORTED, "audio_device", "aplay: audio open error: No such device")
     assert sentence.judge_sentence(replace(gone, beside_speech=True), silent=True, device=None).state == FAILURE
 
@@ -117,7 +117,7 @@ def test_whether_the_server_spoke_is_seen_from_its_goals_before_and_after(monkey
     assert not spoke((None, ()), (None, [replace(SPOKEN, state=State.RECALLED)]))
 
 
-STALLED = SentenceResult(State.ABORTED, "audio_stalled", "aplay took no sound for 3 s")
+STALLED = SentenceResult(State.ABORTED, "audio_stalled", "aplay accepted no sound for 3 s")
 CLIENT = cast("Client", object())
 WARNED = [warning("sound server", "it hangs", "restart it")]
 
@@ -146,7 +146,7 @@ def test_the_next_step_after_a_sentence_depends_on_the_checks_before() -> None:
     assert examined(STALLED).next == examined(STALLED, silent=True).next == "pactl suspend-sink usb 0"
     assert examined(STALLED, hangs=True).next == "restart it"
     custom = examined(replace(STALLED, player="mine"), server={"player": "mine"})
-    assert str(custom.next).startswith("try the player by hand")
+    assert str(custom.next).startswith("test the player with")
     assert examined(HUNG, None, hangs=True).next == "restart it"
     assert str(examined(HUNG, None).next).startswith("run talk doctor again")
     assert str(examined(STALLED, silent=True, server_pid=None).next).startswith("run talk doctor --silent there")
@@ -170,7 +170,7 @@ def test_another_user_s_server_is_to_be_examined_by_that_user(
 
 def test_a_player_without_sound_plays_a_sentence_that_is_not_heard() -> None:
     played = SentenceResult(State.SUCCEEDED, duration=1.0, player="null")
-    assert "without sound" in examined(played, server={"player": "null"}).message
+    assert "a sentence was played without sound" in examined(played, server={"player": "null"}).message
     assert "without sound" not in examined(played, server={"player": "aplay"}).message
 
 
@@ -217,9 +217,9 @@ def test_foreign_text_is_escaped_in_every_finding() -> None:
     [
         ("engine_failed", "pyttsx3 is missing (no module): install it", "pyttsx3", "pip"),
         ("engine_failed", "libespeak-ng is missing: install it", "libespeak-ng", "libesp"),
-        ("engine_failed", "there is no espeak-ng data: install espeak-ng-data", "libespeak-ng", "espeak-ng-data"),
+        ("engine_failed", "espeak-ng data is missing", "libespeak-ng", "espeak-ng-data"),
         ("engine_crashed", "it was killed by SIGSEGV", "libespeak-ng", "reinstall"),
-        ("engine_hung", "the engine process said nothing", "libespeak-ng", "restart the sound server"),
+        ("engine_hung", "the engine process did not respond", "libespeak-ng", "if the sound server hangs"),
         ("unknown_voice", 'unknown voice "x"', "voices", "talk voices"),
     ],
 )
@@ -259,8 +259,8 @@ OTHER_SOCKET = "/run/user/7/talk/talk.sock"
 @pytest.mark.parametrize(
     ("place", "named_by", "error", "others", "words", "step"),
     [
-        (SocketPlace(PATH, PLACE_FORBIDDEN, 7), None, NONE, [], "permission denied (uid 7)", "have uid 7 let you in"),
-        (SocketPlace(PATH, PLACE_ABSENT), "--socket", NONE, [], "named by --socket", "leave --socket out, or"),
+        (SocketPlace(PATH, PLACE_FORBIDDEN, 7), None, NONE, [], "permission denied (uid 7)", "ask uid 7 for access"),
+        (SocketPlace(PATH, PLACE_ABSENT), "--socket", NONE, [], "--socket names", "leave out --socket, or"),
         (SocketPlace(PATH, server.PLACE_LISTENING), None, NO_ANSWER, [], "it does not answer", "restart"),
         (SocketPlace(PATH, server.PLACE_LISTENING), None, FULL, [], "too many", "--max-clients"),
         (SocketPlace(PATH, PLACE_ABSENT), None, NONE, [OTHER_SOCKET], "not found", f"talk --socket {OTHER_SOCKET}"),
@@ -297,8 +297,8 @@ def test_an_obstacle_before_the_server_s_place_is_a_warning() -> None:
     [
         ({}, "server", OK, "None"),
         ({"paused": True}, "server", FAILURE, "talk resume"),
-        ({"version": "0.0.1"}, "server", WARNING, "start the server again"),
-        ({"engine": "pyttsx3 is missing"}, "server", WARNING, "install what"),
+        ({"version": "0.0.1"}, "server", WARNING, "restart the server"),
+        ({"engine": "pyttsx3 is missing"}, "server", WARNING, "install the missing part"),
         ({"volume": 0.0}, "settings", FAILURE, "talk set --volume 1"),
         ({"volume": 0.1}, "settings", WARNING, "talk set --volume 1"),
         ({"ttl": 5.0, "lead_in": 300, "preempt": True}, "settings", OK, "None"),
@@ -317,18 +317,18 @@ def test_recent_failures_are_counted_and_the_last_one_is_told() -> None:
         aborted = Goal("4k7f-2", State.ABORTED, reason="audio_device", ended_at=0.0, message=message)
         found = of(server.judge_server(SERVER, [SPOKEN, aborted], 600.0), "recent goals")
         assert found.state == WARNING
-        assert "1 of the last 2 goals ABORTED, last 4k7f-2, 10 min ago" in found.message
+        assert "ABORTED: 1 of the last 2 goals, most recently 4k7f-2, 10 min ago" in found.message
         assert "audio_device: aplay: device is busy" in found.message
-    assert "another program holds the device" in str(found.next)
+    assert "another program uses the device" in str(found.next)
     found = of(server.judge_server(SERVER, [aborted, SPOKEN], 600.0), "recent goals")
-    assert (found.state, "1 succeeded since" in found.message) == (OK, True)
+    assert (found.state, "1 succeeded since then" in found.message) == (OK, True)
     assert of(server.judge_server(SERVER, [SPOKEN], 0.0), "recent goals").message == "the last goal did not fail"
 
 
 def test_after_a_text_without_words_the_next_step_is_to_send_words() -> None:
     goal = Goal("4k7f-2", State.ABORTED, text="...", reason="nothing_to_say", message="speech failed: nothing")
     assert of(server.judge_server(SERVER, [goal], 0.0), "recent goals").next == (
-        "send a text with words: this one has no letters and no digits"
+        "send a text with words: this one has no letters or digits"
     )
     foreign = replace(goal, text="你好")
     assert "choose a voice" in str(of(server.judge_server(SERVER, [foreign], 0.0), "recent goals").next)
@@ -339,19 +339,19 @@ def test_the_end_of_the_sentence_is_told_with_the_next_step() -> None:
     found = sentence.judge_sentence(played, silent=False, device=None)
     assert found.state == OK
     assert found.message.endswith("was played to its end through the server, aplay, 1.7 s")
-    assert "without sound" in sentence.judge_sentence(played, silent=True, device=None).message
+    assert "a sentence was played without sound" in sentence.judge_sentence(played, silent=True, device=None).message
     for beginning in ("speech failed: ", "Talk aborted: ", ""):  # the second is an older server's
         message = f"{beginning}aplay: audio open error: Permission denied"
         denied = SentenceResult(State.ABORTED, "audio_device", message)
         found = sentence.judge_sentence(denied, silent=False, device=None)
         assert found.message == "ABORTED, audio_device: aplay: audio open error: Permission denied"
     assert "usermod -aG audio" in str(found.next)
-    stalled = SentenceResult(State.ABORTED, "audio_stalled", "aplay took no sound for 3 s")
+    stalled = SentenceResult(State.ABORTED, "audio_stalled", "aplay accepted no sound for 3 s")
     found = sentence.judge_sentence(replace(stalled, suspended=("usb",)), silent=False, device=None)
     assert (found.next, "suspended: usb" in found.message) == ("pactl suspend-sink usb 0", True)
-    late = SentenceResult(State.RECALLED, "late", "it still waited behind 7 goals after 20 s, and was taken back")
+    late = SentenceResult(State.RECALLED, "late", "not spoken: it was still waiting behind 7 goals after 20 s")
     found = sentence.judge_sentence(late, silent=False, device=None)
-    assert found.message.startswith("not spoken: it still waited behind 7 goals")
+    assert found.message.startswith("not spoken: it was still waiting behind 7 goals")
     assert "talk status" in str(found.next)
     assert "run talk doctor again" in str(
         sentence.judge_sentence(
@@ -408,7 +408,7 @@ def test_in_a_pipe_a_finding_is_one_line_without_colour() -> None:
 PI = UserSession(1000, "pi", gids=(1000, 29), runtime_dir="/run/user/1000", runtime_owner=1000)
 CARDS = ("USB Audio Device",)
 NO_SERVER = SoundServer(error="Connection refused")
-WIRE = SoundServer("PipeWire, without its PulseAudio part", accepts_pulse=False)
+WIRE = SoundServer("PipeWire without PulseAudio support", accepts_pulse=False)
 PULSE = SoundServer(name="PulseAudio (on PipeWire 1.2.7)", sink="alsa_output.usb")
 
 
@@ -426,16 +426,19 @@ def player(configured: str | None, used: str | None, *installed: str, by_server:
 def test_a_robot_with_a_card_and_nothing_else_is_well() -> None:
     assert {sound.check_cards(CARDS, SoundServer(), PI).state, judged_server(SoundServer()).state} == {OK}
     used = player(None, "aplay", "aplay", "pacat")
-    assert (used.state, used.message) == (OK, "aplay is used; then pacat")
+    assert (used.state, used.message) == (OK, "aplay is used; other players: pacat")
 
 
 def test_a_sound_server_that_answers_needs_no_program() -> None:
-    assert player(None, "pulse", "aplay", "pacat").message == "pulse is used, by the sound server; then aplay, pacat"
+    assert (
+        player(None, "pulse", "aplay", "pacat").message
+        == "pulse is used to play through the sound server; other players: aplay, pacat"
+    )
     alone = player(None, "pulse")
-    assert (alone.state, alone.message) == (OK, "pulse is used, by the sound server")
-    assert player("pulse", "pulse", by_server=True).message == "pulse (the server's)"
+    assert (alone.state, alone.message) == (OK, "pulse is used to play through the sound server")
+    assert player("pulse", "pulse", by_server=True).message == "pulse (set by the server)"
     both = player("pacat", "pacat", "aplay", "pacat", "pw-cat")
-    assert both.message == "pacat (TALK_PLAYER); there are also aplay, pw-cat"
+    assert both.message == "pacat (set by TALK_PLAYER); other players: aplay, pw-cat"
 
 
 def test_the_player_is_chosen_by_the_engine_process_or_else_by_the_sound_server(
@@ -462,9 +465,9 @@ def test_the_player_is_chosen_by_the_engine_process_or_else_by_the_sound_server(
 def test_a_sound_server_with_only_a_dummy_output_is_not_heard() -> None:
     found = judged_server(replace(PULSE, sink=DUMMY_SINK))
     assert (found.state, found.next) == (
-        WARNING, "plug in a loudspeaker, and look whether it is there: pactl list short sinks"
+        WARNING, "connect a loudspeaker, and check that it is listed: pactl list short sinks"
     )  # fmt: skip
-    assert "has only a dummy output, auto_null: nobody hears it" in found.message
+    assert "has only the dummy output auto_null, which nobody can hear" in found.message
 
 
 def test_a_missing_player_is_named_with_its_package() -> None:
@@ -475,7 +478,7 @@ def test_a_missing_player_is_named_with_its_package() -> None:
     assert (found.state, found.next) == (FAILURE, "sudo apt-get install -y pipewire-bin")
     for each in ("/opt/play -x", "'"):
         found = player(each, each, "aplay")
-        assert (found.state, f"{each} (TALK_PLAYER) is not there" in found.message) == (FAILURE, True)
+        assert (found.state, f"{each} (set by TALK_PLAYER) is not installed" in found.message) == (FAILURE, True)
     assert player("/opt/play -x", "/opt/play -x", "/opt/play", "aplay").state == OK
 
 
@@ -492,7 +495,7 @@ def test_a_player_without_sound_is_not_heard(monkeypatch: pytest.MonkeyPatch) ->
 def test_a_step_that_needs_pactl_names_its_package(tmp_path: Path) -> None:
     muted = failure("loudness", "muted", "pactl set-sink-mute @DEFAULT_SINK@ 0")
     without = {"PATH": str(tmp_path)}
-    step = f"{muted.next} (for pactl: sudo apt-get install -y pulseaudio-utils)"
+    step = f"{muted.next} (to install pactl: sudo apt-get install -y pulseaudio-utils)"
     assert sound.add_pactl_package(muted, without).next == step
     other = failure("socket", "no server", "talk serve")
     assert sound.add_pactl_package(other, without) == other
@@ -502,7 +505,7 @@ def test_a_step_that_needs_pactl_names_its_package(tmp_path: Path) -> None:
 
 def test_a_missing_device_is_to_be_plugged_in_or_given_to_the_container() -> None:
     found = sound.check_cards((), NO_SERVER, PI)
-    assert (found.state, "plug in" in str(found.next)) == (WARNING, True)
+    assert (found.state, "connect a loudspeaker" in str(found.next)) == (WARNING, True)
     found = sound.check_cards((), NO_SERVER, replace(PI, origins=("a container",)))
     assert "--device /dev/snd" in str(found.next)
     assert sound.check_cards((), PULSE, PI).state == OK
@@ -513,7 +516,7 @@ def test_a_missing_device_is_to_be_plugged_in_or_given_to_the_container() -> Non
     [
         ({"origins": ("a container",)}, "PULSE_SERVER"),
         ({"origins": ("a system service",)}, "--print-unit user"),
-        ({"uid": 0, "sudo_uid": 1000}, "leave sudo out"),
+        ({"uid": 0, "sudo_uid": 1000}, "run this without sudo"),
         ({"runtime_dir": None, "usual_runtime_dir": "/run/user/1000"}, "export XDG_RUNTIME_DIR=/run/user/1000"),
         ({}, "systemctl --user restart"),
     ],
@@ -540,20 +543,20 @@ def test_a_missing_runtime_directory_is_told_with_the_variable_to_set() -> None:
     assert (found.state, found.next) == (WARNING, "export XDG_RUNTIME_DIR=/run/user/1000")
     assert "cron, sudo" in found.message
     served = sound.judge_session(replace(PI, runtime_dir=None, usual_runtime_dir="/run/user/1000", server_pid=7))
-    assert "where the server is started" in str(served.next)
+    assert " for the server, and restart it" in str(served.next)
     assert sound.judge_session(replace(PI, runtime_dir=None)).state == OK
-    assert "not there" in sound.judge_session(replace(PI, runtime_owner=None)).message
-    assert "uid 33's" in sound.judge_session(replace(PI, runtime_owner=33)).message
+    assert "does not exist" in sound.judge_session(replace(PI, runtime_owner=None)).message
+    assert "belongs to uid 33" in sound.judge_session(replace(PI, runtime_owner=33)).message
 
 
 SOUND_OUTPUTS = [
     ("Mute: yes\nVolume: mono: 65536 / 100% / 0.00 dB\n", FAILURE, "out is muted"),
-    ("Volume: 0.05\n", WARNING, "out is at 5%: few will hear it"),
+    ("Volume: 0.05\n", WARNING, "out is at 5%, which may be too quiet"),
     ("Volume: 0.40 [MUTED]\n", FAILURE, "out is muted"),
     ("Volume: 0.00\n", FAILURE, "out is at 0%"),
-    ("  Left: Playback 0 [0%] [-65.25dB] [off]\n  Right: 9 [40%] [on]\n", OK, "out at 40%"),
+    ("  Left: Playback 0 [0%] [-65.25dB] [off]\n  Right: 9 [40%] [on]\n", OK, "out is at 40%"),
     ("  Mono: Playback 0 [0%] [-65.25dB] [off]\n", FAILURE, "out is muted"),
-    ("  Mono: Playback [on]\n", OK, "out on"),
+    ("  Mono: Playback [on]\n", OK, "out is not muted"),
 ]
 
 
@@ -573,7 +576,7 @@ def test_the_worst_of_several_outputs_counts(monkeypatch: pytest.MonkeyPatch) ->
         return sound.check_levels({}, NO_SERVER, CARDS, is_used=True)
 
     assert levels() == []
-    assert [each.message for each in levels("[40%] [on]", "[on]")] == ["out0 at 40%, out1 on"]
+    assert [each.message for each in levels("[40%] [on]", "[on]")] == ["out0 is at 40%, out1 is not muted"]
     assert [each.message for each in levels("[40%] [on]", "[5%] [on]", "[off]")] == ["out2 is muted"]
 
 

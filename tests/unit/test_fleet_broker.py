@@ -33,12 +33,12 @@ def test_a_url_names_a_broker(url: str, broker: Broker, shown: str) -> None:
         ("", "export TALK_BROKER=mqtts://broker.example"),
         ("broker", "mqtts://HOST or mqtt://HOST"),
         ("http://broker", "mqtts://HOST or mqtt://HOST"),
-        ("mqtt://", "names no host"),
-        ("mqtt://[::1", "is no URL"),
-        ("mqtt://broker:0", "names no host and port"),
-        ("mqtt://broker:99999", "a port that is none"),
-        ("mqtt://broker/robots", "more than a host and a port: write mqtt://broker"),
-        ("mqtt://broker?x=1", "more than a host and a port"),
+        ("mqtt://", "has no valid host"),
+        ("mqtt://[::1", "is not a valid URL"),
+        ("mqtt://broker:0", "has no valid host or port"),
+        ("mqtt://broker:99999", "an invalid port"),
+        ("mqtt://broker/robots", "must only have a host and a port; use mqtt://broker"),
+        ("mqtt://broker?x=1", "must only have a host and a port"),
     ],
 )
 def test_a_wrong_url_is_refused_with_the_next_step(url: str, words: str) -> None:
@@ -52,7 +52,7 @@ def test_a_wrong_url_is_refused_with_the_next_step(url: str, words: str) -> None
     ["mqtts://olga:hunter2@broker", "mqtts://olga@broker", "mqtts://:hunter2@broker:x", "mqtt://olga:hunter2\u2100@b"],
 )
 def test_a_url_that_holds_a_secret_is_refused_without_showing_it(url: str) -> None:
-    with pytest.raises(UsageError, match=r"TALK_MQTT_PASSWORD_FILE|is no URL") as caught:
+    with pytest.raises(UsageError, match=r"TALK_MQTT_PASSWORD_FILE|is not a valid URL") as caught:
         from_environment({"TALK_BROKER": url})
     assert "hunter2" not in str(caught.value)
 
@@ -72,14 +72,14 @@ def test_a_password_is_sent_in_clear_text_to_this_machine_alone(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("variables", "words"),
     [
-        ({"TALK_MQTT_PASSWORD_FILE": "{file}"}, "TALK_MQTT_USER is not: whose password"),
+        ({"TALK_MQTT_PASSWORD_FILE": "{file}"}, "TALK_MQTT_USER is not; set TALK_MQTT_USER"),
         ({"TALK_MQTT_USER": "olga", "TALK_MQTT_PASSWORD_FILE": "{nothing}"}, "No such file"),
         ({"TALK_MQTT_USER": "olga", "TALK_MQTT_PASSWORD_FILE": "{empty}"}, "is empty"),
         ({"TALK_MQTT_USER": "olga", "TALK_MQTT_PASSWORD_FILE": "{bytes}"}, "not UTF-8"),
         ({"TALK_MQTT_USER": "olga", "TALK_MQTT_PASSWORD_FILE": "{long}"}, "too long"),
         ({"TALK_MQTT_KEY": "{file}"}, "TALK_MQTT_CERT is not"),
         ({"TALK_MQTT_CA": "{nothing}"}, "TALK_MQTT_CA: .*No such file"),
-        ({"TALK_MQTT_CA": "{file}"}, "TALK_MQTT_CA: .*is not what it should be"),
+        ({"TALK_MQTT_CA": "{file}"}, "TALK_MQTT_CA: .*is not a valid certificate or key"),
         ({"TALK_MQTT_CERT": "{file}", "TALK_MQTT_KEY": "{file}"}, "TALK_MQTT_CERT and TALK_MQTT_KEY: "),
     ],
 )
@@ -97,7 +97,7 @@ def test_a_login_that_is_incomplete_or_unreadable_is_refused(
 
 @pytest.mark.parametrize("name", ["TALK_MQTT_CA", "TALK_MQTT_CERT", "TALK_MQTT_KEY"])
 def test_a_certificate_without_tls_is_refused(name: str) -> None:
-    with pytest.raises(UsageError, match=f"{name} means nothing without TLS"):
+    with pytest.raises(UsageError, match=f"{name} needs TLS"):
         from_environment({"TALK_BROKER": "mqtt://broker", name: "/file"})
 
 

@@ -159,16 +159,16 @@ def test_a_glob_or_a_group_may_mean_several(text: str, found: bool) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("@", "no group can be called ''"),
-        ("@a b", "no group can be called 'a b'"),
-        ("@@a", "no group can be called '@a'"),
-        ("@wh-*", "no group can be called 'wh-*'"),
-        ("a b", "no robot can be called 'a b'"),
-        ("", "no robot can be called ''"),
-        ("a/*", "the glob 'a/*' matches no robot's name"),
-        ("ä*", "the glob 'ä*' matches no robot's name"),
-        ("wh-[12", "the glob 'wh-[12' matches no robot's name"),
-        ("wh-[]", "the glob 'wh-[]' matches no robot's name"),
+        ("@", "invalid group name ''"),
+        ("@a b", "invalid group name 'a b'"),
+        ("@@a", "invalid group name '@a'"),
+        ("@wh-*", "invalid group name 'wh-*'"),
+        ("a b", "invalid robot name 'a b'"),
+        ("", "invalid robot name ''"),
+        ("a/*", "the pattern 'a/*' can't match any robot"),
+        ("ä*", "the pattern 'ä*' can't match any robot"),
+        ("wh-[12", "the pattern 'wh-[12' can't match any robot"),
+        ("wh-[]", "the pattern 'wh-[]' can't match any robot"),
     ],
 )
 def test_a_selection_that_can_pick_no_robot_has_a_fault(text: str, words: str) -> None:

@@ -367,7 +367,7 @@ def test_the_doctor_judges_without_looking() -> None:
 def test_contributing_names_every_file_that_an_option_goes_through() -> None:
     """The option --ttl is its example."""
     text = (PACKAGE.parent / ".github" / "CONTRIBUTING.md").read_text("utf-8")
-    steps = text.partition("**An option of `say`**")[2].partition("\n\nThe wire, its checks")[0]
+    steps = text.partition("**An option of `say`**")[2].partition("\n\nThe protocol, its checks")[0]
     named = {module_name(PACKAGE / each) for each in re.findall(r"talkcli/([\w/]+\.py)", steps)}
     having = {module for module in sources() if re.search(r"\bttl\b", ast.unparse(sources()[module]))}
     # On a broker it is a message's expiry, too; no other option is known there.

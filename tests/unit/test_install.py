@@ -65,5 +65,5 @@ def test_on_a_32_bit_system_no_package_is_named_that_has_no_build_for_it(monkeyp
     assert install.espeak_library() == "sudo apt-get install -y libespeak-ng1"
     step = "neural voices need a 64-bit system; use an espeak voice, such as en"
     monkeypatch.setattr(install, "NEURAL_PACKAGES", ["no_such_package"])
-    assert missing_package() == f"no_such_package is missing: {step}"
-    assert unknown_voice_message("piper/joe", ()) == f'unknown voice "piper/joe": {step}'
+    assert missing_package() == f"no_such_package is missing; {step}"
+    assert unknown_voice_message("piper/joe", ()) == f'unknown voice "piper/joe"; {step}'

@@ -55,7 +55,7 @@ def start(configure: protocol.Configure, runner: GoalRunner) -> protocol.Ready:
     try:
         import pyttsx3
     except ModuleNotFoundError as error:
-        raise CannotStart(f"pyttsx3 is missing ({error}): {install.command('pyttsx3')}") from error
+        raise CannotStart(f"pyttsx3 is missing ({error}); install it with: {install.command('pyttsx3')}") from error
     own = is_own_driver(configure.driver)
     driver = configure.driver or (next(iter(SYNTHESIZERS)) if own else pyttsx3.engine.default_engine_by_sys_platform())
     name = f"talk_{driver}" if own else driver
@@ -103,22 +103,22 @@ def _start_engine(pyttsx3: Any, name: str, *, named: bool) -> Any:
         engine = pyttsx3.init(name)
     except ModuleNotFoundError as error:
         if error.name == f"pyttsx3.drivers.{name}":
-            message = f'unknown driver "{name}": there are {", ".join(_driver_names())}'
+            message = f'unknown driver "{name}"; available drivers: {", ".join(_driver_names())}'
             raise CannotStart(message, usage_error=named) from error
-        raise CannotStart(f'the driver "{name}" cannot be loaded: {error}', usage_error=named) from error
+        raise CannotStart(f'the driver "{name}" could not be loaded: {error}', usage_error=named) from error
     except Exception as error:
         raise CannotStart(_start_error(name, error), permanent=False) from error
     try:
         engine.startLoop(False)
         engine.iterate()  # a driver that fails here would otherwise hang at the first goal
     except TypeError as error:
-        message = f'the driver "{name}" cannot be stepped (its iterate() is no generator): leave --driver out'
+        message = f'the driver "{name}" cannot be used (its iterate() is not a generator); leave out --driver'
         raise CannotStart(message, usage_error=True) from error
     return engine
 
 
 def _start_error(driver_name: str, error: Exception) -> str:
-    return f'the driver "{driver_name}" cannot be started: {type(error).__name__}: {error}'
+    return f'the driver "{driver_name}" could not be started: {type(error).__name__}: {error}'
 
 
 def _driver_names() -> list[str]:
@@ -228,7 +228,7 @@ class DriverProperties:
         self._engine.setProperty(name, value)
         error, self._error = self._error, None
         if isinstance(error, UnknownVoice):
-            message = f"the voice {value} is listed, but it cannot be loaded: {error}"
+            message = f"the voice {value} cannot be loaded: {error}"
             raise CannotSpeak(Reason.UNKNOWN_VOICE, message) from error
         if error is not None:
             why = str(error.args[0] if error.args else error) or type(error).__name__

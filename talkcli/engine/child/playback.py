@@ -361,7 +361,7 @@ class Playback:
         deadline = time.monotonic() + PLAYER_KILL_LIMIT_S
         while not player.gone():
             if time.monotonic() >= deadline:
-                raise CannotEnd(f"{player.name} could not be ended within {PLAYER_KILL_LIMIT_S:g} s")
+                raise CannotEnd(f"{player.name} could not be stopped within {PLAYER_KILL_LIMIT_S:g} s")
             self._runner.wait(until=time.monotonic() + PIECE_S)
         if player.real_time and player.proven:
             self._players.silent_since = self._silent_at or time.monotonic()
@@ -458,7 +458,7 @@ class Playback:
             due = feed.progress_at + limit if feed.player.real_time else NEVER  # the reader of a pipe may be slow
             self._wait_for(feed, due)
             if time.monotonic() >= due and not self._runner.hold_number and not self._offer(feed):
-                raise CannotSpeak(Reason.AUDIO_STALLED, f"{feed.player.name} took no sound for {limit:g} s")
+                raise CannotSpeak(Reason.AUDIO_STALLED, f"{feed.player.name} accepted no sound for {limit:g} s")
 
     def _await_samples(self, feed: PlayerFeed, more: Interest) -> None:
         """Keep playing while waiting for more samples."""
@@ -484,12 +484,12 @@ class Playback:
                 self._rewind(feed)
                 raise _PlayerReleased
             if now >= deadline:
-                message = f"{player.name} did not end {DRAIN_LIMIT_S:g} s after the sound"
+                message = f"{player.name} did not exit within {DRAIN_LIMIT_S:g} s after the sound"
                 raise CannotSpeak(Reason.AUDIO_STALLED, message)
             self._wait_for(feed, deadline)
         missing = feed.missing_seconds(time.monotonic())
         if player.real_time and missing > EARLY_END_LIMIT_S - self._seconds(self._samples.end - self._sent):
-            raise CannotSpeak(Reason.AUDIO_LOST, f"{player.name} ended {missing:.1f} s before the sound did")
+            raise CannotSpeak(Reason.AUDIO_LOST, f"{player.name} ended {missing:.1f} s before the end of the sound")
 
     # -- samples
 

@@ -285,7 +285,7 @@ class GoalRunner:
         except CannotSpeak as error:
             self._fail(error.reason, str(error))
         if self._goal is goal and self._pump is not None and goal.command.lead_in:
-            self._fail(Reason.BAD_OPTION, "this driver plays by itself: it can't be given a lead-in")
+            self._fail(Reason.BAD_OPTION, "this driver plays the sound itself, so lead_in can't be used")
         goal.error = None
         while self._goal is goal:
             if goal.with_driver:
@@ -313,7 +313,7 @@ class GoalRunner:
         if self._goal is not goal:
             return
         if self._pump is None:
-            self._fail(Reason.ENGINE_FAILED, "the driver lost the sentence")
+            self._fail(Reason.ENGINE_FAILED, "the driver dropped the sentence")
         elif goal.error is not None:  # a driver never reports the end of a text if its `say` has failed
             self._engine.stop()
             self._engine.proxy.setBusy(False)  # otherwise, pyttsx3 would not send the next text to the driver
@@ -357,7 +357,7 @@ class GoalRunner:
         elif goal.stop_requested:
             self._end(protocol.OUTCOME_STOPPED)
         elif error is None:
-            self._fail(Reason.ENGINE_FAILED, "the driver did not complete the sentence")
+            self._fail(Reason.ENGINE_FAILED, "the driver stopped before the end of the sentence")
         else:
             traceback.print_exception(error)  # this goes to the server's log
             self._fail(Reason.ENGINE_FAILED, f"{type(error).__name__}: {error}")
@@ -393,7 +393,7 @@ class GoalRunner:
         overdue = time.monotonic() > goal.progress_at + limit
         if overdue and not goal.overdue_logged:
             goal.overdue_logged = True
-            sys.stderr.write(f"the driver did not end what takes less than {limit:.0f} s\n")
+            sys.stderr.write(f"the driver did not finish a text that takes less than {limit:.0f} s\n")
         return overdue
 
 

@@ -225,7 +225,7 @@ class PrivateEngine(contextlib.AbstractContextManager["PrivateEngine"]):
         try:
             self._process = EngineProcess(configure, env=env)
         except OSError as error:
-            raise EngineFailed(Reason.ENGINE_FAILED, f"the engine process cannot be started: {error}") from error
+            raise EngineFailed(Reason.ENGINE_FAILED, f"the engine process could not be started: {error}") from error
         self._deadline = deadline
         self._interrupt = interrupt
         self._last_event_at = time.monotonic()
@@ -276,5 +276,5 @@ class PrivateEngine(contextlib.AbstractContextManager["PrivateEngine"]):
                 raise TimeoutError
             if now >= self._last_event_at + limit:
                 if process.ready:
-                    raise EngineFailed(Reason.ENGINE_HUNG, f"the engine gave no sign of life for {limit:g} s", limit)
-                raise EngineFailed(Reason.ENGINE_FAILED, f"the engine was not ready after {limit:g} s", limit)
+                    raise EngineFailed(Reason.ENGINE_HUNG, f"the engine did not respond for {limit:g} s", limit)
+                raise EngineFailed(Reason.ENGINE_FAILED, f"the engine was not ready within {limit:g} s", limit)

@@ -118,7 +118,7 @@ def render(
             raise TimeoutError("the text was not rendered in time") from None
         except CannotWrite as error:
             if output_fd is not None and path in STANDARD_OUTPUT and wait_ready({output_fd: 0}, 0.0):
-                raise BrokenPipeError(errno.EPIPE, "the reader of standard output is gone") from error
+                raise BrokenPipeError(errno.EPIPE, "the reader of standard output has closed it") from error
             raise
 
 
@@ -146,7 +146,7 @@ def _speak_all(engine: PrivateEngine, commands: Iterator[protocol.Speak], engine
     """
     ready = engine.wait_for(protocol.Ready)
     if ready.player is None:
-        raise UsageError(f'the driver "{ready.driver}" cannot write a file: leave --driver out, on Linux')
+        raise UsageError(f'the driver "{ready.driver}" cannot write files; leave out --driver (on Linux)')
     seconds, silent_end = 0.0, None
     for command in commands:
         try:
@@ -174,7 +174,7 @@ def _engine_failure(error: EngineFailed, voice: str | None) -> RenderFailed:
 
 def _goal_failure(ended: protocol.Ended, engine_path: str, path: str) -> RenderFailed:
     reason = ended.reason or Reason.ENGINE_FAILED
-    message = (ended.message or "the engine did not complete the text").replace(engine_path, path)
+    message = (ended.message or "the engine stopped before the end of the text").replace(engine_path, path)
     if reason in _FILE_REASONS:
         problem = message.removeprefix(path)
         return CannotWrite(path, f"cannot be written{problem}" if problem.startswith(": ") else problem.strip())
@@ -210,8 +210,8 @@ def _open_output(path: str, deadline: float, interrupt: Mapping[int, int] | None
     try:
         if os.isatty(output_fd):
             raise UsageError(
-                f"{_display_name(path)} is a terminal, and sound is no text: name a file, or a program that reads it, "
-                "as in: talk say -o - TEXT | aplay"
+                f"{_display_name(path)} is a terminal; write the sound to a file, or pipe it to a program: "
+                "talk say -o - TEXT | aplay"
             )
         yield output_fd
     finally:
@@ -228,7 +228,7 @@ def _open_without_blocking(path: str, deadline: float, interrupt: Mapping[int, i
                 raise _write_failure(path, error) from error
         left = min(_READER_CHECK_INTERVAL_S, deadline - time.monotonic())
         if left <= 0:
-            raise TimeoutError(f"nobody has opened {path} to read it within the time")
+            raise TimeoutError(f"no program opened {path} for reading in time")
         wait_ready({}, left, interrupt)
 
 
@@ -247,7 +247,7 @@ def _hidden_file(path: str) -> Iterator[str]:
         except OSError as error:
             directory = os.path.dirname(hidden)
             if not os.path.isdir(directory):
-                raise CannotWrite(path, f"cannot be written: there is no directory {directory}") from error
+                raise CannotWrite(path, f"cannot be written: the directory {directory} does not exist") from error
             raise _write_failure(path, error) from error
         yield hidden
         try:
@@ -270,7 +270,7 @@ def _resolve_target(path: str) -> str:
         CannotWrite: the path can't be replaced with a file.
     """
     if not path or path.endswith(os.sep) or "\0" in path:
-        raise CannotWrite(repr(path), "is no name of a file: a rendering needs one, as in speech.wav")
+        raise CannotWrite(repr(path), "is not a file name; use one such as speech.wav")
     target = os.path.realpath(path)
     try:
         found = os.stat(path)
@@ -279,11 +279,11 @@ def _resolve_target(path: str) -> str:
     except OSError as error:
         raise _write_failure(path, error) from error
     if stat.S_ISDIR(found.st_mode):
-        raise CannotWrite(path, "is a directory: name a file in it")
+        raise CannotWrite(path, "is a directory; name a file in it")
     # A link in /proc/*/fd may point to a deleted file, which can't be replaced.
     placed = os.path.exists(target) and os.path.samefile(path, target)
     if not stat.S_ISREG(found.st_mode) or not placed or _is_own_output(found):
-        raise CannotWrite(path, "is no file that can be replaced: name another, as in speech.wav")
+        raise CannotWrite(path, "is not a file that can be replaced; name another file, such as speech.wav")
     if not os.access(target, os.W_OK):
         raise CannotWrite(path, "cannot be written: it is write-protected")
     return target

@@ -284,15 +284,15 @@ class Supervisor:
 
     def _deadlines(self) -> Iterator[tuple[float, str]]:
         """Yield the current deadlines, each with the error message to report if it is missed."""
-        goal, no_sign = self._goal, f"the engine gave no sign of life for {HANG_LIMIT_S:g} s"
+        goal, no_sign = self._goal, f"the engine did not respond for {HANG_LIMIT_S:g} s"
         if self._process and not self._process.ready:
-            yield self._started_at + START_LIMIT_S, f"the engine was not ready after {START_LIMIT_S:g} s"
+            yield self._started_at + START_LIMIT_S, f"the engine was not ready within {START_LIMIT_S:g} s"
         if goal and goal.sent:
             yield goal.stop_due, f"the engine did not confirm a stop within {STOP_LIMIT_S * 1000:.0f} ms"
             yield self._last_sign_at + HANG_LIMIT_S, no_sign
             yield goal.hold_due, f"the engine did not confirm a pause within {HOLD_LIMIT_S:g} s"
         elif self._loading is not None:
-            yield self._last_sign_at + HANG_LIMIT_S, f"{no_sign} while it loaded {self._loading}"
+            yield self._last_sign_at + HANG_LIMIT_S, f"{no_sign} while loading {self._loading}"
 
     def _check_deadlines(self, now: float) -> None:
         missed = next((message for deadline, message in self._deadlines() if now >= deadline), None)
@@ -304,7 +304,7 @@ class Supervisor:
             self._dying[process] = NEVER  # do this only once; the process is still reaped when it exits
             process.kill()  # the first kill may have left processes alive if no descriptor was free
             if self._goal and self._goal.lost_process is process:
-                message = f"the player could not be ended within {KILL_LIMIT_S:g} s"
+                message = f"the player could not be stopped within {KILL_LIMIT_S:g} s"
                 self._fail_goal(self._goal, Reason.NOT_SILENT, message)
 
     def _handle_ready(self, process: EngineProcess, descriptor: int) -> None:
@@ -358,7 +358,7 @@ class Supervisor:
             return True
         self._receive(process)  # if the process is dead, this reports a crash instead
         if process is self._process:
-            self._lose_process("the engine takes no commands", Reason.ENGINE_HUNG)
+            self._lose_process("the engine does not accept commands", Reason.ENGINE_HUNG)
         return False
 
     def _hold_goal(self, goal_id: str, number: int | None) -> None:
@@ -409,7 +409,7 @@ class Supervisor:
         try:
             process = EngineProcess(self._configure, self._report_stderr)
         except OSError as error:
-            message = f"the engine process cannot be started: {error.strerror or error}"
+            message = f"the engine process could not be started: {error.strerror or error}"
             self._post(EngineDied(message))
             self._handle_failed_start(message)
             return
@@ -419,7 +419,7 @@ class Supervisor:
     def _report_stderr(self, line: str) -> None:
         omitted = self._stderr_quota.allow(time.monotonic())
         if omitted:
-            self._post(EngineSaid(f"({omitted} lines were left out)"))
+            self._post(EngineSaid(f"({omitted} lines were omitted)"))
         if omitted is not None:
             self._post(EngineSaid(line))
 
@@ -529,7 +529,7 @@ class Supervisor:
 
     def _shut_down(self) -> None:
         """Kill the process, and wait a limited time for it to exit."""
-        self._lose_process("the server ends", Reason.SHUTDOWN)
+        self._lose_process("the server is shutting down", Reason.SHUTDOWN)
         deadline = time.monotonic() + KILL_LIMIT_S / 4
         while self._dying and time.monotonic() < deadline:
             self._wait(deadline)

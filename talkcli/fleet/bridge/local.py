@@ -53,10 +53,10 @@ class LocalConnection(ClientCore):
         try:
             first, *self._lines = await self.read() or [b""]
             if not first and self._loop.time() >= limit.when():
-                hint = f"look at process {listener}, and restart it if it hangs"
-                raise ServerUnavailable(f"the server at {self.path} does not answer; {hint}")
+                hint = f"check process {listener}, and restart it if it hangs"
+                raise ServerUnavailable(f"the server at {self.path} did not answer; {hint}")
             if not first:
-                raise ServerUnavailable(f"the server at {self.path} closed the connection before it answered")
+                raise ServerUnavailable(f"the server at {self.path} closed the connection without an answer")
             boot, pid = read_greeting(first, self.path)
         except BaseException:
             self.close()

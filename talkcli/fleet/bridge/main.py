@@ -58,7 +58,7 @@ _DEVICE_DELAY_S = 3.0
 _OFFLINE_LIMIT_S = 1.0
 #: Prefix of an echo message that asks whether another bridge uses the robot's name.
 _RIVAL_QUESTION = b"? "
-_RIGHTS = "may its user do there what 'talk bridge --print-acl' has for these options?"
+_RIGHTS = "compare its access rules with 'talk bridge --print-acl' (with the same options)"
 
 
 @frozen
@@ -97,7 +97,7 @@ async def _run(settings: BridgeSettings, read_broker: Callable[[], Broker]) -> N
     loop, bridge = asyncio.get_running_loop(), Bridge(settings, read_broker)
 
     def on_signal(number: signal.Signals) -> None:
-        log.write(f"{number.name}: ending")
+        log.write(f"stopping after {number.name}")
         bridge.end()
 
     loop.set_exception_handler(log.handle_loop_error)
@@ -157,7 +157,7 @@ class Bridge:
     async def run(self) -> None:
         """Keep the robot connected until `end` is called."""
         self._broker.ssl_context()  # check the certificate files before anything is started
-        log.write(f"robot {self._settings.name}, by the broker at {self._broker.url}")
+        log.write(f"starting: robot {self._settings.name}, broker {self._broker.url}")
         self._systemd.notify_ready()
         tasks = [asyncio.create_task(each) for each in (self._stay_connected(), self._publisher.run())]
         for task in tasks:
@@ -188,9 +188,9 @@ class Bridge:
     def _status_text(self) -> str:
         """Return the status line for systemd."""
         broker = "online" if self._online else "OFFLINE"
-        there = "server there" if self._publisher.server else "no server"
+        there = "server running" if self._publisher.server else "no server"
         pending = len(self._sessions.goals)
-        goals = f"{pending} goal{'' if pending == 1 else 's'} pending"
+        goals = f"{pending} goal{'' if pending == 1 else 's'} waiting"
         return f"{self._settings.name} at {self._broker.url}: {broker}, {there}, {goals}"
 
     # -- the connection
@@ -207,7 +207,7 @@ class Bridge:
                     await self._disconnected.wait()
                 finally:
                     self._disconnect(link)
-                log.write(f"the connection to the broker has ended: {log.sanitize(str(link.ended))}")
+                log.write(f"disconnected from the broker: {log.sanitize(str(link.ended))}")
             except TalkError as error:
                 log.write_limited("broker", log.sanitize(str(error)))
             await asyncio.sleep(random.uniform(0, self._retry_s))
@@ -215,7 +215,7 @@ class Bridge:
             try:
                 self._broker = self._read_broker()
             except TalkError as error:
-                log.write_limited("settings", f"{log.sanitize(str(error))}; what was there before is used")
+                log.write_limited("settings", f"{log.sanitize(str(error))}; the previous settings are used")
 
     async def _open(self, link: Link) -> None:
         """Open a link without blocking the event loop."""
@@ -261,7 +261,7 @@ class Bridge:
         self._publish_device()
         self._publisher.schedule_status()
         self._systemd.schedule_status()
-        log.write(f"online, at {self._broker.url}")
+        log.write(f"online at {self._broker.url}")
 
     def _disconnect(self, link: Link) -> None:
         """Close a connection, and end all sessions that use it."""
@@ -294,8 +294,8 @@ class Bridge:
         if link is not self._link or self._descriptor < 0:
             return
         if link.ended is None and link.outstanding_bytes > STUCK_BROKER_BYTES:
-            words = f"{STUCK_BROKER_BYTES >> 20} MiB wait, so the connection is given up"
-            log.write_limited("output", f"the broker takes nothing: {words}")
+            words = f"{STUCK_BROKER_BYTES >> 20} MiB are unsent, so the connection is closed"
+            log.write_limited("output", f"the broker accepts no data: {words}")
             link.close()
         if link.ended is not None:
             # Stop watching the descriptor now, because its number may be reused. Disconnect later, because the caller
@@ -321,8 +321,8 @@ class Bridge:
         if link is None:
             return
         if len(message.payload) > link.max_payload_bytes:  # otherwise, the broker would close the connection
-            words = f"{len(message.payload):,} bytes for {message.topic} are not published"
-            log.write_limited("long", f"{words}: the broker takes {link.max_payload_bytes:,}")
+            words = f"dropped a message of {len(message.payload):,} bytes for {message.topic}"
+            log.write_limited("long", f"{words}: the broker accepts at most {link.max_payload_bytes:,}")
             return
         link.publish(message, qos, acknowledged or self._log_denial)
         self._check_link(link)
@@ -335,7 +335,7 @@ class Bridge:
     def _log_denial(self, reason: int) -> None:
         """Log a warning if the broker's reason code means that a message was not authorized."""
         if reason == REASON_NOT_AUTHORIZED:
-            log.write_limited("rights", f"the broker doesn't let this robot publish all that it says: {_RIGHTS}")
+            log.write_limited("rights", f"the broker does not allow this robot to publish a message; {_RIGHTS}")
 
     def _max_payload(self) -> int:
         return self._link.max_payload_bytes if self._link else 0
@@ -346,7 +346,7 @@ class Bridge:
         try:
             self._handle(message)
         except Exception as error:  # noqa: BLE001 - no message may crash the bridge
-            log.write_bug("what came from the broker", error)
+            log.write_bug("a message from the broker", error)
 
     def _handle(self, message: Message) -> None:
         if message.topic == self._echo_topic:
@@ -371,7 +371,7 @@ class Bridge:
             error = decision.error
             if decision.reply:
                 self._publish(decision.reply)
-            log.write_limited(error.code, f"a request of {topic[1]} is refused: {log.sanitize(error.message)}")
+            log.write_limited(error.code, f"refused a request of {topic[1]}: {log.sanitize(error.message)}")
             if error.code == STALE_CODE and boottime() - self._echo_at >= _ECHO_PAUSE_S:
                 self._send_echo()
 
@@ -398,7 +398,7 @@ class Bridge:
         rank = bridge_rank(presence)
         if payload and (presence is None or (presence.online and rank is None)):
             words = 'it is not a JSON object with "online", "session" and a numeric "since"'
-            log.write_limited("presence", f"a message on this robot's presence topic is ignored: {words}")
+            log.write_limited("presence", f"ignored a message on this robot's presence topic: {words}")
         if rank and rank[1] == self._session:
             return
         if not self._rival_timer:
@@ -407,8 +407,8 @@ class Bridge:
             if self._online:
                 self._publish_presence()  # replace an invalid message, or a will that arrived late
         elif rank < (self._since, self._session):
-            words = f"another bridge is '{self._settings.name}' already: session {log.sanitize(rank[1])}"
-            self.end(AddressInUse(f"{words}; each robot has a name of its own, give another --name"))
+            words = f"another bridge already uses the name '{self._settings.name}': session {log.sanitize(rank[1])}"
+            self.end(AddressInUse(f"{words}; choose another name with --name"))
         else:
             self._go_online()
             self._publish_presence()  # tell the younger bridge that the name is in use
@@ -447,7 +447,7 @@ class Bridge:
         self._check_link(link)
         # Compare two sending times, because this process may have been stopped for a while, and have read no echoes.
         if self._echo_at - self._policy.newest_echo_at > _ECHO_TIMEOUT_S:
-            log.write_limited("echo", f"nothing that this robot sends itself comes back: {_RIGHTS}")
+            log.write_limited("echo", f"the broker does not return this robot's own messages; {_RIGHTS}")
             self._disconnect(link)
             return
         self._send_echo()

@@ -140,16 +140,16 @@ class Policy:
             now: the current time, by the `boottime` clock.
         """
         if message.retained:
-            return Ignored("retained", f"a retained message on {message.topic} is dropped: it is no request of now")
+            return Ignored("retained", f"dropped a retained message on {message.topic}, because it may be old")
         reply_topic = None
         if message.response is not None:
             reply_topic = topics.checked_reply(message.response, user, self._name)
             if reply_topic is None:
-                words = f"its response topic, {message.response}, is not its own"
-                return Ignored("response", f"a message of {user} is dropped: {words}")
+                words = f"its response topic {message.response} belongs to another client"
+                return Ignored("response", f"dropped a message of {user}: {words}")
         if not message.payload and kind != topics.PLAIN_CANCEL:
             if reply_topic is None or kind == topics.PLAIN_SAY:
-                return Ignored("empty", f"an empty message on {message.topic} asks for nothing")
+                return Ignored("empty", f"ignored an empty message on {message.topic}")
             return Goodbye(user, reply_topic)
         repeatable = len(message.correlation or b"") <= MAX_CORRELATION_BYTES
         seq, correlation = None, message.correlation if repeatable else None
@@ -157,13 +157,13 @@ class Policy:
             fields = _request_fields(kind, message.payload)
             seq = take_seq(fields)
             if not repeatable:
-                raise BadRequest(f"correlation data have at most {MAX_CORRELATION_BYTES} bytes", "bad_field")
+                raise BadRequest(f"correlation data must have at most {MAX_CORRELATION_BYTES} bytes", "bad_field")
             request = read_request(fields)
             if request.kind not in self._allow:
-                words = f"this robot takes no {request.kind} from afar: see its --allow"
+                words = f"remote clients may not use {request.kind} on this robot; add it to --allow of its bridge"
                 raise BadRequest(words, "not_allowed")
             if isinstance(request, Say) and now - self.newest_echo_at > STALE_AFTER_S:
-                words = "the line to the broker stalled, so this may be old: say it again if it still holds"
+                words = "the connection to the broker stalled; send the sentence again if it is still true"
                 raise BadRequest(words, STALE_CODE)
         except BadRequest as error:
             line = encode(failure(seq, error.code, error.message))
@@ -184,13 +184,13 @@ def _request_fields(kind: str, payload: bytes) -> JsonObject:
         return {"request": "cancel"}
     line = payload.removesuffix(b"\n") if kind == topics.REQUEST else payload
     if len(line) >= MAX_LINE_BYTES:
-        raise LineTooLong(f"a request has at most {MAX_LINE_BYTES} bytes")
+        raise LineTooLong(f"a request must have at most {MAX_LINE_BYTES} bytes")
     if kind == topics.REQUEST:
         return decode(line)
     try:
         return {"request": "say", "text": line.decode()}
     except UnicodeDecodeError as error:
-        words = f"a text is UTF-8, but byte {error.start} of this one is not"
+        words = f"the text must be UTF-8, but byte {error.start} is invalid"
         raise BadRequest(words, "bad_encoding") from None
 
 

@@ -94,7 +94,7 @@ class Publisher:
                     if self.server:
                         self._set_server(None, ServerStatus({}, None, (), ()), "")
             except TalkError as error:
-                log.write_limited("server", f"no news of the server: {log.sanitize(str(error))}")
+                log.write_limited("server", f"not connected to the server: {log.sanitize(str(error))}")
             await asyncio.sleep(random.uniform(0, self._retry_s))
             self._retry_s = min(_LAST_SERVER_RETRY_S, self._retry_s * 2)
 
@@ -113,7 +113,7 @@ class Publisher:
         server.send(Exchange(Watch(), partial(self._on_watching, server), refuse))
         while lines := await server.read():
             self._receive(server, lines)
-        log.write("the server's connection has ended")
+        log.write("the connection to the server has ended")
 
     def schedule_status(self) -> None:
         """Publish the status after a short delay."""
@@ -126,7 +126,7 @@ class Publisher:
         server = self._connection
         if server and self._loop.time() > server.silent_by(0.0)[0]:
             path = log.sanitize(server.path)
-            log.write_limited("silence", f"the server at {path} says nothing: restart it if it hangs")
+            log.write_limited("silence", f"the server at {path} does not respond; restart it if it hangs")
             server.abort()
 
     # -- from the server
@@ -140,7 +140,7 @@ class Publisher:
                 else:
                     server.dispatch(message, self._loop.time())
             except (BadRequest, ValueError) as error:
-                log.write_limited("line", f"what the server says can't be read: {log.sanitize(str(error))}")
+                log.write_limited("line", f"the server sent a malformed message: {log.sanitize(str(error))}")
 
     def _on_watching(self, server: LocalConnection, reply: JsonObject, items: list[JsonObject]) -> None:
         """Store the server's state from its reply to `watch`."""
@@ -148,7 +148,7 @@ class Publisher:
         self._retry_s = _FIRST_SERVER_RETRY_S
         for each in unfinished(status):
             self._sessions.remember(each, server.boot)
-        log.write(f"the server at {log.sanitize(server.path)} is there (pid {server.pid})")
+        log.write(f"connected to the server at {log.sanitize(server.path)} (pid {server.pid})")
         about = {"boot": server.boot, "pid": server.pid, "version": status.server.get("version")}
         self._set_server(about, status, server.boot)
 

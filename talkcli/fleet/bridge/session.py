@@ -48,7 +48,7 @@ CLIENT_SILENCE_LIMIT_S = 90.0
 #: A generated goal id begins with the robot's name, which is cut to this length. An id has at most 64 characters.
 _MAX_ID_PREFIX_CHARS = 48
 #: Message to a client after the server has closed the client's connection.
-_SERVER_GONE = "the robot's talk server ended the connection"
+_SERVER_GONE = "the robot's talk server closed the connection"
 _ALIVE = b'{"event": "alive"}\n'
 #: Lines that start with one of these are published with QoS 0, because losing one does no harm.
 _UNRELIABLE = (b'{"event": "word"', b'{"event": "alive"')
@@ -101,7 +101,7 @@ class RemoteSessions:
             self._sessions[key] = session
             session.submit(request)
         else:
-            session.refuse(request, Busy.code, f"{self.name} has as many askers as it takes: {MAX_SESSIONS}")
+            session.refuse(request, Busy.code, f"{self.name} already has {MAX_SESSIONS} remote clients")
 
     def say_goodbye(self, user: str, reply_topic: str) -> None:
         """End a client's session once the server has answered its requests."""
@@ -120,7 +120,7 @@ class RemoteSessions:
         for session in list(self._sessions.values()):
             if now - session.used_at > CLIENT_SILENCE_LIMIT_S:
                 limit = f"{CLIENT_SILENCE_LIMIT_S:g} s"
-                session.end(f"you have said nothing for {limit}: whoever waits says hello every 30 s")
+                session.end(f"this client sent nothing for {limit}; a waiting client must send hello every 30 s")
             else:
                 session.send_alive()
 
@@ -135,7 +135,7 @@ class RemoteSessions:
         candidates = [each for each in sessions if each.idle] or (sessions if urgent else [])
         if candidates:
             oldest = min(candidates, key=lambda each: each.used_at)
-            oldest.end("the place was needed for another's cancel or status")
+            oldest.end("the session was closed to make room for an urgent request of another client")
         return bool(candidates)
 
     # -- from the sessions
@@ -263,9 +263,9 @@ class RemoteSession:
         urgent = isinstance(request.request, Cancel | Status)
         limit = 2 * MAX_WAITING_BYTES if urgent else MAX_WAITING_BYTES
         if len(self.unanswered) >= MAX_WAITING_REQUESTS:
-            self.refuse(request, Busy.code, f"{MAX_WAITING_REQUESTS} requests of yours are waiting already")
+            self.refuse(request, Busy.code, f"{MAX_WAITING_REQUESTS} requests of this client are already waiting")
         elif self._sessions.waiting_bytes() + request.size_bytes > limit:
-            self.refuse(request, Busy.code, f"{MAX_WAITING_BYTES >> 20} MiB of requests are waiting already")
+            self.refuse(request, Busy.code, f"{MAX_WAITING_BYTES >> 20} MiB of requests are already waiting")
         elif self._server:
             self._send_request(request)
         else:
@@ -358,7 +358,7 @@ class RemoteSession:
         goal_id = say.id or self._new_id()
         boot, counted = shared.ids.boot_of(goal_id), shared.goals.counts(say)
         if boot not in (None, server.boot):
-            words = f"{goal_id} was sent to a server that has ended since: it may have been spoken"
+            words = f"{goal_id} was sent to a server that has ended; it may have been spoken"
             self.refuse(remote, "lost", words)
         elif has_room or (shared.goals.has_room(say) and not (counted and shared.waiting)):
             if self._send(_RemoteExchange(remote, remote.say(goal_id, boottime()), is_new=boot is None)):
@@ -368,7 +368,7 @@ class RemoteSession:
         elif say.patient:
             shared.waiting.append((remote, say, self))
         else:
-            words = f"{policy.MAX_REMOTE_GOALS} goals from afar are waiting already"
+            words = f"{policy.MAX_REMOTE_GOALS} goals of remote clients are already waiting"
             # As at the server, a rejected goal doesn't get the id that its client has chosen.
             self.end_goal(remote, replace(say, id=None), State.REJECTED, "queue_full", f"not spoken: {words}")
 
@@ -391,7 +391,7 @@ class RemoteSession:
         """Send a request to the server. If it is too long, refuse it and return False."""
         assert self._server
         if not self._server.send(exchange):
-            self.refuse(exchange.remote, "line_too_long", f"a request has at most {MAX_LINE_BYTES} bytes")
+            self.refuse(exchange.remote, "line_too_long", f"a request must have at most {MAX_LINE_BYTES} bytes")
             return False
         return True
 
@@ -425,7 +425,7 @@ class RemoteSession:
             while self._queue:
                 self.refuse(self._queue.popleft(), code, " ".join(str(error).split()))
         except Exception as error:  # noqa: BLE001 - a bug in one session must not end the others
-            log.write_bug("a session", error)
+            log.write_bug("a client's session", error)
         self._clean_up()
 
     def _receive(self, lines: list[bytes]) -> None:
@@ -435,7 +435,7 @@ class RemoteSession:
             try:
                 message = decode(line)
             except BadRequest as error:
-                log.write_limited("server", f"what the server says is no line: {error}")
+                log.write_limited("server", f"the server sent a malformed message: {error}")
                 continue
             if "seq" in message:
                 answers += self._translate(message)
@@ -542,11 +542,11 @@ class RemoteSession:
         shorter = encode(policy.without_texts(message))
         if len(shorter) <= limit:
             return shorter
-        words = f"this has {len(line):,} bytes, and the broker takes {limit:,}"
+        words = f"it has {len(line):,} bytes, but the broker accepts at most {limit:,}"
         if "ok" in message:
             seq = message.get("seq")
-            return encode(failure(seq if isinstance(seq, int) else None, "too_long", words))
-        log.write_limited("long", f"a line for {self._sessions.name} is dropped: {words}")
+            return encode(failure(seq if isinstance(seq, int) else None, "too_long", f"the reply was dropped: {words}"))
+        log.write_limited("long", f"dropped a message for a client: {words}")
         return b""
 
     def _clean_up(self) -> None:

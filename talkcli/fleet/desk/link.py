@@ -185,13 +185,13 @@ class DeskLink:
 
         def on_acknowledged(code: int) -> None:
             if code >= REASON_FAILURE:
-                error = self._rejection(code, f"ask {'the group ' * is_group}{to} for anything")
+                error = self._rejection(code, f"send requests to {'the group ' * is_group}{to}")
                 self._calls.append(partial(on_refused, error))
 
         line = request_line({"seq": number, **write_request(request)})
         if len(line) > self.link.max_payload_bytes:
-            limit = f"the broker takes {self.link.max_payload_bytes:,}: nothing was sent"
-            on_refused(RequestRefused(f"{request.kind} has {len(line):,} bytes, and {limit}", "too_long"))
+            limit = f"the broker accepts at most {self.link.max_payload_bytes:,}; nothing was sent"
+            on_refused(RequestRefused(f"the request has {len(line):,} bytes, but {limit}", "too_long"))
             return False
         expiry = (request.ttl or None) if isinstance(request, Say) else _REQUEST_EXPIRY_S
         topic, response = self._topics(to, is_group=is_group)
@@ -244,14 +244,14 @@ class DeskLink:
         """
         url = self.broker.url
         if code != REASON_NOT_AUTHORIZED:
-            return ServerUnavailable(f"nothing was sent: the broker at {url} refuses it, reason 0x{code:02x}")
-        words = f"the broker at {url} does not let '{self.user}' {action}"
-        return AccessDenied(f"{words}: its ACL needs the lines of an operator, see 'talk bridge --print-acl'")
+            return ServerUnavailable(f"nothing was sent: the broker at {url} refused it (reason 0x{code:02x})")
+        words = f"the broker at {url} does not allow '{self.user}' to {action}"
+        return AccessDenied(f"{words}; add the lines of an operator to its access rules: talk bridge --print-acl")
 
     def _no_answer_error(self, timeout: float) -> TalkError:
         """Return the error to raise if the broker hasn't sent its retained messages within `timeout` seconds."""
         if self.link is None or self.marker_at is not None:
-            return ServerUnavailable(f"the broker at {self.broker.url} does not answer within {timeout:g} s")
+            return ServerUnavailable(f"the broker at {self.broker.url} did not answer within {timeout:g} s")
         return self._rejection(REASON_NOT_AUTHORIZED, f"read {topics.reply(self.user, '+', '+')}")
 
     def _maintain(self, link: Link | None, now: float) -> float:
@@ -301,4 +301,4 @@ class DeskLink:
         link.close()
         self.link, self.marker_at = None, None
         self._next_attempt_at = time.monotonic() + random.uniform(0, _FIRST_BROKER_PAUSE_S)
-        self.handler.on_disconnected(f"the broker at {self.broker.url} went away")
+        self.handler.on_disconnected(f"the connection to the broker at {self.broker.url} was lost")

@@ -50,10 +50,10 @@ class Selection:
         for kind, name in (("group", self.group), ("robot", self.name)):
             if name is not None:
                 fault = topics.name_fault(name)
-                return fault and f"no {kind} can be called '{name}': a name {fault}"
+                return fault and f"invalid {kind} name '{name}': it {fault}"
         # An unclosed bracket matches only itself, and robots' names contain no brackets.
         if not _GLOB.fullmatch(self.text) or "[" in re.sub(r"\[!?[^]]+\]", "", self.text):
-            return f"the glob '{self.text}' matches no robot's name: it has A-Z a-z 0-9 . _ - with *, ? and [ ] alone"
+            return f"the pattern '{self.text}' can't match any robot; it may only contain A-Z a-z 0-9 . _ - * ? and [ ]"
         return None
 
     def includes(self, presence: Presence) -> bool:

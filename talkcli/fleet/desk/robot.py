@@ -93,7 +93,7 @@ class RobotConnection(Connection):
         """
         super().__init__(patience)
         if fault := topics.name_fault(robot):
-            raise UsageError(f"no robot can be called '{printable(robot)}': a name {fault}")
+            raise UsageError(f"invalid robot name '{printable(robot)}': it {fault}")
         self._sender = checked_sender_name(name)
         self.robot, self._desk = robot, desk
         self._numbers = numbers or self._numbers
@@ -177,7 +177,7 @@ class RobotConnection(Connection):
     def silent_by(self, began: float) -> tuple[float, str]:
         if self.absent_since is None:
             return super().silent_by(began)
-        return self.absent_since + ABSENCE_LIMIT_S, f"{self.absence}, for {ABSENCE_LIMIT_S:g} s"
+        return self.absent_since + ABSENCE_LIMIT_S, f"{self.absence} (for {ABSENCE_LIMIT_S:g} s)"
 
     def refusal(self, reply: JsonObject, items: list[JsonObject]) -> TalkError:
         error = super().refusal(reply, items)
@@ -235,7 +235,7 @@ class RobotConnection(Connection):
         if presence.get("online") is not True:
             self._mark_absent(f"{self.robot} is offline", RobotOffline)
         elif not isinstance(server, dict):
-            self._mark_absent(f"{self.robot} has no talk server at this moment", NoServer)
+            self._mark_absent(f"{self.robot} has no running talk server", NoServer)
         elif self._bridge_session != presence.get("session") or self.absent_since is not None:
             self.boot, self.pid = identity(server)
             self._bridge_session = presence.get("session")
@@ -255,15 +255,15 @@ class RobotConnection(Connection):
             self._desk.poll(left, self._interrupt)
         self._patience = max(self._patience, round(give_up - time.monotonic(), 1))
         if not self._presence:
-            words = f"no robot '{self.robot}' is known at {self._desk.broker.url}: nothing was sent"
-            raise ServerUnavailable(f"{words}; on the robot: talk bridge --name {self.robot}")
+            words = f"no robot '{self.robot}' is known at {self._desk.broker.url}, so nothing was sent"
+            raise ServerUnavailable(f"{words}; on the robot, run: talk bridge --name {self.robot}")
         self.check_online()
 
     def check_online(self) -> None:
         """Raise ServerUnavailable or ProtocolMismatch if the robot can't receive requests at the moment."""
         check_greeting(self._presence)
         if self.absent_since is not None:
-            raise self._absence_error(f"{self.absence}: nothing was sent")
+            raise self._absence_error(f"{self.absence}, so nothing was sent")
 
     # -- after an absence
 
@@ -297,9 +297,9 @@ class RobotConnection(Connection):
         request = exchange.request
         left = 0.0 if exchange.latest is None else exchange.latest - boottime()
         exchange.resends += 1
-        why = "its time was over before an answer came" if left < 0 else f"{self.absence}, {_MAX_RESENDS} times"
+        why = "its ttl was over before an answer came" if left < 0 else f"{self.absence} ({_MAX_RESENDS} times)"
         if isinstance(request, Say) and request.id in self._canceled:
-            left, why = -1.0, "it was cancelled before the robot had heard of it"
+            left, why = -1.0, "it was cancelled before the robot received it"
         if left < 0 or exchange.resends > _MAX_RESENDS:
             self.fail(exchange, self._lost_error(exchange, why))
             return
@@ -310,7 +310,7 @@ class RobotConnection(Connection):
         self._publish(exchange)
 
     def _lost_error(self, exchange: Exchange, why: str) -> Lost:
-        words = f"{exchange.request.kind} was sent to the server at {self.path}, but {why}"
+        words = f"the {exchange.request.kind} request was sent to {self.path}, but {why}"
         return Lost(f"{words}; it may have been carried out")
 
     def _look_up(self, exchange: RobotExchange, request: Say, now: float) -> None:
@@ -325,7 +325,7 @@ class RobotConnection(Connection):
             if isinstance(error, UnknownGoal):
                 self._resend(exchange)
             elif self.absent_since is None:
-                words = f"what became of {request.id} is not told, it may still be spoken: {error.message}"
+                words = f"the result of {request.id} is unknown, and it may still be spoken: {error.message}"
                 self.fail(exchange, Lost(words))
 
         exchange.heard_at = now
@@ -345,7 +345,7 @@ class RobotConnection(Connection):
 
     def dispatch(self, message: JsonObject, now: float) -> Exchange | None:
         if message.get("event") == "gone":
-            self.end(printable(str(message.get("message") or "the server went away")))
+            self.end(printable(str(message.get("message") or "the connection to the server was lost")))
             return None
         exchange = super().dispatch(message, now)
         if exchange is not None and not isinstance(exchange, RobotExchange):

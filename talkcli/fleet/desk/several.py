@@ -139,7 +139,7 @@ class FleetRequest:
     @property
     def why_disconnected(self) -> str | None:
         """An error message if the broker is disconnected, otherwise None."""
-        return None if self._desk.link else f"the broker at {self._desk.broker.url} went away"
+        return None if self._desk.link else f"the connection to the broker at {self._desk.broker.url} was lost"
 
     def results(self, timeout: float | None = None) -> Iterator[Outcome]:
         """Yield the outcomes as they arrive.
@@ -172,7 +172,7 @@ class FleetRequest:
             now = time.monotonic()
             if end is not None and now >= end:
                 done = len(self) - len(self._unfinished)
-                raise TimeoutError(f"{done} of {len(self)} robots are done after {round(timeout or 0.0, 1):g} s")
+                raise TimeoutError(f"{done} of {len(self)} robots have finished after {round(timeout or 0.0, 1):g} s")
             self._desk.poll(min(next_check, end or next_check) - now, self._interrupt)
             if time.monotonic() >= next_check:
                 self._check_all()
@@ -192,7 +192,7 @@ class FleetRequest:
         if not isinstance(self.request, Say):
             return
         if self._closed:
-            raise UsageError("all outcomes have been taken: cancel the goal by its id")
+            raise UsageError("all outcomes have already been returned; cancel the goal by its id")
         goal_id = self._canceled_id = str(self.request.id)
         group = self._selection.group
         if group is not None:
@@ -243,10 +243,10 @@ class FleetRequest:
         selection, url = self._selection, self._desk.broker.url
         if selection.group is not None and self.why_disconnected:
             words = f"{self.request.kind} was sent to the group '{selection.group}', but {self.why_disconnected}"
-            return Lost(f"{words}; it may be carried out")
+            return Lost(f"{words}; it may still be carried out")
         group = selection.group
         which = f"is in the group '{group}'" if group is not None else f"matches '{selection.text}'"
-        return ServerUnavailable(f"no robot {which} at {url}: nothing was sent; 'talk fleet status' lists all")
+        return ServerUnavailable(f"no robot {which} at {url}, so nothing was sent; list them with: talk fleet status")
 
     # -- messages from the broker
 
@@ -427,9 +427,9 @@ def _check_request(request: Request) -> None:
     for each in (*ids, *(() if other is None else (other,))):
         check_id(each)
         if each.isdecimal():
-            raise UsageError("a number is a goal of one server: to several robots name the goal by its whole id")
+            raise UsageError("a goal's number is only valid on one server; for several robots, use the goal's whole id")
     if len(batches(ids)) > 1:
-        raise UsageError(f"{len(ids):,} ids do not fit into one request: to several robots name fewer, or none for all")
+        raise UsageError(f"{len(ids):,} ids do not fit into one request; name fewer ids, or none to select all goals")
     if isinstance(request, Cancel) and request.key is not None and (fault := key_error(request.key)):
         raise UsageError(fault)
     if isinstance(request, Say | Set):

@@ -239,7 +239,7 @@ class FleetWatch:
         if self._retained is not None and self._desk.retained_received:
             self._process_retained(self._retained, now)
         if self._away_since is not None and now - self._away_since >= ABSENCE_LIMIT_S:
-            raise Lost(f"the broker at {self._broker.url} was away for {ABSENCE_LIMIT_S:g} s: {self._away_why}")
+            raise Lost(f"the broker at {self._broker.url} was unreachable for {ABSENCE_LIMIT_S:g} s: {self._away_why}")
         for name in [name for name, until in self._missing.items() if now >= until]:
             del self._missing[name]
             self._set_presence(name, None)

@@ -131,7 +131,7 @@ class WavPlayer(BuiltInPlayer):
             return 0
         end = self._start + self._taken
         if end + len(data) > _MAX_WAV_BYTES:
-            raise CannotSpeak(Reason.AUDIO_LOST, f"{self._path} is full: a WAV file holds 4 GiB")
+            raise CannotSpeak(Reason.AUDIO_LOST, f"{self._path} is full; a WAV file holds at most 4 GiB")
         with _os_errors(Reason.AUDIO_LOST, self._path):
             taken = os.pwrite(self._file, data, _WAV_HEADER.size + end)
         self._taken += taken
@@ -201,11 +201,11 @@ def _os_errors(reason: Reason, subject: str) -> Iterator[None]:
 
 def _open_regular(path: str) -> int:
     if not path:
-        raise CannotSpeak(Reason.AUDIO_DEVICE, "the player file: needs a path, as in file:speech.wav")
+        raise CannotSpeak(Reason.AUDIO_DEVICE, 'the player "file:" needs a path, such as file:speech.wav')
     file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK, 0o666)
     if not stat.S_ISREG(os.fstat(file).st_mode):
         os.close(file)
-        raise CannotSpeak(Reason.AUDIO_DEVICE, f"{path} is no regular file")
+        raise CannotSpeak(Reason.AUDIO_DEVICE, f"{path} is not a regular file")
     return file
 
 
@@ -229,11 +229,11 @@ def _sample_bytes(file: int, path: str, rate: int) -> int:
     found = _WAV_HEADER.unpack(header.ljust(_WAV_HEADER.size, b"\0"))
     found_rate, length = int(found[7]), int(found[12])
     if found != _header_fields(found_rate, length):
-        fault = "is no WAV file of talk's (16 bit, one channel)"
+        fault = "is not a WAV file written by talk (16 bit, one channel)"
     elif found_rate != rate:
-        fault = f"has {found_rate} samples a second, this voice {rate}"
+        fault = f"has {found_rate} samples per second, but this voice has {rate}"
     elif size < _WAV_HEADER.size + length:
         fault = "is shorter than its header says"
     else:
         return length
-    raise CannotSpeak(Reason.AUDIO_DEVICE, f"{path} {fault}: use another file")
+    raise CannotSpeak(Reason.AUDIO_DEVICE, f"{path} {fault}; use another file")

@@ -241,7 +241,7 @@ class ProgramPlayer(Player):
         try:
             self._process = PlayerProcess(command.argv, inherited)
         except OSError as error:
-            message = f"{self.name} cannot be started: {error.strerror or error}"
+            message = f"{self.name} could not be started: {error.strerror or error}"
             raise CannotSpeak(Reason.NO_PLAYER, message) from error
         #: the number of sample bytes written so far, which is negative until the preamble is written
         self._written = -len(command.preamble)
@@ -280,7 +280,7 @@ class ProgramPlayer(Player):
         if status is None:
             if time.monotonic() >= self._exit_due:
                 line = self._errors.line()
-                raise CannotSpeak(Reason.AUDIO_LOST, line or f"{self.name} closed its input before the sound was over")
+                raise CannotSpeak(Reason.AUDIO_LOST, line or f"{self.name} closed its input too early")
             return False
         if status == 0 and self._closed:
             return True
@@ -323,7 +323,7 @@ class ProgramPlayer(Player):
         if status < 0:
             return CannotSpeak(Reason.AUDIO_LOST, f"{self.name} was killed by {signal_name(-status)}")
         if status == 0:
-            return CannotSpeak(Reason.AUDIO_LOST, line or f"{self.name} ended before the sound did")
+            return CannotSpeak(Reason.AUDIO_LOST, line or f"{self.name} exited too early")
         reason = Reason.AUDIO_LOST if self.proven else Reason.AUDIO_DEVICE
         return CannotSpeak(reason, line or f"{self.name} exited with status {status}")
 

@@ -104,7 +104,7 @@ class PulsePlayer(Player):
         try:
             self._lib = libpulse.load()
         except (OSError, AttributeError) as error:
-            raise CannotSpeak(Reason.NO_PLAYER, f"libpulse cannot be loaded: {error}") from error
+            raise CannotSpeak(Reason.NO_PLAYER, f"libpulse could not be loaded: {error}") from error
         self._started_callback = libpulse.StreamCallback(self._on_started)
         self._underflow_callback = libpulse.StreamCallback(self._on_underflow)
         self._time_callback = libpulse.StreamCallback(self._on_time)
@@ -116,7 +116,7 @@ class PulsePlayer(Player):
         self._context = self._lib.context_new(self._loop.api, b"talk")
         if self._context is None:
             self._loop.free()
-            raise CannotSpeak(Reason.NO_PLAYER, "libpulse makes no connection: is there enough memory?")
+            raise CannotSpeak(Reason.NO_PLAYER, "libpulse could not create a connection; free some memory")
         # errors show up in the state of the context
         self._lib.context_connect(self._context, None, libpulse.NO_AUTOSPAWN, None)
         self._run()
@@ -225,7 +225,7 @@ class PulsePlayer(Player):
             self._fail()
             return False
         if time.monotonic() >= self._ready_by:
-            message = f"the sound server does not answer within {READY_LIMIT_S:g} s"
+            message = f"the sound server did not answer within {READY_LIMIT_S:g} s"
             self._error = CannotSpeak(Reason.AUDIO_DEVICE, message)
             return False
         if self._stream is None:
@@ -331,7 +331,7 @@ class PulsePlayer(Player):
             return
         self._muted = True
         if self._audible and self._error is None:
-            self._error = CannotSpeak(Reason.MUTED, f"the output is muted: {self.device}", final=True)
+            self._error = CannotSpeak(Reason.MUTED, f"the output {self.device} is muted", final=True)
 
     def _restart_clock(self) -> None:
         """Forget the reported playback time, and request it again."""
@@ -346,14 +346,14 @@ class PulsePlayer(Player):
         words = self._lib.strerror(number).decode("utf-8", "replace")
         message = f"the sound server ended the stream: {words}"
         if self._stream is None and number in (libpulse.CONNECTION_REFUSED, libpulse.INVALID_SERVER):
-            reason, message = Reason.NO_PLAYER, f"no sound server answers: {words}"
+            reason, message = Reason.NO_PLAYER, f"no sound server is running: {words}"
         elif self._stream is None:
-            message = f"the sound server lets nobody in: {words}"
+            message = f"the sound server rejected the connection: {words}"
         # Here, the error number may belong to a request for a sink that was removed.
         elif self._sink_index != libpulse.NO_INDEX:
             message = "the sound server ended the stream"
         elif number == libpulse.NO_ENTITY and self._wanted_device is not None:
-            message = f'the sound server has no sink "{self._wanted_device}": see pactl list short sinks'
+            message = f'the sound server has no sink "{self._wanted_device}"; list them with: pactl list short sinks'
         elif number == libpulse.NO_ENTITY:
             message = "the sound server has no output"
         self._error = CannotSpeak(reason, message)

@@ -113,7 +113,8 @@ def load_library() -> tuple[Any, str, int]:
     if sound_server is not None:
         os.environ["PULSE_SERVER"] = sound_server
     if rate <= 0:
-        raise NotInstalled("there is no espeak-ng data: sudo apt-get install -y libespeak-ng1 espeak-ng-data")
+        step = "install it with: sudo apt-get install -y libespeak-ng1 espeak-ng-data"
+        raise NotInstalled(f"espeak-ng data is missing; {step}")
     version = (_espeak.Info(None) or b"").decode("utf-8", "replace").split(" ")[0]
     return _espeak, f"eSpeak NG {version} ({origin})", rate
 
@@ -135,7 +136,8 @@ def _preload() -> tuple[str, bytes | None]:
     except (ImportError, OSError) as error:
         if _is_temporary(error):
             raise
-        raise NotInstalled(f"libespeak-ng is missing ({missing}): {install.espeak_library()}") from error
+        step = f"install it with: {install.espeak_library()}"
+        raise NotInstalled(f"libespeak-ng is missing ({missing}); {step}") from error
     return "espeakng-loader", str(espeakng_loader.get_data_path()).encode()
 
 
@@ -183,7 +185,7 @@ class Espeak:
             # Even after an error, the library has switched to the new voice. If a file of that voice is missing, the
             # library would be silent, so switch back.
             self._espeak.SetVoiceByName(self.voice.encode())
-            raise UnknownVoice("part of it is missing")
+            raise UnknownVoice("one of its files is missing")
         self.voice = voice
 
     def speak(self, text: str, settings: SpeechSettings, sink: SampleSink, fallback_reason: str | None = None) -> None:
@@ -248,7 +250,7 @@ class Espeak:
         voice_id = voice.id if voice is not None else ""
         self._phonemizer = phonemizer = EspeakPhonemizer(self._espeak, voice_id)
         if not voice_id or self._espeak.SetVoiceByName(voice_id.encode()) != self._espeak.EE_OK:
-            raise UnknownVoice(f'{self.version} has no voice "{language}", which knows its sounds')
+            raise UnknownVoice(f'{self.version} has no voice "{language}", which this voice needs for its phonemes')
         self._espeak.SetParameter(self._espeak.RATE, _ESPEAK_DEFAULT_WPM, 0)
         try:
             yield phonemizer

@@ -83,7 +83,7 @@ class ModelCache:
         os.makedirs(directory, 0o700, exist_ok=True)
         status = os.lstat(directory)
         if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid() or status.st_mode & 0o077:
-            raise PermissionError(f"{directory} is not this user's alone: chmod 0700, or remove it")
+            raise PermissionError(f"other users can access {directory}; set its mode to 0700, or remove it")
         self._directory = directory
 
     def find(self, key: str) -> tuple[str, str]:
@@ -183,7 +183,7 @@ class Model:
         with open_checked(path) as file:
             size = os.fstat(file.fileno()).st_size
             if size > _MAX_MODEL_BYTES:
-                raise VoiceFileError(f"{path} is larger than any of Piper's models: get the voice anew")
+                raise VoiceFileError(f"{path} is larger than any Piper model; download the voice again")
             content: bytes = file.read(size)
         key = f"{hashlib.sha256(content).hexdigest()}-{_SPLIT_VERSION}-{onnxruntime.__version__}"
         if cache is not None:
@@ -221,11 +221,11 @@ class Model:
         *values, durations = self._run_half(self._encoder, feed, run)
         durations = durations.reshape(-1)
         if len(durations) != len(ids) or not np.isfinite(durations).all() or (durations < 0).any():
-            raise VoiceFileError(f"{self.path} does not tell how long each sound lasts: get the voice anew")
+            raise VoiceFileError(f"{self.path} does not report the duration of each phoneme; download the voice again")
         limit = _MAX_MEAN_FRAMES * len(ids) * max(1.0, duration_scale)
         if durations.sum() > limit:
-            words = f"makes more than {limit:.0f} frames of {len(ids)} sounds"
-            raise VoiceFileError(f"{self.path} {words}: get the voice anew")
+            words = f"makes more than {limit:.0f} frames for {len(ids)} phonemes"
+            raise VoiceFileError(f"{self.path} {words}; download the voice again")
         return Frames(tuple(values), tuple(int(each) for each in np.cumsum(durations)))
 
     def decode(self, frames: Frames, begin: int, end: int, run: ModelRun) -> Any:
@@ -245,10 +245,10 @@ class Model:
         samples = self._run_half(self._decoder, parts, run)[0].reshape(-1)
         hop, rest = divmod(len(samples), high - low)
         if rest or not 0 < hop <= _MAX_FRAME_SAMPLES:
-            raise self._not_piper_error(f"it makes {len(samples)} samples of {high - low} frames")
+            raise self._not_piper_error(f"it makes {len(samples)} samples for {high - low} frames")
         part = samples[(begin - low) * hop : (end - low) * hop]
         if not np.isfinite(part).all():
-            raise VoiceFileError(f"{self.path} makes no sound, but what is no number: get the voice anew")
+            raise VoiceFileError(f"{self.path} makes samples that are not numbers; download the voice again")
         return part
 
     def seconds(self, frames: int) -> float:
@@ -265,11 +265,11 @@ class Model:
         names = {each.name for each in encoder.get_inputs()}
         self._has_speakers = _SPEAKER_INPUT in names
         if names - {_SPEAKER_INPUT} != {*_INPUTS}:
-            raise self._not_piper_error(f"it takes {', '.join(sorted(names))[:_MAX_ERROR_CHARS]}")
+            raise self._not_piper_error(f"its inputs are {', '.join(sorted(names))[:_MAX_ERROR_CHARS]}")
         if [each.type for each in decoder.get_outputs()] != ["tensor(float)"]:
-            raise self._not_piper_error("it makes no samples")
+            raise self._not_piper_error("it outputs no samples")
         if self._has_speakers != (self.description.speakers > 1):
-            raise self._mismatch_error("one has several speakers, the other has one")
+            raise self._mismatch_error("only one of them has several speakers")
         self._frame_inputs = [each.name for each in decoder.get_inputs()]
         self._samples_per_frame = self._try_out()
 
@@ -293,15 +293,15 @@ class Model:
                 raise
             raise self._mismatch_error(str(error.__cause__ or error)) from error
         if not frames.count:
-            raise VoiceFileError(f"{self.path} speaks nothing: get the voice anew")
+            raise VoiceFileError(f"{self.path} makes no sound; download the voice again")
         return len(self.decode(frames, 0, frames.count, run)) // frames.count
 
     def _not_piper_error(self, why: str) -> VoiceFileError:
-        return VoiceFileError(f"{self.path} is none of Piper's models ({why}): get the voice anew")
+        return VoiceFileError(f"{self.path} is not a Piper model ({why}); download the voice again")
 
     def _mismatch_error(self, why: str) -> VoiceFileError:
         both = f"{self.path} and {os.path.basename(self.path)}.json"
-        return VoiceFileError(f"{both} do not belong together ({why[:_MAX_ERROR_CHARS]}): get both from the same place")
+        return VoiceFileError(f"{both} do not belong together ({why[:_MAX_ERROR_CHARS]}); download both again")
 
 
 def load_libraries(path: str) -> None:
@@ -316,7 +316,7 @@ def load_libraries(path: str) -> None:
         import numpy as np  # noqa: F401 - onnxruntime would hide the reason if numpy can't be imported
         import onnxruntime  # noqa: F401
     except Exception as error:
-        raise _model_error(path, "cannot be loaded", error, install.neural()) from error
+        raise _model_error(path, "could not be loaded", error, f"run: {install.neural()}") from error
 
 
 def _split(path: str, content: bytes, cache: ModelCache | None, key: str) -> tuple[Any, Any]:
@@ -328,14 +328,14 @@ def _split(path: str, content: bytes, cache: ModelCache | None, key: str) -> tup
     try:
         encoder_file, decoder_file = split_model(content)
     except NotSplit as error:
-        raise VoiceFileError(f"{path} {error}: get the voice anew, from a source that you trust") from error
+        raise VoiceFileError(f"{path} {error}; download the voice again, from a source that you trust") from error
     try:
         decoder = _session_of(decoder_file)
         if cache is None:
             return _session_of(encoder_file), decoder
         return cache.store(key, lambda place: _session_of(encoder_file, place), decoder_file), decoder
     except Exception as error:
-        raise _model_error(path, "cannot be loaded", error) from error
+        raise _model_error(path, "could not be loaded", error) from error
 
 
 def _session_of(half: Sequence[Buffer], optimized_path: str | None = None) -> Any:
@@ -374,17 +374,17 @@ def _session(model: str | bytes, optimized_path: str | None = None) -> Any:
     return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
 
 
-def _model_error(path: str, problem: str, error: Exception, step: str = "get the voice anew") -> VoiceFileError:
+def _model_error(path: str, problem: str, error: Exception, step: str = "download the voice again") -> VoiceFileError:
     """Convert an exception of onnxruntime to a VoiceFileError. `step` tells the user what to do next."""
     if _is_out_of_memory(error):
         return no_memory_error(path)
     first_line = (str(error).strip() or type(error).__name__).splitlines()[0]
-    return VoiceFileError(f"{path} {problem} ({first_line[:_MAX_ERROR_CHARS]}): {step}")
+    return VoiceFileError(f"{path} {problem} ({first_line[:_MAX_ERROR_CHARS]}); {step}")
 
 
 def no_memory_error(path: str) -> VoiceFileError:
     """Return the error to raise if there isn't enough memory for a model."""
-    return VoiceFileError(f"{path} cannot be spoken with: there is no memory for it; end another program")
+    return VoiceFileError(f"{path} cannot be used: there is not enough memory; end another program")
 
 
 def _is_out_of_memory(error: BaseException | None) -> bool:

@@ -194,7 +194,7 @@ class ModelLoader:
                 if time.monotonic() < self.deadline:
                     return
                 # The thread may hang forever, for example while it reads a file from a dead network drive.
-                raise VoiceFileError(f"{voice} was not loaded within {LOAD_LIMIT_S:g} s: are its files on a slow disk?")
+                raise VoiceFileError(f"{voice} was not loaded within {LOAD_LIMIT_S:g} s; use a faster disk")
             loaded = load.take()
             assert loaded is not None
             self._models[voice] = loaded
@@ -203,7 +203,7 @@ class ModelLoader:
             error = self.errors[voice] = str(caught)
         except Exception as caught:  # noqa: BLE001 - a faulty voice must not stop the engine process
             traceback.print_exception(caught)
-            error = self.errors[voice] = f"{voice} cannot be loaded: {type(caught).__name__}: {caught}"
+            error = self.errors[voice] = f"{voice} could not be loaded: {type(caught).__name__}: {caught}"
         self._events.append(VoiceLoaded(voice, round(time.monotonic() - self._started_at, 3), error))
         load.close()
         self._load = None
@@ -251,7 +251,7 @@ def _load(voice: str) -> Iterator[tuple[Model, _Fingerprints]]:
     """
     path = models.find_models().get(voice.removeprefix(NEURAL_PREFIX))
     if path is None:
-        raise VoiceFileError(f"{voice}: its file is not there any more")
+        raise VoiceFileError(f"{voice}: its file no longer exists")
     try:
         load_libraries(path)  # Import the libraries before reading any files, which may hang.
         fingerprints = _fingerprints(path)

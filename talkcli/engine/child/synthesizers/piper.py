@@ -113,7 +113,7 @@ class Piper:
         model, _, speaker = voice.partition(SPEAKER_MARK)
         path = models.find_models().get(model.removeprefix(NEURAL_PREFIX))
         if path is None:
-            raise UnknownVoice("its file is not there any more")
+            raise UnknownVoice("its file no longer exists")
         with contextlib.suppress(VoiceFileError):
             description = models.read_description(path)
             speaker_number(speaker, description.speaker_names, description.speakers)
@@ -125,7 +125,7 @@ class Piper:
         The samples vary from call to call, unless the description of the voice sets its noise to 0.
         """
         if settings.pitch != _DEFAULT_PITCH:
-            words = f"the voice {self.voice} has no pitch but its own: leave --pitch out, or choose one of espeak's"
+            words = f"the pitch of {self.voice} can't be changed; leave out --pitch, or choose an espeak voice"
             raise CannotSpeak(Reason.BAD_OPTION, words)
         self.has_written = False
         voice = self._model_id
@@ -145,7 +145,7 @@ class Piper:
             raise CannotSpeak(Reason.VOICE_FAILED, str(no_memory_error(self._path))) from error
         except (VoiceFileError, UnknownVoice) as error:
             unknown = isinstance(error, UnknownVoice)
-            words = f"{model.path}.json: {error}: get the voice anew" if unknown else str(error)
+            words = f"{model.path}.json: {error}; download the voice again" if unknown else str(error)
             self.loader.errors[voice] = words
             raise CannotSpeak(Reason.VOICE_FAILED, words) from error
 
@@ -220,12 +220,12 @@ def _speak_parts(
                 silent.clear()
             words, begin, count = (), end, min(_MAX_DECODED_FRAMES, 2 * count)
         if loudest < _SPEECH_LEVEL:
-            raise VoiceFileError(f"{model.path} makes no sound of a text: get the voice anew")
+            raise VoiceFileError(f"{model.path} made no sound from a text; download the voice again")
         if part.ends_sentence and quiet < pause:
             yield bytes((pause - quiet) * SAMPLE_BYTES), ()
     if unknown and first:
-        why = f"has no number for a sound of the text ({unknown[:20]})"
-        raise VoiceFileError(f"{model.path}.json {why}: get both files from the same place")
+        why = f"has no id for a phoneme of the text ({unknown[:20]})"
+        raise VoiceFileError(f"{model.path}.json {why}; download both files from the same source")
 
 
 def _word_time(model: Model, part: SpeechPart, places: Sequence[int], begins: Sequence[int], at: int) -> float:

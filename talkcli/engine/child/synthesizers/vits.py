@@ -71,13 +71,13 @@ def split_model(model: Buffer) -> tuple[ModelHalf, ModelHalf]:
     fields = reader.fields(memoryview(model))
     graphs = _messages(fields, _GRAPH)
     if len(graphs) != 1:
-        raise NotSplit("is no ONNX model")
+        raise NotSplit("is not an ONNX model")
     if any(number == _MODEL_FUNCTIONS for number, _, _ in fields):
-        raise NotSplit("has operators of its own")
+        raise NotSplit("has custom operators")
     graph = _Graph(reader, graphs[0])
     decoder = graph.nodes_after(_DECODER_WEIGHTS)
     if not decoder:
-        raise NotSplit(f"is none of Piper's models: it has no {_DECODER_WEIGHTS}")
+        raise NotSplit(f"is not a Piper model: it has no {_DECODER_WEIGHTS}")
     constants = graph.constants()
     needed = {name for each in decoder for name in each.inputs}
     made_before = {name for each in graph.nodes for name in each.outputs}
@@ -86,7 +86,7 @@ def split_model(model: Buffer) -> tuple[ModelHalf, ModelHalf]:
     encoder = graph.nodes_for(passed)
     durations = [each.outputs[0] for each in encoder if each.operator == _ROUNDING_OPERATOR and each.outputs]
     if not passed or len(durations) != 1:
-        raise NotSplit("is none of Piper's models: it does not tell how long each sound lasts")
+        raise NotSplit("is not a Piper model: it does not report the duration of each phoneme")
     decoder = [*graph.nodes_for(needed & constants), *decoder]
     head = [each for each in fields if _is_shared(reader, each)]
     outputs = [(_OUTPUT, _BYTES, _float_value(name)) for name in [*passed, *durations]]
@@ -116,12 +116,12 @@ class _Reader:
             elif kind in {_FIXED32, _FIXED64}:
                 size = 4 if kind == _FIXED32 else 8
             else:
-                raise NotSplit("is no ONNX model")
+                raise NotSplit("is not an ONNX model")
             if size > end - at:
-                raise NotSplit("is cut short, or no ONNX model")
+                raise NotSplit("is truncated, or not an ONNX model")
             self._fields_left -= 1
             if self._fields_left < 0:
-                raise NotSplit("is none of Piper's models: it has too many parts")
+                raise NotSplit("is not a Piper model: it has too many parts")
             found.append((number, kind, raw[at : at + size]))
             at += size
         return found
@@ -138,11 +138,11 @@ class _Node:
         self.operator = "".join(_names(fields, _OPERATOR))
         domain = "".join(_names(fields, _NODE_DOMAIN))
         if domain not in _STANDARD_DOMAINS:
-            raise NotSplit(f"has operators of its own ({domain[:40]}:{self.operator[:40]})")
+            raise NotSplit(f"has custom operators ({domain[:40]}:{self.operator[:40]})")
         for attribute in _messages(fields, _ATTRIBUTE):
             parts = reader.fields(attribute)
             if any(number in {_SPARSE_TENSOR, _SPARSE_TENSORS} for number, _, _ in parts):
-                raise NotSplit("has sparse weights, which none of Piper's has")
+                raise NotSplit("has sparse weights, unlike any Piper model")
             for tensor in (*_messages(parts, _TENSOR), *_messages(parts, _TENSORS)):
                 _tensor_name(reader, tensor)
             for inner in (*_messages(parts, _SUBGRAPH), *_messages(parts, _SUBGRAPHS)):
@@ -154,10 +154,10 @@ class _Graph:
 
     def __init__(self, reader: _Reader, raw: Buffer, depth: int = 0) -> None:
         if depth > _MAX_NESTED_GRAPHS:
-            raise NotSplit(f"has graphs inside of graphs, more than {_MAX_NESTED_GRAPHS} deep")
+            raise NotSplit(f"has graphs that are nested more than {_MAX_NESTED_GRAPHS} deep")
         fields = reader.fields(raw)
         if any(number == _SPARSE_INITIALIZER for number, _, _ in fields):
-            raise NotSplit("has sparse weights, which none of Piper's has")
+            raise NotSplit("has sparse weights, unlike any Piper model")
         self.nodes = [_Node(reader, each, depth) for each in _messages(fields, _NODE)]
         self._weights = {_tensor_name(reader, each): each for each in _messages(fields, _INITIALIZER)}
         self.inputs = [each for each in fields if each[:2] == (_INPUT, _BYTES)]
@@ -234,11 +234,11 @@ def _names(fields: Iterable[Field], wanted: int) -> list[str]:
     """Return the content of all fields that have this number, as strings."""
     found = _messages(fields, wanted)
     if any(len(value) > _MAX_NAME_BYTES for value in found):
-        raise NotSplit("is none of Piper's models: it has names that are too long")
+        raise NotSplit("is not a Piper model: it has names that are too long")
     try:
         return [bytes(value).decode() for value in found]
     except UnicodeDecodeError as error:
-        raise NotSplit("is no ONNX model: it has names that are no text") from error
+        raise NotSplit("is not an ONNX model: it has names that are not UTF-8") from error
 
 
 def _parse_integer(raw: Buffer, at: int) -> tuple[int, int]:
@@ -251,7 +251,7 @@ def _parse_integer(raw: Buffer, at: int) -> tuple[int, int]:
         shift += 7
         if byte < 128:
             return result, at
-    raise NotSplit("is cut short, or no ONNX model")
+    raise NotSplit("is truncated, or not an ONNX model")
 
 
 def _encode_integer(value: int) -> bytes:
