@@ -35,7 +35,7 @@ with click.Context(talk, info_name="talk") as parent:
     commands = {each: talk.get_command(parent, each) for each in talk.list_commands(parent)}
     for name, command in commands.items():
         with click.Context(command, info_name=name, parent=parent) as context:
-            assert "Exit codes:" in command.get_help(context), name
+            assert "exit codes: talk --help" in command.get_help(context), name
 print(len(names), len(commands))
 """
 
