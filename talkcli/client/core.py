@@ -471,7 +471,7 @@ class ClientCore:
 
     # -- time limits
 
-    def answer_by(self, exchange: Exchange) -> float:
+    def answer_deadline(self, exchange: Exchange) -> float:
         """Return the time by which a request must be sent, or by which the next line of its answer must arrive."""
         if exchange.sent:
             return float("inf") if exchange.slow else exchange.heard_at + self._patience
@@ -494,7 +494,7 @@ class ClientCore:
 
     def next_expiry(self) -> float:
         """Return the time by which `expire` must be called."""
-        times = [self.answer_by(each) for each in self.exchanges.values()]
+        times = [self.answer_deadline(each) for each in self.exchanges.values()]
         if self.listeners.goals:
             times.append(self.goals_lost_at())
         return min(times, default=float("inf"))
@@ -506,7 +506,7 @@ class ClientCore:
             False if the connection must be closed, because a part of a line has been sent (see `forget`).
         """
         intact = True
-        for exchange in [each for each in self.exchanges.values() if self.answer_by(each) <= now]:
+        for exchange in [each for each in self.exchanges.values() if self.answer_deadline(each) <= now]:
             intact = self.forget(exchange) and intact
             self.fail(exchange, self.unanswered(exchange))
         if now >= self.goals_lost_at():

@@ -73,7 +73,7 @@ class KnownPlayer:
     silent: bool = False
 
 
-def _aplay(rate: int, device: str | None) -> PlayerCommand:
+def _aplay_command(rate: int, device: str | None) -> PlayerCommand:
     argv = ["aplay", "-q", "-t", "raw", "-f", "S16_LE", "-c", "1", "-r", str(rate)]
     argv += [f"--buffer-time={BUFFER_MS * 1000}"]
     argv += ["-D", device] if device else []
@@ -81,7 +81,7 @@ def _aplay(rate: int, device: str | None) -> PlayerCommand:
     return PlayerCommand("aplay", tuple(argv), read_ahead=0)
 
 
-def _pacat(rate: int, device: str | None) -> PlayerCommand:
+def _pacat_command(rate: int, device: str | None) -> PlayerCommand:
     argv = ["pacat", "--playback", "--raw", "--format=s16le", "--channels=1", f"--rate={rate}"]
     argv += [f"--latency-msec={BUFFER_MS}", "--process-time-msec=20", "--client-name=talk", "--stream-name=talk"]
     argv += ["-d", device] if device else []
@@ -89,7 +89,7 @@ def _pacat(rate: int, device: str | None) -> PlayerCommand:
     return PlayerCommand("pacat", tuple(argv), read_ahead=int(PIECE_S * rate) * SAMPLE_BYTES)
 
 
-def _pw_cat(rate: int, device: str | None) -> PlayerCommand:
+def _pw_cat_command(rate: int, device: str | None) -> PlayerCommand:
     argv = ["pw-cat", "--playback", f"--latency={BUFFER_MS}ms", "--media-role=Accessibility"]
     argv += [f"--target={device}"] if device else []
     return PlayerCommand("pw-cat", (*argv, "-"), preamble=_au_header(rate))
@@ -110,9 +110,9 @@ def _au_header(rate: int) -> bytes:
 #: before the other programs because robots without a desktop have it, and because it loses no samples if it can't open
 #: the device.
 PLAYERS = {
-    "aplay": KnownPlayer("ALSA", "alsa-utils", _aplay, automatic=True),
-    "pacat": KnownPlayer("PulseAudio", "pulseaudio-utils", _pacat, automatic=True),
-    "pw-cat": KnownPlayer("PipeWire", "pipewire-bin", _pw_cat, automatic=True),
+    "aplay": KnownPlayer("ALSA", "alsa-utils", _aplay_command, automatic=True),
+    "pacat": KnownPlayer("PulseAudio", "pulseaudio-utils", _pacat_command, automatic=True),
+    "pw-cat": KnownPlayer("PipeWire", "pipewire-bin", _pw_cat_command, automatic=True),
     "pulse": KnownPlayer(
         "the sound server, PulseAudio or PipeWire", "libpulse0", class_path="pulse:PulsePlayer", automatic=True
     ),

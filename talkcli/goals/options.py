@@ -249,20 +249,22 @@ class Option:
         return replace(self, default=setting.initial, special_flags=flags, help=setting.serve_help or self.help)
 
 
-def _priority_error(value: int) -> str | None:
+def _check_priority(value: int) -> str | None:
+    """Return an error message if a priority is out of range."""
     if -MAX_PRIORITY <= value <= MAX_PRIORITY:
         return None
     return f"the priority must be {-MAX_PRIORITY:,} to {MAX_PRIORITY:,}, got {value}"
 
 
-def key_error(value: str) -> str | None:
+def check_key(value: str) -> str | None:
     """Return an error message if a string is not a valid key."""
     if 0 < len(value) <= MAX_KEY_CHARS:
         return None
     return f"the key must have 1 to {MAX_KEY_CHARS} characters, got {len(value)}"
 
 
-def _own_id_error(value: str) -> str | None:
+def _check_own_id(value: str) -> str | None:
+    """Return an error message if a client must not choose this id."""
     if is_clients_id(value):
         return None
     return (
@@ -271,11 +273,13 @@ def _own_id_error(value: str) -> str | None:
     )
 
 
-def _format_error(value: str) -> str | None:
+def _check_format(value: str) -> str | None:
+    """Return an error message if the value of the option `format` is not supported."""
     return None if value == "text" else f"the format must be 'text', got {value[:MAX_ID_CHARS]!r}"
 
 
-def _voice_error(value: str) -> str | None:
+def _check_voice(value: str) -> str | None:
+    """Return an error message if the name of a voice is empty."""
     return None if value else "the voice must not be empty"
 
 
@@ -342,7 +346,7 @@ OPTIONS = (
         "goals with a higher priority go first. Goals with the same priority are spoken in the order of their arrival",
         default=0,
         # The range is not in `limits`, because the help text would then show it.
-        check=_priority_error,
+        check=_check_priority,
         form=f"{-MAX_PRIORITY:,} to {MAX_PRIORITY:,}",
         help="Go before sentences with a lower priority. Sentences with a higher one are never interrupted or removed.",
         in_goal=True,
@@ -368,7 +372,7 @@ OPTIONS = (
         "key",
         WORD,
         "replace the waiting goal that has the same key",
-        check=key_error,
+        check=check_key,
         form=f"1 to {MAX_KEY_CHARS} characters",
         help=f"Replace the waiting sentence with the same KEY. A key has up to {MAX_KEY_CHARS} characters.",
         completion="keys",
@@ -386,7 +390,7 @@ OPTIONS = (
         "id",
         WORD,
         "an id that the sender chooses, see *Ids* below",
-        check=_own_id_error,
+        check=_check_own_id,
         form=f"1 to {MAX_ID_CHARS} characters of `A-Z a-z 0-9 . _ : / -`",
         default_words="set by the server",
         help="Choose the goal's id. A goal that is sent again with the same id is not spoken again.",
@@ -417,7 +421,7 @@ OPTIONS = (
         "voice",
         WORD,
         f"id, name or language of the voice; `{DEFAULT_VOICE}` for the driver's default voice",
-        check=_voice_error,
+        check=_check_voice,
         help="Use this voice: an id, name or language from 'talk voices'.",
         env="TALK_VOICE",
         completion="voices",
@@ -472,7 +476,7 @@ OPTIONS = (
         form=f"up to {MAX_DATA_BYTES:,} bytes of JSON in ASCII (`é` is `\\u00e9`)",
         in_goal=True,
     ),
-    Option("format", TEXT, "only `text` is supported", "text", check=_format_error, in_goal=True),
+    Option("format", TEXT, "only `text` is supported", "text", check=_check_format, in_goal=True),
 )
 
 #: Names of the options that are sent to the engine.

@@ -97,7 +97,7 @@ class Requests:
         try:
             if isinstance(request, Cancel | Pause):
                 self._stop_awaiting_voices(pending.connection)  # carry out earlier requests first, without a delay
-            elif self._needs_voices(pending):
+            elif self._must_await_voices(pending):
                 if self._may_wait(pending):
                     await pending.wait(self._speech.waiting_for_voices, VOICES_LIMIT_S)
                 elif not isinstance(request, Say):
@@ -119,8 +119,8 @@ class Requests:
         """Return the requests of a connection that are waiting for the list of voices."""
         return [each for each in connection.unanswered if each.waiting_list is self._speech.waiting_for_voices]
 
-    def _needs_voices(self, pending: PendingRequest) -> bool:
-        """Return whether a request needs the list of voices, or follows a request that needs it."""
+    def _must_await_voices(self, pending: PendingRequest) -> bool:
+        """Return whether a request must wait for the list of voices, because it or an earlier request needs it."""
         request = pending.request
         if self._speech.waiting_for_voices and (isinstance(request, Say) or self._awaiting_voices(pending.connection)):
             return True

@@ -136,7 +136,7 @@ class Server:
             self._loop.add_signal_handler(number, self._on_signal, number)
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # keep running when the terminal is closed
         signal.pthread_sigmask(signal.SIG_SETMASK, ())  # unblock signals that the parent process may have blocked
-        voice = self._start_voice()
+        voice = self._prepare_voice()
         speech.engine = Supervisor(
             protocol.Configure(
                 os.getpid(),
@@ -178,10 +178,10 @@ class Server:
         if self._fatal_error:
             raise self._fatal_error
 
-    def _start_voice(self) -> str | None:
-        """Return the voice that the engine must check when it starts, or None.
+    def _prepare_voice(self) -> str | None:
+        """Prepare the voice from the settings. Return it if the engine must check it, otherwise None.
 
-        A neural voice is checked here, and loaded later so that it doesn't delay speech.
+        A neural voice is checked here. It becomes a setting and is loaded later, so that it doesn't delay speech.
 
         Raises:
             UsageError: if a neural voice is unknown.

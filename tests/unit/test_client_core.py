@@ -292,14 +292,14 @@ def test_a_reply_with_a_malformed_goal_is_none(core: ClientCore) -> None:
 
 def test_an_answer_must_come_in_time_and_each_line_of_it_counts(core: ClientCore) -> None:
     exchange = begin(core, Status(), now=1.0)
-    assert core.answer_by(exchange) == 1.0 + PATIENCE
+    assert core.answer_deadline(exchange) == 1.0 + PATIENCE
     sent(core)
     hear(core, {"seq": 1, "recent": goal()}, now=3.0)
-    assert core.answer_by(exchange) == 3.0 + PATIENCE
+    assert core.answer_deadline(exchange) == 3.0 + PATIENCE
     slow = begin(core, Say("a", patient=True), now=1.0)
-    assert core.answer_by(slow) == 1.0 + PATIENCE  # it must be sent
+    assert core.answer_deadline(slow) == 1.0 + PATIENCE  # it must be sent
     sent(core)
-    assert core.answer_by(slow) == float("inf")
+    assert core.answer_deadline(slow) == float("inf")
 
 
 def test_a_silent_server_counts_as_gone(core: ClientCore) -> None:

@@ -18,7 +18,14 @@ from talkcli.errors import (
     UnknownGoal,
     UsageError,
 )
-from talkcli.fleet.desk.request import NoServer, Outcome, RobotOffline, cancel_outcomes, failure_outcome, reply_outcomes
+from talkcli.fleet.desk.request import (
+    NoServer,
+    Outcome,
+    RobotOffline,
+    failure_outcome,
+    outcomes_of_cancel,
+    reply_outcomes,
+)
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import Cancel, Say, Set
 from talkcli.goals.states import State
@@ -106,4 +113,4 @@ def test_the_answer_to_a_status_of_a_goal_has_the_goal() -> None:
 
 
 def test_the_goals_of_a_refused_cancel_are_not_the_last_outcomes() -> None:
-    assert [each.last for each in cancel_outcomes("anna", [{"canceled": ENDED}], last=False)] == [False]
+    assert [each.last for each in outcomes_of_cancel("anna", [{"canceled": ENDED}], last=False)] == [False]

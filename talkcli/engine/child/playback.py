@@ -412,7 +412,7 @@ class Playback:
         lost = error.final or error.reason == Reason.AUDIO_STALLED or (feed is not None and feed.player.proven)
         others = list(self._untried or ())
         self._untried = iter(others) if others else None
-        if lost or not (others or self._is_busy(first)):
+        if lost or not (others or self._may_retry(first)):
             if feed is not None:
                 self._players.update_output(feed.player)
             raise error if lost else first
@@ -420,8 +420,8 @@ class Playback:
         if not others:
             self._wait(until=time.monotonic() + DEVICE_RETRY_INTERVAL_S)
 
-    def _is_busy(self, error: CannotSpeak) -> bool:
-        """Return whether the device is busy and should be tried again."""
+    def _may_retry(self, error: CannotSpeak) -> bool:
+        """Return whether the device is busy and may be tried again. The first call starts the time limit."""
         if error.reason != Reason.AUDIO_DEVICE or "busy" not in str(error).lower():
             return False
         self._busy_until = self._busy_until or time.monotonic() + DEVICE_BUSY_LIMIT_S

@@ -287,10 +287,13 @@ class Bridge:
         """Read from the link, or write to it, when its descriptor is ready."""
         if link := self._link:
             action(link)
-            self._check_link(link)
+            self._handle_link_state(link)
 
-    def _check_link(self, link: Link) -> None:
-        """Check whether the link has ended and whether the broker is slow. Call this after each use of the link."""
+    def _handle_link_state(self, link: Link) -> None:
+        """Close a stuck link, disconnect from an ended one, and slow down for a slow broker.
+
+        Call this after each use of the link.
+        """
         if link is not self._link or self._descriptor < 0:
             return
         if link.ended is None and link.outstanding_bytes > STUCK_BROKER_BYTES:
@@ -325,7 +328,7 @@ class Bridge:
             log.write_limited("long", f"{words}: the broker accepts at most {link.max_payload_bytes:,}")
             return
         link.publish(message, qos, acknowledged or self._log_denial)
-        self._check_link(link)
+        self._handle_link_state(link)
 
     def _publish_to_all(self, message: Message) -> None:
         """Publish a status or an event. Events are dropped if the broker is slow."""
@@ -444,7 +447,7 @@ class Bridge:
         if link is None:
             return
         link.tick()
-        self._check_link(link)
+        self._handle_link_state(link)
         # Compare two sending times, because this process may have been stopped for a while, and have read no echoes.
         if self._echo_at - self._policy.newest_echo_at > _ECHO_TIMEOUT_S:
             log.write_limited("echo", f"the broker does not return this robot's own messages; {_RIGHTS}")

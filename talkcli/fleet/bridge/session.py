@@ -463,15 +463,15 @@ class RemoteSession:
         found: list[JsonObject] = []
         if "ok" in message:
             self._server.forget(exchange)
-            self._count_goal(exchange, state, refused=message["ok"] is not True or state is State.REJECTED)
+            self._record_say_reply(exchange, state, refused=message["ok"] is not True or state is State.REJECTED)
             found = [{"canceled": each.to_json()} for each in exchange.canceled]
             count = message.get("count")
             if found and isinstance(count, int):
                 message["count"] = count + len(found)
         return [(encode(item(remote.seq, **each)), remote.correlation) for each in (*found, message)]
 
-    def _count_goal(self, exchange: _RemoteExchange, state: State | None, *, refused: bool) -> None:
-        """Update the number of pending goals after the server has answered a `say` request."""
+    def _record_say_reply(self, exchange: _RemoteExchange, state: State | None, *, refused: bool) -> None:
+        """Record whether a goal is pending after the reply to its `say`, and free the id of a refused goal."""
         if exchange.goal_id is not None:
             self._sessions.goals.answered(exchange.goal_id, pending=state is State.PENDING)
             if exchange.is_new and refused:

@@ -162,11 +162,11 @@ class RobotConnection(Connection):
         exchange.sent = True
         return True
 
-    def answer_by(self, exchange: Exchange) -> float:
+    def answer_deadline(self, exchange: Exchange) -> float:
         if not isinstance(exchange, RobotExchange):
             return float("inf")  # This is a lookup, which is repeated after each absence.
         if self.absent_since is None:
-            by = super().answer_by(exchange)
+            by = super().answer_deadline(exchange)
         else:
             by = self.absent_since + (ABSENCE_LIMIT_S if self._patience >= ANSWER_LIMIT_S else self._patience)
         return by if self._end is None else min(by, max(self._end, exchange.heard_at))
