@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 class Fleet:
     """All robots that are connected to the same broker.
 
-    Most methods have an argument `to` that selects robots. It is the name of a robot, a glob that matches names
+    Most methods have an argument `to` that selects robots. It is the name of a robot, a pattern that matches names
     (`wh-*`), or a group (`@warehouse`). The group `@all` contains every robot.
 
     These methods return a FleetRequest. Iterate over it to receive the outcomes as they arrive. There is one for each
@@ -91,7 +91,7 @@ class Fleet:
         outcome, call `Fleet.cancel` with the id instead.
 
         Args:
-            to: the name of a robot, a glob or a group.
+            to: the name of a robot, a pattern or a group.
             text: the text to speak.
             wait: whether to wait until each goal has ended. Otherwise, wait only until each robot has accepted it.
             ttl: the time in seconds within which each robot must start speaking, or 0 for no limit. The default is 10.

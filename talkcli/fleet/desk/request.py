@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from talkcli.fleet.payloads import Presence
 
 _GROUP_PREFIX, _WILDCARDS = "@", "*?["
-#: Matches a glob in which all characters are valid. No other glob can match the name of a robot.
+#: Matches a pattern in which all characters are valid. No other pattern can match the name of a robot.
 _GLOB = re.compile(r"[A-Za-z0-9._*?\[\]!-]+")
 
 
 def selects_several(text: str) -> bool:
-    """Return whether a value of `--robot` is a glob or a group, and not the name of a single robot."""
+    """Return whether a value of `--robot` is a pattern or a group, and not the name of a single robot."""
     return text.startswith(_GROUP_PREFIX) or any(each in text for each in _WILDCARDS)
 
 
@@ -34,7 +34,7 @@ class Selection:
     """The robots selected by a value of `--robot`.
 
     Attributes:
-        text: the value of `--robot`: a name, a glob (`*`, `?` and `[abc]`, as in a shell), or `@GROUP`.
+        text: the value of `--robot`: a name, a pattern (`*`, `?` and `[abc]`, as in a shell), or `@GROUP`.
         group: the name of the group, or None if the value is not a group. Every robot belongs to the group `all`.
         name: the name of the robot, or None if the value may select several robots.
     """

@@ -1,6 +1,6 @@
 """Classes for a request to several robots at once.
 
-If the robots are selected by a glob, each of them is sent its own request. If they are selected by a group, a single
+If the robots are selected by a pattern, each of them is sent its own request. If they are selected by a group, a single
 message is sent, which the broker delivers to all members. The members are known from their presence and their answers.
 A request counts as successful only if the robot itself has confirmed it.
 """
