@@ -124,6 +124,7 @@ def test_socket_named_from_the_working_directory_is_bound_again_where_that_was(h
 def test_lock_alone_that_was_removed_is_made_again_and_no_descriptor_is_left_open(home: str) -> None:
     path = f"{home}/s"
     with serving(environment(home, TALK_SOCKET=path), command=HASTY) as server:
+        await_true(lambda: "engine ready" in server.log)  # the engine's pipes are opened once, after the socket
         found_again(path, server.process.pid)
         before = len(census.descriptors(server.process.pid))
         socket_file = os.stat(path).st_ino
