@@ -28,6 +28,7 @@ class TalkError(Exception):
 
     @property
     def message(self) -> str:
+        """The human-readable message of the error."""
         return str(self)
 
 
@@ -144,12 +145,12 @@ _ERRORS_BY_CODE: dict[str, type[RequestRefused]] = {
 
 
 def refusal(code: str, message: str, items: list[dict[str, object]] | None = None) -> RequestRefused:
-    """Return the exception that matches a server's error reply."""
+    """Return the exception for the error code in a server's reply, which is a RequestRefused or a subclass."""
     return _ERRORS_BY_CODE.get(code, RequestRefused)(message, code, items)
 
 
 def memory_limits() -> str:
-    """Return the part of an out-of-memory message that explains which limits apply to this process."""
+    """Return a text that names the memory limit of this process, or says what to check if there is none."""
     import resource  # rarely needed, and slow to import
 
     # Each memory limit, its unit, and the shell command and systemd option that change it.

@@ -34,33 +34,33 @@ class Environment:
     needs_sudo: bool = False
 
 
-def command(*packages: str, again: bool = False) -> str:
+def command(*packages: str, reinstall: bool = False) -> str:
     """Return the shell command that installs packages into this process's environment.
 
     Args:
         packages: names of the packages.
-        again: reinstall packages that are installed already.
+        reinstall: reinstall packages that are installed already.
     """
-    return command_for(_environment(), packages, again=again)
+    return command_for(_inspect_environment(), packages, reinstall=reinstall)
 
 
-def neural(*more: str, again: bool = False) -> str:
-    """Return the shell command that installs the packages for neural voices, and any further packages.
+def neural(*more: str, reinstall: bool = False) -> str:
+    """Return the shell command that installs the packages for neural voices, or advice on a 32-bit system.
 
     On a 32-bit system, return advice to use an espeak voice instead.
     """
     if not IS_64_BIT:
         return "neural voices need a 64-bit system; use an espeak voice, such as en"
-    return command(*NEURAL_PACKAGES, *more, again=again)
+    return command(*NEURAL_PACKAGES, *more, reinstall=reinstall)
 
 
 def espeak_library() -> str:
-    """Return the shell command that installs libespeak-ng."""
+    """Return the shell command that installs libespeak-ng, or two alternative commands joined by "or"."""
     package = "sudo apt-get install -y libespeak-ng1"
     return f"{package}, or {command('espeakng-loader')}" if IS_64_BIT else package
 
 
-def command_for(environment: Environment, packages: Sequence[str], *, again: bool = False) -> str:
+def command_for(environment: Environment, packages: Sequence[str], *, reinstall: bool = False) -> str:
     """Return the shell command that installs packages into the given environment."""
     from shlex import join, quote
 
@@ -70,19 +70,19 @@ def command_for(environment: Environment, packages: Sequence[str], *, again: boo
     if environment.pipx is not None:
         home = os.path.dirname(os.path.dirname(environment.pipx))
         named = "" if home.startswith(f"{environment.user_home}/") else f"PIPX_HOME={quote(home)} "
-        force = "--force " if again else ""
+        force = "--force " if reinstall else ""
         return f"{sudo}{named}pipx inject {force}{quote(os.path.basename(environment.pipx))} {names}"
     if environment.made_by_uv and not environment.has_pip:
-        return f"{sudo}uv pip install {'--reinstall ' if again else ''}--python {python} {names}"
-    names = f"--force-reinstall {names}" if again else names
+        return f"{sudo}uv pip install {'--reinstall ' if reinstall else ''}--python {python} {names}"
+    names = f"--force-reinstall {names}" if reinstall else names
     managed = environment.externally_managed
     pip = f"{sudo}{python} -m pip install {'--break-system-packages ' if managed else ''}{names}"
     get_pip = "sudo apt-get install -y python3-pip" if managed else f"{sudo}{python} -m ensurepip"
     return pip if environment.has_pip else f"{get_pip} && {pip}"
 
 
-def _environment() -> Environment:
-    """Return the properties of this process's environment."""
+def _inspect_environment() -> Environment:
+    """Return the properties of the Python environment that this process runs in."""
     from importlib.util import find_spec
 
     is_virtual = sys.prefix != sys.base_prefix

@@ -34,7 +34,7 @@ def named_socket(option: str | None) -> str | None:
 
 
 def named_robot(option: str | None, socket: str | None) -> str | None:
-    """Return the robot's name from the option or from TALK_ROBOT, or None if neither is set.
+    """Return the value of --robot, or of TALK_ROBOT if --socket isn't given either, or None if there is none.
 
     Both options take precedence over the variables, and TALK_ROBOT over TALK_SOCKET.
     """
@@ -42,7 +42,7 @@ def named_robot(option: str | None, socket: str | None) -> str | None:
 
 
 def client_sockets(named: str | None) -> list[str]:
-    """Return the socket paths that a client tries, in order. A named socket is the only one tried."""
+    """Return the socket paths for a client to try, in order: only `named` if it is given, or the usual ones."""
     if named:
         return [named]
     directories = [os.environ.get("XDG_RUNTIME_DIR"), *_runtime_directories(os.getuid())]
@@ -83,19 +83,19 @@ def _runtime_directories(uid: int) -> list[str]:
 
 
 def sudo_caller(environment: Mapping[str, str]) -> int | None:
-    """Return the id of the user who called sudo, or None if this process isn't root under sudo."""
+    """Return the user id of the user who called sudo, or None if this process isn't root under sudo."""
     caller = environment.get("SUDO_UID", "")
     return int(caller) if os.getuid() == 0 and caller.isdecimal() else None
 
 
-def sudo_hint() -> str | None:
-    """Return the usual socket of the user who called sudo, or None if this process isn't root under sudo."""
+def sudo_caller_socket() -> str | None:
+    """Return the usual socket path of the user who called sudo, or None if this process isn't root under sudo."""
     caller = sudo_caller(os.environ)
     return None if caller is None else f"/run/user/{caller}/talk/{SOCKET_NAME}"
 
 
 def server_socket(named: str | None) -> str:
-    """Return the path for a server's socket, and create its directory.
+    """Return the path for a server's socket. For the default path, also create the directory.
 
     Raises:
         AddressInUse: the directory is missing or not safe.
@@ -151,5 +151,5 @@ def cache_directory() -> str:
 
 
 def _user_directory(named: str | None, default: str) -> str:
-    """Return the given directory if it is an absolute path, or else the default."""
+    """Return the given directory if it is an absolute path, or else the default with `~` expanded."""
     return named if named and os.path.isabs(named) else os.path.expanduser(default)

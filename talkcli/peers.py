@@ -35,13 +35,14 @@ def credentials(peer: _socket.socket) -> tuple[int, int]:
     """
     if hasattr(_socket, "SO_PEERCRED"):
         found = peer.getsockopt(_socket.SOL_SOCKET, _socket.SO_PEERCRED, 12)  # struct ucred: pid, uid, gid
-        return _integer(found[:4]), _integer(found[4:8])
+        return _decode_integer(found[:4]), _decode_integer(found[4:8])
     # struct xucred: version, uid, number of groups, sixteen groups
-    uid = _integer(peer.getsockopt(_SOL_LOCAL, _LOCAL_PEERCRED, 76)[4:8])
-    return _integer(peer.getsockopt(_SOL_LOCAL, _LOCAL_PEERPID, 4)), uid
+    uid = _decode_integer(peer.getsockopt(_SOL_LOCAL, _LOCAL_PEERCRED, 76)[4:8])
+    return _decode_integer(peer.getsockopt(_SOL_LOCAL, _LOCAL_PEERPID, 4)), uid
 
 
-def _integer(data: bytes) -> int:
+def _decode_integer(data: bytes) -> int:
+    """Decode an unsigned integer in the native byte order."""
     return int.from_bytes(data, sys.byteorder)
 
 
@@ -51,8 +52,8 @@ def command_name(pid: int) -> str | None:
     return line.decode(errors="replace").rstrip("\n") if line else None
 
 
-def parents(pid: int) -> Iterator[int]:
-    """Yield the process ids of a process's parent, grandparent, and so on."""
+def ancestors(pid: int) -> Iterator[int]:
+    """Yield the process ids of a process's parent, grandparent and so on, at most eight of them."""
     for _ in range(_MAX_PARENTS_COUNT):
         stat = process_stat(pid)
         pid = int(stat[1]) if stat else 0
@@ -62,12 +63,13 @@ def parents(pid: int) -> Iterator[int]:
 
 
 def parent_command_line(pid: int) -> str | None:
-    """Return the command line of a process's parent, or None if it is unknown.
+    """Return the start of the command line of a process's parent, skipping wrappers, or None if it is unknown.
 
-    Wrapper programs are skipped: of `timeout 5 talk say …`, the result is the script that called `timeout`.
+    Wrappers are programs that run another program. Of `timeout 5 talk say …`, the result is the script that called
+    `timeout`.
     """
     line = None
-    for parent in parents(pid):
+    for parent in ancestors(pid):
         above = read_proc_file(f"/proc/{parent}/cmdline")
         if not above or (line and parent == 1):
             break
@@ -79,10 +81,7 @@ def parent_command_line(pid: int) -> str | None:
 
 
 def process_stat(pid: int) -> list[bytes]:
-    """Return the fields of /proc/PID/stat, starting with the state, parent, group and session.
-
-    The list is empty if the process is unknown.
-    """
+    """Return the fields of /proc/PID/stat from the state onwards, or an empty list if it can't be read."""
     stat = read_proc_file(f"/proc/{pid}/stat") or b""
     # The program's name comes before the state, in brackets. The name itself can contain spaces and brackets.
     return stat.rpartition(b")")[2].split()

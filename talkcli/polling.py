@@ -13,13 +13,13 @@ NEVER = float("inf")
 
 
 class Interrupted(Exception):
-    """The wait was interrupted."""
+    """Raised by `wait_ready` if one of the interrupting descriptors is ready."""
 
 
 def wait_ready(
     watched: Mapping[int, int], timeout: float | None, interrupt: Mapping[int, int] | None = None
 ) -> set[int]:
-    """Wait until at least one descriptor is ready, and return the ready ones.
+    """Wait for descriptors, and return the ready ones, if any. Raise Interrupted if one of `interrupt` is ready.
 
     Args:
         watched: the poll events to wait for, by descriptor. Errors and hang-ups always count.

@@ -30,7 +30,7 @@ def open_pipes(count: int) -> list[tuple[int, int]]:
 
 
 def close(*descriptors: int) -> None:
-    """Close the descriptors."""
+    """Close file descriptors."""
     for each in descriptors:
         os.close(each)
 
@@ -52,8 +52,8 @@ def kill_holders(pipe: int) -> bool:
         return False
     link, own = f"pipe:[{os.fstat(pipe).st_ino}]", os.getpid()
     # Stop as soon as the pipe is closed, because reading all of a busy machine's /proc takes tenths of a second.
-    while_held = itertools.takewhile(lambda _: is_held(pipe, 0), processes())
-    return kill(pid for pid in while_held if pid != own and link in _links(f"/proc/{pid}/fd"))
+    while_held = itertools.takewhile(lambda _: is_held(pipe, 0), process_ids())
+    return kill(pid for pid in while_held if pid != own and link in _read_links(f"/proc/{pid}/fd"))
 
 
 def kill(pids: Iterable[int]) -> bool:
@@ -66,18 +66,20 @@ def kill(pids: Iterable[int]) -> bool:
     return killed
 
 
-def processes() -> list[int]:
+def process_ids() -> list[int]:
     """Return the ids of all processes, or an empty list if /proc can't be read."""
-    return [int(name) for name in _names("/proc") if name.isdigit()]
+    return [int(name) for name in _list_names("/proc") if name.isdigit()]
 
 
-def _links(folder: str) -> Iterator[str]:
-    for name in _names(folder):
+def _read_links(folder: str) -> Iterator[str]:
+    """Yield the targets of all readable symbolic links in a directory."""
+    for name in _list_names(folder):
         with contextlib.suppress(OSError):  # the descriptor has been closed in the meantime
             yield os.readlink(f"{folder}/{name}")
 
 
-def _names(folder: str) -> list[str]:
+def _list_names(folder: str) -> list[str]:
+    """Return the names of the entries in a directory, or an empty list if it can't be read."""
     try:
         return os.listdir(folder)
     except OSError:  # the directory belongs to another user, or doesn't exist
@@ -85,7 +87,7 @@ def _names(folder: str) -> list[str]:
 
 
 def signal_name(number: int) -> str:
-    """Return the name of a signal, such as SIGTERM."""
+    """Return the name of a signal, such as SIGTERM, or "signal N" if it has none."""
     try:
         return signal.Signals(number).name
     except ValueError:

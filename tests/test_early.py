@@ -306,12 +306,12 @@ def test_a_signal_to_another_thread_ends_the_waiting(number: signal.Signals) -> 
 def test_after_a_reset_only_a_first_signal_ends_the_waiting() -> None:
     with Interrupts() as interrupts:
         signal.raise_signal(signal.SIGHUP)
-        interrupts.reset()
+        interrupts.prepare_cleanup()
         signal.raise_signal(signal.SIGHUP)
         assert wait_ready({}, 0.05, interrupts.watched) == set()
     assert interrupts.signal_number == signal.SIGHUP
     with Interrupts() as interrupts:
-        interrupts.reset()
+        interrupts.prepare_cleanup()
         signal.raise_signal(signal.SIGTERM)
         wait_ready({}, 10, interrupts.watched)
         pytest.fail("it was not interrupted")

@@ -34,7 +34,7 @@ _PAUSED_TEXT_CHARS = 40
 
 
 def cancel(options: CommonOptions, ids: tuple[str, ...], current: bool, before: str | None, key: str | None) -> None:
-    """Cancel the selected goals, or all goals if none are selected."""
+    """Cancel the selected goals, or all goals if none are selected, and print their ids."""
     with options.connect() as client:
         try:
             done = client.cancel(ids or None, current=current, before=before, key=key)
@@ -47,7 +47,7 @@ def cancel(options: CommonOptions, ids: tuple[str, ...], current: bool, before: 
 
 
 def status(options: CommonOptions, goal_id: str | None, long: bool) -> None:
-    """Show the status of the server or the details of a goal."""
+    """Show the status of the server or, if an id is given, the details of this goal."""
     from talkcli.goals.goal import Goal
     from talkcli.terminal.goals import goal_lines, status_lines
 
@@ -100,7 +100,7 @@ def voices(options: CommonOptions, language: str | None) -> None:
         wanted = matching_languages(language, listed)
         found = [each for each in every if _language_code(each) in wanted]
         if not found:
-            raise TalkError(_no_voice(language, every))
+            raise TalkError(_describe_missing_voice(language, every))
     show_result(options, found, lambda: voice_lines(found))
 
 
@@ -115,7 +115,7 @@ def change(options: CommonOptions, **settings: Any) -> None:
 
 
 def pause(options: CommonOptions) -> None:
-    """Pause speech."""
+    """Pause speech, and report which goal is paused."""
     with options.connect() as client:
         goal = client.pause()
     from talkcli.terminal.text import printable
@@ -123,25 +123,25 @@ def pause(options: CommonOptions) -> None:
     heard = goal.spoken[-_PAUSED_TEXT_CHARS:] if goal and goal.spoken else ""
     place = f' after "{printable(heard)}"' if heard else ""
     words = f"goal {printable(goal.id)} is paused{place}" if goal else "speech is paused"
-    _show_paused(options, goal, paused=True, words=f"{words}; continue with: talk resume")
+    _report_pause(options, goal, paused=True, message=f"{words}; continue with: talk resume")
 
 
 def resume(options: CommonOptions) -> None:
-    """Resume speech."""
+    """Resume speech, and report which goal continues."""
     with options.connect() as client:
         goal = client.resume()
     from talkcli.terminal.text import printable
 
     words = f"speech continues with goal {printable(goal.id)}" if goal else "speech continues"
-    _show_paused(options, goal, paused=False, words=words)
+    _report_pause(options, goal, paused=False, message=words)
 
 
-def _show_paused(options: CommonOptions, goal: Goal | None, *, paused: bool, words: str) -> None:
-    """Report that speech has been paused or resumed."""
+def _report_pause(options: CommonOptions, goal: Goal | None, *, paused: bool, message: str) -> None:
+    """Report that speech has been paused or resumed, as JSON or with this message."""
     if options.json:
         show_json({"paused": paused, "goal": None if goal is None else goal.to_json()})
     elif not options.quiet:
-        note(words)
+        note(message)
 
 
 def doctor(options: CommonOptions, silent: bool) -> int:
@@ -152,7 +152,7 @@ def doctor(options: CommonOptions, silent: bool) -> int:
 
     findings = []
     with Interrupts() as interrupts:
-        examination = _examination(options, interrupts.watched, silent=silent)
+        examination = _create_examination(options, interrupts.watched, silent=silent)
         for finding in examination.findings():
             findings.append(finding)
             show_result(options, [fields(finding)], partial(format_finding, finding, screen()))
@@ -166,10 +166,10 @@ def doctor(options: CommonOptions, silent: bool) -> int:
     return 0 if next_step(findings) is None else EXIT_CODES[State.ABORTED]
 
 
-def _examination(
+def _create_examination(
     options: CommonOptions, interrupt: Mapping[int, int], *, silent: bool
 ) -> examine.LocalExamination | broker.BrokerExamination:
-    """Return the checks for this machine, or for the connection to a robot of a fleet."""
+    """Return an object that checks this machine or, if a robot is selected, the connection to it."""
     robot = named_robot(options.robot, options.socket)
     if robot is None:
         from talkcli.doctor.examine import LocalExamination
@@ -184,6 +184,7 @@ def _examination(
 
 
 def _show_canceled(done: Canceled, options: CommonOptions) -> None:
+    """Print the ids of the cancelled goals, and a message for each goal that had already ended."""
     for goal in done.canceled:
         if options.json:
             show_json(goal.to_json())
@@ -195,7 +196,7 @@ def _show_canceled(done: Canceled, options: CommonOptions) -> None:
 
 
 def _suggest_key(key: str, client: Client) -> None:
-    """Suggest a similar key of an unfinished goal, if there is one."""
+    """Print a message that suggests a similar key of an unfinished goal, if there is one."""
     from talkcli.terminal.text import printable
 
     try:
@@ -207,7 +208,7 @@ def _suggest_key(key: str, client: Client) -> None:
         note(f"no goal has the key '{printable(key)}'; did you mean '{printable(near)}'?")
 
 
-def _no_voice(language: str, voices: Iterable[JsonObject]) -> str:
+def _describe_missing_voice(language: str, voices: Iterable[JsonObject]) -> str:
     """Return the error message for a language that has no voice, with a suggestion."""
     from talkcli.goals.options import is_neural
     from talkcli.terminal.text import printable
@@ -226,4 +227,5 @@ def _no_voice(language: str, voices: Iterable[JsonObject]) -> str:
 
 
 def _language_code(voice: JsonObject) -> str:
+    """Return the language code of a voice in lower case, or an empty string if it has none."""
     return str(voice.get("language") or "").lower()

@@ -16,7 +16,7 @@ import click
 from click.core import ParameterSource
 
 from talkcli import __version__
-from talkcli.cli.command import ALL_EXIT_CODES, COMMON_OPTIONS, OUTPUT_FILE, nearest, read_value, spelling
+from talkcli.cli.command import ALL_EXIT_CODES, COMMON_OPTIONS, OUTPUT_FILE, long_flag, nearest, read_value
 from talkcli.cli.commands import COMMANDS
 from talkcli.cli.show import CommonOptions, note, run_command, show_error, write_error_line
 from talkcli.errors import UsageError
@@ -61,22 +61,25 @@ class _OptionType(click.FloatRange):
         super().__init__(*option.limits, min_open=option.excludes_minimum)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Parse the value of an option, or raise BadParameter with the name of the option or variable."""
         try:
             return read_value(self._option, str(value))
         except ValueError as error:
             if self._option.kind in (INTEGER, NUMBER, SECONDS):
                 source = None  # click adds the option's name to the message
             elif ctx and ctx.get_parameter_source(self._option.name) is not ParameterSource.ENVIRONMENT:
-                source = spelling(self._option)
+                source = long_flag(self._option)
             else:
                 source = f"environment variable {self._option.env}"
             raise click.BadParameter(str(error), ctx, param, source) from error
 
     def _describe_range(self) -> str:
+        """Return the range of valid numbers, as click shows it in help."""
         return self._option.range
 
 
-def _click_option(option: Option, *, common: bool = False) -> click.Option:
+def _make_click_option(option: Option, *, common: bool = False) -> click.Option:
+    """Create the click version of an option. The value of a common option is stored in CommonOptions."""
     flag = option.kind is FLAG
     return click.Option(
         [*option.flags.split(", "), option.name],
@@ -88,31 +91,33 @@ def _click_option(option: Option, *, common: bool = False) -> click.Option:
         help=option.help,
         envvar=option.env or None,
         show_envvar=bool(option.env),
-        shell_complete=_completer(option.completion),
+        shell_complete=_make_completer(option.completion),
         callback=_store_common if common else None,
         expose_value=not common,
     )
 
 
 def _click_type(option: Option) -> Any:
+    """Return the click type that checks and converts the values of an option."""
     if option.choices:
         return click.Choice(option.choices)
     return click.Path(dir_okay=False) if option.kind is OUTPUT_FILE else _OptionType(option)
 
 
-def _click_argument(argument: Option) -> click.Argument:
+def _make_click_argument(argument: Option) -> click.Argument:
+    """Create the click version of a command's positional argument."""
     return click.Argument(
         [argument.name],
         nargs=-1 if argument.metavar.endswith("...") else 1,
         required=bool(argument.choices),
         type=click.Choice(argument.choices) if argument.choices else None,
         metavar=argument.metavar,
-        shell_complete=_completer(argument.completion),
+        shell_complete=_make_completer(argument.completion),
     )
 
 
-def _completer(name: str) -> Callable[..., list[CompletionItem]] | None:
-    """Return a click callback for the named completer, or None if the name is empty."""
+def _make_completer(name: str) -> Callable[..., list[CompletionItem]] | None:
+    """Create the function that click calls to complete a value, or return None if the name is empty."""
 
     def complete(context: click.Context, _: click.Parameter, incomplete: str) -> list[CompletionItem]:
         from talkcli.cli import completion
@@ -123,6 +128,7 @@ def _completer(name: str) -> Callable[..., list[CompletionItem]] | None:
 
 
 def _store_common(context: click.Context, parameter: click.Parameter, value: object) -> None:
+    """Store the value of a common option in the CommonOptions object, unless the value is empty."""
     if value:
         setattr(context.ensure_object(CommonOptions), parameter.name or "", value)
 
@@ -144,11 +150,13 @@ class _HelpfulCommand(click.Command):
         return found
 
     def format_help_text(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the description of the command, followed by the examples."""
         super().format_help_text(ctx, formatter)
         with formatter.section("Examples"):
             _write_lines(self.examples, formatter)
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
+        """Write the table of exit codes, if there is one."""
         if self.exit_codes:
             with formatter.section("Exit codes"):
                 formatter.write_dl([(str(code), words) for code, words in self.exit_codes.items()])
@@ -169,8 +177,9 @@ class ClickCommand(_HelpfulCommand):
     def __init__(self, row: Command) -> None:
         self.row = row
         self.examples, self.exit_codes = row.examples, row.exit_codes
-        arguments: list[click.Parameter] = [_click_argument(row.argument)] if row.argument else []
-        own, common = map(_click_option, row.options), [_click_option(each, common=True) for each in COMMON_OPTIONS]
+        arguments: list[click.Parameter] = [_make_click_argument(row.argument)] if row.argument else []
+        own = map(_make_click_option, row.options)
+        common = [_make_click_option(each, common=True) for each in COMMON_OPTIONS]
         super().__init__(
             row.name,
             params=[*arguments, *own, *common],
@@ -180,13 +189,16 @@ class ClickCommand(_HelpfulCommand):
         )
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the help of the command's own options, but not that of the common options."""
         self.write_options("Options", (each for each in self.params if each.expose_value), ctx, formatter)
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the table of exit codes, if there is one, and a reference to `talk --help`."""
         super().format_epilog(ctx, formatter)
         formatter.write("\nCommon options and exit codes: talk --help\n")
 
     def _run(self, **given: Any) -> int | None:
+        """Run the command with these values, or raise a click.UsageError if they can't be combined."""
         context = click.get_current_context()
         options: CommonOptions = context.obj
         source = context.get_parameter_source
@@ -197,6 +209,7 @@ class ClickCommand(_HelpfulCommand):
         return self.row.run(options, given)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the arguments, and raise a click.UsageError for extra ones, except during completion."""
         ctx.allow_extra_args = True  # extra arguments are reported below
         try:
             rest = super().parse_args(ctx, args)
@@ -215,35 +228,40 @@ class _CommandGroup(_HelpfulCommand, click.Group):
     examples, exit_codes = _EXAMPLES, ALL_EXIT_CODES
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
+        """Return the names of all commands, in the order in which help lists them."""
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
+        """Create the command with this name, or return None if there is none."""
         return ClickCommand(COMMANDS[cmd_name]) if cmd_name in COMMANDS else None
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Return the command's name, the command and its arguments. Raise an error with a hint if it is unknown."""
         unknown = args[0] not in COMMANDS and args[0][:1] not in ("", "-")
         if unknown and not ctx.resilient_parsing:  # errors aren't shown during completion
-            raise click.UsageError(_unknown_command(args), ctx)
+            raise click.UsageError(_describe_unknown_command(args), ctx)
         return super().resolve_command(ctx, args)
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the list of commands and the help of the common options."""
         self.format_commands(ctx, formatter)
         self.write_options("Common options, before or after the command", self.get_params(ctx), ctx, formatter)
 
 
 @click.group(
+    help="Let a robot speak. Sentences can be awaited, cancelled and interrupted.",
     cls=_CommandGroup,
     invoke_without_command=True,
     subcommand_metavar="COMMAND [ARGS]...",
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
-    params=[_click_option(each, common=True) for each in COMMON_OPTIONS],
+    params=[_make_click_option(each, common=True) for each in COMMON_OPTIONS],
 )
 @click.version_option(__version__, prog_name="talk", message="%(prog)s %(version)s")
 @click.pass_context
 def talk(context: click.Context) -> None:
-    """Let a robot speak. Sentences can be awaited, cancelled and interrupted."""
+    """Parse the common options and, if no command follows, print the first screen."""
     if context.invoked_subcommand is None:
         click.echo(_first_screen(context))
 
@@ -273,6 +291,7 @@ def run(arguments: list[str]) -> int:
 
 
 def _run_group(arguments: list[str], options: CommonOptions) -> object:
+    """Return the result of a command line that click runs. Report click's errors, and return their exit codes."""
     try:
         with talk.make_context("talk", [*arguments], obj=options) as context:
             return talk.invoke(context)
@@ -295,12 +314,12 @@ def _run_group(arguments: list[str], options: CommonOptions) -> object:
 
 
 def _write_lines(text: str, formatter: click.HelpFormatter) -> None:
-    """Write each line at the formatter's current indentation, without wrapping it."""
+    """Write each line of a text at the formatter's current indentation, without wrapping it."""
     for line in text.strip().splitlines():
         formatter.write(f"{'':{formatter.current_indent}}{line.strip()}\n")
 
 
-def _unknown_command(words: list[str]) -> str:
+def _describe_unknown_command(words: list[str]) -> str:
     """Return the error message for an unknown command, with a suggestion."""
     name = words[0]
     if name.lower() == "help":

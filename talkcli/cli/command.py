@@ -84,7 +84,7 @@ class Command:
     exit_codes: ExitCodes | None = None
 
     def usage_fault(self, given: Mapping[str, Any], typed: frozenset[str], common: Mapping[str, Any]) -> str | None:
-        """Return an error message if the options can't be combined, otherwise None.
+        """Return an error message if an option is invalid or options can't be combined, otherwise None.
 
         Args:
             given: the values of the command's own options and of its argument, by name.
@@ -128,7 +128,7 @@ class Command:
         return Selection(robot).fault
 
     def run(self, options: CommonOptions, given: Mapping[str, Any]) -> int | None:
-        """Run the command with these option values. Return its exit code, or None for success."""
+        """Run the command on this machine, one robot or several robots. Return its exit code, or None for success."""
         options.urgent = self.urgent
         function = self.function or f"ask:{self.name}"
         robot = None if self._is_local(given) else named_robot(options.robot, options.socket)
@@ -143,17 +143,18 @@ class Command:
         return run(options, **given)
 
 
-def option(flags: str, kind: Kind, words: str, **more: Any) -> Option:
+def option(flags: str, kind: Kind, help_text: str, **more: Any) -> Option:
     """Create an option that is named after its long flag.
 
     Args:
         flags: the option's flags, as click expects them.
         kind: the type of its values.
-        words: its help text.
+        help_text: its help text.
         more: further fields of `Option`.
     """
     name = flags.rpartition("--")[2].replace("-", "_")
-    return Option(name, kind, special_flags=flags, help=words, **{"default": False if kind is FLAG else None, **more})
+    default = False if kind is FLAG else None
+    return Option(name, kind, special_flags=flags, help=help_text, **{"default": default, **more})
 
 
 #: The options that every command accepts, before or after the command's name.
@@ -186,26 +187,23 @@ COMMON_OPTIONS = (
 )
 
 
-def spelling(option: Option, value: object = None) -> str:
-    """Return the long flag of an option.
-
-    If the option has a positive and a negative flag, `value` selects one of them.
-    """
+def long_flag(option: Option, value: object = None) -> str:
+    """Return the long flag of an option, such as --preempt, or the negative one if `value` is False."""
     forms = option.flags.split("/")
     return (forms[-1] if value is False else forms[0]).split(", ")[-1]
 
 
 def read_value(option: Option, text: str) -> Any:
-    """Parse the value of an option.
+    """Parse and check the text of an option's value, and return the value.
 
     Raises:
         ValueError: the text isn't a valid value. The message says why.
     """
     kind = option.kind
     if kind in (INTEGER, NUMBER, SECONDS):
-        return _read_number(option, text)
+        return _parse_number(option, text)
     if kind is FILE_MODE:
-        return _read_mode(text)
+        return _parse_mode(text)
     if kind in (WORD, ID):
         text = _as_utf8(text)
         bad = next(filter(_is_bad_byte, text), None)
@@ -218,7 +216,8 @@ def read_value(option: Option, text: str) -> Any:
     return text
 
 
-def _read_number(option: Option, text: str) -> float:
+def _parse_number(option: Option, text: str) -> float:
+    """Parse a number that the option accepts, or raise ValueError."""
     whole = option.kind is INTEGER
     try:
         value = int(text) if whole else float(text)
@@ -233,8 +232,8 @@ def _read_number(option: Option, text: str) -> float:
     return value
 
 
-def _read_mode(text: str) -> int:
-    """Parse the file mode of a socket.
+def _parse_mode(text: str) -> int:
+    """Parse the file mode of a socket, or raise ValueError if it isn't suitable.
 
     The owner must be able to read and write, and nobody may have execute permission.
     """
@@ -256,15 +255,16 @@ def _is_bad_byte(character: str) -> bool:
 
 
 def _format_byte(character: str) -> str:
+    """Format the invalid byte that a surrogate represents, such as 0xff."""
     return f"0x{ord(character) - 0xDC00:02x}"
 
 
-def replace_bad_bytes(text: str, line: int = 1) -> tuple[str, str | None]:
-    """Replace bytes that aren't valid UTF-8 with U+FFFD.
+def replace_bad_bytes(text: str, first_line: int = 1) -> tuple[str, str | None]:
+    """Return a text with invalid UTF-8 replaced by U+FFFD, and a message about it, or None if there was none.
 
     Args:
         text: the text, with invalid bytes decoded to surrogates.
-        line: the number of the text's first line.
+        first_line: the number of the text's first line.
 
     Returns:
         The text, and a message about the replaced bytes, or None if there were none.
@@ -276,7 +276,7 @@ def replace_bad_bytes(text: str, line: int = 1) -> tuple[str, str | None]:
     if not found:
         return text, None
     first = found[0]
-    line += text.count("\n", 0, first)
+    line = first_line + text.count("\n", 0, first)
     column = first - text.rfind("\n", 0, first)
     words = (
         f"line {line}, column {column}: the byte {_format_byte(text[first])} is not valid UTF-8, so it is not spoken"

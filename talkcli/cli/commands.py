@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 
-from talkcli.cli.command import FILE_MODE, OUTPUT_FILE, Command, option, spelling
+from talkcli.cli.command import FILE_MODE, OUTPUT_FILE, Command, long_flag, option
 from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals import options as goal_options
 from talkcli.goals.options import FLAG, ID, IDS, INTEGER, MAX_LOG_GOALS, MAX_TEXT_CHARS, NUMBER, TEXT, WORD, Option
@@ -21,12 +21,13 @@ if TYPE_CHECKING:
 MAX_QUEUED_GOALS = 10_000
 
 
-def _timeout_option(words: str) -> Option:
+def _timeout_option(help_text: str) -> Option:
     """Return a --timeout option with this help text."""
-    return option("-t, --timeout", NUMBER, words, limits=(0, None), excludes_minimum=True, metavar="SEC")
+    return option("-t, --timeout", NUMBER, help_text, limits=(0, None), excludes_minimum=True, metavar="SEC")
 
 
 def _print_unit_option(*names: str) -> Option:
+    """Return a --print-unit option that accepts these names of units."""
     words = f"Print a systemd unit that uses the other options, and exit. UNIT is one of {', '.join(names)}."
     return option("--print-unit", TEXT, words, metavar="UNIT", choices=names)
 
@@ -55,10 +56,11 @@ _SERVERLESS_OPTIONS = {"timeout", "output", *(each.name for each in goal_options
 _OTHER_EXTENSIONS = (".aac", ".aiff", ".au", ".flac", ".m4a", ".mp3", ".mp4", ".oga", ".ogg", ".opus", ".webm", ".wma")
 
 
-def _say_rule(given: Mapping[str, Any], typed: frozenset[str]) -> str | None:
+def _say_fault(given: Mapping[str, Any], typed: frozenset[str]) -> str | None:
+    """Return why these options of `say` can't be combined, as an error message, or None if they can."""
     output, text, waits = given["output"], given["text"], given["wait"] or given["feedback"]
     if output is not None:
-        named = [spelling(each, given[each.name]) for each in _SAY_OPTIONS if each.name in typed - _SERVERLESS_OPTIONS]
+        named = [long_flag(each, given[each.name]) for each in _SAY_OPTIONS if each.name in typed - _SERVERLESS_OPTIONS]
         if named:
             return f"--output writes a file without a server; leave out {', '.join(named)}"
         extension = os.path.splitext(output)[1]
@@ -135,7 +137,8 @@ _SERVE_OPTIONS = (
 )
 
 
-def _serve_rule(given: Mapping[str, Any], _: frozenset[str]) -> str | None:
+def _serve_fault(given: Mapping[str, Any], _: frozenset[str]) -> str | None:
+    """Return why these options of `serve` can't be combined, as an error message, or None if they can."""
     player = given["player"] or ""
     if given["device"] and player.startswith(("null", "file:")):
         return f"the player {player} has no devices; leave out --device"
@@ -144,7 +147,8 @@ def _serve_rule(given: Mapping[str, Any], _: frozenset[str]) -> str | None:
     return None
 
 
-def _bridge_rule(given: Mapping[str, Any], _: frozenset[str]) -> str | None:
+def _bridge_fault(given: Mapping[str, Any], _: frozenset[str]) -> str | None:
+    """Return an error message if `bridge` needs a --name and none is given, otherwise None."""
     if given["name"] is None and not given["print_acl"]:
         return "--name is missing; choose the robot's name on the broker, as in: talk bridge --name anna"
     return None
@@ -172,7 +176,7 @@ _ROWS = (
         talk serve --print-unit user   a systemd service, with instructions
         """,
         options=_SERVE_OPTIONS,
-        rule=_serve_rule,
+        rule=_serve_fault,
     ),
     Command(
         name="say",
@@ -213,7 +217,7 @@ _ROWS = (
         options=_SAY_OPTIONS,
         argument=Option("text", TEXT, metavar="TEXT..."),
         unknown_option_hint="To speak a text that starts with '-', type: talk say -- TEXT",
-        rule=_say_rule,
+        rule=_say_fault,
     ),
     Command(
         name="wait",
@@ -437,7 +441,7 @@ _ROWS = (
             _print_unit_option("user", "system"),
             option("--print-acl", FLAG, "Print access rules for mosquitto's acl_file, and exit."),
         ),
-        rule=_bridge_rule,
+        rule=_bridge_fault,
     ),
     Command(
         name="fleet",

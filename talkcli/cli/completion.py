@@ -69,12 +69,12 @@ def _completion_lines(talk: click.Command, options: CommonOptions) -> list[str]:
     if len(split_arg_string(f"{line}x")) > len(words):
         words.append("")
     found = ShellComplete(talk, {"obj": options}, "talk", "_TALK_COMPLETE").get_completions(words[1:-1], words[-1])
-    format_line = {"bash": _bash_line, "zsh": _zsh_line, "fish": _fish_line}[shell]
+    format_line = {"bash": _format_for_bash, "zsh": _format_for_zsh, "fish": _format_for_fish}[shell]
     return ["file" if each.type == "file" else format_line(words[-1], each.value, each.help) for each in found]
 
 
-def _bash_line(word: str, value: str, _: str | None) -> str:
-    """Format a value for bash, which inserts it without quoting it.
+def _format_for_bash(word: str, value: str, _: str | None) -> str:
+    """Format a value for bash as its script expects it: quoted, and without the part that bash keeps.
 
     bash replaces the text in COMP_CWORD, which may be only the last part of the word.
     """
@@ -86,7 +86,7 @@ def _bash_line(word: str, value: str, _: str | None) -> str:
     return f"plain,{_quote_for_bash(_with_flag(value, word).removeprefix(kept), quote)}"
 
 
-def _zsh_line(_: str, value: str, words: str | None) -> str:
+def _format_for_zsh(_: str, value: str, words: str | None) -> str:
     """Format a value and its help text for zsh, which quotes the value itself."""
     if not words:
         return f"plain,{value}"
@@ -95,7 +95,7 @@ def _zsh_line(_: str, value: str, words: str | None) -> str:
     return f"described,{value}:{words}"
 
 
-def _fish_line(word: str, value: str, words: str | None) -> str:
+def _format_for_fish(word: str, value: str, words: str | None) -> str:
     """Format a value and its help text for fish, which quotes the value itself."""
     return f"plain,{_with_flag(value, word)}" + (f"\t{words}" if words else "")
 
@@ -166,36 +166,37 @@ def complete(completer: str, options: CommonOptions, incomplete: str) -> list[Co
 
 
 def _matches(value: str, incomplete: str) -> bool:
+    """Return whether a value begins with the typed text and has no invisible characters."""
     # Leave out values with invisible characters, because the shell would write them to the terminal unescaped.
     return bool(value) and value.startswith(incomplete) and value.isprintable()
 
 
 def goal_ids(options: CommonOptions, incomplete: str) -> Offers:
-    """Offer the ids of unfinished goals."""
-    status = _status(options)
+    """Return the ids of unfinished goals as completions."""
+    status = _request_status(options)
     return _offer_ids(unfinished(status), status, incomplete)
 
 
 def known_ids(options: CommonOptions, incomplete: str) -> Offers:
-    """Offer the ids of unfinished goals, followed by those of the latest ended goals."""
+    """Return the ids of unfinished goals, followed by those of the latest ended goals, as completions."""
     with options.connect(COMPLETION_TIMEOUT_S) as client:
         status, ended = client.status(), client.log(_MAX_ENDED_GOALS)
     return _offer_ids([*unfinished(status), *reversed(ended)], status, incomplete)
 
 
 def keys(options: CommonOptions, _: str) -> Offers:
-    """Offer the keys of unfinished and recent goals."""
-    status = _status(options)
+    """Return the keys of unfinished and recent goals as completions."""
+    status = _request_status(options)
     return _offer_keys([*unfinished(status), *reversed(status.recent)])
 
 
 def unfinished_keys(options: CommonOptions, _: str) -> Offers:
-    """Offer the keys of unfinished goals."""
-    return _offer_keys(unfinished(_status(options)))
+    """Return the keys of unfinished goals as completions."""
+    return _offer_keys(unfinished(_request_status(options)))
 
 
 def voices(options: CommonOptions, incomplete: str) -> Offers:
-    """Offer the languages of the voices. If no language matches, offer voice ids or names.
+    """Return the languages of the voices as completions. If no language matches, return voice ids or names.
 
     Neural voices are always offered by id, because there are few of them and users select them by id.
     """
@@ -211,7 +212,7 @@ def voices(options: CommonOptions, incomplete: str) -> Offers:
 
 
 def robots(options: CommonOptions, _: str) -> Offers:
-    """Offer the names and groups of the robots that are online."""
+    """Return the names and groups of the robots that are online as completions."""
     broker = options.broker()
     from talkcli.fleet import topics
     from talkcli.fleet.desk.watch import read_robots
@@ -226,35 +227,40 @@ def robots(options: CommonOptions, _: str) -> Offers:
 
 
 def players(_: CommonOptions, __: str) -> Offers:
-    """Offer the names of the players."""
+    """Return the names of the players as completions."""
     from talkcli.engine.players import PLAYERS
 
     return [(name, each.description) for name, each in PLAYERS.items()]
 
 
-def _status(options: CommonOptions) -> ServerStatus:
+def _request_status(options: CommonOptions) -> ServerStatus:
+    """Return the server's status, or raise an error if the answer takes more than half a second."""
     with options.connect(COMPLETION_TIMEOUT_S) as client:
         return client.status()
 
 
 def _offer_ids(goals: Iterable[Goal], status: ServerStatus, incomplete: str) -> Offers:
-    """Offer goal ids. If the user has typed digits, also offer short ids such as 12."""
+    """Return the ids of goals as completions. If the user has typed digits, add short ids such as 12."""
     own = f"{status.server.get('boot')}-" if incomplete.isascii() and incomplete.isdecimal() else ""
     return [(name, _goal_help(each)) for each in goals for name in dict.fromkeys((each.id.removeprefix(own), each.id))]
 
 
 def _offer_keys(goals: Iterable[Goal]) -> Offers:
+    """Return the keys of goals as completions. Goals without a key are left out."""
     return [(each.key, _goal_help(each)) for each in goals if each.key is not None]
 
 
 def _shorten(text: str) -> str:
+    """Return a text for use in a help text: escaped, and cut to 60 characters."""
     return printable(text, _HELP_TEXT_CHARS)
 
 
 def _goal_help(goal: Goal) -> str:
+    """Return the help text for a goal's id or key: the goal's state and text."""
     return f"{goal.state.name} {_shorten(goal.text or '')}"
 
 
 def _voice_help(voice: JsonObject, field: str) -> str:
+    """Return the help text for a voice: its name and language, without the field that is offered."""
     parts = [_shorten(str(voice.get(each) or "")) for each in ("name", "language") if each != field]
     return ", ".join(filter(None, parts)) or "voice"

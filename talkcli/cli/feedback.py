@@ -44,16 +44,17 @@ def make_feedback(options: CommonOptions) -> Feedback:
 
 
 class _JsonFeedback(Feedback):
-    """Prints each event as a JSON object."""
+    """A display that prints each event as a JSON object."""
 
     shows_events = True
 
     def show(self, goal: Goal, event: Event) -> None:  # noqa: ARG002
+        """Print an event as a JSON object."""
         show_json(event.to_json())
 
 
 class _LineFeedback(Feedback):
-    """Prints each event as a line.
+    """A display that prints each event as a line.
 
     Fields are separated by spaces, so only the last field can contain spaces.
     """
@@ -65,6 +66,7 @@ class _LineFeedback(Feedback):
         self._shown: dict[str, State] = {}
 
     def show(self, goal: Goal, event: Event) -> None:  # noqa: ARG002
+        """Print a state, a word or a pause as a line. A result is printed as a state."""
         if isinstance(event, StateChanged):
             self._show_state(event.id, event.state)
         elif isinstance(event, WordHeard):
@@ -77,6 +79,7 @@ class _LineFeedback(Feedback):
             self._shown.pop(event.goal.id, None)
 
     def _show_state(self, goal_id: str, state: State) -> None:
+        """Print the state of a goal, unless it was the last one that was printed for this goal."""
         # The end of a goal is usually reported twice, as a new state and as a result. Print it only once.
         if self._shown.get(goal_id) is not state:
             self._shown[goal_id] = state
@@ -84,7 +87,7 @@ class _LineFeedback(Feedback):
 
 
 class _TerminalFeedback(Feedback):
-    """Shows the sentence on one line of a terminal and highlights each word as it is spoken.
+    """A display that shows the sentence on one line of a terminal and highlights each word as it is heard.
 
     The line is rewritten in place and is never wider than the terminal, so only part of a long text is visible. When
     the goal ends, the whole sentence is written.
@@ -99,6 +102,7 @@ class _TerminalFeedback(Feedback):
         self._resizes = _ResizeWatcher(self._paint)
 
     def begin(self, goals: Sequence[Goal]) -> None:
+        """Show the goal that is being spoken, or else the first unfinished one, if no goal is shown yet."""
         unfinished = [each for each in goals if not each.state.terminal]
         if unfinished and self._line is None:
             spoken = (each for each in unfinished if each.state is not State.PENDING)
@@ -106,9 +110,10 @@ class _TerminalFeedback(Feedback):
             self._paint()
 
     def show(self, goal: Goal, event: Event) -> None:
+        """Update the line after an event. When a goal has ended, write its whole sentence."""
         line = self._line
         if isinstance(event, Result):
-            self._end(event.goal)
+            self._show_end(event.goal)
         elif isinstance(event, PausedChanged):  # pausing affects all goals
             if line:
                 line.paused = event.paused
@@ -120,21 +125,23 @@ class _TerminalFeedback(Feedback):
                 line.update(event)
         self._paint()
 
-    def note(self, words: str) -> None:
+    def note(self, message: str) -> None:
+        """Write a message to standard error, and repaint the line below it."""
         with self._writing:
             if self._line:
                 _write(_CLEAR_LINE)
-            note(words)
+            note(message)
         self._paint()
 
     def close(self) -> None:
-        """Write the current goal's whole sentence, and end the line."""
+        """Write the current goal's whole sentence, end the line, and stop adapting it to the terminal's width."""
         self._resizes.close()
         if self._line:
             self._write_whole(self._line)
             self._line = None
 
-    def _end(self, goal: Goal) -> None:
+    def _show_end(self, goal: Goal) -> None:
+        """Write the whole sentence of a goal that has ended, and stop showing this goal."""
         line, ended = self._line, _GoalLine(goal)
         ended.state = goal.state
         if line and line.goal.id == goal.id:
@@ -153,10 +160,11 @@ class _TerminalFeedback(Feedback):
             )
 
     def _paint(self) -> None:
+        """Rewrite the current goal's line on the terminal, if a goal is shown."""
         with self._writing:
             line = self._line  # another thread may set `_line` to None
             if line:
-                _write(line.painted())
+                _write(line.render())
 
 
 class _ResizeWatcher(threading.Thread):
@@ -177,11 +185,12 @@ class _ResizeWatcher(threading.Thread):
             self._closed = True
 
     def run(self) -> None:
+        """Call the function after each resize until the watcher is closed."""
         while signal.sigwait({signal.SIGWINCH}) and not self._closed:
             self._on_resize()
 
     def close(self) -> None:
-        """Stop the thread."""
+        """Stop the thread, and unblock the signal that it waits for."""
         if not self._closed:
             self._closed = True
             assert self.ident
@@ -210,8 +219,8 @@ class _GoalLine:
             # A PENDING event may arrive late, when the goal is already in a later state.
             self.state = event.state
 
-    def painted(self) -> str:
-        """Return the line as text with terminal codes."""
+    def render(self) -> str:
+        """Return the line as text with terminal codes, cut to the width of the terminal."""
         # Leave the last column free, because some terminals start a new line as soon as it is filled.
         columns = terminal_columns(sys.stdout) - 1
         state = "PAUSED" if self.paused and self.state is State.ACTIVE else self.state.name
@@ -224,6 +233,7 @@ class _GoalLine:
 
 
 def _is_spoken(event: Event) -> bool:
+    """Return whether this event means that its goal is being spoken."""
     return isinstance(event, WordHeard) or (isinstance(event, StateChanged) and event.state is State.ACTIVE)
 
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def fleet(options: CommonOptions, what: str, long: bool) -> int | None:
-    """Show the state of each robot, or watch the robots until interrupted.
+    """Show the state of each selected robot or, if `what` is "watch", their events until interrupted.
 
     Return the exit code, or None for success.
     """
@@ -56,7 +56,7 @@ def _no_robot_error(broker: Broker, selection: Selection | None) -> ServerUnavai
 
 
 def _watch(options: CommonOptions, broker: Broker, selection: Selection | None, *, long: bool) -> int:
-    """Show events until the command is interrupted, and return the exit code."""
+    """Show the events of the selected robots until the command is interrupted, and return the exit code."""
     from talkcli.cli.interrupts import Interrupts, has_reader
     from talkcli.fleet.desk.watch import FleetWatch
 
@@ -73,7 +73,7 @@ def _watch(options: CommonOptions, broker: Broker, selection: Selection | None, 
 def _show_event(
     options: CommonOptions, broker: Broker, transcript: FleetTranscript, event: FleetEvent, output: Screen
 ) -> None:
-    """Print an event. Messages about a lost or recovered broker go to standard error."""
+    """Print an event of the fleet. Messages about a lost or recovered broker go to standard error."""
     from talkcli.fleet.desk.watch import BrokerAway, EventsMissed, FleetSnapshot, RobotChanged, RobotEvent
 
     now = time.time()
@@ -100,4 +100,5 @@ def _show_event(
 
 
 def _snapshot_object(robot: RobotInfo) -> JsonObject:
+    """Return the JSON object in which `talk fleet watch` prints the whole state of a robot."""
     return {"robot": robot.presence.name, "event": "snapshot", **robot.to_json()}

@@ -24,7 +24,7 @@ _HANDLED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def discard_unread_output() -> None:
-    """Discard all output if nothing reads it.
+    """Redirect standard output to /dev/null if it is closed or has no reader.
 
     Commands call this before they write anything.
     """
@@ -39,7 +39,7 @@ def has_reader() -> bool:
 
 
 def _poll_output() -> int:
-    """Poll standard output, and return its events."""
+    """Return the current poll events of standard output, without waiting."""
     poll = select.poll()
     poll.register(STDOUT_FD, 0)
     return next((events for _, events in poll.poll(0)), 0)
@@ -103,9 +103,9 @@ class Interrupts:
         return kind is Interrupted
 
     def record(self, error: Interrupted | OSError) -> None:
-        """Record what ended the wait, and discard all output if its reader is gone.
+        """Record whether the output's reader is gone, and if so, discard all output. Raise unrelated errors again.
 
-        Errors other than an interrupt, a timeout or a missing reader are raised again.
+        The unrelated errors are those other than an interrupt, a timeout or a missing reader.
         """
         if isinstance(error, Interrupted | TimeoutError):
             self.reader_gone = STDOUT_FD in self.watched and not has_reader()
@@ -116,11 +116,8 @@ class Interrupts:
         if self.reader_gone:
             discard_output()
 
-    def reset(self) -> None:
-        """Prepare for cleanup after an interrupted wait.
-
-        During the cleanup, only a signal can end a wait.
-        """
+    def prepare_cleanup(self) -> None:
+        """Clear the interrupt, so that the cleanup after it can wait. Only a new signal can interrupt the cleanup."""
         if self.signal_number is not None:
             signal.set_wakeup_fd(-1)  # a second SIGHUP must not interrupt the cleanup
         self.watched.pop(STDOUT_FD, None)
@@ -128,6 +125,7 @@ class Interrupts:
             os.read(self._descriptor, 16)
 
     def _handle_signal(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
+        """Record the first signal. At a second one, exit the process, or ignore it if it is SIGHUP."""
         if self.signal_number is not None:
             if number == signal.SIGHUP:
                 return

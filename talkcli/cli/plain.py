@@ -59,6 +59,7 @@ def read(arguments: list[str], environment: Mapping[str, str]) -> PlainCommand |
 
 
 def _parse(arguments: list[str], environment: Mapping[str, str]) -> PlainCommand | None:
+    """Parse a command line. If click has to parse it, return None or raise an error."""
     command: Command | None = None
     words: list[str] = []
     given: dict[str, Any] = {}
@@ -73,10 +74,11 @@ def _parse(arguments: list[str], environment: Mapping[str, str]) -> PlainCommand
             words.append(word)
         else:
             _read_option(flags, word, rest, given)
-    return _add_defaults(command, given, words, environment) if command else None
+    return _build_command(command, given, words, environment) if command else None
 
 
 def _flag_table(options: Iterable[Option]) -> Flags:
+    """Return each flag's option, and the value that the flag sets if it takes no argument."""
     found: Flags = {}
     for option in options:
         yes, _, no = option.flags.partition("/")
@@ -87,7 +89,7 @@ def _flag_table(options: Iterable[Option]) -> Flags:
 
 
 def _read_option(flags: Flags, word: str, rest: Iterator[str], given: dict[str, Any]) -> None:
-    """Parse an option into `given`.
+    """Parse an option, whose value may be the next word in `rest`, and store the value in `given`.
 
     Raises:
         KeyError, ValueError, StopIteration: click has to parse the option.
@@ -99,10 +101,10 @@ def _read_option(flags: Flags, word: str, rest: Iterator[str], given: dict[str, 
     given[option.name] = value if option.kind is FLAG else read_value(option, text if equals else next(rest))
 
 
-def _add_defaults(
+def _build_command(
     command: Command, given: dict[str, Any], words: list[str], environment: Mapping[str, str]
 ) -> PlainCommand | None:
-    """Add the argument and default values. Return None if click has to report an error."""
+    """Return the command with its argument and default values, or None if click has to report an error."""
     common = {name: given.pop(name) for name in _COMMON_NAMES & given.keys()}
     typed = frozenset(given)
     for option in command.options:
@@ -121,7 +123,7 @@ def _add_defaults(
 
 
 def run(plain: PlainCommand) -> int:
-    """Run a parsed command, and return its exit code."""
+    """Run a parsed command, sending its request early if possible, and return its exit code."""
     started_at = time.monotonic()
     command, given = plain.command.name, plain.given
     blocked: set[int] = set()
@@ -153,7 +155,11 @@ def may_send_early(plain: PlainCommand) -> bool:
 
 
 def _connect_early(plain: PlainCommand, before_sending: Callable[[], None]) -> ConnectionAttempt | None:
-    """Connect to the server and send the request, without waiting for a slow server.
+    """Connect to the server and, if possible, send the request, without waiting for a slow server.
+
+    Args:
+        plain: the command.
+        before_sending: called immediately before the request is sent.
 
     Returns:
         The connection attempt, or None if the connection broke before anything was sent.
@@ -176,6 +182,7 @@ def early_messages(plain: PlainCommand) -> tuple[JsonObject, JsonObject] | None:
 
 
 def _early_request(command: str, given: dict[str, Any]) -> JsonObject | None:
+    """Return the request message of a command, or None if the client library has to build it."""
     from talkcli.protocol.lines import write_request
 
     if command == "say":
@@ -194,7 +201,7 @@ def _early_request(command: str, given: dict[str, Any]) -> JsonObject | None:
 
 
 def _is_full_id(goal_id: str) -> bool:
-    """Return whether a goal id is complete.
+    """Return whether a goal id is complete and short enough, so that it can be sent unchanged.
 
     A number such as 12 isn't complete, because the library has to add the server's boot id.
     """

@@ -62,7 +62,7 @@ def say(
     found = _read_input(options, timeout, wait, feedback, output) if text == ("-",) else " ".join(text)
     if isinstance(found, int):
         return found  # nothing can be spoken
-    sentence = without_bad_bytes(found, options)
+    sentence = replace_and_report_bad_bytes(found, options)
     if output is not None:
         return _write_file(output, sentence, goal_options, timeout, options)
     with Interrupts(blocked=options.blocked_signals, output=wait) as interrupts:
@@ -87,18 +87,21 @@ def say(
 def _read_input(
     options: CommonOptions, timeout: float | None, wait: bool, feedback: bool, output: str | None
 ) -> str | int:
-    """Return the text on standard input, or the exit code if it can't be read or is too long."""
+    """Return the text on standard input, or an exit code if no text could be read.
+
+    This is the case if a signal or closed output ends the reading, or if the text is too long, which is reported.
+    """
     from talkcli.cli.stdin import InputTooLong, read_text, rejected_goal
 
     try:
-        return read_text(options.deadline(timeout), wait=wait, whole=output is not None)
+        return read_text(options.deadline(timeout), stop_without_reader=wait, any_length=output is not None)
     except InputTooLong as error:
         reporter = GoalReporter(options, feedback=feedback)
         return retry_without_output(reporter.report_refused, rejected_goal(str(error)))
 
 
-def without_bad_bytes(text: str, options: CommonOptions) -> str:
-    """Replace bytes that aren't valid UTF-8, and print a message about them."""
+def replace_and_report_bad_bytes(text: str, options: CommonOptions) -> str:
+    """Return a text with invalid UTF-8 replaced, and print a message about that unless --quiet is given."""
     text, problem = replace_bad_bytes(text)
     if problem and not options.quiet:
         note(problem)
@@ -120,7 +123,7 @@ def _report_sent(goal: GoalHandle, options: CommonOptions, reporter: GoalReporte
 def _wait_for_goal(
     goal: GoalHandle, interrupts: Interrupts, timeout: float | None, options: CommonOptions, reporter: GoalReporter
 ) -> int:
-    """Wait until a goal has ended, report how it ended, and return the exit code.
+    """Wait until a goal has ended, or cancel it if interrupted or late. Report the end, and return the exit code.
 
     The goal is cancelled if the wait is interrupted or times out. However, if an earlier command has already sent a
     goal with the same id, that goal isn't cancelled.
@@ -166,7 +169,7 @@ def _write_file(
 
 
 def _sound_settings(goal_options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the engine's settings from the options or from environment variables."""
+    """Return the engine's settings, by name, from the options or else from environment variables."""
     found = {}
     for option in SOUND_OPTIONS:
         value, text = goal_options[option.name], os.environ.get(option.env) if option.env else None

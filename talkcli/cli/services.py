@@ -19,7 +19,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from talkcli import paths
-from talkcli.cli.command import FILE_MODE, nearest, spelling
+from talkcli.cli.command import FILE_MODE, long_flag, nearest
 from talkcli.cli.commands import COMMANDS
 from talkcli.cli.show import note, show
 from talkcli.errors import EXIT_OK, UsageError
@@ -67,7 +67,7 @@ def serve(options: CommonOptions, print_unit: str | None, **given: Any) -> int:
 
 
 def _warn_about_sound(player: str, driver: str | None) -> None:
-    """Warn if speech can't be heard, because there is no sound device or the player isn't installed."""
+    """Print a warning if there is no sound device or if the player isn't installed."""
     from talkcli.engine.players import PACKAGES, PLAYERS, PlayerMissing, has_no_output, is_silent, player_commands
     from talkcli.engine.voices import is_own_driver
 
@@ -123,35 +123,37 @@ def bridge(options: CommonOptions, print_unit: str | None, print_acl: bool, **gi
 
 
 def _print_unit(
-    options: CommonOptions, command: str, name: str, given: Mapping[str, Any], words: Sequence[str], **values: str
+    options: CommonOptions, command: str, kind: str, given: Mapping[str, Any], arguments: Sequence[str], **values: str
 ) -> int:
     """Print a systemd unit, and warn if the service's user can't access the program. Return the exit code.
 
     Args:
         options: the common options, with the socket and the names of the options to copy into the unit.
         command: the command that the unit runs.
-        name: the name of the unit for --print-unit.
+        kind: the value of --print-unit, such as user or system-socket.
         given: the values of the command's options, by name.
-        words: further arguments for the unit's command line.
+        arguments: further arguments for the unit's command line.
         values: further values for the template, by name.
     """
     row = COMMANDS[command]
-    typed = [_assignment(each, given[each.name]) for each in row.options if each.name in options.typed & given.keys()]
+    typed = [
+        _format_option(each, given[each.name]) for each in row.options if each.name in options.typed & given.keys()
+    ]
     socket = os.path.abspath(options.socket) if options.socket else None
     socket_option = [f"--socket={socket}"] if socket else []
-    usual_socket = paths.SYSTEM_SOCKET if name.startswith("system") else f"%t/talk/{paths.SOCKET_NAME}"
-    escape = _escape_path if name.endswith("-socket") else printable
-    program = _program(sys.argv[0])
+    usual_socket = paths.SYSTEM_SOCKET if kind.startswith("system") else f"%t/talk/{paths.SOCKET_NAME}"
+    escape = _escape_path if kind.endswith("-socket") else printable
+    program = _find_program(sys.argv[0])
     # The program's script, interpreter and package must all be accessible.
     files = (program[0], *map(os.path.realpath, (program[0], sys.executable, __file__)))
-    unit = _template(f"{command}-{name}").format(
-        command=" ".join(map(_quote, (*program, command, *words, *socket_option, *typed))),
+    unit = _read_template(f"{command}-{kind}").format(
+        command=" ".join(map(_quote_argument, (*program, command, *arguments, *socket_option, *typed))),
         home="read-only" if any(each.startswith(_HOME_DIRECTORIES) for each in files) else "yes",
         socket=escape(socket) if socket else usual_socket,
         **values,
     )
     show(unit.rstrip("\n"))
-    hidden = _find_hidden(files) if name == "system" else None
+    hidden = _find_inaccessible(files) if kind == "system" else None
     if hidden:
         file, directory = hidden
         note(
@@ -162,31 +164,28 @@ def _print_unit(
     return EXIT_OK
 
 
-def _template(name: str) -> str:
-    """Return the text of a template with all included files inserted."""
+def _read_template(name: str) -> str:
+    """Return the text of a template for a unit, with all included files inserted."""
     with open(os.path.join(os.path.dirname(__file__), "systemd", name), encoding="utf-8") as file:
-        return "".join(_template(line[1:].strip()) if line.startswith("@") else line for line in file)
+        return "".join(_read_template(line[1:].strip()) if line.startswith("@") else line for line in file)
 
 
-def _program(started_as: str) -> tuple[str, ...]:
+def _find_program(started_as: str) -> tuple[str, ...]:
     """Return the command that starts this program: the installed script or `python -m talkcli`."""
     script = os.path.join(os.path.dirname(sys.executable), "talk")
     found = shutil.which(started_as if os.path.basename(started_as) == "talk" else script)
     return (os.path.abspath(found),) if found else (sys.executable, "-m", "talkcli")
 
 
-def _assignment(option: Option, value: object) -> str:
+def _format_option(option: Option, value: object) -> str:
     """Format an option and its value as one command-line argument."""
     if value is True:
-        return spelling(option)
-    return f"{spelling(option)}={value:04o}" if option.kind is FILE_MODE else f"{spelling(option)}={value}"
+        return long_flag(option)
+    return f"{long_flag(option)}={value:04o}" if option.kind is FILE_MODE else f"{long_flag(option)}={value}"
 
 
-def _find_hidden(files: Sequence[str]) -> tuple[str, str] | None:
-    """Find a file that other users can't access.
-
-    Return the file and the directory that blocks access, or None if all files can be accessed.
-    """
+def _find_inaccessible(files: Sequence[str]) -> tuple[str, str] | None:
+    """Return the first file that other users can't reach and the directory that blocks them, or None."""
     for path in files:
         steps = path.split(os.sep)
         for count in range(2, len(steps)):
@@ -196,25 +195,22 @@ def _find_hidden(files: Sequence[str]) -> tuple[str, str] | None:
     return None
 
 
-def _quote(word: str) -> str:
+def _quote_argument(word: str) -> str:
     """Quote an argument for the command line in a unit."""
     word = word.replace("%", "%%").replace("$", "$$")  # systemd would expand specifiers and variables
     if word and all(each.isalnum() or each in "/._-+=:,@%{}" for each in word):
         return word
     escaped = word.replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{re.sub(_UNSAFE_CHARACTERS, _as_bytes, escaped)}"'
+    return f'"{re.sub(_UNSAFE_CHARACTERS, _escape_match, escaped)}"'
 
 
-def _as_bytes(found: re.Match[str]) -> str:
+def _escape_match(found: re.Match[str]) -> str:
+    """Return the matched characters as escapes for their bytes."""
     return "".join(f"\\x{each:02x}" for each in os.fsencode(found[0]))
 
 
 def _escape_path(path: str) -> str:
-    """Escape a path for use as a setting in a unit, where quotes aren't allowed.
-
-    Raises:
-        UsageError: systemd would misread the path.
-    """
+    """Escape a path for a setting in a unit, or raise UsageError if systemd would misread the path."""
     if re.search(_UNSAFE_CHARACTERS, path) or path.endswith(("\\", " ")):
         raise UsageError(
             f"a socket unit can't contain the path {printable(path)}; choose one without control characters"

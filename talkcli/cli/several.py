@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from talkcli import paths
 from talkcli.cli.interrupts import Interrupts, discard_unread_output
-from talkcli.cli.say import without_bad_bytes
+from talkcli.cli.say import replace_and_report_bad_bytes
 from talkcli.cli.show import note, retry_without_output, show, show_error, show_if_possible, show_json
 from talkcli.cli.wait import CANCEL_TIMEOUT_S, seconds_left, timeout_error
 from talkcli.client.connect import ANSWER_LIMIT_S
@@ -44,7 +44,7 @@ def say(
     name: str | None,
     **chosen: Any,
 ) -> int:
-    """Speak a text on each robot, and return the exit code.
+    """Send a text to each selected robot, print the outcomes, and return the exit code.
 
     The arguments are explained in `say.say`.
     """
@@ -53,45 +53,51 @@ def say(
     if text == ("-",):
         from talkcli.cli.stdin import read_text
 
-        sentence = read_text(options.deadline(timeout), wait=wait)
+        sentence = read_text(options.deadline(timeout), stop_without_reader=wait)
     if isinstance(sentence, int):
         return sentence  # a signal or closed output has ended the reading
-    return _ask(options, Say(without_bad_bytes(sentence, options), wait=wait, **chosen), timeout, name)
+    return _send_request(
+        options, Say(replace_and_report_bad_bytes(sentence, options), wait=wait, **chosen), timeout, name
+    )
 
 
 def wait(options: CommonOptions, ids: tuple[str, ...], timeout: float | None) -> int:
     """Wait on each robot until the given goals, or all goals, have ended. Return the exit code."""
     discard_unread_output()
-    return _ask(options, Wait(ids or None), timeout)
+    return _send_request(options, Wait(ids or None), timeout)
 
 
 def cancel(options: CommonOptions, ids: tuple[str, ...], current: bool, before: str | None, key: str | None) -> int:
     """Cancel the selected goals, or all goals, on each robot. Return the exit code."""
-    return _ask(options, Cancel(ids or None, current, before, key))
+    return _send_request(options, Cancel(ids or None, current, before, key))
 
 
 def status(options: CommonOptions, goal_id: str | None, long: bool) -> int:  # noqa: ARG001 - ids are always whole
     """Show the status of each robot, or the state of one goal on each robot. Return the exit code."""
-    return _ask(options, Status(goal_id))
+    return _send_request(options, Status(goal_id))
 
 
 def change(options: CommonOptions, **settings: Any) -> int:
     """Change the given settings on each robot, or show all settings if none are given. Return the exit code."""
-    return _ask(options, Set(**settings))
+    return _send_request(options, Set(**settings))
 
 
 def pause(options: CommonOptions) -> int:
     """Pause speech on each robot, and return the exit code."""
-    return _ask(options, Pause())
+    return _send_request(options, Pause())
 
 
 def resume(options: CommonOptions) -> int:
     """Resume paused speech on each robot, and return the exit code."""
-    return _ask(options, Resume())
+    return _send_request(options, Resume())
 
 
-def _ask(options: CommonOptions, request: Request, timeout: float | None = None, name: str | None = None) -> int:
-    """Send a request to the robots, show the outcomes, and return the exit code.
+def _send_request(
+    options: CommonOptions, request: Request, timeout: float | None = None, name: str | None = None
+) -> int:
+    """Send a request to the robots, print the outcomes, and return the exit code. Cancel its goals if interrupted.
+
+    Goals are only cancelled if the command waits for goals that it has sent itself. A timeout also interrupts the wait.
 
     Args:
         options: the options of every command.
@@ -118,7 +124,7 @@ def _ask(options: CommonOptions, request: Request, timeout: float | None = None,
                 interrupts.record(error)
                 is_late = isinstance(error, TimeoutError)
             if owns_goals:
-                _cancel(fleet_request, interrupts, printer)
+                _cancel_goals(fleet_request, interrupts, printer)
             if is_late:
                 show_error(timeout_error(timeout), json=options.json)
             printer.summarize(fleet_request, "may still be speaking" if owns_goals else "not done")
@@ -126,9 +132,9 @@ def _ask(options: CommonOptions, request: Request, timeout: float | None = None,
     return interrupts.exit_code
 
 
-def _cancel(fleet_request: FleetRequest, interrupts: Interrupts, printer: _OutcomePrinter) -> None:
-    """Cancel all unfinished goals, and wait briefly until the robots are silent."""
-    interrupts.reset()
+def _cancel_goals(fleet_request: FleetRequest, interrupts: Interrupts, printer: _OutcomePrinter) -> None:
+    """Cancel the unfinished goals of a request, and print the outcomes that arrive within a second."""
+    interrupts.prepare_cleanup()
     try:
         if fleet_request.unfinished_robots:
             fleet_request.cancel()
@@ -151,33 +157,34 @@ class _OutcomePrinter:
         self._terminal = sys.stderr if shows_count else None
 
     def show_outcomes(self, fleet_request: FleetRequest, timeout: float | None) -> None:
-        """Print all outcomes as they arrive.
+        """Record and print each outcome as it arrives, and keep the number of finished robots on the screen.
 
         This raises the same errors as `FleetRequest.results`.
         """
         try:
             self._show_count(fleet_request)
             for each in fleet_request.results(timeout):
-                self._add(each)
+                self._record(each)
                 self._clear_count()
-                self._show(each)
+                self._print_outcome(each)
                 self._show_count(fleet_request)
         finally:
             self._clear_count()
 
-    def _add(self, outcome: Outcome) -> None:
+    def _record(self, outcome: Outcome) -> None:
+        """Record an outcome. A robot's earlier failure is kept, unless it seemed to be the final outcome."""
         before = self._outcomes.get(outcome.robot)
         # If a robot answers after a failure that seemed final, it only appeared to be absent. Replace the failure.
         if before is not None and before.exit_code and not before.last:
             outcome = replace(before, last=outcome.last)
         self._outcomes[outcome.robot] = outcome
 
-    def summarize(self, fleet_request: FleetRequest, unknown: str = "not done") -> int:
-        """Print how many robots carried out the request and why others failed. Return the exit code.
+    def summarize(self, fleet_request: FleetRequest, unfinished_label: str = "not done") -> int:
+        """Print how many robots succeeded and why others failed, unless --quiet is given. Return the exit code.
 
         Args:
             fleet_request: the request.
-            unknown: the description of robots whose last outcome hasn't arrived.
+            unfinished_label: the description of robots whose last outcome hasn't arrived.
         """
         failures = [each for each in self._outcomes.values() if each.exit_code]
         done = sum(each.last and not each.exit_code for each in self._outcomes.values())
@@ -186,12 +193,13 @@ class _OutcomePrinter:
                 note(words)
             if fleet_request.unfinished_robots:
                 why = f": {fleet_request.why_disconnected}" if fleet_request.why_disconnected else ""
-                note(f"{unknown}: {_join_names(fleet_request.unfinished_robots)}{why}")
+                note(f"{unfinished_label}: {_join_names(fleet_request.unfinished_robots)}{why}")
             note(f"{done} of {len(fleet_request)} robots succeeded")
         codes = {each.exit_code for each in failures}
         return EXIT_DIFFER if len(codes) > 1 else next(iter(codes), EXIT_OK)
 
-    def _show(self, outcome: Outcome) -> None:
+    def _print_outcome(self, outcome: Outcome) -> None:
+        """Print an outcome as JSON, as settings or as a line. With --quiet, leave out the line, except for `status`."""
         if self._options.json:
             show_if_possible(show_json, outcome.to_json())
         elif outcome.said and self._request == Set():
@@ -203,13 +211,14 @@ class _OutcomePrinter:
             show_if_possible(show, f"{outcome.robot} {goal} {outcome.state} {outcome.exit_code}")
 
     def _show_count(self, fleet_request: FleetRequest) -> None:
-        """Show the number of finished robots if standard error is a terminal."""
+        """Show the number of finished robots if standard error is a terminal and --quiet isn't given."""
         if self._terminal:
             finished = sum(each.last for each in self._outcomes.values())
             self._terminal.write(f"\r{finished} of {len(fleet_request)} robots")
             self._terminal.flush()
 
     def _clear_count(self) -> None:
+        """Remove the number of finished robots from the terminal."""
         if self._terminal:
             self._terminal.write("\r\x1b[2K")
             self._terminal.flush()

@@ -65,11 +65,11 @@ class CommonOptions:
         vars(self).update(given)
 
     def deadline(self, timeout: float | None) -> float | None:
-        """Return the monotonic time at which a timeout expires, counted from the start of the command."""
+        """Convert a timeout, counted from the start of the command, to a monotonic time. None means no limit."""
         return None if timeout is None else self.started_at + timeout
 
     def connect(self, timeout: float | None = None, **options: Any) -> Client:
-        """Connect to the server.
+        """Return a client connected to the server or the robot. Retry as long as --connect-timeout allows.
 
         The first call keeps trying for `connect_timeout` seconds.
 
@@ -90,7 +90,7 @@ class CommonOptions:
         if end is not None:
             seconds = min(seconds, max(0.0, end - began))
         try:
-            return Client.over(self._connection(keep_trying=seconds, **options))
+            return Client.over(self._open_connection(keep_trying=seconds, **options))
         except ServerUnavailable as error:
             now = time.monotonic()
             if connect_timeout is None or now < began + seconds:  # retrying wasn't requested or can't help
@@ -101,7 +101,7 @@ class CommonOptions:
             raise ServerUnavailable(words) from None
 
     def broker(self) -> Broker:
-        """Return the broker's address and login.
+        """Return the broker's address and login from the environment variables.
 
         Raises:
             UsageError: a setting or paho-mqtt is missing.
@@ -111,7 +111,8 @@ class CommonOptions:
         require_paho()
         return from_environment(os.environ, insecure=self.insecure)
 
-    def _connection(self, **options: Any) -> Connection:
+    def _open_connection(self, **options: Any) -> Connection:
+        """Open a connection to the robot, or to the server of this machine if no robot is selected."""
         robot = paths.named_robot(self.robot, self.socket)
         if not robot:
             from talkcli.client.connection import SocketConnection
@@ -162,6 +163,7 @@ def discard_output() -> None:
 
 
 def _redirect_to_null(descriptor: int) -> None:
+    """Make a file descriptor refer to /dev/null."""
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, descriptor)
     os.close(null)
@@ -175,12 +177,12 @@ def reader_is_gone(error: OSError) -> bool:
 
 
 def handle_output_error(error: Exception) -> int | None:
-    """Discard further output if this error means that it can't be written.
+    """Return the exit code for an error of standard output, and discard further output.
 
     A full or broken disk is reported.
 
     Returns:
-        The exit code for the error, or None if the error doesn't concern standard output.
+        The exit code, or None if the error doesn't concern standard output.
     """
     global _output_lost  # noqa: PLW0603 - a process has only one standard output
     if not isinstance(error, OSError):
@@ -205,43 +207,39 @@ def _is_read_only(error: OSError) -> bool:
     return fcntl.fcntl(STDOUT_FD, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY
 
 
-def show_if_possible(put: Callable[..., None], *what: object) -> None:
+def show_if_possible(write: Callable[..., None], *given: object) -> None:
     """Call a function that writes output. If the disk is full or broken, report this and continue.
 
     Raises:
         OSError: the reader of the output is gone.
     """
     try:
-        put(*what)
+        write(*given)
     except OSError as error:
         if reader_is_gone(error) or handle_output_error(error) is None:
             raise
 
 
-def retry_without_output(act: Callable[..., _T], *given: Any) -> _T:
-    """Call a function that writes output. If the reader is gone, discard all output and call it again."""
+def retry_without_output(write: Callable[..., _T], *given: Any) -> _T:
+    """Call a function and return its result. If nothing reads its output, discard all output and call it again."""
     try:
-        return act(*given)
+        return write(*given)
     except OSError as error:
         if not reader_is_gone(error):
             raise
         discard_output()
-        return act(*given)
+        return write(*given)
 
 
 def standard_output() -> TextIO:
-    """Return `sys.stdout`.
-
-    Raises:
-        BrokenPipeError: standard output is closed.
-    """
+    """Return `sys.stdout`, or raise BrokenPipeError if it is closed."""
     if sys.stdout is None:
         raise BrokenPipeError("standard output is closed")
     return sys.stdout
 
 
 def show(line: str) -> None:
-    """Write a line to standard output.
+    """Write a line to standard output, and flush it.
 
     Raises:
         BrokenPipeError: standard output is closed.
@@ -263,7 +261,7 @@ def show_json(message: JsonObject) -> None:
 
 
 def show_result(options: CommonOptions, items: Iterable[JsonObject], lines: Callable[[], Iterable[str]]) -> None:
-    """Print a result as JSON objects with --json, otherwise as lines of text."""
+    """Print `items` as JSON objects with --json, otherwise the lines of text that `lines` returns."""
     if options.json:
         for item in items:
             show_json(item)
@@ -273,6 +271,7 @@ def show_result(options: CommonOptions, items: Iterable[JsonObject], lines: Call
 
 
 def _write_json(stream: TextIO, message: JsonObject) -> None:
+    """Write an object to a stream as one line of JSON. On a terminal, escape invisible characters."""
     from talkcli.protocol.lines import encode  # imported late, because help and completion don't need JSON
 
     line = encode(message)
@@ -285,16 +284,16 @@ def _write_json(stream: TextIO, message: JsonObject) -> None:
     stream.buffer.flush()
 
 
-def note(words: str) -> None:
-    """Write a message to standard error. On a terminal, long lines are wrapped."""
-    lines = f"talk: {words}"
+def note(message: str) -> None:
+    """Write a message to standard error, starting with `talk:`. On a terminal, wrap long lines."""
+    lines = f"talk: {message}"
     if sys.stderr is not None and sys.stderr.isatty():
         lines = _wrap(lines)
     write_error_line(lines)
 
 
 def write_error_line(line: str = "") -> None:
-    """Write a line to standard error unless it is closed."""
+    """Write a line to standard error if it is open. If this fails, discard all further messages."""
     if sys.stderr is not None:
         # The command must continue even if nothing reads its messages.
         try:
@@ -305,7 +304,7 @@ def write_error_line(line: str = "") -> None:
 
 
 def terminal_columns(stream: TextIO) -> int:
-    """Return the width of a terminal, or the usual width if the terminal doesn't report it."""
+    """Return the width of a terminal. If the terminal doesn't report it, return COLUMNS or 80."""
     try:
         columns = os.get_terminal_size(stream.fileno()).columns
     except OSError:
@@ -316,7 +315,7 @@ def terminal_columns(stream: TextIO) -> int:
 
 
 def _wrap(text: str) -> str:
-    """Wrap the text to the width of the terminal."""
+    """Wrap a message to the width of the terminal at standard error, without breaking commands in it."""
     columns = terminal_columns(sys.stderr)
     if all(len(line) <= columns for line in text.split("\n")):
         return text
@@ -334,7 +333,7 @@ def _wrap(text: str) -> str:
 
 
 def show_error(error: TalkError, *, json: bool) -> None:
-    """Write an error to standard error."""
+    """Write an error to standard error, as a JSON object or as a message."""
     if not json:
         note(error.message)
     elif sys.stderr is not None:
@@ -346,23 +345,23 @@ def show_error(error: TalkError, *, json: bool) -> None:
 
 
 class Feedback:
-    """Base class for the displays in `feedback`. It shows no events itself."""
+    """A display that shows no events. It is the base class of the displays in `feedback`."""
 
     #: whether the display shows events; if so, the command itself doesn't print ids and results
     shows_events = False
 
     def begin(self, goals: Sequence[Goal]) -> None:
-        """Show the initial state of these goals."""
+        """Show the initial state of these goals. The base class shows nothing."""
 
     def show(self, goal: Goal, event: Event) -> None:
-        """Show an event of this goal."""
+        """Show an event of this goal. The base class shows nothing."""
 
-    def note(self, words: str) -> None:
+    def note(self, message: str) -> None:
         """Write a message to standard error without disturbing the display."""
-        note(words)
+        note(message)
 
     def close(self) -> None:
-        """Finish the display before other output is written."""
+        """Finish the display before other output is written. In the base class, there is nothing to do."""
 
 
 def has_colour() -> bool:
@@ -371,7 +370,7 @@ def has_colour() -> bool:
 
 
 def screen(*, long: bool = False, boot: str = "") -> Screen:
-    """Return the properties of standard output, with these details to show."""
+    """Return a Screen, which describes the width and colours of standard output and how much detail to show."""
     from talkcli.terminal.text import Screen
 
     if sys.stdout is None or not sys.stdout.isatty():

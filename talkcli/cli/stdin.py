@@ -48,7 +48,7 @@ _DEFAULT_PENDING_GOALS = 10
 #: The maximum number of started or ended goals that haven't been reported yet.
 _MAX_UNREPORTED_GOALS = 1_000
 #: The maximum number of expired lines to drop before signals and the server are checked again.
-_MAX_LATE_LINES = 1_000
+_MAX_EXPIRED_LINES = 1_000
 #: The deadline that is used if there is no time limit.
 _NO_LIMIT = float("inf")
 
@@ -57,13 +57,13 @@ class InputTooLong(UsageError):
     """Raised if standard input exceeds the maximum length of a text."""
 
 
-def read_text(end: float | None, *, wait: bool = False, whole: bool = False) -> str | int:
-    """Read standard input as one text.
+def read_text(end: float | None, *, stop_without_reader: bool = False, any_length: bool = False) -> str | int:
+    """Read standard input as one text. Return it, or the exit code if a signal or closed output ends the reading.
 
     Args:
         end: the monotonic time by which the input must have ended, or None for no limit.
-        wait: whether to stop if the reader of standard output goes away.
-        whole: whether to read a text of any length.
+        stop_without_reader: whether to stop if the reader of standard output goes away.
+        any_length: whether to read a text of any length.
 
     Returns:
         The text, or the exit code if a signal or a missing reader has ended the reading.
@@ -73,13 +73,13 @@ def read_text(end: float | None, *, wait: bool = False, whole: bool = False) -> 
         InputTooLong: the text is too long. The rest of the input may not have been read.
     """
     data = bytearray()
-    with Interrupts(output=wait) as interrupts:
-        while whole or len(data) <= MAX_TEXT_BYTES + len("\r\n"):
+    with Interrupts(output=stop_without_reader) as interrupts:
+        while any_length or len(data) <= MAX_TEXT_BYTES + len("\r\n"):
             if not wait_ready({0: select.POLLIN}, seconds_left(end), interrupts.watched):
                 raise TimedOut("standard input did not end in time; nothing was sent")
             more = _read_available()
             if more == b"":
-                return _decode(bytes(data))
+                return _decode_text(bytes(data))
             data += more or b""
         raise InputTooLong(
             f"standard input is too long (more than {MAX_TEXT_BYTES:,} bytes; a text has at most {MAX_TEXT_CHARS:,} "
@@ -90,9 +90,9 @@ def read_text(end: float | None, *, wait: bool = False, whole: bool = False) -> 
     return interrupts.exit_code
 
 
-def rejected_goal(words: str) -> Goal:
-    """Return a rejected goal for a text that is too long to be sent."""
-    return Goal("", State.REJECTED, reason="text_too_long", message=f"not spoken: {words}")
+def rejected_goal(problem: str) -> Goal:
+    """Return a goal in the state REJECTED for a text that is too long to be sent."""
+    return Goal("", State.REJECTED, reason="text_too_long", message=f"not spoken: {problem}")
 
 
 @frozen
@@ -136,32 +136,32 @@ class LineBuffer:
 
     @property
     def first(self) -> InputLine | None:
-        """The oldest line that isn't blank, or None."""
+        """The oldest line that isn't blank, or None if the buffer contains no such line."""
         while not self._lines and self._chunks:
             now, data = self._chunks.popleft()
             self.size -= len(data)
             end = now + (self._ttl or _NO_LIMIT)
             for line in self._splitter.feed(data) if data else [self._splitter.take_rest()]:
                 self._number += 1
-                text, oversize_bytes = _decode(line), line.size if isinstance(line, TruncatedLine) else 0
+                text, oversize_bytes = _decode_text(line), line.size if isinstance(line, TruncatedLine) else 0
                 if oversize_bytes or text.strip():
                     self._lines.append(InputLine(self._number, text, oversize_bytes, end))
         return self._lines[0] if self._lines else None
 
     def take(self) -> InputLine:
-        """Remove and return the oldest line."""
+        """Remove and return the line that `first` returns."""
         return self._lines.popleft()
 
-    def take_late(self, now: float) -> Iterator[InputLine]:
-        """Remove and yield the expired lines, but no more than the caller may process without checking for signals."""
-        for _ in range(_MAX_LATE_LINES):
+    def take_expired(self, now: float) -> Iterator[InputLine]:
+        """Remove and yield expired lines, at most 1,000 at once so that the caller can check for signals."""
+        for _ in range(_MAX_EXPIRED_LINES):
             if not self.first or self.first.end > now:
                 break
             yield self.take()
 
 
 def _read_available() -> bytes | None:
-    """Read from standard input, and return b"" at its end, or None if no input is available yet."""
+    """Read from standard input, and return the data, b"" at its end, or None if no input is available yet."""
     try:
         return os.read(0, _STDIN_READ_BYTES)
     except BlockingIOError:  # another program has made standard input non-blocking
@@ -170,7 +170,8 @@ def _read_available() -> bytes | None:
         raise UsageError(f"can't read standard input: {error.strerror}") from error
 
 
-def _decode(data: bytes) -> str:
+def _decode_text(data: bytes) -> str:
+    """Decode UTF-8, with surrogates for invalid bytes, and remove line breaks at the end."""
     # Invalid bytes are decoded to surrogates, which `replace_bad_bytes` replaces later.
     return data.decode(errors="surrogateescape").rstrip("\r\n")
 
@@ -233,7 +234,7 @@ class LineSpeaker:
                 self._options.connect(self._timeout, name=self._name, interrupt=interrupts.watched) as client,
             ):
                 self._client, self._connection = client, client._connection
-                return self._speak()
+                return self._run_connected()
         except ServerUnavailable:
             if time.monotonic() >= self._end:
                 raise timeout_error(self._timeout) from None
@@ -242,7 +243,8 @@ class LineSpeaker:
             retry_without_output(self._feedback.close)
         return interrupts.exit_code
 
-    def _speak(self) -> int:
+    def _run_connected(self) -> int:
+        """Send all lines and follow their goals until done or interrupted. Report errors, and return the exit code."""
         try:
             while not self._done:
                 try:
@@ -256,7 +258,7 @@ class LineSpeaker:
         except (Interrupted, OSError) as error:
             interrupts = self._interrupts
             interrupts.record(error)
-            self._stop()
+            self._stop_early()
             if interrupts.signal_number is None and not interrupts.reader_gone:
                 raise timeout_error(self._timeout) from None
             return interrupts.exit_code
@@ -301,23 +303,23 @@ class LineSpeaker:
         return not (self._buffer.first or self._unanswered or self._full)
 
     def _step(self) -> None:
-        """Send as many lines as possible, drop expired lines, and wait until there is more to do.
+        """Drop expired lines, send as many lines as possible, and process the next input, answer or event.
 
         Raises:
             TimeoutError: the time limit of the command is over.
         """
         if self._error is None:
             now = time.monotonic()
-            for line in self._buffer.take_late(now):
+            for line in self._buffer.take_expired(now):
                 self._report_expired(line)
             while self._buffer.first and self._buffer.first.end > now and not (self._unanswered or self._full):
-                self._send(self._buffer.take())
+                self._send_line(self._buffer.take())
             if self._done:
                 return
         if time.monotonic() >= self._end:
             raise TimeoutError
         self._wait_for_news()
-        self._take_answer()
+        self._process_answer()
         self._report_goals()
         if self._connection.ended is not None and self._error is None and self._has_lines:
             path = self._connection.path
@@ -325,10 +327,11 @@ class LineSpeaker:
 
     # Sending lines
 
-    def _send(self, line: InputLine) -> None:
+    def _send_line(self, line: InputLine) -> None:
+        """Send a line as a goal, without waiting for the answer. Report a line that is too long as rejected."""
         if line.oversize_bytes:
             words = f"the line has {line.oversize_bytes:,} bytes, but at most {MAX_TEXT_BYTES:,} are allowed"
-            self._report_refused(line.number, rejected_goal(words))
+            self._report_rejected(line.number, rejected_goal(words))
             return
         self._sending = line.number
         text, problem = replace_bad_bytes(line.text, line.number)
@@ -341,55 +344,55 @@ class LineSpeaker:
         request = Say(text, wait=True, feedback=self._feedback.shows_events, patient=True, **goal_options)
         handle, accepted = self._client._handle(request)
         if handle.state is State.REJECTED:
-            self._report_refused(line.number, handle.goal)
+            self._report_rejected(line.number, handle.goal)
             return
         self._unanswered = handle, self._connection.begin(request, accepted)
 
-    def _take_answer(self) -> None:
-        """Process the server's answer to the last line, if it has arrived or the connection has ended."""
+    def _process_answer(self) -> None:
+        """If the last line has been answered, report its goal as accepted or rejected, and follow an accepted one."""
         if self._unanswered is None or not self._unanswered[1].over:
             return
         (handle, exchange), number = self._unanswered, self._sending or 0
         self._unanswered = None
         reply, _ = self._connection.answer(exchange)
         if handle.state is State.REJECTED:
-            self._report_refused(number, handle.goal)
+            self._report_rejected(number, handle.goal)
             return
         self._sending = None
-        self._show(self._reporter.show_accepted, handle, self._pause_known)
+        self._call_writer(self._reporter.show_accepted, handle, self._pause_known)
         self._pause_known = handle.speech_paused
         if not self._wait:  # report the state in the reply, because the goal may have ended since then
-            self._show(self._reporter.report, Goal.from_json(reply.get("goal")))
+            self._call_writer(self._reporter.report, Goal.from_json(reply.get("goal")))
         elif not self._goals:
             self._feedback.begin([handle.goal])
         self._goals.append((number, handle))
 
-    def _report_refused(self, number: int, goal: Goal) -> None:
-        """Report a rejected line."""
+    def _report_rejected(self, number: int, goal: Goal) -> None:
+        """Report a rejected line, and record its exit code as a failure."""
         self._sending = None
-        self._count_failure(number, self._show(self._reporter.report_refused, goal, f"line {number}: "))
+        self._record_failure(number, self._call_writer(self._reporter.report_refused, goal, f"line {number}: "))
 
     def _report_expired(self, line: InputLine) -> None:
-        """Report a line that expired before it was sent."""
+        """Report a line that expired before it was sent. With --wait, also record this as a failure."""
         words = f"line {line.number} was not sent: its ttl of {format_number(self._ttl)} s is over"
         goal = Goal("", State.RECALLED, text=line.text, reason="expired", message=words)
-        code = self._show(self._reporter.report_refused, goal)
+        code = self._call_writer(self._reporter.report_refused, goal)
         if self._wait:
-            self._count_failure(line.number, code)
+            self._record_failure(line.number, code)
 
-    def _count_failure(self, number: int, code: int) -> None:
-        """Record the exit code if this is the first line that has failed."""
+    def _record_failure(self, number: int, code: int) -> None:
+        """Record an exit code, unless it is 0 or an earlier line has failed."""
         if code and (self._failure is None or number < self._failure[0]):
             self._failure = number, code
 
-    def _show(self, act: Callable[..., _T], *given: object) -> _T:
-        """Call a function that writes output. Without --wait, continue even if the reader is gone."""
-        return act(*given) if self._wait else retry_without_output(act, *given)
+    def _call_writer(self, write: Callable[..., _T], *given: object) -> _T:
+        """Call a function that writes output, and return its result. Without --wait, ignore a missing reader."""
+        return write(*given) if self._wait else retry_without_output(write, *given)
 
     # Waiting for input and for the server
 
     def _wait_for_news(self) -> None:
-        """Wait for input, an answer or an event, until a line expires or the command times out."""
+        """Wait for input, an answer or an event, until a line expires or time is up. Add any input to the buffer."""
         watched = self._interrupts.watched
         first = self._buffer.first
         end = min(first.end, self._end) if first and self._error is None else self._end
@@ -426,7 +429,7 @@ class LineSpeaker:
             watched.pop(0, None)
 
     def _report_goals(self) -> None:
-        """Report goal events in the order of the lines, and forget goals that have ended."""
+        """Forget goals that have ended. With --wait, first report their events in the order of the lines."""
         if not self._wait:
             self._goals = deque(each for each in self._goals if not each[1].state.terminal)
             return
@@ -436,30 +439,30 @@ class LineSpeaker:
                 show_if_possible(self._feedback.show, handle.goal, event)
             if not handle.state.terminal:
                 return
-            self._count_failure(number, self._reporter.report(handle.goal))
+            self._record_failure(number, self._reporter.report(handle.goal))
             self._goals.popleft()
             if self._goals:
                 self._feedback.begin([self._goals[0][1].goal])
 
     # Stopping before the end of the input
 
-    def _stop(self) -> None:
-        """Stop before the end of the input. With --wait, cancel all goals."""
+    def _stop_early(self) -> None:
+        """With --wait, cancel all goals. Then report the first line that wasn't sent."""
         if self._wait:
             # Close the connection first. Otherwise, a line that is waiting for room in the queue would be accepted when
             # the other goals are cancelled.
             self._client.close()
-            self._interrupts.reset()
-            self._cancel([each.id for _, each in self._goals if not each.state.terminal])
+            self._interrupts.prepare_cleanup()
+            self._cancel_goals([each.id for _, each in self._goals if not each.state.terminal])
         self._report_unsent()
 
-    def _cancel(self, ids: list[str]) -> None:
-        """Cancel these goals, and report how they ended."""
+    def _cancel_goals(self, ids: list[str]) -> None:
+        """Cancel these and all other goals of this process, and report how they ended."""
         self._options.urgent = True
         try:
             with self._options.connect(CANCEL_TIMEOUT_S, interrupt=self._interrupts.watched, end=None) as client:
                 # The server may have accepted one more goal just before the connection was closed.
-                ids = list(dict.fromkeys([*ids, *_own_goals(client)]))
+                ids = list(dict.fromkeys([*ids, *_own_goal_ids(client)]))
                 done = client.cancel(ids)
         except (TalkError, Interrupted) as error:
             self._feedback.note(f"the goals were cancelled, but may still be spoken: {str(error) or 'interrupted'}")
@@ -475,7 +478,7 @@ class LineSpeaker:
             note(f"removed {recalled} waiting line{'s' * (recalled > 1)} from the queue")
 
     def _report_unsent(self) -> None:
-        """Print a message about the first line that wasn't sent or accepted, if there is one."""
+        """Print a message about the first line that wasn't sent or accepted, if any, unless --quiet is given."""
         if self._options.quiet:
             return
         if self._sending is not None:
@@ -486,7 +489,7 @@ class LineSpeaker:
             self._feedback.note(f"line {self._buffer.first.number} and the lines after it were not sent")
 
 
-def _own_goals(client: Client) -> list[str]:
+def _own_goal_ids(client: Client) -> list[str]:
     """Return the ids of this process's unfinished goals.
 
     The list is empty if the server is on another machine.

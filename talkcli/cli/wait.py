@@ -29,13 +29,13 @@ CANCEL_TIMEOUT_S = 1.0
 
 
 def seconds_left(end: float | None) -> float | None:
-    """Return the number of seconds until a monotonic time, or None if there is no limit."""
+    """Return the number of seconds until a monotonic time, at least 0, or None if there is no limit."""
     return None if end is None else max(0.0, end - time.monotonic())
 
 
-def timeout_error(timeout: float | None, words: str = "") -> TimedOut:
-    """Return the error to raise when --timeout has expired. `words` is added to its message."""
-    return TimedOut(f"timed out after {format_number(timeout or 0)} s{words and f': {words}'}")
+def timeout_error(timeout: float | None, details: str = "") -> TimedOut:
+    """Return the error to raise when --timeout has expired. `details` is added to its message."""
+    return TimedOut(f"timed out after {format_number(timeout or 0)} s{details and f': {details}'}")
 
 
 class GoalReporter:
@@ -85,7 +85,7 @@ class GoalReporter:
         return self.report(goal, prefix)
 
     def report(self, goal: Goal, prefix: str = "") -> int:
-        """Report a goal's result or current state, and return its exit code.
+        """With --json, print a goal. If it failed, print why. Return its exit code, or 124 if it is unfinished.
 
         `prefix` is put in front of any message.
         """
@@ -107,7 +107,7 @@ class GoalReporter:
         Output may fail, because Ctrl-C may also have ended the program that reads it, and SIGHUP means that the
         terminal is gone.
         """
-        interrupts.reset()
+        interrupts.prepare_cleanup()
         problem = "could not be cancelled"
         try:
             goal.request_cancel()
@@ -124,7 +124,7 @@ class GoalReporter:
 
 
 def wait(options: CommonOptions, ids: tuple[str, ...], timeout: float | None, feedback: bool) -> int:
-    """Wait until the given goals, or all unfinished goals, have ended. Return the exit code."""
+    """Wait until the given goals, or all unfinished goals, have ended. Report failures, and return the exit code."""
     end = options.deadline(timeout)
     discard_unread_output()
     with Interrupts(output=True) as interrupts, options.connect(timeout, interrupt=interrupts.watched) as client:

@@ -311,7 +311,7 @@ def unreachable(attempt: ConnectionAttempt, named: str | None) -> TalkError:
     step = f"{_LET_IN_STEP}\n{_START_OWN_STEP}" if denied else _START_STEP
     if named:
         step = _named_step(named, found, denied=denied)
-    hint = paths.sudo_hint()
+    hint = paths.sudo_caller_socket()
     if hint and not os.environ.get("TALK_SOCKET"):
         step += f"\nto use the server of the user who called sudo, run: talk --socket {hint}"
     if denied:

@@ -24,7 +24,7 @@ from talkcli.doctor.report import FAILURE, WARNING, Finding, failure, join_names
 from talkcli.engine import players
 from talkcli.engine.players import DUMMY_SINK, PACKAGES, PLAYERS, is_silent, on_path
 from talkcli.frozen import frozen, replace
-from talkcli.peers import command_name, parents, read_proc_file
+from talkcli.peers import ancestors, command_name, read_proc_file
 from talkcli.processes import kill, signal_name
 
 if TYPE_CHECKING:
@@ -194,7 +194,7 @@ def _origins(environment: Mapping[str, str], pid: int) -> Iterable[str]:
     unit = re.search(r"system\.slice/(?:[^\n]*/)?([^/\n]+)\.service", _read_text(f"/proc/{pid}/cgroup"))
     service = unit[1] if unit else ""
     # The names are compared in lower case, because Debian's cron is also called CRON.
-    programs = {service, *(str(command_name(each)).lower() for each in parents(pid))}
+    programs = {service, *(str(command_name(each)).lower() for each in ancestors(pid))}
     if not _CRON_PROGRAMS.isdisjoint(programs):
         yield _CRON_JOB
     elif service and service not in _SSH_PROGRAMS and environment.get("INVOCATION_ID"):

@@ -63,7 +63,7 @@ _IMPORT_TIMED_OUT = f"it takes more than {_IMPORT_LIMIT_S:g} s"
 _IMPORT_ADVICE = {
     _IMPORT_TIMED_OUT: "run talk doctor again when this machine is less busy",
     "SIGILL": "this processor is too old for that version: install an older version, or use an espeak voice",
-    "": f"install it again: {install.neural(again=True)}",
+    "": f"install it again: {install.neural(reinstall=True)}",
 }
 _CHOOSE_ESPEAK = "choose an espeak voice: talk set --voice en, or talk serve --voice en"
 

@@ -96,11 +96,11 @@ def goal_lines(goal: Goal, screen: Screen, now: float) -> list[str]:
         ("from", _describe_sender(goal.client)),
         ("priority", str(goal.priority)),
         ("key", _quote(goal.key or None)),
-        ("ttl", goal.ttl and ", ".join(filter(None, (f"{format_number(goal.ttl)} s", _time_left(goal, now))))),
+        ("ttl", goal.ttl and ", ".join(filter(None, (f"{format_number(goal.ttl)} s", _describe_time_left(goal, now))))),
         ("data", None if goal.data is None else printable(encode(goal.data).decode().rstrip("\n"))),
-        ("queued", _date_and_time(goal.queued_at)),
-        ("started", _date_and_time(goal.started_at)),
-        ("ended at", _date_and_time(goal.ended_at)),
+        ("queued", _format_date_and_time(goal.queued_at)),
+        ("started", _format_date_and_time(goal.started_at)),
+        ("ended at", _format_date_and_time(goal.ended_at)),
         ("duration", None if goal.duration is None else f"{goal.duration:.2f} s of audio"),
         ("voice", goal.voice and printable(goal.voice)),
         ("output", goal.output and _describe_output(goal.output)),
@@ -109,7 +109,7 @@ def goal_lines(goal: Goal, screen: Screen, now: float) -> list[str]:
     for name, value in rows:
         if value:
             # Don't wrap JSON, so that it stays valid when it is copied from the terminal.
-            lines += wrap(value.split(" "), _label(name), Screen() if name == "data" else screen)
+            lines += wrap(value.split(" "), _pad_label(name), Screen() if name == "data" else screen)
     return lines
 
 
@@ -119,31 +119,31 @@ def status_lines(status: ServerStatus, screen: Screen, now: float) -> list[str]:
     screen = replace(screen, boot=str(server.get("boot")))
     uptime = server.get("uptime")
     identity = [
-        f"pid {_format_field(server, 'pid')} on {_format_field(server, 'socket')}",
+        f"pid {_format_status_field(server, 'pid')} on {_format_status_field(server, 'socket')}",
         f"up {format_duration(float(uptime) if isinstance(uptime, int | float) else 0.0)}",
-        f"{_format_field(server, 'clients')} of {_format_field(server, 'max_clients')} clients",
+        f"{_format_status_field(server, 'clients')} of {_format_status_field(server, 'max_clients')} clients",
     ]
-    engine = _format_fields(server, "engine", "driver", "synthesizer", "player", "device", "lead_in")
-    settings = _format_fields(server, "rate", "volume", "pitch", "voice", "ttl", "preempt")
+    engine = _format_status_fields(server, "engine", "driver", "synthesizer", "player", "device", "lead_in")
+    settings = _format_status_fields(server, "rate", "volume", "pitch", "voice", "ttl", "preempt")
     lines: list[str] = []
     for label, parts in (("server", identity), ("engine", engine), ("settings", settings)):
-        lines += wrap([*(f"{each}," for each in parts[:-1]), parts[-1]], _label(label), screen)
+        lines += wrap([*(f"{each}," for each in parts[:-1]), parts[-1]], _pad_label(label), screen)
     neural = server.get("neural_voices")
     for voice, found in neural.items() if isinstance(neural, dict) else ():
         state, why = (found.get(each) for each in ("state", "why"))
-        lines += wrap(printable(f"{voice} {state}{f': {why}' if why else ''}").split(" "), _label("voice"), screen)
+        lines += wrap(printable(f"{voice} {state}{f': {why}' if why else ''}").split(" "), _pad_label("voice"), screen)
     if server.get("paused"):
         paused = screen.coloured("speech is paused", State.PREEMPTING)
-        lines.append(f"{_label('paused')}{paused}; continue with: talk resume")
+        lines.append(f"{_pad_label('paused')}{paused}; continue with: talk resume")
     active = [status.active] if status.active else []
     tables = (("now", active, "silent"), ("queue", status.pending, "nothing"), ("said", status.recent, "nothing"))
     id_columns = max((width(screen.goal_id(goal.id)) for _, goals, _ in tables for goal in goals), default=0)
     for label, goals, without in tables:
-        lines += _goal_table(label, goals, id_columns, screen, now) if goals else [_label(label) + without]
+        lines += _goal_table(label, goals, id_columns, screen, now) if goals else [_pad_label(label) + without]
     return lines
 
 
-def _label(name: str) -> str:
+def _pad_label(name: str) -> str:
     """Pad a label to the width of the label column."""
     return f"{name:<{_LABEL_COLUMNS}}"
 
@@ -177,9 +177,11 @@ def format_duration(seconds: float) -> str:
 
 
 def _goal_table(label: str, goals: Sequence[Goal], id_columns: int, screen: Screen, now: float) -> list[str]:
-    """Return one line for each goal, cut to the width of the terminal."""
+    """Return one line for each goal, cut to the width of the terminal. The first one starts with the label."""
     labels = [label, *[""] * (len(goals) - 1)]
-    heads = [_label(name) + _head_columns(goal, id_columns, screen) for name, goal in zip(labels, goals, strict=True)]
+    heads = [
+        _pad_label(name) + _head_columns(goal, id_columns, screen) for name, goal in zip(labels, goals, strict=True)
+    ]
     tails = [_tail_forms(goal, screen, now) for goal in goals]
     texts = [quoted_text(goal, _LISTED_TEXT_CHARS) for goal in goals]
     text_columns = min(TEXT_COLUMNS, max(map(width, texts)))
@@ -205,11 +207,12 @@ def _tail_forms(goal: Goal, screen: Screen, now: float) -> list[str]:
 
 
 def quoted_text(goal: Goal, limit: int | None = None) -> str:
-    """Return a goal's text in quotes, cut to `limit` characters."""
+    """Return a goal's text in quotes, cut to `limit` characters, or a placeholder if it is no longer kept."""
     return _quote(goal.text, limit) or TEXT_NOT_KEPT
 
 
 def _quote(text: str | None, limit: int | None = None) -> str | None:
+    """Escape a text, cut it to `limit` characters and put it in quotes. Return None if the text is None."""
     return None if text is None else f'"{printable(text, limit)}"'
 
 
@@ -220,13 +223,13 @@ def _unfinished_details(goal: Goal, now: float) -> list[str]:
         None if goal.started_at is None else f"{paused}for {max(0.0, now - goal.started_at):.1f} s",
         f"priority {goal.priority}" if goal.priority else None,
         None if goal.key is None else f'key "{printable(goal.key)}"',
-        _time_left(goal, now),
+        _describe_time_left(goal, now),
     ]
     return [each for each in notes if each is not None]
 
 
-def _time_left(goal: Goal, now: float) -> str | None:
-    """Return how much time a pending goal has left, or None if it has no ttl."""
+def _describe_time_left(goal: Goal, now: float) -> str | None:
+    """Describe how much time a pending goal has left before it expires. Return None if it has no ttl."""
     if goal.state is not State.PENDING or not goal.ttl or goal.queued_at is None:
         return None
     left = max(0.0, goal.queued_at + goal.ttl - now)
@@ -247,9 +250,9 @@ def _describe_sender(sender: Sender | None) -> str:
 
 
 def sender_forms(sender: Sender | None, screen: Screen) -> list[str]:
-    """Return several descriptions of a sender, longest first.
+    """Return alternative descriptions of a sender, longest first, so that the first one that fits can be shown.
 
-    A column shows the first one that fits. Only with `screen.long`, they contain the command and the process id.
+    The command and the process id are only included with `screen.long`.
 
     The name that the sender has chosen comes first. It is in quotes because it isn't verified.
     """
@@ -269,14 +272,14 @@ def _describe_cause(by: By) -> str:
 
 
 def listed_reason_forms(goal: Goal, screen: Screen) -> list[str]:
-    """Return the descriptions to show in a list of goals. A success has none, unless the output was muted."""
+    """Return descriptions of why a goal ended, longest first. The duration is only shown with `screen.long`."""
     if goal.state is State.SUCCEEDED and not screen.long:
         return _muted_note(goal) or [""]
     return reason_forms(goal, screen)
 
 
 def reason_forms(goal: Goal, screen: Screen) -> list[str]:
-    """Return several descriptions of why a goal ended and who ended it, longest first."""
+    """Return descriptions of why a goal ended and who ended it, longest first, or the duration of a success."""
     if goal.state is State.SUCCEEDED:
         return [", ".join([*([] if goal.duration is None else [f"{goal.duration:.1f} s"]), *_muted_note(goal)])]
     reason = printable(goal.reason or goal.state.name.lower())
@@ -303,6 +306,7 @@ def _message_details(goal: Goal) -> str:
 
 
 def _describe_output(output: Output) -> str:
+    """Describe the device, the player and the volume that a goal was played with."""
     muted = ", muted" if output.muted else ""
     return f"{printable(output.device)}, by {printable(output.player)}, volume {output.volume:g}{muted}"
 
@@ -313,6 +317,7 @@ def _muted_note(goal: Goal) -> list[str]:
 
 
 def _sender_command(sender: Sender) -> str:
+    """Return the command line of the sender's parent or, if unknown, the sender's program, cut to 60 characters."""
     return printable(sender.parent or sender.command or "a program", _SENDER_COMMAND_CHARS)
 
 
@@ -327,7 +332,7 @@ def _script_name(sender: Sender) -> str:
 
 
 def _launched_command(words: list[str]) -> list[str]:
-    """Return the command line that a launcher runs.
+    """Return the command line that a launcher such as `bash` or `sudo` runs, or an empty list.
 
     The list is empty if the command isn't a launcher, or if the script has no name.
     """
@@ -355,15 +360,18 @@ def _launched_command(words: list[str]) -> list[str]:
 
 
 def _file_name(path: str) -> str:
+    """Return the last component of a path."""
     return path.rstrip("/").rpartition("/")[2] or path
 
 
-def _format_fields(server: JsonObject, *names: str) -> list[str]:
+def _format_status_fields(server: JsonObject, *names: str) -> list[str]:
+    """Format fields of the server's status. Optional fields without a value are left out."""
     shown = [each for each in names if server.get(each) or each not in _OPTIONAL_FIELDS]
-    return [_FIELD_FORMATS.get(each, f"{each} {{}}").format(_format_field(server, each)) for each in shown]
+    return [_FIELD_FORMATS.get(each, f"{each} {{}}").format(_format_status_field(server, each)) for each in shown]
 
 
 def _format_value(value: object) -> str:
+    """Format a value of a setting. A boolean becomes "yes" or "no"."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     return format_number(value)
@@ -374,10 +382,12 @@ def clock_time(seconds: float | None) -> str:
     return "--:--:--" if seconds is None else time.strftime("%H:%M:%S", time.localtime(seconds))
 
 
-def _date_and_time(seconds: float | None) -> str | None:
+def _format_date_and_time(seconds: float | None) -> str | None:
+    """Format a timestamp as local date and time, or return None if it is None."""
     return None if seconds is None else time.strftime("%Y-%m-%d %H:%M:%S %z", time.localtime(seconds))
 
 
-def _format_field(server: JsonObject, name: str) -> str:
+def _format_status_field(server: JsonObject, name: str) -> str:
+    """Format the value of a field of the server's status, or return "default" if it is None."""
     value = server.get(name)
     return "default" if value is None else printable(_format_value(value), _LISTED_TEXT_CHARS)

@@ -154,7 +154,10 @@ def longest_fitting(forms: Sequence[str], columns: int | None) -> str:
 
 
 def room_beside(text: str, columns: int, screen: Screen) -> int:
-    """Return how many columns the details beside a text may take. They leave at least half of the line to the text."""
+    """Return how many columns the details beside a text may take, so that enough of the text can be shown.
+
+    They leave at least half of the line to the text, or 16 columns if whole ids are shown.
+    """
     return columns - len(COLUMN_GAP) - min(width(text), _MIN_TEXT_COLUMNS if screen.long else columns // 2)
 
 
@@ -177,20 +180,19 @@ def fit_row(head: str, text: str, details: Sequence[str], text_columns: int, scr
     return (head + pad(text, text_columns) + COLUMN_GAP + shown).rstrip()
 
 
-def wrap(pieces: Sequence[str], first: str, screen: Screen) -> list[str]:
-    """Join pieces of text with spaces, and wrap them into lines that fit the screen.
+def wrap(pieces: Sequence[str], head: str, screen: Screen) -> list[str]:
+    """Join pieces of text with spaces, and wrap them into lines that fit the screen. `head` starts the first line.
 
-    The first line starts with `first`, and the other lines are indented by its width. Lines are only broken between
-    pieces.
+    The other lines are indented by its width. Lines are only broken between pieces.
     """
-    columns = screen.columns_left(width(first))
+    columns = screen.columns_left(width(head))
     lines = [pieces[0]]
     for piece in pieces[1:]:
         if columns is not None and width(lines[-1]) + 1 + width(piece) > columns:
             lines.append(piece)
         else:
             lines[-1] += f" {piece}"
-    return [f"{' ' * width(first) if number else first}{each}" for number, each in enumerate(lines)]
+    return [f"{' ' * width(head) if number else head}{each}" for number, each in enumerate(lines)]
 
 
 class MeasuredText:
@@ -207,7 +209,7 @@ class MeasuredText:
         return "".join(self._shown)
 
     def split(self, heard: int) -> tuple[str, str]:
-        """Split the escaped text after `heard` characters."""
+        """Return the escaped text in two parts: the first `heard` characters, and the rest."""
         return self._slice(0, heard), self._slice(heard, len(self._shown))
 
     def view(self, start: int, end: int, columns: int) -> tuple[str, str, str]:
@@ -240,6 +242,7 @@ class MeasuredText:
         return before + self._slice(first, start), self._slice(start, end), self._slice(end, stop) + after
 
     def _slice(self, start: int, end: int) -> str:
+        """Return the characters from `start` to `end`, with invisible ones escaped."""
         return "".join(self._shown[start:end])
 
     def _first_shown(self, column: int, start: int) -> int:
@@ -259,14 +262,17 @@ class MeasuredText:
 
 
 def _is_hidden(character: str) -> bool:
+    """Return whether a character is invisible or can change how a line is shown."""
     return unicodedata.category(character) in _HIDDEN_CATEGORIES
 
 
 def _escape(character: str) -> str:
+    """Return a character, or its escape sequence if it is invisible or a backslash."""
     return character.encode("unicode_escape").decode() if character == "\\" or _is_hidden(character) else character
 
 
 def _character_width(character: str) -> int:
+    """Return how many columns of a terminal a character takes: 0, 1 or 2."""
     if unicodedata.category(character) in _COMBINING_CATEGORIES:
         return int(character == _EMOJI_SELECTOR)
     is_flag = _FLAG_LETTERS[0] <= character <= _FLAG_LETTERS[1]

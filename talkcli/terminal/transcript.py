@@ -53,7 +53,7 @@ class ColumnWidths:
     def __init__(self) -> None:
         self._ids, self._robots = _FIRST_ID_COLUMNS, _FIRST_NAME_COLUMNS
 
-    def robot(self, name: str, screen: Screen) -> str:
+    def pad_robot(self, name: str, screen: Screen) -> str:
         """Pad a robot's name to the width of its column, which is widened if necessary.
 
         The name takes up at most a sixth of the terminal.
@@ -62,7 +62,7 @@ class ColumnWidths:
         self._robots = max(self._robots, min(width(shown), _MAX_NAME_COLUMNS))
         return pad(shown, self._robots)
 
-    def goal_id(self, goal_id: str, screen: Screen) -> str:
+    def pad_goal_id(self, goal_id: str, screen: Screen) -> str:
         """Pad a goal id to the width of its column, which is widened if necessary."""
         shown = screen.goal_id(goal_id)
         self._ids = max(self._ids, _FIRST_NAME_COLUMNS * screen.long, min(width(shown), _MAX_NAME_COLUMNS))
@@ -99,27 +99,28 @@ class Transcript:
         self._widths = widths or ColumnWidths()
 
     def lines(self, event: Event, screen: Screen, now: float) -> list[str]:
-        """Return the lines for an event. `now` is the time to show if the event has none."""
+        """Return the lines that show an event, and remember its goal. `now` is shown if the event has no time."""
         if isinstance(event, Snapshot):
             self._boot = str(event.status.server.get("boot"))
         screen = replace(screen, boot=self._boot)
         if isinstance(event, Snapshot):
-            return self._snapshot_lines(event, screen, now)
+            return self._format_snapshot(event, screen, now)
         if isinstance(event, StateChanged):
-            return self._state_lines(event, screen, now)
+            return self._format_state_change(event, screen, now)
         if isinstance(event, PausedChanged):
-            return [self._pause_line(event, screen, now)]
+            return [self._format_pause(event, screen, now)]
         if isinstance(event, WordHeard) and self._with_words:
             word = f"{printable(event.word)}{COLUMN_GAP}{event.time:.2f} s"
             return [self._head_columns(event.at or now, "word", None, event.id, screen) + word]
         return []  # results aren't shown, and words only on request
 
-    def _snapshot_lines(self, event: Snapshot, screen: Screen, now: float) -> list[str]:
+    def _format_snapshot(self, event: Snapshot, screen: Screen, now: float) -> list[str]:
+        """Remember the server's state, and return a line about the server and the lines of all unfinished goals."""
         status = event.status
         goals = unfinished(status)
         for goal in goals:
             self._goals[goal.id] = goal
-            self._widths.goal_id(goal.id, screen)  # widen the column now to align all lines
+            self._widths.pad_goal_id(goal.id, screen)  # widen the column now to align all lines
         self._paused = status.server.get("paused") is True
         place = f"server {printable(str(status.server.get('pid')))} on {printable(str(status.server.get('socket')))}"
         waiting = f", {len(status.pending)} waiting" if status.pending else ""
@@ -128,10 +129,11 @@ class Transcript:
         lines = [cut(head, screen.columns_left(0))]
         for goal in goals:
             since = goal.queued_at if goal.started_at is None else goal.started_at
-            lines += self._goal_lines(goal, goal.state, since or now, screen)
+            lines += self._format_goal(goal, goal.state, since or now, screen)
         return lines
 
-    def _state_lines(self, event: StateChanged, screen: Screen, now: float) -> list[str]:
+    def _format_state_change(self, event: StateChanged, screen: Screen, now: float) -> list[str]:
+        """Remember or forget a goal after a change of its state, and return the lines that show the change."""
         if event.goal is not None:
             self._goals[event.id] = event.goal
             if len(self._goals) > _MAX_REMEMBERED_GOALS:  # the event for the end of the oldest goal was probably missed
@@ -146,9 +148,10 @@ class Transcript:
         at = event.at or now
         if goal is None:
             return [self._head_columns(at, event.state.name, event.state, event.id, screen).rstrip()]
-        return self._goal_lines(goal, event.state, at, screen)
+        return self._format_goal(goal, event.state, at, screen)
 
-    def _pause_line(self, event: PausedChanged, screen: Screen, now: float) -> str:
+    def _format_pause(self, event: PausedChanged, screen: Screen, now: float) -> str:
+        """Remember whether speech is paused, and return the line that says so."""
         self._paused = event.paused
         name = "paused" if event.paused else "resumed"
         head = self._head_columns(event.at or now, name, State.PREEMPTING, event.id or "", screen)
@@ -156,7 +159,8 @@ class Transcript:
         forms = [f"by {each}" for each in sender_forms(by, screen)] if by else [""]
         return (head + longest_fitting(forms, screen.columns_left(width(head)))).rstrip()
 
-    def _goal_lines(self, goal: Goal, state: State, at: float, screen: Screen) -> list[str]:
+    def _format_goal(self, goal: Goal, state: State, at: float, screen: Screen) -> list[str]:
+        """Return the lines that show a goal with its state, text, and sender or reason. `at` is a timestamp."""
         head = self._head_columns(at, state.name, state, goal.id, screen)
         ended = state.terminal
         forms = reason_forms(goal, screen) if ended else sender_forms(goal.client, screen)
@@ -174,17 +178,18 @@ class Transcript:
         return [fit_row(head, text, forms, columns * 3 // 4, screen)]
 
     def _head_columns(self, at: float, word: str, state: State | None, goal_id: str, screen: Screen) -> str:
-        robot = [] if self._robot is None else [self._widths.robot(self._robot, screen)]
-        cells = (screen.coloured(pad(word, 10), state), self._widths.goal_id(goal_id, screen))
+        """Return the first columns of a line: time, robot, a word in the colour of the state, and goal id."""
+        robot = [] if self._robot is None else [self._widths.pad_robot(self._robot, screen)]
+        cells = (screen.coloured(pad(word, 10), state), self._widths.pad_goal_id(goal_id, screen))
         return COLUMN_GAP.join((clock_time(at), *robot, *cells, ""))
 
 
 def log_lines(goals: Sequence[Goal], screen: Screen, now: float) -> list[str]:
-    """Return one line for each ended goal. `now` is a Unix timestamp."""
+    """Return one line for each ended goal, for `talk log`. `now` is a Unix timestamp."""
     if not goals:
         return []
     today = time.localtime(now)[:3]
-    cells = [(_log_time(goal.ended_at, today), goal.state.name, screen.goal_id(goal.id)) for goal in goals]
+    cells = [(_format_log_time(goal.ended_at, today), goal.state.name, screen.goal_id(goal.id)) for goal in goals]
     widths = [max(map(width, column)) for column in zip(*cells, strict=True)]
     heads = []
     for goal, (when, state, goal_id) in zip(goals, cells, strict=True):
@@ -209,7 +214,8 @@ def log_lines(goals: Sequence[Goal], screen: Screen, now: float) -> list[str]:
     return lines
 
 
-def _log_time(seconds: float | None, today: tuple[int, ...]) -> str:
+def _format_log_time(seconds: float | None, today: tuple[int, ...]) -> str:
+    """Format a timestamp as local time, with the date if it isn't today."""
     if seconds is None or time.localtime(seconds)[:3] == today:
         return clock_time(seconds)
     return time.strftime("%b %d %H:%M:%S", time.localtime(seconds))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from talkcli import __version__
-from talkcli.cli.ask import _examination
+from talkcli.cli.ask import _create_examination
 from talkcli.cli.show import CommonOptions
 from talkcli.doctor import broker as judging
 from talkcli.errors import UsageError
@@ -104,9 +104,9 @@ def test_a_bridge_is_not_disturbed_if_its_own_user_runs_the_doctor(robot: Robot)
 def test_a_variable_names_the_robot_as_the_option_does(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TALK_ROBOT", "anna")
     options = CommonOptions()
-    assert isinstance(_examination(options, {}, silent=False), judging.BrokerExamination)
+    assert isinstance(_create_examination(options, {}, silent=False), judging.BrokerExamination)
     options.socket = "/nowhere"
-    assert not isinstance(_examination(options, {}, silent=False), judging.BrokerExamination)
+    assert not isinstance(_create_examination(options, {}, silent=False), judging.BrokerExamination)
 
 
 @pytest.mark.slow

@@ -53,7 +53,7 @@ OPT = Environment("/opt/talk/bin/python3", needs_sudo=True)
 )
 def test_the_command_fits_the_environment(environment: Environment, again: bool, command: str) -> None:
     wanted = command.replace("PY ", f"{shlex.quote(environment.python)} ")
-    assert command_for(environment, ["numpy"], again=again) == wanted
+    assert command_for(environment, ["numpy"], reinstall=again) == wanted
 
 
 def test_the_command_names_the_python_that_runs() -> None:

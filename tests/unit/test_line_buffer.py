@@ -9,11 +9,11 @@ def test_a_line_has_its_ttl_from_when_its_newline_was_read() -> None:
     buffer = LineBuffer(ttl=10)
     for data, now in ((b"one\ntw", 100.0), (b"o\n\n", 103.0), (b"four", 104.0), (b"", 105.0)):
         buffer.feed(data, now)
-    assert [(each.number, each.text) for each in buffer.take_late(109.9)] == []
-    assert [(each.number, each.text) for each in buffer.take_late(110.0)] == [(1, "one")]
+    assert [(each.number, each.text) for each in buffer.take_expired(109.9)] == []
+    assert [(each.number, each.text) for each in buffer.take_expired(110.0)] == [(1, "one")]
     assert buffer.first is not None
     assert (buffer.first.number, buffer.first.end) == (2, 113.0)
-    assert [(each.number, each.end) for each in buffer.take_late(1000.0)] == [(2, 113.0), (4, 115.0)]
+    assert [(each.number, each.end) for each in buffer.take_expired(1000.0)] == [(2, 113.0), (4, 115.0)]
     assert buffer.first is None
     assert buffer.ended
 
@@ -21,14 +21,14 @@ def test_a_line_has_its_ttl_from_when_its_newline_was_read() -> None:
 def test_no_more_late_lines_are_taken_at_once_than_a_signal_can_wait_for() -> None:
     buffer = LineBuffer(ttl=10)
     buffer.feed(b"a\n" * 2_500, 0.0)
-    assert [len(list(buffer.take_late(10.0))) for _ in range(4)] == [1_000, 1_000, 500, 0]
+    assert [len(list(buffer.take_expired(10.0))) for _ in range(4)] == [1_000, 1_000, 500, 0]
 
 
 def test_without_a_ttl_no_line_is_ever_late() -> None:
     for ttl in (None, 0.0):
         buffer = LineBuffer(ttl)
         buffer.feed(b"one\n", 0.0)
-        assert list(buffer.take_late(1e9)) == []
+        assert list(buffer.take_expired(1e9)) == []
         assert buffer.take().end == float("inf")
 
 

@@ -23,7 +23,7 @@ from talkcli.engine import protocol
 from talkcli.engine.protocol import HANG_LIMIT_S, KILL_LIMIT_S, START_LIMIT_S
 from talkcli.goals.reasons import Reason
 from talkcli.polling import wait_ready
-from talkcli.processes import close, kill, kill_holders, open_pipes, processes, signal_name
+from talkcli.processes import close, kill, kill_holders, open_pipes, process_ids, signal_name
 from talkcli.protocol.lines import LineSplitter
 
 if TYPE_CHECKING:
@@ -158,7 +158,7 @@ class EngineProcess:
             kill([-self.pid])
             # A player dies with the engine process, but the programs of a pipeline have a process group of their own
             # and would survive.
-            kill(pid for pid in processes() if peers.process_stat(pid)[3:4] == [b"%d" % self.pid])
+            kill(pid for pid in process_ids() if peers.process_stat(pid)[3:4] == [b"%d" % self.pid])
             kill_holders(self.liveness)
 
     def describe_exit(self) -> str:

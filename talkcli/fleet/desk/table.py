@@ -148,7 +148,7 @@ class FleetTranscript:
     def begin(self, robots: Sequence[Presence], broker: str, screen: Screen, now: float) -> list[str]:
         """Return the first line, which shows the number of robots and the URL of the broker."""
         for each in robots:
-            self._columns.robot(each.name, screen)  # All names must be known first, so that all lines are aligned.
+            self._columns.pad_robot(each.name, screen)  # All names must be known first, so that all lines are aligned.
             self._boots[each.name] = _boot(each)
         offline = sum(not each.online for each in robots)
         serverless = sum(each.online and each.server is None for each in robots)
@@ -185,5 +185,5 @@ class FleetTranscript:
             word, state, more = server, State.LOST, ""
         else:
             word, state, more = "server", State.SUCCEEDED, server
-        name, shown = self._columns.robot(robot.name, screen), pad(word, 10) if more else word
+        name, shown = self._columns.pad_robot(robot.name, screen), pad(word, 10) if more else word
         return [COLUMN_GAP.join((clock_time(now), name, screen.coloured(shown, state), *filter(None, [more])))]
