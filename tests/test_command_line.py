@@ -229,7 +229,8 @@ def test_json_on_a_terminal_is_escaped_and_means_the_same(scripted: Talk, comman
         shown.finish()
         line = shown.raw.decode().split("\r\n")[0]
     assert not RAW.search(line), repr(line)
-    assert all(each in line for each in (r"\u009b31m \u007f \ue000 \udb40\udc01", "Grüße 日本 👩", r"\u202epatrol"))
+    for each in (r"\u009b31m \u007f \ue000 \udb40\udc01", "Grüße 日本 👩", r"\u202epatrol"):
+        assert each in line
     assert json.dumps(text)[1:-1] in json.dumps(json.loads(line))
     if command != ["watch"]:  # a program gets the text unchanged
         assert json.loads(scripted.run(*words).out)
