@@ -67,7 +67,7 @@ def test_second_server_names_the_one_that_serves_and_never_the_one_before_it(hom
     with open(path, "w+b", buffering=0) as file:
         file.write(f"{gone.pid}\n".encode())
         found: list[int | None] = []
-        reader = threading.Thread(target=lambda: found.append(listener._holder(file.fileno())))
+        reader = threading.Thread(target=lambda: found.append(listener._read_holder(file.fileno())))
         reader.start()
         reader.join(0.1)
         assert reader.is_alive(), f"it named {found}, which has ended"

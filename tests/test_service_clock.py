@@ -45,9 +45,9 @@ def slept(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 async def _queued_behind_another(ttl: float) -> Speech:
     served = Speech(Scheduler("4k7f", max_queue=1, settings=replace(INITIAL, ttl=ttl)))
     served.engine = _BusyEngine()  # type: ignore[assignment]
-    served.scheduler.engine_ready(served.now())
+    served.scheduler.engine_ready(served.advance_time())
     for text in ("a long sentence", "the door is open"):
-        served.apply(served.scheduler.submit(Say(text), Sender(), served.now())[1])
+        served.apply(served.scheduler.submit(Say(text), Sender(), served.advance_time())[1])
     return served
 
 
@@ -67,7 +67,7 @@ async def test_a_goal_whose_time_ended_in_a_suspend_is_recalled_when_the_machine
 async def test_no_request_after_a_suspend_finds_a_goal_whose_time_is_over(slept: list[float]) -> None:
     served = await _queued_behind_another(ttl=600)
     slept.append(3_600)
-    served.now()  # every request begins with this
+    served.advance_time()  # every request begins with this
     assert len(served.scheduler.pending) == 0
 
 

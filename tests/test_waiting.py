@@ -53,7 +53,7 @@ class Client:
     def publish(self, event: bytes, *, feedback: bool = False) -> None:
         """Ignore events: these tests count replies."""
 
-    def has_hung_up(self) -> bool:
+    def detect_hang_up(self) -> bool:
         return False
 
     def goals(self) -> list[str]:
@@ -80,7 +80,7 @@ class Server:
     def __init__(self, max_queue: int = 1) -> None:
         self.speech = Speech(Scheduler("4k7f", max_queue=max_queue))
         self.speech.engine = cast("Any", Engine())
-        self.speech.scheduler.engine_ready(self.speech.now())
+        self.speech.scheduler.engine_ready(self.speech.advance_time())
         self.requests = Requests(self.speech, dict)
         self.asked = 0
         has_room = self.speech.scheduler.has_room
@@ -104,7 +104,9 @@ class Server:
     def make_room(self) -> None:
         """Cancel the pending goal."""
         (pending,) = self.speech.scheduler.pending
-        self.speech.apply(self.speech.scheduler.cancel(Cancel(ids=(pending.id,)), None, self.speech.now()).effects)
+        self.speech.apply(
+            self.speech.scheduler.cancel(Cancel(ids=(pending.id,)), None, self.speech.advance_time()).effects
+        )
 
 
 async def turn() -> None:
@@ -126,7 +128,7 @@ async def test_a_check_for_room_asks_once_for_goals_that_need_the_same_room() ->
     for number in range(1_000):
         server.wait(client, f"{number}", priority=-(number % 2))
     server.asked = 0
-    server.requests._check_room_soon()
+    server.requests._schedule_room_check()
     await turn()
     assert (server.asked, client.told) == (2, [])
     server.make_room()
@@ -163,7 +165,7 @@ async def test_waiting_requests_of_all_connections_have_a_limit_in_bytes() -> No
 @in_loop
 async def test_small_values_count_with_the_memory_that_they_take(request_: Say | Wait) -> None:
     server = Server()
-    assert server.requests._may_wait(PendingRequest(cast("Any", Client()), None, request_))
+    assert server.requests._reserve_memory(PendingRequest(cast("Any", Client()), None, request_))
     assert server.requests._waiting_bytes > REQUEST_BYTES + 16_000
 
 
@@ -398,14 +400,14 @@ async def test_engine_gets_its_next_task_before_clients_get_events() -> None:
     written: list[str] = []
     served = Speech(Scheduler("4k7f", max_queue=1))
     served.engine = _Written(written)  # type: ignore[assignment]
-    served.scheduler.engine_ready(served.now())
+    served.scheduler.engine_ready(served.advance_time())
 
     def changed(record: Record, state: State, _: float) -> None:
         written.append(f"{state.name} {record.say.text}")
 
     served.subscribers.state_changed = changed  # type: ignore[assignment, method-assign]
     for text, preempt in (("first", False), ("second", True)):
-        served.apply(served.scheduler.submit(Say(text, preempt=preempt), Sender(), served.now())[1])
+        served.apply(served.scheduler.submit(Say(text, preempt=preempt), Sender(), served.advance_time())[1])
     served.report(protocol.Ended("4k7f-1", protocol.OUTCOME_STOPPED))
     await asyncio.sleep(0)
     assert written == [

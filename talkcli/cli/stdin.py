@@ -342,7 +342,7 @@ class LineSpeaker:
             goal_options = {**goal_options, "ttl": max(MIN_TTL_S, round(line.end - time.monotonic(), 2))}
         # Follow the goal even without --wait, to find out when it is no longer pending.
         request = Say(text, wait=True, feedback=self._feedback.shows_events, patient=True, **goal_options)
-        handle, accepted = self._client._handle(request)
+        handle, accepted = self._client._create_handle(request)
         if handle.state is State.REJECTED:
             self._report_rejected(line.number, handle.goal)
             return

@@ -16,7 +16,7 @@ import os
 import time
 
 from talkcli.client.connect import ANSWER_LIMIT_S
-from talkcli.client.connection import ReconnectingConnection, taken
+from talkcli.client.connection import ReconnectingConnection, take_repeatedly
 from talkcli.client.core import EventBuffer
 from talkcli.client.goal import GoalHandle
 from talkcli.errors import Lost, UnknownGoal, UsageError
@@ -194,7 +194,7 @@ class Client:
         )
         if not block and id is None:
             request = replace(request, id=f"talk:{os.urandom(8).hex()}")
-        handle, accepted = self._handle(request)
+        handle, accepted = self._create_handle(request)
         if handle.state.terminal:
             return handle
         if block:
@@ -205,7 +205,7 @@ class Client:
         return handle
 
     def follow(self, ids: Iterable[str] | None = None, *, feedback: bool = False) -> list[GoalHandle]:
-        """Follow goals that any client has sent, and return their handles.
+        """Receive the events of goals that any client has sent, and return their handles.
 
         Args:
             ids: ids of goals; None for all goals that have not ended.
@@ -384,8 +384,8 @@ class Client:
 
     # -- internal
 
-    def _handle(self, request: Say) -> tuple[GoalHandle, OnReply]:
-        """Create a handle for a new goal, and the function that processes the server's reply.
+    def _create_handle(self, request: Say) -> tuple[GoalHandle, OnReply]:
+        """Check a new goal, and return its handle and the function that processes the server's reply.
 
         If the text is too long for a request, the goal is already REJECTED.
 
@@ -403,15 +403,15 @@ class Client:
         return handle, accepted
 
     def _full_id(self, goal_id: str) -> str:
-        """Check an id, after prepending the boot id if it is only a number. Raises the same errors as `check_id`."""
+        """Return an id, prefixed with the boot id if it is only a number. Raises the same errors as `check_id`."""
         if goal_id.isascii() and goal_id.isdecimal():
             goal_id = f"{self._first_boot}-{goal_id}"
         check_id(goal_id)
         return goal_id
 
     def _take_all(self, buffer: EventBuffer) -> Iterator[Event]:
-        """Iterate over the events in a buffer. Raises Lost when the buffer or the connection is closed."""
-        for event in taken(self._connection, lambda: buffer.take() or buffer.closed, None):
+        """Yield the events of a buffer as they arrive. Raises Lost when the buffer or the connection is closed."""
+        for event in take_repeatedly(self._connection, lambda: buffer.take() or buffer.closed, None):
             if event is None or isinstance(event, str):
                 break
             yield event
@@ -420,12 +420,7 @@ class Client:
 
 
 def check_id(goal_id: str) -> None:
-    """Check the length of an id.
-
-    Raises:
-        UsageError: the id is empty.
-        UnknownGoal: the id is too long for any goal.
-    """
+    """Raise UsageError if an id is empty, or UnknownGoal if it is too long for any goal."""
     if not goal_id:
         raise UsageError("the goal's id is empty; check the variable that should contain it")
     if len(goal_id) > MAX_ID_CHARS:
@@ -448,11 +443,7 @@ def batches(ids: Iterable[str]) -> list[tuple[str, ...]]:
 
 
 def check(request: Say | Set) -> None:
-    """Check the types and ranges of a request's options in the same way as the server.
-
-    Raises:
-        UsageError: an option is not valid.
-    """
+    """Raise UsageError if an option of a request is invalid, using the same checks as the server."""
     for option in request.options:
         try:
             fault = option.type_error(getattr(request, option.name))

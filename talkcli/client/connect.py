@@ -74,7 +74,7 @@ class ConnectionAttempt:
 def reach(
     named: str | None, failures: tuple[tuple[str, Exception], ...] = (), only: str | None = None
 ) -> ConnectionAttempt:
-    """Connect to the first usable socket, without sending anything.
+    """Try to connect to the first usable socket, without sending anything, and return the attempt.
 
     Args:
         named: path of the only socket to try, as the user named it; None for the usual places.
@@ -218,7 +218,7 @@ def connect(
     attempt = attempt or reach(named)
     while True:
         error: TalkError | None = None
-        again = attempt.backlog_full or (keep_trying > 0 and _may_start(attempt))
+        again = attempt.backlog_full or (keep_trying > 0 and _server_may_start(attempt))
         if attempt.socket:
             greet_by = max(time.monotonic() + patience, give_up)
             if keep_trying and end is not None:
@@ -244,8 +244,8 @@ def connect(
         attempt = reach(named)
 
 
-def _may_start(attempt: ConnectionAttempt) -> bool:
-    """Return whether a server could still be starting at one of the failed places."""
+def _server_may_start(attempt: ConnectionAttempt) -> bool:
+    """Return whether a server could still be starting at one of the paths that could not be used."""
     found = {paths.describe_place(path, error) for path, error in attempt.failures if isinstance(error, OSError)}
     return not found.isdisjoint({paths.PLACE_ABSENT, paths.PLACE_STALE})
 
@@ -253,7 +253,7 @@ def _may_start(attempt: ConnectionAttempt) -> bool:
 def _greet(
     attempt: ConnectionAttempt, hello: JsonObject, end: float, interrupt: Mapping[int, int] | None
 ) -> ConnectionAttempt:
-    """Send hello if it has not been sent yet, and read the server's greeting.
+    """Send hello if it has not been sent yet, read the server's greeting, and return the updated attempt.
 
     The connection is closed if the greeting has not arrived by `end` (monotonic), and after any other error.
 
@@ -293,7 +293,7 @@ def _greet(
 
 
 def unreachable(attempt: ConnectionAttempt, named: str | None) -> TalkError:
-    """Return an error that lists the failed places and advises the user."""
+    """Return an error that lists the sockets that could not be used and advises the user."""
     if attempt.backlog_full:
         path = attempt.failures[-1][0]
         return ServerUnavailable(f"the server at {path} doesn't accept connections; restart it if it hangs")
@@ -305,12 +305,12 @@ def unreachable(attempt: ConnectionAttempt, named: str | None) -> TalkError:
         if isinstance(error, OSError):
             words = found = paths.describe_place(path, error)
             if found == paths.PLACE_DIRECTORY:
-                words += f"; use {_inside(path)}"
+                words += f"; use {_socket_inside(path)}"
         denied = denied or isinstance(error, AccessDenied) or found == paths.PLACE_FORBIDDEN
         tried += f"  {path}: {words}\n"
     step = f"{_LET_IN_STEP}\n{_START_OWN_STEP}" if denied else _START_STEP
     if named:
-        step = _named_step(named, found, denied=denied)
+        step = _advice_for_named_socket(named, found, denied=denied)
     hint = paths.sudo_caller_socket()
     if hint and not os.environ.get("TALK_SOCKET"):
         step += f"\nto use the server of the user who called sudo, run: talk --socket {hint}"
@@ -319,7 +319,7 @@ def unreachable(attempt: ConnectionAttempt, named: str | None) -> TalkError:
     return ServerUnavailable(f"no server found; tried:\n{tried}{step}")
 
 
-def _named_step(named: str, found: str, *, denied: bool) -> str:
+def _advice_for_named_socket(named: str, found: str, *, denied: bool) -> str:
     """Return advice for a user who named a socket with an option or a variable.
 
     Args:
@@ -332,7 +332,7 @@ def _named_step(named: str, found: str, *, denied: bool) -> str:
     from talkcli.terminal.text import printable
 
     by_variable = named == os.environ.get("TALK_SOCKET")
-    place = shlex.quote(printable(_inside(named) if found == paths.PLACE_DIRECTORY else named))
+    place = shlex.quote(printable(_socket_inside(named) if found == paths.PLACE_DIRECTORY else named))
     if denied:
         step = _LET_IN_STEP if by_variable else f"{_LET_IN_STEP}\n{_START_OWN_STEP}"
     elif found == paths.PLACE_FILE:
@@ -344,6 +344,6 @@ def _named_step(named: str, found: str, *, denied: bool) -> str:
     return f"{step}\nor unset TALK_SOCKET to try the usual places" if by_variable else step
 
 
-def _inside(directory: str) -> str:
+def _socket_inside(directory: str) -> str:
     """Return the path of the socket in a directory."""
     return f"{directory.rstrip('/')}/{paths.SOCKET_NAME}"

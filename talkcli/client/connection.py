@@ -41,15 +41,15 @@ _RECONNECT_PAUSE_S = 0.1
 
 
 def checked_sender_name(name: str | None) -> str | None:
-    """Return the same as `sender_name`. Raises UsageError if the name is too long."""
+    """Return the given name, or else TALK_NAME, or None. Raises UsageError if the name is too long."""
     name = sender_name(name)
     if name and len(name) > MAX_SENDER_NAME_CHARS:
         raise UsageError(f"the sender's name is too long: {len(name)} characters (at most {MAX_SENDER_NAME_CHARS})")
     return name
 
 
-def taken(connection: Connection, take: Callable[[], _T], end: float | None) -> Iterator[_T]:
-    """Call `take` repeatedly and yield its results, waiting for the server while there are none.
+def take_repeatedly(connection: Connection, take: Callable[[], _T], end: float | None) -> Iterator[_T]:
+    """Yield the results of `take` endlessly. Before each one, wait for the server until there is a result.
 
     An empty result is yielded if `end` has passed or the connection has ended. Nothing more is received after `end`, so
     that a loop over the results ends even if the server keeps sending events.
@@ -153,8 +153,9 @@ class Connection(ClientCore):
         return self.answer(exchange)
 
     def begin(self, request: Request, on_reply: OnReply | None = None, on_failure: OnFailure | None = None) -> Exchange:
-        """Send a request without waiting for the answer. The arguments are those of `Exchange`.
+        """Send a request, and return its exchange without waiting for the answer.
 
+        The arguments are those of `Exchange`.
         A caller without `on_failure` must call `forget` if it stops waiting for the answer.
         """
         exchange = self.exchange_type(request, on_reply, on_failure)
@@ -193,7 +194,7 @@ class Connection(ClientCore):
         since: float | None = None,
         interruptible: bool = True,
     ) -> bool:
-        """Read and process messages until `done()` is true, or until the connection has ended.
+        """Read and process messages until `done()` is true, the deadline passes, or the connection ends.
 
         If the server is silent for too long, the connection ends.
 
@@ -332,6 +333,7 @@ class SocketConnection(Connection):
         return None if self._socket is None else peers.credentials(self._socket)[0]
 
     def _send(self, exchange: Exchange) -> None:
+        """Queue the request of a registered exchange, and send as many bytes as the server accepts now."""
         line = self.line(exchange)
         if exchange.on_failure and self.unsent_bytes + len(line) > MAX_UNSENT_BYTES:
             words = f"{MAX_UNSENT_BYTES >> 10} KiB are already waiting for the server at {self.path}"
@@ -351,6 +353,7 @@ class SocketConnection(Connection):
                 self.stop_sending(f"the connection to the server was lost: {error.strerror}")
 
     def _step(self, timeout: float, interruptible: bool) -> None:
+        """Send waiting requests, wait up to `timeout` seconds for data, and process it."""
         with self.changed:
             early, self._received_early = self._received_early, b""
             if early:
@@ -385,6 +388,7 @@ class SocketConnection(Connection):
                 self.break_off(why, now)
 
     def _hang_up(self) -> None:
+        """Shut down the socket, which also wakes the thread that reads from it."""
         try:
             if self._socket is not None:
                 self._socket.shutdown(SHUT_RDWR)  # closing the socket would not wake the reading thread
@@ -392,6 +396,7 @@ class SocketConnection(Connection):
             pass  # the server has closed the connection
 
     def _drop(self) -> None:
+        """Close the socket's descriptor in this process."""
         if self._socket is not None:
             self._socket.close()
 
@@ -409,6 +414,7 @@ class ReconnectingConnection(SocketConnection):
         self._due = 0.0
 
     def begin(self, request: Request, on_reply: OnReply | None = None, on_failure: OnFailure | None = None) -> Exchange:
+        """Send a request, after reconnecting if necessary, and return its exchange without waiting."""
         if on_failure is None:
             self._read_available()  # notices if the connection has broken
         with self.changed:
@@ -420,6 +426,7 @@ class ReconnectingConnection(SocketConnection):
         return super().begin(request, on_reply, on_failure)
 
     def break_off(self, why: str, now: float) -> None:
+        """Disconnect, and schedule an attempt to reconnect, unless the connection has ended for good."""
         if self.ended is not None:
             return
         was_greeted = self.greeted
@@ -428,15 +435,16 @@ class ReconnectingConnection(SocketConnection):
             self.disconnected(why, now)
             self._due = now
         else:
-            self._not_connected(ServerUnavailable(f"nothing was sent to the server at {self.path}: {why}"), now)
+            self._schedule_retry(ServerUnavailable(f"nothing was sent to the server at {self.path}: {why}"), now)
 
     def _step(self, timeout: float, interruptible: bool) -> None:
+        """Reconnect if necessary, wait up to `timeout` seconds for data, and process it."""
         with self.changed:
             now = time.monotonic()
             if self._socket is not None and not self.greeted and now >= self._due:
                 self._drop()
                 self._give_up_socket()
-                self._not_connected(ServerUnavailable(f"the server at {self.path} doesn't respond"), now)
+                self._schedule_retry(ServerUnavailable(f"the server at {self.path} doesn't respond"), now)
             if self.ended is None:
                 self._connect_again(now)
             if not self.greeted:
@@ -448,25 +456,26 @@ class ReconnectingConnection(SocketConnection):
                 polled.close()
 
     def receive(self, data: bytes, now: float) -> None:
+        """Process received bytes. If the greeting refuses this client, disconnect and try again later."""
         try:
             super().receive(data, now)
         except TalkError as error:  # the greeting shows that the server can't be used
             self._give_up_socket()
-            self._not_connected(error, now)
+            self._schedule_retry(error, now)
 
     def _connect_again(self, now: float, *, at_once: bool = False) -> None:
-        """Reconnect if the connection is broken and the pause is over. `at_once` ignores the pause."""
+        """Reconnect if disconnected and the pause between attempts is over. `at_once` ignores the pause."""
         if self._socket is not None or (now < self._due and not at_once):
             return
         found = reach(self._named, only=self.path)
         if found.socket is None:
-            self._not_connected(unreachable(found, self._named), now)
+            self._schedule_retry(unreachable(found, self._named), now)
             return
         self._socket, self._due = found.socket, now + self._patience
         self.connecting(request_line(self._hello_message))
         self._flush()
 
-    def _not_connected(self, error: TalkError, now: float) -> None:
+    def _schedule_retry(self, error: TalkError, now: float) -> None:
         """Record a failed attempt to connect, and schedule the next one."""
         self._due = now + _RECONNECT_PAUSE_S
         self.not_connected(error)

@@ -71,7 +71,7 @@ class EventBuffer:
         self.reconnects = reconnects
 
     def add(self, event: Event) -> None:
-        """Add an event, unless it is a duplicate or the buffer is closed.
+        """Add an event unless it is a duplicate. Close the buffer if too many state changes are unread.
 
         A connection that waits for a goal and also watches all goals receives each state twice.
         """
@@ -117,12 +117,12 @@ class EventListeners:
         return {goal_id: any(each._with_feedback for each in some) for goal_id, some in self._goals.items()}
 
     def lose(self, goal_id: str, why: str) -> None:
-        """End a followed goal as LOST. `why` is a human-readable reason."""
+        """End a followed goal as LOST, and stop following it. `why` is a human-readable reason."""
         for tracked in self._goals.pop(goal_id, set()):
             tracked._mark_lost(why)
 
     def update(self, goal: Goal) -> None:
-        """Pass on the current state of a followed goal."""
+        """Pass a goal's current state on to all objects that follow the goal."""
         for tracked in self._goals.get(goal.id, set()):
             tracked._hear(goal)
 
@@ -139,7 +139,7 @@ class EventListeners:
                 self.watches.discard(buffer)
 
     def publish(self, event: Event | None) -> None:
-        """Pass an event to the followed goal and to the readers that watch all goals. None is ignored."""
+        """Pass an event to the goals that it concerns and to the readers that watch all goals. None is ignored."""
         if isinstance(event, Result):
             for tracked in self._goals.pop(event.goal.id, set()):
                 tracked._update(event.goal)
@@ -174,7 +174,7 @@ class TrackedGoal:
         self._buffer = EventBuffer()
 
     def _expect(self, request: Say, now: float) -> None:
-        """Copy the goal's id and text from a `say` request that has not been answered yet."""
+        """Copy the id and text of an unanswered `say` request, and record whether it asks for events."""
         self.goal = replace(self.goal, id=request.id or "", text=request.text)
         if request.wait:
             self._followed_at = now
@@ -186,7 +186,7 @@ class TrackedGoal:
         self.speech_paused = reply.get("paused") is True
 
     def _listen_to(self, listeners: EventListeners, *, feedback: bool, now: float) -> None:
-        """Start listening for the goal's events, which the server sends from `now` on."""
+        """Start to receive the goal's events, which the server sends from `now` on."""
         self._with_feedback = self._with_feedback or feedback
         if self._followed_at is None:
             self._followed_at = now
@@ -205,7 +205,7 @@ class TrackedGoal:
             self._update(replace(self.goal, state=State.REJECTED, reason=reason, message=message))
 
     def _mark_lost(self, why: str) -> None:
-        """End the goal as LOST. `why` is a human-readable reason."""
+        """End the goal as LOST, unless it has already ended. `why` is a human-readable reason."""
         from talkcli.goals.reasons import Reason  # rarely needed, and slow to import
 
         self._update(replace(self.goal, state=State.LOST, reason=Reason.LOST.value, message=f"result unknown: {why}"))
@@ -216,7 +216,7 @@ class TrackedGoal:
             self.goal = goal
 
     def _hear(self, event: StateChanged | WordHeard | PausedChanged | Goal) -> None:
-        """Process an event of this goal, a pause of all speech, or the goal's current state after reconnecting."""
+        """Update the goal from an event or from its state after reconnecting, and buffer the event."""
         if self.goal.state.terminal:
             return
         if isinstance(event, Goal):
@@ -241,12 +241,12 @@ class TrackedGoal:
         return self.goal.state.terminal or bool(self._buffer)
 
     def _take(self) -> Event | None:
-        """Remove and return the oldest event. If there is none, return the Result of an ended goal."""
+        """Remove and return the oldest event, or else the Result of an ended goal, or None."""
         return self._buffer.take() or (Result(self.goal) if self.goal.state.terminal else None)
 
 
 def read_greeting(line: bytes, path: str) -> tuple[str, int | None]:
-    """Read a server's first line, and return the server's boot id and process id.
+    """Return the boot id and process id in a server's first line. Raises an error if the server can't be used.
 
     Raises:
         ServerUnavailable: the line is not a greeting.
@@ -274,7 +274,7 @@ def identity(server: JsonObject) -> tuple[str, int | None]:
 
 
 class Exchange:
-    """A request and its answer, which consists of list items and a reply."""
+    """A request of a client and its answer, which consists of list items and a reply."""
 
     def __init__(self, request: Request, on_reply: OnReply | None = None, on_failure: OnFailure | None = None) -> None:
         """Create an exchange, which must be registered before the request is sent.
@@ -393,7 +393,7 @@ class ClientCore:
         return sum(len(line) for line, _ in self._unsent) - self._first_sent_bytes
 
     def outgoing(self) -> bytes:
-        """Return the bytes that can be sent now. Requests wait for the server's greeting."""
+        """Return the bytes that can be sent now: the hello line, or the requests once the server has greeted."""
         if self._hello or not self.greeted:
             return self._hello
         return b"".join(line for line, _ in self._unsent)[self._first_sent_bytes :]
@@ -411,7 +411,7 @@ class ClientCore:
         self._first_sent_bytes = count
 
     def forget(self, exchange: Exchange) -> bool:
-        """Stop waiting for an answer. A request that has not been sent is removed.
+        """Stop waiting for an answer, and remove the request if it is unsent. Return False if part of it was sent.
 
         Returns:
             False if a part of the line has been sent. The connection must then be closed before the newline is sent,
@@ -430,12 +430,12 @@ class ClientCore:
         """Fail all unsent and later requests, for this reason. Answers to earlier requests can still be received."""
         self._sending_ended = self._sending_ended or why
         unsent = [exchange for _, exchange in self._unsent]
-        self._drop_lines()
+        self._drop_unsent_lines()
         for exchange in unsent:
             self.fail(exchange, self.unanswered(exchange))
 
     def answer(self, exchange: Exchange) -> tuple[JsonObject, list[JsonObject]]:
-        """Return the reply to a request, and the items that came before it.
+        """Return the reply to a request and the items that came before it, or raise the request's error.
 
         Raises:
             RequestRefused: the server refused the request.
@@ -447,7 +447,7 @@ class ClientCore:
         return exchange.reply, exchange.items
 
     def unanswered(self, exchange: Exchange) -> TalkError:
-        """Return the error for an unanswered request."""
+        """Return the error for an unanswered request, which says whether the request was sent."""
         request = exchange.request
         why = self.ended or (self.absence if self.absent_since is not None else "")
         if not exchange.sent:
@@ -462,7 +462,7 @@ class ClientCore:
         return Lost(words) if isinstance(request, self.lasting) else ServerUnavailable(words)
 
     def refusal(self, reply: JsonObject, items: list[JsonObject]) -> TalkError:
-        """Return the error that a refusing reply reports. Its `items` are the items that came before the reply."""
+        """Return the error that a refusing reply reports. `items` are the list items that came before the reply."""
         from talkcli.terminal.text import printable  # rarely needed, and slow to import
 
         error = reply.get("error")
@@ -500,7 +500,7 @@ class ClientCore:
         return min(times, default=float("inf"))
 
     def expire(self, now: float) -> bool:
-        """Fail exchanges that have reached their time limit, and lose goals after a long disconnection.
+        """Fail requests that have reached their time limit, and end goals as LOST after a long disconnection.
 
         Returns:
             False if the connection must be closed, because a part of a line has been sent (see `forget`).
@@ -516,7 +516,7 @@ class ClientCore:
     # -- receiving
 
     def split(self, data: bytes, now: float) -> list[bytes]:
-        """Split received bytes into lines, and return the complete ones.
+        """Add received bytes, record their time, and return the lines that are now complete.
 
         Shells that pass lines on undecoded use this method instead of `receive`.
         """
@@ -551,10 +551,7 @@ class ClientCore:
         return self.exchanges.get(number) if isinstance(number, int) else None
 
     def dispatch(self, message: JsonObject, now: float) -> Exchange | None:
-        """Process a received message.
-
-        Returns:
-            The exchange that this message ends, or None if the message ends no exchange.
+        """Process a received event, list item or reply, and return the exchange that it ends, or None.
 
         Raises:
             ValueError: the event, or a goal in the reply, is malformed.
@@ -575,7 +572,7 @@ class ClientCore:
         return exchange
 
     def _finish(self, exchange: Exchange, reply: JsonObject) -> None:
-        """End an exchange with its reply.
+        """End an exchange with its reply, or with an error if the reply is a refusal. Calls the callbacks.
 
         Raises:
             Unreadable: a goal in the reply is malformed.
@@ -601,14 +598,14 @@ class ClientCore:
         self.end(why)
 
     def end(self, why: str) -> None:
-        """End the connection for good. Events that have already been received can still be read."""
+        """End the connection for good, and fail all unanswered requests. Received events can still be read."""
         if self.ended is not None:
             return
         self.ended = self._last_error or why
         self._fail_all()
 
     def disconnected(self, why: str, now: float) -> None:
-        """Record that the connection has broken and the shell is going to reconnect. All unanswered requests fail."""
+        """Record that the connection has broken. Fail unanswered requests, and end watches that don't reconnect."""
         self.absence = self._last_error or why
         self.absent_since, self._last_error, self._sending_ended = now, None, None
         self.greeted = False
@@ -623,17 +620,14 @@ class ClientCore:
         self.begin_stream()
 
     def not_connected(self, error: TalkError) -> None:
-        """Record that an attempt to reconnect has failed.
-
-        Exchanges without an `on_failure` fail, too.
-        """
+        """Record that an attempt to reconnect has failed, and fail all requests without an `on_failure`."""
         self.connect_error = error
         for exchange in [each for each in self.exchanges.values() if not each.on_failure]:
             self.forget(exchange)
             self.fail(exchange, error)
 
     def connected(self, boot: str, pid: int | None, now: float) -> None:
-        """Record that the server has sent its greeting on a new connection.
+        """Record the greeting on a new connection, and follow goals again, or mark them LOST after a restart.
 
         Goals are followed again if this is still the same run of the server. Otherwise they are LOST.
 
@@ -653,10 +647,10 @@ class ClientCore:
         if self.listeners.watches:
             self._watch_again(now)
         for _, exchange in waiting:
-            self.queue(self._line_now(exchange, now), exchange)
+            self.queue(self._renew_line(exchange, now), exchange)
 
-    def _line_now(self, exchange: Exchange, now: float) -> bytes:
-        """Return a waiting request's line, with its TTL reduced by the time waited."""
+    def _renew_line(self, exchange: Exchange, now: float) -> bytes:
+        """Reduce a waiting request's TTL by the time waited, restart its time limit, and return its line."""
         request = exchange.request
         if isinstance(request, Say) and request.ttl:
             exchange.request = replace(request, ttl=max(MIN_TTL_S, request.ttl - (now - exchange.heard_at)))
@@ -664,7 +658,7 @@ class ClientCore:
         return self.line(exchange)
 
     def _follow_again(self, goal_id: str, *, feedback: bool, now: float) -> None:
-        """Follow a goal again after reconnecting."""
+        """Queue a request to follow a goal again after reconnecting."""
 
         def on_reply(_: JsonObject, items: list[JsonObject]) -> None:
             for goal in goals(items, "goal"):
@@ -678,7 +672,7 @@ class ClientCore:
         self._begin(Exchange(Wait((goal_id,), feedback), on_reply, on_failure), now)
 
     def _watch_again(self, now: float) -> None:
-        """Watch all goals again after reconnecting."""
+        """Queue a request to watch all goals again after reconnecting."""
 
         def on_reply(reply: JsonObject, items: list[JsonObject]) -> None:
             self.listeners.publish(Snapshot(ServerStatus.from_reply(reply, items)))
@@ -695,7 +689,7 @@ class ClientCore:
         self.queue(self.line(exchange), exchange)
 
     def fail(self, exchange: Exchange, error: TalkError) -> None:
-        """End an exchange with an error, unless it has already ended."""
+        """End an exchange with an error and call its `on_failure`, unless the exchange has already ended."""
         if exchange.over:
             return
         exchange.error = error
@@ -705,7 +699,7 @@ class ClientCore:
 
     def _fail_all(self) -> None:
         """Fail all unanswered requests, and send nothing more of them."""
-        self._drop_lines()
+        self._drop_unsent_lines()
         for exchange in list(self.exchanges.values()):
             self.fail(exchange, self.unanswered(exchange))
 
@@ -714,6 +708,7 @@ class ClientCore:
         for goal_id in self.listeners.goals:
             self.listeners.lose(goal_id, f"{self.absence}; the sentence may still be spoken")
 
-    def _drop_lines(self) -> None:
+    def _drop_unsent_lines(self) -> None:
+        """Remove all lines that are waiting to be sent. Their exchanges don't fail."""
         self._unsent.clear()
         self._first_sent_bytes = 0

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 
-from talkcli.client.connection import taken
+from talkcli.client.connection import take_repeatedly
 from talkcli.client.core import TrackedGoal
 from talkcli.errors import UsageError
 from talkcli.frozen import TYPE_CHECKING
@@ -63,7 +63,7 @@ class GoalHandle(TrackedGoal):
         Raises:
             TimeoutError: the goal has not ended in this time. The goal itself is not affected.
         """
-        end = _end(timeout)
+        end = _end_time(timeout)
         self._follow(feedback=False)
         if not self._connection.wait_until(lambda: self.state.terminal, end):
             self._give_up(timeout)
@@ -82,9 +82,9 @@ class GoalHandle(TrackedGoal):
         Raises:
             TimeoutError: the goal has not ended in this time.
         """
-        end = _end(timeout)
+        end = _end_time(timeout)
         self._follow(feedback=False)
-        return self._events(end, timeout)
+        return self._iterate_events(end, timeout)
 
     def feedback(self, timeout: float | None = None) -> Iterator[WordHeard]:
         """Iterate over the goal's words as they are heard, until the goal has ended.
@@ -97,15 +97,15 @@ class GoalHandle(TrackedGoal):
         Raises:
             TimeoutError: the goal has not ended in this time.
         """
-        end = _end(timeout)
+        end = _end_time(timeout)
         self._follow(feedback=True)
-        return (each for each in self._events(end, timeout) if isinstance(each, WordHeard))
+        return (each for each in self._iterate_events(end, timeout) if isinstance(each, WordHeard))
 
     def poll(self) -> Event | None:
-        """Return the goal's next event, or None if there is no new event. The last event is the Result.
+        """Read from the server without blocking, and return the goal's next event, or None. The Result comes last.
 
-        This method never blocks. Call it regularly, because each call also receives the events of other
-        goals, and sends the rest of earlier requests.
+        Call this method regularly, because each call also receives the events of other goals, and sends the rest of
+        earlier requests.
 
         Raises:
             UsageError: the goal was sent with `follow=False`, and neither `wait` nor `events` has been called.
@@ -115,7 +115,7 @@ class GoalHandle(TrackedGoal):
         since = None if self.state.terminal else self._followed_at
         self._connection.wait_until(lambda: False, time.monotonic(), since=since, interruptible=False)
         if not self._has_event():
-            self._lose()
+            self._lose_if_disconnected()
         with self._connection.changed:
             event = self._take()
             if isinstance(event, Result):
@@ -155,11 +155,12 @@ class GoalHandle(TrackedGoal):
     # -- internal
 
     def _listen(self, *, feedback: bool) -> None:
-        """Start listening for the goal's events. The caller must hold the connection's lock."""
+        """Register for the goal's events, optionally with words. The caller must hold the connection's lock."""
         self._listen_to(self._connection.listeners, feedback=feedback, now=time.monotonic())
 
-    def _events(self, end: float | None, timeout: float | None) -> Iterator[Event]:
-        for event in taken(self._connection, self._take, end):
+    def _iterate_events(self, end: float | None, timeout: float | None) -> Iterator[Event]:
+        """Yield the goal's events up to its Result. Raises TimeoutError if `end` (monotonic) passes first."""
+        for event in take_repeatedly(self._connection, self._take, end):
             if event is None:
                 self._give_up(timeout)
             elif isinstance(event, Result):
@@ -170,7 +171,7 @@ class GoalHandle(TrackedGoal):
                 yield event
 
     def _follow(self, *, feedback: bool) -> None:
-        """Ask the server to send the goal's events, unless it already does."""
+        """Ask the server to send the goal's events, unless it already does or the goal has ended."""
         if self.state.terminal or (self._followed_at is not None and (self._with_feedback or not feedback)):
             return
 
@@ -182,10 +183,10 @@ class GoalHandle(TrackedGoal):
 
     def _give_up(self, timeout: float | None) -> None:
         """End the goal as LOST if the connection has ended, or else raise TimeoutError."""
-        if not self._lose():
+        if not self._lose_if_disconnected():
             raise TimeoutError(f"goal {self.id} has not ended after {0 if timeout is None else round(timeout, 1):g} s")
 
-    def _lose(self) -> bool:
+    def _lose_if_disconnected(self) -> bool:
         """End the goal as LOST if the connection has ended. Return whether the connection has ended."""
         ended = self._connection.ended
         if ended is not None:
@@ -195,7 +196,7 @@ class GoalHandle(TrackedGoal):
 
 
 def merged(handles: Sequence[GoalHandle], timeout: float | None = None) -> Iterator[tuple[GoalHandle, Event]]:
-    """Iterate over the events of several goals until all of them have ended.
+    """Yield the events of several goals, each with its goal's handle, until all of the goals have ended.
 
     The last event of each goal is its Result. A pause of all speech is yielded only once. If the connection ends, the
     remaining goals end as LOST.
@@ -213,7 +214,7 @@ def merged(handles: Sequence[GoalHandle], timeout: float | None = None) -> Itera
     stream = _EventStream(handles)
     if not handles:
         return
-    for found in taken(handles[0]._connection, stream.take, _end(timeout)):
+    for found in take_repeatedly(handles[0]._connection, stream.take, _end_time(timeout)):
         if not found:
             for each in stream.unfinished:
                 each._give_up(timeout)
@@ -234,7 +235,7 @@ class _EventStream:
         self._last_pause = 0
 
     def take(self) -> list[tuple[GoalHandle, Event]]:
-        """Remove and return the new events of all goals. The caller must hold the connection's lock."""
+        """Remove and return the new events of all goals in order. The caller must hold the connection's lock."""
         found: list[tuple[int, GoalHandle, Event]] = []
         for handle in self.unfinished:
             event: Event | None = None
@@ -255,6 +256,6 @@ class _EventStream:
         return merged_events
 
 
-def _end(timeout: float | None) -> float | None:
+def _end_time(timeout: float | None) -> float | None:
     """Return the monotonic time at which a timeout expires, or None if there is no timeout."""
     return None if timeout is None else time.monotonic() + timeout

@@ -39,27 +39,34 @@ class Sender:
     name: str | None = None
 
     def to_json(self) -> JsonObject:
+        """Return the JSON object that clients receive."""
         return fields(self)
 
     @classmethod
     def from_json(cls, value: object) -> Sender:
+        """Read a sender from a JSON object. Missing and malformed fields are None."""
         return cls(**read_fields(cls, value))
 
 
 @frozen
 class By:
-    """The goal or client that ended a goal. Both fields are None if the server itself ended it."""
+    """The goal or client that ended or rejected a goal, or the client that paused or resumed speech.
+
+    Both fields are None if the server itself ended the goal.
+    """
 
     goal: str | None = None
     client: Sender | None = None
 
     def to_json(self) -> JsonObject | None:
+        """Return a JSON object with the goal or the client, or None if both are None."""
         if self.goal is not None:
             return {"goal": self.goal}
         return None if self.client is None else {"client": self.client.to_json()}
 
     @classmethod
     def from_json(cls, value: object) -> By | None:
+        """Read the value from its JSON object. Return None if it isn't an object."""
         return cls(**read_fields(cls, value)) if isinstance(value, dict) else None
 
 
@@ -76,10 +83,12 @@ class Output:
     muted: bool
 
     def to_json(self) -> JsonObject:
+        """Return the JSON object that clients receive."""
         return fields(self)
 
     @classmethod
     def from_json(cls, value: object) -> Output | None:
+        """Read an output from its JSON object. Return None if a field is missing or malformed."""
         found = read_fields(cls, value)
         return cls(**found) if len(found) == len(cls.__annotations__) else None
 
@@ -123,6 +132,7 @@ class Goal:
         return 0 if self.reason == "throttled" else EXIT_CODES.get(self.state)
 
     def to_json(self) -> JsonObject:
+        """Return the JSON object that clients receive."""
         # A loop over the fields would be slower, and a busy server spends most of its time here.
         return {
             "id": self.id,
@@ -150,11 +160,7 @@ class Goal:
 
     @classmethod
     def from_json(cls, value: object) -> Goal:
-        """Return the goal in a server's message.
-
-        Raises:
-            Unreadable: if the id or the state is missing or invalid.
-        """
+        """Read a goal from its JSON object. Raises Unreadable if the id or the state is missing or invalid."""
         found = read_fields(cls, value)
         if not str(found.get("id", "\n")).isprintable() or "state" not in found:  # ids are printed unescaped
             raise Unreadable("received a goal with an invalid id or an unknown state")
@@ -162,7 +168,7 @@ class Goal:
 
 
 def read_fields(cls: type, message: object) -> dict[str, Any]:
-    """Return the fields of a class that a JSON object contains. Values of the wrong type are skipped."""
+    """Return the fields of a class that a JSON object contains, as a dict. Values of the wrong type are skipped."""
     found = {}
     values = message if isinstance(message, dict) else {}
     for name, annotation in cls.__annotations__.items():

@@ -41,7 +41,7 @@ MAX_EARLY_CANCELS = 1_000
 
 
 class History:
-    """Goals that have ended, oldest first."""
+    """Records of ended goals, oldest first. The number of goals and the size of their texts are limited."""
 
     def __init__(self) -> None:
         self._all: dict[str, Record] = {}
@@ -68,7 +68,7 @@ class History:
         return self._all.get(goal_id)
 
     def latest(self, count: int, *, rejected: bool) -> list[Record]:
-        """Return the most recently ended goals, oldest first.
+        """Return the most recently ended goals, oldest first, with or without REJECTED goals.
 
         Args:
             count: the maximum number of goals.
@@ -86,15 +86,15 @@ class SpeechTimes:
         self._starts: OrderedDict[str | bytes, tuple[float, str]] = OrderedDict()
 
     def add(self, record: Record) -> None:
-        """Record the start time of a goal that was at least partly heard."""
+        """Record the start time of a goal that was at least partly heard, by its key and by its text."""
         for each in (record.say.key, _digest(record.say.text)):
             if each is not None:
                 _set_newest(self._starts, each, (record.began_at, record.id), MAX_SPEECH_TIMES)
 
-    def find(self, since: float, key: str | None, text: str) -> str | None:
-        """Return the last goal with the same key that started after `since`, or None.
+    def last_goal_id(self, since: float, key: str | None, text: str) -> str | None:
+        """Return the id of the last goal after `since` with this key, or with this text if the key is None.
 
-        If the key is None, return the last goal with the same text instead. Only the goal's id is returned.
+        Return None if no goal started after `since` (monotonic) with this key or text.
         """
         last = self._starts.get(_digest(text) if key is None else key)
         return last[1] if last is not None and last[0] > since else None

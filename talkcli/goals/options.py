@@ -95,10 +95,12 @@ def is_clients_id(goal_id: str) -> bool:
 
 
 def _id_error(value: str) -> str | None:
+    """Return an error message if an id is empty or too long, or None."""
     return None if 0 < len(value) <= MAX_ID_CHARS else f"must have 1 to {MAX_ID_CHARS} characters"
 
 
 def _ids_error(value: list[object]) -> str | None:
+    """Return an error message if a list of ids is too long or contains an invalid id, or None."""
     if len(value) > MAX_IDS:
         return IDS.wrong_type
     errors = (_id_error(each) if isinstance(each, str) else ID.wrong_type for each in value)
@@ -106,6 +108,7 @@ def _ids_error(value: list[object]) -> str | None:
 
 
 def _data_error(value: JsonObject) -> str | None:
+    """Return an error message if a goal's `data` is too large or nested too deeply, or None."""
     import json
 
     try:
@@ -209,7 +212,7 @@ class Option:
         return kind.check(value) if kind.check else None
 
     def value_error(self, value: Any) -> str | None:
-        """Return an error message if a value is not allowed, although its type is right."""
+        """Return an error message if a value of the right type is not allowed, or None."""
         if value is None:
             return None
         if self.limits != (None, None) and self.is_out_of_range(value):
@@ -236,13 +239,13 @@ class Option:
         return f"more than {low:g}" if self.excludes_minimum else f"{low:g} or more"
 
     def for_set(self) -> Option:
-        """Return the option for `talk set`. It has no default, because omitted settings don't change."""
+        """Return a copy of the option for `talk set`, without a default, because omitted settings don't change."""
         setting = self.setting
         assert setting
         return replace(self, env="", special_flags=setting.flags or self.flags, help=setting.set_help or self.help)
 
     def for_serve(self) -> Option:
-        """Return the option for `talk serve`."""
+        """Return a copy of the option for `talk serve`, with the initial setting as its default."""
         setting = self.setting
         assert setting
         flags = (setting.flags or self.flags).split("/")[0]
@@ -250,21 +253,21 @@ class Option:
 
 
 def _check_priority(value: int) -> str | None:
-    """Return an error message if a priority is out of range."""
+    """Return an error message if a priority is out of range, or None."""
     if -MAX_PRIORITY <= value <= MAX_PRIORITY:
         return None
     return f"the priority must be {-MAX_PRIORITY:,} to {MAX_PRIORITY:,}, got {value}"
 
 
 def check_key(value: str) -> str | None:
-    """Return an error message if a string is not a valid key."""
+    """Return an error message if a string is not a valid key, or None."""
     if 0 < len(value) <= MAX_KEY_CHARS:
         return None
     return f"the key must have 1 to {MAX_KEY_CHARS} characters, got {len(value)}"
 
 
 def _check_own_id(value: str) -> str | None:
-    """Return an error message if a client must not choose this id."""
+    """Return an error message if a client must not choose this id, or None."""
     if is_clients_id(value):
         return None
     return (
@@ -274,12 +277,12 @@ def _check_own_id(value: str) -> str | None:
 
 
 def _check_format(value: str) -> str | None:
-    """Return an error message if the value of the option `format` is not supported."""
+    """Return an error message if the value of the option `format` is not supported, or None."""
     return None if value == "text" else f"the format must be 'text', got {value[:MAX_ID_CHARS]!r}"
 
 
 def _check_voice(value: str) -> str | None:
-    """Return an error message if the name of a voice is empty."""
+    """Return an error message if the name of a voice is empty, or None."""
     return None if value else "the voice must not be empty"
 
 
@@ -595,11 +598,7 @@ class Cancel:
 
 
 def require_fields(cls: type, options: Iterable[str]) -> None:
-    """Check at import time that a class has a field for each option.
-
-    Raises:
-        TypeError: if a field is missing.
-    """
+    """Raise TypeError if a class has no field for one of the options. Called when a module is imported."""
     for name in options:
         if name not in cls.__annotations__:
             raise TypeError(f"{cls.__name__} has no field for the option {name!r}")
@@ -612,12 +611,12 @@ for _request in (Say, Set, Cancel):
 INITIAL = Set(**{each.name: each.setting.initial for each in SETTINGS if each.setting})
 
 
-def bad_option(asked: Say | Set) -> str | None:
-    """Return an error message if a request contains a value that is not allowed."""
-    if isinstance(asked, Say) and asked.flush and asked.preempt is False:
+def bad_option(request: Say | Set) -> str | None:
+    """Return an error message if a request contains a value that is not allowed, or None."""
+    if isinstance(request, Say) and request.flush and request.preempt is False:
         return "flush can't be combined with preempt false, because it always interrupts"
-    for option in asked.options:
-        value = getattr(asked, option.name)
+    for option in request.options:
+        value = getattr(request, option.name)
         if value != option.default and (words := option.value_error(value)):
             return words
     return None
@@ -651,10 +650,7 @@ def bad_text(text: str, max_chars: int | None = MAX_TEXT_CHARS) -> Refusal | Non
 
 
 def engine_options(say: Say, settings: Set) -> dict[str, Any]:
-    """Return the options that the engine needs for a goal, by name.
-
-    If the goal omits an option, the server's setting is used.
-    """
+    """Return the options that the engine needs for a goal, by name. Omitted options come from the settings."""
     found = {}
     for name in ENGINE_OPTIONS:
         own = getattr(say, name)
@@ -668,12 +664,12 @@ def shown_settings(settings: Set) -> JsonObject:
 
 
 def _replace_none_values(values: dict[str, Any]) -> dict[str, Any]:
-    """Replace values that mean "none" with None."""
+    """Return a copy of settings or options in which values that mean "none" are None."""
     return {name: None if value == _NONE_VALUES.get(name) else value for name, value in values.items()}
 
 
 def describe_settings(settings: JsonObject) -> list[str]:
-    """Return a short description of each setting."""
+    """Return a short description of each setting, such as "rate 200"."""
     found = []
     for each in SETTINGS:
         value = settings.get(each.name)

@@ -51,11 +51,11 @@ class Queue:
         return self._goals[0][2] if self._goals else None
 
     def with_key(self, key: str | None) -> Record | None:
-        """Return the goal with this key, if any. Two pending goals never have the same key."""
+        """Return the pending goal with this key, if any. Two pending goals never have the same key."""
         return None if key is None else self._by_key.get(key)
 
     def with_text(self, text: str) -> Record | None:
-        """Return the first goal with this text. This is slow, because it checks every goal."""
+        """Return the first goal with this text, or None. This is slow, because it checks every goal."""
         return next((each for each in self if each.say.text == text), None)
 
     def goals_up_to(self, priority: int) -> list[Record]:
@@ -63,15 +63,15 @@ class Queue:
         return list(map(_record_of, self._goals[bisect_left(self._goals, (-priority,)) :]))
 
     def preempting_goals_up_to(self, priority: int) -> list[Record]:
-        """Return all preempting goals with this priority or a lower one."""
+        """Return all goals that interrupt others (`preempt`) and have this priority or a lower one."""
         return list(map(_record_of, self._preempting[bisect_left(self._preempting, (-priority,)) :]))
 
     def displaceable_goal(self) -> Record | None:
-        """Return the newest goal of the lowest priority, which is the first to be displaced."""
+        """Return the newest goal of the lowest priority, which is removed first if the queue is full, or None."""
         return self._displaceable[-1][2] if self._displaceable else None
 
     def add(self, record: Record, replaced: Record | None = None) -> None:
-        """Add a goal behind the others of its priority, or in front of them if it preempts.
+        """Add a goal behind the others of its priority, in front of them if it preempts, or in place of another.
 
         Args:
             record: the new goal.
@@ -96,7 +96,7 @@ class Queue:
         return self._expiries[0][0] if self._expiries else inf
 
     def expired(self, now: float) -> list[Record]:
-        """Return the expired goals, earliest first."""
+        """Return the expired goals, earliest first. They stay in the queue."""
         return list(map(_record_of, self._expiries[: bisect_left(self._expiries, (now, inf))]))
 
     def _entries(self, record: Record) -> Iterator[tuple[list[_Entry], _Entry]]:

@@ -72,17 +72,13 @@ class Record:
         return len(self.say.text.encode(errors="surrogatepass"))
 
     def change_state(self, state: State) -> None:
-        """Change the state of the goal.
-
-        Raises:
-            IllegalTransition: if the change isn't allowed.
-        """
+        """Change the state of the goal. Raises IllegalTransition if the change isn't allowed."""
         if state not in TRANSITIONS[self.state]:
             raise IllegalTransition(f"a goal can't change from {self.state.name} to {state.name}")
         self.state = state
 
     def drop_text(self) -> None:
-        """Drop the text to save memory."""
+        """Replace the text with its hash to save memory."""
         self.text_hash, self.say = hash(self.say.text), replace(self.say, text="")
 
     def has_text(self, text: str) -> bool:
@@ -90,7 +86,7 @@ class Record:
         return text == self.say.text if self.text_hash is None else hash(text) == self.text_hash
 
     def snapshot(self, state: State | None = None) -> Goal:
-        """Return an immutable copy of the goal.
+        """Return an immutable copy of the goal, with the current state or another one.
 
         Args:
             state: the state to show instead of the current one. With PENDING, the copy shows the goal as it was

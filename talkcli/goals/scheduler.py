@@ -148,7 +148,7 @@ class Scheduler:
         return self._by_id.get(goal_id) or self.history.find(goal_id)
 
     def has_room(self, say: Say) -> bool:
-        """Return whether the queue has room for a goal. A goal with a known id needs no room."""
+        """Return whether the queue has room for a goal, or can make room. A goal with a known id needs none."""
         attaches = say.id is not None and self.find(say.id) is not None
         return attaches or self._find_room(say) is not None
 
@@ -158,7 +158,7 @@ class Scheduler:
         `refusal` is the server's own reason to reject the goal, as in `submit`.
         """
         canceled = self._early_cancels.find(say.id, now.monotonic)
-        return not (canceled or self.has_room(say)) and self._refuse(say, refusal, None) is None
+        return not (canceled or self.has_room(say)) and self._find_refusal(say, refusal, None) is None
 
     def wanted_voice(self, record: Record) -> str:
         """Return the voice that a goal asks for, or the server's default voice.
@@ -178,7 +178,7 @@ class Scheduler:
         canceled: By | None = None,
         waited_s: float = 0.0,
     ) -> tuple[Record, list[Effect]]:
-        """Accept or reject a goal. A rejected goal doesn't affect other goals.
+        """Reject a goal or add it to the queue, and start the next goal if possible.
 
         Args:
             say: the goal.
@@ -201,7 +201,7 @@ class Scheduler:
         number, asked = self._count, say if ttl == say.ttl else replace(say, ttl=ttl)
         record = Record(f"{self.boot}-{number}", number, asked, sender, now.wall, self._preempts(say), expires_at)
         by = canceled or self._early_cancels.find(say.id, now.monotonic)
-        refused = self._refuse(say, refusal, first) or (None if canceled else self._throttle(say, record, now))
+        refused = self._find_refusal(say, refusal, first) or (None if canceled else self._throttle(say, record, now))
         expired = expires_at <= now.monotonic
         recalled = self._find_room(say)
         if recalled is None and not (by or refused or expired):
@@ -222,12 +222,12 @@ class Scheduler:
             return record, effects + self._end_unqueued(record, Reason.EXPIRED, words, None, now)
         effects += self._enqueue(record, recalled or [], now)
         self._request_voice(self.wanted_voice(record), now)
-        return record, effects + self._start_next(now) + self._load_next(now)
+        return record, effects + self._start_next(now) + self._order_next_voice(now)
 
     def cancel(
         self, selection: Cancel, sender: Sender | None, now: Now, waiting: Collection[str | None] = ()
     ) -> Cancellation:
-        """Cancel goals. Pending goals end at once. The active goal ends when the engine is silent.
+        """End pending goals, have the engine stop the active goal, and remember cancels for unknown goals.
 
         Args:
             selection: the goals to cancel.
@@ -247,11 +247,11 @@ class Scheduler:
             else:
                 result.effects += self._stop(record, Reason.CANCELED, by, now)
                 result.stopping = record
-        result.effects += self._load_next(now)
+        result.effects += self._order_next_voice(now)
         return result
 
     def change_settings(self, changes: dict[str, object], now: Now) -> list[Effect]:
-        """Change the server's settings. They apply to goals that have not started.
+        """Change the server's settings for goals that have not started, and request the new voice, if any.
 
         A new voice that failed to load earlier is loaded again.
         """
@@ -284,7 +284,7 @@ class Scheduler:
         return [EngineOrder(self.active, Order.RESUME)]
 
     def shutdown(self, now: Now) -> list[Effect]:
-        """End all goals and reject new ones."""
+        """End all pending goals, stop the active goal, and reject new goals."""
         self.closing = True
         effects: list[Effect] = []
         for record in list(self.pending):
@@ -301,11 +301,11 @@ class Scheduler:
         return [*self.voices.engine_lost(now.monotonic)]
 
     def engine_ready(self, now: Now) -> list[Effect]:
-        """Record that an engine is ready, start the next goal, and load the voices that goals need."""
+        """Record that an engine is ready, start the next goal, and load the next voice that goals need."""
         self.has_engine = self._loads_voices = True
         for voice in (*self._needed_voices(), self.settings.voice or ""):
             self._request_voice(voice, now)
-        return self._start_next(now) + self._load_next(now)
+        return self._start_next(now) + self._order_next_voice(now)
 
     def engine_unavailable(self, now: Now) -> list[Effect]:
         """Record that no engine can be started. From now on, goals fail at once instead of waiting."""
@@ -313,7 +313,7 @@ class Scheduler:
         return self._start_next(now)
 
     def fail_next(self, message: str, now: Now) -> list[Effect]:
-        """Fail the next goal, because no engine has been available for a long time."""
+        """Fail the next goal with this message, unless an engine is available. Called after a long wait for one."""
         if self.has_engine:
             return []
         record, effects = self._activate_next(now)
@@ -332,7 +332,7 @@ class Scheduler:
     def voice_chosen(self, goal_id: str, voice: str, now: Now) -> list[Effect]:
         """Record which voice speaks the active goal, and load the next voice if possible."""
         self._require_active(goal_id).voice = voice
-        return self._load_next(now)
+        return self._order_next_voice(now)
 
     def output_changed(self, goal_id: str, output: Output | None) -> None:
         """Record the audio output of the active goal, or None if it is unknown."""
@@ -341,7 +341,7 @@ class Scheduler:
     def completed(
         self, goal_id: str, duration: float | None, now: Now, gaps: int = 0, gap_seconds: float = 0
     ) -> list[Effect]:
-        """End the active goal, because it was played to the end.
+        """End the active goal as SUCCEEDED, because it was played to the end.
 
         Args:
             goal_id: the id of the goal.
@@ -363,7 +363,7 @@ class Scheduler:
         return self._end(record, State.SUCCEEDED, None, words, None, now)
 
     def failed(self, goal_id: str, reason: Reason, message: str, duration: float | None, now: Now) -> list[Effect]:
-        """End the active goal, because the engine or the audio failed.
+        """End the active goal as ABORTED after a failure, or as PREEMPTED if it was being stopped anyway.
 
         If the goal was being stopped, the failure has silenced it, so it ends PREEMPTED. It ends ABORTED only with the
         reason `not_silent`.
@@ -375,12 +375,12 @@ class Scheduler:
         return self._end(record, State.ABORTED, reason, f"speech failed: {message}", record.by, now)
 
     def stopped(self, goal_id: str, now: Now) -> list[Effect]:
-        """End the active goal, because it was stopped and the engine is silent."""
+        """End the active goal as PREEMPTED, because it was stopped and the engine is silent."""
         record = self._require_active(goal_id)
         return self._end(record, State.PREEMPTED, record.reason, "Talk preempted", record.by, now)
 
     def voice_load_ended(self, voice: str, error: str | None, now: Now, *, has_libraries: bool) -> list[Effect]:
-        """Record that a voice was loaded, or that loading it failed.
+        """Record that a voice was loaded or couldn't be. Start the next goal if it waited for this voice.
 
         Args:
             voice: the id of the voice.
@@ -390,10 +390,10 @@ class Scheduler:
         """
         self.voices.has_libraries = self.voices.has_libraries or has_libraries
         self.voices.load_ended(voice, error, now.monotonic)
-        return self._drop_excess() + self.tick(now)
+        return self._order_voice_drops() + self.tick(now)
 
     def voices_measured(self, voice: str, memory_bytes: int, now: Now) -> list[Effect]:
-        """Record how much memory all neural voices use.
+        """Record how much memory all neural voices use, and order the engine to drop or load voices.
 
         Args:
             voice: the voice that was just loaded or has just spoken, or "" if a voice was dropped.
@@ -401,12 +401,12 @@ class Scheduler:
             now: the current time.
         """
         self.voices.measured(voice, memory_bytes)
-        return self._drop_excess() + self._load_next(now)
+        return self._order_voice_drops() + self._order_next_voice(now)
 
     def voice_unloaded(self, voice: str, now: Now) -> list[Effect]:
-        """Record that the engine has dropped a voice without being told to."""
+        """Record that the engine has dropped a voice without being told to, and load the next voice."""
         self.voices.unloaded(voice, self._needed_voices())
-        return self._load_next(now)
+        return self._order_next_voice(now)
 
     # -- time limits
 
@@ -429,15 +429,12 @@ class Scheduler:
                 words = f"speech failed: it was stopped, but silence was not confirmed within {CONFIRM_SILENCE_S:g} s"
                 effects = [EngineOrder(record, Order.GIVE_UP)]
                 effects += self._end(record, State.ABORTED, Reason.NOT_SILENT, words, record.by, now)
-        return effects + self._expire(now) + self._start_next(now) + self._load_next(now)
+        return effects + self._expire(now) + self._start_next(now) + self._order_next_voice(now)
 
     # -- selecting and accepting goals
 
     def _select(self, selection: Cancel, result: Cancellation, waiting: Collection[str | None]) -> list[Record]:
-        """Return the unfinished goals that a cancel request selects.
-
-        Ended goals and unknown ids are added to `result`.
-        """
+        """Return the unfinished goals that a cancel selects, and add ended goals and unknown ids to `result`."""
         chosen = self.unfinished() if selection.selects_all else []
         for goal_id in dict.fromkeys(selection.ids or ()):
             record = self.find(goal_id)
@@ -461,24 +458,24 @@ class Scheduler:
         # Cancel the active goal last. Otherwise, another selected goal could start before it is recalled.
         return sorted(unique, key=lambda each: (each is self.active, each.number))
 
-    def _refuse(self, say: Say, refusal: Refusal | None, first: Record | None) -> Refusal | None:
+    def _find_refusal(self, say: Say, refusal: Refusal | None, same_id: Record | None) -> Refusal | None:
         """Return the reason why a goal must be rejected, or None. The state of the queue doesn't matter.
 
         Args:
             say: the goal.
             refusal: the server's own reason to reject the goal, or None.
-            first: an earlier goal with the same id and another text, or None.
+            same_id: an earlier goal with the same id and another text, or None.
         """
         if self.closing:
             return Reason.SHUTDOWN, "the server is stopping"
         if words := options.bad_option(say):
             return Reason.BAD_OPTION, words
-        if first is not None:
+        if same_id is not None:
             return Reason.ID_CONFLICT, f"the id {say.id} was already used for another text"
         return options.bad_text(say.text, self.max_text) or refusal
 
     def _throttle(self, say: Say, record: Record, now: Now) -> Refusal | None:
-        """Return the reason for rejecting a goal that repeats another goal too soon, or None.
+        """Return the reason to reject a goal that repeats another too soon, and set `record.by`, or return None.
 
         If the goal is rejected, `record.by` is set to the other goal.
         """
@@ -491,7 +488,7 @@ class Scheduler:
         elif waiting:
             first, words = waiting.id, "is already waiting"
         else:
-            last = self._speech_times.find(now.monotonic - say.throttle, say.key, say.text)
+            last = self._speech_times.last_goal_id(now.monotonic - say.throttle, say.key, say.text)
             if last is None:
                 return None
             first, words = last, f"was spoken less than {options.format_number(say.throttle)} s ago"
@@ -500,13 +497,11 @@ class Scheduler:
         return Reason.THROTTLED, f"{what} {words}"
 
     def _preempts(self, say: Say) -> bool:
+        """Return whether a goal interrupts others, by its own options or by the server's setting."""
         return say.flush or bool(self.settings.preempt if say.preempt is None else say.preempt)
 
     def _find_room(self, say: Say) -> list[tuple[Record, Reason]] | None:
-        """Return the pending goals that a new goal removes from the queue, with the reasons.
-
-        Return None if the queue has no room for the new goal.
-        """
+        """Return the goals that a new goal would remove from the queue, with reasons, or None if it doesn't fit."""
         replaced = self.pending.with_key(say.key)
         preempted: list[Record] = []
         if say.flush:
@@ -540,7 +535,7 @@ class Scheduler:
     # -- voices
 
     def _request_voice(self, voice: str, now: Now) -> None:
-        """Request a neural voice for a goal, if an engine process is running."""
+        """Request a voice for a goal, if it is neural and an engine process is running."""
         if self._loads_voices and options.is_neural(model := options.without_speaker(voice)):
             self.voices.request(model, now.monotonic)
 
@@ -553,8 +548,8 @@ class Scheduler:
         voices = (options.without_speaker(self.wanted_voice(each)) for each in self.unfinished() if each.voice is None)
         return list(filter(options.is_neural, dict.fromkeys(voices)))
 
-    def _load_next(self, now: Now) -> list[Effect]:
-        """Return an order to load the next voice, or an empty list if no voice can be loaded now.
+    def _order_next_voice(self, now: Now) -> list[Effect]:
+        """Choose the next voice to load, record that it is loading, and return the order in a list, if any.
 
         The first voice is not loaded while a goal is active. Loading it imports libraries, which blocks the engine
         process for a tenth of a second.
@@ -568,8 +563,8 @@ class Scheduler:
         )
         return [order] if order else []
 
-    def _drop_excess(self) -> list[Effect]:
-        """Return orders to drop voices if they use too much memory."""
+    def _order_voice_drops(self) -> list[Effect]:
+        """Return orders to drop voices if they use too much memory, and record them as dropped."""
         needed = self._needed_voices()
         speaking = options.without_speaker(self.active.voice) if self.active else ""
         if options.is_neural(speaking) and not self.voices.is_loaded(speaking):
@@ -579,14 +574,14 @@ class Scheduler:
     # -- starting and ending goals
 
     def _expire(self, now: Now) -> list[Effect]:
-        """Recall all pending goals that have expired."""
+        """End all pending goals that have expired as RECALLED."""
         effects: list[Effect] = []
         for record in self.pending.expired(now.monotonic):
             effects += self._recall(record, Reason.EXPIRED, _expiry_message(record), None, now)
         return effects
 
     def _active_deadline(self) -> float:
-        """Return the monotonic time limit of the active goal, or inf if it has no limit.
+        """Return the monotonic time by which the active goal must be silent, or at which it expires, or inf.
 
         If the goal is being stopped, it must be silent by then. Otherwise, it expires then, but only if the engine was
         lost before anything was heard, because the goal must start again.
@@ -599,25 +594,25 @@ class Scheduler:
         return inf if self.has_engine or goal.spoken_end else goal.expires_at
 
     def _next_deadline(self) -> float:
-        """Return the monotonic time at which the next goal stops waiting for its voice, or inf."""
+        """Return the monotonic time at which `tick` must try to start the next goal, or inf if none can start."""
         record = None if self.active or self.paused or not self.has_engine else self.pending.first()
         if record is None:
             return inf
         return 0.0 if record.next_since == inf else self._start_time(record)
 
     def _start_time(self, record: Record) -> float:
-        """Return the earliest monotonic time at which the next goal may start."""
+        """Return the monotonic time until which a goal waits for its voice, or 0 if it doesn't wait."""
         return self.voices.start_time(record, self.settings.voice) if self._loads_voices else 0.0
 
     def _start_next(self, now: Now) -> list[Effect]:
-        """Start the next goal if possible."""
+        """Make the next goal ACTIVE and return the order to speak it, if there is an engine and a goal can start."""
         if not self.has_engine:
             return []
         record, effects = self._activate_next(now)
         return [*effects, EngineOrder(record, Order.START)] if record else effects
 
     def _activate_next(self, now: Now) -> tuple[Record | None, list[Effect]]:
-        """Make the next goal ACTIVE, and return it with the effects.
+        """Make the next goal ACTIVE if it can start, and return it with the effects, but no order to the engine.
 
         Return None instead of a goal if no goal can start now.
         """
@@ -636,18 +631,18 @@ class Scheduler:
         self.active = record
         return record, [*effects, StateChange(record, State.ACTIVE)]
 
-    def _recall(self, record: Record, reason: Reason, words: str, by: By | None, now: Now) -> list[Effect]:
+    def _recall(self, record: Record, reason: Reason, details: str, by: By | None, now: Now) -> list[Effect]:
         """Remove a goal from the queue and end it with the state RECALLED."""
         self.pending.remove(record)
-        return self._end_unqueued(record, reason, words, by, now)
+        return self._end_unqueued(record, reason, details, by, now)
 
-    def _end_unqueued(self, record: Record, reason: Reason, words: str, by: By | None, now: Now) -> list[Effect]:
+    def _end_unqueued(self, record: Record, reason: Reason, details: str, by: By | None, now: Now) -> list[Effect]:
         """End a pending goal that is not in the queue with the state RECALLED."""
         record.change_state(State.RECALLING)
-        return self._end(record, State.RECALLED, reason, f"not spoken: {words}", by, now)
+        return self._end(record, State.RECALLED, reason, f"not spoken: {details}", by, now)
 
     def _stop(self, record: Record, reason: Reason, by: By | None, now: Now) -> list[Effect]:
-        """Tell the engine to stop the active goal."""
+        """Make the active goal PREEMPTING and return the order to stop it, unless it is already being stopped."""
         if record.state is State.PREEMPTING:
             return []  # keep the reason for the first stop
         record.change_state(State.PREEMPTING)
@@ -656,11 +651,7 @@ class Scheduler:
         return [StateChange(record, State.PREEMPTING), EngineOrder(record, Order.STOP)]
 
     def _require_active(self, goal_id: str) -> Record:
-        """Return the active goal, which must have this id.
-
-        Raises:
-            IllegalTransition: if another goal or no goal is active.
-        """
+        """Return the active goal. Raises IllegalTransition if it doesn't have this id."""
         if self.active is None or self.active.id != goal_id:
             raise IllegalTransition(f"goal {goal_id} is not being spoken")
         return self.active
@@ -668,7 +659,7 @@ class Scheduler:
     def _end(
         self, record: Record, state: State, reason: Reason | None, message: str, by: By | None, now: Now
     ) -> list[Effect]:
-        """End a goal. If it was the active goal, start the next one."""
+        """Set a goal's final state and move it to the history. If it was the active goal, start the next one."""
         record.change_state(state)
         record.reason, record.message, record.by = reason, message, by
         record.ended_at, record.paused = now.wall, False
@@ -679,8 +670,9 @@ class Scheduler:
         if record is not self.active:
             return [StateChange(record, state)]
         self.active = None
-        return [StateChange(record, state), *self._start_next(now), *self._load_next(now)]
+        return [StateChange(record, state), *self._start_next(now), *self._order_next_voice(now)]
 
 
 def _expiry_message(record: Record) -> str:
+    """Return a message saying that a goal's time to live was over."""
     return f"its ttl of {options.format_number(record.say.ttl)} s was over"

@@ -60,7 +60,7 @@ class NeuralVoice:
     loading_since: float = inf
 
     def fail(self, why: str, now: float) -> None:
-        """Record that loading the voice failed."""
+        """Record that loading the voice failed, and delay the next attempt."""
         self.failures += 1
         self.retry_at = now + min(LAST_VOICE_RETRY_S, FIRST_VOICE_RETRY_S * 2 ** (self.failures - 1))
         self.state, self.why = VoiceState.FAILED, why
@@ -68,7 +68,7 @@ class NeuralVoice:
 
 @frozen
 class VoiceLoadOrder:
-    """An effect that makes the engine load a voice, after dropping others to make room."""
+    """An effect that makes the engine load a voice, after unloading others to make room."""
 
     voice: str
     dropped: tuple[str, ...] = ()
@@ -76,7 +76,7 @@ class VoiceLoadOrder:
 
 @frozen
 class VoiceDropOrder:
-    """An effect that makes the engine drop a voice to save memory."""
+    """An effect that makes the engine unload a voice to save memory."""
 
     voice: str
 
@@ -89,7 +89,7 @@ class VoiceWarning:
 
 
 class VoiceScheduler:
-    """Decides which neural voices the engine loads and drops."""
+    """Decides which neural voices the engine loads and drops (unloads)."""
 
     def __init__(self, limit_bytes: int = 0, file_size: Callable[[str], int] = lambda _: 0) -> None:
         """Create a scheduler with no voices.
@@ -117,7 +117,7 @@ class VoiceScheduler:
 
     def request(self, voice: str, now: float) -> None:
         """Request a voice for a goal. A voice that failed to load is tried again only after a delay."""
-        found = self._voices.pop(voice, None) or self._new(voice)
+        found = self._voices.pop(voice, None) or self._new_voice(voice)
         self._voices[voice] = found
         if found.state is VoiceState.FAILED and voice != self._loading and now >= found.retry_at:
             found.wanted = True
@@ -165,7 +165,7 @@ class VoiceScheduler:
         return self._loading is None and any(each.wanted for each in self._voices.values())
 
     def load_next(self, needed: Sequence[str], default_voice: str, now: float) -> VoiceLoadOrder | None:
-        """Return an order to load the next voice, or None if no voice can be loaded now.
+        """Choose the next voice to load, record that it is loading, and return the order, or None.
 
         Call this only if `can_load` is true. A loaded voice is not dropped if a goal needs it sooner than the next
         voice, because it would have to be loaded again.
@@ -181,7 +181,7 @@ class VoiceScheduler:
             if found and found.state is VoiceState.LOADED:
                 before.add(voice)
             elif found and found.wanted:
-                drop = self._make_room(found.size_bytes, before)
+                drop = self._voices_to_drop(found.size_bytes, before)
                 if drop is None or (drop and voice not in needed):
                     return None
                 self._loading, found.wanted = voice, False
@@ -194,7 +194,7 @@ class VoiceScheduler:
         return None
 
     def drop_excess(self, first: str, needed: Sequence[str]) -> list[VoiceDropOrder | VoiceWarning]:
-        """Return orders to drop voices until the others fit into the memory limit.
+        """Drop voices until the others fit into the memory limit, and return orders and warnings.
 
         This is necessary if the voices use more memory than was estimated.
 
@@ -202,7 +202,7 @@ class VoiceScheduler:
             first: the voice that speaks now or next. It is never dropped.
             needed: the voices that waiting goals need, in the order of the goals. They are dropped last.
         """
-        loaded = self._loaded()
+        loaded = self._loaded_bytes()
         order = [each for each in loaded if each not in needed]
         order += [each for each in reversed(needed) if each in loaded]
         dropped: list[str] = []
@@ -224,7 +224,7 @@ class VoiceScheduler:
         """
         if voice == self._loading:  # the engine also loads voices without an order, for `voice_only` goals
             self._loading = None
-        found = self._voices.setdefault(voice, self._new(voice))
+        found = self._voices.setdefault(voice, self._new_voice(voice))
         found.wanted = False
         if error is None:
             found.state, found.why, found.failures = VoiceState.LOADED, None, 0
@@ -232,7 +232,7 @@ class VoiceScheduler:
             found.fail(error, now)
 
     def measured(self, voice: str, memory_bytes: int) -> None:
-        """Record how much memory the voices use in the engine process.
+        """Record how much memory the voices use, and attribute the change to one voice.
 
         Args:
             voice: the voice that was just loaded or has just spoken, or "" if a voice was dropped.
@@ -253,7 +253,7 @@ class VoiceScheduler:
             self._voices[voice] = NeuralVoice(found.size_bytes)
 
     def engine_lost(self, now: float) -> list[VoiceWarning]:
-        """Record that the engine process has exited. Return a warning if a voice seems to have caused it."""
+        """Record that the engine process has exited, and return a warning if loading a voice was the likely cause."""
         suspect, self._loading, self.has_libraries = self._loading, None, False
         self._reported_bytes = self._used_bytes = 0
         for voice, found in list(self._voices.items()):
@@ -268,19 +268,19 @@ class VoiceScheduler:
 
     def is_loaded(self, voice: str) -> bool:
         """Return whether a voice is loaded."""
-        return voice in self._loaded()
+        return voice in self._loaded_bytes()
 
     # -- memory
 
-    def _loaded(self) -> dict[str, int]:
+    def _loaded_bytes(self) -> dict[str, int]:
         """Return the memory use of each loaded voice."""
         return {voice: each.size_bytes for voice, each in self._voices.items() if each.state is VoiceState.LOADED}
 
     def _total_bytes(self) -> int:
         """Return the memory use of all voices together, including memory that belongs to no loaded voice."""
-        return max(self._used_bytes, sum(self._loaded().values()))
+        return max(self._used_bytes, sum(self._loaded_bytes().values()))
 
-    def _make_room(self, size_bytes: int, keep: Collection[str]) -> tuple[str, ...] | None:
+    def _voices_to_drop(self, size_bytes: int, keep: Collection[str]) -> tuple[str, ...] | None:
         """Return the voices to drop to make room for a new one, or None if it can't fit.
 
         The least recently used voices are dropped first.
@@ -291,15 +291,15 @@ class VoiceScheduler:
         """
         total = size_bytes + self._total_bytes()
         dropped = []
-        for voice, size in self._loaded().items():
+        for voice, size in self._loaded_bytes().items():
             if total > self._limit_bytes and voice not in keep:
                 total -= size
                 dropped.append(voice)
         return None if keep and total > self._limit_bytes else tuple(dropped)
 
     def _warn_too_large(self) -> list[VoiceWarning]:
-        """Return a warning if a single voice exceeds the memory limit. Each voice is warned about only once."""
-        loaded = self._loaded()
+        """Return a warning if the only loaded voice exceeds the memory limit, but only once for each voice."""
+        loaded = self._loaded_bytes()
         voice = next(iter(loaded), "")
         taken = self._total_bytes()
         if self._loading or len(loaded) != 1 or not 0 < self._limit_bytes < taken or self._voices[voice].why:
@@ -309,13 +309,13 @@ class VoiceScheduler:
         return [VoiceWarning(f"voice {voice}: {why}")]
 
     def _forget_unneeded(self, needed: Collection[str]) -> None:
-        """Cancel the plans to load voices that are no longer needed."""
+        """Cancel the plans to load voices that are not in `needed`."""
         for voice, found in list(self._voices.items()):
             if found.wanted and voice not in needed:
                 found.wanted = False
                 if found.state is VoiceState.WAITING:
                     del self._voices[voice]
 
-    def _new(self, voice: str) -> NeuralVoice:
-        """Create the entry for a voice that is not loaded."""
+    def _new_voice(self, voice: str) -> NeuralVoice:
+        """Return a new entry for a voice that is not loaded, with its measured or estimated size."""
         return NeuralVoice(self._measured_bytes.get(voice) or self._file_size(voice))

@@ -37,6 +37,7 @@ class ServerStatus:
     recent: tuple[Goal, ...]
 
     def to_json(self) -> JsonObject:
+        """Return the JSON object that clients receive."""
         return {
             "server": self.server,
             "active": None if self.active is None else self.active.to_json(),
@@ -57,7 +58,7 @@ class ServerStatus:
 
     @classmethod
     def from_reply(cls, reply: JsonObject, items: list[JsonObject]) -> ServerStatus:
-        """Read a status from a reply and from the list items that preceded the reply."""
+        """Read a status from a reply and from the list items that preceded it."""
         lists = {name: [each[name] for each in items if name in each] for name in ("pending", "recent")}
         return cls.from_json({**reply, **lists})
 
@@ -97,7 +98,8 @@ class StateChanged:
     goal: Goal | None = None
 
     def to_json(self) -> JsonObject:
-        message = {**_numbered("state", self), "state": self.state.name}
+        """Return the event's JSON object."""
+        message = {**_event_json("state", self), "state": self.state.name}
         return message if self.goal is None else {**message, "goal": self.goal.to_json()}
 
 
@@ -118,7 +120,8 @@ class WordHeard:
     n: int | None = None
 
     def to_json(self) -> JsonObject:
-        return _numbered("word", self)
+        """Return the event's JSON object."""
+        return _event_json("word", self)
 
 
 @frozen
@@ -134,7 +137,8 @@ class PausedChanged:
     n: int | None = None
 
     def to_json(self) -> JsonObject:
-        return {**_numbered("paused", self), "by": None if self.by is None else self.by.to_json()}
+        """Return the event's JSON object."""
+        return {**_event_json("paused", self), "by": None if self.by is None else self.by.to_json()}
 
 
 @frozen
@@ -144,6 +148,7 @@ class Result:
     goal: Goal
 
     def to_json(self) -> JsonObject:
+        """Return the event's JSON object."""
         return {"event": "result", "goal": self.goal.to_json()}
 
 
@@ -154,6 +159,7 @@ class Snapshot:
     status: ServerStatus
 
     def to_json(self) -> JsonObject:
+        """Return the event's JSON object."""
         return {"event": "snapshot", **self.status.to_json()}
 
 
@@ -165,7 +171,7 @@ _EVENTS_BY_KIND = {"state": StateChanged, "word": WordHeard, "paused": PausedCha
 
 
 def from_json(message: JsonObject) -> Event | None:
-    """Read an event from its message. Return None if the kind of event is unknown.
+    """Read an event from its JSON object. Return None if the kind of event is unknown.
 
     Raises:
         Unreadable: a field is malformed.
@@ -186,7 +192,7 @@ def from_json(message: JsonObject) -> Event | None:
     return event(**found)
 
 
-def _numbered(kind: str, event: StateChanged | WordHeard | PausedChanged) -> JsonObject:
+def _event_json(kind: str, event: StateChanged | WordHeard | PausedChanged) -> JsonObject:
     """Return an event's JSON object, without its goal."""
     own = {name: value for name, value in fields(event).items() if name not in {"at", "n", "goal"}}
     return {"event": kind, **own, "n": event.n, "at": event.at}
@@ -234,22 +240,22 @@ def check_greeting(message: JsonObject) -> None:
 
 
 def item(seq: int | None, **fields: object) -> JsonObject:
-    """Return the message for one item of a list. The items are sent before the reply."""
+    """Return the message for one item of a list, with these fields. The items are sent before the reply."""
     return fields if seq is None else {"seq": seq, **fields}
 
 
 def ok(seq: int | None, **fields: object) -> JsonObject:
-    """Return the reply to a request that succeeded."""
+    """Return the reply to a request that succeeded, with these fields."""
     return item(seq, ok=True, **fields)
 
 
 def failure(seq: int | None, code: str, message: str) -> JsonObject:
-    """Return the reply to a request that failed."""
+    """Return the reply to a request that failed, with an error code and a message for the user."""
     return item(seq, ok=False, error={"code": code, "message": message})
 
 
 def take_seq(message: JsonObject) -> int | None:
-    """Remove the `seq` number from a request, and return it. Raises BadRequest if it isn't an integer."""
+    """Remove the `seq` number from a request, and return it, or None. Raises BadRequest if it isn't an integer."""
     seq = message.pop("seq", None)
     if seq is not None and (isinstance(seq, bool) or not isinstance(seq, int)):
         raise BadRequest("'seq' must be an integer", "bad_field")

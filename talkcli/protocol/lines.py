@@ -55,9 +55,9 @@ class LineSplitter:
         *lines, rest = data.split(b"\n")
         for place, line in enumerate(lines):
             if self.size or len(line) > self._max_bytes:
-                self._add(line)
+                self._append(line)
                 lines[place] = self.take_rest()
-        self._add(rest)
+        self._append(rest)
         return lines
 
     def take_rest(self) -> bytes:
@@ -70,7 +70,8 @@ class LineSplitter:
         self.size = 0
         return line
 
-    def _add(self, data: bytes) -> None:
+    def _append(self, data: bytes) -> None:
+        """Append bytes to the incomplete line, or only count them if the line is too long."""
         self.size += len(data)
         self._rest += data[: self._max_bytes - len(self._rest)]
 
@@ -88,13 +89,13 @@ def write_request(request: Request) -> JsonObject:
 def request_line(message: JsonObject) -> bytes:
     """Encode an object as a line of JSON, without importing `json` if all values are simple."""
     try:
-        shown = ", ".join(f'"{name}": {_plain(value)}' for name, value in message.items())
+        shown = ", ".join(f'"{name}": {_encode_simple(value)}' for name, value in message.items())
         return f"{{{shown}}}\n".encode()
     except (TypeError, UnicodeEncodeError):
         return encode(message)
 
 
-def _plain(value: object) -> str:
+def _encode_simple(value: object) -> str:
     """Encode a simple value as JSON. Raises TypeError if the value needs the `json` module."""
     if isinstance(value, str):
         if value.isprintable() and '"' not in value and "\\" not in value:
@@ -106,10 +107,10 @@ def _plain(value: object) -> str:
         return "true" if value else "false"
     if isinstance(value, int):
         return int.__repr__(value)
-    if isinstance(value, float) and _finite(value):
+    if isinstance(value, float) and _is_finite(value):
         return float.__repr__(value)
     if isinstance(value, list):
-        return f"[{', '.join(map(_plain, value))}]"
+        return f"[{', '.join(map(_encode_simple, value))}]"
     raise TypeError
 
 
@@ -119,20 +120,20 @@ def encode(message: JsonObject) -> bytes:
     Text is written as UTF-8. Only lone surrogates, which UTF-8 can't hold, are escaped.
     """
     try:
-        line: bytes = _json("encode")(message).encode()
+        line: bytes = _json_function("encode")(message).encode()
     except UnicodeEncodeError:
-        line = _json("escape")(message).encode()
+        line = _json_function("escape")(message).encode()
     return line + b"\n"
 
 
 def decode(line: bytes) -> JsonObject:
-    """Decode the JSON object in a line. Raises BadRequest if the line is malformed."""
+    """Decode the JSON object in a line. Raises BadRequest if the line is malformed or too long."""
     from talkcli.errors import BadRequest, LineTooLong
 
     if isinstance(line, TruncatedLine):
         raise LineTooLong(f"the line is too long (at most {MAX_LINE_BYTES:,} bytes)")
     try:
-        value = _json("decode")(line.decode())
+        value = _json_function("decode")(line.decode())
     except UnicodeDecodeError as error:
         raise BadRequest(f"the line is not valid UTF-8 (byte {error.start})", "bad_encoding") from None
     except RecursionError:
@@ -149,43 +150,50 @@ def decode(line: bytes) -> JsonObject:
 _json_functions: dict[str, Callable[[Any], Any]] = {}
 
 
-def _json(name: str) -> Callable[[Any], Any]:
+def _json_function(name: str) -> Callable[[Any], Any]:
     """Return the JSON function called `decode`, `encode` or `escape`. The first call creates all three."""
     if not _json_functions:
         import json
 
         reading = json.JSONDecoder(
-            object_pairs_hook=_no_duplicates, parse_constant=_no_constant, parse_int=_short_integer, parse_float=_number
+            object_pairs_hook=_create_object,
+            parse_constant=_refuse_constant,
+            parse_int=_parse_integer,
+            parse_float=_parse_float,
         )
         writing, escaping = json.JSONEncoder(ensure_ascii=False, allow_nan=False), json.JSONEncoder(allow_nan=False)
         _json_functions.update(decode=reading.decode, encode=writing.encode, escape=escaping.encode)
     return _json_functions[name]
 
 
-def _no_duplicates(pairs: list[tuple[str, object]]) -> JsonObject:
+def _create_object(pairs: list[tuple[str, object]]) -> JsonObject:
+    """Return an object with these keys and values. Raises ValueError if a key appears twice."""
     fields = dict(pairs)
     if len(fields) != len(pairs):
         raise ValueError("a key appears twice")
     return fields
 
 
-def _no_constant(name: str) -> object:
+def _refuse_constant(name: str) -> object:
+    """Raise ValueError, because `NaN` and `Infinity` are not valid JSON."""
     raise ValueError(f"{name} is not allowed")
 
 
-def _short_integer(digits: str) -> int:
+def _parse_integer(digits: str) -> int:
+    """Convert the digits of an integer. Raises ValueError if there are too many."""
     if len(digits) > MAX_DIGITS:
         raise ValueError(f"an integer has {len(digits):,} digits (at most {MAX_DIGITS})")
     return int(digits)
 
 
-def _number(digits: str) -> float:
+def _parse_float(digits: str) -> float:
+    """Convert the digits of a float. Raises ValueError if the number is too large for a float."""
     number = float(digits)
-    if not _finite(number):
+    if not _is_finite(number):
         raise ValueError("a number is too large")
     return number
 
 
-def _finite(number: float) -> bool:
+def _is_finite(number: float) -> bool:
     """Return whether a number is finite."""
     return number - number == 0

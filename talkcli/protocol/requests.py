@@ -30,21 +30,23 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
 
 
-def _bad_name(value: str) -> str | None:
+def _sender_name_error(value: str) -> str | None:
+    """Return an error message if a client's name is empty or too long, or None."""
     return None if 0 < len(value) <= MAX_SENDER_NAME_CHARS else f"must have 1 to {MAX_SENDER_NAME_CHARS} characters"
 
 
-def _bad_count(value: int) -> str | None:
+def _log_count_error(value: int) -> str | None:
+    """Return an error message if the `count` of a `log` request is out of range, or None."""
     return None if 0 < value <= MAX_LOG_GOALS else f"must be 1 to {MAX_LOG_GOALS:,}"
 
 
-_NAME_TYPE = Kind("string", (str,), "must be a string", check=_bad_name)
-_COUNT_TYPE = Kind("integer", (int,), "must be an integer", check=_bad_count)
+_NAME_TYPE = Kind("string", (str,), "must be a string", check=_sender_name_error)
+_COUNT_TYPE = Kind("integer", (int,), "must be an integer", check=_log_count_error)
 
 
 @frozen
 class Hello:
-    """The first message of a client."""
+    """The first message of a client, with its name and whether it will send only urgent requests."""
 
     kind: ClassVar[str] = "hello"
     meaning: ClassVar[str] = "Identify the client. Send this first"
@@ -63,7 +65,7 @@ class Hello:
 
 @frozen
 class Wait:
-    """A request for the results of goals, which other clients may have sent."""
+    """A request for the results of the named goals, or of all unfinished goals. Any client may have sent them."""
 
     kind: ClassVar[str] = "wait"
     meaning: ClassVar[str] = "Send the results of these goals, whoever sent them"
@@ -141,7 +143,7 @@ REQUEST_TYPES: dict[str, type[Request]] = {each.kind: each for each in Request._
 
 
 def read_request(message: JsonObject) -> Request:
-    """Create a request from its JSON object, which must not contain `seq`.
+    """Check a request's JSON object, which must not contain `seq`, and return the request.
 
     Raises:
         BadRequest: the request is malformed.

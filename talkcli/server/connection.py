@@ -64,7 +64,7 @@ class Handler(Protocol):
         """Remove a client that has disconnected."""
 
     def handle(self, connection: ClientConnection, seq: int | None, request: Request) -> None:
-        """Handle a request. The reply may be sent later."""
+        """Start to carry out a client's request. The reply may be sent later."""
 
     def is_waiting(self, connection: ClientConnection) -> bool:
         """Return whether a client is still waiting for a reply or an event."""
@@ -109,7 +109,7 @@ class PendingRequest:
                 timer.cancel()
 
     def resume(self, in_time: bool = True) -> None:
-        """Continue the request if it is waiting."""
+        """Continue the request if it is waiting. Its call of `wait` returns `in_time`."""
         if self._leave():
             self._step(in_time)
 
@@ -125,7 +125,7 @@ class PendingRequest:
         self._steps.close()
 
     def answer(self, items: Iterable[JsonObject] = (), events: Iterable[JsonObject] = (), /, **fields: object) -> None:
-        """Send a successful reply.
+        """Send a successful reply, with list items before it and events after it.
 
         Args:
             items: the lines of a list to send before the reply.
@@ -135,7 +135,7 @@ class PendingRequest:
         self._reply(ok(self.seq, **fields), items, events)
 
     def refuse(self, code: str, message: str, items: Iterable[JsonObject] = ()) -> None:
-        """Send an error reply.
+        """Send an error reply, with list items before it.
 
         Args:
             code: the machine-readable error.
@@ -145,6 +145,7 @@ class PendingRequest:
         self._reply(failure(self.seq, code, message), items)
 
     def _reply(self, reply: JsonObject, items: Iterable[JsonObject], events: Iterable[JsonObject] = ()) -> None:
+        """Send the list items, then the reply, and then the events."""
         if items or events:
             lines = (item(self.seq, **each) for each in items)
             self.connection.send_list(chain(lines, [reply], events))
@@ -152,6 +153,7 @@ class PendingRequest:
             self.connection.send(reply)
 
     def _step(self, value: bool | None) -> None:
+        """Continue the coroutine with this value until it waits in a list or ends."""
         with contextlib.suppress(StopIteration):  # raised when the coroutine has ended
             self.move_to(self._steps.send(value))
 
@@ -172,6 +174,7 @@ def resume_all(waiting_list: WaitingList) -> None:
 
 @coroutine
 def _wait_in(waiting_list: WaitingList) -> Generator[WaitingList, bool, bool]:
+    """Suspend a request's coroutine until it is resumed from this list. Return whether that was in time."""
     return (yield waiting_list)
 
 
@@ -203,7 +206,7 @@ class ClientConnection(asyncio.Protocol):
         self._outbox: deque[Iterator[JsonObject] | bytes] = deque()
         #: latest feedback, held back because the client reads too slowly
         self._held_feedback = b""
-        self._half_closed = self._finishing = self._turn_is_due = False
+        self._half_closed = self._finishing = self._work_is_scheduled = False
         self._bad_lines = 0
         self._first_limit = self._close_after(FIRST_REQUEST_S, f"no request arrived within {FIRST_REQUEST_S:g} s")
         self._line_limit: asyncio.TimerHandle | None = None
@@ -226,8 +229,9 @@ class ClientConnection(asyncio.Protocol):
     # -- called by the stream
 
     def connection_lost(self, error: Exception | None) -> None:
+        """Process the last requests if the connection broke, and remove the client from the server."""
         self._first_limit.cancel()
-        self._stop_line_limit()
+        self._cancel_line_limit()
         if error is not None and self.admitted:
             self._process_last_requests()
         self._lines.clear()
@@ -235,29 +239,33 @@ class ClientConnection(asyncio.Protocol):
         self._handler.left(self)
 
     def data_received(self, data: bytes) -> None:
+        """Split received data into lines, and process them."""
         self._lines.extend(self._splitter.feed(data))
         if self._splitter.size >= MAX_LINE_BYTES:
             self._lines.append(self._splitter.take_rest())  # this line is too long
         if b"\n" in data:
-            self._stop_line_limit()  # the next line has a new time limit
+            self._cancel_line_limit()  # the next line has a new time limit
         self._work()
 
     def eof_received(self) -> None:
+        """Record that the client will send nothing more, and close the connection once it has all answers."""
         self._half_closed = True
         self._work()
 
     def pause_writing(self) -> None:
-        self._set_reading()
+        """Stop reading requests, because the client doesn't read its output."""
+        self._update_reading()
 
     def resume_writing(self) -> None:
+        """Continue to send output and to process requests."""
         self._work()
 
     # -- called by the handler
 
     def send(self, message: JsonObject | bytes) -> None:
-        """Send a reply or an encoded line, after all lists that are still being sent."""
+        """Send a reply or an encoded line after all unfinished lists, or disconnect if too many lines wait."""
         if self._half_closed:  # if this is the last reply, close the connection soon
-            self._ask_for_turn()
+            self._schedule_work()
         line = message if isinstance(message, bytes) else encode(message)
         if not self._outbox:
             self._write(line)
@@ -270,7 +278,7 @@ class ClientConnection(asyncio.Protocol):
     def send_list(self, messages: Iterator[JsonObject]) -> None:
         """Send a list of messages as fast as the client reads them. Later messages follow the list."""
         self._outbox.append(messages)
-        self._ask_for_turn()
+        self._schedule_work()
 
     def publish(self, event: bytes, *, feedback: bool = False) -> None:
         """Send an encoded event. If the client reads too slowly, only the newest feedback is kept."""
@@ -280,7 +288,7 @@ class ClientConnection(asyncio.Protocol):
             held, self._held_feedback = self._held_feedback, b""
             self.send(held + event)
 
-    def has_hung_up(self) -> bool:
+    def detect_hang_up(self) -> bool:
         """Send pending output, and return whether the client has closed its socket."""
         self.stream.flush()
         return self.stream.closing
@@ -291,18 +299,18 @@ class ClientConnection(asyncio.Protocol):
         self.stream.close()
 
     def finish(self) -> None:
-        """Answer the lines that have arrived, send the rest of all lists, and close the connection."""
+        """Answer the lines that have arrived, send the rest of all lists, and then close the connection."""
         self._finishing = True
-        self._ask_for_turn()
+        self._schedule_work()
 
     # -- internals
 
-    def _close_after(self, seconds: float, words: str) -> asyncio.TimerHandle:
-        """Start a timer that closes the connection with an error message."""
-        return self._loop.call_later(seconds, self.close_with, failure(None, "too_slow", words))
+    def _close_after(self, seconds: float, message: str) -> asyncio.TimerHandle:
+        """Start and return a timer that closes the connection with this error message."""
+        return self._loop.call_later(seconds, self.close_with, failure(None, "too_slow", message))
 
-    def _set_reading(self) -> None:
-        """Start or stop reading from the client.
+    def _update_reading(self) -> None:
+        """Start or stop reading from the client, and the time limit for an incomplete line.
 
         The server reads only while the client reads its replies and has few unprocessed lines.
         """
@@ -314,16 +322,18 @@ class ClientConnection(asyncio.Protocol):
         else:
             self.stream.pause_reading()
         if not reading or not self._splitter.size:
-            self._stop_line_limit()
+            self._cancel_line_limit()
         elif self._line_limit is None:
             self._line_limit = self._close_after(LINE_LIMIT_S, f"a line was not complete within {LINE_LIMIT_S:g} s")
 
-    def _stop_line_limit(self) -> None:
+    def _cancel_line_limit(self) -> None:
+        """Cancel the time limit for an incomplete line, if there is one."""
         if self._line_limit:
             self._line_limit.cancel()
             self._line_limit = None
 
     def _write(self, line: bytes) -> None:
+        """Write a line to the stream, or disconnect the client if too much output is unsent."""
         self.stream.write(line)
         if self.stream.unsent_bytes > MAX_CLIENT_OUTPUT_BYTES:
             self.stream.abort()
@@ -340,24 +350,26 @@ class ClientConnection(asyncio.Protocol):
             self._process_line(self._lines.popleft())
 
     def _work(self) -> None:
-        """Send output and process requests, up to the limit for one iteration of the event loop."""
+        """Send output and process requests, up to a limit for each iteration, and close a finished connection."""
         for _ in range(LINES_PER_TURN):
             if self.stream.closing or self.stream.congested or not self._send_or_process_one():
                 break
         else:
-            self._ask_for_turn()
+            self._schedule_work()
         idle = not (self._outbox or self._lines or self.stream.congested)
         if idle and (self._finishing or (self._half_closed and not self._handler.is_waiting(self))):
             self.stream.close()
-        self._set_reading()
+        self._update_reading()
 
-    def _ask_for_turn(self) -> None:
-        if not self._turn_is_due:
-            self._turn_is_due = True
-            self._loop.call_soon(self._next_turn)
+    def _schedule_work(self) -> None:
+        """Schedule `_work` for the next iteration of the event loop, unless it is already scheduled."""
+        if not self._work_is_scheduled:
+            self._work_is_scheduled = True
+            self._loop.call_soon(self._do_scheduled_work)
 
-    def _next_turn(self) -> None:
-        self._turn_is_due = False
+    def _do_scheduled_work(self) -> None:
+        """Call `_work` in the iteration for which it was scheduled."""
+        self._work_is_scheduled = False
         self._work()
 
     def _send_or_process_one(self) -> bool:
@@ -382,7 +394,7 @@ class ClientConnection(asyncio.Protocol):
         return True
 
     def _process_line(self, line: bytes) -> None:
-        """Pass a request to the handler, or reply with an error if the line is invalid."""
+        """Pass a line's request to the handler, or reply with an error. An urgent request admits the client."""
         seq = None
         try:
             message = decode(line)

@@ -58,7 +58,7 @@ class Listener:
         self.path = paths.server_socket(path)
         #: absolute form of the given path, because the current directory may change later
         self._named_path = self.path if path else None
-        _check_directory(os.path.dirname(self.path))
+        _prepare_directory(os.path.dirname(self.path))
         _refuse_other_file(self.path)
         _refuse_second_server(self._named_path)
         self._lock = _acquire_lock(self.path)
@@ -80,7 +80,7 @@ class Listener:
             AddressInUse: if another server or file is in the way. In this case, the old socket is kept.
         """
         path = paths.server_socket(self._named_path)
-        _check_directory(os.path.dirname(path))
+        _prepare_directory(os.path.dirname(path))
         if not _is_lock_of(path, self._lock):
             former_lock, self._lock = self._lock, _acquire_lock(path)
             os.close(former_lock)
@@ -127,12 +127,12 @@ class InheritedListener:
         raise AddressInUse(f"the socket {self.path} was removed or replaced; {_RESTART_SOCKET}")
 
     def close(self) -> None:
-        """Close the socket. The socket file stays."""
+        """Close the socket without removing its file."""
         self.socket.close()
 
 
 def listen(path: str | None, mode: int) -> Listener | InheritedListener:
-    """Return the socket passed by systemd if it has this path. Otherwise, bind a new socket.
+    """Return the listening socket passed by systemd if it has this path. Otherwise, bind a new socket.
 
     Args:
         path: the path of the socket file, or None for any passed socket, or else the usual place.
@@ -155,12 +155,12 @@ def is_temporary(error: AddressInUse) -> bool:
 
 
 @contextlib.contextmanager
-def _refusing(what: str) -> Iterator[None]:
-    """Turn an OSError into AddressInUse, with a message that starts with `what`."""
+def _raise_in_use(problem: str) -> Iterator[None]:
+    """Turn an OSError in a `with` block into AddressInUse, with `problem` as the start of the message."""
     try:
         yield
     except OSError as error:
-        raise AddressInUse(f"{what}: {error.strerror or error}") from error
+        raise AddressInUse(f"{problem}: {error.strerror or error}") from error
 
 
 def _identity(path: str) -> tuple[int, int] | None:
@@ -231,13 +231,13 @@ def _refuse_live_socket(path: str) -> None:
     raise AddressInUse(f"another program now listens at {path}")
 
 
-def _check_directory(directory: str) -> None:
-    """Create the socket's directory if it doesn't exist, and check that it is safe.
+def _prepare_directory(directory: str) -> None:
+    """Create the socket's directory if it doesn't exist, and check that other users can't change it.
 
     Raises:
         AddressInUse: if the directory can't be created, or if other users could replace the socket in it.
     """
-    with _refusing(f"can't create the socket's directory {directory}"), contextlib.suppress(FileExistsError):
+    with _raise_in_use(f"can't create the socket's directory {directory}"), contextlib.suppress(FileExistsError):
         os.mkdir(directory, 0o700)
     status = os.lstat(directory)
     if stat.S_ISLNK(status.st_mode):
@@ -268,11 +268,11 @@ def _refuse_other_file(path: str) -> None:
 
 
 def _bind(path: str, mode: int) -> socket.socket:
-    """Create a socket that listens at this path. The caller must hold the lock."""
+    """Remove an old socket file, and return a new socket that listens there. The caller must hold the lock."""
     _refuse_other_file(path)
-    with _refusing(f"can't remove the old socket {path}"), contextlib.suppress(FileNotFoundError):
+    with _raise_in_use(f"can't remove the old socket {path}"), contextlib.suppress(FileNotFoundError):
         os.unlink(path)
-    with _refusing(f"can't listen at {path}"):
+    with _raise_in_use(f"can't listen at {path}"):
         listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         listening.setblocking(False)
         listening.bind(path)
@@ -285,7 +285,7 @@ def _bind(path: str, mode: int) -> socket.socket:
 
 
 def _acquire_lock(path: str) -> int:
-    """Lock a socket's path for this server, and return the descriptor of the lock file.
+    """Lock a socket's path for this server, write the process id, and return the lock file's descriptor.
 
     The lock lasts until the descriptor is closed.
 
@@ -297,7 +297,7 @@ def _acquire_lock(path: str) -> int:
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            holder = _holder(fd)
+            holder = _read_holder(fd)
             raise _already_served(holder, path, here=holder is not None) from None
         if _is_lock_of(path, fd):
             break
@@ -314,21 +314,21 @@ def _is_lock_of(path: str, fd: int) -> bool:
     return _identity(f"{path}.lock") == (status.st_dev, status.st_ino)
 
 
-def _open_lock(name: str) -> int:
-    """Open or create a lock file, and return its descriptor."""
+def _open_lock(path: str) -> int:
+    """Open or create a lock file, and return its descriptor. Raises AddressInUse if it isn't a plain file."""
     flags = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
     while True:
-        with _refusing(f"can't open the lock file {name}"):
+        with _raise_in_use(f"can't open the lock file {path}"):
             with contextlib.suppress(FileExistsError):
-                return os.open(name, flags | os.O_CREAT | os.O_EXCL, 0o600)
+                return os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o600)
             with contextlib.suppress(FileNotFoundError):  # the file has just been removed, so try again
-                _refuse_other_lock(name, os.lstat(name))  # check first, because opening a device may have side effects
-                fd = os.open(name, flags)
-                _refuse_other_lock(name, os.fstat(fd))
+                _refuse_other_lock(path, os.lstat(path))  # check first, because opening a device may have side effects
+                fd = os.open(path, flags)
+                _refuse_other_lock(path, os.fstat(fd))
                 return fd
 
 
-def _refuse_other_lock(name: str, status: os.stat_result) -> None:
+def _refuse_other_lock(path: str, status: os.stat_result) -> None:
     """Raise AddressInUse unless the file is a regular file without other hard links."""
     if stat.S_ISLNK(status.st_mode):
         what = "a symbolic link"
@@ -338,10 +338,10 @@ def _refuse_other_lock(name: str, status: os.stat_result) -> None:
         what = "a hard link to another file"
     else:
         return
-    raise AddressInUse(f"the lock file {name} is {what}; remove it, or choose another socket with --socket")
+    raise AddressInUse(f"the lock file {path} is {what}; remove it, or choose another socket with --socket")
 
 
-def _exists(pid: int) -> bool:
+def _process_exists(pid: int) -> bool:
     """Return whether a process with this id exists."""
     try:
         os.kill(pid, 0)
@@ -352,15 +352,15 @@ def _exists(pid: int) -> bool:
     return True
 
 
-def _holder(fd: int) -> int | None:
-    """Return the process id in the lock file, or None if the holder doesn't write it in time.
+def _read_holder(fd: int) -> int | None:
+    """Wait for the process id in the lock file, and return it, or None if it isn't written in time.
 
     The id of a process that no longer exists was written by an earlier server, and is ignored.
     """
     end = time.monotonic() + HOLDER_ID_S
     while True:
         words = os.pread(fd, 32, 0).decode(errors="replace")
-        if words.endswith("\n") and words.strip().isdecimal() and _exists(int(words)):
+        if words.endswith("\n") and words.strip().isdecimal() and _process_exists(int(words)):
             return int(words)
         if time.monotonic() > end:
             return None

@@ -67,10 +67,10 @@ class Requests:
         #: memory counted for all waiting requests
         self._waiting_bytes = 0
         self._room_check: asyncio.Handle | None = None
-        speech.on_queue_change = self._check_room_soon
+        speech.on_queue_change = self._schedule_room_check
 
     def handle(self, connection: ClientConnection, seq: int | None, request: Request) -> None:
-        """Handle a request. The reply may be sent later."""
+        """Start to carry out a client's request. The reply may be sent later."""
         pending = PendingRequest(connection, seq, request)
         connection.unanswered[pending] = None
         pending.start(self._carry_out(pending))
@@ -86,19 +86,20 @@ class Requests:
         self._speech.subscribers.left(connection)
 
     def shut_down(self) -> None:
-        """End all goals, including those that wait for room in the queue."""
+        """End all goals, including those that wait for room in the queue, and reject new ones."""
         notifications = self._cancel_waiting(self._select_waiting(Cancel()), None)
         self._speech.shut_down()
         resume_all(self._speech.waiting_for_voices)
         self._speech.notifications.add(notifications)
 
     async def _carry_out(self, pending: PendingRequest) -> None:
+        """Carry out a request, after waiting for the list of voices if necessary. Reply to errors, too."""
         request = pending.request
         try:
             if isinstance(request, Cancel | Pause):
                 self._stop_awaiting_voices(pending.connection)  # carry out earlier requests first, without a delay
             elif self._must_await_voices(pending):
-                if self._may_wait(pending):
+                if self._reserve_memory(pending):
                     await pending.wait(self._speech.waiting_for_voices, VOICES_LIMIT_S)
                 elif not isinstance(request, Say):
                     self._stop_awaiting_voices(pending.connection)
@@ -132,11 +133,8 @@ class Requests:
         for each in self._awaiting_voices(connection):
             each.resume()
 
-    def _may_wait(self, pending: PendingRequest) -> bool:
-        """Return whether a request may wait, and count its memory if so.
-
-        If too many requests are waiting already, the refusal of the request is set.
-        """
+    def _reserve_memory(self, pending: PendingRequest) -> bool:
+        """Count a waiting request's memory and return True. If too many wait, set its refusal and return False."""
         if pending.kept_bytes:
             return True  # the request has waited before
         size = REQUEST_BYTES + sum(map(_memory_of, fields(pending.request).values()))
@@ -151,14 +149,14 @@ class Requests:
         pending.refusal = Reason.QUEUE_FULL, words
         return False
 
-    def _check_room_soon(self) -> None:
-        """Schedule a check of the waiting goals after the queue has changed."""
+    def _schedule_room_check(self) -> None:
+        """Schedule a check of the goals that wait for room, unless there are none or it is already scheduled."""
         if self._speech.waiting_for_room and self._room_check is None:
             # Check in the next iteration of the event loop, because the caller may not have finished its changes.
-            self._room_check = asyncio.get_running_loop().call_soon(self._check_room)
+            self._room_check = asyncio.get_running_loop().call_soon(self._submit_waiting_goals)
 
-    def _check_room(self) -> None:
-        """Submit the waiting goals for which the queue has room now."""
+    def _submit_waiting_goals(self) -> None:
+        """Continue the waiting `say` requests for whose goals the queue now has room."""
         self._room_check = None
         without_room: set[object] = set()
         for each in list(self._speech.waiting_for_room):
@@ -171,20 +169,20 @@ class Requests:
             if not self._scheduler.has_room(say):
                 if kind:
                     without_room.add(kind)
-            elif not each.connection.has_hung_up():
+            elif not each.connection.detect_hang_up():
                 # If the goal enters the queue, another check follows, because it may make room for an earlier goal.
                 each.resume()
 
     def _select_waiting(self, selection: Cancel) -> list[PendingRequest]:
-        """Return the selected goals that are waiting for room or for the list of voices."""
+        """Return the `say` requests that a cancel selects while they wait for room or for the list of voices."""
         waiting = (*self._speech.canceled_goals, *self._speech.waiting_for_room, *self._speech.waiting_for_voices)
         goals = [(each, each.request) for each in waiting if isinstance(each.request, Say)]
         selected = (goals[index][0] for index in selection.select_waiting([say for _, say in goals]))
         # Waiting goals of a disconnected client are dropped instead of cancelled.
-        return [each for each in selected if not each.connection.has_hung_up()]
+        return [each for each in selected if not each.connection.detect_hang_up()]
 
     def _cancel_waiting(self, goals: list[PendingRequest], by: By | None) -> list[Callable[[], None]]:
-        """Mark waiting goals as cancelled, and return functions that submit them.
+        """Mark waiting goals as cancelled, and return functions that submit them to the scheduler.
 
         The scheduler then recalls them like other goals.
         """
@@ -197,26 +195,27 @@ class Requests:
     async def _await_room(self, pending: PendingRequest, say: Say) -> float:
         """Wait until the queue has room or the goal has expired. Return the waiting time in seconds."""
         ttl = (self._scheduler.settings.ttl if say.ttl is None else say.ttl) or None
-        began = self._speech.now().monotonic
-        self._speech.subscribers.keep_alive()
+        began = self._speech.advance_time().monotonic
+        self._speech.subscribers.schedule_keep_alive()
         in_time = await pending.wait(self._speech.waiting_for_room, ttl)
-        waited = self._speech.now().monotonic - began
+        waited = self._speech.advance_time().monotonic - began
         return waited if in_time or ttl is None else max(waited, ttl)
 
     # -- coroutines, named after the requests that they handle
 
     async def _say(self, pending: PendingRequest, say: Say) -> None:
+        """Submit a goal, after waiting for room if it is a `patient` goal and the queue is full, and reply."""
         speech, scheduler, connection = self._speech, self._scheduler, pending.connection
         waited = 0.0
         if pending.canceled_by is None:
-            now = speech.now()
+            now = speech.advance_time()
             if self._room_check:  # goals that are already waiting come first
                 self._room_check.cancel()
-                self._check_room()
+                self._submit_waiting_goals()
             _, refusal = self._check_goal(pending, say)
-            if say.patient and scheduler.lacks_room(say, now, refusal) and self._may_wait(pending):
+            if say.patient and scheduler.lacks_room(say, now, refusal) and self._reserve_memory(pending):
                 waited = await self._await_room(pending, say)
-        now = speech.now()
+        now = speech.advance_time()
         say, refusal = self._check_goal(pending, say)
         record, effects = scheduler.submit(say, connection.client, now, refusal, pending.canceled_by, waited)
         extra: JsonObject = {"paused": True} if scheduler.paused else {}
@@ -232,7 +231,7 @@ class Requests:
         goal = record.snapshot(state).to_json()
         ended = attached and state.terminal
         if (say.wait or say.feedback) and not ended:
-            speech.subscribers.await_result(record.id, connection, feedback=say.feedback)
+            speech.subscribers.subscribe_to_goal(record.id, connection, feedback=say.feedback)
         pending.answer(goal=goal, **extra)
         if ended and (say.wait or say.feedback):
             connection.publish(encode({"event": "result", "goal": goal}))
@@ -251,14 +250,15 @@ class Requests:
         return say, pending.refusal or refusal
 
     async def _wait(self, pending: PendingRequest, request: Wait) -> None:
+        """Reply with the requested goals, and subscribe the client to those that haven't ended."""
         await self._speech.notifications.wait_done(pending)  # send earlier events of a goal before its result
         if request.ids is None:
             records = self._scheduler.unfinished()
         else:
-            records = [self._find(each) for each in dict.fromkeys(request.ids)]
+            records = [self._require_goal(each) for each in dict.fromkeys(request.ids)]
         for record in records:
             if not record.state.terminal:
-                self._speech.subscribers.await_result(record.id, pending.connection, feedback=request.feedback)
+                self._speech.subscribers.subscribe_to_goal(record.id, pending.connection, feedback=request.feedback)
         # The list shows the goals as they are now, and events report later changes. Only the active goal may look
         # different later, so its snapshot is made now. The other snapshots are made when they are sent.
         active = self._scheduler.active
@@ -269,8 +269,9 @@ class Requests:
         pending.answer(({"goal": each.to_json()} for each in goals), results, count=len(records))
 
     async def _cancel(self, pending: PendingRequest, selection: Cancel) -> None:
+        """Cancel goals, wait until the active one is silent, and reply with the cancelled and the ended goals."""
         speech, client = self._speech, pending.connection.client
-        now = speech.now()
+        now = speech.advance_time()
         waiting = self._select_waiting(selection)
         notifications = self._cancel_waiting(waiting, By(client=client))
         ids = {each.request.id for each in waiting if isinstance(each.request, Say)}
@@ -285,15 +286,16 @@ class Requests:
         ended = result.recalled + [each.canceled_goal for each in waiting if each.canceled_goal]
         if result.stopping and result.stopping.state is not State.SUCCEEDED:
             ended.append(result.stopping)
-        goals = chain(_goal_lines("canceled", ended), _goal_lines("ended", result.ended))
+        goals = chain(_goal_items("canceled", ended), _goal_items("ended", result.ended))
         if result.unknown:
             pending.refuse(UnknownGoal.code, _unknown_message(*result.unknown), goals)
         else:
             pending.answer(goals, count=len(ended))
 
     async def _pause(self, pending: PendingRequest, _: Pause) -> None:
+        """Pause speech, and reply when the active goal is silent. Raises RequestRefused if that takes too long."""
         speech, scheduler = self._speech, self._scheduler
-        speech.now()
+        speech.advance_time()
         changed, effects, active = not scheduler.paused, scheduler.pause(), scheduler.active
         if changed:
             self._publish_pause(active if active and active.paused else None, pending)
@@ -307,8 +309,9 @@ class Requests:
         self._answer_pause(pending, active)
 
     async def _resume(self, pending: PendingRequest, _: Resume) -> None:
+        """Resume speech, and reply with the resumed goal, if any."""
         speech, scheduler = self._speech, self._scheduler
-        now = speech.now()
+        now = speech.advance_time()
         changed, active = scheduler.paused, scheduler.active
         if active and active.state is not State.ACTIVE:
             active = None  # a goal that is being stopped can't be resumed
@@ -321,36 +324,42 @@ class Requests:
             resume_all(speech.waiting_for_silence(active))  # requests that wait for silence can be answered now
         self._answer_pause(pending, active)
 
-    def _publish_pause(self, held: Record | None, pending: PendingRequest) -> None:
-        """Publish and log that speech was paused or resumed."""
-        paused, held_id, client = self._scheduler.paused, held.id if held else None, pending.connection.client
+    def _publish_pause(self, affected: Record | None, pending: PendingRequest) -> None:
+        """Publish and log that speech was paused or resumed. `affected` is the goal being spoken, if any."""
+        paused, client = self._scheduler.paused, pending.connection.client
+        goal_id = affected.id if affected else None
         publish = self._speech.subscribers.paused_changed
-        self._speech.notifications.add([partial(publish, held_id, paused=paused, by=By(client=client), at=time.time())])
+        self._speech.notifications.add([partial(publish, goal_id, paused=paused, by=By(client=client), at=time.time())])
         log.write(f"{'paused' if paused else 'resumed'} by {describe_sender(client)}")
 
     def _answer_pause(self, pending: PendingRequest, goal: Record | None) -> None:
+        """Reply to a `pause` or `resume` request, with the goal unless it has ended."""
         shown = None if goal is None or goal.state.terminal else goal.snapshot().to_json()
         pending.answer(paused=self._scheduler.paused, goal=shown)
 
     async def _status(self, pending: PendingRequest, request: Status) -> None:
+        """Reply with one goal, or with the state of the server and its goals."""
         if request.id is None:
             self._answer_overview(pending)
         else:
-            pending.answer(goal=self._find(request.id).snapshot().to_json())
+            pending.answer(goal=self._require_goal(request.id).snapshot().to_json())
 
     async def _watch(self, pending: PendingRequest, _: Watch) -> None:
+        """Reply with the state of the server and its goals, and subscribe the client to all events."""
         await self._speech.notifications.wait_done(pending)  # send earlier events before the overview
         self._answer_overview(pending)
         self._speech.subscribers.watch(pending.connection)
 
     def _answer_overview(self, pending: PendingRequest) -> None:
+        """Reply with the state of the server and with its active, pending and recent goals."""
         recent = self._scheduler.history.latest(RECENT_GOALS, rejected=False)
         active = self._scheduler.active
         now = active.snapshot().to_json() if active else None
-        goals = chain(_goal_lines("pending", list(self._scheduler.pending)), _goal_lines("recent", recent))
+        goals = chain(_goal_items("pending", list(self._scheduler.pending)), _goal_items("recent", recent))
         pending.answer(goals, server=self._describe(), active=now)
 
     async def _voices(self, pending: PendingRequest, _: Voices) -> None:
+        """Reply with the engine's voices, including new files of neural voices."""
         self._speech.voices.find_new_files()
         voices = self._speech.voices.listed
         if voices is None:
@@ -361,10 +370,12 @@ class Requests:
         pending.answer(({"voice": fields(each)} for each in voices), count=len(voices))
 
     async def _log(self, pending: PendingRequest, request: Log) -> None:
+        """Reply with the most recently ended goals."""
         records = self._scheduler.history.latest(request.count, rejected=True)
-        pending.answer(_goal_lines("goal", records), count=len(records))
+        pending.answer(_goal_items("goal", records), count=len(records))
 
     async def _set(self, pending: PendingRequest, request: Set) -> None:
+        """Check and change the server's settings, and reply with all settings."""
         speech, scheduler = self._speech, self._scheduler
         if words := options.bad_option(request):
             raise RequestRefused(words, Reason.BAD_OPTION)
@@ -373,15 +384,16 @@ class Requests:
             raise RequestRefused(refusal[1], refusal[0])
         given = fields(replace(request, voice=voice))
         changes = {name: value for name, value in given.items() if value is not None}
-        effects = scheduler.change_settings(changes, speech.now())
-        self._check_room_soon()  # a waiting goal may now be able to preempt others
+        effects = scheduler.change_settings(changes, speech.advance_time())
+        self._schedule_room_check()  # a waiting goal may now be able to preempt others
         speech.apply(effects)
         if changes:
             values = ", ".join(f"{name} {options.format_number(value)}" for name, value in changes.items())
             log.write(f"settings changed to {log.sanitize(values)} by {describe_sender(pending.connection.client)}")
         pending.answer(settings=options.shown_settings(scheduler.settings))
 
-    def _find(self, goal_id: str) -> Record:
+    def _require_goal(self, goal_id: str) -> Record:
+        """Return the goal with this id. Raises UnknownGoal if there is none."""
         record = self._scheduler.find(goal_id)
         if record is None:
             raise UnknownGoal(_unknown_message(goal_id))
@@ -389,15 +401,16 @@ class Requests:
 
 
 def _unknown_message(*ids: str) -> str:
+    """Return the error message for goal ids that the server doesn't know."""
     return f"unknown goal{'s' * (len(ids) > 1)} {', '.join(map(repr, ids))}; list the goals with: talk status"
 
 
-def _goal_lines(name: str, records: Iterable[Record]) -> Iterator[JsonObject]:
-    """Return the lines of a list of goals. Each snapshot is made when its line is sent."""
+def _goal_items(name: str, records: Iterable[Record]) -> Iterator[JsonObject]:
+    """Return the list items for some goals, each under this field name, made when the item is sent."""
     return ({name: each.snapshot().to_json()} for each in records)
 
 
 def _memory_of(value: object) -> int:
-    """Return the memory used by a value, which may be many times the size of its JSON."""
+    """Estimate the memory used by a value in bytes, which may be many times the size of its JSON."""
     inside = value.values() if isinstance(value, dict) else value if isinstance(value, (list, tuple)) else ()
     return sys.getsizeof(value) + sum(map(_memory_of, inside))

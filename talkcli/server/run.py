@@ -127,7 +127,7 @@ class Server:
         self._end_signals = [signal.SIGTERM] if ignored else [signal.SIGTERM, signal.SIGINT]
 
     async def run(self) -> None:
-        """Run the server until it is stopped or fails."""
+        """Run the server until it is stopped by a signal or fails, and then close all connections."""
         settings, speech = self._settings, self.speech
         descriptors = raise_descriptor_limit(settings.max_clients + MAX_EXTRA_CLIENTS)
         self._acceptor = Acceptor(lambda each: ClientConnection(self, speech.streams, each).begin(), descriptors)
@@ -155,7 +155,7 @@ class Server:
             raise TalkError(f"can't start the engine's thread: {memory_limits()}") from error
         try:
             self._acceptor.open(self._listener.socket)
-            self._socket_check = self._loop.call_later(SOCKET_CHECK_S, self._check_socket)
+            self._socket_check = self._loop.call_later(SOCKET_CHECK_S, self._maintain_socket)
             if voice or settings.driver:
                 # Wait before logging, so that an unknown voice or driver produces nothing but an error message.
                 with contextlib.suppress(asyncio.TimeoutError):
@@ -165,7 +165,7 @@ class Server:
                 log.write(f"ready on {self._listener.path} (pid {os.getpid()})")
             if settings.greeting:
                 itself = Sender(os.getpid(), os.getuid(), "talk")
-                _, effects = self._scheduler.submit(Say(settings.greeting), itself, speech.now())
+                _, effects = self._scheduler.submit(Say(settings.greeting), itself, speech.advance_time())
                 speech.apply(effects)
             await speech.finished.wait()
             self._socket_check.cancel()
@@ -179,7 +179,7 @@ class Server:
             raise self._fatal_error
 
     def _prepare_voice(self) -> str | None:
-        """Prepare the voice from the settings. Return it if the engine must check it, otherwise None.
+        """Return the configured voice if the engine must check it. Return None for a neural voice or none.
 
         A neural voice is checked here. It becomes a setting and is loaded later, so that it doesn't delay speech.
 
@@ -192,12 +192,12 @@ class Server:
             return voice
         if refusal:
             raise UsageError(refusal[1])
-        self.speech.apply(self._scheduler.change_settings({"voice": voice}, self.speech.now()))
+        self.speech.apply(self._scheduler.change_settings({"voice": voice}, self.speech.advance_time()))
         return None
 
-    def _check_socket(self) -> None:
-        """Bind the socket again if clients can't find it. Existing connections stay open."""
-        self._socket_check = self._loop.call_later(SOCKET_CHECK_S, self._check_socket)
+    def _maintain_socket(self) -> None:
+        """Bind the socket again if clients can't find it, and schedule the next check. Shut down if it can't."""
+        self._socket_check = self._loop.call_later(SOCKET_CHECK_S, self._maintain_socket)
         if self._listener.in_place():
             self._unreachable = ""
             return
@@ -278,7 +278,7 @@ class Server:
     # -- shutdown
 
     def _end(self, fatal: TalkError | None = None) -> None:
-        """End all goals and then shut down.
+        """Start to shut down: end all goals and reject new ones.
 
         Args:
             fatal: the error that caused the shutdown, if any.
@@ -297,6 +297,7 @@ class Server:
             connection.stream.abort()
 
     def _on_signal(self, number: signal.Signals) -> None:
+        """Log the signal and start to shut down. A second signal ends the process immediately."""
         log.write(f"stopping after {signal.Signals(number).name}")
         for each in self._end_signals:
             # A second signal ends the server immediately, without the event loop, which may be busy.
@@ -304,7 +305,7 @@ class Server:
         self._end()
 
     def _on_second_signal(self, number: int, _: object) -> None:
-        """Exit immediately. The engine process notices this and exits, too."""
+        """Close the socket and exit immediately. The engine process notices this and exits, too."""
         with contextlib.suppress(OSError):
             self._listener.close()
         os._exit(EXIT_SIGNAL + number)

@@ -101,7 +101,7 @@ class Speech:
         self.subscribers = Subscribers(lambda: (each.connection for each in self.waiting_for_room))
         self.streams = ClientStreams()
         self.notifications = Notifications(self.streams)
-        self.notifications.on_done = self._check_finished
+        self.notifications.on_done = self._finish_if_all_ended
         self._timer: asyncio.TimerHandle | None = None
         #: requests that are waiting for a goal to become silent or to end
         self._waiting_for_silence: dict[Record, WaitingList] = {}
@@ -115,7 +115,7 @@ class Speech:
         self._announced_next = False, False
 
     def status_words(self) -> str:
-        """Return a short status message. It contains no texts of goals, because every user can read it."""
+        """Return a short status message without the texts of goals, because every user can read it."""
         scheduler, ready = self.scheduler, self.ready
         if self.engine_status != READY:
             doing = f"engine: {self.engine_status}"
@@ -138,7 +138,7 @@ class Speech:
 
     # -- the scheduler's effects
 
-    def now(self) -> Now:
+    def advance_time(self) -> Now:
         """Handle all time limits that have been reached, and return the current time."""
         now = Now(elapsed(), time.time())
         if self.scheduler.deadline() <= now.monotonic:
@@ -146,7 +146,7 @@ class Speech:
         return now
 
     def apply(self, effects: list[Effect]) -> None:
-        """Carry out the scheduler's effects. The engine gets its orders first, so that it can start working."""
+        """Carry out the scheduler's effects: first the orders to the engine, then the notifications of clients."""
         changes, queue_changed, at = [], False, time.time()
         for effect in effects:
             if isinstance(effect, StateChange):
@@ -165,9 +165,10 @@ class Speech:
         self.on_status_change()
 
     def _carry_out(self, effect: EngineOrder | VoiceLoadOrder | VoiceDropOrder | VoiceWarning) -> None:
+        """Give the engine an order, or log a warning about a voice."""
         match effect:
             case EngineOrder(record=record, order=Order.START):
-                self._start(record)
+                self._start_speaking(record)
             case EngineOrder(record=record, order=Order.STOP):
                 self.engine.stop(record.id)
             case EngineOrder(record=record, order=Order.GIVE_UP):
@@ -187,8 +188,9 @@ class Speech:
             case VoiceWarning(message=message):
                 log.write(log.sanitize(message))
 
-    def _start(self, record: Record) -> None:
-        self._announced_next = next_waits, next_is_neural = self._following()
+    def _start_speaking(self, record: Record) -> None:
+        """Tell the engine to speak a goal, or report it as failed if a voice that it requires is unavailable."""
+        self._announced_next = next_waits, next_is_neural = self._describe_next()
         options = engine_options(record.say, self.scheduler.settings)
         if not is_neural(options["voice"] or ""):
             options["voice_only"] = False
@@ -203,23 +205,25 @@ class Speech:
 
     def _announce_next(self) -> None:
         """Tell the engine whether another goal follows the active one, so that it can prepare for it."""
-        active, following = self.scheduler.active, self._following()
+        active, following = self.scheduler.active, self._describe_next()
         if active and following != self._announced_next:
             self._announced_next = following
             self.engine.announce_next(active.id, *following)
 
-    def _following(self) -> tuple[bool, bool]:
+    def _describe_next(self) -> tuple[bool, bool]:
         """Return whether there is a next goal, and whether its voice is neural."""
         following = self.scheduler.pending.first()
         return following is not None, following is not None and is_neural(self.scheduler.wanted_voice(following))
 
     def _publish_change(self, record: Record, state: State, at: float) -> None:
+        """Send a goal's new state to clients. If the goal has ended, log it and resume the requests that wait."""
         self.subscribers.state_changed(record, state, at)
         if state.terminal:
-            _log_end(record, elapsed() - record.began_at)
+            _log_goal_end(record, elapsed() - record.began_at)
             resume_all(self._waiting_for_silence.pop(record, {}))
 
     def _set_timer(self) -> None:
+        """Schedule `_tick` for the scheduler's next time limit, and cancel the previous timer."""
         if self._timer:
             self._timer.cancel()
         deadline = self.scheduler.deadline()
@@ -228,7 +232,8 @@ class Speech:
             self._timer = self._loop.call_later(min(deadline - elapsed(), CLOCK_CHECK_S), self._tick)
 
     def _tick(self) -> None:
-        self.now()
+        """Handle the time limits that have been reached, and set the timer for the next one."""
+        self.advance_time()
         self._set_timer()
 
     # -- reports from the engine
@@ -246,6 +251,7 @@ class Speech:
                 self._loop.call_soon_threadsafe(self._process_reports)
 
     def _process_reports(self) -> None:
+        """Process a limited number of queued reports, and schedule another call for the rest."""
         # Reset this first, so that a report that arrives during the loop below wakes the event loop again.
         self._reports_due = False
         for _ in range(REPORTS_PER_TURN):
@@ -261,7 +267,7 @@ class Speech:
 
     def _process_report(self, report: Report) -> None:
         """Process one report from the engine."""
-        now, active = self.now(), self.scheduler.active
+        now, active = self.advance_time(), self.scheduler.active
         if isinstance(report, protocol.GoalEvent):
             if active and active.id == report.id:  # ignore reports about a goal that is no longer active
                 self._process_goal_event(report, active, now)
@@ -271,6 +277,7 @@ class Speech:
             self._process_engine_event(report, now)
 
     def _process_goal_event(self, event: protocol.GoalEvent, active: Record, now: Now) -> None:
+        """Process the engine's report of a word, the output, the voice, a pause or the end of the active goal."""
         scheduler = self.scheduler
         match event:
             case protocol.Word():
@@ -278,7 +285,7 @@ class Speech:
                 text = active.say.text[event.start : event.end]
                 self.notifications.add([partial(self.subscribers.word_heard, event, text, time.time())])
             case protocol.Ended():
-                self._goal_ended(event, active, now)
+                self._end_active_goal(event, active, now)
             case protocol.OutputChanged():
                 scheduler.output_changed(event.id, Output.from_json(event.output))
             case protocol.VoiceChosen():
@@ -291,6 +298,7 @@ class Speech:
                     resume_all(self.waiting_for_silence(active))
 
     def _process_voice_event(self, event: protocol.VoiceEvent, now: Now) -> None:
+        """Process the engine's list of voices, or its report of a loaded, measured or unloaded voice."""
         scheduler = self.scheduler
         match event:
             case protocol.VoiceList():
@@ -306,26 +314,28 @@ class Speech:
                 self.apply(scheduler.voice_unloaded(event.voice, now))
 
     def _process_engine_event(self, event: Report, now: Now) -> None:
+        """Process a report about the engine itself, for example that it is ready or has died."""
         match event:
             case protocol.Ready():
-                self._engine_ready(event, now)
+                self._handle_ready(event, now)
             case protocol.StartFailed():
-                self._start_failed(event, now)
+                self._handle_failed_start(event, now)
             case EngineSaid():
                 log.write(f"engine: {log.sanitize(event.line)}")
             case EngineDied():
                 self.apply(self.scheduler.engine_lost(now))
-                self._engine_failed(event.message)
+                self._record_engine_failure(event.message)
             case EngineMissing():
                 self.apply(self.scheduler.fail_next(event.message, now))
             case ThreadDied():
                 # Nothing can be spoken any more, so shut down. A service manager may restart the server.
-                self._engine_failed(event.message)
+                self._record_engine_failure(event.message)
                 self.on_failure(TalkError(event.message))
                 if active := self.scheduler.active:
                     self.apply(self.scheduler.failed(active.id, Reason.ENGINE_FAILED, event.message, None, now))
 
-    def _goal_ended(self, ended: protocol.Ended, active: Record, now: Now) -> None:
+    def _end_active_goal(self, ended: protocol.Ended, active: Record, now: Now) -> None:
+        """End the active goal as the engine reports: completed, stopped or failed."""
         scheduler = self.scheduler
         if self.ready and ended.player:  # let `status` show the player that was used
             self.ready = replace(self.ready, player=ended.player)
@@ -338,7 +348,8 @@ class Speech:
             effects = scheduler.failed(ended.id, reason, words, ended.duration, now)
         self.apply(effects)
 
-    def _engine_ready(self, ready: protocol.Ready, now: Now) -> None:
+    def _handle_ready(self, ready: protocol.Ready, now: Now) -> None:
+        """Record and log that an engine is ready, and start the next goal."""
         if self.ready is None and ready.voice is not None:
             self.apply(self.scheduler.change_settings({"voice": ready.voice}, now))
         if self.ready is None or self.ready != replace(ready, player=self.ready.player):
@@ -347,19 +358,21 @@ class Speech:
         self.engine_known.set()
         self.apply(self.scheduler.engine_ready(now))
 
-    def _start_failed(self, failed: protocol.StartFailed, now: Now) -> None:
+    def _handle_failed_start(self, failed: protocol.StartFailed, now: Now) -> None:
+        """Record that the engine could not be started, and shut down if its options are wrong."""
         if failed.usage_error and self.ready is None:
             self.on_failure(UsageError(failed.message))
             return
-        self._engine_failed(failed.message)
+        self._record_engine_failure(failed.message)
         if failed.permanent:
             self.engine_known.set()
             self.apply(self.scheduler.engine_unavailable(now))
 
-    def _engine_failed(self, words: str) -> None:
-        if words != self.engine_status:
-            log.write(log.sanitize(words))
-        self.engine_status = words
+    def _record_engine_failure(self, message: str) -> None:
+        """Record and log why there is no engine, and resume the requests that wait for its list of voices."""
+        if message != self.engine_status:
+            log.write(log.sanitize(message))
+        self.engine_status = message
         resume_all(self.waiting_for_voices)
         self.on_status_change()
 
@@ -368,10 +381,10 @@ class Speech:
     def shut_down(self) -> None:
         """End all goals and reject new ones."""
         self.engine_known.set()
-        self.apply(self.scheduler.shutdown(self.now()))
+        self.apply(self.scheduler.shutdown(self.advance_time()))
 
-    def _check_finished(self) -> None:
-        """After all notifications were sent, set `finished` if the server shuts down and all goals have ended."""
+    def _finish_if_all_ended(self) -> None:
+        """Set `finished` if the server is shutting down, all goals have ended, and clients have been notified."""
         if self.scheduler.closing and not (self.scheduler.active or self.canceled_goals):
             self.finished.set()
 
@@ -379,7 +392,7 @@ class Speech:
 # -- the log
 
 
-def _log_end(record: Record, seconds: float) -> None:
+def _log_goal_end(record: Record, seconds: float) -> None:
     """Log that a goal has ended. `seconds` is how long it was active."""
     took = "" if record.started_at is None else f" after {seconds:.1f} s"
     how = f"{record.id} {record.state.name}{took}"
@@ -393,7 +406,7 @@ def _log_end(record: Record, seconds: float) -> None:
 
 
 def _log_engine(engine: protocol.Ready, player_options: Sequence[str]) -> None:
-    """Log that the engine is ready.
+    """Log that the engine is ready, with its driver and audio output.
 
     Args:
         engine: the engine's description of itself.

@@ -77,10 +77,11 @@ class ClientStreams:
     def flush_later(self, stream: ClientStream) -> None:
         """Send a stream's output at the end of this iteration of the event loop."""
         if not self._written:
-            self.loop.call_soon(self._flush)
+            self.loop.call_soon(self._flush_written)
         self._written[stream] = None
 
-    def _flush(self) -> None:
+    def _flush_written(self) -> None:
+        """Send the output of all streams that were written to in this iteration."""
         written, self._written = self._written, {}
         for stream in written:
             try:
@@ -142,6 +143,7 @@ class ClientStream:
             self._loop.remove_reader(self.socket)
 
     def _read(self) -> None:
+        """Read once, and pass the data or the end of the input to the receiver."""
         try:
             data = self.socket.recv(_READ_BYTES)
         except BlockingIOError:
@@ -168,7 +170,7 @@ class ClientStream:
         return len(self._unread)
 
     def count_held(self, size_bytes: int) -> None:
-        """Add to the size of the output that the receiver holds back. The argument may be negative."""
+        """Add to the counted size of the output that the receiver holds back. The argument may be negative."""
         if self in self._streams.open:
             self.held_bytes += size_bytes
             self._streams.unread_bytes += size_bytes
@@ -194,7 +196,7 @@ class ClientStream:
             self._send()
 
     def close(self) -> None:
-        """Close the stream after all output has been sent."""
+        """Stop reading, and close the stream after all output has been sent."""
         if self.closing:
             return
         self.closing = True
@@ -203,6 +205,7 @@ class ClientStream:
             self.abort()
 
     def _send(self) -> None:
+        """Send as much output as the socket accepts now. If the stream is closing, close it after the last byte."""
         try:
             sent = self.socket.send(self._unread)
         except BlockingIOError:
@@ -224,6 +227,7 @@ class ClientStream:
             self._report_congestion()
 
     def _report_congestion(self) -> None:
+        """Tell the receiver to pause or resume writing, depending on the size of the unsent output."""
         if not self.congested and len(self._unread) > CONGESTION_BYTES:
             self.congested = True
             self._receiver.pause_writing()
@@ -234,7 +238,7 @@ class ClientStream:
     # -- closing
 
     def abort(self, error: OSError | None = None) -> None:
-        """Close the stream immediately and drop its output.
+        """Drop the output, and close the stream without waiting for the client.
 
         Args:
             error: the error that broke the connection, if any.
@@ -253,12 +257,13 @@ class ClientStream:
         self._loop.call_soon(self._report_end, error)
 
     def _report_end(self, error: OSError | None) -> None:
+        """Tell the receiver that the connection has ended, and close the socket."""
         with self.socket:
             self._receiver.connection_lost(error)
 
 
 def raise_descriptor_limit(clients: int) -> int:
-    """Raise the limit of open files to fit this number of clients, and return the new limit."""
+    """Raise the limit of open files to fit this number of clients, or log that it is too low. Return the limit."""
     wanted = clients + RESERVED_DESCRIPTORS + OWN_DESCRIPTORS
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     allowed, most = (2**31 if each == resource.RLIM_INFINITY else each for each in limits)
@@ -307,6 +312,7 @@ class Acceptor:
             self._listening = None
 
     def _accept(self, listening: socket.socket) -> None:
+        """Accept some of the waiting connections, and pass them to `serve`. Pause for a second after an error."""
         for _ in range(ACCEPTS_PER_TURN):
             try:
                 connected, _ = listening.accept()

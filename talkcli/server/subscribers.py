@@ -60,19 +60,16 @@ class Subscribers:
         self._watchers: dict[ClientConnection, None] = {}
         self._alive_timer: asyncio.TimerHandle | None = None
 
-    def await_result(self, goal_id: str, connection: ClientConnection, *, feedback: bool = False) -> None:
-        """Subscribe a connection to the states and the result of a goal.
-
-        With `feedback`, the connection also receives the words of the goal.
-        """
+    def subscribe_to_goal(self, goal_id: str, connection: ClientConnection, *, feedback: bool = False) -> None:
+        """Subscribe a connection to a goal's states and result, and with `feedback` also to its words."""
         waiting = self._waiters.setdefault(goal_id, {})
         waiting[connection] = waiting.get(connection, False) or feedback
-        self.keep_alive()
+        self.schedule_keep_alive()
 
     def watch(self, connection: ClientConnection) -> None:
         """Subscribe a connection to all events."""
         self._watchers[connection] = None
-        self.keep_alive()
+        self.schedule_keep_alive()
 
     def is_subscribed(self, connection: ClientConnection) -> bool:
         """Return whether a connection is subscribed to any events."""
@@ -85,7 +82,7 @@ class Subscribers:
             waiting.pop(connection, None)
 
     def state_changed(self, record: Record, state: State, at: float) -> None:
-        """Publish a goal's new state, and its result if it has ended."""
+        """Publish a goal's new state, and its result if it has ended. Waiting clients are then unsubscribed."""
         event = StateChanged(record.id, state, at, next(self._numbers))
         if self._watchers:
             # The first and the last event of a goal contain the whole goal.
@@ -100,7 +97,7 @@ class Subscribers:
                 connection.publish(lines)
 
     def word_heard(self, word: Word, text: str, at: float) -> None:
-        """Publish that a word is being spoken.
+        """Publish that a word is being spoken to the connections that want feedback.
 
         Args:
             word: the engine's event.
@@ -108,34 +105,36 @@ class Subscribers:
             at: the time, in seconds since 1970 UTC.
         """
         event = WordHeard(word.id, text, word.start, word.end, word.number, word.time, at, next(self._numbers))
-        _publish(event.to_json(), self._listeners([self._waiters.get(word.id, {})]), feedback=True)
+        _publish(event.to_json(), self._feedback_receivers([self._waiters.get(word.id, {})]), feedback=True)
 
-    def paused_changed(self, held_id: str | None, *, paused: bool, by: By, at: float) -> None:
-        """Publish that speech was paused or resumed. `held_id` is the id of the affected goal, if any."""
-        event = PausedChanged(paused, held_id, by, at, next(self._numbers))
-        _publish(event.to_json(), self._listeners(self._waiters.values()))
+    def paused_changed(self, goal_id: str | None, *, paused: bool, by: By, at: float) -> None:
+        """Publish that speech was paused or resumed. `goal_id` is the id of the affected goal, if any."""
+        event = PausedChanged(paused, goal_id, by, at, next(self._numbers))
+        _publish(event.to_json(), self._feedback_receivers(self._waiters.values()))
 
-    def keep_alive(self) -> None:
+    def schedule_keep_alive(self) -> None:
         """Schedule the next keep-alive messages, unless they are scheduled already."""
         if self._alive_timer is None:
             self._alive_timer = self._loop.call_later(CLIENT_ALIVE_INTERVAL_S, self._send_alive)
 
-    def _listeners(self, waiting: Iterable[dict[ClientConnection, bool]]) -> dict[ClientConnection, None]:
-        """Return all watchers, and the waiting connections that want feedback."""
+    def _feedback_receivers(self, waiters: Iterable[dict[ClientConnection, bool]]) -> dict[ClientConnection, None]:
+        """Return all connections that watch, and those of the waiting connections that want feedback."""
         listeners = dict(self._watchers)
-        for each in waiting:
+        for each in waiters:
             listeners.update((connection, None) for connection, feedback in each.items() if feedback)
         return listeners
 
     def _send_alive(self) -> None:
+        """Send a keep-alive message to all clients that are waiting or watching, and schedule the next one."""
         self._alive_timer = None
         listeners = dict.fromkeys(chain(self._watchers, self._waiting_for_room(), *self._waiters.values()))
         _publish({"event": "alive"}, listeners)
         if listeners:
-            self.keep_alive()
+            self.schedule_keep_alive()
 
 
 def _publish(event: JsonObject, connections: Iterable[ClientConnection], *, feedback: bool = False) -> None:
+    """Encode an event once, and send it to these connections. Feedback may be dropped for slow clients."""
     receivers = list(connections)
     line = encode(event) if receivers else b""  # usually, there are no receivers
     for connection in receivers:
@@ -165,7 +164,7 @@ class Notifications:
         return not self._pending
 
     def add(self, notifications: Iterable[Callable[[], None]]) -> None:
-        """Add functions to the queue. If one of them adds more functions, those are called immediately."""
+        """Add functions to the queue, and begin to call them. Functions added by another one are called at once."""
         if self._working:
             for each in notifications:
                 self._call(each)
@@ -181,7 +180,7 @@ class Notifications:
             await request.wait({})
 
     def _work(self, unread_before: int) -> None:
-        """Call functions from the queue, up to the limit for one iteration of the event loop.
+        """Call functions from the queue, up to a limit for each iteration, and schedule a call for the rest.
 
         Args:
             unread_before: the size of the unread output before the first call.
@@ -213,6 +212,7 @@ class Notifications:
             self._work(self._streams.unread_bytes)
 
     def _call(self, notification: Callable[[], None]) -> None:
+        """Call a function. Log an exception instead of raising it."""
         try:
             notification()
         except Exception as error:  # noqa: BLE001 - the other functions must still be called

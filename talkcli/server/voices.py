@@ -44,7 +44,7 @@ class VoiceCatalog:
             return voice, (Reason.UNKNOWN_VOICE, words)
         if not is_neural(found.id):
             return voice, None
-        missing = self._missing(found.id)
+        missing = self._missing_part(found.id)
         words = f"the voice {voice[:60]} can't be used: {missing}"
         return found.id, (Reason.UNKNOWN_VOICE, words) if missing else None
 
@@ -62,6 +62,7 @@ class VoiceCatalog:
             return 0
 
     def _find(self, voice: str, settings_voice: str | None) -> Voice | None:
+        """Return the voice that matches the client's input, or None. Read directories only if necessary."""
         if not (is_neural(voice) or is_neural(settings_voice or "")):
             found = find_voice(voice, self._driver_voices)
             if found is not None:
@@ -70,10 +71,11 @@ class VoiceCatalog:
 
     @property
     def _driver_voices(self) -> tuple[Voice, ...]:
+        """Voices listed by the engine that are not neural."""
         return tuple(each for each in self.listed or () if not is_neural(each.id))
 
     def _candidates(self, voice: str) -> tuple[Voice, ...]:
-        """Return the voices to search, including the neural voices that are installed now."""
+        """Return the voices to search for this name, including the neural voices that are installed now."""
         own = () if is_neural(voice) else self._driver_voices
         if self._foreign_driver is not None:
             return own
@@ -89,8 +91,8 @@ class VoiceCatalog:
         return None if is_own_driver(self.driver) else self.driver or "the system's own"
 
     @staticmethod
-    def _missing(voice: str) -> str | None:
-        """Return an error message if a neural voice lacks a speaker or a package, or None."""
+    def _missing_part(voice: str) -> str | None:
+        """Return an error message if a neural voice lacks the named speaker or a Python package, or None."""
         model, mark, speaker = voice.partition(SPEAKER_MARK)
         if mark:
             try:

@@ -218,8 +218,8 @@ sys.path.insert(0, {root!r})
 from talkcli.daemon import log
 from talkcli.server.requests import Requests
 from tests.support import scripted_serve
-check_room = Requests._check_room
-Requests._check_room = lambda self: (log.write("looks for room"), check_room(self))
+check_room = Requests._submit_waiting_goals
+Requests._submit_waiting_goals = lambda self: (log.write("looks for room"), check_room(self))
 scripted_serve.main()
 """
 

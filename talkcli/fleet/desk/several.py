@@ -388,7 +388,7 @@ class RobotRequest:
             silent_at, why = self.connection.silent_by(self._since)
             if now > silent_at:
                 self.connection.end(why)
-        while self._handles and (self._handles[0].state.terminal or self._handles[0]._lose()):
+        while self._handles and (self._handles[0].state.terminal or self._handles[0]._lose_if_disconnected()):
             handle = self._handles.popleft()
             # Waiting for all goals succeeds even if the goals fail.
             any_end = isinstance(self._request, Wait) and self._request.ids is None and handle.state is not State.LOST
