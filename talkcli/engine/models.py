@@ -95,7 +95,7 @@ def find_models(environment: Mapping[str, str] | None = None) -> dict[str, str]:
     """
     result: dict[str, str] = {}
     for directory in _model_directories(environment):
-        for path in _entries(directory, _MODEL_SUFFIX):
+        for path in _list_entries(directory, _MODEL_SUFFIX):
             name = os.path.basename(path).removesuffix(_MODEL_SUFFIX)
             if SPEAKER_MARK not in name and name.isprintable():
                 result.setdefault(name, path)
@@ -103,12 +103,12 @@ def find_models(environment: Mapping[str, str] | None = None) -> dict[str, str]:
 
 
 def installed_voices() -> tuple[Voice, ...]:
-    """Return all installed neural voices, even those that can't be loaded."""
-    return tuple(_described_voice(name, path) for name, path in find_models().items())
+    """Return all installed neural voices, with the details from their descriptions if these can be read."""
+    return tuple(_describe_voice(name, path) for name, path in find_models().items())
 
 
-def installed_names(environment: Mapping[str, str] | None = None) -> tuple[Voice, ...]:
-    """Return all installed neural voices, without reading their descriptions."""
+def undescribed_voices(environment: Mapping[str, str] | None = None) -> tuple[Voice, ...]:
+    """Return all installed neural voices by name only, without reading their descriptions."""
     return tuple(Voice(NEURAL_PREFIX + name, None, name) for name in find_models(environment))
 
 
@@ -146,7 +146,7 @@ def open_checked(path: str, missing: str = "restore it", model: str = "") -> Any
     try:
         if not stat.S_ISREG(os.stat(path).st_mode):  # Opening a pipe would wait for a writer.
             raise VoiceFileError(f"{path} is not a regular file; replace it with the voice's file")
-        _check_paths(path, *filter(os.path.exists, [model]))
+        _require_safe_paths(path, *filter(os.path.exists, [model]))
         return open(path, "rb")
     except FileNotFoundError as error:
         raise VoiceFileError(f"{path} does not exist; {missing}") from error
@@ -154,8 +154,8 @@ def open_checked(path: str, missing: str = "restore it", model: str = "") -> Any
         raise VoiceFileError(f"{path} cannot be read: {error.strerror}") from error
 
 
-def _check_paths(*paths: str) -> None:
-    """Check that no other user can replace these files, or a directory or link in their paths.
+def _require_safe_paths(*paths: str) -> None:
+    """Raise VoiceFileError if another user could replace these files, or a directory or link in their paths.
 
     In a sticky directory such as /tmp, only the owner of an entry can replace it. Everyone may write to such a
     directory, but it must not directly contain a voice file or a link to one.
@@ -170,6 +170,7 @@ def _check_paths(*paths: str) -> None:
     wrong = []
     for each, sticky_is_safe in may_be_sticky.items():
         status = os.stat(each)
+        _require_safe_owner(each, status)
         if _others_can_write(each, status) and not (sticky_is_safe and status.st_mode & stat.S_ISVTX):
             wrong.append(each)
     if wrong:
@@ -199,7 +200,7 @@ def _walk_path(path: str) -> Iterator[tuple[str, bool]]:
         if not stat.S_ISLNK(status.st_mode):
             at = each
             continue
-        _check_owner(each, status)
+        _require_safe_owner(each, status)
         target = os.readlink(each)
         at = os.sep if os.path.isabs(target) else at
         parts += target.split(os.sep)[::-1]
@@ -207,12 +208,7 @@ def _walk_path(path: str) -> Iterator[tuple[str, bool]]:
 
 
 def _others_can_write(path: str, status: os.stat_result) -> bool:
-    """Return whether a file is writable by anyone except root and this user.
-
-    Raises:
-        VoiceFileError: The file belongs to another user.
-    """
-    _check_owner(path, status)
+    """Return whether a file's mode or access control list lets anyone except root and this user write to it."""
     if status.st_mode & stat.S_IWOTH:
         return True
     if not status.st_mode & stat.S_IWGRP:
@@ -220,15 +216,15 @@ def _others_can_write(path: str, status: os.stat_result) -> bool:
     return _has_acl(path) or not any(_is_private_group(each, status.st_gid) for each in {0, os.geteuid()})
 
 
-def _check_owner(path: str, status: os.stat_result) -> None:
-    """Raise VoiceFileError if a file belongs to another user."""
+def _require_safe_owner(path: str, status: os.stat_result) -> None:
+    """Raise VoiceFileError if a file belongs to anyone except root and this user."""
     if status.st_uid not in {0, os.geteuid()}:
         words = f"{path} belongs to another user (#{status.st_uid}), who could change the voice"
         raise VoiceFileError(f"{words}; put it into a directory of your own")
 
 
 def _has_acl(path: str) -> bool:
-    """Return whether a file has an access control list, which can allow more users to write to it."""
+    """Return whether a file may have an access control list, which can allow more users to write to it."""
     try:
         return hasattr(os, "listxattr") and "system.posix_acl_access" in os.listxattr(path)
     except OSError as error:
@@ -260,13 +256,14 @@ def _writable_error(*paths: str) -> VoiceFileError:
 
 
 def _model_directories(environment: Mapping[str, str] | None) -> Iterator[str]:
+    """Yield the directories to search for models, including those in installed Python packages."""
     yield from voice_directories(environment)
     for directory in filter(None, sys.path):
-        for package in _entries(os.path.abspath(directory), _PACKAGE_SUFFIX):
+        for package in _list_entries(os.path.abspath(directory), _PACKAGE_SUFFIX):
             yield from (os.path.join(package, each).rstrip("/") for each in _PACKAGE_DIRS)
 
 
-def _entries(directory: str, suffix: str) -> list[str]:
+def _list_entries(directory: str, suffix: str) -> list[str]:
     """Return the sorted paths of a directory's entries with this suffix, except hidden ones.
 
     If the directory can't be read, return an empty list.
@@ -274,7 +271,7 @@ def _entries(directory: str, suffix: str) -> list[str]:
     return sorted(glob.glob(os.path.join(glob.escape(directory), f"*{suffix}")))
 
 
-def _described_voice(name: str, path: str) -> Voice:
+def _describe_voice(name: str, path: str) -> Voice:
     """Return the voice of a model, with the details from its description if it can be read."""
     try:
         found = read_description(path)
@@ -287,34 +284,34 @@ def _described_voice(name: str, path: str) -> Voice:
     return Voice(NEURAL_PREFIX + name, found.language, found.name, found.quality, tuple(names.values()) or None)
 
 
-def _parse_description(found: Any) -> VoiceDescription:
+def _parse_description(content: Any) -> VoiceDescription:
     """Create a description from the parsed content of a voice's JSON file.
 
     Raises:
         KeyError, TypeError, ValueError, AttributeError: The content is invalid.
     """
-    if found.get("phoneme_type", "espeak") != "espeak":
-        raise ValueError(f"its phoneme_type must be 'espeak', got {found['phoneme_type']!r}")
-    phoneme_ids = {str(key): tuple(map(_checked_integer, value)) for key, value in found["phoneme_id_map"].items()}
+    if content.get("phoneme_type", "espeak") != "espeak":
+        raise ValueError(f"its phoneme_type must be 'espeak', got {content['phoneme_type']!r}")
+    phoneme_ids = {str(key): tuple(map(_checked_integer, value)) for key, value in content["phoneme_id_map"].items()}
     if max(map(len, phoneme_ids.values()), default=0) > _MAX_IDS_PER_PHONEME:
         raise ValueError(f"phoneme_id_map has more than {_MAX_IDS_PER_PHONEME} ids for a phoneme")
     for each in (PAD_SYMBOL, BEGIN_SYMBOL, END_SYMBOL):
         if not phoneme_ids.get(each):
             raise ValueError(f"phoneme_id_map has no {each}")
-    rate = _checked_integer(found["audio"]["sample_rate"])
+    rate = _checked_integer(content["audio"]["sample_rate"])
     if rate not in _RATES_HZ:
         raise ValueError(f"unsupported sample rate: {rate}")
-    inference = found.get("inference", {})
-    names = found.get("speaker_id_map") or {}
-    quality = _shorten(found["audio"].get("quality") or "")
-    speakers = _checked_integer(found.get("num_speakers", 1))
+    inference = content.get("inference", {})
+    names = content.get("speaker_id_map") or {}
+    quality = _shorten(content["audio"].get("quality") or "")
+    speakers = _checked_integer(content.get("num_speakers", 1))
     if speakers > _MAX_SPEAKERS:
         raise ValueError(f"too many speakers: {speakers}")
-    parts = [_shorten(found.get("dataset") or ""), quality, f"{speakers} speakers" if speakers > 1 else ""]
-    code = found.get("language", {}).get("code") or found["espeak"]["voice"]
+    parts = [_shorten(content.get("dataset") or ""), quality, f"{speakers} speakers" if speakers > 1 else ""]
+    code = content.get("language", {}).get("code") or content["espeak"]["voice"]
     return VoiceDescription(
         rate=rate,
-        espeak_voice=_shorten(found["espeak"]["voice"]),
+        espeak_voice=_shorten(content["espeak"]["voice"]),
         language=_shorten(code).replace("_", "-").lower(),
         name=", ".join(filter(None, parts)) or "Piper",
         quality=quality or None,
@@ -328,6 +325,7 @@ def _parse_description(found: Any) -> VoiceDescription:
 
 
 def _shorten(value: object) -> str:
+    """Return a value as text, which is cut off if it is too long to be shown to users."""
     words = str(value)
     return words if len(words) <= _MAX_SHOWN_CHARS else f"{words[:_MAX_SHOWN_CHARS]}…"
 

@@ -74,6 +74,7 @@ class KnownPlayer:
 
 
 def _aplay_command(rate: int, device: str | None) -> PlayerCommand:
+    """Return the command line of aplay."""
     argv = ["aplay", "-q", "-t", "raw", "-f", "S16_LE", "-c", "1", "-r", str(rate)]
     argv += [f"--buffer-time={BUFFER_MS * 1000}"]
     argv += ["-D", device] if device else []
@@ -82,6 +83,7 @@ def _aplay_command(rate: int, device: str | None) -> PlayerCommand:
 
 
 def _pacat_command(rate: int, device: str | None) -> PlayerCommand:
+    """Return the command line of pacat."""
     argv = ["pacat", "--playback", "--raw", "--format=s16le", "--channels=1", f"--rate={rate}"]
     argv += [f"--latency-msec={BUFFER_MS}", "--process-time-msec=20", "--client-name=talk", "--stream-name=talk"]
     argv += ["-d", device] if device else []
@@ -90,6 +92,7 @@ def _pacat_command(rate: int, device: str | None) -> PlayerCommand:
 
 
 def _pw_cat_command(rate: int, device: str | None) -> PlayerCommand:
+    """Return the command line of pw-cat."""
     argv = ["pw-cat", "--playback", f"--latency={BUFFER_MS}ms", "--media-role=Accessibility"]
     argv += [f"--target={device}"] if device else []
     return PlayerCommand("pw-cat", (*argv, "-"), preamble=_au_header(rate))
@@ -126,7 +129,7 @@ NO_PLAYER = f"no player found; install {', '.join(_OTHERS)} or {_LAST}"
 
 
 class PlayerMissing(Exception):
-    """A player program is not installed, or its command line can't be parsed."""
+    """Raised if a player program is not installed, or if its command line can't be parsed."""
 
 
 def is_silent(player: str | None) -> bool:
@@ -147,7 +150,7 @@ def on_path(program: str, env: Mapping[str, str] | None = None) -> bool:
 
 
 def player_commands(player: str | None, device: str | None, rate: int, last: str | None = None) -> list[PlayerCommand]:
-    """Return the command lines to try, best first.
+    """Return the command lines of the player programs to try, best first.
 
     Args:
         player: The name of a known program, a custom command line, or None for all installed programs that may be
@@ -167,14 +170,14 @@ def player_commands(player: str | None, device: str | None, rate: int, last: str
         return [programs[name](rate, device) for name in names]
     command = PLAYERS[player].command if player in PLAYERS else None
     if command is None:
-        return [_custom_command(player, device, rate)]
+        return [_parse_custom_command(player, device, rate)]
     if not on_path(player):
         raise PlayerMissing(f'player "{player}" not found; install {PACKAGES[player]}')
     return [command(rate, device)]
 
 
-def _custom_command(player: str, device: str | None, rate: int) -> PlayerCommand:
-    """Return a custom player command with its placeholders filled in."""
+def _parse_custom_command(player: str, device: str | None, rate: int) -> PlayerCommand:
+    """Return a custom player command with its placeholders filled in. Its program must be installed."""
     import shlex
 
     try:

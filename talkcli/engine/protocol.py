@@ -93,7 +93,7 @@ class Configure:
 
 @frozen
 class Speak:
-    """Speak a text. Rate, volume and pitch are absolute values, not relative changes."""
+    """The command to speak a text. Rate, volume and pitch are absolute values, not relative changes."""
 
     id: str
     text: str
@@ -110,14 +110,14 @@ class Speak:
 
 @frozen
 class Stop:
-    """Stop speaking this goal at once. Ignored if the goal has already ended."""
+    """The command to stop speaking a goal at once. It is ignored if the goal has already ended."""
 
     id: str
 
 
 @frozen
 class Hold:
-    """Pause this goal, and send `Held` once it is silent. Ignored if the goal has already ended."""
+    """The command to pause a goal, and to send `Held` once it is silent. It is ignored if the goal has ended."""
 
     id: str
     number: int  # number of this pause within the goal, starting at 1
@@ -125,14 +125,14 @@ class Hold:
 
 @frozen
 class Continue:
-    """Resume a paused goal. Ignored if the goal is not paused."""
+    """The command to resume a paused goal. It is ignored if the goal is not paused."""
 
     id: str
 
 
 @frozen
 class NextGoal:
-    """Update `next_waits` and `next_is_neural` for the current goal."""
+    """The command to update whether another goal waits behind the current one, and whether it has a neural voice."""
 
     id: str  # ID of the current goal
     next_waits: bool  # whether another goal is waiting in the queue
@@ -141,14 +141,14 @@ class NextGoal:
 
 @frozen
 class LoadVoice:
-    """Load a neural voice in the background. The reply is one `VoiceLoaded`."""
+    """The command to load a neural voice in the background. The reply is one `VoiceLoaded`."""
 
     voice: str  # ID of the voice, without a speaker
 
 
 @frozen
 class DropVoice:
-    """Unload a neural voice as soon as no sentence is using it. The reply is `VoiceMemory`, if the voice was loaded."""
+    """The command to unload a neural voice once no sentence uses it. If it was loaded, the reply is `VoiceMemory`."""
 
     voice: str  # ID of the voice, without a speaker
 
@@ -300,7 +300,7 @@ def encode(message: Command | Event) -> bytes:
 
 
 def decode(line: bytes, classes: Mapping[str, type[_M]]) -> _M:
-    """Parse a message.
+    """Parse a line of JSON, and return the message.
 
     Args:
         line: the line of JSON.

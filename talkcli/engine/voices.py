@@ -48,7 +48,7 @@ class UnknownVoice(Exception):
 
 
 def is_own_driver(driver: str | None) -> bool:
-    """Return whether a driver is one of the built-in synthesizers.
+    """Return whether a driver is one of `talk`'s own synthesizers, which exist only on Linux.
 
     A built-in synthesizer plays through a player, while any other driver plays its sound itself.
     """
@@ -77,7 +77,7 @@ def find_voice(wanted: str, voices: tuple[Voice, ...], preferred: str | None = N
             it: "en-us" and "en" select an "en-us" voice. The voices of libespeak-ng in this language are then found
             only by their ids or names.
     """
-    fitting = _matches(wanted, voices, preferred)
+    fitting = _matching_voices(wanted, voices, preferred)
     return next(iter(fitting.values())) if len(fitting) == 1 else None
 
 
@@ -86,7 +86,7 @@ def matching_languages(wanted: str, voices: Sequence[Voice]) -> set[str]:
     known = {each.language for each in voices if each.language}
     word = _fold(wanted)
     region = _WITH_REGION.fullmatch(word)
-    named = [_fold(each) for each in _by_english_name(word, _split_variants(voices)[0])]
+    named = [_fold(each) for each in _languages_named(word, _split_variants(voices)[0])]
     for codes in ([word], [region[1]] if region else [], named):
         found = {each for each in known if any(f"{_fold(each)}-".startswith(f"{code}-") for code in codes if code)}
         if found:
@@ -94,7 +94,7 @@ def matching_languages(wanted: str, voices: Sequence[Voice]) -> set[str]:
     return set()
 
 
-def _matches(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> dict[str, Voice]:
+def _matching_voices(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> dict[str, Voice]:
     """Return the voices that a name may refer to, with their unambiguous names as keys."""
     for words in _possible_names(wanted, voices):
         fitting: dict[Voice, str] = {}
@@ -122,12 +122,12 @@ def _possible_names(wanted: str, voices: tuple[Voice, ...]) -> Iterator[list[str
     region = _WITH_REGION.fullmatch(_fold(base))
     if region:
         yield [region[1] + plus + variant]
-    yield [each + plus + variant for each in _by_english_name(_fold(base), _split_variants(voices)[0])]
+    yield [each + plus + variant for each in _languages_named(_fold(base), _split_variants(voices)[0])]
     yield [NEURAL_PREFIX + name + mark + speaker]
     yield [each + mark + speaker for each in neural if word in map(_fold, _short_names(each))]
 
 
-def _by_english_name(word: str, voices: Sequence[Voice]) -> list[str]:
+def _languages_named(word: str, voices: Sequence[Voice]) -> list[str]:
     """Return the codes of the languages with this English name.
 
     The names come from the voices' names, such as "English (Great Britain)". If a language has several voices, and its
@@ -139,7 +139,7 @@ def _by_english_name(word: str, voices: Sequence[Voice]) -> list[str]:
             groups.setdefault(_fold(each.language).partition("-")[0], []).append(each)
     result: list[str] = []
     for code, group in groups.items():
-        means_one = len(group) > 1 and _by_name(code, group)
+        means_one = len(group) > 1 and _find_by_name(code, group)
         result += [code] if means_one else [each.language or "" for each in group]
     return result
 
@@ -167,7 +167,7 @@ def _find_exact(wanted: str, voices: tuple[Voice, ...], preferred: str | None = 
     """
     if is_neural(wanted):
         name, mark, speaker = wanted.partition(SPEAKER_MARK)
-        found = _by_name(name, [each for each in voices if is_neural(each.id)])
+        found = _find_by_name(name, [each for each in voices if is_neural(each.id)])
         if found is None or (mark and not speaker):
             return None
         return Voice(found.id + mark + speaker, found.language, found.name)
@@ -177,12 +177,12 @@ def _find_exact(wanted: str, voices: tuple[Voice, ...], preferred: str | None = 
         if language and _fold(wanted) in {language, language.partition("-")[0]}:
             return own
     plain, variants = _split_variants(voices)
-    found = _by_name(wanted, plain)
+    found = _find_by_name(wanted, plain)
     if found is not None or not variants:
         return found
     name, plus, suffix = wanted.partition(VARIANT_PREFIX)
-    variant = _find_variant(suffix, variants) if plus else _by_name(wanted, variants)
-    base = _by_name(name if plus and name else _DEFAULT_LANGUAGE, plain)
+    variant = _find_variant(suffix, variants) if plus else _find_by_name(wanted, variants)
+    base = _find_by_name(name if plus and name else _DEFAULT_LANGUAGE, plain)
     if variant is None or base is None:
         return None
     return Voice(base.id + variant.id, base.language, base.name + variant.id)
@@ -193,42 +193,44 @@ def neural_language(voice: str) -> str:
     return voice.removeprefix(NEURAL_PREFIX).partition("-")[0].replace("_", "-").lower()
 
 
-def speaker_number(word: str, numbers: Mapping[str, int], count: int) -> int:
-    """Return the number of a speaker of a neural voice.
+def speaker_number(speaker: str, numbers: Mapping[str, int], count: int) -> int:
+    """Return the number of a speaker of a neural voice, given the speaker's name or number.
 
     Args:
-        word: The name or the number of the speaker, or "" for the first speaker.
+        speaker: The name or number, or "" for the first speaker.
         numbers: The numbers of the speakers, by name.
         count: How many speakers the voice has.
 
     Raises:
         UnknownVoice: The voice has no such speaker.
     """
-    number = numbers.get(word, -1)
-    if not word:
+    number = numbers.get(speaker, -1)
+    if not speaker:
         number = 0
-    elif number < 0 and word.isascii() and word.isdecimal():
-        number = int(word[:9])
+    elif number < 0 and speaker.isascii() and speaker.isdecimal():
+        number = int(speaker[:9])
     if 0 <= number < count:
         return number
     many = f"the voice has {count} speakers, 0 to {count - 1}" if count > 1 else "the voice has one speaker"
-    raise UnknownVoice(f'no speaker "{word[:40]}"; {many}')
+    raise UnknownVoice(f'no speaker "{speaker[:40]}"; {many}')
 
 
-def unknown_voice_message(wanted: str, voices: tuple[Voice, ...], foreign: str | None = None) -> str:
+def unknown_voice_message(wanted: str, voices: tuple[Voice, ...], foreign_driver: str | None = None) -> str:
     """Return the error message for an unknown voice. It suggests similar voices, or says what to do next.
 
     Args:
         wanted: The name that the user typed.
         voices: All voices.
-        foreign: The name of the driver, unless it is a built-in synthesizer.
+        foreign_driver: The name of the driver, unless it is a built-in synthesizer.
     """
     shown = wanted if len(wanted) <= _MAX_WORD_CHARS else f"{wanted[:_MAX_WORD_CHARS]}…"
-    if is_neural(wanted) and foreign is not None:
+    if is_neural(wanted) and foreign_driver is not None:
         if sys.platform.startswith("linux"):
-            return f'"{shown}" is a neural voice, which the driver "{foreign}" does not support; leave out --driver'
+            return (
+                f'"{shown}" is a neural voice, which the driver "{foreign_driver}" does not support; leave out --driver'
+            )
         return f'"{shown}" is a neural voice, which talk only supports on Linux; list other voices with: talk voices'
-    fitting = list(_matches(wanted, voices))
+    fitting = list(_matching_voices(wanted, voices))
     if len(fitting) > 1:
         more = f", or {len(fitting) - _MAX_SUGGESTIONS} others" if len(fitting) > _MAX_SUGGESTIONS else ""
         return f'the voice "{shown}" could be {" or ".join(fitting[:_MAX_SUGGESTIONS])}{more}; write the whole name'
@@ -247,10 +249,10 @@ def _suggestions(wanted: str, voices: tuple[Voice, ...]) -> list[str]:
     plain, variants = _split_variants(voices)
     neural = [each for each in voices if is_neural(each.id)]
     if is_neural(wanted):
-        return _similar(wanted.partition(SPEAKER_MARK)[0], {each.id: each for each in neural})
+        return _similar_names(wanted.partition(SPEAKER_MARK)[0], {each.id: each for each in neural})
     name, plus, suffix = wanted.partition(VARIANT_PREFIX)
     if plus and variants and (not name or find_voice(name, (*plain, *variants))):
-        near = _similar(suffix, {each.id.removeprefix(VARIANT_PREFIX): each for each in variants})
+        near = _similar_names(suffix, {each.id.removeprefix(VARIANT_PREFIX): each for each in variants})
         return [f"{name}{VARIANT_PREFIX}{each}" for each in near]
     words: dict[str, Voice] = {}
     # Suggest the spelling that `talk voices` shows, which is "en-us" rather than the id "en-US".
@@ -263,7 +265,7 @@ def _suggestions(wanted: str, voices: tuple[Voice, ...]) -> list[str]:
     for each in plain if variants else ():
         for called in _english_names(each):
             words.setdefault(called, each)
-    return _similar(name, words)
+    return _similar_names(name, words)
 
 
 def _split_variants(voices: Sequence[Voice]) -> tuple[list[Voice], list[Voice]]:
@@ -272,7 +274,7 @@ def _split_variants(voices: Sequence[Voice]) -> tuple[list[Voice], list[Voice]]:
     return plain, [each for each in voices if each.id.startswith(VARIANT_PREFIX)]
 
 
-def _by_name(wanted: str, voices: Sequence[Voice]) -> Voice | None:
+def _find_by_name(wanted: str, voices: Sequence[Voice]) -> Voice | None:
     """Find a voice by name, ignoring case. If several match, prefer the one with the same spelling."""
     word = _fold(wanted)
     found = [
@@ -306,12 +308,12 @@ def _find_variant(suffix: str, variants: list[Voice]) -> Voice | None:
     return next((each for each in variants if each.id.casefold() == VARIANT_PREFIX + word), None)
 
 
-def _similar(wanted: str, words: dict[str, Voice]) -> list[str]:
+def _similar_names(wanted: str, names: dict[str, Voice]) -> list[str]:
     """Return the names most similar to `wanted`, at most one for each voice."""
     import difflib
 
     folded: dict[str, str] = {}
-    for each in words:
+    for each in names:
         folded.setdefault(_fold(each), each)
     word = _fold(wanted)
     near = difflib.get_close_matches(word, folded, n=4 * _MAX_SUGGESTIONS, cutoff=_MIN_SIMILARITY)
@@ -320,7 +322,7 @@ def _similar(wanted: str, words: dict[str, Voice]) -> list[str]:
         near += [each for each in folded if each.startswith(word)]
     result: dict[str, str] = {}
     for each in near:
-        result.setdefault(words[folded[each]].id, folded[each])
+        result.setdefault(names[folded[each]].id, folded[each])
     return list(result.values())[:_MAX_SUGGESTIONS]
 
 

@@ -80,7 +80,7 @@ class VoiceCatalog:
         if self._foreign_driver is not None:
             return own
         listed = {each.id: each for each in self.listed or ()}
-        return (*own, *(listed.get(each.id, each) for each in models.installed_names()))
+        return (*own, *(listed.get(each.id, each) for each in models.undescribed_voices()))
 
     @property
     def _foreign_driver(self) -> str | None:

@@ -14,7 +14,7 @@ from pyttsx3.engine import Engine
 
 from talkcli import install
 from talkcli.engine import protocol
-from talkcli.engine.child.driver import register
+from talkcli.engine.child.driver import register_driver
 from talkcli.engine.child.players.base import CannotSpeak
 from talkcli.engine.child.players.chooser import PlayerChooser
 from talkcli.engine.voices import UnknownVoice
@@ -355,7 +355,7 @@ class Told:
         self.at_wait: Callable[[], None] = lambda: None
         self.players = PlayerChooser(protocol.Configure(0, None, player, None, None))
         self.hold_number = 0
-        register(_NAME, synthesizer or Scripted(), cast("GoalRunner", self))
+        register_driver(_NAME, synthesizer or Scripted(), cast("GoalRunner", self))
         self.engine: Any = Engine(_NAME)
         for topic in ("started-utterance", "started-word", "finished-utterance", "error"):
             self.engine.connect(topic, self._note(topic))

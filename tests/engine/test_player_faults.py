@@ -261,7 +261,7 @@ guard.guarded = lambda *text: (tell("text"), guarded(*text))[1]
 def _status(child: PlayerProcess, seconds: float = 10.0) -> int:
     """Wait for a child's end, and return its status."""
     end = time.monotonic() + seconds
-    while (status := child.status()) is None:
+    while (status := child.poll()) is None:
         assert time.monotonic() < end, "it has not ended"
         child.await_end(0.1)
     child.release()

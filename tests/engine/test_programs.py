@@ -131,14 +131,14 @@ def test_the_line_that_names_the_error_is_found(said: str, line: str | None) -> 
     complaint = ErrorOutput()
     for byte in said.encode():
         complaint.feed(bytes([byte]))
-    assert complaint.line() == line
+    assert complaint.find_error() == line
 
 
 def test_a_flood_of_standard_error_is_not_kept() -> None:
     complaint = ErrorOutput()
     for _ in range(100):
         complaint.feed(b"x" * 10_000)
-    assert complaint.line() == "x" * MAX_ERROR_LINE_BYTES
+    assert complaint.find_error() == "x" * MAX_ERROR_LINE_BYTES
 
 
 # -- whether anything could sound

@@ -30,7 +30,7 @@ from talkcli.doctor.voice import EngineOptions, EngineReport
 from talkcli.engine import protocol
 from talkcli.engine.parent import process
 from talkcli.engine.parent.process import EngineFailed, PrivateEngine, engine_command
-from talkcli.engine.parent.render import CannotWrite, RenderFailed, pieces, render
+from talkcli.engine.parent.render import CannotWrite, RenderFailed, render, split_into_pieces
 from talkcli.errors import TalkError, UsageError
 from talkcli.goals.states import State
 from talkcli.polling import Interrupted
@@ -91,7 +91,7 @@ def test_a_text_longer_than_a_goal_is_rendered_in_pieces(tmp_path: Path, monkeyp
     monkeypatch.setattr("talkcli.engine.parent.render.MAX_PIECE_CHARS", 500)
     sentences = [f"This is number {number}, and so on." for number in range(20)]
     text = f"{' '.join(sentences)}\n\n{'... ' * 200}"  # a silent piece is not an error
-    first, second, *rest = pieces(text)
+    first, second, *rest = split_into_pieces(text)
     assert first + second + "".join(rest) == text
     assert first.endswith("so on. ")
     seconds = render(text, str(path), rate=450)
@@ -108,7 +108,7 @@ def test_a_text_longer_than_a_goal_is_rendered_in_pieces(tmp_path: Path, monkeyp
     )
 )
 def test_pieces_are_the_text_and_none_is_too_long(text: str) -> None:
-    found = list(pieces(text))
+    found = list(split_into_pieces(text))
     assert "".join(found) == text
     assert max(map(len, found)) <= 10_000
 

@@ -376,13 +376,13 @@ def test_a_goal_ends_once_when_its_process_is_gone_or_should_be(monkeypatch: pyt
     engine._goal = SupervisedGoal(YES, sent=True, started=True)
     engine._lose_process("it hangs", Reason.ENGINE_HUNG)
     due = engine._dying[process]
-    engine._check_deadlines(due - KILL_LIMIT_S / 2)
+    engine._handle_deadlines(due - KILL_LIMIT_S / 2)
     assert [type(each).__name__ for each in posted] == ["EngineDied"]
     assert undying.kills == 1
     if not in_time:
-        engine._check_deadlines(due)
+        engine._handle_deadlines(due)
         assert undying.kills == 2
-        engine._check_deadlines(due + 1)
+        engine._handle_deadlines(due + 1)
         assert undying.kills == 2, "it was overdue once"
     engine._release_process(process)
     reason = "engine_hung" if in_time else "not_silent"

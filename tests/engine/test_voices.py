@@ -310,10 +310,10 @@ def test_mbrolas_voices_are_listed_if_they_are_installed(tmp_path: Path, monkeyp
     monkeypatch.setenv("PATH", str(tmp_path / "bin"))
     (tmp_path / "us1").mkdir()
     (tmp_path / "us1" / "us1").touch()
-    assert espeak._mbrola_voices(None) == []
+    assert espeak._list_mbrola_voices(None) == []
     (tmp_path / "bin").mkdir()
     (tmp_path / "bin" / "mbrola").touch(0o755)
-    assert espeak._mbrola_voices(None) == [Voice("mb/mb-us1", "en-us", "us-mbrola-1")]
+    assert espeak._list_mbrola_voices(None) == [Voice("mb/mb-us1", "en-us", "us-mbrola-1")]
 
 
 # -- a goal's own

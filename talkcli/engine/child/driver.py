@@ -34,7 +34,7 @@ _RUN_LOOP_DRIVERS = ("nsss", "avspeech")
 
 
 class CannotStart(Exception):
-    """The engine can't start.
+    """Raised if the engine can't start.
 
     Attributes:
         failure: the message for the server, which says what to install or to change.
@@ -47,7 +47,7 @@ class CannotStart(Exception):
 
 
 def start(configure: protocol.Configure, runner: GoalRunner) -> protocol.Ready:
-    """Start pyttsx3's engine and attach it to the runner.
+    """Start pyttsx3's engine, attach it to the runner, and return the `Ready` message for the server.
 
     Raises:
         CannotStart: a driver, a voice or a library is missing or unknown.
@@ -59,22 +59,26 @@ def start(configure: protocol.Configure, runner: GoalRunner) -> protocol.Ready:
     own = is_own_driver(configure.driver)
     driver = configure.driver or (next(iter(SYNTHESIZERS)) if own else pyttsx3.engine.default_engine_by_sys_platform())
     name = f"talk_{driver}" if own else driver
-    synthesizer = _register_own(driver, name, runner) if own else None
-    engine = _start_engine(pyttsx3, name, named=configure.driver is not None)
+    synthesizer = _register_own_driver(driver, name, runner) if own else None
+    engine = _start_engine(pyttsx3, name, user_chosen=configure.driver is not None)
     properties = DriverProperties(engine, driver)
     try:
         properties.set_voice(configure.voice)
-        voice = properties.voice_id(configure.voice) if configure.voice else ""
+        voice = properties.find_voice_id(configure.voice) if configure.voice else ""
     except CannotSpeak as error:
         unknown = error.reason == Reason.UNKNOWN_VOICE
         raise CannotStart(str(error), error.reason, permanent=unknown, usage_error=unknown) from error
-    runner.attach_engine(engine, properties.apply, None if own else _run_loop_step(name), synthesizer)
-    version, player = (synthesizer.version, runner.players.first_player()) if synthesizer else (None, None)
+    runner.attach_engine(engine, properties.apply, None if own else _make_run_loop_step(name), synthesizer)
+    version, player = (synthesizer.version, runner.players.find_first_player()) if synthesizer else (None, None)
     return protocol.Ready(driver, version, player, voice if is_neural(voice) else None)
 
 
-def _register_own(synthesizer_name: str, driver_name: str, runner: GoalRunner) -> CombinedSynthesizer:
-    """Create one of `talk`'s synthesizers, and register a driver for it."""
+def _register_own_driver(synthesizer_name: str, driver_name: str, runner: GoalRunner) -> CombinedSynthesizer:
+    """Create one of `talk`'s synthesizers, register a driver for it, and return the synthesizer.
+
+    Raises:
+        CannotStart: a library or the default voice is missing.
+    """
     module, _, function = SYNTHESIZERS[synthesizer_name].partition(":")
     try:
         imported = import_module(f"talkcli.engine.child.synthesizers.{module}")
@@ -82,32 +86,35 @@ def _register_own(synthesizer_name: str, driver_name: str, runner: GoalRunner) -
     except NotInstalled as error:
         raise CannotStart(str(error)) from error
     except UnknownVoice as error:  # even the default voice is missing
-        raise CannotStart(_start_error(driver_name, error), permanent=False) from error
-    register(driver_name, synthesizer, runner)
+        raise CannotStart(_start_error_message(driver_name, error), permanent=False) from error
+    register_driver(driver_name, synthesizer, runner)
     return synthesizer
 
 
-def register(name: str, synthesizer: Synthesizer, runner: GoalRunner) -> None:
-    """Register a driver, so that `pyttsx3.init(name)` finds it."""
+def register_driver(name: str, synthesizer: Synthesizer, runner: GoalRunner) -> None:
+    """Register a driver for this synthesizer, so that `pyttsx3.init(name)` finds it."""
     module: Any = types.ModuleType(f"pyttsx3.drivers.{name}")
     module.buildDriver = lambda proxy: Driver(proxy, synthesizer, runner)
     sys.modules[module.__name__] = module
 
 
-def _start_engine(pyttsx3: Any, name: str, *, named: bool) -> Any:
-    """Start pyttsx3's engine with a driver, and return the engine.
+def _start_engine(pyttsx3: Any, name: str, *, user_chosen: bool) -> Any:
+    """Initialize pyttsx3 with a driver, start its event loop, and return its engine.
 
-    If an option `named` the driver, a wrong name is a usage error.
+    If the user has chosen the driver, a wrong name is a usage error.
+
+    Raises:
+        CannotStart: the driver is unknown or faulty.
     """
     try:
         engine = pyttsx3.init(name)
     except ModuleNotFoundError as error:
         if error.name == f"pyttsx3.drivers.{name}":
-            message = f'unknown driver "{name}"; available drivers: {", ".join(_driver_names())}'
-            raise CannotStart(message, usage_error=named) from error
-        raise CannotStart(f'the driver "{name}" could not be loaded: {error}', usage_error=named) from error
+            message = f'unknown driver "{name}"; available drivers: {", ".join(_available_drivers())}'
+            raise CannotStart(message, usage_error=user_chosen) from error
+        raise CannotStart(f'the driver "{name}" could not be loaded: {error}', usage_error=user_chosen) from error
     except Exception as error:
-        raise CannotStart(_start_error(name, error), permanent=False) from error
+        raise CannotStart(_start_error_message(name, error), permanent=False) from error
     try:
         engine.startLoop(False)
         engine.iterate()  # a driver that fails here would otherwise hang at the first goal
@@ -117,11 +124,12 @@ def _start_engine(pyttsx3: Any, name: str, *, named: bool) -> Any:
     return engine
 
 
-def _start_error(driver_name: str, error: Exception) -> str:
+def _start_error_message(driver_name: str, error: Exception) -> str:
     return f'the driver "{driver_name}" could not be started: {type(error).__name__}: {error}'
 
 
-def _driver_names() -> list[str]:
+def _available_drivers() -> list[str]:
+    """Return the sorted names of pyttsx3's drivers and of `talk`'s own synthesizers."""
     import pkgutil
 
     from pyttsx3 import drivers
@@ -130,8 +138,8 @@ def _driver_names() -> list[str]:
     return sorted(found | SYNTHESIZERS.keys())
 
 
-def _run_loop_step(driver_name: str) -> Callable[[], None]:
-    """Return a function that runs the event loop of a third-party driver, if it needs one."""
+def _make_run_loop_step(driver_name: str) -> Callable[[], None]:
+    """Return a function that runs macOS's event loop once, or does nothing if the driver doesn't need it."""
     if sys.platform != "darwin" or driver_name not in _RUN_LOOP_DRIVERS:
         return lambda: None
     from Foundation import NSDate, NSRunLoop  # type: ignore[import-not-found,unused-ignore]
@@ -140,7 +148,7 @@ def _run_loop_step(driver_name: str) -> Callable[[], None]:
 
 
 class DriverProperties:
-    """The voice, rate, volume and pitch of the engine.
+    """Sets the voice, rate, volume and pitch of pyttsx3's engine.
 
     A property is only set if its value changes, because a third-party driver may not support all of them. The voice is
     always set by an ID from the driver's own list.
@@ -157,7 +165,7 @@ class DriverProperties:
         engine.connect("error", self._record_error)
 
     def apply(self, command: protocol.Speak) -> str | None:
-        """Set the properties for a goal.
+        """Set the properties for a goal. Return the reason if another voice had to be used, otherwise None.
 
         A neural voice may have disappeared since the goal was accepted. The driver then falls back to another of its
         voices, preferably in the same language. It doesn't do so if `voice_only` is set.
@@ -182,12 +190,12 @@ class DriverProperties:
         wanted = fields(command)
         for name, value in self._values.items():
             if wanted[name] != value:
-                self._set(name, wanted[name], f"{name} to {wanted[name]}")
+                self._set_property(name, wanted[name], f"{name} to {wanted[name]}")
                 self._values[name] = wanted[name]
         return fallback_reason
 
     def set_voice(self, wanted: str | None) -> None:
-        """Set a voice, or the driver's default voice if `wanted` is None.
+        """Set the voice that best matches a name, or the driver's default voice if `wanted` is None.
 
         Raises:
             CannotSpeak: there is no such voice.
@@ -196,10 +204,11 @@ class DriverProperties:
             return
         if self._voice is None:
             self._default_voice = self._engine.getProperty("voice")
-        self._set("voice", self._default_voice if wanted is None else self.voice_id(wanted), f"the voice {wanted}")
+        voice = self._default_voice if wanted is None else self.find_voice_id(wanted)
+        self._set_property("voice", voice, f"the voice {wanted}")
         self._voice = wanted
 
-    def voice_id(self, wanted: str) -> str:
+    def find_voice_id(self, wanted: str) -> str:
         """Return the ID of the voice that best matches the user's input.
 
         Raises:
@@ -216,8 +225,8 @@ class DriverProperties:
             raise CannotSpeak(Reason.UNKNOWN_VOICE, voices.unknown_voice_message(wanted, self._voices, foreign))
         return found.id
 
-    def _set(self, name: str, value: Any, shown: str) -> None:
-        """Set a property of the engine. In error messages, `shown` describes the property and its value.
+    def _set_property(self, name: str, value: Any, setting: str) -> None:
+        """Set a property of the engine. In error messages, `setting` names the property and its value.
 
         pyttsx3 reports errors through notifications. This method raises them as exceptions.
 
@@ -232,9 +241,10 @@ class DriverProperties:
             raise CannotSpeak(Reason.UNKNOWN_VOICE, message) from error
         if error is not None:
             why = str(error.args[0] if error.args else error) or type(error).__name__
-            raise CannotSpeak(Reason.BAD_OPTION, f"the driver {self._driver} cannot set {shown}: {why}") from error
+            raise CannotSpeak(Reason.BAD_OPTION, f"the driver {self._driver} cannot set {setting}: {why}") from error
 
     def _record_error(self, exception: Exception, **_: object) -> None:
+        """Store an error that pyttsx3 reports, so that `_set_property` can raise it."""
         self._error = exception
 
 
@@ -269,12 +279,12 @@ class Driver:
             self._speak(text)
 
     def say(self, text: str) -> None:
-        """Store a text. The next step of `iterate` speaks it."""
+        """Store a text, which the next step of `iterate` speaks, and tell pyttsx3 that the driver is busy."""
         self._proxy.setBusy(True)
         self._text = text
 
     def stop(self) -> None:
-        """Stop speaking at once."""
+        """Discard the stored text, and stop speaking at once."""
         self._text = None
         if self._playback is not None:
             self._playback.stop()
@@ -283,7 +293,7 @@ class Driver:
     destroy = stop
 
     def getProperty(self, name: str) -> Any:  # noqa: N802 - pyttsx3's name
-        """Return the value of a property.
+        """Return the list of voices, the ID of the current voice, or the value of a speech setting.
 
         Raises:
             KeyError: the property is unknown.
@@ -296,7 +306,7 @@ class Driver:
         return self._synthesizer.voice if name == "voice" else fields(self._sound)[name]
 
     def setProperty(self, name: str, value: Any) -> None:  # noqa: N802 - pyttsx3's name
-        """Set a property.
+        """Load a voice if the property is "voice". Otherwise, change a setting for the next sentences.
 
         Raises:
             KeyError: the property is unknown.
@@ -309,10 +319,10 @@ class Driver:
             self._sound = replace(self._sound, **{name: kind(value)})
 
     def _speak(self, text: str) -> None:
-        """Speak a text, and then notify pyttsx3 exactly once that it is finished."""
+        """Speak a text to its end, store the results in the runner, and notify pyttsx3 of each step."""
         runner = self._runner
         self._proxy.notify("started-utterance")
-        self._playback = playback = Playback(runner, self._report_word)
+        self._playback = playback = Playback(runner, self._notify_word)
         runner.duration = None
         try:
             self._synthesizer.speak(text, self._sound, playback)
@@ -326,6 +336,7 @@ class Driver:
         self._playback = None
         self._proxy.notify("finished-utterance", completed=runner.duration is not None)
 
-    def _report_word(self, word: TimedWord) -> None:
+    def _notify_word(self, word: TimedWord) -> None:
+        """Notify pyttsx3 that a word is being heard, and store its position in the audio in the runner."""
         self._runner.position = word.position
         self._proxy.notify("started-word", location=word.location, length=word.length)

@@ -104,7 +104,7 @@ class SentenceSamples:
         return self.begin + len(self._kept)
 
     def add(self, samples: bytes) -> None:
-        """Add samples at the end."""
+        """Add samples at the end, and update what is known about sound and silence in the sentence."""
         self._kept += samples
         self.audible = self.audible or samples.count(0) != len(samples)
         backwards = reversed(array("h", samples))
@@ -112,11 +112,11 @@ class SentenceSamples:
         self._quiet = self._quiet + len(samples) if quiet_count is None else quiet_count * SAMPLE_BYTES
 
     def leading_zeros(self) -> int:
-        """Return the length in bytes of the zero samples at the beginning."""
+        """Return the length in bytes of the zero samples at the beginning of the buffer."""
         return (len(self._kept) - len(self._kept.lstrip(b"\0"))) // SAMPLE_BYTES * SAMPLE_BYTES
 
     def part(self, begin: int, end: int) -> memoryview:
-        """Return the samples between two offsets. Release the view before adding or dropping samples."""
+        """Return a view of the samples between two offsets. Release it before adding or dropping samples."""
         return memoryview(self._kept)[begin - self.begin : end - self.begin]
 
     def drop_until(self, offset: int) -> None:
@@ -130,7 +130,7 @@ class SentenceSamples:
 
 
 class PlayerFeed:
-    """Sends samples to one player, and adjusts the word clock to the player's progress."""
+    """Sends samples to one player, and adjusts the clock for word reports to the player's progress."""
 
     def __init__(self, player: Player, rate: int, clock: WordClock, begin: float, lead_in: float) -> None:
         """Start a stream, and reset the clock for it.
@@ -161,7 +161,7 @@ class PlayerFeed:
         clock.reset(begin)
 
     def offer(self, samples: memoryview) -> int:
-        """Offer at most `piece_bytes` of samples to the player, and return the number of bytes accepted."""
+        """Offer samples to the player, and return the number of bytes accepted. The first ones start the clock."""
         taken = self.player.offer(samples)
         if taken:
             now = time.monotonic()
@@ -174,7 +174,7 @@ class PlayerFeed:
         return taken
 
     def offer_silence(self, position: float, limit: int | None = None) -> int:
-        """Offer silence to the player, and return the number of bytes accepted.
+        """Offer silence to the player, record it in the clock, and return the number of bytes accepted.
 
         Args:
             position: position in the audio of the next sample.
@@ -204,9 +204,12 @@ class PlayerFeed:
         """Return how many seconds of sound were written but not heard yet."""
         return max(0.0, self.time_left(self.written, now))
 
-    def time_left(self, written: int, now: float) -> float:
-        """Return the seconds until a byte of the stream is heard. The result is negative if it was already heard."""
-        return self._seconds(written) - self._clock.elapsed(now)
+    def time_left(self, byte_count: int, now: float) -> float:
+        """Return the seconds until this many bytes of the stream have been heard.
+
+        The result is negative if they have already been heard.
+        """
+        return self._seconds(byte_count) - self._clock.elapsed(now)
 
     def silent_for(self, now: float) -> float:
         """Return how long the player has had nothing to play, in seconds."""
@@ -218,12 +221,13 @@ class PlayerFeed:
         """Return how many seconds of audio would be lost if the player ended now."""
         return self._first_write_at + self._seconds(self.written) - now
 
-    def _seconds(self, length: int) -> float:
-        return length / (self._rate * SAMPLE_BYTES)
+    def _seconds(self, byte_count: int) -> float:
+        """Return the duration of this many bytes of samples."""
+        return byte_count / (self._rate * SAMPLE_BYTES)
 
 
 class _PlayerReleased(Exception):
-    """The player was released during a pause. The current step is repeated with a new player after the pause."""
+    """Raised if the player was released during a pause. After the pause, a new player repeats the current step."""
 
 
 class Playback:
@@ -270,7 +274,7 @@ class Playback:
     # -- methods for the synthesizer
 
     def begin(self, rate: int, voice: str, fallback_reason: str | None = None) -> None:
-        """Begin the sentence and start a player.
+        """Set the sample rate, report the voice to the server, and start a player unless the goal is paused.
 
         The player starts in 1 to 15 ms, while the synthesizer produces the first samples. `write` raises its errors.
 
@@ -307,7 +311,7 @@ class Playback:
         """
         self._samples.add(samples)
         self._wait(until=0.0)  # check for a stop here, because writing to a file never waits
-        if self._samples.audible and self._find_start():
+        if self._samples.audible and self._skip_leading_zeros():
             self._with_player(self._send_all)
 
     def wait(self, descriptor: int) -> None:
@@ -320,13 +324,13 @@ class Playback:
         if self._feed is not None:
             self._with_player(lambda feed: self._await_samples(feed, more))
             return
-        self._await_continue()
+        self._wait_for_continue()
         self._wait((more,))
 
     # -- methods for the driver
 
     def finish(self) -> float:
-        """Play the sentence to its end, and return its length in seconds.
+        """Play the sentence to its end, report its remaining words, and return its length in seconds.
 
         If any part of the sentence wasn't heard, this method raises CannotSpeak.
         """
@@ -375,21 +379,22 @@ class Playback:
         It is repeated if the player fails before any sound was heard, or if the player was released during a pause.
         """
         while True:
-            self._check_stopped()
+            self._raise_if_stopped()
             try:
                 if self._feed is None:
-                    self._await_continue()
+                    self._wait_for_continue()
                     if 0 < self._begin == self._samples.end:  # the sentence was paused at its very end
                         return
-                    self._feed = self._open()
+                    self._feed = self._open_next_player()
                 step(self._feed)
                 return
             except _PlayerReleased:
                 pass
             except CannotSpeak as error:
-                self._next_player(error)
+                self._handle_player_error(error)
 
-    def _open(self) -> PlayerFeed:
+    def _open_next_player(self) -> PlayerFeed:
+        """Open the next candidate player, and return a feed that begins with the first unheard sample."""
         self._untried = self._untried or self._players.candidates(self._rate)
         player = next(self._untried)()
         self._sent = self._begin
@@ -397,14 +402,14 @@ class Playback:
         lead_in = self._players.lead_in_seconds(begins=self._begin == self._skipped)
         return PlayerFeed(player, self._rate, self._clock, self._seconds(self._begin), lead_in)
 
-    def _next_player(self, error: CannotSpeak) -> None:
-        """Release a player that has failed, or raise an error if no other player can replace it.
+    def _handle_player_error(self, error: CannotSpeak) -> None:
+        """Release a failed player so that the next can be tried, or raise an error if none can replace it.
 
         There is no replacement if some of the sound may have been heard, or if no other player is left.
         """
         feed = self._feed
         if feed is not None and feed.player.real_time and self._runner.hold_number:
-            self._rewind(feed)  # another player continues the sentence after the pause
+            self._release_and_rewind(feed)  # another player continues the sentence after the pause
             return
         first = self._first_error
         if first is None or first.reason == Reason.NO_PLAYER:  # prefer any other error to NO_PLAYER
@@ -412,7 +417,7 @@ class Playback:
         lost = error.final or error.reason == Reason.AUDIO_STALLED or (feed is not None and feed.player.proven)
         others = list(self._untried or ())
         self._untried = iter(others) if others else None
-        if lost or not (others or self._may_retry(first)):
+        if lost or not (others or self._may_retry_busy_device(first)):
             if feed is not None:
                 self._players.update_output(feed.player)
             raise error if lost else first
@@ -420,20 +425,20 @@ class Playback:
         if not others:
             self._wait(until=time.monotonic() + DEVICE_RETRY_INTERVAL_S)
 
-    def _may_retry(self, error: CannotSpeak) -> bool:
+    def _may_retry_busy_device(self, error: CannotSpeak) -> bool:
         """Return whether the device is busy and may be tried again. The first call starts the time limit."""
         if error.reason != Reason.AUDIO_DEVICE or "busy" not in str(error).lower():
             return False
         self._busy_until = self._busy_until or time.monotonic() + DEVICE_BUSY_LIMIT_S
         return time.monotonic() < self._busy_until
 
-    def _release_player(self, begin: int) -> None:
-        """Release the player. The next player continues at the offset `begin`."""
-        self._begin = self._sent = begin
+    def _release_player(self, next_begin: int) -> None:
+        """Kill the player, and start over with the best one. It continues at the offset `next_begin`."""
+        self._begin = self._sent = next_begin
         self._untried = self._first_error = None
         self.silence()
 
-    def _rewind(self, feed: PlayerFeed) -> None:
+    def _release_and_rewind(self, feed: PlayerFeed) -> None:
         """Release a player that still has sound in its buffer. The next player repeats the unheard sound."""
         feed.update(time.monotonic(), complete=False)
         self._release_player(self._unheard_begin() if feed.player.proven else self._begin)
@@ -441,32 +446,32 @@ class Playback:
     # -- steps
 
     def _send_all(self, feed: PlayerFeed) -> None:
-        """Send all samples in the buffer to the player."""
+        """Send the player all samples up to `_sendable_end`. Play silence while the sentence is paused."""
         if feed.written == 0:
             feed.progress_at = time.monotonic()  # until now, the player had nothing to play
         while True:
             if self._runner.hold_number:
                 self._keep_silent(feed)
-            if self._sent == self._audible_end(feed):
-                self._update(feed)  # the next samples may not arrive for a long time
+            if self._sent == self._sendable_end(feed):
+                self._update_progress(feed)  # the next samples may not arrive for a long time
                 return
-            taken = self._offer(feed)
-            self._update(feed)
+            taken = self._offer_next(feed)
+            self._update_progress(feed)
             if taken:
                 continue
             limit = FIRST_SOUND_LIMIT_S if feed.consumed == 0 else STALL_LIMIT_S
             due = feed.progress_at + limit if feed.player.real_time else NEVER  # the reader of a pipe may be slow
-            self._wait_for(feed, due)
-            if time.monotonic() >= due and not self._runner.hold_number and not self._offer(feed):
+            self._wait_for_player(feed, due)
+            if time.monotonic() >= due and not self._runner.hold_number and not self._offer_next(feed):
                 raise CannotSpeak(Reason.AUDIO_STALLED, f"{feed.player.name} accepted no sound for {limit:g} s")
 
     def _await_samples(self, feed: PlayerFeed, more: Interest) -> None:
-        """Keep playing while waiting for more samples."""
+        """Keep playing until the descriptor `more` announces samples or the player needs attention."""
         if self._runner.hold_number:
             self._keep_silent(feed)
         feed.player.ended()  # check for a failure here, because the wait below doesn't report it
-        self._wait_for(feed, NEVER, more)
-        self._update(feed)
+        self._wait_for_player(feed, NEVER, more)
+        self._update_progress(feed)
         feed.progress_at = time.monotonic()  # until now, the player had nothing to play
 
     def _drain(self, feed: PlayerFeed) -> None:
@@ -477,24 +482,24 @@ class Playback:
         now = time.monotonic()
         deadline = now + feed.buffered(now) + DRAIN_LIMIT_S
         while not player.ended():
-            self._update(feed)
+            self._update_progress(feed)
             now = time.monotonic()
             # If less sound is left, it isn't worth killing the player, because it will finish anyway.
             if self._runner.hold_number and feed.buffered(now) > HOLD_SILENCE_LIMIT_S:
-                self._rewind(feed)
+                self._release_and_rewind(feed)
                 raise _PlayerReleased
             if now >= deadline:
                 message = f"{player.name} did not exit within {DRAIN_LIMIT_S:g} s after the sound"
                 raise CannotSpeak(Reason.AUDIO_STALLED, message)
-            self._wait_for(feed, deadline)
+            self._wait_for_player(feed, deadline)
         missing = feed.missing_seconds(time.monotonic())
         if player.real_time and missing > EARLY_END_LIMIT_S - self._seconds(self._samples.end - self._sent):
             raise CannotSpeak(Reason.AUDIO_LOST, f"{player.name} ended {missing:.1f} s before the end of the sound")
 
     # -- samples
 
-    def _find_start(self) -> bool:
-        """Decide how many zero samples to skip at the beginning. Return False if it is too early to decide.
+    def _skip_leading_zeros(self) -> bool:
+        """Decide how many zero samples at the beginning to skip. Return False if it is too early to decide.
 
         Zeros before the first sound are skipped, so that it is heard earlier. They are kept in a file. They are also
         kept after another sentence, because they are part of the silence between the two sentences.
@@ -512,13 +517,13 @@ class Playback:
             self._clock.reset(self._seconds(zeros))
         return True
 
-    def _offer(self, feed: PlayerFeed) -> int:
-        """Offer the next samples or silence to the player, and return the number of bytes accepted."""
+    def _offer_next(self, feed: PlayerFeed) -> int:
+        """Offer the next samples or the lead-in silence to the player, and return the number of bytes accepted."""
         if feed.lead_in:
             taken = feed.offer_silence(self._seconds(self._begin), feed.lead_in)
             feed.lead_in -= taken
             return taken
-        with self._samples.part(self._sent, min(self._audible_end(feed), self._sent + feed.piece_bytes)) as part:
+        with self._samples.part(self._sent, min(self._sendable_end(feed), self._sent + feed.piece_bytes)) as part:
             silent = feed.silent_for(time.monotonic())
             taken = feed.offer(part)
         if taken and silent > INAUDIBLE_GAP_S and self._in_background and feed.player.real_time:
@@ -526,8 +531,8 @@ class Playback:
         self._sent += taken
         return taken
 
-    def _audible_end(self, feed: PlayerFeed) -> int:
-        """Return the offset at which to stop playing for now.
+    def _sendable_end(self, feed: PlayerFeed) -> int:
+        """Return the offset up to which samples may be sent for now.
 
         Silence at the end is held back, because it is shortened if another goal is waiting.
         """
@@ -536,10 +541,10 @@ class Playback:
         limit = int(self._players.handovers.silence_to_cut(feed.player.name) * self._rate) * SAMPLE_BYTES
         return max(self._sent, self._samples.end - self._samples.trailing_silence(limit))
 
-    def _update(self, feed: PlayerFeed) -> None:
+    def _update_progress(self, feed: PlayerFeed) -> None:
         """Adjust the clock, report the words that have started, and drop the samples that were heard."""
         now = time.monotonic()
-        sent_all = self._complete and self._sent == self._audible_end(feed)
+        sent_all = self._complete and self._sent == self._sendable_end(feed)
         feed.update(now, complete=sent_all and not self._runner.hold_number)
         player = feed.player
         if not player.proven:
@@ -561,19 +566,20 @@ class Playback:
         heard = self._clock.heard_position(time.monotonic()) - REPEATED_SOUND_S
         return min(self._sent, max(self._begin, self._samples.begin, int(max(0.0, heard) * self._rate) * SAMPLE_BYTES))
 
-    def _seconds(self, length: int) -> float:
-        return length / (self._rate * SAMPLE_BYTES)
+    def _seconds(self, byte_count: int) -> float:
+        """Return the duration of this many bytes of samples."""
+        return byte_count / (self._rate * SAMPLE_BYTES)
 
     # -- holding
 
     def _keep_silent(self, feed: PlayerFeed) -> None:
-        """Play silence while the sentence is paused.
+        """Play silence while the sentence is paused, and confirm the pause to the server.
 
         Raises:
             _PlayerReleased: the player failed, or the pause is longer than `RELEASE_DELAY_S`.
         """
         if not feed.player.real_time:
-            self._await_continue()
+            self._wait_for_continue()
             return
         self._await_silence(feed)
         self._silent_at = time.monotonic()
@@ -589,33 +595,33 @@ class Playback:
                 self._release_player(self._sent)  # everything sent so far has been heard
                 raise _PlayerReleased
             if not taken:
-                self._wait_for(feed, due)
+                self._wait_for_player(feed, due)
         self._silent_at = None
         feed.progress_at = time.monotonic()
 
     def _await_silence(self, feed: PlayerFeed) -> None:
-        """Wait until the player has played the rest of its buffer, or the sentence continues."""
-        self._update(feed)
+        """Wait until the player has played its buffer or the sentence continues. Replace a player that is too slow."""
+        self._update_progress(feed)
         written, now = feed.written, time.monotonic()
         deadline = now + HOLD_SILENCE_LIMIT_S
         too_late = feed.consumed == 0 or feed.time_left(written, now) > HOLD_SILENCE_LIMIT_S
         while self._runner.hold_number and (left := feed.time_left(written, now) + CLOCK_ERROR_S) > 0:
             if too_late or now >= deadline:
-                self._rewind(feed)
+                self._release_and_rewind(feed)
                 raise _PlayerReleased
             if not self._offer_silence(feed):
-                self._wait_for(feed, min(deadline, now + left))
-            self._update(feed)
+                self._wait_for_player(feed, min(deadline, now + left))
+            self._update_progress(feed)
             now = time.monotonic()
 
     def _offer_silence(self, feed: PlayerFeed) -> int:
-        """Offer silence to the player, unless it already has enough.
+        """Offer silence to the player, unless it already has enough, and return the number of bytes accepted.
 
         Without this limit, some players would accept silence endlessly.
         """
         feed.player.ended()  # raises an error if the player has failed
         taken = 0 if self._has_enough_silence(feed) else feed.offer_silence(self._seconds(self._sent))
-        self._update(feed)
+        self._update_progress(feed)
         return taken
 
     def _has_enough_silence(self, feed: PlayerFeed) -> bool:
@@ -624,14 +630,14 @@ class Playback:
 
     # -- waiting
 
-    def _await_continue(self) -> None:
-        """Wait without a player until the sentence continues."""
+    def _wait_for_continue(self) -> None:
+        """Confirm the pause, and wait without a player until the sentence continues."""
         while self._runner.hold_number:
             self._runner.confirm_hold()
             self._wait()
 
-    def _wait_for(self, feed: PlayerFeed, until: float, more: Interest | None = None) -> None:
-        """Wait until the player needs attention or a time limit is reached.
+    def _wait_for_player(self, feed: PlayerFeed, until: float, more: Interest | None = None) -> None:
+        """Wait until the player needs attention, a word is due or a time limit is reached.
 
         Args:
             feed: the stream of the player.
@@ -651,10 +657,10 @@ class Playback:
         self._wait(interests, until)
 
     def _wait(self, interests: Sequence[Interest] = (), until: float = NEVER) -> None:
-        """Wait in the runner. If the sentence is stopped during the wait, raise Stopped."""
+        """Let the runner wait and execute commands. If the sentence has been stopped, raise Stopped."""
         self._runner.wait(interests, until)
-        self._check_stopped()
+        self._raise_if_stopped()
 
-    def _check_stopped(self) -> None:
+    def _raise_if_stopped(self) -> None:
         if self._stopped:
             raise Stopped

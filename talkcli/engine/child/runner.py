@@ -70,7 +70,7 @@ class Channel:
             self.closed = True
 
     def receive(self) -> list[protocol.Command]:
-        """Wait for data, and return the commands that have arrived completely."""
+        """Wait for data, and return the commands that have arrived completely. At the end, set `closed`."""
         try:
             data = os.read(self.descriptor, 65536)
         except ConnectionResetError:
@@ -82,7 +82,7 @@ class Channel:
 
 
 class ActiveGoal:
-    """The goal being spoken."""
+    """The state of the goal that is being spoken."""
 
     def __init__(self, command: protocol.Speak, now: float) -> None:
         self.id = command.id
@@ -117,7 +117,7 @@ class ActiveGoal:
 
 
 class GoalRunner:
-    """Receives the server's commands and executes them. Call `attach_engine` once, and then `run`."""
+    """Executes the server's commands, and speaks its goals. Call `attach_engine` once, and then `run`."""
 
     def __init__(self, channel: Channel, players: PlayerChooser) -> None:
         """Create a runner without an engine.
@@ -150,7 +150,7 @@ class GoalRunner:
         pump: Callable[[], None] | None,
         synthesizer: CombinedSynthesizer | None,
     ) -> None:
-        """Set the engine that speaks the goals.
+        """Set the pyttsx3 engine that speaks the goals, and subscribe to its notifications.
 
         Args:
             engine: pyttsx3's engine.
@@ -164,11 +164,11 @@ class GoalRunner:
         self._pump = pump
         self._synthesizer = synthesizer
         engine.connect("started-word", _with_traceback(self._report_word))
-        engine.connect("finished-utterance", _with_traceback(self._driver_finished))
+        engine.connect("finished-utterance", _with_traceback(self._handle_driver_finished))
         engine.connect("error", _with_traceback(self._record_error))
 
     def run(self, *, send_voices: bool) -> None:
-        """Execute commands until the server has closed the connection.
+        """Speak goals and execute other commands until the server has closed the connection.
 
         Args:
             send_voices: whether to send the list of voices first.
@@ -187,7 +187,7 @@ class GoalRunner:
                 self._speak(self._goal)
 
     def wait(self, interests: Iterable[Interest] = (), until: float = NEVER) -> None:
-        """Wait for a descriptor, a command or a time limit, and execute any commands that arrive.
+        """Wait for a descriptor, a command or a time limit. Execute arriving commands, and send events that are due.
 
         This method may return early. By then, a command may have stopped or paused the sentence.
 
@@ -237,16 +237,18 @@ class GoalRunner:
                 self._engine.stop()
 
     def _stop_goal(self) -> None:
+        """Stop the driver or, if it isn't speaking the current goal, end the goal at once."""
         if self._goal is not None and not self._goal.stop_requested:
             self._goal.stop_requested = True
             if self._goal.with_driver:
                 self._engine.stop()
             else:  # the goal is paused or hasn't started, so the driver would not report its end
-                self._end(protocol.OUTCOME_STOPPED)
+                self._end_goal(protocol.OUTCOME_STOPPED)
 
     def _send_voice_events(self) -> None:
+        """Send the server the latest events about the loading and memory of neural voices."""
         loader = self._synthesizer.loader if self._synthesizer else None
-        for event in loader.events() if loader else ():
+        for event in loader.take_events() if loader else ():
             self._channel.send(event)
 
     def report_voice(self, voice: str, fallback_reason: str | None) -> None:
@@ -264,6 +266,7 @@ class GoalRunner:
             self._channel.send(protocol.Held(goal.id, self.hold_number))
 
     def _report_output(self) -> None:
+        """Tell the server about the output of the current goal, if it has changed."""
         goal, output = self._goal, self.players.output
         if goal is not None and output != goal.reported_output:
             goal.reported_output = output
@@ -272,20 +275,20 @@ class GoalRunner:
     # -- one goal
 
     def _begin_goal(self, command: protocol.Speak) -> None:
-        """Make this the current goal, which `run` speaks next. Commands for it may have arrived together with it."""
+        """Make this the current goal, which `run` speaks next, and tell the server that it has started."""
         self._goal = ActiveGoal(command, time.monotonic())
         self.hold_number, self.duration, self.gaps = 0, None, []
         self.players.begin(command)
         self._channel.send(protocol.Started(command.id))
 
     def _speak(self, goal: ActiveGoal) -> None:
-        """Speak a goal. Return when the goal has ended."""
+        """Set the engine's properties for a goal, and speak the goal until it has ended."""
         try:
             goal.fallback_reason = self._set_properties(goal.command)
         except CannotSpeak as error:
-            self._fail(error.reason, str(error))
+            self._fail_goal(error.reason, str(error))
         if self._goal is goal and self._pump is not None and goal.command.lead_in:
-            self._fail(Reason.BAD_OPTION, "this driver plays the sound itself, so lead_in can't be used")
+            self._fail_goal(Reason.BAD_OPTION, "this driver plays the sound itself, so lead_in can't be used")
         goal.error = None
         while self._goal is goal:
             if goal.with_driver:
@@ -302,10 +305,10 @@ class GoalRunner:
         goal.offset = goal.last_word
         goal.with_driver, goal.interrupted = True, False
         if self._engine.say(goal.command.text[goal.offset :], goal.id) is not None:
-            self._fail(Reason.NOTHING_TO_SAY, "nothing in the text can be spoken")
+            self._fail_goal(Reason.NOTHING_TO_SAY, "nothing in the text can be spoken")
 
     def _step_driver(self, goal: ActiveGoal) -> None:
-        """Run one step of the driver.
+        """Run one step of the driver, and fail the goal if the driver has dropped or rejected the text.
 
         `talk`'s own driver speaks the whole text in one step. A third-party driver needs many steps.
         """
@@ -313,17 +316,17 @@ class GoalRunner:
         if self._goal is not goal:
             return
         if self._pump is None:
-            self._fail(Reason.ENGINE_FAILED, "the driver dropped the sentence")
+            self._fail_goal(Reason.ENGINE_FAILED, "the driver dropped the sentence")
         elif goal.error is not None:  # a driver never reports the end of a text if its `say` has failed
             self._engine.stop()
             self._engine.proxy.setBusy(False)  # otherwise, pyttsx3 would not send the next text to the driver
-            self._driver_finished(goal.id, completed=False)
+            self._handle_driver_finished(goal.id, completed=False)
         else:
             self.wait(until=time.monotonic() + DRIVER_STEP_S)
             self._pump()
 
     def _report_word(self, location: int, length: int, **_: object) -> None:
-        """Report a word to the server.
+        """Send the server the word that starts at a location in the text, unless it was sent before.
 
         The notification's `name` is not compared with the goal's ID, because some drivers set it to the word.
         """
@@ -339,10 +342,12 @@ class GoalRunner:
             self._channel.send(protocol.Word(goal.id, start, end, number, round(seconds, 3)))
 
     def _record_error(self, exception: Exception, **_: object) -> None:
+        """Store the first error that the driver reports for the current goal."""
         if self._goal is not None and self._goal.error is None:
             self._goal.error = exception
 
-    def _driver_finished(self, name: str | None, completed: bool, **_: object) -> None:
+    def _handle_driver_finished(self, name: str | None, completed: bool, **_: object) -> None:
+        """End the current goal after the driver has finished its text, unless it was interrupted by a pause."""
         goal = self._goal
         if goal is None or name != goal.id:  # the notification is for an earlier goal
             return
@@ -351,21 +356,22 @@ class GoalRunner:
             goal.with_driver = False
             goal.spoken_s += time.monotonic() - goal.resumed_at
         elif completed:
-            self._end(protocol.OUTCOME_COMPLETED)
+            self._end_goal(protocol.OUTCOME_COMPLETED)
         elif isinstance(error, CannotSpeak):
-            self._fail(error.reason, str(error))
+            self._fail_goal(error.reason, str(error))
         elif goal.stop_requested:
-            self._end(protocol.OUTCOME_STOPPED)
+            self._end_goal(protocol.OUTCOME_STOPPED)
         elif error is None:
-            self._fail(Reason.ENGINE_FAILED, "the driver stopped before the end of the sentence")
+            self._fail_goal(Reason.ENGINE_FAILED, "the driver stopped before the end of the sentence")
         else:
             traceback.print_exception(error)  # this goes to the server's log
-            self._fail(Reason.ENGINE_FAILED, f"{type(error).__name__}: {error}")
+            self._fail_goal(Reason.ENGINE_FAILED, f"{type(error).__name__}: {error}")
 
-    def _fail(self, reason: Reason, message: str) -> None:
-        self._end(protocol.OUTCOME_FAILED, reason, message)
+    def _fail_goal(self, reason: Reason, message: str) -> None:
+        self._end_goal(protocol.OUTCOME_FAILED, reason, message)
 
-    def _end(self, outcome: str, reason: Reason | None = None, message: str | None = None) -> None:
+    def _end_goal(self, outcome: str, reason: Reason | None = None, message: str | None = None) -> None:
+        """End the current goal, and tell the server how it ended."""
         assert self._goal is not None
         self._report_output()
         goal, self._goal = self._goal, None
@@ -374,15 +380,15 @@ class GoalRunner:
         self._channel.send(ended)
 
     def _alive_due(self) -> float:
-        """Return the time at which to send the next `Alive`, or NEVER if none is needed."""
+        """Return the time at which to send the next `Alive`, or NEVER if none is due or the driver hangs."""
         loader = self._synthesizer.loader if self._synthesizer else None
         loading = loader is not None and loader.descriptor is not None
-        if not loading and (self._goal is None or self._is_overdue(self._goal)):
+        if not loading and (self._goal is None or self._notice_overdue(self._goal)):
             return NEVER
         return self._channel.sent_at + protocol.ALIVE_INTERVAL_S
 
-    def _is_overdue(self, goal: ActiveGoal) -> bool:
-        """Return whether a third-party driver has taken longer than the text can possibly need.
+    def _notice_overdue(self, goal: ActiveGoal) -> bool:
+        """Return whether a third-party driver has taken longer than the text can need, and log it once.
 
         The process then sends no `Alive`, so that the server kills it. There may be no other way to stop the driver.
         """
@@ -398,7 +404,7 @@ class GoalRunner:
 
 
 def _with_traceback(callback: Callable[..., None]) -> Callable[..., None]:
-    """Wrap a callback so that an exception prints its traceback. pyttsx3 drops exceptions silently."""
+    """Wrap a callback so that an exception prints its traceback, because pyttsx3 drops exceptions silently."""
 
     def call(**values: Any) -> None:
         try:

@@ -109,7 +109,7 @@ class WordClock:
         self._waiting.append(word)
 
     def skip_until(self, position: float) -> None:
-        """Skip the audio before this position. Any words in it now start at this position."""
+        """Move all words before this position to it, because the audio before it is skipped."""
         self._waiting = deque(replace(each, position=max(position, each.position)) for each in self._waiting)
 
     def reset(self, position: float) -> None:

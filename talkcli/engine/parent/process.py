@@ -133,7 +133,7 @@ class EngineProcess:
             yield event
 
     def read_stderr(self) -> bool:
-        """Read from the standard error of the process, and return whether it is still open."""
+        """Read the process's standard error, pass on complete lines, and return whether it is still open."""
         try:
             data = os.read(self.stderr, 65536)
         except BlockingIOError:
@@ -142,6 +142,7 @@ class EngineProcess:
         return bool(data)
 
     def _report_stderr(self, data: bytes) -> None:
+        """Pass each complete line to `on_stderr_line`, and remember the last one."""
         for line in self._stderr_lines.feed(data):
             text = line.decode(errors="replace").rstrip()
             if text:
@@ -162,7 +163,7 @@ class EngineProcess:
             kill_holders(self.liveness)
 
     def describe_exit(self) -> str:
-        """Return a human-readable description of how the process exited. Kill it if it is still running."""
+        """Wait briefly for the process to exit, kill it, and return a description of how it exited."""
         wait_ready({self.liveness: select.POLLIN}, _EXIT_WAIT_S)  # macOS doesn't report a closed end without POLLIN
         self.kill()  # must happen before the process is reaped, because its group ID may be reused afterwards
         try:
@@ -175,7 +176,7 @@ class EngineProcess:
         return f"{how} ({self._last_stderr_line})" if self._last_stderr_line else how
 
     def close(self) -> None:
-        """Reap the process if it has exited, and close the descriptors."""
+        """Wait briefly for the process to exit, and close the descriptors."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(_EXIT_WAIT_S)
         self.socket.close()
@@ -183,7 +184,7 @@ class EngineProcess:
 
 
 class EngineFailed(Exception):
-    """The engine process failed.
+    """Raised if the engine process failed.
 
     Attributes:
         reason: machine-readable reason, as in a goal. For ENGINE_CRASHED, the message describes how the process exited.
@@ -239,7 +240,7 @@ class PrivateEngine(contextlib.AbstractContextManager["PrivateEngine"]):
         self._process.close()
 
     def speak(self, command: protocol.GoalCommand) -> None:
-        """Start speaking a text. The process must be ready, and the previous text must have ended."""
+        """Tell the process to speak a text. It must be ready, and must have finished the previous text."""
         self._last_event_at = time.monotonic()
         self._process.send(command)  # if this fails, `wait_for` raises an error
 
@@ -254,6 +255,7 @@ class PrivateEngine(contextlib.AbstractContextManager["PrivateEngine"]):
         return next(event for event in self.events if isinstance(event, event_class))
 
     def _receive_events(self) -> Iterator[protocol.Event]:
+        """Yield the events of the process endlessly. Raise an error if it fails or a time limit has passed."""
         process = self._process
         watched = {process.socket.fileno(): select.POLLIN, process.stderr: select.POLLIN}
         while True:

@@ -97,7 +97,7 @@ def render(
         raise RenderFailed(*fault)
     sound = {each.name: getattr(INITIAL, each.name) for each in SOUND_OPTIONS} | sound
     # A rendering can wait for its voice to load. A file with a different voice would be useless.
-    numbered = enumerate(pieces(text), 1)
+    numbered = enumerate(split_into_pieces(text), 1)
     commands = (protocol.Speak(f"{number}", piece, **sound, voice_only=True) for number, piece in numbered)
     with contextlib.ExitStack() as stack:
         player: str | None = None
@@ -113,7 +113,7 @@ def render(
             with PrivateEngine(configure, deadline=deadline, interrupt=interrupt) as engine:
                 return _speak_all(engine, commands, engine_path, _display_name(path))
         except EngineFailed as error:
-            raise _engine_failure(error, None) from error
+            raise _convert_engine_error(error, None) from error
         except TimeoutError:
             raise TimeoutError("the text was not rendered in time") from None
         except CannotWrite as error:
@@ -122,7 +122,7 @@ def render(
             raise
 
 
-def pieces(text: str) -> Iterator[str]:
+def split_into_pieces(text: str) -> Iterator[str]:
     """Cut a text into pieces of at most `MAX_PIECE_CHARS`, at the end of a sentence or a word if possible."""
     start = 0
     while len(text) - start > MAX_PIECE_CHARS:
@@ -153,26 +153,28 @@ def _speak_all(engine: PrivateEngine, commands: Iterator[protocol.Speak], engine
             engine.speak(command)
             ended = engine.wait_for(protocol.Ended)
         except EngineFailed as error:
-            raise _engine_failure(error, command.voice) from error
+            raise _convert_engine_error(error, command.voice) from error
         if ended.outcome == protocol.OUTCOME_COMPLETED and ended.duration is not None:
             seconds += ended.duration
         elif ended.reason == Reason.NOTHING_TO_SAY:  # a piece of a long text may contain nothing but dots
             silent_end = ended
         else:
-            raise _goal_failure(ended, engine_path, path)
+            raise _convert_goal_error(ended, engine_path, path)
     if silent_end and not seconds:
-        raise _goal_failure(silent_end, engine_path, path)
+        raise _convert_goal_error(silent_end, engine_path, path)
     return seconds
 
 
-def _engine_failure(error: EngineFailed, voice: str | None) -> RenderFailed:
+def _convert_engine_error(error: EngineFailed, voice: str | None) -> RenderFailed:
+    """Convert an EngineFailed to a RenderFailed. `voice` is the voice that was speaking, or None."""
     while_speaking = "" if voice is None else f' while it spoke with the voice "{voice}"'
     if error.reason == Reason.ENGINE_CRASHED:
         return RenderFailed(error.reason, f"the engine crashed{while_speaking}: {error}")
     return RenderFailed(error.reason, f"{error}{while_speaking}")
 
 
-def _goal_failure(ended: protocol.Ended, engine_path: str, path: str) -> RenderFailed:
+def _convert_goal_error(ended: protocol.Ended, engine_path: str, path: str) -> RenderFailed:
+    """Convert the unsuccessful end of a goal to an exception that names the user's file."""
     reason = ended.reason or Reason.ENGINE_FAILED
     message = (ended.message or "the engine stopped before the end of the text").replace(engine_path, path)
     if reason in _FILE_REASONS:
@@ -181,11 +183,13 @@ def _goal_failure(ended: protocol.Ended, engine_path: str, path: str) -> RenderF
     return RenderFailed(reason, message)
 
 
-def _write_failure(path: str, error: OSError) -> CannotWrite:
+def _convert_os_error(path: str, error: OSError) -> CannotWrite:
+    """Convert an OSError to a CannotWrite."""
     return CannotWrite(path, f"cannot be written: {error.strerror}")
 
 
 def _display_name(path: str) -> str:
+    """Return the path for messages, or "standard output" if the path stands for it."""
     return "standard output" if path in STANDARD_OUTPUT else path
 
 
@@ -205,8 +209,8 @@ def _is_stream(path: str) -> bool:
 
 @contextlib.contextmanager
 def _open_output(path: str, deadline: float, interrupt: Mapping[int, int] | None) -> Iterator[int]:
-    """Open standard output, a named pipe or a device for writing, and yield its descriptor."""
-    output_fd = os.dup(1) if path in STANDARD_OUTPUT else _open_without_blocking(path, deadline, interrupt)
+    """Open standard output, a pipe or a device in a `with` block, and yield its descriptor. Refuse a terminal."""
+    output_fd = os.dup(1) if path in STANDARD_OUTPUT else _open_pipe_or_device(path, deadline, interrupt)
     try:
         if os.isatty(output_fd):
             raise UsageError(
@@ -218,14 +222,14 @@ def _open_output(path: str, deadline: float, interrupt: Mapping[int, int] | None
         os.close(output_fd)
 
 
-def _open_without_blocking(path: str, deadline: float, interrupt: Mapping[int, int] | None) -> int:
+def _open_pipe_or_device(path: str, deadline: float, interrupt: Mapping[int, int] | None) -> int:
     """Open a device or a named pipe for writing. Wait until a named pipe has a reader."""
     while True:
         try:
             return os.open(path, os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
         except OSError as error:
             if error.errno != errno.ENXIO or not stat.S_ISFIFO(os.stat(path).st_mode):
-                raise _write_failure(path, error) from error
+                raise _convert_os_error(path, error) from error
         left = min(_READER_CHECK_INTERVAL_S, deadline - time.monotonic())
         if left <= 0:
             raise TimeoutError(f"no program opened {path} for reading in time")
@@ -248,14 +252,14 @@ def _hidden_file(path: str) -> Iterator[str]:
             directory = os.path.dirname(hidden)
             if not os.path.isdir(directory):
                 raise CannotWrite(path, f"cannot be written: the directory {directory} does not exist") from error
-            raise _write_failure(path, error) from error
+            raise _convert_os_error(path, error) from error
         yield hidden
         try:
             with open(hidden, "rb") as file:
                 os.fsync(file)  # protects the file against power cuts, and makes some file systems report a full disk
             os.replace(hidden, target)
         except OSError as error:
-            raise _write_failure(path, error) from error
+            raise _convert_os_error(path, error) from error
     finally:
         # The hidden file may have been renamed or never created. If it can't be removed, the original error is more
         # useful.
@@ -264,7 +268,7 @@ def _hidden_file(path: str) -> Iterator[str]:
 
 
 def _resolve_target(path: str) -> str:
-    """Return the path of the file to replace, with symbolic links resolved.
+    """Return the path of the file to replace, with symbolic links resolved. Refuse a path that can't be replaced.
 
     Raises:
         CannotWrite: the path can't be replaced with a file.
@@ -277,7 +281,7 @@ def _resolve_target(path: str) -> str:
     except FileNotFoundError:
         return target
     except OSError as error:
-        raise _write_failure(path, error) from error
+        raise _convert_os_error(path, error) from error
     if stat.S_ISDIR(found.st_mode):
         raise CannotWrite(path, "is a directory; name a file in it")
     # A link in /proc/*/fd may point to a deleted file, which can't be replaced.
@@ -289,10 +293,10 @@ def _resolve_target(path: str) -> str:
     return target
 
 
-def _is_own_output(found: os.stat_result) -> bool:
+def _is_own_output(status: os.stat_result) -> bool:
     """Return whether the file is this process's own standard output or standard error."""
     for descriptor in (1, 2):
         with contextlib.suppress(OSError):  # the descriptor is closed
-            if os.path.samestat(found, os.fstat(descriptor)):
+            if os.path.samestat(status, os.fstat(descriptor)):
                 return True
     return False

@@ -87,7 +87,7 @@ class ActionQueue:
         return self._receiver.fileno()
 
     def call(self, action: Callable[[], object]) -> None:
-        """Run an action in the engine thread. After `close`, it never runs."""
+        """Queue an action to run in the engine thread. After `close`, it never runs."""
         self._actions.append(action)
         with contextlib.suppress(OSError):  # the queue is closed, or its buffer is full
             self._sender.send(b"\0")
@@ -146,6 +146,7 @@ class RestartPolicy:
         return permanent_error is None and started_at >= self._missing_since + ENGINE_WAIT_LIMIT_S
 
     def _back_off(self, now: float) -> None:
+        """Schedule the next start after a delay that grows with each consecutive failure."""
         self.next_start_at = now + RESTART_DELAYS_S[min(self._failures, len(RESTART_DELAYS_S) - 1)]
         self._failures += 1
 
@@ -207,7 +208,7 @@ class Supervisor:
     # -- methods for other threads
 
     def speak(self, command: protocol.GoalCommand) -> None:
-        """Submit a goal. The previous goal must have ended or been given up."""
+        """Submit a goal to be spoken. The previous goal must have ended or been given up."""
         self._actions.call(lambda: self._begin_goal(command))
 
     def stop(self, goal_id: str) -> None:
@@ -244,7 +245,7 @@ class Supervisor:
         self._actions.call(lambda: self._give_up_goal(goal_id))
 
     def close(self) -> None:
-        """Kill the process and end the thread."""
+        """Tell the engine thread to kill the process and end. Return without waiting."""
         self._closing = True
         self._actions.call(lambda: None)
 
@@ -257,9 +258,9 @@ class Supervisor:
                 # The time is taken before waiting. If the machine is suspended during the wait, messages that have
                 # arrived are then read before any deadline counts as missed.
                 now, deadline = time.monotonic(), self._next_deadline()
-                self._wait(deadline)
+                self._wait_and_handle(deadline)
                 if now >= deadline and not self._closing:
-                    self._check_deadlines(now)
+                    self._handle_deadlines(now)
             self._actions.run()  # actions submitted before `close`
         except Exception as error:
             self._closing = True
@@ -268,7 +269,7 @@ class Supervisor:
         finally:
             self._shut_down()
 
-    def _wait(self, until: float) -> None:
+    def _wait_and_handle(self, until: float) -> None:
         """Wait until a process sends something, an action is submitted, or the time is reached, and handle it."""
         watched = dict.fromkeys([self._actions.fileno(), *self._watched], select.POLLIN)
         ready = wait_ready(watched, until - time.monotonic())
@@ -279,6 +280,7 @@ class Supervisor:
                 self._handle_ready(process, descriptor)
 
     def _next_deadline(self) -> float:
+        """Return the time at which `_handle_deadlines` must be called next."""
         deadlines = [*(deadline for deadline, _ in self._deadlines()), *self._dying.values()]
         return min([*deadlines, NEVER if self._process else self._restarts.next_start_at])
 
@@ -294,7 +296,8 @@ class Supervisor:
         elif self._loading is not None:
             yield self._last_sign_at + HANG_LIMIT_S, f"{no_sign} while loading {self._loading}"
 
-    def _check_deadlines(self, now: float) -> None:
+    def _handle_deadlines(self, now: float) -> None:
+        """Replace a process that has missed a deadline, start a missing process, or kill a dying one again."""
         missed = next((message for deadline, message in self._deadlines() if now >= deadline), None)
         if missed:
             self._lose_process(missed, Reason.ENGINE_HUNG)
@@ -308,6 +311,7 @@ class Supervisor:
                 self._fail_goal(self._goal, Reason.NOT_SILENT, message)
 
     def _handle_ready(self, process: EngineProcess, descriptor: int) -> None:
+        """Handle a readable descriptor of a process: its exit, its standard error or its messages."""
         if descriptor == process.liveness:
             if process is self._process:
                 self._receive(process)  # read the last messages of the process before handling its death
@@ -322,19 +326,19 @@ class Supervisor:
 
     # -- goals
 
-    def _current(self, goal_id: str) -> SupervisedGoal | None:
-        """Return the goal with this ID, or None if the goal has ended."""
+    def _current_goal(self, goal_id: str) -> SupervisedGoal | None:
+        """Return the current goal if it has this ID, otherwise None."""
         return self._goal if self._goal and self._goal.command.id == goal_id else None
 
     def _begin_goal(self, command: protocol.GoalCommand) -> None:
-        """Make this the current goal, and send it to the process."""
+        """Make this the current goal, and send it to the process. If no process can start, fail the goal."""
         self._goal = SupervisedGoal(command)
         if self._restarts.permanent_error is not None:
             self._fail_goal(self._goal, Reason.ENGINE_FAILED, self._restarts.permanent_error)
         else:
-            self._send_goal()
+            self._send_waiting_goal()
 
-    def _send_goal(self) -> None:
+    def _send_waiting_goal(self) -> None:
         """Send the current goal to the process, if the goal is waiting and the process is ready."""
         goal = self._goal
         if goal and not (goal.sent or goal.hold_number or goal.end):
@@ -347,7 +351,7 @@ class Supervisor:
             self._loading, self._last_sign_at = voice, time.monotonic()
 
     def _send(self, command: protocol.Command) -> bool:
-        """Send a command to the process if it is ready, and return whether it was sent.
+        """Send a command if the process is ready, and return whether it was sent. Replace a process that refuses it.
 
         A process that doesn't accept the command is replaced.
         """
@@ -363,7 +367,7 @@ class Supervisor:
 
     def _hold_goal(self, goal_id: str, number: int | None) -> None:
         """Pause the goal, or resume it if `number` is None."""
-        goal = self._current(goal_id)
+        goal = self._current_goal(goal_id)
         if goal is None or goal.stop_due != NEVER or goal.end or goal.hold_number == number:
             return
         goal.hold_number = number
@@ -373,10 +377,11 @@ class Supervisor:
         elif number is not None:
             self._post(protocol.Held(goal_id, number))  # the goal is already silent, because no process is speaking it
         else:
-            self._send_goal()
+            self._send_waiting_goal()
 
     def _stop_goal(self, goal_id: str) -> None:
-        goal = self._current(goal_id)
+        """Tell the process to stop the goal. If the process doesn't have the goal, end it as stopped."""
+        goal = self._current_goal(goal_id)
         if goal is None or goal.stop_due != NEVER:
             return
         stopped = protocol.Ended(goal_id, protocol.OUTCOME_STOPPED)
@@ -389,22 +394,26 @@ class Supervisor:
             self._send(protocol.Stop(goal_id))
 
     def _give_up_goal(self, goal_id: str) -> None:
-        goal = self._current(goal_id)
+        """Forget the goal, and replace the process that is speaking it."""
+        goal = self._current_goal(goal_id)
         if goal:
             self._goal = None
             if goal.sent:
                 self._lose_process("the engine could not be silenced", Reason.NOT_SILENT)
 
     def _fail_goal(self, goal: SupervisedGoal, reason: Reason, message: str) -> None:
+        """End the goal as failed."""
         self._end_goal(protocol.Ended(goal.command.id, protocol.OUTCOME_FAILED, reason, message))
 
     def _end_goal(self, ended: protocol.Ended) -> None:
+        """Forget the current goal, and post its `Ended` event."""
         self._goal = None
         self._post(ended)
 
     # -- the process
 
     def _start_process(self) -> None:
+        """Start an engine process. If this fails, report it and schedule another start."""
         self._started_at = time.monotonic()
         try:
             process = EngineProcess(self._configure, self._report_stderr)
@@ -417,6 +426,7 @@ class Supervisor:
         self._watched |= dict.fromkeys((process.socket.fileno(), process.liveness, process.stderr), process)
 
     def _report_stderr(self, line: str) -> None:
+        """Post a line from a process's standard error, unless there were too many lines recently."""
         omitted = self._stderr_quota.allow(time.monotonic())
         if omitted:
             self._post(EngineSaid(f"({omitted} lines were omitted)"))
@@ -434,12 +444,14 @@ class Supervisor:
             self._handle_event(process, event)
 
     def _handle_crash(self, process: EngineProcess) -> None:
+        """Clean up after a process that has crashed, and report how it exited."""
         self._lose_process(f"the engine crashed: {process.describe_exit()}", Reason.ENGINE_CRASHED)
 
     def _handle_event(self, process: EngineProcess, event: protocol.Event) -> None:
+        """Update the state after an event from the process, and post the event if others need it."""
         self._last_sign_at = time.monotonic()
         if isinstance(event, protocol.GoalEvent):
-            goal = self._current(event.id)
+            goal = self._current_goal(event.id)
             if goal:
                 process.had_goal = True
                 self._handle_goal_event(goal, event)
@@ -451,9 +463,10 @@ class Supervisor:
         self._post(event)
         if isinstance(event, protocol.StartFailed):
             self._lose_process(event.message, event.reason, event)
-        self._send_goal()
+        self._send_waiting_goal()
 
     def _handle_goal_event(self, goal: SupervisedGoal, event: protocol.GoalEvent) -> None:
+        """Update the current goal after an event about it, and post the event if others need it."""
         if isinstance(event, protocol.Started):
             goal.started = True
         elif isinstance(event, protocol.Ended):
@@ -517,7 +530,7 @@ class Supervisor:
             self._post(EngineMissing(message))
 
     def _release_process(self, process: EngineProcess) -> None:
-        """Clean up after a process that has exited, and end its goal."""
+        """Release a process that has exited, and end the goal that was waiting for its exit."""
         del self._watched[process.liveness]
         if self._watched.pop(process.stderr, None):
             process.read_stderr()
@@ -528,11 +541,11 @@ class Supervisor:
             self._end_goal(goal.end)
 
     def _shut_down(self) -> None:
-        """Kill the process, and wait a limited time for it to exit."""
+        """Kill the process, wait a limited time for it to exit, and close all descriptors."""
         self._lose_process("the server is shutting down", Reason.SHUTDOWN)
         deadline = time.monotonic() + KILL_LIMIT_S / 4
         while self._dying and time.monotonic() < deadline:
-            self._wait(deadline)
+            self._wait_and_handle(deadline)
         for process in self._dying:
             process.close()
         self._actions.close()

@@ -21,7 +21,7 @@ Interest = tuple[int, int]
 
 
 class CannotSpeak(Exception):
-    """All or part of the sentence can't be spoken.
+    """Raised if all or part of the sentence can't be spoken.
 
     Args:
         reason: The machine-readable reason, such as "audio_lost".
@@ -36,15 +36,15 @@ class CannotSpeak(Exception):
 
 
 class Stopped(Exception):
-    """The sentence was stopped."""
+    """Raised if the sentence was stopped."""
 
 
 class CannotEnd(Exception):
-    """A player couldn't be killed. The engine process must exit, because it can't guarantee silence any more."""
+    """Raised if a player couldn't be killed. The engine process must exit, because it can't guarantee silence."""
 
 
 class Player(Protocol):
-    """A player for one sentence.
+    """The interface of a player, which plays the samples of one sentence.
 
     The constructor raises CannotSpeak (`no_player` or `audio_device`) if the output can't be opened, and leaves nothing
     open then. After that, the playback calls the player from a single thread:
@@ -106,7 +106,7 @@ class Player(Protocol):
         return None
 
     def close(self) -> None:
-        """Accept no more samples, and play the accepted ones to the end.
+        """Accept no more samples, and let the accepted ones play to the end. Return without waiting.
 
         Raises:
             CannotSpeak: The accepted samples can't be played to the end.
@@ -120,13 +120,13 @@ class Player(Protocol):
         """
 
     def interests(self) -> Sequence[Interest]:
-        """Return the open descriptors that report room for samples, a failure or the end of the player.
+        """Return the open descriptors to poll for room, a failure or the end, each with its poll events.
 
         The playback ignores descriptors that only wait for POLLOUT while it has no samples to offer.
         """
 
     def wake_at(self) -> float:
-        """Return the monotonic time at which to check the player again, or NEVER if poll is enough."""
+        """Return the monotonic time at which to check the player again, or NEVER if its descriptors are enough."""
 
     def kill(self) -> None:
         """Stop playing at once, and start to release all resources.

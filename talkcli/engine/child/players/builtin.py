@@ -43,24 +43,31 @@ class BuiltInPlayer(Player):
         self._closed = False
 
     def consumed(self) -> int:
+        """Return the number of bytes accepted so far."""
         return self._taken
 
     def close(self) -> None:
+        """Accept no more samples."""
         self._closed = True
 
     def ended(self) -> bool:
+        """Return whether `close` or `kill` was called."""
         return self._closed
 
     def interests(self) -> Sequence[Interest]:
+        """Return no descriptors, because this player never makes the caller wait."""
         return ()
 
     def wake_at(self) -> float:
+        """Return 0, so that the player is checked again at once."""
         return 0.0
 
     def kill(self) -> None:
+        """Accept no more samples."""
         self._closed = True
 
     def gone(self) -> bool:
+        """Return True, because there is nothing to release."""
         return True
 
 
@@ -82,6 +89,7 @@ class NullPlayer(BuiltInPlayer):
         self._end_time = 0.0
 
     def offer(self, data: memoryview) -> int:
+        """Accept all of the samples if the simulated buffer has room for them, otherwise none."""
         now = self._clock()
         end = max(now, self._end_time) + len(data) / self._bytes_per_second
         if end > now + NULL_AHEAD_S:
@@ -91,9 +99,11 @@ class NullPlayer(BuiltInPlayer):
         return len(data)
 
     def ended(self) -> bool:
+        """Return whether the player was closed and all accepted samples would have been heard."""
         return self._closed and self._clock() >= self._end_time
 
     def wake_at(self) -> float:
+        """Return the time at which the simulated buffer has room or, after `close`, is empty."""
         # At this time, a third of the buffer is free, so this player wakes up no more often than a real one.
         return self._end_time if self._closed else self._end_time - NULL_AHEAD_S * 2 / 3
 
@@ -118,40 +128,44 @@ class WavPlayer(BuiltInPlayer):
         self.name = f"{FILE_PREFIX}{path}"
         self._path = path
         self._rate = rate
-        with _os_errors(Reason.AUDIO_DEVICE, f"{path} cannot be written"), contextlib.ExitStack() as opened:
-            self._file = _open_regular(path)
+        with _convert_os_errors(Reason.AUDIO_DEVICE, f"{path} cannot be written"), contextlib.ExitStack() as opened:
+            self._file = _open_regular_file(path)
             opened.callback(os.close, self._file)
-            self._start = _sample_bytes(self._file, path, rate)
+            self._start = _read_sample_bytes(self._file, path, rate)
             os.ftruncate(self._file, _WAV_HEADER.size + self._start)
             self._write_header()
             opened.pop_all()
 
     def offer(self, data: memoryview) -> int:
+        """Write the samples to the file, and return the number of bytes written."""
         if self._closed:
             return 0
         end = self._start + self._taken
         if end + len(data) > _MAX_WAV_BYTES:
             raise CannotSpeak(Reason.AUDIO_LOST, f"{self._path} is full; a WAV file holds at most 4 GiB")
-        with _os_errors(Reason.AUDIO_LOST, self._path):
+        with _convert_os_errors(Reason.AUDIO_LOST, self._path):
             taken = os.pwrite(self._file, data, _WAV_HEADER.size + end)
         self._taken += taken
         return taken
 
     def close(self) -> None:
+        """Write the final header, and close the file."""
         if self._closed:
             return
         self._closed = True
-        with _os_errors(Reason.AUDIO_LOST, self._path):
+        with _convert_os_errors(Reason.AUDIO_LOST, self._path):
             try:
                 self._write_header()
             finally:
                 os.close(self._file)  # some network file systems report a full disk or an exceeded quota only here
 
     def kill(self) -> None:
+        """Keep the samples written so far, close the file, and ignore any error."""
         with contextlib.suppress(CannotSpeak):  # the sentence was stopped, or has already failed with another error
             self.close()
 
     def _write_header(self) -> None:
+        """Write a WAV header for all samples that the file contains so far."""
         os.pwrite(self._file, _WAV_HEADER.pack(*_header_fields(self._rate, self._start + self._taken)), 0)
 
 
@@ -173,10 +187,11 @@ class WavStreamPlayer(BuiltInPlayer):
         self._header = _WAV_HEADER.pack(*_header_fields(rate, _UNKNOWN_BYTES)) if first else b""
 
     def offer(self, data: memoryview) -> int:
+        """Write the samples if the output has room, and return the number of sample bytes written."""
         # A writable pipe has room for at least a header and a piece of samples.
         if not wait_ready({self._output: select.POLLOUT}, 0.0):
             return 0
-        with _os_errors(Reason.AUDIO_LOST, self.name):
+        with _convert_os_errors(Reason.AUDIO_LOST, self.name):
             written = os.write(self._output, self._header + data)
         header = min(written, len(self._header))
         self._header = self._header[header:]
@@ -184,22 +199,30 @@ class WavStreamPlayer(BuiltInPlayer):
         return written - header
 
     def interests(self) -> list[Interest]:
+        """Return the output's descriptor, to be polled for room."""
         return [(self._output, select.POLLOUT)]
 
     def wake_at(self) -> float:
+        """Return NEVER, because the output's descriptor reports when there is room."""
         return NEVER
 
 
 @contextlib.contextmanager
-def _os_errors(reason: Reason, subject: str) -> Iterator[None]:
-    """Convert an OSError to CannotSpeak."""
+def _convert_os_errors(reason: Reason, subject: str) -> Iterator[None]:
+    """Convert an OSError raised in a `with` block to CannotSpeak."""
     try:
         yield
     except OSError as error:
         raise CannotSpeak(reason, f"{subject}: {error.strerror}") from error
 
 
-def _open_regular(path: str) -> int:
+def _open_regular_file(path: str) -> int:
+    """Open a file for reading and writing, and return its descriptor. Create the file if it doesn't exist.
+
+    Raises:
+        CannotSpeak: The path is empty, or isn't that of a regular file.
+        OSError: The file can't be opened.
+    """
     if not path:
         raise CannotSpeak(Reason.AUDIO_DEVICE, 'the player "file:" needs a path, such as file:speech.wav')
     file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK, 0o666)
@@ -216,8 +239,8 @@ def _header_fields(rate: int, sample_bytes: int) -> tuple[bytes | int, ...]:
     return b"RIFF", riff_bytes, b"WAVE", b"fmt ", 16, *audio_format, b"data", sample_bytes
 
 
-def _sample_bytes(file: int, path: str, rate: int) -> int:
-    """Return the number of sample bytes in a file, or 0 if the file is empty.
+def _read_sample_bytes(file: int, path: str, rate: int) -> int:
+    """Read the number of sample bytes from a file's WAV header, or return 0 if the file is empty.
 
     Raises:
         CannotSpeak: The file wasn't written by a `WavPlayer` with this sample rate.

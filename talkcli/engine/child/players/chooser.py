@@ -71,20 +71,20 @@ class HandoverTimes:
         """Whether another goal was waiting when the previous sentence ended."""
         return self._previous is not None
 
-    def silence_to_cut(self, player: str) -> float:
+    def silence_to_cut(self, player_name: str) -> float:
         """Return how many seconds of silence to cut from the end of a sentence with this player."""
-        measured = sorted(self._measured.get((player, self.next_is_neural), ()))
+        measured = sorted(self._measured.get((player_name, self.next_is_neural), ()))
         return min(MAX_CUT_S, measured[len(measured) // 2]) if measured else 0.0
 
-    def sentence_ended(self, player: str, last_sample_at: float) -> None:
-        """Record when the last sample of a completed sentence is heard."""
-        self._previous = (player, last_sample_at) if self.next_waits else None
+    def sentence_ended(self, player_name: str, last_sample_at: float) -> None:
+        """If another goal is waiting, record when the last sample of the completed sentence is heard."""
+        self._previous = (player_name, last_sample_at) if self.next_waits else None
 
-    def sentence_started(self, player: str, at: float, *, neural: bool = False) -> None:
-        """Record when the first sample of a new sentence was played."""
+    def sentence_started(self, player_name: str, at: float, *, neural: bool = False) -> None:
+        """Record the delay since the end of the previous sentence, if this one was waiting then."""
         previous, self._previous = self._previous, None
-        if previous is not None and previous[0] == player and 0 < at - previous[1] < MAX_HANDOVER_S:
-            self._measured.setdefault((player, neural), deque(maxlen=MAX_HANDOVERS)).append(at - previous[1])
+        if previous is not None and previous[0] == player_name and 0 < at - previous[1] < MAX_HANDOVER_S:
+            self._measured.setdefault((player_name, neural), deque(maxlen=MAX_HANDOVERS)).append(at - previous[1])
 
 
 class PlayerChooser:
@@ -120,33 +120,33 @@ class PlayerChooser:
         self.silent_since: float | None = None
 
     def candidates(self, rate: int) -> Iterator[Callable[[], Player]]:
-        """Yield functions that open the players to try, best first.
+        """Yield functions that each open and return a player to try, best first.
 
         Programs are searched for only after the players in this process have been tried.
         """
         player, device = self._configure.player, self._configure.device
         if not self.takes_time:
-            yield partial(self._open_file, rate)
+            yield partial(self._open_wav_player, rate)
             return
-        yield from (partial(_open, name, rate, device, self._audible) for name in self._in_process)
+        yield from (partial(_open_in_process, name, rate, device, self._audible) for name in self._in_process)
         if player in self._in_process:
             return
         try:
             found = player_commands(player, device, rate, self.last_player)
         except PlayerMissing as error:
-            yield partial(_fail, CannotSpeak(Reason.NO_PLAYER, str(error)))
+            yield partial(_raise_error, CannotSpeak(Reason.NO_PLAYER, str(error)))
             return
         yield from (partial(ProgramPlayer, command, self._inherited) for command in found)
 
     def begin(self, command: Speak) -> None:
-        """Prepare for a new sentence."""
+        """Store the settings that a `Speak` command has for its sentence, and forget the previous output."""
         self._own_lead_in = command.lead_in
         self._audible = self._configure.audible if command.audible is None else command.audible
         self.output = None
         self.handovers.next_waits, self.handovers.next_is_neural = command.next_waits, command.next_is_neural
 
     def update_output(self, player: Player) -> None:
-        """Record the output of the current sentence. If it is ever muted, the whole sentence counts as muted."""
+        """Record a player's output and, if it works, its name. A sentence that was ever muted counts as muted."""
         if player.proven and self._configure.player is None:
             self.last_player = player.name
         output, before = player.output, self.output
@@ -169,29 +169,33 @@ class PlayerChooser:
         milliseconds, due = (self._configure.lead_in, idle) if own is None else (own, begins or idle)
         return milliseconds / 1000 if due else 0.0
 
-    def first_player(self) -> str | None:
-        """Return the name of the player that would be tried first, or None if there is no player."""
+    def find_first_player(self) -> str | None:
+        """Return the name of the player that would be tried first, or None if there is no player.
+
+        To test the players that run in this process, open and close them.
+        """
         if self._configure.output_fd is not None:
             return WavStreamPlayer.name
         if self._configure.player is not None:
             return self._configure.player
         for name in self._in_process:
             with contextlib.suppress(CannotSpeak):
-                _open(name, 1).kill()
+                _open_in_process(name, 1).kill()
                 return name
         try:
             return player_commands(None, None, 1, self.last_player)[0].name
         except PlayerMissing:
             return None
 
-    def _open_file(self, rate: int) -> Player:
+    def _open_wav_player(self, rate: int) -> Player:
+        """Return a player that writes to the configured WAV file or stream."""
         if self._configure.output_fd is None:
             return WavPlayer((self._configure.player or "").removeprefix(FILE_PREFIX), rate)
         first, self._streaming = not self._streaming, True
         return WavStreamPlayer(self._configure.output_fd, rate, first=first)
 
 
-def _open(name: str, rate: int, device: str | None = None, audible: bool = False) -> Player:
+def _open_in_process(name: str, rate: int, device: str | None = None, audible: bool = False) -> Player:
     """Open a player that runs in this process, given its name in PLAYERS."""
     module, _, member = PLAYERS[name].class_path.partition(":")
     player_class = getattr(import_module(f"talkcli.engine.child.players.{module}"), member)
@@ -199,5 +203,6 @@ def _open(name: str, rate: int, device: str | None = None, audible: bool = False
     return player
 
 
-def _fail(error: CannotSpeak) -> Player:
+def _raise_error(error: CannotSpeak) -> Player:
+    """Raise the error. This takes the place of a function that opens a player."""
     raise error

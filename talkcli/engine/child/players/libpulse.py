@@ -157,7 +157,7 @@ _SIGNATURES: tuple[tuple[str, Any, list[Any]], ...] = (
 
 @cache
 def load() -> Any:
-    """Return an object with libpulse's functions (without the prefix "pa_") and the C library's `poll`.
+    """Load libpulse, and return an object with its functions, without the prefix "pa_", and the C library's `poll`.
 
     Raises:
         OSError: libpulse can't be loaded.
@@ -200,6 +200,7 @@ class MainLoop:
         self.freed, self.interests, self.wake_at = True, [], NEVER
 
     def _poll(self, wanted: Any, count: int, timeout: int, _: object) -> int:
+        """Store what libpulse wants to wait for, poll without waiting, and return the number of ready descriptors."""
         self.interests = [(wanted[number].fd, wanted[number].events) for number in range(count)]
         self.wake_at = NEVER if timeout < 0 else time.monotonic() + timeout / 1000
         return max(0, int(self._library.poll(wanted, count, 0)))  # libpulse would abort the process after an error

@@ -113,8 +113,8 @@ class PlayerProcess:
         with contextlib.suppress(AttributeError, OSError):  # the system is too old, or a sandbox forbids it
             self.exit = io.FileIO(os.pidfd_open(self.pid))
 
-    def status(self) -> int | None:
-        """Return the exit status, or None while the program runs.
+    def poll(self) -> int | None:
+        """Reap the program if it has exited, and kill what it left. Return its exit status, or None if it is running.
 
         If a signal killed the program, the status is the negative number of the signal. The program counts as running
         until all processes that it has started have exited.
@@ -200,16 +200,17 @@ class ErrorOutput:
         self._first: str | None = None
 
     def feed(self, data: bytes) -> None:
-        """Process bytes that the program wrote to standard error."""
+        """Look for an error message in bytes that the program wrote to standard error."""
         for line in self._lines.feed(data):
-            self._examine(line)
+            self._examine_line(line)
 
-    def line(self) -> str | None:
+    def find_error(self) -> str | None:
         """Return the first line that looks like an error, or else the first line, or None if there are no lines."""
-        self._examine(self._lines.take_rest())
+        self._examine_line(self._lines.take_rest())
         return self._error or self._first
 
-    def _examine(self, raw: bytes) -> None:
+    def _examine_line(self, raw: bytes) -> None:
+        """Store a line if it is the first one, or the first that looks like an error. Ignore noise."""
         line = raw.decode("utf-8", "replace").strip()
         if not line or re.search(_NOISE, line, re.IGNORECASE):
             return
@@ -252,6 +253,7 @@ class ProgramPlayer(Player):
         self._write(memoryview(command.preamble))
 
     def offer(self, data: memoryview) -> int:
+        """Write the samples to the program once it has read the previous ones. Return the number of bytes written."""
         self.ended()  # raises CannotSpeak if the program has exited
         stdin = self._process.stdin
         if stdin.closed:
@@ -261,7 +263,7 @@ class ProgramPlayer(Player):
         return self._write(data) if _unread_bytes(stdin) == 0 or not is_held(stdin.fileno()) else 0
 
     def consumed(self) -> int:
-        """Return the number of sample bytes that the program has read from the pipe."""
+        """Return the number of sample bytes that the program has read from the pipe, and update `proven`."""
         if not self._process.stdin.closed:
             self._consumed = max(self._consumed, self._written - _unread_bytes(self._process.stdin))
         elif self._closed:
@@ -271,42 +273,52 @@ class ProgramPlayer(Player):
         return self._consumed
 
     def close(self) -> None:
+        """Close the program's standard input, so that it plays the rest and exits."""
         self._closed = True
         self._process.stdin.close()
 
     def ended(self) -> bool:
-        status = self._process.status()
+        """Return whether the program has played everything and exited. If it has failed, raise CannotSpeak."""
+        status = self._process.poll()
         self._read_stderr()
         if status is None:
             if time.monotonic() >= self._exit_due:
-                line = self._errors.line()
+                line = self._errors.find_error()
                 raise CannotSpeak(Reason.AUDIO_LOST, line or f"{self.name} closed its input too early")
             return False
         if status == 0 and self._closed:
             return True
-        raise self._failure(status)
+        raise self._exit_error(status)
 
     def interests(self) -> list[Interest]:
+        """Return the descriptors of the program's input, error output and exit, each with its poll events."""
         process = self._process
         wanted = ((process.stdin, select.POLLOUT), (process.stderr, select.POLLIN), (process.exit, select.POLLIN))
         return [(file.fileno(), events) for file, events in wanted if file is not None and not file.closed]
 
     def wake_at(self) -> float:
+        """Return the time at which to check whether the program has exited, or NEVER if poll is enough."""
         return time.monotonic() + EXIT_CHECK_S if self._process.exit is None else self._exit_due
 
     def kill(self) -> None:
+        """Kill the program, close its standard input, and wait briefly for its exit."""
         self._process.kill()
         self._process.stdin.close()
         self._process.await_end(REAP_WAIT_S)
         self.gone()
 
     def gone(self) -> bool:
-        if self._process.status() is None:
+        """Return whether the program has exited. If so, close its descriptors."""
+        if self._process.poll() is None:
             return False
         self._process.release()
         return True
 
     def _write(self, data: memoryview) -> int:
+        """Write to the program without blocking, and return the number of bytes written.
+
+        If the program has closed its input, return 0, and allow it a short time to exit.
+        """
         try:
             written = self._process.stdin.write(data) or 0  # None if the pipe is full
         except BrokenPipeError:
@@ -316,10 +328,10 @@ class ProgramPlayer(Player):
         self._written += written
         return written
 
-    def _failure(self, status: int) -> CannotSpeak:
+    def _exit_error(self, status: int) -> CannotSpeak:
         """Return the error for a program that exited too early or with an error status."""
         self.consumed()
-        line = self._errors.line()
+        line = self._errors.find_error()
         if status < 0:
             return CannotSpeak(Reason.AUDIO_LOST, f"{self.name} was killed by {signal_name(-status)}")
         if status == 0:
@@ -328,6 +340,7 @@ class ProgramPlayer(Player):
         return CannotSpeak(reason, line or f"{self.name} exited with status {status}")
 
     def _read_stderr(self) -> None:
+        """Read new error output of the program without blocking, and close the pipe at its end."""
         stderr = self._process.stderr
         data = None if stderr.closed else stderr.read(65536)  # None if there is nothing to read
         if data:

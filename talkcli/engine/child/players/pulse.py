@@ -119,7 +119,7 @@ class PulsePlayer(Player):
             raise CannotSpeak(Reason.NO_PLAYER, "libpulse could not create a connection; free some memory")
         # errors show up in the state of the context
         self._lib.context_connect(self._context, None, libpulse.NO_AUTOSPAWN, None)
-        self._run()
+        self._run_libpulse()
         if self._error is not None:
             self.kill()
             raise self._error
@@ -127,15 +127,16 @@ class PulsePlayer(Player):
     # -- the interface `Player`
 
     def offer(self, data: memoryview) -> int:
-        self._check()
+        """Write as many samples as the server has room for, and return the number of bytes written."""
+        self._run_and_check()
         length = min(len(data), self._room())
         if length == 0:
             return 0
         if self._lib.stream_write(self._stream, bytes(data[:length]), length, None, 0, 0) < 0:
-            self._fail()
-            self._check()
+            self._record_failure()
+            self._run_and_check()
         self._written += length
-        self._run()
+        self._run_libpulse()
         return length
 
     def consumed(self) -> int:
@@ -144,6 +145,7 @@ class PulsePlayer(Player):
         return self._heard
 
     def heard(self) -> float | None:
+        """Return how many seconds of the stream have been heard according to the server's clock."""
         if self._drained:
             self._heard = self._written
         elif self._clock_report is not None:
@@ -153,24 +155,27 @@ class PulsePlayer(Player):
         return self._heard / (self._rate * SAMPLE_BYTES)
 
     def close(self) -> None:
+        """Accept no more samples, and ask the server to play the rest."""
         self._closed = True
-        self._check()
+        self._run_and_check()
 
     def ended(self) -> bool:
-        self._check()
+        """Return whether the server has played the whole stream. If the stream has failed, raise CannotSpeak."""
+        self._run_and_check()
         return self._drained
 
     def interests(self) -> list[Interest]:
+        """Return the descriptors that libpulse wants to wait for, each with its poll events."""
         return self._loop.interests
 
     def wake_at(self) -> float:
-        """Return the time at which libpulse has work to do or a time limit ends.
+        """Run libpulse, and return the time at which it has more work to do or a time limit ends.
 
         The result is 0, which means now, if the server has room for samples. It is also 0 after each report of the
         playback time, because words may be due.
         """
         report = self._clock_report
-        self._run()
+        self._run_libpulse()
         if self._error is not None or self._drained or self._clock_report is not report or self._room():
             return 0.0
         settled_at = self._volume_settled_at if self._is_volume_pending() else NEVER
@@ -189,10 +194,12 @@ class PulsePlayer(Player):
         self._error = self._error or CannotSpeak(Reason.AUDIO_LOST, "the stream was ended")
 
     def gone(self) -> bool:
+        """Return whether the connection to the server is closed."""
         return self._loop.freed
 
     @property
     def output(self) -> Output | None:
+        """The sink, its volume and whether it was muted, or None until the server has reported them."""
         sink, stream = self._sink_level, self._stream_level
         if self.device is None or sink is None or stream is None or self._is_volume_pending():
             return None
@@ -201,28 +208,28 @@ class PulsePlayer(Player):
 
     # -- the states of the stream
 
-    def _check(self) -> None:
-        """Process the server's messages.
+    def _run_and_check(self) -> None:
+        """Process the server's messages. If the stream has failed, raise CannotSpeak.
 
         Raises:
             CannotSpeak: The stream has failed.
         """
-        self._run()
+        self._run_libpulse()
         if self._error is not None and not self._drained:
             raise self._error
 
-    def _run(self) -> None:
-        """Run libpulse until it has no more work."""
-        while self._loop.iterate() or self._advance():
+    def _run_libpulse(self) -> None:
+        """Run libpulse and take the next steps of the stream until there is no more work."""
+        while self._loop.iterate() or self._advance_stream():
             pass
 
-    def _advance(self) -> bool:
+    def _advance_stream(self) -> bool:
         """Check the stream's state and take the next step. Return whether libpulse may have more work now."""
         if self._error is not None or self._drained:
             return False
         state = self._lib.context_get_state(self._context)
         if state in (libpulse.CONTEXT_FAILED, libpulse.CONTEXT_TERMINATED):
-            self._fail()
+            self._record_failure()
             return False
         if time.monotonic() >= self._ready_by:
             message = f"the sound server did not answer within {READY_LIMIT_S:g} s"
@@ -232,9 +239,9 @@ class PulsePlayer(Player):
             return state == libpulse.CONTEXT_READY and self._open_stream()
         state = self._lib.stream_get_state(self._stream)
         if state in (libpulse.STREAM_FAILED, libpulse.STREAM_TERMINATED):
-            self._fail()
+            self._record_failure()
         elif state == libpulse.STREAM_READY:
-            asked = self._check_sink() or self._request_time()
+            asked = self._follow_sink() or self._request_time()
             if self._closed and not self._draining and self._error is None:
                 self._release(self._lib.stream_drain(self._stream, self._drained_callback, None))
                 self._draining = asked = True
@@ -242,6 +249,7 @@ class PulsePlayer(Player):
         return False
 
     def _open_stream(self) -> bool:
+        """Create the stream, and connect it to a sink. Return whether libpulse may have more work now."""
         buffered, request = (each * self._rate // 1000 * SAMPLE_BYTES for each in (BUFFER_MS, REQUEST_MS))
         # The server starts playing once the buffer is full. If it started with the first piece, it would run out of
         # samples before the second, and would have to rewind. Some sinks can't rewind.
@@ -249,7 +257,7 @@ class PulsePlayer(Player):
         spec = libpulse.SampleSpec(libpulse.S16LE, self._rate, 1)
         self._stream = self._lib.stream_new(self._context, b"talk", byref(spec), None)
         if self._stream is None:
-            self._fail()
+            self._record_failure()
             return False
         self._lib.stream_set_started_callback(self._stream, self._started_callback, None)
         self._lib.stream_set_underflow_callback(self._stream, self._underflow_callback, None)
@@ -257,11 +265,11 @@ class PulsePlayer(Player):
         flags = libpulse.ADJUST_LATENCY | libpulse.AUTO_TIMING_UPDATE
         device = None if self._wanted_device is None else self._wanted_device.encode()
         if self._lib.stream_connect_playback(self._stream, device, byref(sizes), flags, None, None) < 0:
-            self._fail()
+            self._record_failure()
         return True
 
-    def _check_sink(self) -> bool:
-        """Check the stream's sink, and whether it is suspended. Return whether any requests were sent."""
+    def _follow_sink(self) -> bool:
+        """Respond to a change or suspension of the stream's sink. Return whether any requests were sent."""
         index = int(self._lib.stream_get_device_index(self._stream))
         changed = index != self._sink_index
         if changed:
@@ -276,7 +284,7 @@ class PulsePlayer(Player):
                 mask = libpulse.MASK_SINK | libpulse.MASK_SINK_INPUT
                 self._release(self._lib.context_subscribe(self._context, mask, None, None))
             self._request_levels()
-        self._check_mute()
+        self._record_mute()
         if not self._lib.stream_is_suspended(self._stream):
             if self._resumed_by != NEVER:
                 self._resumed_by = NEVER
@@ -309,7 +317,7 @@ class PulsePlayer(Player):
             self._lib.operation_unref(operation)
 
     def _room(self) -> int:
-        """Return how many bytes of whole samples the server has room for."""
+        """Return how many bytes of whole samples the server has room for, or 0 if writing isn't possible now."""
         if self._sink_index == libpulse.NO_INDEX or self._closed or self._error is not None:
             return 0
         if self._audible and not (self._level_refused or self.output):
@@ -324,8 +332,8 @@ class PulsePlayer(Player):
             return False
         return self._pending_levels > 0 or time.monotonic() < self._volume_settled_at
 
-    def _check_mute(self) -> None:
-        """Mark the whole sentence as muted if the output is muted now."""
+    def _record_mute(self) -> None:
+        """If the output is muted now, mark the whole sentence as muted, and fail if it must be audible."""
         levels = [each for each in (self._sink_level, self._stream_level) if each is not None]
         if self._drained or self._is_volume_pending() or not any(each.muted or each.volume == 0 for each in levels):
             return
@@ -337,7 +345,7 @@ class PulsePlayer(Player):
         """Forget the reported playback time, and request it again."""
         self._clock_report, self._time_request_at = None, 0.0
 
-    def _fail(self) -> None:
+    def _record_failure(self) -> None:
         """Record that the stream has failed, with a message for libpulse's error number."""
         if self._error is not None:
             return
@@ -361,13 +369,16 @@ class PulsePlayer(Player):
     # -- callbacks of libpulse
 
     def _on_started(self, *_: Any) -> None:
+        """Restart the clock after the server has started to play, which proves that sound was heard."""
         self.proven, self._dry_at = True, None
         self._restart_clock()
 
     def _on_underflow(self, *_: Any) -> None:
+        """Record how much was written when the server ran out of samples."""
         self._dry_at = self._written
 
     def _on_time(self, *_: Any) -> None:
+        """Store the playback time that the server has reported, or request it again if nothing was heard."""
         if not self.proven:
             return  # before the stream has started, the reported time is only the delay of the answer
         heard, now = c_uint64(), time.monotonic()
@@ -377,26 +388,29 @@ class PulsePlayer(Player):
             self._time_request_at = now + TIME_REQUEST_S
 
     def _on_drained(self, _stream: int, success: int, _data: object) -> None:
+        """Record that the server has played the whole stream, or that the stream has failed."""
         if not success:
-            self._fail()
+            self._record_failure()
             return
-        self._check_sink()  # the stream may have been moved in the meantime
+        self._follow_sink()  # the stream may have been moved in the meantime
         self._volume_settled_at = 0.0
-        self._check_mute()
+        self._record_mute()
         self._drained = self.proven = self._error is None
 
     def _on_sink(self, _context: int, found: Any, end: int, _data: object) -> None:
+        """Store the volume and mute state of the sink, as reported by the server."""
         if end == 0 and found[0].index == self._sink_index:  # ignore a sink that the stream has left
             flat = bool(found[0].flags & libpulse.FLAT_VOLUME)
             self._sink_level = Level(libpulse.loudest(found[0].volume), bool(found[0].mute), flat)
-            self._check_mute()
+            self._record_mute()
         elif end < 0:
             self._level_refused = True
 
     def _on_stream(self, _context: int, found: Any, end: int, _data: object) -> None:
+        """Store the volume and mute state of the stream, as reported by the server."""
         self._pending_levels -= end != 0
         if end == 0:
             self._stream_level = Level(libpulse.loudest(found[0].volume), bool(found[0].mute))
-            self._check_mute()
+            self._record_mute()
         elif end < 0:
             self._level_refused = True

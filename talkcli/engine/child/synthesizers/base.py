@@ -49,7 +49,7 @@ class SampleSink(Protocol):
         """
 
     def word(self, start: int, length: int, position: float) -> None:
-        """Report when a word will be heard.
+        """Announce the time at which a word will be heard.
 
         Args:
             start: The position of the word in the text.

@@ -35,10 +35,12 @@ class CombinedSynthesizer:
         self.voice = self._espeak.voice
 
     def voices(self) -> tuple[Voice, ...]:
+        """Return all voices of libespeak-ng, and then all installed neural voices."""
         return (*self._espeak.voices(), *models.installed_voices())
 
     def load(self, voice: str) -> None:
-        current: Synthesizer = self._piper() if is_neural(voice) else self._espeak
+        """Choose a voice of libespeak-ng or a neural voice for the next sentences."""
+        current: Synthesizer = self._get_piper() if is_neural(voice) else self._espeak
         current.load(voice)
         self._current, self.voice = current, current.voice
 
@@ -74,13 +76,14 @@ class CombinedSynthesizer:
 
     def carry_out(self, command: LoadVoice | DropVoice) -> None:
         """Start loading a neural voice in the background, or unload one."""
-        loader = self._piper().loader
+        loader = self._get_piper().loader
         if isinstance(command, protocol.DropVoice):
             loader.drop(command.voice)
         else:
             loader.start(command.voice)
 
-    def _piper(self) -> Piper:
+    def _get_piper(self) -> Piper:
+        """Return the synthesizer for neural voices, which the first call creates."""
         if self._neural is None:
             from talkcli.engine.child.synthesizers.piper import Piper
 

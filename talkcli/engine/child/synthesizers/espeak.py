@@ -88,7 +88,7 @@ def _events_of(pointer: Any) -> Iterator[_EspeakEvent]:
 
 
 def load_library() -> tuple[Any, str, int]:
-    """Load and initialize libespeak-ng.
+    """Load and initialize libespeak-ng. Return pyttsx3's binding, the version and the sample rate.
 
     The library of the system is preferred. If it is missing, the library from the package espeakng-loader is used. Call
     this once per process, before anything imports `pyttsx3.drivers._espeak`, which also loads the library.
@@ -101,7 +101,7 @@ def load_library() -> tuple[Any, str, int]:
         NotInstalled: The library or its data is missing.
         OSError: There is not enough memory, or too many files are open. A later attempt may succeed.
     """
-    origin, data = _preload()
+    origin, data = _preload_library()
     from pyttsx3.drivers import _espeak
 
     # The library connects to PulseAudio although it won't play anything. This takes 7 ms, or 30 s if PulseAudio hangs.
@@ -119,7 +119,7 @@ def load_library() -> tuple[Any, str, int]:
     return _espeak, f"eSpeak NG {version} ({origin})", rate
 
 
-def _preload() -> tuple[str, bytes | None]:
+def _preload_library() -> tuple[str, bytes | None]:
     """Load the library before pyttsx3's binding does. Return where it came from, and the directory of its data."""
     try:
         ctypes.CDLL(_LIBESPEAK)
@@ -174,7 +174,7 @@ class Espeak:
     def voices(self) -> tuple[Voice, ...]:
         """Return the normal voices, the installed MBROLA voices, and the variants."""
         self._stop_phonemizer()
-        return (*_list_voices(self._espeak, None), *_mbrola_voices(self._espeak), *_variants(self._espeak))
+        return (*_list_voices(self._espeak, None), *_list_mbrola_voices(self._espeak), *_list_variants(self._espeak))
 
     def load(self, voice: str) -> None:
         """Load a voice by its id, which may end with a variant, or by another name known to the library."""
@@ -225,17 +225,14 @@ class Espeak:
             raise CannotSpeak(Reason.ENGINE_FAILED, f"espeak_Synth failed with {status}")
 
     def load_language(self, language: str) -> None:
-        """Load a voice for a language code such as "de-at".
-
-        If there is none, try the code without its region ("de"), and then English.
-        """
+        """Load a voice for a language code such as "de-at" or, if there is none, for "de" or English."""
         self._stop_phonemizer()
         found = (self._find_voice(each) for each in (language, language.partition("-")[0], *_ENGLISH))
         self.load(next((each.id for each in found if each), self.voice))
 
     @contextlib.contextmanager
     def phonemizer(self, language: str) -> Iterator[EspeakPhonemizer]:
-        """Provide a phonemizer for a language in a `with` block.
+        """Switch the library to a language, and provide a phonemizer for it in a `with` block.
 
         Another thread may use the phonemizer during the block, but nothing may use the synthesizer. After the block,
         calls of the phonemizer raise Stopped. If a call is still running at the end of the block, it continues for a
@@ -271,6 +268,7 @@ class Espeak:
             self._parameters.clear()
 
     def _set_parameters(self, settings: SpeechSettings) -> None:
+        """Pass the rate, volume and pitch to the library if they have changed."""
         espeak = self._espeak
         volume = round(settings.volume * 100)
         wanted = {espeak.RATE: settings.rate, espeak.VOLUME: volume, espeak.PITCH: settings.pitch}
@@ -300,6 +298,7 @@ class EspeakPhonemizer:
         self._to_phonemes.restype = ctypes.c_char_p
 
     def clauses(self, text: str) -> list[tuple[str, str]]:
+        """Split a text into clauses, and return each clause with its phonemes in IPA."""
         # The library reads ahead, and any other call discards that text. So get all clauses before doing anything else.
         raw = ctypes.create_string_buffer(guard.guarded(text, self._voice).encode("utf-8", "replace"))
         base = ctypes.addressof(raw)
@@ -307,7 +306,7 @@ class EspeakPhonemizer:
         found: list[tuple[str, str]] = []
         begin = begin_character = 0
         while at.value:
-            with self._call():
+            with self._library_call():
                 ipa = self._to_phonemes(ctypes.byref(at), self._espeak.CHARS_UTF8, _IPA) or b""
             end = len(raw) - 1 if at.value is None else at.value - base
             clause = raw.raw[begin:end].decode("utf-8", "replace")
@@ -324,14 +323,14 @@ class EspeakPhonemizer:
 
         The library has to speak the clause without output, which takes 1 ms per second of sound.
         """
-        positions, _ = self._speak(clause)
+        positions, _ = self._speak_silently(clause)
         return positions
 
     def ends_with_abbreviation(self, clause: str) -> bool:
         """Return whether a clause ends with an abbreviation such as "Mr.", after which the library makes no pause."""
         word = clause.rsplit(maxsplit=1)[-1]
-        _, alone = self._speak(word)
-        _, with_pause = self._speak(f"{word} A")
+        _, alone = self._speak_silently(word)
+        _, with_pause = self._speak_silently(f"{word} A")
         return with_pause - alone < _PAUSE_SAMPLES
 
     def end(self) -> None:
@@ -339,8 +338,8 @@ class EspeakPhonemizer:
         self._ended = True
 
     @contextlib.contextmanager
-    def _call(self) -> Iterator[None]:
-        """Hold the lock in a `with` block that calls the library.
+    def _library_call(self) -> Iterator[None]:
+        """Hold the lock in a `with` block that calls the library. After `end`, raise Stopped.
 
         Raises:
             Stopped: `end` was called before or during the block. The result of the call may be incomplete.
@@ -352,7 +351,7 @@ class EspeakPhonemizer:
         if self._ended:
             raise Stopped
 
-    def _speak(self, text: str) -> tuple[list[tuple[int, int]], int]:
+    def _speak_silently(self, text: str) -> tuple[list[tuple[int, int]], int]:
         """Speak a text without output. Return the positions of its words, and the samples in its first clause."""
         text = guard.guarded(text, self._voice)
         positions: list[tuple[int, int]] = []
@@ -366,7 +365,7 @@ class EspeakPhonemizer:
                     clause_ends.append(event.sample)
             return int(self._ended)  # 1 stops the synthesis
 
-        with self._call():
+        with self._library_call():
             self._espeak.SetSynthCallback(on_audio)
             self._espeak.Synth(text.encode("utf-8", "replace"), flags=self._espeak.CHARS_UTF8)
         return positions, next(iter(clause_ends), 0)
@@ -379,13 +378,13 @@ def _word_position(event: _EspeakEvent, text: str) -> tuple[int, int] | None:
     return (start, length) if length else None
 
 
-def _variants(espeak: Any) -> list[Voice]:
+def _list_variants(espeak: Any) -> list[Voice]:
     """Return all voice variants of the library."""
     found = [(each.id.rpartition("/")[2], each.name) for each in _list_voices(espeak, _VARIANTS)]
     return [Voice(VARIANT_PREFIX + file, None, f"variant {name}") for file, name in found]
 
 
-def _mbrola_voices(espeak: Any) -> list[Voice]:
+def _list_mbrola_voices(espeak: Any) -> list[Voice]:
     """Return the installed MBROLA voices. The library also lists those that aren't installed."""
     if not on_path("mbrola"):
         return []

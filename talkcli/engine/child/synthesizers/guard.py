@@ -86,7 +86,7 @@ _SEPARATE_DIGITS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def guarded(text: str, voice: str = "") -> str:
-    """Replace characters that would crash libespeak-ng. The length of the text stays the same.
+    """Replace the characters of a text that would crash libespeak-ng, and return the text. Its length stays the same.
 
     Args:
         text: The text to make safe.
@@ -108,7 +108,7 @@ def _unsafe_characters(language: str) -> re.Pattern[str]:
 
 
 def _split_number(number: str, least: int, most: int) -> str:
-    """Split a number in two if it has `least` to `most` digits. Only one digit is replaced."""
+    """If a number has `least` to `most` digits, split it in two by replacing one digit with a superscript."""
     if not least <= sum(map(str.isdigit, number)) <= most:
         return number
     middle = next(place for place in range(len(number) // 2, len(number)) if number[place].isdigit())
@@ -186,13 +186,16 @@ def _without_leading_hyphens(text: str) -> str:
     return _HYPHEN.sub(blanked, text)
 
 
-def _split_word(piece: re.Match[str]) -> str:
-    """Split a word that is too long for the library, by removing apostrophes or capitalizing letters."""
-    word = piece.group(1) or ""
+def _split_word(match: re.Match[str]) -> str:
+    """Return the matched text. If it is a word that is too long for the library, split it first.
+
+    Apostrophes become blanks, or pairs of letters get another case.
+    """
+    word = match.group(1) or ""
     # If a script has no capital letters, its words can only be split at apostrophes.
     short = _utf8_bytes(word) <= _MAX_WORD_BYTES or word.lower() == word.upper()
     if short and word.count("'") + word.count("’") <= _MAX_WORD_APOSTROPHES:
-        return piece.group()
+        return match.group()
     result = list(word)
     size = endings = 0
     for at, character in enumerate(word):

@@ -68,7 +68,7 @@ _CACHED_NAME = re.compile(r"[0-9a-f]{64}-.*(\.encoder\.onnx|\.decoder\.onnx|\.ne
 
 
 class ModelCache:
-    """A directory in which the halves of models are cached. Only this user can read and write it.
+    """A directory that caches models in two halves. Only this user can read and write it.
 
     The encoder is stored after onnxruntime has optimized it. If a file is damaged or can't be written, the halves are
     made again, so voices work without the cache. A key consists of 64 hexadecimal digits, a hyphen and anything else.
@@ -92,13 +92,13 @@ class ModelCache:
         Raises:
             OSError: They aren't cached.
         """
-        paths = self._path(key, _ENCODER_SUFFIX), self._path(key, _DECODER_SUFFIX)
+        paths = self._cached_path(key, _ENCODER_SUFFIX), self._cached_path(key, _DECODER_SUFFIX)
         for each in paths:
             os.utime(each)
         return paths
 
     def store(self, key: str, make_encoder: Callable[[str | None], Any], decoder: Iterable[Buffer]) -> Any:
-        """Create the encoder, and store both halves.
+        """Create and return the encoder, store both halves of the model if possible, and remove old files.
 
         Args:
             key: The key of the model.
@@ -115,15 +115,16 @@ class ModelCache:
                 unfinished = os.path.join(folder, "half")
                 with open(unfinished, "wb", _WRITE_BYTES) as file:
                     file.writelines(decoder)
-                os.replace(unfinished, self._path(key, _DECODER_SUFFIX))
+                os.replace(unfinished, self._cached_path(key, _DECODER_SUFFIX))
                 made = make_encoder(unfinished)
-                os.replace(unfinished, self._path(key, _ENCODER_SUFFIX))
+                os.replace(unfinished, self._cached_path(key, _ENCODER_SUFFIX))
         except Exception:  # noqa: BLE001 - if the encoder is at fault, the next line raises the error again
             made = make_encoder(None)
         self._shrink()
         return made
 
-    def _path(self, key: str, suffix: str) -> str:
+    def _cached_path(self, key: str, suffix: str) -> str:
+        """Return the path at which a half of a model is cached."""
         return os.path.join(self._directory, key + suffix)
 
     def _shrink(self) -> None:
@@ -150,6 +151,7 @@ class Frames:
 
     @property
     def count(self) -> int:
+        """The total number of frames."""
         return self.ends[-1]
 
 
@@ -188,12 +190,12 @@ class Model:
         key = f"{hashlib.sha256(content).hexdigest()}-{_SPLIT_VERSION}-{onnxruntime.__version__}"
         if cache is not None:
             try:
-                self._set_halves(*map(_session, cache.find(key)))
+                self._set_halves(*map(_create_session, cache.find(key)))
                 return
             except Exception as error:  # The halves aren't cached, or a full disk has truncated them.
                 if _is_out_of_memory(error):
                     raise no_memory_error(path) from error
-        self._set_halves(*_split(path, content, cache, key))
+        self._set_halves(*_split_and_cache(path, content, cache, key))
 
     def encode(self, ids: Sequence[int], speaker: int, scale: float, run: ModelRun) -> Frames:
         """Encode a sequence of phoneme ids as frames.
@@ -256,7 +258,7 @@ class Model:
         return frames * self._samples_per_frame / self.description.rate
 
     def _set_halves(self, encoder: Any, decoder: Any) -> None:
-        """Check both halves of the model, and speak a test phoneme with them.
+        """Store both halves of the model, check them, and test them with a phoneme.
 
         Raises:
             VoiceFileError: The halves are faulty, or don't match the description.
@@ -271,17 +273,18 @@ class Model:
         if self._has_speakers != (self.description.speakers > 1):
             raise self._mismatch_error("only one of them has several speakers")
         self._frame_inputs = [each.name for each in decoder.get_inputs()]
-        self._samples_per_frame = self._try_out()
+        self._samples_per_frame = self._test_model()
 
     def _run_half(self, half: Any, feed: dict[str, Any], run: ModelRun) -> list[Any]:
+        """Run the encoder or the decoder, and return its outputs."""
         try:
             found: list[Any] = half.run(None, feed, run.options)
         except Exception as error:
             raise _model_error(self.path, "cannot be run", error) from error
         return found
 
-    def _try_out(self) -> int:
-        """Speak the phoneme with the highest id, and return the number of samples per frame."""
+    def _test_model(self) -> int:
+        """Synthesize the phoneme with the highest id as a test, and return the number of samples per frame."""
         ids = self.description.phoneme_ids
         highest = max(each for every in ids.values() for each in every)
         phonemes = [*ids[BEGIN_SYMBOL], *ids[PAD_SYMBOL], highest, *ids[PAD_SYMBOL], *ids[END_SYMBOL]]
@@ -297,17 +300,19 @@ class Model:
         return len(self.decode(frames, 0, frames.count, run)) // frames.count
 
     def _not_piper_error(self, why: str) -> VoiceFileError:
+        """Return the error for a file that isn't a Piper model."""
         return VoiceFileError(f"{self.path} is not a Piper model ({why}); download the voice again")
 
     def _mismatch_error(self, why: str) -> VoiceFileError:
+        """Return the error for a model that doesn't match its JSON file."""
         both = f"{self.path} and {os.path.basename(self.path)}.json"
         return VoiceFileError(f"{both} do not belong together ({why[:_MAX_ERROR_CHARS]}); download both again")
 
 
 def load_libraries(path: str) -> None:
-    """Import numpy and onnxruntime.
+    """Import numpy and onnxruntime. Error messages name the `path` of the model that needs them.
 
-    This takes 0.25 s, and blocks all other threads for a tenth of that time. Error messages name the path of the model.
+    This takes 0.25 s, and blocks all other threads for a tenth of that time.
 
     Raises:
         VoiceFileError: The packages can't be imported, or there is not enough memory.
@@ -319,7 +324,7 @@ def load_libraries(path: str) -> None:
         raise _model_error(path, "could not be loaded", error, f"run: {install.neural()}") from error
 
 
-def _split(path: str, content: bytes, cache: ModelCache | None, key: str) -> tuple[Any, Any]:
+def _split_and_cache(path: str, content: bytes, cache: ModelCache | None, key: str) -> tuple[Any, Any]:
     """Split a model, cache its halves, and return an onnxruntime session for each half.
 
     Raises:
@@ -330,15 +335,15 @@ def _split(path: str, content: bytes, cache: ModelCache | None, key: str) -> tup
     except NotSplit as error:
         raise VoiceFileError(f"{path} {error}; download the voice again, from a source that you trust") from error
     try:
-        decoder = _session_of(decoder_file)
+        decoder = _create_half_session(decoder_file)
         if cache is None:
-            return _session_of(encoder_file), decoder
-        return cache.store(key, lambda place: _session_of(encoder_file, place), decoder_file), decoder
+            return _create_half_session(encoder_file), decoder
+        return cache.store(key, lambda place: _create_half_session(encoder_file, place), decoder_file), decoder
     except Exception as error:
         raise _model_error(path, "could not be loaded", error) from error
 
 
-def _session_of(half: Sequence[Buffer], optimized_path: str | None = None) -> Any:
+def _create_half_session(half: Sequence[Buffer], optimized_path: str | None = None) -> Any:
     """Create an onnxruntime session for a half of a model.
 
     onnxruntime reads the half from a temporary file in memory. To pass bytes instead, the parts would have to be
@@ -349,12 +354,12 @@ def _session_of(half: Sequence[Buffer], optimized_path: str | None = None) -> An
         with open(os.memfd_create("half"), "wb", _WRITE_BYTES) as file:
             file.writelines(half)
             file.flush()
-            return _session(f"/proc/self/fd/{file.fileno()}", optimized_path)
+            return _create_session(f"/proc/self/fd/{file.fileno()}", optimized_path)
     except (OSError, AttributeError):  # The system doesn't support files in memory, or limits their size.
-        return _session(b"".join(half), optimized_path)
+        return _create_session(b"".join(half), optimized_path)
 
 
-def _session(model: str | bytes, optimized_path: str | None = None) -> Any:
+def _create_session(model: str | bytes, optimized_path: str | None = None) -> Any:
     """Create an onnxruntime session from the path or the content of a model.
 
     If `optimized_path` is given, also write the optimized model to this path.
@@ -388,4 +393,5 @@ def no_memory_error(path: str) -> VoiceFileError:
 
 
 def _is_out_of_memory(error: BaseException | None) -> bool:
+    """Return whether an exception says that there isn't enough memory."""
     return isinstance(error, MemoryError) or any(each in str(error) for each in _NO_MEMORY)

@@ -104,6 +104,7 @@ class BackgroundIterator(threading.Thread, Generic[_T]):
         self._room.release()
 
     def _put(self, item: _T | None, error: BaseException | None = None) -> None:
+        """Add an item, or the end of the iterator with its error, and make the descriptor readable."""
         self._made.append((item, error))
         with self._lock:
             if not self._closed:
@@ -141,7 +142,7 @@ class ModelLoader:
         return self._started_at + LOAD_LIMIT_S
 
     def drop(self, voice: str) -> None:
-        """Unload a voice. If it is speaking a sentence, its memory is freed after the sentence."""
+        """Unload a voice, and forget its error. If it is being spoken, its memory is freed after the sentence."""
         if self._models.pop(voice, None):
             self._unmeasured = ""
         self.errors.pop(voice, None)
@@ -153,14 +154,14 @@ class ModelLoader:
         elif voice not in self._waiting and not (self._load and voice == self._voice):
             self.errors.pop(voice, None)
             self._waiting.append(voice)
-            self._start_next()
+            self._start_next_load()
 
-    def model(self, voice: str) -> Model | None:
-        """Return the model of a voice, or None if it isn't loaded.
+    def get_model(self, voice: str) -> Model | None:
+        """Return the model of a voice, or None if it isn't loaded. Finish a load first if its thread is done.
 
         If the voice has failed to speak, and its files have changed since it was loaded, it is unloaded.
         """
-        self._check_load()
+        self._finish_load()
         model, fingerprints = self._models.get(voice, (None, ()))
         if model and voice in self.errors and fingerprints != _fingerprints(model.path):
             self.drop(voice)
@@ -169,22 +170,22 @@ class ModelLoader:
         return model
 
     def mark_spoken(self, voice: str) -> None:
-        """Measure the memory again later, because the first sentences of a voice allocate memory permanently."""
+        """Schedule a memory measurement, because the first sentences of a voice allocate memory permanently."""
         if voice not in self._models:
             self._unmeasured = ""  # The voice was unloaded during the sentence, and its memory has been freed just now.
         elif self._unmeasured is None:
             self._unmeasured = voice
 
-    def events(self) -> list[VoiceLoaded | VoiceUnloaded | VoiceMemory]:
-        """Return the events that have happened since the last call."""
-        self._check_load()
+    def take_events(self) -> list[VoiceLoaded | VoiceUnloaded | VoiceMemory]:
+        """Return and clear the events since the last call, including that of a load that has just finished."""
+        self._finish_load()
         if self._unmeasured is not None:
-            self._measure(self._unmeasured, min_growth=GROWTH_BYTES)
+            self._measure_memory(self._unmeasured, min_growth=GROWTH_BYTES)
         events, self._events = self._events, []
         return events
 
-    def _check_load(self) -> None:
-        """Store the model if the load has finished. Record a failure if the load takes too long."""
+    def _finish_load(self) -> None:
+        """If the load has finished or takes too long, store its result and start the next load."""
         load, voice = self._load, self._voice
         if load is None:
             return
@@ -198,7 +199,7 @@ class ModelLoader:
             loaded = load.take()
             assert loaded is not None
             self._models[voice] = loaded
-            self._measure(voice)
+            self._measure_memory(voice)
         except VoiceFileError as caught:
             error = self.errors[voice] = str(caught)
         except Exception as caught:  # noqa: BLE001 - a faulty voice must not stop the engine process
@@ -207,22 +208,22 @@ class ModelLoader:
         self._events.append(VoiceLoaded(voice, round(time.monotonic() - self._started_at, 3), error))
         load.close()
         self._load = None
-        self._start_next()
+        self._start_next_load()
 
-    def _measure(self, voice: str, min_growth: float = -math.inf) -> None:
-        """Report how much the process's memory has grown since before the first load.
+    def _measure_memory(self, voice: str, min_growth: float = -math.inf) -> None:
+        """Record an event with the growth of the process's memory since before the first load.
 
-        If the growth since the last report is below `min_growth` bytes, report nothing unless a voice was unloaded.
+        If the growth since the last event is below `min_growth` bytes, record nothing unless a voice was unloaded.
         """
         self._unmeasured = None
-        before, now = self._initial_bytes, _private_bytes()
+        before, now = self._initial_bytes, _read_private_bytes()
         if before is None or now is None or (voice and now - before - self._reported_growth < min_growth):
             return
         _trim_heap()
-        self._reported_growth = max(0, (_private_bytes() or now) - before)
+        self._reported_growth = max(0, (_read_private_bytes() or now) - before)
         self._events.append(VoiceMemory(voice, self._reported_growth))
 
-    def _start_next(self) -> None:
+    def _start_next_load(self) -> None:
         """Start loading the next voice if no other is being loaded.
 
         A load keeps one processor busy, and temporarily needs twice the memory of the model.
@@ -230,8 +231,8 @@ class ModelLoader:
         if self._load is None and self._waiting:
             self._voice, self._started_at = self._waiting.popleft(), time.monotonic()
             if self._initial_bytes is None:
-                self._initial_bytes = _private_bytes()
-            self._load = BackgroundIterator(_load(self._voice), max_ahead=1)
+                self._initial_bytes = _read_private_bytes()
+            self._load = BackgroundIterator(_load_model(self._voice), max_ahead=1)
 
 
 def _fingerprints(path: str) -> _Fingerprints:
@@ -243,7 +244,7 @@ def _fingerprints(path: str) -> _Fingerprints:
     return tuple((each.st_ino, each.st_size, each.st_mtime_ns) for each in found)
 
 
-def _load(voice: str) -> Iterator[tuple[Model, _Fingerprints]]:
+def _load_model(voice: str) -> Iterator[tuple[Model, _Fingerprints]]:
     """Load a voice, and yield its model with the fingerprints of its files.
 
     Raises:
@@ -271,7 +272,7 @@ def _open_cache() -> ModelCache | None:
         return None
 
 
-def _private_bytes() -> int | None:
+def _read_private_bytes() -> int | None:
     """Return how much private memory this process uses, including swap. Return None if a sandbox hides it."""
     try:
         with open("/proc/self/status", "rb") as file:

@@ -99,7 +99,7 @@ def split_text(phonemizer: Phonemizer, text: str) -> Iterator[SpeechPart]:
         at = 0
         if len(phonemes) > _LONG_PART_PHONEMES:
             yield finish(ends_sentence=False)
-        for section in _sections(groups):
+        for section in _split_long_groups(groups):
             if phonemes and len(phonemes) + 1 + len(section) > _MAX_SECTION_PHONEMES:
                 yield finish(ends_sentence=False)
             if phonemes:
@@ -119,7 +119,7 @@ def split_text(phonemizer: Phonemizer, text: str) -> Iterator[SpeechPart]:
         yield finish(ends_sentence=True)
 
 
-def _sections(groups: Sequence[str]) -> Iterator[str]:
+def _split_long_groups(groups: Sequence[str]) -> Iterator[str]:
     """Yield the groups of phonemes, but split those that are too long for a part."""
     for group in groups:
         for begin in range(0, len(group), _MAX_SECTION_PHONEMES):
@@ -127,12 +127,12 @@ def _sections(groups: Sequence[str]) -> Iterator[str]:
 
 
 def _phoneme_groups(ipa: str) -> list[str]:
-    """Split phonemes at the blanks. Each character of the result is a phoneme."""
+    """Split IPA text at the blanks. Each character of the result is a phoneme."""
     return [unicodedata.normalize("NFD", each) for each in _LANGUAGE_MARK.sub(" ", ipa).split()]
 
 
 def _locate_words(phonemizer: Phonemizer, clause: str, groups: Sequence[str]) -> list[tuple[int, int, int]]:
-    """Return the first phoneme of each word in a clause, with the word's start and length in the text.
+    """Return the index of the first phoneme of each word in a clause, with the word's start and length.
 
     The phonemes are counted across all groups.
     """
@@ -143,20 +143,20 @@ def _locate_words(phonemizer: Phonemizer, clause: str, groups: Sequence[str]) ->
     if not positions:  # The library has reported no words for these phonemes.
         return []
     # If a word is spelled out, the library reports the same position for each letter.
-    positions = _increasing(positions)
+    positions = _drop_repeated_positions(positions)
     next_starts = [*(start for start, _ in positions[1:]), len(clause)]
     # Convert each word on its own, and align the results with the phonemes of the whole clause.
     limits = zip(positions, next_starts, strict=True)
     words = [clause[start : min(start + length, next_start)] for (start, length), next_start in limits]
     alone = ["".join(itertools.chain(*(_phoneme_groups(ipa) for _, ipa in phonemizer.clauses(word)))) for word in words]
     ends = [0, *itertools.accumulate(map(len, alone))]
-    found = _align("".join(alone), "".join(groups), ends[:-1])
+    found = _map_indexes("".join(alone), "".join(groups), ends[:-1])
     last = max(0, group_starts[-1] - 1)
     return [(min(start, last), *position) for start, position in zip(found, positions, strict=True)]
 
 
-def _increasing(positions: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return the positions without those that go back in the text."""
+def _drop_repeated_positions(positions: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return the word positions without those that repeat an earlier one or go back in the text."""
     found: list[tuple[int, int]] = []
     for position in positions:
         if not found or position[0] > found[-1][0]:
@@ -164,7 +164,7 @@ def _increasing(positions: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
     return found
 
 
-def _align(first: str, second: str, places: Sequence[int]) -> list[int]:
+def _map_indexes(first: str, second: str, places: Sequence[int]) -> list[int]:
     """Return the indexes in the second string that correspond to `places` in the first string, which is similar."""
     if len(first) * len(second) > _MAX_COMPARISONS:
         return [place * len(second) // len(first) for place in places]

@@ -85,7 +85,7 @@ class Piper:
     @property
     def problem(self) -> str | None:
         """A message saying why the current voice can't speak, or None if it is loaded."""
-        if self.loader.model(self._model_id) is not None:
+        if self.loader.get_model(self._model_id) is not None:
             return None
         return self.loader.errors.get(self._model_id) or f"{self.voice} is not loaded"
 
@@ -101,6 +101,7 @@ class Piper:
             return neural_language(self._model_id)
 
     def voices(self) -> tuple[Voice, ...]:
+        """Return all installed neural voices."""
         return models.installed_voices()
 
     def load(self, voice: str) -> None:
@@ -140,7 +141,7 @@ class Piper:
             with self._espeak.phonemizer(description.espeak_voice) as phonemizer:
                 run = ModelRun()
                 parts = _speak_parts(model, split_text(phonemizer, text), speaker, settings, run)
-                self._write(parts, description.rate, run, sink)
+                self._write_sound(parts, description.rate, run, sink)
         except MemoryError as error:
             raise CannotSpeak(Reason.VOICE_FAILED, str(no_memory_error(self._path))) from error
         except (VoiceFileError, UnknownVoice) as error:
@@ -150,18 +151,19 @@ class Piper:
             raise CannotSpeak(Reason.VOICE_FAILED, words) from error
 
     def _wait_for_model(self, voice: str, sink: SampleSink) -> Model:
+        """Return the model of a voice, after loading it if necessary. The sink keeps playing meanwhile."""
         loader = self.loader
-        if loader.model(voice) is None:
+        if loader.get_model(voice) is None:
             loader.start(voice)  # Try again even after an error, because the files may have been repaired.
-        while (model := loader.model(voice)) is None:
+        while (model := loader.get_model(voice)) is None:
             if voice in loader.errors:
                 raise CannotSpeak(Reason.VOICE_FAILED, loader.errors[voice])
             assert loader.descriptor is not None
             sink.wait(loader.descriptor)
         return model
 
-    def _write(self, parts: Iterator[SpokenPart], rate: int, run: ModelRun, sink: SampleSink) -> None:
-        """Synthesize parts of a text in a background thread, and write their sound to the sink."""
+    def _write_sound(self, parts: Iterator[SpokenPart], rate: int, run: ModelRun, sink: SampleSink) -> None:
+        """Synthesize parts of a text in a background thread, and write their sound and words to the sink."""
         write_bytes = int(_WRITE_S * rate) * SAMPLE_BYTES
         seconds = 0.0
         spoken_parts = BackgroundIterator(parts, _MAX_PARTS_AHEAD)
@@ -183,7 +185,7 @@ class Piper:
 def _speak_parts(
     model: Model, parts: Iterator[SpeechPart], speaker: int, settings: SpeechSettings, run: ModelRun
 ) -> Iterator[SpokenPart]:
-    """Synthesize the parts of a text, and yield the sound in small pieces.
+    """Synthesize the parts of a text, and yield the sound in small pieces, each with its words.
 
     Raises:
         VoiceFileError: The model is faulty, or doesn't know any of the phonemes.
@@ -251,13 +253,14 @@ def _word_time(model: Model, part: SpeechPart, places: Sequence[int], begins: Se
 
 
 def _cut_leading_silence(samples: Any, levels: Any, words: WordTimes, rate: int) -> tuple[Any, WordTimes]:
-    """Remove the silence at the start of a sentence, and adjust the times of its words."""
+    """Return the samples without the silence at the start of a sentence, and its words with adjusted times."""
     audible = (levels > _LEADING_LEVEL).nonzero()[0]
     cut = max(0, int(audible[0]) - int(_LEADING_S * rate)) if len(audible) else 0
     return samples[cut:], tuple((start, length, max(0.0, time - cut / rate)) for start, length, time in words)
 
 
 def _to_bytes(samples: Any, volume: float) -> bytes:
+    """Scale float samples by the volume, and convert them to 16-bit integers."""
     return bytes((samples * (_FULL_SCALE * volume)).clip(-_FULL_SCALE, _FULL_SCALE).astype("<i2"))
 
 

@@ -59,7 +59,7 @@ class NotSplit(Exception):
 
 
 def split_model(model: Buffer) -> tuple[ModelHalf, ModelHalf]:
-    """Split a model into its encoder and its decoder.
+    """Split the content of a Piper model into its encoder and its decoder.
 
     The encoder has the inputs of the whole model. It outputs the decoder's inputs, and then the number of frames of
     each phoneme id. The decoder has the output of the whole model.
@@ -89,8 +89,8 @@ def split_model(model: Buffer) -> tuple[ModelHalf, ModelHalf]:
         raise NotSplit("is not a Piper model: it does not report the duration of each phoneme")
     decoder = [*graph.nodes_for(needed & constants), *decoder]
     head = [each for each in fields if _is_shared(reader, each)]
-    outputs = [(_OUTPUT, _BYTES, _float_value(name)) for name in [*passed, *durations]]
-    inputs = [(_INPUT, _BYTES, _float_value(name)) for name in passed]
+    outputs = [(_OUTPUT, _BYTES, _encode_float_value(name)) for name in [*passed, *durations]]
+    inputs = [(_INPUT, _BYTES, _encode_float_value(name)) for name in passed]
     encoder_fields = [*graph.fields_of(encoder), *graph.inputs, *outputs]
     decoder_fields = [*graph.fields_of(decoder), *inputs, *graph.outputs]
     return _encode_model(head, encoder_fields), _encode_model(head, decoder_fields)
@@ -103,7 +103,7 @@ class _Reader:
         self._fields_left = _MAX_FIELDS
 
     def fields(self, raw: Buffer) -> list[Field]:
-        """Return the fields of a message."""
+        """Parse a protobuf message, and return its fields."""
         found = []
         at, end = 0, len(raw)
         while at < end:
@@ -144,7 +144,7 @@ class _Node:
             if any(number in {_SPARSE_TENSOR, _SPARSE_TENSORS} for number, _, _ in parts):
                 raise NotSplit("has sparse weights, unlike any Piper model")
             for tensor in (*_messages(parts, _TENSOR), *_messages(parts, _TENSORS)):
-                _tensor_name(reader, tensor)
+                _checked_tensor_name(reader, tensor)
             for inner in (*_messages(parts, _SUBGRAPH), *_messages(parts, _SUBGRAPHS)):
                 self.inputs += [name for each in _Graph(reader, inner, depth + 1).nodes for name in each.inputs]
 
@@ -159,7 +159,7 @@ class _Graph:
         if any(number == _SPARSE_INITIALIZER for number, _, _ in fields):
             raise NotSplit("has sparse weights, unlike any Piper model")
         self.nodes = [_Node(reader, each, depth) for each in _messages(fields, _NODE)]
-        self._weights = {_tensor_name(reader, each): each for each in _messages(fields, _INITIALIZER)}
+        self._weights = {_checked_tensor_name(reader, each): each for each in _messages(fields, _INITIALIZER)}
         self.inputs = [each for each in fields if each[:2] == (_INPUT, _BYTES)]
         self.outputs = [each for each in fields if each[:2] == (_OUTPUT, _BYTES)]
 
@@ -212,7 +212,7 @@ def _is_shared(reader: _Reader, field: Field) -> bool:
     return number == _IR_VERSION
 
 
-def _tensor_name(reader: _Reader, raw: Buffer) -> str:
+def _checked_tensor_name(reader: _Reader, raw: Buffer) -> str:
     """Return the name of a tensor, after checking that its data is in the same file.
 
     Raises:
@@ -225,14 +225,14 @@ def _tensor_name(reader: _Reader, raw: Buffer) -> str:
     return "".join(_names(fields, _TENSOR_NAME))
 
 
-def _messages(fields: Iterable[Field], wanted: int) -> list[Buffer]:
-    """Return the content of all fields that have this number."""
-    return [value for number, kind, value in fields if (number, kind) == (wanted, _BYTES)]
+def _messages(fields: Iterable[Field], field_number: int) -> list[Buffer]:
+    """Return the content of all fields with this number."""
+    return [value for number, kind, value in fields if (number, kind) == (field_number, _BYTES)]
 
 
-def _names(fields: Iterable[Field], wanted: int) -> list[str]:
-    """Return the content of all fields that have this number, as strings."""
-    found = _messages(fields, wanted)
+def _names(fields: Iterable[Field], field_number: int) -> list[str]:
+    """Return the content of all fields with this number, as strings."""
+    found = _messages(fields, field_number)
     if any(len(value) > _MAX_NAME_BYTES for value in found):
         raise NotSplit("is not a Piper model: it has names that are too long")
     try:
@@ -255,6 +255,7 @@ def _parse_integer(raw: Buffer, at: int) -> tuple[int, int]:
 
 
 def _encode_integer(value: int) -> bytes:
+    """Encode an integer as a protobuf varint."""
     out = bytearray()
     while value > 127:
         out.append(value & 127 | 128)
@@ -263,13 +264,14 @@ def _encode_integer(value: int) -> bytes:
 
 
 def _encode_model(head: list[Field], graph: list[Field]) -> ModelHalf:
-    """Encode a model with these fields and this graph."""
+    """Encode a model with the fields `head` and a graph with the fields `graph`."""
     parts = list(_encode_fields(graph))
     key = _encode_integer(_GRAPH << 3 | _BYTES) + _encode_integer(sum(map(len, parts)))
     return (*_encode_fields(head), key, *parts)
 
 
 def _encode_fields(fields: Iterable[Field]) -> Iterator[Buffer]:
+    """Yield the encoded fields of a message, in parts."""
     for number, kind, value in fields:
         yield _encode_integer(number << 3 | kind)
         if kind == _BYTES:
@@ -277,6 +279,6 @@ def _encode_fields(fields: Iterable[Field]) -> Iterator[Buffer]:
         yield value
 
 
-def _float_value(name: str) -> bytes:
+def _encode_float_value(name: str) -> bytes:
     """Encode the description of an input or output that is a tensor of floats."""
     return b"".join(_encode_fields([(1, _BYTES, name.encode())])) + _FLOAT_TYPE
