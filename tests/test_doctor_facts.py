@@ -163,7 +163,7 @@ def unable(directory: Path, named: str | None = None) -> Finding:
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(directory)
         env = environment(str(directory), LD_LIBRARY_PATH=str(directory))
-        found = voice.judge_engine("2.99", voice.find_engine(voice.EngineOptions(voice=named, env=env)), server=None)[
+        found = voice.judge_engine("2.99", voice.probe_engine(voice.EngineOptions(voice=named, env=env)), server=None)[
             -1
         ]
     assert found.state == FAILURE
@@ -353,7 +353,7 @@ def nodes(tmp_path: Path) -> str:
 def test_a_card_may_be_opened_by_root_by_its_group_or_by_its_mode(nodes: str, monkeypatch: pytest.MonkeyPatch) -> None:
     group = os.stat(f"{nodes}/pcmC0D0p").st_gid
     name = grp.getgrgid(group).gr_name if group else "audio"
-    monkeypatch.setattr(sound, "_name", lambda _, number: name if number == group else str(number))
+    monkeypatch.setattr(sound, "_name_or_id", lambda _, number: name if number == group else str(number))
     found = sound.check_access(SoundServer(), STRANGER, nodes)
     assert (found.state, found.next) == (WARNING, f"sudo usermod -aG {name} stranger, and log in again")
     assert found.message == f"user stranger may not open {nodes}/pcmC0D0p, and is not in the group {name}"
@@ -385,7 +385,7 @@ def test_a_server_of_the_same_user_is_examined_in_its_own_environment(tmp_path: 
     with subprocess.Popen(["sh", "-c", "sleep 98; :", "--player", "x"], env=env, start_new_session=True) as process:
         try:
             end = time.monotonic() + 5
-            while sound._environment(process.pid) != env:  # the process has ours until its program has started
+            while sound._read_environment(process.pid) != env:  # the process has ours until its program has started
                 assert time.monotonic() < end
             found, seen = sound.find_session(process.pid)
             assert seen == env

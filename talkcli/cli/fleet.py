@@ -10,7 +10,7 @@ from talkcli.cli.show import note, screen, show_result
 from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.errors import EXIT_SIGPIPE, ServerUnavailable
 from talkcli.fleet.desk.request import Selection
-from talkcli.fleet.desk.table import FleetTranscript, robot_lines
+from talkcli.fleet.desk.table import FleetTranscript, format_robots
 from talkcli.fleet.payloads import Presence, RobotInfo
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def fleet(options: CommonOptions, what: str, long: bool) -> int | None:
     if not selected:
         raise _no_robot_error(broker, selection)
     output = screen(long=long)
-    show_result(options, [each.to_json() for each in selected], lambda: robot_lines(selected, output, time.time()))
+    show_result(options, [each.to_json() for each in selected], lambda: format_robots(selected, output, time.time()))
     return None
 
 
@@ -84,7 +84,7 @@ def _show_event(
     elif isinstance(event, RobotChanged):
         message: JsonObject = {"robot": event.name, "event": "presence", "presence": event.now and event.now.to_json()}
         robot = event.now or Presence(event.name, online=False)
-        show_result(options, [message], lambda: transcript.change(event.before, robot, output, now))
+        show_result(options, [message], lambda: transcript.change_lines(event.before, robot, output, now))
     elif isinstance(event, RobotEvent):
         message = {"robot": event.name, **event.message}
         show_result(options, [message], lambda: transcript.lines(event.name, event.event, output, now))

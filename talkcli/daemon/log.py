@@ -40,8 +40,8 @@ class RateLimit:
         #: number of events in this period, including suppressed events
         self._event_count = 0
 
-    def allow(self, now: float) -> int | None:
-        """Count an event, and return None if it exceeds the limit and must be suppressed.
+    def count_event(self, now: float) -> int | None:
+        """Count an event. Return how many events were suppressed before it, or None to suppress it, too.
 
         If the event is allowed, return how many events have been suppressed since the last allowed event.
         """
@@ -77,20 +77,20 @@ def write(message: str) -> None:
 
 
 def write_limited(kind: str, message: str) -> None:
-    """Write at most one line of this kind per minute.
+    """Write a line to the log, unless a line of this kind was written less than a minute ago.
 
     The next line of the kind gives the number of suppressed lines.
     """
-    suppressed = _rate_limits.setdefault(kind, RateLimit(1, _REPEAT_AFTER_S)).allow(time.monotonic())
+    suppressed = _rate_limits.setdefault(kind, RateLimit(1, _REPEAT_AFTER_S)).count_event(time.monotonic())
     if suppressed is not None:
         write(f"{message} ({suppressed} similar lines were not logged)" if suppressed else message)
 
 
-def write_bug(what: str, error: Exception) -> None:
-    """Log an unexpected exception, with the file and line that raised it."""
+def write_bug(context: str, error: Exception) -> None:
+    """Log an unexpected exception as a bug, with the file and line that raised it."""
     frames = traceback.extract_tb(error.__traceback__)
     place = f" at {os.path.basename(frames[-1].filename)}:{frames[-1].lineno}" if frames else ""
-    write(f"a bug in talk ({what}{place}): {sanitize(f'{type(error).__name__}: {error}')}")
+    write(f"a bug in talk ({context}{place}): {sanitize(f'{type(error).__name__}: {error}')}")
 
 
 def handle_loop_error(_loop: object, context: Mapping[str, Any]) -> None:

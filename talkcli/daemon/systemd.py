@@ -40,7 +40,7 @@ class ServiceManager:
         """
         self._loop = loop
         self._describe_status = describe_status
-        self._address = _notify_address(os.environ.get("NOTIFY_SOCKET", ""))
+        self._address = _parse_notify_address(os.environ.get("NOTIFY_SOCKET", ""))
         self._socket: socket.socket | None = None
         self._watchdog_interval = _watchdog_interval()
         #: unsent fields, with their newest values
@@ -61,7 +61,7 @@ class ServiceManager:
         self._notify_watchdog()
 
     def schedule_status(self) -> None:
-        """Report the status after a short delay."""
+        """Report the process's status after a short delay, unless this is already scheduled."""
         self._schedule("status", STATUS_DELAY_S, self._notify_status)
 
     def notify_stopping(self) -> None:
@@ -79,16 +79,19 @@ class ServiceManager:
             self._socket = None
 
     def _notify_status(self) -> None:
+        """Report the process's status if it has changed, unless the process is stopping."""
         status = self._describe_status()
         if self._status not in {status, "stopping"}:
             self._send(STATUS=status)
 
     def _notify_watchdog(self) -> None:
+        """If there is a watchdog, notify it now and schedule the next notification."""
         if self._watchdog_interval:
             self._send(WATCHDOG="1")
             self._schedule("watchdog", self._watchdog_interval, self._notify_watchdog)
 
     def _schedule(self, name: str, seconds: float, action: Callable[[], None]) -> None:
+        """Call `action` after a delay, unless a timer with this name is already running."""
         if self._socket is None or name in self._timers:
             return
 
@@ -99,6 +102,7 @@ class ServiceManager:
         self._timers[name] = self._loop.call_later(seconds, act)
 
     def _send(self, **fields: str) -> None:
+        """Send these fields together with unsent ones. If this fails, try again later."""
         if self._socket is None:
             return
         self._status = fields.get("STATUS", self._status)
@@ -114,15 +118,15 @@ class ServiceManager:
             self._unsent.clear()
 
 
-def _notify_address(name: str) -> str:
-    """Return the socket address in NOTIFY_SOCKET, or "" if it is unset or invalid."""
-    if name.startswith("@"):
-        return "\0" + name[1:]  # an abstract socket, which Linux names with @
-    return name if os.path.isabs(name) else ""
+def _parse_notify_address(value: str) -> str:
+    """Convert the value of NOTIFY_SOCKET to a socket address. Return "" if it is unset or invalid."""
+    if value.startswith("@"):
+        return "\0" + value[1:]  # an abstract socket, which Linux names with @
+    return value if os.path.isabs(value) else ""
 
 
 def _watchdog_interval() -> float | None:
-    """Return the seconds between two watchdog notifications, or None if there is no watchdog."""
+    """Return the seconds between two watchdog notifications, or None if the environment sets no watchdog."""
     timeout, own_pid = os.environ.get("WATCHDOG_USEC", ""), str(os.getpid())
     is_for_us = os.environ.get("WATCHDOG_PID", own_pid) == own_pid  # the watchdog may watch another process
     timeout_us = int(timeout) if timeout.isdecimal() and is_for_us else 0

@@ -103,7 +103,7 @@ class BrokerExamination:
             broker = from_environment(self._environment, insecure=self._insecure)
             name, context = client_user(broker), broker.ssl_context()
         except UsageError as error:
-            yield judge_settings(error.message, named=bool(self._environment.get(URL)))
+            yield judge_settings(error.message, has_url=bool(self._environment.get(URL)))
             return
         for finding in self._check_connection(broker, context):
             yield finding
@@ -123,9 +123,9 @@ class BrokerExamination:
         elif self._is_robot:
             presence_finding = ok("name", f"the name '{self._robot}' is free: no bridge has used it")
         else:
-            privileged = rights_finding.state != FAILURE
-            known = sorted(presences) if privileged else []
-            presence_finding = judge_unknown(self._robot, known, name, privileged=privileged)
+            has_rights = rights_finding.state != FAILURE
+            known = sorted(presences) if has_rights else []
+            presence_finding = judge_unknown_robot(self._robot, known, name, has_rights=has_rights)
         yield presence_finding
         yield rights_finding
         if not self._is_robot and FAILURE not in (presence_finding.state, rights_finding.state):
@@ -137,7 +137,7 @@ class BrokerExamination:
         try:
             connection = self._wait_for(partial(socket.create_connection, (broker.host, broker.port), LOGIN_LIMIT_S))
         except (OSError, UnicodeError) as error:  # UnicodeError means that the host name is invalid
-            yield judge_unreachable(broker, _describe_error(error))
+            yield judge_unreachable(broker, _explain_error(error))
             return
         yield ok("broker", f"connected to {broker.url} in {(time.monotonic() - began) * 1000:.0f} ms")
         expires_at = None
@@ -147,13 +147,13 @@ class BrokerExamination:
                     expires_at = self._wait_for(partial(_read_expiry, connection, context, broker.host))
                 except OSError as error:
                     code = error.verify_code if isinstance(error, ssl.SSLCertVerificationError) else 0
-                    yield judge_tls_error(broker, _describe_error(error), code, time.time())
+                    yield judge_tls_error(broker, _explain_error(error), code, time.time())
                     return
         if broker.tls or not is_local(broker.host):
             yield judge_certificate(broker, expires_at, time.time())
 
     def _log_in(self, broker: Broker) -> Link:
-        """Connect to the broker and log in. Raises the same errors as `Link.open`."""
+        """Connect to the broker, log in, and return the connection. Raises the same errors as `Link.open`."""
         name = f"talk-doctor-{os.urandom(8).hex()}"
         link = Link(broker, name, self._inbox.append, receive_maximum=MAX_RECEIVE_COUNT)
         try:
@@ -163,7 +163,7 @@ class BrokerExamination:
         return link
 
     def _check_anonymous(self, broker: Broker) -> Finding:
-        """Check whether the broker refuses clients without credentials."""
+        """Try to log in without credentials, and return the finding. It is a warning if the broker allows this."""
         try:
             self._log_in(replace(broker, user=None, password=None, cert=None, key=None)).close()
         except TalkError:
@@ -171,18 +171,18 @@ class BrokerExamination:
         words = "the broker accepts clients without credentials: anybody on the network can make the robots speak"
         return warning("anonymous", words, "allow_anonymous false in mosquitto.conf; then: talk bridge --print-acl")
 
-    def _test_rights(self, link: Link, name: str) -> tuple[Finding, dict[str, Presence]]:
-        """Find out whether the user has the access rights of an operator, or of this robot's bridge.
+    def _test_rights(self, link: Link, user: str) -> tuple[Finding, dict[str, Presence]]:
+        """Test the user's rights with messages. Return the finding about them, and each robot's presence by its name.
 
-        Return the finding about the rights, and the presence of each robot by its name. Other robots are only read if
-        this robot's presence is missing, and the user isn't the robot.
+        The user needs the rights of an operator, or those of this robot's bridge. Other robots are only read if this
+        robot's presence is missing, and the user isn't the robot.
         """
-        robot, replies = partial(topics.robot, self._robot), partial(topics.reply, name, os.urandom(8).hex())
+        robot, replies = partial(topics.robot, self._robot), partial(topics.reply, user, os.urandom(8).hex())
         if self._is_robot:
             echo = robot(topics.ECHO)
             others = [robot(topics.STATUS), robot(topics.EVENT, "doctor"), replies(self._robot)]
         else:
-            echo, others = replies(topics.MARKER), [robot(topics.REQUEST, name)]
+            echo, others = replies(topics.MARKER), [robot(topics.REQUEST, user)]
         codes, presences = dict[str, int](), dict[str, Presence]()
         link.subscribe(echo, retained=False)
         link.subscribe(robot(topics.PRESENCE), retained=True)
@@ -211,10 +211,10 @@ class BrokerExamination:
         missing = [each for each in tested if each not in codes]
         trouble = link.ended or (f"the broker did not acknowledge a message to {missing[0]}" if missing else None)
         unreadable = () if is_back or echo in unwritable else (echo,)
-        return judge_rights(name, unwritable, unreadable, trouble), presences
+        return judge_rights(user, unwritable, unreadable, trouble), presences
 
     def _ask_robot(self, broker: Broker) -> Finding:
-        """Check whether the robot's server answers a status request."""
+        """Request the status of the robot's server, and return the finding about the answer."""
         end = time.monotonic() + _STEP_LIMIT_S
         try:
             connection = connect_robot(
@@ -223,14 +223,14 @@ class BrokerExamination:
             with Client.over(connection) as client:
                 began = time.monotonic()
                 server = client.status().server
-                return judge_bridge(self._robot, server, time.monotonic() - began)
+                return judge_server_status(self._robot, server, time.monotonic() - began)
         except TalkError as error:
             wrong, _, remedy = error.message.partition("; ")
             step = f"read the bridge's log on {self._robot}: journalctl -u talk-bridge"
             return failure("bridge", wrong, remedy or step)
 
-    def _wait_for(self, work: Callable[[], _Result]) -> _Result:
-        """Run a blocking function in a thread, and return its result.
+    def _wait_for(self, function: Callable[[], _Result]) -> _Result:
+        """Run a blocking function in a thread with a time limit, and return its result.
 
         Raises:
             TimeoutError: The work takes too long. The thread continues, but its result is ignored.
@@ -242,7 +242,7 @@ class BrokerExamination:
         def run() -> None:
             with writer:
                 try:
-                    result.set_result(work())
+                    result.set_result(function())
                 except BaseException as error:  # noqa: BLE001 - raised again in the waiting thread
                     result.set_exception(error)
 
@@ -254,12 +254,13 @@ class BrokerExamination:
 
 
 def _read_expiry(connection: socket.socket, context: ssl.SSLContext, host: str) -> float:
-    """Start TLS, and return when the broker's certificate expires, in seconds since 1970."""
+    """Start TLS on a connection, and return when the broker's certificate expires, in seconds since 1970."""
     with context.wrap_socket(connection, server_hostname=host) as secured:
         return ssl.cert_time_to_seconds(str((secured.getpeercert() or {})["notAfter"]))
 
 
-def _describe_error(error: OSError | UnicodeError) -> str:
+def _explain_error(error: OSError | UnicodeError) -> str:
+    """Return a short text that says why a connection to the broker failed."""
     if isinstance(error, ssl.SSLCertVerificationError):
         return error.verify_message
     if isinstance(error, ssl.SSLError):
@@ -271,22 +272,22 @@ def _describe_error(error: OSError | UnicodeError) -> str:
     return _NO_ANSWER if isinstance(error, TimeoutError) else error.strerror or str(error)
 
 
-def judge_settings(words: str, *, named: bool) -> Finding:
+def judge_settings(message: str, *, has_url: bool) -> Finding:
     """Return the finding about invalid broker settings.
 
     Args:
-        words: the error message.
-        named: whether TALK_BROKER is set.
+        message: the error message.
+        has_url: whether TALK_BROKER is set.
     """
-    if not named:
+    if not has_url:
         return failure("broker", f"{URL} is not set", f"export {URL}=mqtts://broker.example")
-    return failure("broker", words, "correct it in the shell's start file, or in the unit's EnvironmentFile=")
+    return failure("broker", message, "correct it in the shell's start file, or in the unit's EnvironmentFile=")
 
 
-def judge_unreachable(broker: Broker, trouble: str) -> Finding:
-    """Return the finding about a broker that can't be reached."""
-    step = _UNREACHABLE_STEPS.get(trouble, _UNREACHABLE_STEPS[_NO_ANSWER])
-    return failure("broker", f"{broker.url}: {trouble}", step.format(host=broker.host, port=broker.port))
+def judge_unreachable(broker: Broker, reason: str) -> Finding:
+    """Return the finding about a broker that can't be reached. `reason` is a text of `_explain_error`."""
+    step = _UNREACHABLE_STEPS.get(reason, _UNREACHABLE_STEPS[_NO_ANSWER])
+    return failure("broker", f"{broker.url}: {reason}", step.format(host=broker.host, port=broker.port))
 
 
 def judge_certificate(broker: Broker, expires_at: float | None, now: float) -> Finding:
@@ -303,10 +304,10 @@ def judge_certificate(broker: Broker, expires_at: float | None, now: float) -> F
         return warning("certificate", words, step)
     date = time.strftime("%Y-%m-%d", time.gmtime(expires_at))
     if expires_at - now < _RENEWAL_LIMIT_S:
-        words = f"valid until {date}, {format_span(expires_at - now)} from now; trusted by {_authority(broker)}"
+        words = f"valid until {date}, {format_span(expires_at - now)} from now; trusted by {_describe_cas(broker)}"
         step = f"renew the certificate of {broker.host}, and send SIGHUP to mosquitto, so that it reads the new one"
         return warning("certificate", words, step)
-    return ok("certificate", f"trusted by {_authority(broker)}; valid until {date}")
+    return ok("certificate", f"trusted by {_describe_cas(broker)}; valid until {date}")
 
 
 def judge_tls_error(broker: Broker, message: str, code: int, now: float) -> Finding:
@@ -318,16 +319,16 @@ def judge_tls_error(broker: Broker, message: str, code: int, now: float) -> Find
         code: OpenSSL's error code if the certificate was rejected, otherwise 0.
         now: the current time in seconds since 1970.
     """
-    step = _trust_step(broker, message, code, now)
-    return failure("certificate", f"{message} (checked against {_authority(broker)})", step)
+    step = _advise_on_tls_error(broker, message, code, now)
+    return failure("certificate", f"{message} (checked against {_describe_cas(broker)})", step)
 
 
-def _authority(broker: Broker) -> str:
-    """Return which CAs the broker's certificate is checked against."""
+def _describe_cas(broker: Broker) -> str:
+    """Return words for the CAs against which the broker's certificate is checked."""
     return f"the CA in {broker.ca}" if broker.ca else "the system's CAs"
 
 
-def _trust_step(broker: Broker, message: str, code: int, now: float) -> str:
+def _advise_on_tls_error(broker: Broker, message: str, code: int, now: float) -> str:
     """Return advice on how to fix a TLS error. The arguments are those of `judge_tls_error`."""
     if code in _DATE_CODES:
         clock = time.strftime("%Y-%m-%d %H:%M", time.gmtime(now))
@@ -360,7 +361,7 @@ def judge_login(broker: Broker, refusal: str | None) -> Finding:
 
 
 def judge_presence(presence: Presence, now: float) -> Finding:
-    """Return the finding about the robot's presence."""
+    """Return the finding about whether the robot is online and has a server, from its presence message."""
     robot = presence.name
     if not presence.online:
         step = f"check its network and power; on {robot}, run: systemctl status talk-bridge"
@@ -377,52 +378,52 @@ def judge_presence(presence: Presence, now: float) -> Finding:
     return ok("name", f"{words}; its server is talk {server.get('version')}, process {server.get('pid')}")
 
 
-def judge_unknown(robot: str, known: list[str], name: str, *, privileged: bool) -> Finding:
+def judge_unknown_robot(robot: str, known_robots: list[str], user: str, *, has_rights: bool) -> Finding:
     """Return the finding about a robot for which the broker sends no presence message.
 
     Args:
         robot: the robot's name.
-        known: the names of the robots that the broker knows.
-        name: the user's name.
-        privileged: whether the user has all other access rights.
+        known_robots: the names of the robots that the broker knows.
+        user: the user's name.
+        has_rights: whether the user has all other access rights.
     """
     words = f"the broker knows no robot named '{robot}'"
-    by_lower = {each.lower(): each for each in known}
+    by_lower = {each.lower(): each for each in known_robots}
     near = [by_lower[each] for each in difflib.get_close_matches(robot.lower(), by_lower)]
     if near:
         return failure("name", f"{words}; known robots: {join_names(near)}", f"talk --robot {near[0]} doctor")
     step = f"on the robot, run: talk bridge --name {robot}"
-    if known:
-        return failure("name", f"{words}; known robots: {join_names(known)}", step)
-    words += f", or '{name}' is not allowed to see it"
-    if not privileged:
-        return warning("name", words, f"give '{name}' the rights of an operator, and run talk doctor again")
-    return failure("name", words, f"{step}; or add the access rules for '{name}': talk bridge --print-acl")
+    if known_robots:
+        return failure("name", f"{words}; known robots: {join_names(known_robots)}", step)
+    words += f", or '{user}' is not allowed to see it"
+    if not has_rights:
+        return warning("name", words, f"give '{user}' the rights of an operator, and run talk doctor again")
+    return failure("name", words, f"{step}; or add the access rules for '{user}': talk bridge --print-acl")
 
 
-def judge_rights(name: str, unwritable: tuple[str, ...], unreadable: tuple[str, ...], trouble: str | None) -> Finding:
+def judge_rights(user: str, unwritable: tuple[str, ...], unreadable: tuple[str, ...], error: str | None) -> Finding:
     """Return the finding about the user's access rights, as shown by test messages.
 
     Args:
-        name: the user's name.
+        user: the user's name.
         unwritable: topics to which the user must not publish.
         unreadable: topics that the user can't read, because no message came back.
-        trouble: why the rights could not be tested, or None if they could.
+        error: why the rights could not be tested, or None if they could.
     """
     parts = [f"write to {' and '.join(unwritable)}"] if unwritable else []
     # If the connection broke, a missing message doesn't prove that reading is forbidden.
-    parts += [f"read {' and '.join(unreadable)}"] if unreadable and trouble is None else []
+    parts += [f"read {' and '.join(unreadable)}"] if unreadable and error is None else []
     if parts:
-        words = f"the broker does not allow '{name}' to {', or to '.join(parts)}"
+        words = f"the broker does not allow '{user}' to {', or to '.join(parts)}"
         return failure("rights", words, "add the missing lines to the broker's acl_file: talk bridge --print-acl")
-    if trouble is not None:
-        return failure("rights", f"the rights of '{name}' could not be tested: {trouble}", _LOG_STEP)
-    return ok("rights", f"the broker allows '{name}' everything that is needed")
+    if error is not None:
+        return failure("rights", f"the rights of '{user}' could not be tested: {error}", _LOG_STEP)
+    return ok("rights", f"the broker allows '{user}' everything that is needed")
 
 
-def judge_bridge(robot: str, server: JsonObject, took: float) -> Finding:
-    """Return the finding about the robot's answer, which arrived after `took` seconds."""
-    words = f"{robot} answered in {took * 1000:.0f} ms: {summarize_server(server)}"
+def judge_server_status(robot: str, server: JsonObject, answer_s: float) -> Finding:
+    """Return the finding about the status that the robot's server sent within `answer_s` seconds."""
+    words = f"{robot} answered in {answer_s * 1000:.0f} ms: {summarize_server(server)}"
     if server.get("paused") is True:
         return warning("bridge", f"speech is paused; {words}", f"talk --robot {robot} resume")
     if server.get("engine") not in WORKING_STATES:

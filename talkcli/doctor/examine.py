@@ -69,23 +69,23 @@ class LocalExamination:
         client, socket = server.connect(self._socket, self._interrupt)
         with client or contextlib.nullcontext():
             for each in self._run_checks(client, socket):
-                finding = sound.add_pactl_package(each, self._env)
+                finding = sound.add_pactl_hint(each, self._env)
                 self._findings.append(finding)
                 yield finding
 
-    def _run_checks(self, client: Client | None, socket: Finding) -> Iterator[Finding]:
-        """Run all checks. The arguments are the results of `server.connect`."""
+    def _run_checks(self, client: Client | None, socket_finding: Finding) -> Iterator[Finding]:
+        """Run all checks, and yield their findings. The arguments are the results of `server.connect`."""
         of_server: list[Finding] = []
         if client is not None:
             try:
-                self._server, log = server.describe_server(client)
+                self._server, log = server.request_status_and_log(client)
                 of_server = server.judge_server(self._server, log, time.time())
             except TalkError as error:
-                client, of_server = None, [server.judge_gone(error.message)]
+                client, of_server = None, [server.judge_unresponsive_server(error.message)]
         self._client = client
         self._server_pid = None if client is None else server.local_pid(client)
         voice_here = None if client else self._setting("voice", "TALK_VOICE")
-        self._engine = voice.find_engine(voice.EngineOptions(voice=voice_here, interrupt=self._interrupt))
+        self._engine = voice.probe_engine(voice.EngineOptions(voice=voice_here, interrupt=self._interrupt))
         yield voice.judge_python()
         pyttsx3 = voice.installed_version("pyttsx3")
         yield from voice.judge_engine(pyttsx3, self._engine, server=self._setting("engine"))
@@ -98,12 +98,12 @@ class LocalExamination:
         elif sys.platform.startswith("linux"):
             yield sound.judge_session(self._session)
             yield from self._check_sound()
-        yield socket
+        yield socket_finding
         yield from of_server
-        yield self._check_sentence()
+        yield self._speak_sentence()
 
     def _setting(self, name: str, variable: str = "") -> str | None:
-        """Return a server setting, or an environment variable if there is no server. None if it isn't set."""
+        """Return a server setting, or an environment variable if there is no server. Return None if it isn't set."""
         value = self._server.get(name) if self._server else os.environ.get(variable)
         return str(value) if value else None
 
@@ -113,7 +113,7 @@ class LocalExamination:
         return self._setting("player", "TALK_PLAYER")
 
     def _check_neural(self) -> Iterator[Finding]:
-        """Check neural voices if one is installed or in use."""
+        """Check neural voices if one is installed or in use, and yield the findings."""
         used, engine, env = self._setting("voice", "TALK_VOICE"), self._engine, self._env
         reported = self._server.get("neural_voices")
         server_voices = reported if isinstance(reported, dict) else {}
@@ -132,7 +132,7 @@ class LocalExamination:
         yield from voice.check_neural(used, options, SENTENCE_LIMIT_S, server_voices if self._client else None)
 
     def _check_sound(self) -> Iterator[Finding]:
-        """Check everything between the engine and the loudspeaker."""
+        """Check everything between the engine and the loudspeaker, and yield the findings."""
         env, session, device, by_server = self._env, self._session, self._setting("device"), self._client is not None
         if not is_own_driver(self._setting("driver")):
             return  # pyttsx3's other drivers play the sound themselves
@@ -155,13 +155,13 @@ class LocalExamination:
         yield sound.judge_sound_server(sound_server, cards, session)
         yield from sound.check_levels(env, sound_server, cards, is_used=device is None and used in PLAYERS)
 
-    def _check_sentence(self) -> Finding:
-        """Speak the sentence, and return the finding."""
+    def _speak_sentence(self) -> Finding:
+        """Speak the doctor's sentence, audibly or silently, and return the finding about it."""
         client, engine, player = self._client, self._engine, self._player
         if client is not None and self._silent:
             if self._server_pid is None:
                 return sentence.SENTENCE_ELSEWHERE
-            result = sentence.speak_beside_server(client, self._server_options(self._server_pid), SENTENCE_LIMIT_S)
+            result = sentence.speak_beside_server(client, self._copy_server_options(self._server_pid), SENTENCE_LIMIT_S)
         elif client is not None:
             result = sentence.speak_by_server(client, SENTENCE_TEXT, SENTENCE_LIMIT_S)
         elif engine.reason is not None:
@@ -182,8 +182,8 @@ class LocalExamination:
         silent, device = self._silent or is_silent(player), self._setting("device")
         return sentence.judge_sentence(result, silent=silent, device=device, playback_step=step, hangs=self._hangs)
 
-    def _server_options(self, server_pid: int) -> voice.EngineOptions:
-        """Return the options with which the doctor's engine plays in the same way as the server's engine."""
+    def _copy_server_options(self, server_pid: int) -> voice.EngineOptions:
+        """Return options with which the doctor's own engine uses the same player, device and voice as the server."""
         player, first = self._player, None
         if is_silent(player):
             player = "null"  # don't write to the server's output file

@@ -43,7 +43,7 @@ class Finding:
 
 @frozen
 class Question:
-    """The question that an examination answers."""
+    """A question that an examination answers, given as the text of each answer."""
 
     #: the human-readable answers
     yes: str
@@ -74,7 +74,7 @@ def failure(check: str, message: str, step: str) -> Finding:
 
 
 def join_names(names: Sequence[str]) -> str:
-    """Join names with commas. A long list is shortened."""
+    """Join names with commas. If there are many, show only the first four."""
     hidden = len(names) - _SHOWN_NAMES_COUNT
     return ", ".join(names) if hidden <= 1 else f"{', '.join(names[:_SHOWN_NAMES_COUNT])} and {hidden} more"
 
@@ -115,7 +115,7 @@ def format_conclusion(findings: Sequence[Finding], screen: Screen, question: Que
 
 
 def _wrap(text: str, room: int | None) -> list[str]:
-    """Wrap a text to `room` columns. If `room` is None, return it as one line."""
+    """Split a text into lines of at most `room` characters. If `room` is None, return a single line."""
     if room is None:
         return [text]
     # Don't break words at hyphens, because users copy paths and commands.

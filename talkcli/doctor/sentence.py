@@ -88,7 +88,7 @@ class SentenceResult:
 
 
 def speak_by_server(client: Client, text: str, limit: float) -> SentenceResult:
-    """Speak a sentence through the server. Cancel it if it has not ended after `limit` seconds."""
+    """Speak a sentence through the server, and return how it ended. Cancel it after `limit` seconds."""
     try:
         goal = client.say(text, preempt=False, ttl=0)
         try:
@@ -99,7 +99,7 @@ def speak_by_server(client: Client, text: str, limit: float) -> SentenceResult:
                 result = replace(result, player=client.status().server.get("player"))
             return result
         except TimeoutError:
-            return _cancel_late(client, goal, limit)
+            return _cancel_late_goal(client, goal, limit)
         except Interrupted:
             goal.request_cancel()
             raise
@@ -107,8 +107,8 @@ def speak_by_server(client: Client, text: str, limit: float) -> SentenceResult:
         return SentenceResult(State.LOST, Reason.LOST, error.message)
 
 
-def _cancel_late(client: Client, goal: GoalHandle, limit: float) -> SentenceResult:
-    """Cancel a goal that took too long, and return the reason for the delay."""
+def _cancel_late_goal(client: Client, goal: GoalHandle, limit: float) -> SentenceResult:
+    """Cancel a goal that took longer than `limit` seconds, and return a result that explains the delay."""
     before = client.status()
     ended = goal.cancel()
     if ended.state in {State.SUCCEEDED, State.ABORTED}:  # it ended before it could be cancelled
@@ -124,12 +124,12 @@ def _cancel_late(client: Client, goal: GoalHandle, limit: float) -> SentenceResu
 
 
 def _goal_result(goal: Goal) -> SentenceResult:
-    """Return the result of a goal that has ended."""
+    """Convert an ended goal to a SentenceResult."""
     return SentenceResult(goal.state, goal.reason, goal.message, goal.duration, by_server=True)
 
 
 def speak_beside_server(client: Client, options: EngineOptions, limit: float) -> SentenceResult:
-    """Play a silent sentence with the doctor's own engine, while the server may also be speaking."""
+    """Play a silent sentence with the doctor's own engine. Return how it ended, and whether the server spoke."""
     try:
         before = client.status()
         result = speak_by_engine(SILENT_TEXT, options, 0.0, limit)
@@ -142,7 +142,7 @@ def speak_beside_server(client: Client, options: EngineOptions, limit: float) ->
 
 
 def speak_by_engine(text: str, options: EngineOptions, volume: float, limit: float) -> SentenceResult:
-    """Speak a sentence with the doctor's own engine. Give up after `limit` seconds."""
+    """Speak a sentence with the doctor's own engine, and return how it ended. Give up after `limit` seconds."""
     try:
         with start_engine(options, limit) as engine:
             player = engine.wait_for(protocol.Ready).player
@@ -201,7 +201,7 @@ def advise(
 def judge_sentence(
     result: SentenceResult, *, silent: bool, device: object, playback_step: str | None = None, hangs: bool = False
 ) -> Finding:
-    """Return the finding about the sentence.
+    """Return the finding about how the doctor's sentence ended.
 
     Args:
         result: how the sentence ended.

@@ -83,7 +83,7 @@ class SocketPlace:
 
 
 def connect(option: str | None, interrupt: Mapping[int, int] | None) -> tuple[Client | None, Finding]:
-    """Connect to the server, and return the client with the finding about the server's socket.
+    """Connect to the server. Return the client, and the finding about the server's socket.
 
     The client is None if no connection was possible.
 
@@ -99,23 +99,23 @@ def connect(option: str | None, interrupt: Mapping[int, int] | None) -> tuple[Cl
     try:
         client = Client.over(SocketConnection(option, name=DOCTOR_NAME, interrupt=interrupt))
     except TalkError as error:
-        return None, explain_missing([_find_place(each, trusted) for each in tried], named_by, error)
-    before = [_find_place(each, trusted) for each in tried[: tried.index(client.path)]]
+        return None, explain_missing_server([_probe_path(each, trusted) for each in tried], named_by, error)
+    before = [_probe_path(each, trusted) for each in tried[: tried.index(client.path)]]
     by = f"{named_by}, " if named_by else ""
-    return client, judge_found(f"the server is on {client.path} ({by}process {client.server_pid})", before)
+    return client, judge_found_server(f"the server is on {client.path} ({by}process {client.server_pid})", before)
 
 
-def _client_message(error: TalkError, found: list[SocketPlace]) -> str | None:
-    """Return the part of an error message that says why a listening process refused the client."""
+def _find_refusal(error: TalkError, places: list[SocketPlace]) -> str | None:
+    """Return the line of an error message that says why a process refused the client, or None."""
     lines = error.message.splitlines()
     if not lines[0].startswith(_NO_SERVER_PREFIX):
         return lines[0]
-    listening = [f"  {each.path}: " for each in found if each.what == PLACE_LISTENING]
+    listening = [f"  {each.path}: " for each in places if each.what == PLACE_LISTENING]
     return next((line.removeprefix(each) for line in lines for each in listening if line.startswith(each)), None)
 
 
-def _find_place(path: str, trusted: Container[str | None]) -> SocketPlace:
-    """Find out what is at a path, by connecting to it and disconnecting at once."""
+def _probe_path(path: str, trusted: Container[str | None]) -> SocketPlace:
+    """Connect to a path, disconnect at once, and return what is there."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         try:
@@ -133,8 +133,8 @@ def _find_place(path: str, trusted: Container[str | None]) -> SocketPlace:
     return SocketPlace(path, PLACE_STOPPED if stopped else PLACE_LISTENING, uid, pid)
 
 
-def describe_server(client: Client) -> tuple[JsonObject, list[Goal]]:
-    """Return a server's description of itself and its recently ended goals, oldest first.
+def request_status_and_log(client: Client) -> tuple[JsonObject, list[Goal]]:
+    """Ask a server for its description of itself and its recently ended goals, oldest first.
 
     If the server has just started, wait a moment until its engine has reported the player.
     """
@@ -158,22 +158,22 @@ def local_pid(client: Client) -> int | None:
     return client.server_pid if is_local else None
 
 
-def judge_found(words: str, before: list[SocketPlace]) -> Finding:
+def judge_found_server(message: str, earlier_places: list[SocketPlace]) -> Finding:
     """Return the finding about the server's socket, and about anything at the places that clients try first.
 
     Args:
-        words: the description of the server's socket.
-        before: the places that clients try first.
+        message: the description of the server's socket.
+        earlier_places: the places that clients try first.
     """
-    obstacles = [each for each in before if each.what != PLACE_ABSENT]
+    obstacles = [each for each in earlier_places if each.what != PLACE_ABSENT]
     if not obstacles:
-        return ok("socket", words)
-    words = f"{words}; clients first try {'; '.join(map(_format_place, obstacles))}"
-    return warning("socket", words, f"remove {obstacles[0].path}")
+        return ok("socket", message)
+    message = f"{message}; clients first try {'; '.join(map(_format_place, obstacles))}"
+    return warning("socket", message, f"remove {obstacles[0].path}")
 
 
-def explain_missing(places: list[SocketPlace], named_by: str | None, error: TalkError) -> Finding:
-    """Return the finding about a missing server.
+def explain_missing_server(places: list[SocketPlace], named_by: str | None, error: TalkError) -> Finding:
+    """Return the finding that no server was found, with advice.
 
     Args:
         places: the places that were tried.
@@ -182,21 +182,22 @@ def explain_missing(places: list[SocketPlace], named_by: str | None, error: Talk
     """
     tried = f"{named_by} names" if named_by else "tried:"
     words = f"no server found; {tried} {'; '.join(map(_format_place, places))}"
-    message = _client_message(error, places)
+    message = _find_refusal(error, places)
     if message is not None and not any(each.what == PLACE_STOPPED for each in places):
         words = f"{words}; {message}"
-    return failure("socket", words, _missing_step(places, named_by, error.code))
+    return failure("socket", words, _advise_on_missing_server(places, named_by, error.code))
 
 
 def _format_place(place: SocketPlace) -> str:
+    """Format a path and what was found there as words of a message."""
     whose = "" if place.uid is None or place.what not in {PLACE_FOREIGN, PLACE_FORBIDDEN} else f" (uid {place.uid})"
     return f"{place.path}: {place.what}{whose}"
 
 
-def _missing_step(places: list[SocketPlace], named_by: str | None, code: str) -> str:
-    """Return advice for the user if no server was found. `code` is the code of the client's error."""
+def _advise_on_missing_server(places: list[SocketPlace], named_by: str | None, code: str) -> str:
+    """Return advice for a user whose server wasn't found. `code` is the code of the client's error."""
     for each in paths.client_sockets(None) if named_by else []:
-        if _find_place(each, set()).what == PLACE_LISTENING:
+        if _probe_path(each, set()).what == PLACE_LISTENING:
             return f"{_UNNAMING[named_by]}: a server is running on {each}"
     place = next((each for what in _PLACE_ADVICE for each in places if each.what == what), None)
     if place is None:  # a new server could start at any of the places
@@ -218,7 +219,7 @@ def _missing_step(places: list[SocketPlace], named_by: str | None, code: str) ->
     return _PLACE_ADVICE[place.what].format(whose=whose, **fields(place))
 
 
-def judge_gone(message: str) -> Finding:
+def judge_unresponsive_server(message: str) -> Finding:
     """Return the finding about a server that accepted the connection, but didn't answer."""
     return failure("server", message, "read its log, and restart it: talk serve")
 
@@ -235,6 +236,7 @@ def judge_server(server: JsonObject, log: Sequence[Goal], now: float) -> list[Fi
 
 
 def _judge_state(server: JsonObject) -> Finding:
+    """Return the finding about a server's version, engine and pause."""
     version, words = server.get("version"), summarize_server(server)
     if server.get("paused") is True:
         return failure("server", f"speech is paused; {words}", "talk resume")
@@ -256,6 +258,7 @@ def summarize_server(server: JsonObject) -> str:
 
 
 def _judge_settings(server: JsonObject) -> Finding:
+    """Return the finding about a server's settings. It is not ok if the volume is too low."""
     volume = server.get("volume")
     lead_in = [f"lead-in {server['lead_in']} ms"] if server.get("lead_in") else []
     words = ", ".join([*describe_settings(server), *lead_in])
@@ -265,19 +268,20 @@ def _judge_settings(server: JsonObject) -> Finding:
     return ok("settings", words)
 
 
-def _judge_recent(log: Sequence[Goal], now: float, server: JsonObject) -> Finding:
-    if not log:
+def _judge_recent(goals: Sequence[Goal], now: float, server: JsonObject) -> Finding:
+    """Return the finding about recent goals. It is a warning if no goal has succeeded since the last failure."""
+    if not goals:
         return ok(_RECENT_CHECK, "no goals yet")
-    aborted = [each for each in log if each.state is State.ABORTED]
-    many = "the last goal" if len(log) == 1 else f"the last {len(log)} goals"
+    aborted = [each for each in goals if each.state is State.ABORTED]
+    many = "the last goal" if len(goals) == 1 else f"the last {len(goals)} goals"
     if not aborted:
-        return ok(_RECENT_CHECK, f"none of {many} failed" if len(log) > 1 else f"{many} did not fail")
+        return ok(_RECENT_CHECK, f"none of {many} failed" if len(goals) > 1 else f"{many} did not fail")
     last = aborted[-1]
     message = message_details(last.message)
     when = "" if last.ended_at is None else f", {format_span(now - last.ended_at)} ago ({clock_time(last.ended_at)})"
-    which = f"{many}, {last.id}" if len(log) == 1 else f"{len(aborted)} of {many}, most recently {last.id}"
+    which = f"{many}, {last.id}" if len(goals) == 1 else f"{len(aborted)} of {many}, most recently {last.id}"
     words = f"ABORTED: {which}{when}: {last.reason}: {message}"
-    succeeded = sum(each.state is State.SUCCEEDED for each in log[log.index(last) + 1 :])
+    succeeded = sum(each.state is State.SUCCEEDED for each in goals[goals.index(last) + 1 :])
     if succeeded:
         return ok(_RECENT_CHECK, f"{words}; {succeeded} succeeded since then")
     step = advise(last.reason, message, server.get("player"), server.get("device"), last.text)
@@ -285,7 +289,7 @@ def _judge_recent(log: Sequence[Goal], now: float, server: JsonObject) -> Findin
 
 
 def format_span(seconds: object) -> str:
-    """Format a duration in its largest unit, such as "3 min", or return "?" if it isn't a number."""
+    """Format a duration in a suitable unit, such as "3 min". Return "?" if it isn't a number."""
     if not isinstance(seconds, int | float):
         return "?"
     for unit, length in (("d", 86400), ("h", 3600), ("min", 60)):

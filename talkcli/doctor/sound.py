@@ -124,7 +124,7 @@ def find_session(server_pid: int | None) -> tuple[UserSession, Mapping[str, str]
 
     This is the server, or this process if there is no server or its environment can't be read.
     """
-    environment = None if server_pid is None else _environment(server_pid)
+    environment = None if server_pid is None else _read_environment(server_pid)
     if environment is None:
         server_pid, environment = None, dict(os.environ)
     pid = os.getpid() if server_pid is None else server_pid
@@ -133,11 +133,11 @@ def find_session(server_pid: int | None) -> tuple[UserSession, Mapping[str, str]
     usual = f"/run/user/{uid}"
     session = UserSession(
         uid=uid,
-        user=_name(pwd.getpwuid, uid),
+        user=_name_or_id(pwd.getpwuid, uid),
         server_pid=server_pid,
         gids=_group_ids(pid),
         sudo_uid=paths.sudo_caller(environment),
-        origins=tuple(_origins(environment, pid)),
+        origins=tuple(_find_origins(environment, pid)),
         runtime_dir=runtime,
         runtime_owner=None if runtime is None else file_owner(runtime),
         usual_runtime_dir=usual if os.path.isdir(usual) else None,
@@ -150,7 +150,7 @@ def names_a_player(server_pid: int, env: Mapping[str, str]) -> bool:
 
     If it does, the server tries no other player.
     """
-    return bool(env.get("TALK_PLAYER") or re.search(r"\0--player[=\0]", _read_text(f"/proc/{server_pid}/cmdline")))
+    return bool(env.get("TALK_PLAYER") or re.search(r"\0--player[=\0]", _read_proc_text(f"/proc/{server_pid}/cmdline")))
 
 
 def file_owner(path: str) -> int | None:
@@ -163,7 +163,7 @@ def file_owner(path: str) -> int | None:
     return None
 
 
-def _environment(pid: int) -> dict[str, str] | None:
+def _read_environment(pid: int) -> dict[str, str] | None:
     """Return the environment of another process, or None if it belongs to another user."""
     data = read_proc_file(f"/proc/{pid}/environ", -1)
     if data is None or file_owner(f"/proc/{pid}") != os.getuid():
@@ -171,8 +171,8 @@ def _environment(pid: int) -> dict[str, str] | None:
     return dict(each.split("=", 1) for each in os.fsdecode(data).split("\0") if "=" in each)
 
 
-def _name(look_up: Callable[[int], tuple[Any, ...]], number: int) -> str:
-    """Return the name of a user or group, or the number if there is no name."""
+def _name_or_id(look_up: Callable[[int], tuple[Any, ...]], number: int) -> str:
+    """Return the name of a user or group, or the id if it has no name. `look_up` is `getpwuid` or `getgrgid`."""
     try:
         return str(look_up(number)[0])
     except KeyError:
@@ -181,17 +181,17 @@ def _name(look_up: Callable[[int], tuple[Any, ...]], number: int) -> str:
 
 def _group_ids(pid: int) -> tuple[int, ...]:
     """Return the group ids of a process, or those of this process if /proc can't be read."""
-    status = _read_text(f"/proc/{pid}/status")
+    status = _read_proc_text(f"/proc/{pid}/status")
     found = re.search(r"^Gid:\s+\d+\s+(\d+).*?^Groups:([\d \t]*)$", status, re.MULTILINE | re.DOTALL)
     groups = map(int, " ".join(found.groups()).split()) if found else (os.getegid(), *os.getgroups())
     return tuple(sorted(set(groups)))
 
 
-def _origins(environment: Mapping[str, str], pid: int) -> Iterable[str]:
+def _find_origins(environment: Mapping[str, str], pid: int) -> Iterable[str]:
     """Yield descriptions of what started a process, with the most specific one first."""
     if environment.get("container") or any(map(os.path.exists, _CONTAINER_FILES)):
         yield _CONTAINER
-    unit = re.search(r"system\.slice/(?:[^\n]*/)?([^/\n]+)\.service", _read_text(f"/proc/{pid}/cgroup"))
+    unit = re.search(r"system\.slice/(?:[^\n]*/)?([^/\n]+)\.service", _read_proc_text(f"/proc/{pid}/cgroup"))
     service = unit[1] if unit else ""
     # The names are compared in lower case, because Debian's cron is also called CRON.
     programs = {service, *(str(command_name(each)).lower() for each in ancestors(pid))}
@@ -206,26 +206,26 @@ def _origins(environment: Mapping[str, str], pid: int) -> Iterable[str]:
 def find_cards(directory: str = _KERNEL_SOUND) -> tuple[str, ...]:
     """Return the names of the sound cards that the kernel has found."""
     # The first of a card's two lines looks like " 0 [Device         ]: USB-Audio - USB Audio Device".
-    names = re.findall(r"^\s*\d+ \[[^\]]*\]:.*? - (.*)$", _read_text(f"{directory}/cards"), re.MULTILINE)
+    names = re.findall(r"^\s*\d+ \[[^\]]*\]:.*? - (.*)$", _read_proc_text(f"{directory}/cards"), re.MULTILINE)
     return tuple(each.strip() for each in names)
 
 
-def _may_open(found: os.stat_result, entries: list[tuple[int, int, int]], session: UserSession) -> bool:
+def _may_open(stat: os.stat_result, acl: list[tuple[int, int, int]], session: UserSession) -> bool:
     """Return whether the user may read and write a file.
 
     Args:
-        found: the file's mode and owner.
-        entries: the file's access control list, as returned by `_access_list`.
+        stat: the file's mode and owner.
+        acl: the file's access control list, as returned by `_read_acl`.
         session: the user.
     """
     own = {(_ACL_USER, session.uid), *((_ACL_GROUP, each) for each in session.gids)}
-    of_mode = (_ACL_USER, found.st_mode >> 6, found.st_uid), (_ACL_GROUP, found.st_mode >> 3, found.st_gid)
+    of_mode = (_ACL_USER, stat.st_mode >> 6, stat.st_uid), (_ACL_GROUP, stat.st_mode >> 3, stat.st_gid)
     # logind adds an entry for the user. The permissions for others apply only if no entry matches the user.
-    granted = [bits for tag, bits, holder in (*of_mode, *entries) if (tag, holder) in own] or [found.st_mode]
+    granted = [bits for tag, bits, holder in (*of_mode, *acl) if (tag, holder) in own] or [stat.st_mode]
     return session.uid == 0 or any(bits & _ACL_READ_WRITE == _ACL_READ_WRITE for bits in granted)
 
 
-def _access_list(path: str) -> list[tuple[int, int, int]]:
+def _read_acl(path: str) -> list[tuple[int, int, int]]:
     """Return the entries of a file's access control list.
 
     Each entry has a tag, permission bits, and a user or group id.
@@ -236,7 +236,7 @@ def _access_list(path: str) -> list[tuple[int, int, int]]:
     return []
 
 
-def _read_text(path: str) -> str:
+def _read_proc_text(path: str) -> str:
     """Return the text of a file in /proc, or "" if it can't be read."""
     return (read_proc_file(path, -1) or b"").decode(errors="replace")
 
@@ -295,12 +295,12 @@ def installed_players(env: Mapping[str, str]) -> list[str]:
     return [each for each in PACKAGES if on_path(each, env)]
 
 
-def _parse_alsa(output: ProgramOutput) -> list[str]:
-    """Parse the list of devices printed by `aplay -L`, in which descriptions are indented."""
+def _parse_alsa_devices(output: ProgramOutput) -> list[str]:
+    """Return the names in the device list of `aplay -L`, without ALSA's plugins and converters."""
     return [each for each in output.stdout.splitlines() if each and not each[0].isspace() and each not in _NOT_DEVICES]
 
 
-def _parse_sinks(output: ProgramOutput) -> dict[str, str]:
+def _parse_pulse_sinks(output: ProgramOutput) -> dict[str, str]:
     """Parse the list of sinks printed by pactl, and return the state of each sink by name.
 
     A line has the sink's number, name, module, format and state, separated by tabs.
@@ -309,8 +309,8 @@ def _parse_sinks(output: ProgramOutput) -> dict[str, str]:
     return {each[1]: each[-1].strip() for each in lines if len(each) > 2}
 
 
-def _parse_nodes(output: ProgramOutput) -> list[str]:
-    """Parse the list of nodes printed by `pw-cli ls Node`, and return the names of the sinks."""
+def _parse_pipewire_sinks(output: ProgramOutput) -> list[str]:
+    """Return the names of the sinks in the list of nodes printed by `pw-cli ls Node`."""
     nodes = re.split(r"^\s*id \d+,", output.stdout, flags=re.MULTILINE)
     found = [re.search(r'node\.name = "([^"]*)"', each) for each in nodes if '"Audio/Sink"' in each]
     return [each[1] for each in found if each]
@@ -319,15 +319,15 @@ def _parse_nodes(output: ProgramOutput) -> list[str]:
 _LIST_SINKS = "pactl list short sinks"
 #: For each player: the command that lists its devices, the parser for the command's output, and the command's package.
 DEVICE_LISTS: dict[str, tuple[str, Callable[[ProgramOutput], Iterable[str]], str]] = {
-    "aplay": ("aplay -L", _parse_alsa, PACKAGES["aplay"]),
-    "pulse": (_LIST_SINKS, _parse_sinks, PACKAGES["pacat"]),
-    "pacat": (_LIST_SINKS, _parse_sinks, PACKAGES["pacat"]),
-    "pw-cat": ("pw-cli ls Node", _parse_nodes, PACKAGES["pw-cat"]),
+    "aplay": ("aplay -L", _parse_alsa_devices, PACKAGES["aplay"]),
+    "pulse": (_LIST_SINKS, _parse_pulse_sinks, PACKAGES["pacat"]),
+    "pacat": (_LIST_SINKS, _parse_pulse_sinks, PACKAGES["pacat"]),
+    "pw-cat": ("pw-cli ls Node", _parse_pipewire_sinks, PACKAGES["pw-cat"]),
 }
 
 
-def add_pactl_package(finding: Finding, env: Mapping[str, str]) -> Finding:
-    """Add advice on how to install pactl to a finding that mentions pactl, if pactl isn't installed."""
+def add_pactl_hint(finding: Finding, env: Mapping[str, str]) -> Finding:
+    """Return a finding, with a hint on how to install pactl if its advice uses pactl and pactl is missing."""
     if finding.next is None or "pactl " not in finding.next or on_path("pactl", env):
         return finding
     return replace(finding, next=f"{finding.next} (to install pactl: sudo apt-get install -y {PACKAGES['pacat']})")
@@ -335,19 +335,19 @@ def add_pactl_package(finding: Finding, env: Mapping[str, str]) -> Finding:
 
 def suspended_sinks(env: Mapping[str, str]) -> tuple[str, ...]:
     """Return the names of suspended sinks, including sinks that are only suspended because nothing is playing."""
-    sinks = _parse_sinks(run_program(*_LIST_SINKS.split(), env=env))
+    sinks = _parse_pulse_sinks(run_program(*_LIST_SINKS.split(), env=env))
     return tuple(name for name, state in sinks.items() if state == "SUSPENDED")
 
 
 def find_sound_server(env: Mapping[str, str], session: UserSession) -> SoundServer:
-    """Return the sound server to which players in this session connect."""
+    """Find out which sound server the players of this session connect to, or why none answers."""
     pulse = run_program("pactl", "info", env=env)
     if pulse.error is None:
         fields = dict(re.findall(r"^\s*([\w ]+): (.*\S)", pulse.stdout, re.MULTILINE))
         return SoundServer(fields.get("Server Name", "PulseAudio"), fields.get("Default Sink"))
     pipewire = pulse if pulse.timed_out else run_program("pw-cli", "info", "0", env=env)
     # If pactl isn't installed, connecting to the socket is the only way to test whether PulseAudio clients can connect.
-    native = None if on_path("pactl", env) else _pulse_address(env)
+    native = None if on_path("pactl", env) else _find_pulse_address(env)
     if pipewire.error is None:
         name = "PipeWire" if native else "PipeWire without PulseAudio support"
         return SoundServer(name, accepts_pulse=native is not None)
@@ -360,7 +360,7 @@ def find_sound_server(env: Mapping[str, str], session: UserSession) -> SoundServ
     return SoundServer(sockets=sockets, error=error, hangs=pipewire.timed_out, pulse_server=named)
 
 
-def _pulse_address(env: Mapping[str, str]) -> str | None:
+def _find_pulse_address(env: Mapping[str, str]) -> str | None:
     """Return the address of a server that accepts PulseAudio clients, or None if there is none.
 
     An address on another machine isn't tested. The sentence will show whether it works.
@@ -377,7 +377,7 @@ def _pulse_address(env: Mapping[str, str]) -> str | None:
 
 
 def check_levels(env: Mapping[str, str], server: SoundServer, cards: Sequence[str], *, is_used: bool) -> list[Finding]:
-    """Check the volume of the default sink, or of the sound cards if there is no sound server.
+    """Return the findings about the volume of the default sink, or of the sound cards if there is no sound server.
 
     Args:
         env: the environment of the player.
@@ -385,15 +385,15 @@ def check_levels(env: Mapping[str, str], server: SoundServer, cards: Sequence[st
         cards: the names of the sound cards.
         is_used: whether speech is known to go to these outputs.
     """
-    levels = [judge_level(*each, is_used=is_used) for each in _find_levels(env, server, cards)]
+    levels = [judge_level(*each, is_used=is_used) for each in _read_levels(env, server, cards)]
     bad = [each for state in (FAILURE, WARNING) for each in levels if each.state == state]
     if bad or not levels:
         return bad[:1]
     return [ok(_LOUDNESS_CHECK, ", ".join(each.message for each in levels))]
 
 
-def _find_levels(env: Mapping[str, str], server: SoundServer, cards: Sequence[str]) -> Iterable[tuple[str, ...]]:
-    """Yield the arguments of `judge_level` for each output."""
+def _read_levels(env: Mapping[str, str], server: SoundServer, cards: Sequence[str]) -> Iterable[tuple[str, ...]]:
+    """Run mixer programs, and yield the first four arguments of `judge_level` for each output."""
     if server.name is not None:
         mute = run_program("pactl", "get-sink-mute", "@DEFAULT_SINK@", env=env)
         if mute.error is None:
@@ -412,7 +412,7 @@ def _find_levels(env: Mapping[str, str], server: SoundServer, cards: Sequence[st
 
 
 def judge_level(name: str, text: str, unmute_command: str, louder_command: str, *, is_used: bool) -> Finding:
-    """Return the finding about the volume of one output, in which the loudest channel counts.
+    """Return the finding about the volume of one output. If its channels differ, the loudest one counts.
 
     Args:
         name: the name of the sink or the mixer control.
@@ -469,16 +469,16 @@ def judge_session(session: UserSession) -> Finding:
 def judge_silent_player(player: str | None, *, by_server: bool) -> Finding:
     """Return the finding about a configured player that makes no sound."""
     step = "restart the server without --player" if by_server else "unset TALK_PLAYER"
-    return failure("player", f"{player} ({_set_by(by_server)}) makes no sound", step)
+    return failure("player", f"{player} ({_describe_player_setting(by_server)}) makes no sound", step)
 
 
-def _set_by(by_server: bool) -> str:
-    """Return a description of what configured the player."""
+def _describe_player_setting(by_server: bool) -> str:
+    """Return words that say whether the server or TALK_PLAYER configured the player."""
     return "set by the server" if by_server else "set by TALK_PLAYER"
 
 
 def check_player(env: Mapping[str, str], configured: str | None, used: str | None, *, by_server: bool) -> Finding:
-    """Check whether the player is installed.
+    """Check whether the player is installed, and return the finding.
 
     Args:
         env: the environment of the player.
@@ -494,7 +494,7 @@ def check_player(env: Mapping[str, str], configured: str | None, used: str | Non
     if configured is None:
         how = " to play through the sound server" if used == "pulse" else ""
         return ok("player", f"{used} is used{how}" + (f"; other players: {', '.join(others)}" if others else ""))
-    words = f"{configured} ({_set_by(by_server)})"
+    words = f"{configured} ({_describe_player_setting(by_server)})"
     program = _program_of(configured)
     if program is None or not (program == "pulse" or on_path(program, env)):
         known = PACKAGES.get(configured)
@@ -505,7 +505,7 @@ def check_player(env: Mapping[str, str], configured: str | None, used: str | Non
 
 
 def check_device(env: Mapping[str, str], player: str, configured: str | None) -> Finding:
-    """Check whether the device is among those that the player can use.
+    """Check whether the player can use the configured device, and return the finding.
 
     Args:
         env: the environment of the player.
@@ -534,7 +534,7 @@ def check_device(env: Mapping[str, str], player: str, configured: str | None) ->
 
 
 def check_cards(cards: Sequence[str], server: SoundServer, session: UserSession) -> Finding:
-    """Check whether the kernel has found sound cards."""
+    """Return the finding about whether the kernel has found sound cards."""
     if cards:
         return ok("cards", join_names(cards))
     if server.name is not None:
@@ -548,18 +548,18 @@ def check_cards(cards: Sequence[str], server: SoundServer, session: UserSession)
 
 
 def check_access(server: SoundServer, session: UserSession, directory: str = "/dev/snd") -> Finding:
-    """Check whether the user may open the sound cards."""
+    """Check whether the user may open the sound cards, and return the finding."""
     nodes, group, forbidden = players.playback_devices(directory), _AUDIO_GROUP, []
     for each in nodes:
         with contextlib.suppress(OSError):
             found = os.stat(each)
-            group = _name(grp.getgrgid, found.st_gid) if found.st_gid else group
-            if not _may_open(found, _access_list(each), session):
+            group = _name_or_id(grp.getgrgid, found.st_gid) if found.st_gid else group
+            if not _may_open(found, _read_acl(each), session):
                 forbidden.append(each)
     if not nodes:
         return ok("group", f"{directory} has no playback devices, so the group {group} is not needed")
     if not forbidden:
-        is_member = group in [_name(grp.getgrgid, each) for each in session.gids]
+        is_member = group in [_name_or_id(grp.getgrgid, each) for each in session.gids]
         member = f"in the group {group}" if is_member else f"not in the group {group}, which is not needed"
         return ok("group", f"user {session.user} may open the cards ({member})")
     words = f"user {session.user} may not open {join_names(forbidden)}, and is not in the group {group}"
@@ -596,8 +596,8 @@ def judge_sound_server(server: SoundServer, cards: Sequence[str], session: UserS
     return _judge_unreachable(server, session, f"the sound server at {at} cannot be reached {where}: {server.error}")
 
 
-def _judge_unreachable(server: SoundServer, session: UserSession, words: str) -> Finding:
-    """Return a warning that the sound server can't be reached, with the most likely cause."""
+def _judge_unreachable(server: SoundServer, session: UserSession, message: str) -> Finding:
+    """Return a warning that the sound server can't be reached, with advice for the most likely cause."""
     hint, step = "", "systemctl --user restart pipewire pipewire-pulse (or: pulseaudio --start)"
     if server.pulse_server is not None:
         step = "unset PULSE_SERVER, or start the sound server that it names"
@@ -612,4 +612,4 @@ def _judge_unreachable(server: SoundServer, session: UserSession, words: str) ->
         step = "run this without sudo, as the user of the sound server"
     elif session.runtime_dir is None and session.usual_runtime_dir is not None:
         step = f"export XDG_RUNTIME_DIR={session.usual_runtime_dir}"
-    return warning(_SOUND_SERVER_CHECK, words + hint, step)
+    return warning(_SOUND_SERVER_CHECK, message + hint, step)

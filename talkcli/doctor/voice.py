@@ -135,8 +135,8 @@ def start_engine(options: EngineOptions, limit: float = math.inf, output: int | 
     return PrivateEngine(configure, env=options.env, deadline=deadline, interrupt=options.interrupt)
 
 
-def find_engine(options: EngineOptions) -> EngineReport:
-    """Start an engine process, and return its report."""
+def probe_engine(options: EngineOptions) -> EngineReport:
+    """Start an engine process, end it, and return what it reported."""
     ready = None
     try:
         with start_engine(options) as engine:
@@ -164,11 +164,11 @@ def judge_python() -> Finding:
     return ok("python", f"Python {platform.python_version()} ({sys.executable})")
 
 
-def judge_engine(pyttsx3: str | None, engine: EngineReport, *, server: str | None) -> list[Finding]:
+def judge_engine(installed: str | None, engine: EngineReport, *, server: str | None) -> list[Finding]:
     """Return the findings about pyttsx3, libespeak-ng and the voices.
 
     Args:
-        pyttsx3: version of pyttsx3, or None if it is not installed.
+        installed: version of pyttsx3, or None if it is not installed.
         engine: the report of the doctor's engine process.
         server: the state of the server's engine, or None if there is no server. If that engine works, faults of the
             doctor's own engine are only warnings.
@@ -177,12 +177,12 @@ def judge_engine(pyttsx3: str | None, engine: EngineReport, *, server: str | Non
     if engine.ready is not None and server not in {None, *WORKING_STATES}:
         engine = EngineReport(reason=Reason.ENGINE_FAILED, message=f"the server's engine: {server}")
     if engine.ready is not None:
-        words = f"{pyttsx3 or 'unknown version'}, driver {engine.ready.driver}"
+        words = f"{installed or 'unknown version'}, driver {engine.ready.driver}"
         return [ok("pyttsx3", words), *_judge_library(engine.ready.version, engine.voices)]
     message = engine.message.partition("; install it with: ")[0]  # the finding shows the advice separately
-    if "pyttsx3 is missing" in message or pyttsx3 is None:
+    if "pyttsx3 is missing" in message or installed is None:
         return [broken("pyttsx3", message or "pyttsx3 is missing", _INSTALL_PYTTSX3)]
-    found = ok("pyttsx3", pyttsx3)
+    found = ok("pyttsx3", installed)
     if engine.reason == Reason.UNKNOWN_VOICE:
         step = "set TALK_VOICE or --voice to a voice that 'talk voices' lists"
         step = _INSTALL_NEURAL if _INSTALL_NEURAL in engine.message else step
@@ -194,8 +194,9 @@ def judge_engine(pyttsx3: str | None, engine: EngineReport, *, server: str | Non
     return [found, broken("libespeak-ng", message, step)]
 
 
-def _judge_library(synthesizer: str | None, voices: tuple[str, ...] | None) -> list[Finding]:
-    found = [] if synthesizer is None else [ok("libespeak-ng", f"{synthesizer}, with its data")]
+def _judge_library(library_version: str | None, voices: tuple[str, ...] | None) -> list[Finding]:
+    """Return the findings about libespeak-ng and the engine's voices."""
+    found = [] if library_version is None else [ok("libespeak-ng", f"{library_version}, with its data")]
     if voices is None:
         return [*found, warning("voices", "the engine did not list its voices in time", "run talk doctor again")]
     if not voices:
@@ -207,7 +208,7 @@ def _judge_library(synthesizer: str | None, voices: tuple[str, ...] | None) -> l
 def check_neural(
     used: str | None, options: EngineOptions, limit: float, server_voices: dict[str, Any] | None
 ) -> Iterator[Finding]:
-    """Check the packages and files of neural voices, and try the voice in use.
+    """Check the packages and files of neural voices, try the voice in use, and yield the findings.
 
     Args:
         used: the voice in use, as the user wrote it, or None if no neural voice is in use.
@@ -222,13 +223,13 @@ def check_neural(
         yield ok(_PACKAGES_CHECK, ", ".join(map(_with_version, install.NEURAL_PACKAGES)))
     else:
         yield broken(_PACKAGES_CHECK, *fault)
-    yield from _check_files(options.env)
+    yield from _check_voice_files(options.env)
     if used is not None and fault is None:
         yield judge_trial(used, _try_voice(used, options, limit), server_voices)
 
 
-def _check_files(env: Mapping[str, str] | None) -> Iterator[Finding]:
-    """Check the files of all installed neural voices."""
+def _check_voice_files(env: Mapping[str, str] | None) -> Iterator[Finding]:
+    """Check the files of all installed neural voices, and yield a finding if there are any."""
     valid, invalid = [], []
     for name, path in models.find_models(env).items():
         try:
@@ -239,7 +240,7 @@ def _check_files(env: Mapping[str, str] | None) -> Iterator[Finding]:
             invalid.append((NEURAL_PREFIX + name, str(error)))
     if invalid:
         (voice, error_message), *others = invalid
-        message, step = _split_step(error_message)
+        message, step = _split_advice(error_message)
         names = join_names([each for each, _ in others])
         more = f"; also faulty: {names}" if others else ""
         yield warning(_FILES_CHECK, f"{voice}: {message}{more}", step)
@@ -248,10 +249,10 @@ def _check_files(env: Mapping[str, str] | None) -> Iterator[Finding]:
 
 
 def _find_package_fault(env: Mapping[str, str]) -> tuple[str, str] | None:
-    """Check the packages of neural voices. Return an error message and advice, or None if all of them work."""
+    """Test the packages of neural voices. Return an error message and advice, or None if they can be imported."""
     missing = models.missing_package()
     if missing is not None:
-        return _split_step(missing)
+        return _split_advice(missing)
     env = {**env, **models.PACKAGE_VARIABLES}
     fault = None
     for package in install.NEURAL_PACKAGES:  # the first one imports numpy, which may be the one that doesn't work
@@ -269,7 +270,7 @@ def _with_version(package: str) -> str:
     return f"{package} {installed_version(package) or '(unknown version)'}"
 
 
-def _split_step(message: str) -> tuple[str, str]:
+def _split_advice(message: str) -> tuple[str, str]:
     """Split an error message into the fault and the advice, which follows the last semicolon.
 
     The default advice is to choose another voice.
@@ -278,17 +279,17 @@ def _split_step(message: str) -> tuple[str, str]:
     return (what, step.partition("it with: ")[2] or step) if semicolon else (message, _CHOOSE_ESPEAK)
 
 
-def _try_voice(used: str, options: EngineOptions, limit: float) -> VoiceTrial:
+def _try_voice(voice: str, options: EngineOptions, limit: float) -> VoiceTrial:
     """Load a voice, and measure how fast it speaks a sentence. Nothing is played."""
     try:
         with open(os.devnull, "wb") as output, start_engine(options, limit, output.fileno()) as engine:
             engine.wait_for(protocol.Ready)
-            ended, load_s = _speak(engine, used, "a")  # speaking for the first time also loads the voice
+            ended, load_s = _speak(engine, voice, "a")  # speaking for the first time also loads the voice
             began = time.monotonic()
             if ended.outcome == protocol.OUTCOME_COMPLETED:
-                ended, _ = _speak(engine, used, SENTENCE_TEXT)
+                ended, _ = _speak(engine, voice, SENTENCE_TEXT)
             if ended.outcome != protocol.OUTCOME_COMPLETED or ended.duration is None:
-                return VoiceTrial(fault=_split_step(ended.message or "the sentence was not completed"))
+                return VoiceTrial(fault=_split_advice(ended.message or "the sentence was not completed"))
             speed = ended.duration / (time.monotonic() - began)
             return VoiceTrial(load_s, speed, _memory_of(engine._process.pid))
     except EngineFailed as error:
@@ -332,7 +333,7 @@ def judge_server_voices(voices: dict[str, Any]) -> list[Finding]:
 
 
 def judge_trial(used: str, trial: VoiceTrial, server_voices: dict[str, Any] | None) -> Finding:
-    """Return the finding about the neural voice in use. The arguments are those of `check_neural`."""
+    """Return the finding about trying the neural voice in use. The other arguments are those of `check_neural`."""
     broken = failure if server_voices is None else warning
     words = f"{used} is in use: "
     if trial.speed is None:

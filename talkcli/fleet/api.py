@@ -85,7 +85,7 @@ class Fleet:
         return Client.over(connect_robot(name, self._broker, name=self._name))
 
     def say(self, to: str, text: str, *, wait: bool = True, ttl: float | None = None, **options: Any) -> FleetRequest:
-        """Speak a text on each robot.
+        """Speak a text on each robot, and return the request, which yields the outcomes.
 
         The goal has the same id on all robots. To cancel it, call `cancel` on the returned FleetRequest. After the last
         outcome, call `Fleet.cancel` with the id instead.
@@ -97,7 +97,7 @@ class Fleet:
             ttl: the time in seconds within which each robot must start speaking, or 0 for no limit. The default is 10.
             options: other options of `Client.say`, except `follow`.
         """
-        return self._ask(to, Say(text, wait=wait, ttl=ttl, **options))
+        return self._send_request(to, Say(text, wait=wait, ttl=ttl, **options))
 
     def cancel(
         self,
@@ -108,36 +108,37 @@ class Fleet:
         before: str | None = None,
         key: str | None = None,
     ) -> FleetRequest:
-        """Cancel goals on each robot, by default all of them.
+        """Cancel goals on each robot, by default all of them. Return the request, which yields the outcomes.
 
         The other arguments are those of `Client.cancel`. The outcome of a robot arrives when the robot is silent.
         """
-        return self._ask(to, Cancel(None if ids is None else tuple(ids), current, before, key))
+        return self._send_request(to, Cancel(None if ids is None else tuple(ids), current, before, key))
 
     def wait(self, to: str, ids: Iterable[str] | None = None) -> FleetRequest:
-        """Wait for goals on each robot to end, by default all current goals."""
-        return self._ask(to, Wait(None if ids is None else tuple(ids)))
+        """Wait for goals on each robot, by default all current ones. Return the request, which yields the outcomes."""
+        return self._send_request(to, Wait(None if ids is None else tuple(ids)))
 
     def status(self, to: str) -> FleetRequest:
         """Get the status of each robot's server. The details are in the `said["status"]` field of each outcome."""
-        return self._ask(to, Status())
+        return self._send_request(to, Status())
 
     def pause(self, to: str) -> FleetRequest:
-        """Pause speech on each robot until `resume` is called."""
-        return self._ask(to, Pause())
+        """Pause speech on each robot until `resume` is called. Return the request, which yields the outcomes."""
+        return self._send_request(to, Pause())
 
     def resume(self, to: str) -> FleetRequest:
-        """Resume paused speech on each robot."""
-        return self._ask(to, Resume())
+        """Resume paused speech on each robot. Return the request, which yields the outcomes."""
+        return self._send_request(to, Resume())
 
     def set(self, to: str, **settings: Any) -> FleetRequest:
         """Change the settings of each robot's server. The robot's bridge must allow it.
 
         The arguments are those of `Client.set`.
         """
-        return self._ask(to, Set(**settings))
+        return self._send_request(to, Set(**settings))
 
-    def _ask(self, to: str, request: Request) -> FleetRequest:
+    def _send_request(self, to: str, request: Request) -> FleetRequest:
+        """Send a request to the selected robots, and return it."""
         from talkcli.fleet.desk.several import FleetRequest
 
         return FleetRequest(self._broker, Selection(to), request, name=self._name)

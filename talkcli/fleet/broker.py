@@ -70,9 +70,9 @@ class Broker:
             context = ssl.create_default_context(cafile=path)
             if self.cert:
                 names, path = f"{CERT} and {KEY}", self.cert
-                context.load_cert_chain(path, self.key, password=_no_passphrase)
+                context.load_cert_chain(path, self.key, password=_refuse_passphrase)
         except (OSError, UsageError) as error:
-            raise UsageError(f"{names}: {_file_error(path, error)}") from error
+            raise UsageError(f"{names}: {_describe_file_error(path, error)}") from error
         return context
 
 
@@ -163,11 +163,12 @@ def _parse_url(url: str) -> tuple[str, int, bool]:
 
 
 def _read_password(path: str) -> str:
+    """Return the password in a file. Raise UsageError if the file is unusable."""
     try:
         with open(path, "rb") as file:
             password = file.read(_MAX_PASSWORD_BYTES + 3).rstrip(b"\r\n")
     except OSError as error:
-        raise UsageError(f"{PASSWORD_FILE}: {_file_error(path, error)}") from error
+        raise UsageError(f"{PASSWORD_FILE}: {_describe_file_error(path, error)}") from error
     if not password or len(password) > _MAX_PASSWORD_BYTES:
         raise UsageError(
             f"{PASSWORD_FILE}: {printable(path)} is {'too long' if password else 'empty'}; put only the password in it"
@@ -179,7 +180,7 @@ def _read_password(path: str) -> str:
 
 
 def is_local(host: str) -> bool:
-    """Return whether a host name or address refers to this machine."""
+    """Return whether a host is localhost or a loopback address."""
     if host == "localhost":
         return True
     try:
@@ -188,11 +189,12 @@ def is_local(host: str) -> bool:
         return False
 
 
-def _no_passphrase() -> str:
+def _refuse_passphrase() -> str:
+    """Raise UsageError when OpenSSL asks for the passphrase of a key."""
     raise UsageError("the key has a passphrase, which talk can't ask for; use a key without one")
 
 
-def _file_error(path: str | None, error: Exception) -> str:
+def _describe_file_error(path: str | None, error: Exception) -> str:
     """Return a message that explains why a file can't be used."""
     if isinstance(error, ssl.SSLError):
         return f"{printable(str(path))} is not a valid certificate or key: {error.reason or error}"

@@ -310,6 +310,7 @@ class Link:
     def _on_connect(
         self, _client: paho.Client, _data: object, _flags: object, code: ReasonCode, properties: Properties | None
     ) -> None:
+        """Store the broker's response to the login, and the size of the largest payload that it accepts."""
         self._answer = code
         # Turn off paho's log, which is only needed to explain a failed login. It would use a tenth of the CPU time.
         self._paho.on_log = None
@@ -317,22 +318,26 @@ class Link:
         self.max_payload_bytes = max(0, min(MAX_PACKET_BYTES, limit) - MAX_HEADER_BYTES)
 
     def _on_disconnect(self, _client: paho.Client, _data: object, flags: object, code: ReasonCode, _: object) -> None:
+        """Record why the connection has ended."""
         said = getattr(flags, "is_disconnect_packet_from_server", False)
         self.ended = self.ended or (f"the broker disconnected: {code}" if said else "the connection was lost")
         self._socket = None  # paho closes it
 
     def _on_message(self, _client: paho.Client, _data: object, message: paho.MQTTMessage) -> None:
+        """Convert paho's message to a Message, and pass it to the caller's `on_message`."""
         names = "ResponseTopic", "CorrelationData", "MessageExpiryInterval"
         properties = [getattr(message.properties, each, None) for each in names]
         self._deliver(Message(message.topic, bytes(message.payload), message.retain, *properties))
 
     def _on_publish(self, _client: paho.Client, _data: object, mid: int, code: ReasonCode, _: object) -> None:
+        """Call the callback of a message that the broker has acknowledged."""
         size, acknowledged = self._unacknowledged.pop(mid, (0, None))
         self.outstanding_bytes -= size
         if acknowledged:
             acknowledged(code.value)
 
     def _on_log(self, _client: paho.Client, _data: object, _level: int, words: str) -> None:
+        """Store the TLS alert from a line that paho logs during the login."""
         # With TLS 1.3, the broker's alert about a missing certificate arrives in the first read, and paho only logs it.
         if "ALERT" in words and self._answer is None:
             self._alert = words.rpartition("] ")[2].partition(" (")[0]
@@ -375,6 +380,7 @@ class LinkOpener:
                 self.link.close()
 
     def _open(self) -> None:
+        """Open the link and store any error. Then call `on_done`, or close the link if `cancel` was called."""
         try:
             self.link.open()
         except TalkError as error:

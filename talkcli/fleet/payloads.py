@@ -64,7 +64,7 @@ class Presence:
 
         An empty payload, which clears a retained presence, also counts as invalid.
         """
-        said = _object(payload)
+        said = _decode_object(payload)
         if said is None or topics.name_fault(name):
             return None
         lists = {each: _texts(said.pop(each, None)) for each in ("groups", "allow")}
@@ -116,7 +116,7 @@ class RobotStatus:
     @classmethod
     def read(cls, payload: bytes) -> RobotStatus | None:
         """Parse a status message, or return None if the payload is empty or malformed."""
-        said = _object(payload)
+        said = _decode_object(payload)
         if said is None:
             return None
         last = read_fields(LastGoal, said.pop("last", None))
@@ -155,7 +155,7 @@ class RobotInfo:
         return {"robot": self.presence.name, "presence": self.presence.to_json(), "status": status}
 
 
-def _object(payload: bytes) -> JsonObject | None:
+def _decode_object(payload: bytes) -> JsonObject | None:
     """Decode a JSON object, or return None if the payload contains anything else."""
     try:
         return decode(payload.strip())
@@ -164,6 +164,7 @@ def _object(payload: bytes) -> JsonObject | None:
 
 
 def _texts(value: object) -> tuple[str, ...]:
+    """Return the strings in a list. For any other value, return an empty tuple."""
     return tuple(each for each in value if isinstance(each, str)) if isinstance(value, list) else ()
 
 
@@ -215,15 +216,15 @@ def homeassistant_device(name: str, allow: Collection[str], version: str) -> Mes
     return Message(topics.homeassistant_device(name), encode(payload), retained=True)
 
 
-def _command(name: str, kind: str, platform: str, shown: str | None, *, allowed: bool) -> JsonObject:
+def _command(name: str, kind: str, platform: str, label: str | None, *, allowed: bool) -> JsonObject:
     """Return a Home Assistant component that sends a request, or an empty one if the request isn't allowed."""
     if not allowed:
         return {"platform": platform}
     topic = topics.robot(name, kind, topics.HOMEASSISTANT)
-    return {"platform": platform, "command_topic": topic, "qos": 1, "name": shown}
+    return {"platform": platform, "command_topic": topic, "qos": 1, "name": label}
 
 
-def _sensor(name: str, shown: str, template: str, platform: str = "sensor", **more: object) -> JsonObject:
+def _sensor(name: str, label: str, template: str, platform: str = "sensor", **more: object) -> JsonObject:
     """Return a Home Assistant component that shows part of the robot's status."""
     topic = topics.robot(name, topics.STATUS)
-    return {"platform": platform, "name": shown, "state_topic": topic, "value_template": template, "qos": 1, **more}
+    return {"platform": platform, "name": label, "state_topic": topic, "value_template": template, "qos": 1, **more}

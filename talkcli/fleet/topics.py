@@ -73,7 +73,7 @@ def homeassistant_device(name: str) -> str:
 
 
 def parse_request(topic: str) -> tuple[str, str] | None:
-    """Parse a request topic, or return None for any other topic.
+    """Return a request topic's kind and its client's user name, or None for any other topic.
 
     Returns:
         REQUEST, PLAIN_SAY or PLAIN_CANCEL, and the client's user name. The broker's access rules verify the name.

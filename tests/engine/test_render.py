@@ -504,7 +504,7 @@ def test_doctor_tells_silence_alike_before_and_after_the_start(monkeypatch: pyte
     monkeypatch.setenv("SCRIPTED_START_FILE", str(behaviour))
     monkeypatch.setattr(process, "START_LIMIT_S", 0.3)
     words = "the engine process did not respond for 0.3 s"
-    assert voice.find_engine(EngineOptions()) == EngineReport(reason="engine_hung", message=words)
+    assert voice.probe_engine(EngineOptions()) == EngineReport(reason="engine_hung", message=words)
 
 
 @pytest.mark.usefixtures("scripted_process")

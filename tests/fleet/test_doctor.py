@@ -317,5 +317,5 @@ def test_a_broker_that_hangs_up_on_a_forbidden_topic_is_told_from_one_that_refus
     ],
 )
 def test_the_server_s_own_words_are_judged(change: dict[str, object], state: str, step: str | None) -> None:
-    found = judging.judge_bridge("anna", SERVER | change, 0.001)
+    found = judging.judge_server_status("anna", SERVER | change, 0.001)
     assert (found.state, found.next) == (state, step)

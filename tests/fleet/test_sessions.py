@@ -241,9 +241,9 @@ async def test_all_remote_clients_hold_four_mebibytes_and_a_cancel_is_taken_beyo
         refused.append([each for each in anna.lines(f"s{session}") if each.get("ok") is False])
     assert [bool(each) for each in refused] == [False, True, True]
     assert {each["error"]["code"] for each in refused[1]} == {"busy"}
-    assert (4 << 20) - 61_000 < anna.sessions.waiting_bytes() <= 4 << 20
+    assert (4 << 20) - 61_000 < anna.sessions.count_waiting_bytes() <= 4 << 20
     assert (await anna.ask({"seq": 3, "request": "cancel"}, "another"))["ok"]
-    assert anna.sessions.waiting_bytes() == 0
+    assert anna.sessions.count_waiting_bytes() == 0
     anna.sessions.end_all()
 
 

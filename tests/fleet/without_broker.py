@@ -44,7 +44,7 @@ class SessionsWithoutBroker:
         now = self._policy.newest_echo_at = self._boottime()
         found = self._policy.decide(message, *asked, now)
         if isinstance(found, policy.Goodbye):
-            self.sessions.say_goodbye(found.user, found.reply_topic)
+            self.sessions.handle_goodbye(found.user, found.reply_topic)
         else:
             assert isinstance(found, policy.RemoteRequest), found
             self.sessions.submit(found)

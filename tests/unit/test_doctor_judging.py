@@ -136,7 +136,7 @@ def examined(
         for name in ("speak_beside_server", "speak_by_server", "speak_by_engine"):
             patch.setattr(sentence, name, lambda *_: played)
         patch.setattr(sound, "suspended_sinks", lambda _: ("usb",))
-        return examination._check_sentence()
+        return examination._speak_sentence()
 
 
 HUNG = SentenceResult(State.ABORTED, "engine_hung", "silence")
@@ -185,7 +185,7 @@ def test_without_a_server_an_engine_process_plays_by_the_variables(monkeypatch: 
     monkeypatch.setenv("TALK_PLAYER", "pacat")
     monkeypatch.setenv("TALK_VOICE", "de")
     for silent in (False, True):
-        LocalExamination(None, silent=silent)._check_sentence()
+        LocalExamination(None, silent=silent)._speak_sentence()
     setting = EngineOptions("pacat", None, "de")
     assert [each[:3] for each in given] == [(SENTENCE_TEXT, setting, 1.0), (SENTENCE_TEXT, setting, 0.0)]
 
@@ -196,7 +196,7 @@ def test_silent_plays_with_the_server_s_settings_and_tries_the_same_players(monk
         examination = LocalExamination(None, silent=True)
         examination._server = {"player": told, "device": "usb", "voice": "de", "driver": "espeak"}
         examination._env = {}
-        return examination._server_options(7)
+        return examination._copy_server_options(7)
 
     rest = ("usb", "de", "espeak")
     assert setting("aplay", named=False) == EngineOptions(None, *rest, "aplay", {})
@@ -277,7 +277,7 @@ def test_without_a_server_each_place_is_described(
 ) -> None:
     monkeypatch.setattr(paths, "client_sockets", lambda _: [])
     monkeypatch.setattr("glob.glob", lambda _: others)
-    judgement = server.explain_missing([place], named_by, error)
+    judgement = server.explain_missing_server([place], named_by, error)
     assert judgement.state == FAILURE
     assert words in judgement.message
     assert step in str(judgement.next)
@@ -285,9 +285,9 @@ def test_without_a_server_each_place_is_described(
 
 def test_an_obstacle_before_the_server_s_place_is_a_warning() -> None:
     words = f"the server is on {PATH} (process 4711)"
-    found = server.judge_found(words, [SocketPlace("/a", PLACE_ABSENT)])
+    found = server.judge_found_server(words, [SocketPlace("/a", PLACE_ABSENT)])
     assert (found.state, found.message) == (OK, words)
-    found = server.judge_found(words, [SocketPlace("/a", server.PLACE_FOREIGN, 7)])
+    found = server.judge_found_server(words, [SocketPlace("/a", server.PLACE_FOREIGN, 7)])
     assert found.state == WARNING
     assert "/a: another user's server (uid 7)" in found.message
 
@@ -445,7 +445,7 @@ def test_the_player_is_chosen_by_the_engine_process_or_else_by_the_sound_server(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(sound, "on_path", lambda program, _: program in {"aplay", "pacat"})
-    monkeypatch.setattr(sound, "_find_levels", lambda *_: ())
+    monkeypatch.setattr(sound, "_read_levels", lambda *_: ())
     monkeypatch.setattr(sound, "run_program", lambda *_, **__: sound.ProgramOutput("it is not there"))
 
     def first(server: SoundServer, chosen: str | None = None, *, by_server: bool = False) -> str:
@@ -496,11 +496,11 @@ def test_a_step_that_needs_pactl_names_its_package(tmp_path: Path) -> None:
     muted = failure("loudness", "muted", "pactl set-sink-mute @DEFAULT_SINK@ 0")
     without = {"PATH": str(tmp_path)}
     step = f"{muted.next} (to install pactl: sudo apt-get install -y pulseaudio-utils)"
-    assert sound.add_pactl_package(muted, without).next == step
+    assert sound.add_pactl_hint(muted, without).next == step
     other = failure("socket", "no server", "talk serve")
-    assert sound.add_pactl_package(other, without) == other
+    assert sound.add_pactl_hint(other, without) == other
     write(tmp_path / "pactl", "", 0o755)
-    assert sound.add_pactl_package(muted, without) == muted
+    assert sound.add_pactl_hint(muted, without) == muted
 
 
 def test_a_missing_device_is_to_be_plugged_in_or_given_to_the_container() -> None:
@@ -572,7 +572,7 @@ def test_a_muted_output_is_not_heard(text: str, state: str, message: str) -> Non
 def test_the_worst_of_several_outputs_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     def levels(*texts: str) -> list[Finding]:
         found = [(f"out{number}", text, "unmute", "louder") for number, text in enumerate(texts)]
-        monkeypatch.setattr(sound, "_find_levels", lambda *_: found)
+        monkeypatch.setattr(sound, "_read_levels", lambda *_: found)
         return sound.check_levels({}, NO_SERVER, CARDS, is_used=True)
 
     assert levels() == []

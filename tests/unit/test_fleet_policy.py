@@ -198,7 +198,7 @@ def test_a_sentence_must_begin_before_its_message_expires(
     ttl: float | None, expiry: int | None, waited: float, left: float | None
 ) -> None:
     found = asked(judge(request({**SAY, **({} if ttl is None else {"ttl": ttl})}, expiry=expiry)))
-    say = found.say("x", NOW + waited)
+    say = found.build_say("x", NOW + waited)
     assert (say.ttl, say.id) == (left, "x")
 
 
@@ -211,7 +211,7 @@ def is_stale(rules: Policy, now: float) -> bool:
 def returned(rules: Policy, sent_at: float, now: float) -> bool:
     """Return an echo to the robot, and tell whether it is the newest one."""
     before = rules.newest_echo_at
-    rules.echo_returned(f"{sent_at}".encode(), now)
+    rules.record_echo(f"{sent_at}".encode(), now)
     return rules.newest_echo_at > before
 
 
@@ -238,7 +238,7 @@ def test_what_comes_within_six_seconds_of_the_newest_echo_that_came_back_is_take
 )
 def test_an_unknown_echo_tells_nothing(unknown: bytes) -> None:
     rules = connected(0.0)
-    rules.echo_returned(unknown, 20.0)
+    rules.record_echo(unknown, 20.0)
     assert is_stale(rules, 10.0)
     assert returned(rules, 10.0, 20.0)
     assert not returned(rules, 10.0, 20.0)  # twice
@@ -290,25 +290,25 @@ def test_twenty_goals_may_be_pending_whichever_of_reply_and_event_comes_first() 
         assert share.has_room(Say("a"))
         share.add(f"g{each}", "battery" if each == 7 else None)
         if each % 2:
-            share.queued(f"g{each}", "battery" if each == 7 else None)
-            share.answered(f"g{each}", pending=True)
+            share.record_pending(f"g{each}", "battery" if each == 7 else None)
+            share.record_reply(f"g{each}", pending=True)
         elif each:  # the first goal is still on its way
-            share.answered(f"g{each}", pending=True)
-            share.queued(f"g{each}", None)
+            share.record_reply(f"g{each}", pending=True)
+            share.record_pending(f"g{each}", None)
     assert (len(share), share.pending_count) == (20, 19)
     sentences = [Say("a"), Say("a", key="door"), Say("a", key="battery"), Say("a", flush=True), Say("a", preempt=True)]
     assert [share.has_room(each) for each in sentences] == [False, False, True, True, True]
-    share.dequeued("g3")
+    share.remove("g3")
     assert share.has_room(Say("a"))
 
 
 def test_goals_on_their_way_still_count_if_the_server_is_watched_anew() -> None:
     share = RemoteGoals()
     share.add("on its way", None)
-    share.queued("over", None)
-    share.reset([("there", "k")])
+    share.record_pending("over", None)
+    share.replace_pending([("there", "k")])
     assert (len(share), share.pending_count) == (2, 1)
-    share.reset([])
+    share.replace_pending([])
     assert (len(share), share.pending_count) == (1, 0)
 
 
@@ -327,15 +327,15 @@ def test_the_share_counts_like_a_slow_model(steps: list[tuple[str, int]]) -> Non
             share.add(name, None)
             on_way |= {number}
         elif what in ("accepted", "refused"):
-            share.answered(name, pending=what == "accepted")
+            share.record_reply(name, pending=what == "accepted")
             if number in on_way and what == "accepted":
                 pending |= {number}
             on_way -= {number}
         elif what == "came":
-            share.queued(name, None)
+            share.record_pending(name, None)
             pending |= {number}
         else:
-            assert share.dequeued(name) is (number in on_way | pending)
+            assert share.remove(name) is (number in on_way | pending)
             on_way -= {number}
             pending -= {number}
         assert (len(share), share.pending_count) == (len(on_way | pending), len(pending))

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.fleet.desk.table import COLUMN_NAMES, FleetTranscript, robot_lines
+from talkcli.fleet.desk.table import COLUMN_NAMES, FleetTranscript, format_robots
 from talkcli.fleet.payloads import LastGoal, Presence, RobotInfo, RobotStatus
 from talkcli.frozen import replace
 from talkcli.goals.states import State
@@ -52,17 +52,17 @@ def anna(**changes: Any) -> RobotInfo:
 
 def cells(robot: RobotInfo) -> list[str]:
     """Return a robot's line, cut at the heads; it has all the room that it needs."""
-    head, line = robot_lines([robot], Screen(long=True), NOW)
+    head, line = format_robots([robot], Screen(long=True), NOW)
     places = [*(head.index(each) for each in COLUMN_NAMES), None]
     return [line[start:end].strip() for start, end in pairwise(places)]
 
 
 @given(st.lists(ROBOTS, max_size=3), st.integers(1, 200), st.booleans())
 def test_no_line_is_wider_than_its_terminal(robots: list[RobotInfo], columns: int, colour: bool) -> None:
-    lines = robot_lines(robots, Screen(columns, colour), NOW)
+    lines = format_robots(robots, Screen(columns, colour), NOW)
     assert len(lines) == len(robots) + 1
     assert max(map(width, lines)) <= max(columns, MIN_COLUMNS)
-    head, *lines = robot_lines(robots, Screen(), NOW)  # in a pipe nothing is cut
+    head, *lines = format_robots(robots, Screen(), NOW)  # in a pipe nothing is cut
     assert head.split() == list(SHORT_NAMES)
     for robot, line in zip(robots, lines, strict=True):
         presence, status = robot.presence, robot.status or RobotStatus()
@@ -125,7 +125,7 @@ def test_a_time_is_shown_by_its_age(seconds: float, shown: str) -> None:
     ],
 )
 def test_the_text_gives_way_first_and_then_whole_columns(columns: int, long: bool, heads: tuple[str, ...]) -> None:
-    head, first, bert = robot_lines([ANNA, GONE], Screen(columns, long=long), NOW)
+    head, first, bert = format_robots([ANNA, GONE], Screen(columns, long=long), NOW)
     assert tuple(head.split()) == heads
     assert '"please ste' in first
     assert ("doors are" in first) == (columns > 100 or (columns == 80 and not long))
@@ -133,13 +133,13 @@ def test_the_text_gives_way_first_and_then_whole_columns(columns: int, long: boo
 
 
 def test_wide_characters_line_up() -> None:
-    lines = robot_lines([ANNA, anna(text="请往后退，门即将关闭，请注意安全")], Screen(80), NOW)
+    lines = format_robots([ANNA, anna(text="请往后退，门即将关闭，请注意安全")], Screen(80), NOW)
     ends = {width(each[: each.index("2  ")]) for each in lines[1:]}
     assert len(ends) == 1
 
 
 def test_colours_are_those_of_the_states() -> None:
-    head, first, bert = robot_lines([ANNA, GONE], Screen(120, colour=True), NOW)
+    head, first, bert = format_robots([ANNA, GONE], Screen(120, colour=True), NOW)
     assert head.startswith("\x1b[1mROBOT")
     assert '\x1b[1;32m"please' in first
     assert "\x1b[31mOFFLINE\x1b[0m" in bert
@@ -155,7 +155,7 @@ def test_a_robot_with_an_impossible_time_is_shown_all_the_same(moment: float) ->
     assert status
     assert status.last
     assert isinstance(event, StateChanged)
-    assert robot_lines([RobotInfo(presence, status)], Screen(), NOW)[1].split()[:3] == ["anna", "no", "server"]
+    assert format_robots([RobotInfo(presence, status)], Screen(), NOW)[1].split()[:3] == ["anna", "no", "server"]
     transcript = FleetTranscript(full=True)
     assert "SUCCEEDED" in transcript.lines("anna", event, Screen(), NOW)[0]
-    assert transcript.change(None, presence, Screen(), NOW)
+    assert transcript.change_lines(None, presence, Screen(), NOW)

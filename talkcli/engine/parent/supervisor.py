@@ -427,7 +427,7 @@ class Supervisor:
 
     def _report_stderr(self, line: str) -> None:
         """Post a line from a process's standard error, unless there were too many lines recently."""
-        omitted = self._stderr_quota.allow(time.monotonic())
+        omitted = self._stderr_quota.count_event(time.monotonic())
         if omitted:
             self._post(EngineSaid(f"({omitted} lines were omitted)"))
         if omitted is not None:

@@ -83,7 +83,7 @@ class LocalConnection(ClientCore):
         return lines
 
     def send(self, exchange: Exchange) -> bool:
-        """Send a request. Return False if it is too long, otherwise True."""
+        """Send the request of an exchange, which will receive the answer. Return False if the request is too long."""
         self.register(exchange, self._loop.time())
         line = self.line(exchange)
         if len(line) > MAX_LINE_BYTES:
@@ -128,7 +128,7 @@ class LocalConnection(ClientCore):
 
 
 async def dial(socket: str | None, name: str, *, urgent: bool = False) -> LocalConnection:
-    """Connect to the server, and wait for its greeting.
+    """Connect to the server, try again while it is busy, and return the connection after the server's greeting.
 
     Args:
         socket: path of the server's socket, or None for the default locations.

@@ -90,10 +90,11 @@ def run_bridge(settings: BridgeSettings, read_broker: Callable[[], Broker]) -> N
         UsageError: a certificate or key file is unusable.
         AddressInUse: an older bridge has the same robot name.
     """
-    asyncio.run(_run(settings, read_broker))
+    asyncio.run(_run_until_signal(settings, read_broker))
 
 
-async def _run(settings: BridgeSettings, read_broker: Callable[[], Broker]) -> None:
+async def _run_until_signal(settings: BridgeSettings, read_broker: Callable[[], Broker]) -> None:
+    """Run the bridge in the event loop until SIGTERM, SIGINT or an error."""
     loop, bridge = asyncio.get_running_loop(), Bridge(settings, read_broker)
 
     def on_signal(number: signal.Signals) -> None:
@@ -129,12 +130,12 @@ class Bridge:
             settings.name, True, self._session, self._since, groups, settings.allow, version=__version__
         )
         self._policy = Policy(settings.name, settings.allow)
-        self._systemd = ServiceManager(self._loop, self._status_text)
+        self._systemd = ServiceManager(self._loop, self._describe_status)
         self._sessions = RemoteSessions(
             settings.name, settings.socket, self._publish, self._max_payload, self._systemd.schedule_status
         )
         self._publisher = Publisher(
-            self._sessions, self._publish_to_all, self._server_changed, with_text=settings.with_text
+            self._sessions, self._publish_to_all, self._on_server_change, with_text=settings.with_text
         )
         offline = {"talk": PROTOCOL, "online": False, "session": self._session, "groups": groups}
         #: the message that reports that the robot is offline
@@ -155,7 +156,7 @@ class Bridge:
         self._error: BaseException | None = None
 
     async def run(self) -> None:
-        """Keep the robot connected until `end` is called."""
+        """Keep the robot connected until `end` is called. Then take it offline, and raise the error given to `end`."""
         self._broker.ssl_context()  # check the certificate files before anything is started
         log.write(f"starting: robot {self._settings.name}, broker {self._broker.url}")
         self._systemd.notify_ready()
@@ -176,7 +177,7 @@ class Bridge:
             raise self._error
 
     def end(self, error: BaseException | None = None) -> None:
-        """Take the robot offline, and make `run` return or raise the given error."""
+        """Make `run` take the robot offline, and then return or raise the given error."""
         self._error = self._error or error
         self._ending.set()
 
@@ -185,7 +186,7 @@ class Bridge:
         if not task.cancelled() and (error := task.exception()):
             self.end(error)
 
-    def _status_text(self) -> str:
+    def _describe_status(self) -> str:
         """Return the status line for systemd."""
         broker = "online" if self._online else "OFFLINE"
         there = "server running" if self._publisher.server else "no server"
@@ -196,13 +197,13 @@ class Bridge:
     # -- the connection
 
     async def _stay_connected(self) -> None:
-        """Connect to the broker, and reconnect whenever the connection ends."""
+        """Connect to the broker. Whenever the connection ends, read the broker's settings again and reconnect."""
         client_id = f"talk-{self._settings.name}-{self._session}"
         while True:
             try:
                 link = Link(self._broker, client_id, self._on_message, self._will, _MAX_INCOMING_BYTES)
                 try:
-                    await self._open(link)
+                    await self._open_link(link)
                     self._on_connect(link)
                     await self._disconnected.wait()
                 finally:
@@ -217,8 +218,8 @@ class Bridge:
             except TalkError as error:
                 log.write_limited("settings", f"{log.sanitize(str(error))}; the previous settings are used")
 
-    async def _open(self, link: Link) -> None:
-        """Open a link without blocking the event loop."""
+    async def _open_link(self, link: Link) -> None:
+        """Open a connection to the broker in a thread, and wait for it without blocking the event loop."""
         done = asyncio.Event()
         opener = LinkOpener(link, lambda: self._loop.call_soon_threadsafe(done.set))
         try:
@@ -264,10 +265,10 @@ class Bridge:
         log.write(f"online at {self._broker.url}")
 
     def _disconnect(self, link: Link) -> None:
-        """Close a connection, and end all sessions that use it."""
+        """Close a connection to the broker. If it is the current one, also end the sessions of all clients."""
         if self._link is link:
             self._link, self._online = None, False
-            self._forget_descriptor()
+            self._unwatch_link()
             if self._rival_timer:
                 self._rival_timer.cancel()
             self._sessions.end_all()
@@ -275,7 +276,8 @@ class Bridge:
             self._disconnected.set()
         link.close()
 
-    def _forget_descriptor(self) -> None:
+    def _unwatch_link(self) -> None:
+        """Stop watching the descriptor of the connection to the broker."""
         if self._descriptor >= 0:
             for forget in (self._loop.remove_reader, self._loop.remove_writer):
                 # If paho has already closed the socket, the descriptor is removed, but an error is raised.
@@ -284,13 +286,13 @@ class Bridge:
             self._descriptor = -1
 
     def _on_ready(self, action: Callable[[Link], None]) -> None:
-        """Read from the link, or write to it, when its descriptor is ready."""
+        """Call `Link.read` or `Link.write` when the link's descriptor is ready, and handle the link's new state."""
         if link := self._link:
             action(link)
             self._handle_link_state(link)
 
     def _handle_link_state(self, link: Link) -> None:
-        """Close a stuck link, disconnect from an ended one, and slow down for a slow broker.
+        """Close a link that is stuck, disconnect one that has ended, and pause sessions while the broker is slow.
 
         Call this after each use of the link.
         """
@@ -303,7 +305,7 @@ class Bridge:
         if link.ended is not None:
             # Stop watching the descriptor now, because its number may be reused. Disconnect later, because the caller
             # may still be using the sessions.
-            self._forget_descriptor()
+            self._unwatch_link()
             self._loop.call_soon(self._disconnect, link)
             return
         if link.outstanding_bytes > SLOW_BROKER_BYTES:
@@ -327,31 +329,34 @@ class Bridge:
             words = f"dropped a message of {len(message.payload):,} bytes for {message.topic}"
             log.write_limited("long", f"{words}: the broker accepts at most {link.max_payload_bytes:,}")
             return
-        link.publish(message, qos, acknowledged or self._log_denial)
+        link.publish(message, qos, acknowledged or self._log_if_denied)
         self._handle_link_state(link)
 
     def _publish_to_all(self, message: Message) -> None:
-        """Publish a status or an event. Events are dropped if the broker is slow."""
+        """Publish a status or an event, if the robot is online. Drop events while the broker is slow."""
         if self._online and self._link and (message.retained or self._link.outstanding_bytes <= SLOW_BROKER_BYTES):
             self._publish(message)
 
-    def _log_denial(self, reason: int) -> None:
-        """Log a warning if the broker's reason code means that a message was not authorized."""
-        if reason == REASON_NOT_AUTHORIZED:
+    def _log_if_denied(self, code: int) -> None:
+        """Log an error if the broker's reason code says that this robot may not publish a message."""
+        if code == REASON_NOT_AUTHORIZED:
             log.write_limited("rights", f"the broker does not allow this robot to publish a message; {_RIGHTS}")
 
     def _max_payload(self) -> int:
+        """Return the size of the largest payload that the broker accepts, or 0 without a connection."""
         return self._link.max_payload_bytes if self._link else 0
 
     # -- messages
 
     def _on_message(self, message: Message) -> None:
+        """Process a message from the broker. Log any exception as a bug."""
         try:
-            self._handle(message)
+            self._handle_message(message)
         except Exception as error:  # noqa: BLE001 - no message may crash the bridge
             log.write_bug("a message from the broker", error)
 
-    def _handle(self, message: Message) -> None:
+    def _handle_message(self, message: Message) -> None:
+        """Process a message from the broker: an echo, a presence, or a request that the policy accepts or refuses."""
         if message.topic == self._echo_topic:
             self._handle_echo(message.payload)
             return
@@ -367,7 +372,7 @@ class Bridge:
         if isinstance(decision, Ignored):
             log.write_limited(decision.kind, log.sanitize(decision.words))
         elif isinstance(decision, Goodbye):
-            self._sessions.say_goodbye(decision.user, decision.reply_topic)
+            self._sessions.handle_goodbye(decision.user, decision.reply_topic)
         elif isinstance(decision, RemoteRequest):
             self._sessions.submit(decision)
         else:
@@ -379,7 +384,7 @@ class Bridge:
                 self._send_echo()
 
     def _handle_echo(self, payload: bytes) -> None:
-        """Process a message on the echo topic: an echo, or a bridge's question about the robot's name."""
+        """Process this bridge's own echo, or a bridge's question whether the robot's name is in use."""
         if payload.startswith(_RIVAL_QUESTION):
             if payload != _RIVAL_QUESTION + self._session.encode():
                 if self._online:
@@ -390,10 +395,10 @@ class Bridge:
             return
         session, _, sent_at = payload.partition(b" ")
         if session == self._session.encode():
-            self._policy.echo_returned(sent_at, boottime())
+            self._policy.record_echo(sent_at, boottime())
 
     def _handle_presence(self, payload: bytes) -> None:
-        """Process a message on the robot's presence topic.
+        """Find out from a presence message whether another bridge has this robot's name. The younger bridge ends.
 
         It may come from this bridge, an earlier one, or another one with the same robot name.
         """
@@ -419,6 +424,7 @@ class Bridge:
     # -- what this bridge publishes about itself
 
     def _publish_presence(self) -> None:
+        """Publish a retained message that says that the robot is online, and describes its server."""
         self._presence_at = self._loop.time()
         presence = replace(self._presence, server=self._publisher.server).to_json()
         line = encode({"talk": PROTOCOL, "version": __version__, **presence})
@@ -429,17 +435,19 @@ class Bridge:
         if self._settings.homeassistant and self._online:
             self._publish(homeassistant_device(self._settings.name, self._settings.allow, __version__))
 
-    def _server_changed(self) -> None:
+    def _on_server_change(self) -> None:
+        """Report to systemd and in the robot's presence that the server has started or ended."""
         self._systemd.schedule_status()
         if self._online:
             self._publish_presence()
 
     def _send_echo(self) -> None:
+        """Publish a message with the current time, which the broker sends back."""
         self._echo_at = boottime()
         self._publish(Message(self._echo_topic, f"{self._session} {self._echo_at}".encode()))
 
     def _tick(self) -> None:
-        """Send an echo, check for timeouts, and renew the presence if it is due."""
+        """Every few seconds, send an echo, check for timeouts, and renew the presence if it is due."""
         self._tick_timer = self._loop.call_later(ECHO_EVERY_S, self._tick)
         self._sessions.tick()
         self._publisher.tick()

@@ -61,7 +61,7 @@ class RemoteRequest:
     #: latest time at which the goal may start, by the `boottime` clock; None for no limit
     start_by: float | None = None
 
-    def say(self, goal_id: str, now: float) -> Say:
+    def build_say(self, goal_id: str, now: float) -> Say:
         """Return the `say` request for the server, with an id and with a TTL limited by the message's expiry.
 
         Args:
@@ -123,7 +123,7 @@ class Policy:
         #: when the newest returned echo was sent, or when the connection was opened, by the `boottime` clock
         self.newest_echo_at = 0.0
 
-    def echo_returned(self, sent_at_text: bytes, now: float) -> None:
+    def record_echo(self, sent_at_text: bytes, now: float) -> None:
         """Record that an echo has returned. Ignore it if it has an invalid time, or one after `now`."""
         with contextlib.suppress(ValueError):
             sent_at = float(sent_at_text)
@@ -131,7 +131,7 @@ class Policy:
                 self.newest_echo_at = sent_at
 
     def decide(self, message: Message, kind: str, user: str, now: float) -> RemoteRequest | Refusal | Goodbye | Ignored:
-        """Decide what to do with a message.
+        """Decide whether to accept, refuse or ignore a message, or to end its client's session.
 
         Args:
             message: a message on a request topic of the robot or one of its groups.
@@ -154,7 +154,7 @@ class Policy:
         repeatable = len(message.correlation or b"") <= MAX_CORRELATION_BYTES
         seq, correlation = None, message.correlation if repeatable else None
         try:
-            fields = _request_fields(kind, message.payload)
+            fields = _parse_request_fields(kind, message.payload)
             seq = take_seq(fields)
             if not repeatable:
                 raise BadRequest(f"correlation data must have at most {MAX_CORRELATION_BYTES} bytes", "bad_field")
@@ -174,7 +174,7 @@ class Policy:
         return RemoteRequest(user, reply_topic, seq, request, correlation, size, start_by)
 
 
-def _request_fields(kind: str, payload: bytes) -> JsonObject:
+def _parse_request_fields(kind: str, payload: bytes) -> JsonObject:
     """Parse a payload, and return the fields of the request.
 
     Raises:
@@ -213,7 +213,7 @@ class SentIds:
         return self._sent.get(goal_id) == (boot, True)
 
     def add(self, goal_id: str, boot: str, *, counted: bool = True) -> None:
-        """Record that a goal was sent to the server with this boot id."""
+        """Record that a goal was sent to the server with this boot id. Forget the oldest one if there are too many."""
         self._sent.pop(goal_id, None)
         self._sent[goal_id] = boot, counted
         if len(self._sent) > MAX_REMEMBERED_IDS:
@@ -257,11 +257,11 @@ class RemoteGoals:
         return len(self) < MAX_REMOTE_GOALS or not self.counts(say) or replaces
 
     def add(self, goal_id: str, key: str | None) -> None:
-        """Add a goal that is being sent to the server."""
+        """Add a goal that is being sent to the server, unless it is already known."""
         self._goals.setdefault(goal_id, (key, False))
 
-    def answered(self, goal_id: str, *, pending: bool) -> None:
-        """Process the server's reply to a `say` request.
+    def record_reply(self, goal_id: str, *, pending: bool) -> None:
+        """Record from the server's reply to `say` whether a goal is pending. If it isn't, remove the goal.
 
         The reply is ignored if an event has already confirmed that the goal is pending.
 
@@ -275,15 +275,15 @@ class RemoteGoals:
         elif not is_known:
             del self._goals[goal_id]
 
-    def queued(self, goal_id: str, key: str | None) -> None:
+    def record_pending(self, goal_id: str, key: str | None) -> None:
         """Record that a goal is pending, as reported by an event."""
         self._goals[goal_id] = key, True
 
-    def dequeued(self, goal_id: str) -> bool:
+    def remove(self, goal_id: str) -> bool:
         """Remove a goal that is no longer pending, and return whether it was counted."""
         return self._goals.pop(goal_id, None) is not None
 
-    def reset(self, pending: Iterable[tuple[str, str | None]]) -> None:
+    def replace_pending(self, pending: Iterable[tuple[str, str | None]]) -> None:
         """Replace all pending goals. The new goals are given as pairs of id and key.
 
         Goals that are still on their way to the server are kept.

@@ -87,7 +87,7 @@ class Publisher:
             try:
                 server = self._connection = await dial(self._sessions.socket, "talk bridge")
                 try:
-                    await self._follow(server)
+                    await self._watch_server(server)
                 finally:
                     self._connection = None
                     server.close()
@@ -98,7 +98,7 @@ class Publisher:
             await asyncio.sleep(random.uniform(0, self._retry_s))
             self._retry_s = min(_LAST_SERVER_RETRY_S, self._retry_s * 2)
 
-    async def _follow(self, server: LocalConnection) -> None:
+    async def _watch_server(self, server: LocalConnection) -> None:
         """Watch the server, and process its lines until the connection ends."""
 
         def remember(_: JsonObject, ended: list[JsonObject]) -> None:
@@ -110,13 +110,13 @@ class Publisher:
 
         # Request the log first, because it contains the goals that an earlier bridge has sent.
         server.send(Exchange(Log(MAX_LOG_GOALS), remember))
-        server.send(Exchange(Watch(), partial(self._on_watching, server), refuse))
+        server.send(Exchange(Watch(), partial(self._on_watch_reply, server), refuse))
         while lines := await server.read():
             self._receive(server, lines)
         log.write("the connection to the server has ended")
 
     def schedule_status(self) -> None:
-        """Publish the status after a short delay."""
+        """Publish the robot's status after a short delay, unless this is already scheduled."""
         if self._timer is None:
             due = max(self._loop.time() + _STATUS_AFTER_CHANGE_S, self._published_at + _STATUS_EVERY_S)
             self._timer = self._loop.call_at(due, self._publish_status)
@@ -132,6 +132,7 @@ class Publisher:
     # -- from the server
 
     def _receive(self, server: LocalConnection, lines: list[bytes]) -> None:
+        """Process replies and events from the server. Log malformed lines."""
         for line in lines:
             try:
                 message = decode(line)
@@ -142,8 +143,8 @@ class Publisher:
             except (BadRequest, ValueError) as error:
                 log.write_limited("line", f"the server sent a malformed message: {log.sanitize(str(error))}")
 
-    def _on_watching(self, server: LocalConnection, reply: JsonObject, items: list[JsonObject]) -> None:
-        """Store the server's state from its reply to `watch`."""
+    def _on_watch_reply(self, server: LocalConnection, reply: JsonObject, items: list[JsonObject]) -> None:
+        """Replace the state of the server by the state in its reply to `watch`."""
         status = ServerStatus.from_reply(reply, items)
         self._retry_s = _FIRST_SERVER_RETRY_S
         for each in unfinished(status):
@@ -153,7 +154,7 @@ class Publisher:
         self._set_server(about, status, server.boot)
 
     def _set_server(self, about: JsonObject | None, status: ServerStatus, boot: str) -> None:
-        """Replace the state of the server and its goals. `about` is the new value of `server`."""
+        """Replace the state of the server and its goals, and report the change. `about` is the new `server`."""
         self.server = about
         self._active = status.active.id if status.active else None
         self._texts = {each.id: _shown_text(each) for each in unfinished(status)}
@@ -164,10 +165,11 @@ class Publisher:
         self.schedule_status()
 
     def _receive_event(self, server: LocalConnection, message: JsonObject, line: bytes) -> None:
+        """Update the state from an event, publish the event, and schedule the next status."""
         event = from_json(message)
         if isinstance(event, StateChanged):
-            self._update(event)
-            self._sessions.goal_changed(event, server.boot)
+            self._update_goals(event)
+            self._sessions.handle_goal_change(event, server.boot)
             if event.goal and (not self._with_text or len(line) >= self._sessions.max_payload()):
                 # The goal's message may quote its text.
                 goal = replace(event.goal, text=None, spoken=None, message=None)
@@ -180,8 +182,8 @@ class Publisher:
         self._publish(Message(topic, line + b"\n", expiry=EVENT_EXPIRY_S))
         self.schedule_status()
 
-    def _update(self, event: StateChanged) -> None:
-        """Update the status from an event, without publishing it."""
+    def _update_goals(self, event: StateChanged) -> None:
+        """Update the active goal, the last goal and the texts from an event, without publishing them."""
         if event.state is State.PENDING:
             self._texts[event.id] = _shown_text(event.goal)
         elif event.state is State.ACTIVE:
@@ -194,6 +196,7 @@ class Publisher:
     # -- to the broker
 
     def _publish_status(self) -> None:
+        """Publish the robot's status as a retained message. Leave out texts that are private or too long."""
         self._timer, self._published_at = None, self._loop.time()
         active, last = self._active, self._last
         text = self._texts.get(active) if active else None

@@ -94,7 +94,7 @@ class RemoteSessions:
     # -- from the broker
 
     def submit(self, request: RemoteRequest) -> None:
-        """Pass a request to its client's session, which is created if necessary."""
+        """Pass a request to its client's session. Create the session, or refuse the request if there are too many."""
         key = request.user, request.reply_topic
         session = self._sessions.get(key) or RemoteSession(self, *key)
         if key in self._sessions or self._make_room(urgent=isinstance(request.request, Cancel | Status)):
@@ -103,10 +103,10 @@ class RemoteSessions:
         else:
             session.refuse(request, Busy.code, f"{self.name} already has {MAX_SESSIONS} remote clients")
 
-    def say_goodbye(self, user: str, reply_topic: str) -> None:
-        """End a client's session once the server has answered its requests."""
+    def handle_goodbye(self, user: str, reply_topic: str) -> None:
+        """End the session of a client that has said goodbye, once the server has answered its important requests."""
         if session := self._sessions.get((user, reply_topic)):
-            session.say_goodbye()
+            session.handle_goodbye()
 
     def end_all(self) -> None:
         """End all sessions without informing the clients, because the connection to the broker has ended."""
@@ -115,7 +115,7 @@ class RemoteSessions:
         self.may_read.set()
 
     def tick(self) -> None:
-        """End the sessions of silent clients, and send signs of life to the others. Call this every few seconds."""
+        """Every few seconds, end silent clients' sessions, and send signs of life to clients with waiting goals."""
         now = self._loop.time()
         for session in list(self._sessions.values()):
             if now - session.used_at > CLIENT_SILENCE_LIMIT_S:
@@ -144,19 +144,19 @@ class RemoteSessions:
         """Remove a session that has ended."""
         self._sessions = {key: each for key, each in self._sessions.items() if each is not session}
 
-    def waiting_bytes(self) -> int:
+    def count_waiting_bytes(self) -> int:
         """Return the total size of all clients' unanswered requests."""
         return sum(each.size_bytes for session in self._sessions.values() for each in session.unanswered)
 
-    def cancel_waiting(self, selection: Cancel, by: By | None) -> list[Goal]:
-        """Cancel the waiting goals that match a `cancel` request, and return them."""
+    def cancel_waiting(self, selection: Cancel, canceled_by: By | None) -> list[Goal]:
+        """Cancel the goals that match a `cancel` request while they wait in the bridge, and return them."""
         selected = [self.waiting[each] for each in selection.select_waiting([say for _, say, _ in self.waiting])]
         self.waiting = [each for each in self.waiting if not any(each is other for other in selected)]
-        ending = State.RECALLED, "canceled", "not spoken: it was cancelled first", by
+        ending = State.RECALLED, "canceled", "not spoken: it was cancelled first", canceled_by
         return [session.end_goal(request, say, *ending) for request, say, session in selected]
 
-    def schedule_release(self) -> None:
-        """Schedule `_release`, which sends waiting goals to the server.
+    def handle_pending_change(self) -> None:
+        """Call `on_change`, and if any goals are waiting, schedule a call of `_release`.
 
         Call this whenever the number of pending goals may have changed. Events that were received together are all
         processed before goals are released.
@@ -166,7 +166,7 @@ class RemoteSessions:
             self._release_handle = self._loop.call_soon(self._release)
 
     def _release(self) -> None:
-        """Send waiting goals to the server as long as there is room."""
+        """Send waiting goals to the server while there is room, or cancel them if a client has canceled all goals."""
         self._release_handle = None
         canceled_by, self._canceled_by = self._canceled_by, None
         if canceled_by and not self.goals.pending_count:
@@ -178,19 +178,19 @@ class RemoteSessions:
 
     # -- from the watch of the server
 
-    def goal_changed(self, event: StateChanged, boot: str) -> None:
-        """Process a state change that was reported by the server with this boot id."""
+    def handle_goal_change(self, event: StateChanged, boot: str) -> None:
+        """Update the pending goals after a state change, which was reported by the server with this boot id."""
         goal = event.goal
         if event.state is not State.PENDING:
-            counted = self.goals.dequeued(event.id)
+            counted = self.goals.remove(event.id)
             if counted and self.waiting and goal and event.state is State.RECALLED and goal.reason == "canceled":
                 self._canceled_by = goal.by
         elif self.ids.is_counted(event.id, boot):
-            self.goals.queued(event.id, goal.key if goal else None)
-        self.schedule_release()
+            self.goals.record_pending(event.id, goal.key if goal else None)
+        self.handle_pending_change()
 
     def remember(self, goal: Goal, boot: str) -> None:
-        """Remember the id of a goal that an earlier bridge process may have sent.
+        """Remember the id of a remote client's goal, which an earlier bridge process may have sent.
 
         The goal counts towards the limit even if it was sent with `preempt`, because the server doesn't report that.
         """
@@ -199,8 +199,8 @@ class RemoteSessions:
 
     def reset_pending(self, pending: tuple[Goal, ...], boot: str) -> None:
         """Replace the pending goals with those that the server has just reported."""
-        self.goals.reset((each.id, each.key) for each in pending if self.ids.is_counted(each.id, boot))
-        self.schedule_release()
+        self.goals.replace_pending((each.id, each.key) for each in pending if self.ids.is_counted(each.id, boot))
+        self.handle_pending_change()
 
 
 class _RemoteExchange(Exchange):
@@ -256,7 +256,7 @@ class RemoteSession:
         return not (self.unanswered or self._awaited or self._watching)
 
     def submit(self, request: RemoteRequest) -> None:
-        """Send or queue a request, or refuse it if too many requests are unanswered."""
+        """Send a request, queue it until the server is connected, or refuse it if too many are unanswered."""
         self.used_at = self._loop.time()
         if self._said_goodbye:  # the client has returned
             self._said_goodbye, self._reply_topic = False, request.reply_topic
@@ -264,7 +264,7 @@ class RemoteSession:
         limit = 2 * MAX_WAITING_BYTES if urgent else MAX_WAITING_BYTES
         if len(self.unanswered) >= MAX_WAITING_REQUESTS:
             self.refuse(request, Busy.code, f"{MAX_WAITING_REQUESTS} requests of this client are already waiting")
-        elif self._sessions.waiting_bytes() + request.size_bytes > limit:
+        elif self._sessions.count_waiting_bytes() + request.size_bytes > limit:
             self.refuse(request, Busy.code, f"{MAX_WAITING_BYTES >> 20} MiB of requests are already waiting")
         elif self._server:
             self._send_request(request)
@@ -273,8 +273,8 @@ class RemoteSession:
             if self._task is None:
                 self._task = asyncio.create_task(self._run(urgent=urgent))
 
-    def say_goodbye(self) -> None:
-        """End the session after its client has said goodbye.
+    def handle_goodbye(self) -> None:
+        """Drop the client's waiting goals, and end the session when its important requests have been answered.
 
         The client gets no more answers, and its waiting goals are dropped. The session stays open until the server has
         answered requests with a lasting effect.
@@ -300,7 +300,7 @@ class RemoteSession:
 
     def send_alive(self) -> None:
         """Send a sign of life to the client if one of its goals is waiting for room in the queue."""
-        if self._waiting_for_room():
+        if self._find_waiting():
             self._publish([(_ALIVE, None)])
 
     @property
@@ -312,14 +312,14 @@ class RemoteSession:
     @property
     def unanswered(self) -> list[RemoteRequest]:
         """The client's unanswered requests, including goals that are waiting for room."""
-        return [*self._queue, *(each.remote for each in self._exchanges), *self._waiting_for_room()]
+        return [*self._queue, *(each.remote for each in self._exchanges), *self._find_waiting()]
 
-    def _waiting_for_room(self) -> list[RemoteRequest]:
+    def _find_waiting(self) -> list[RemoteRequest]:
         """Return the client's goals that are waiting for room in the server's queue."""
         return [request for request, _, session in self._sessions.waiting if session is self]
 
     def _drop_waiting(self) -> None:
-        """Drop the client's waiting goals."""
+        """Remove the client's goals from the list of goals that are waiting for room."""
         self._sessions.waiting = [each for each in self._sessions.waiting if each[2] is not self]
 
     def _end_if_done(self) -> None:
@@ -333,6 +333,7 @@ class RemoteSession:
     # -- to the server
 
     def _send_request(self, remote: RemoteRequest) -> None:
+        """Send a client's request to the server. A goal may have to wait, and a cancel first ends waiting goals."""
         request = remote.request
         if isinstance(request, Say):
             self.send_say(remote, request)
@@ -355,13 +356,13 @@ class RemoteSession:
         """
         shared, server = self._sessions, self._server
         assert server
-        goal_id = say.id or self._new_id()
+        goal_id = say.id or self._new_goal_id()
         boot, counted = shared.ids.boot_of(goal_id), shared.goals.counts(say)
         if boot not in (None, server.boot):
             words = f"{goal_id} was sent to a server that has ended; it may have been spoken"
             self.refuse(remote, "lost", words)
         elif has_room or (shared.goals.has_room(say) and not (counted and shared.waiting)):
-            if self._send(_RemoteExchange(remote, remote.say(goal_id, boottime()), is_new=boot is None)):
+            if self._send(_RemoteExchange(remote, remote.build_say(goal_id, boottime()), is_new=boot is None)):
                 shared.ids.add(goal_id, server.boot, counted=counted)
                 if counted:
                     shared.goals.add(goal_id, say.key)
@@ -395,7 +396,7 @@ class RemoteSession:
             return False
         return True
 
-    def _new_id(self) -> str:
+    def _new_goal_id(self) -> str:
         """Generate an id for a goal that has none."""
         return f"{self._sessions.name[:_MAX_ID_PREFIX_CHARS]}-x{random.getrandbits(48):012x}"
 
@@ -417,7 +418,7 @@ class RemoteSession:
             while lines := await server.read():
                 self._receive(lines)
                 await shared.may_read.wait()
-            for request in self._waiting_for_room():
+            for request in self._find_waiting():
                 self.refuse(request, "no_server", _SERVER_GONE)
             self._send_gone(_SERVER_GONE)
         except TalkError as error:  # the connection failed
@@ -438,7 +439,7 @@ class RemoteSession:
                 log.write_limited("server", f"the server sent a malformed message: {error}")
                 continue
             if "seq" in message:
-                answers += self._translate(message)
+                answers += self._process_answer(message)
             elif "event" in message:
                 if message["event"] == "result" and isinstance(goal := message.get("goal"), dict):
                     self._awaited.discard(str(goal.get("id")))
@@ -446,8 +447,8 @@ class RemoteSession:
         self._publish(answers)
         self._end_if_done()
 
-    def _translate(self, message: JsonObject) -> list[tuple[bytes, bytes | None]]:
-        """Convert one line of the server's answer to lines for the client."""
+    def _process_answer(self, message: JsonObject) -> list[tuple[bytes, bytes | None]]:
+        """Process one line of the server's answer. Return lines for the client, with their correlation data."""
         assert self._server
         exchange = self._server.match(message)
         if not isinstance(exchange, _RemoteExchange):
@@ -471,23 +472,23 @@ class RemoteSession:
         return [(encode(item(remote.seq, **each)), remote.correlation) for each in (*found, message)]
 
     def _record_say_reply(self, exchange: _RemoteExchange, state: State | None, *, refused: bool) -> None:
-        """Record whether a goal is pending after the reply to its `say`, and free the id of a refused goal."""
+        """If a request is a `say`, record whether its goal is pending. Forget the id of a refused goal."""
         if exchange.goal_id is not None:
-            self._sessions.goals.answered(exchange.goal_id, pending=state is State.PENDING)
+            self._sessions.goals.record_reply(exchange.goal_id, pending=state is State.PENDING)
             if exchange.is_new and refused:
                 self._sessions.ids.discard(exchange.goal_id)
-            self._sessions.schedule_release()
+            self._sessions.handle_pending_change()
 
     # -- to the client
 
-    def refuse(self, request: RemoteRequest, code: str, words: str) -> None:
+    def refuse(self, request: RemoteRequest, code: str, message: str) -> None:
         """Send an error to the client in place of an answer."""
-        self._publish([(encode(failure(request.seq, code, words)), request.correlation)])
+        self._publish([(encode(failure(request.seq, code, message)), request.correlation)])
 
     def end_goal(
-        self, remote: RemoteRequest, say: Say, state: State, reason: str, words: str, by: By | None = None
+        self, remote: RemoteRequest, say: Say, state: State, reason: str, message: str, by: By | None = None
     ) -> Goal:
-        """End a goal that was never sent to the server, and return it.
+        """End a goal that was never sent to the server, inform its client, and return it.
 
         Its client gets the lines that the server would send.
 
@@ -496,11 +497,11 @@ class RemoteSession:
             say: the goal in it.
             state: the goal's end state.
             reason: the machine-readable reason for the end.
-            words: the human-readable reason for the end.
+            message: the human-readable reason for the end.
             by: the client that canceled the goal, or None.
         """
-        goal_id, sender, now = say.id or self._new_id(), Sender(name=policy.sender_name(self._user)), time.time()
-        goal = Goal(goal_id, state, say.text, reason, by, words, client=sender, queued_at=now, ended_at=now)
+        goal_id, sender, now = say.id or self._new_goal_id(), Sender(name=policy.sender_name(self._user)), time.time()
+        goal = Goal(goal_id, state, say.text, reason, by, message, client=sender, queued_at=now, ended_at=now)
         goal = replace(goal, **{name: getattr(say, name) for name in SHOWN_OPTIONS})
         lines = [(encode(ok(remote.seq, goal=goal.to_json())), remote.correlation)]
         if say.wait or say.feedback:
@@ -523,7 +524,7 @@ class RemoteSession:
         limit = self._sessions.max_payload()
         payload, current, reliable = b"", None, False
         for whole, correlation in lines:
-            line = whole if len(whole) <= limit else self._shortened(whole, limit)
+            line = whole if len(whole) <= limit else self._shorten_line(whole, limit)
             if payload and (correlation != current or len(payload) + len(line) > limit):
                 self._sessions.publish(Message(self._reply_topic, payload, correlation=current), int(reliable))
                 payload, reliable = b"", False
@@ -532,7 +533,7 @@ class RemoteSession:
         if payload:
             self._sessions.publish(Message(self._reply_topic, payload, correlation=current), int(reliable))
 
-    def _shortened(self, line: bytes, limit: int) -> bytes:
+    def _shorten_line(self, line: bytes, limit: int) -> bytes:
         """Shorten a line that is too long for the broker.
 
         Return the line without texts if that is short enough. Otherwise, return an error in place of a reply, and an
@@ -550,17 +551,17 @@ class RemoteSession:
         return b""
 
     def _clean_up(self) -> None:
-        """Close the connection to the server, and forget unanswered requests."""
+        """Close the connection to the server, and remove this session and its unanswered requests."""
         shared = self._sessions
         self._drop_waiting()
         for exchange in self._exchanges:
             if exchange.goal_id is not None:
-                shared.goals.answered(exchange.goal_id, pending=False)
+                shared.goals.record_reply(exchange.goal_id, pending=False)
         if self._server:
             self._server.exchanges.clear()
             self._server.close()
         shared.forget(self)
-        shared.schedule_release()
+        shared.handle_pending_change()
 
 
 def _has_lasting_effect(remote: RemoteRequest) -> bool:

@@ -137,7 +137,7 @@ class DeskLink:
         return descriptor in ready
 
     def _receive(self, message: Message) -> None:
-        """Process the marker message, or pass another message to the handler."""
+        """Pass a message to the handler. If it is the marker message, record instead that it has come back."""
         if message.topic == self.reply_topic(topics.MARKER):
             self.marker_at = time.monotonic()
         else:
@@ -185,7 +185,7 @@ class DeskLink:
 
         def on_acknowledged(code: int) -> None:
             if code >= REASON_FAILURE:
-                error = self._rejection(code, f"send requests to {'the group ' * is_group}{to}")
+                error = self._rejection_error(code, f"send requests to {'the group ' * is_group}{to}")
                 self._calls.append(partial(on_refused, error))
 
         line = request_line({"seq": number, **write_request(request)})
@@ -217,7 +217,7 @@ class DeskLink:
             self._wake_writer.send(b"\0")
 
     def flush(self, timeout: float) -> None:
-        """Wait until the broker has acknowledged all messages, but at most `timeout` seconds."""
+        """Poll until the broker has acknowledged all messages, but at most for `timeout` seconds."""
         end = time.monotonic() + timeout
         while self.link is not None and self.link.outstanding_bytes and (left := end - time.monotonic()) > 0:
             self.poll(left)
@@ -235,7 +235,7 @@ class DeskLink:
         self._wake_reader.close()
         self._wake_writer.close()
 
-    def _rejection(self, code: int, action: str) -> TalkError:
+    def _rejection_error(self, code: int, action: str) -> TalkError:
         """Return the error to raise if the broker has rejected a message or a subscription.
 
         Args:
@@ -252,10 +252,10 @@ class DeskLink:
         """Return the error to raise if the broker hasn't sent its retained messages within `timeout` seconds."""
         if self.link is None or self.marker_at is not None:
             return ServerUnavailable(f"the broker at {self.broker.url} did not answer within {timeout:g} s")
-        return self._rejection(REASON_NOT_AUTHORIZED, f"read {topics.reply(self.user, '+', '+')}")
+        return self._rejection_error(REASON_NOT_AUTHORIZED, f"read {topics.reply(self.user, '+', '+')}")
 
     def _maintain(self, link: Link | None, now: float) -> float:
-        """Connect, or keep the connection alive. Return the maximum number of seconds until the next call."""
+        """Connect, or keep the connection alive. Return the number of seconds after which to call this again."""
         if link is not None:
             link.tick()
             if self.marker_at is None or self.retained_received:
@@ -276,7 +276,7 @@ class DeskLink:
         return TICK_EVERY_S if self._opening else max(0.0, self._next_attempt_at - now)
 
     def _end_attempt(self, opening: LinkOpener) -> None:
-        """Start using a new connection. If connecting has failed, schedule the next attempt."""
+        """Start using the connection that was opened. If opening it has failed, schedule the next attempt."""
         self._opening = None
         if opening.error is not None:
             self._failed_attempts += 1
@@ -294,10 +294,12 @@ class DeskLink:
         link.publish(Message(self.reply_topic(topics.MARKER), b"\n"), acknowledged=self._on_marker_acknowledged)
 
     def _on_marker_acknowledged(self, code: int) -> None:
+        """Store an error if the broker has rejected the marker message."""
         if code >= REASON_FAILURE:
-            self.failure = self._rejection(code, f"write to {topics.reply(self.user, '+', '+')}")
+            self.failure = self._rejection_error(code, f"write to {topics.reply(self.user, '+', '+')}")
 
     def _disconnect(self, link: Link) -> None:
+        """Close the connection, schedule an attempt to reconnect, and inform the handler."""
         link.close()
         self.link, self.marker_at = None, None
         self._next_attempt_at = time.monotonic() + random.uniform(0, _FIRST_BROKER_PAUSE_S)

@@ -113,7 +113,7 @@ def failure_outcome(robot: str, error: TalkError) -> Outcome:
 
 
 def reply_outcomes(robot: str, request: Request, reply: JsonObject, items: list[JsonObject]) -> list[Outcome]:
-    """Return the outcomes of a request from the server's reply.
+    """Convert the server's reply to a list of outcomes.
 
     Args:
         robot: the name of the robot.

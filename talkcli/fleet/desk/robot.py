@@ -116,6 +116,7 @@ class RobotConnection(Connection):
     # -- requests
 
     def _send(self, exchange: Exchange) -> None:
+        """Send a request now, or when the robot is back. A goal gets an id and an expiry time."""
         request = exchange.request
         if isinstance(request, Say) and isinstance(exchange, RobotExchange):
             exchange.request = replace(request, id=request.id or new_goal_id(self._desk))
@@ -124,7 +125,7 @@ class RobotConnection(Connection):
             self._desk.wake()  # The request will be sent when the robot is back.
 
     def expect_reply(self, exchange: RobotExchange) -> None:
-        """Expect an answer to a request that was sent to the robot's group."""
+        """Register an exchange to receive its answer, because its request was sent to the robot's group."""
         exchange.sent = True
         self._published_at = time.monotonic()
         self.register(exchange, self._published_at)
@@ -139,16 +140,16 @@ class RobotConnection(Connection):
         with self.changed:
             self._canceled.add(goal_id)
             if not is_sent:
-                self._post(Cancel((goal_id,)))
+                self._send_without_answer(Cancel((goal_id,)))
 
-    def _post(self, request: Request) -> bool:
+    def _send_without_answer(self, request: Request) -> bool:
         """Send a request whose answer is ignored. Return whether it could be sent."""
         exchange = RobotExchange(request)
         exchange.number = next(self._numbers)
         return self._publish(exchange)
 
     def _publish(self, exchange: Exchange) -> bool:
-        """Send a request to the robot. Return whether it could be sent."""
+        """Send a request if the robot isn't absent. Return whether it was sent."""
 
         def on_refused(error: TalkError) -> None:
             with self.changed:
@@ -163,6 +164,7 @@ class RobotConnection(Connection):
         return True
 
     def answer_deadline(self, exchange: Exchange) -> float:
+        """Return the time by which a line of the answer must arrive, or by which an absent robot must be back."""
         if not isinstance(exchange, RobotExchange):
             return float("inf")  # This is a lookup, which is repeated after each absence.
         if self.absent_since is None:
@@ -172,14 +174,17 @@ class RobotConnection(Connection):
         return by if self._end is None else min(by, max(self._end, exchange.heard_at))
 
     def goals_lost_at(self) -> float:
+        """Return infinity, because `silent_by` ends the connection before goals count as lost."""
         return float("inf")  # `silent_by` ends the connection before goals count as lost.
 
     def silent_by(self, began: float) -> tuple[float, str]:
+        """Return the time at which to give up on a silent or absent robot, and the reason to report."""
         if self.absent_since is None:
             return super().silent_by(began)
         return self.absent_since + ABSENCE_LIMIT_S, f"{self.absence} (for {ABSENCE_LIMIT_S:g} s)"
 
     def refusal(self, reply: JsonObject, items: list[JsonObject]) -> TalkError:
+        """Return the error that a refusing reply reports. Errors of the bridge have classes of their own."""
         error = super().refusal(reply, items)
         kinds = {"not_allowed": AccessDenied, "no_server": NoServer, "stale": ServerUnavailable, "lost": Lost}
         kind = kinds.get(error.code)
@@ -188,13 +193,14 @@ class RobotConnection(Connection):
     # -- messages from the robot
 
     def _step(self, timeout: float, interruptible: bool) -> None:
+        """Keep the bridge's session alive, and process messages for up to `timeout` seconds."""
         self.keep_alive()
         self._desk.poll(timeout, self._interrupt if interruptible else None)
 
     def keep_alive(self) -> None:
         """Send a message if nothing has been sent for a while, so that the bridge doesn't end the session."""
         if time.monotonic() - self._published_at > _KEEP_ALIVE_INTERVAL_S:
-            self._post(Hello(self._sender))
+            self._send_without_answer(Hello(self._sender))
 
     def on_connected(self, link: Link) -> None:
         """Subscribe to the robot's replies and its presence."""
@@ -209,7 +215,7 @@ class RobotConnection(Connection):
             self._mark_absent(why)
 
     def on_message(self, message: Message) -> None:
-        """Handle a message from the broker: the robot's presence, or lines from its server."""
+        """Process a message from the broker: the robot's presence, or lines from its server."""
         with self.changed:
             if message.topic == topics.robot(self.robot, topics.PRESENCE):
                 self._update_presence(message.payload)
@@ -217,12 +223,13 @@ class RobotConnection(Connection):
                 self.receive(message.payload, time.monotonic())
 
     def _mark_absent(self, why: str, error: type[ServerUnavailable] = ServerUnavailable) -> None:
+        """Record that the robot can't receive requests, and which error to raise while it can't."""
         self.absence, self._absence_error = why, error
         if self.absent_since is None:
             self.absent_since = time.monotonic()
 
     def _update_presence(self, payload: bytes) -> None:
-        """Process the robot's presence.
+        """Update whether the robot is absent, from its presence message. If it is back, send open requests again.
 
         It comes from the robot's bridge, or from the broker if the bridge has lost its connection.
         """
@@ -240,12 +247,12 @@ class RobotConnection(Connection):
             self.boot, self.pid = identity(server)
             self._bridge_session = presence.get("session")
             self.absent_since, self._heard = None, time.monotonic()
-            self._resend_all()
+            self._resume_requests()
 
     # -- connecting
 
     def wait_online(self, give_up: float) -> None:
-        """Wait until the robot is online.
+        """Wait until the robot can receive requests, at most until `give_up` (monotonic time).
 
         If it is offline, wait until `give_up` (monotonic time). Raises the same errors as `connect_robot`.
         """
@@ -267,13 +274,13 @@ class RobotConnection(Connection):
 
     # -- after an absence
 
-    def _resend_all(self) -> None:
-        """Send open requests again, but first look up goals that the robot may already have."""
+    def _resume_requests(self) -> None:
+        """After an absence, send each open request again, or fail it, or look up its goal."""
         now = time.monotonic()
         if self._sender:
-            self._post(Hello(self._sender))
+            self._send_without_answer(Hello(self._sender))
         if self._canceled:
-            self._post(Cancel(tuple(self._canceled)))
+            self._send_without_answer(Cancel(tuple(self._canceled)))
         self._lookups.clear()
         interrupted = [each for each in self.exchanges.values() if isinstance(each, RobotExchange)]
         self.exchanges = {each.number: each for each in interrupted}
@@ -281,7 +288,7 @@ class RobotConnection(Connection):
             self._follow_again(goal_id, feedback=feedback, now=now)
         for exchange in interrupted:
             if exchange.sent and isinstance(exchange.request, Say):
-                self._look_up(exchange, exchange.request, now)
+                self._look_up_goal(exchange, exchange.request, now)
             elif exchange.sent and isinstance(exchange.request, self.lasting):
                 # The robot may have carried out this request. If it were sent again, it could affect newer goals.
                 self.fail(exchange, self._lost_error(exchange, self.absence))
@@ -310,10 +317,11 @@ class RobotConnection(Connection):
         self._publish(exchange)
 
     def _lost_error(self, exchange: Exchange, why: str) -> Lost:
+        """Return the error for a request that was sent but not answered. `why` says why the answer is missing."""
         words = f"the {exchange.request.kind} request was sent to {self.path}, but {why}"
         return Lost(f"{words}; it may have been carried out")
 
-    def _look_up(self, exchange: RobotExchange, request: Say, now: float) -> None:
+    def _look_up_goal(self, exchange: RobotExchange, request: Say, now: float) -> None:
         """Ask the robot whether it has accepted a goal. If it doesn't know the goal, send the goal again."""
 
         def on_reply(_: JsonObject, items: list[JsonObject]) -> None:
@@ -332,6 +340,7 @@ class RobotConnection(Connection):
         self._begin(Exchange(Wait((str(request.id),), request.feedback), on_reply, on_failure), now)
 
     def _begin(self, exchange: Exchange, now: float) -> None:
+        """Queue a request that looks up a goal, and send it if not too many are open."""
         self._lookups.append(exchange)
         self._send_lookups(now)
 
@@ -344,6 +353,7 @@ class RobotConnection(Connection):
             self._publish(exchange)
 
     def dispatch(self, message: JsonObject, now: float) -> Exchange | None:
+        """Process a message from the robot's server or bridge. Return the exchange that it ends, or None."""
         if message.get("event") == "gone":
             self.end(printable(str(message.get("message") or "the connection to the server was lost")))
             return None
@@ -360,15 +370,17 @@ class RobotConnection(Connection):
             self._desk.end_session(self.robot)
 
     def _hang_up(self) -> None:
+        """End the bridge's session, and wake the thread that is waiting in `poll`."""
         self.end_session()
         self._desk.wake()
 
     def _drop(self) -> None:
+        """Close the connection to the broker. In a forked child, close only the child's descriptors."""
         self._desk.close(forked=os.getpid() != self._process)
 
 
 def connect_robot(robot: str, broker: Broker, *, keep_trying: float = 0.0, **options: Any) -> RobotConnection:
-    """Connect to a robot's server through the broker.
+    """Connect to a robot's server through the broker, and return the connection.
 
     Args:
         robot: the name of the robot.
@@ -397,5 +409,5 @@ def connect_robot(robot: str, broker: Broker, *, keep_trying: float = 0.0, **opt
 
 
 def new_goal_id(desk: DeskLink) -> str:
-    """Create a goal id. The colon keeps it different from the ids of servers."""
+    """Return a new random goal id, which begins with the user's name. The colon sets it apart from servers' ids."""
     return f"{desk.user[:_ID_USER_CHARS]}:{os.urandom(5).hex()}"

@@ -175,7 +175,7 @@ class FleetRequest:
                 raise TimeoutError(f"{done} of {len(self)} robots have finished after {round(timeout or 0.0, 1):g} s")
             self._desk.poll(min(next_check, end or next_check) - now, self._interrupt)
             if time.monotonic() >= next_check:
-                self._check_all()
+                self._check_for_late_robots()
                 next_check = time.monotonic() + _CHECK_INTERVAL_S
         if not len(self):
             raise self._no_robot_error()
@@ -228,9 +228,10 @@ class FleetRequest:
                 self._on_presence(robot, robot.presence)
 
     def _on_refused(self, error: TalkError) -> None:
+        """Store the error for `results` to raise, because the broker has rejected the message to the group."""
         self._refused = error
 
-    def _check_all(self) -> None:
+    def _check_for_late_robots(self) -> None:
         """Process all waiting messages. Then record a failure for each robot that hasn't answered in time."""
         for _ in range(_MAX_MESSAGES_PER_CHECK):
             if not self._desk.poll(0.0, self._interrupt):
@@ -256,7 +257,7 @@ class FleetRequest:
         link.subscribe(topics.robot(topics.ANY, topics.PRESENCE), retained=True)
 
     def on_disconnected(self, why: str) -> None:
-        """Treat all robots as absent."""
+        """Treat all robots as absent, and ignore robots that appear later."""
         # Ignore robots that appear after this, because the broker may be back too late.
         self._complete = self._complete or self._began
         for each in self._robots.values():
@@ -272,7 +273,7 @@ class FleetRequest:
         if presence is None:
             return  # The retained message has been deleted, or it is malformed.
         if name in self._robots or self._selection.includes(presence):
-            robot = self._robot(name)
+            robot = self._get_robot(name)
             robot.presence = presence
             robot.connection.on_message(message)
             if self._began:
@@ -306,7 +307,7 @@ class FleetRequest:
         """
         if topics.name_fault(name) or not self._began:
             return
-        robot = self._robot(name)
+        robot = self._get_robot(name)
         if self._selection.group is not None and not robot.was_asked:
             self._include(name)
             robot.expect_reply(self._number, self._latest)
@@ -315,7 +316,7 @@ class FleetRequest:
         robot.connection.on_message(message)
         self._update(name)
 
-    def _robot(self, name: str) -> RobotRequest:
+    def _get_robot(self, name: str) -> RobotRequest:
         """Return the RobotRequest for a robot. Create it if necessary."""
         if name not in self._robots:
             connection = RobotConnection(
@@ -325,7 +326,7 @@ class FleetRequest:
         return self._robots[name]
 
     def _include(self, name: str) -> None:
-        """Add a robot to the request."""
+        """Add a robot to those that the request is for."""
         self._included.add(name)
         self._unfinished.add(name)
 
@@ -335,6 +336,7 @@ class FleetRequest:
             self._robots[name].update(check_time=check_time)
 
     def _record(self, *outcomes: Outcome) -> None:
+        """Add outcomes to those that `results` yields. A robot has finished after its last outcome."""
         self._outcomes += outcomes
         self._unfinished -= {each.robot for each in outcomes if each.last}
 
@@ -364,7 +366,7 @@ class RobotRequest:
             self._on_failure(error)
 
     def expect_reply(self, number: int, latest: float | None) -> None:
-        """Expect an answer to the request, which was sent to the robot's group.
+        """Prepare to receive the answer to the request, which was sent to the robot's group.
 
         Args:
             number: the number of the request.
@@ -376,7 +378,7 @@ class RobotRequest:
         self.was_asked = True
 
     def update(self, *, check_time: bool) -> None:
-        """Record the outcomes of goals that have ended since the last call.
+        """Keep the bridge's session alive, and record the outcomes of goals that have ended since the last call.
 
         Args:
             check_time: whether to record a failure if the robot hasn't answered in time.
@@ -412,6 +414,7 @@ class RobotRequest:
             self._record(*reply_outcomes(self._name, request, reply, items))
 
     def _on_failure(self, error: TalkError) -> None:
+        """Record the failure of the request, after the outcomes of any goals that it could cancel."""
         try:
             items = error.items if isinstance(error, UnknownGoal) else []
             self._record(*outcomes_of_cancel(self._name, items, last=False))

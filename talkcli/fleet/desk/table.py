@@ -33,7 +33,7 @@ _MAX_VERSION_CHARS = 12
 _EMPTY_CELL: Cell = ("-", None)
 
 
-def robot_lines(robots: Sequence[RobotInfo], screen: Screen, now: float) -> list[str]:
+def format_robots(robots: Sequence[RobotInfo], screen: Screen, now: float) -> list[str]:
     """Format a table of robots. The first line is the heading.
 
     If a terminal is too narrow, the texts of sentences are shortened, and then columns are omitted.
@@ -43,7 +43,7 @@ def robot_lines(robots: Sequence[RobotInfo], screen: Screen, now: float) -> list
         screen: the properties of the terminal.
         now: the current time in seconds since 1970.
     """
-    rows = [_cells(each, screen, now) for each in robots]
+    rows = [_row_cells(each, screen, now) for each in robots]
     names = [each for each in COLUMN_NAMES if screen.long or each not in _LONG_COLUMNS]
     widths = {name: max(map(width, (name, *(cells[name][0] for cells in rows)))) for name in names}
     _fit_columns(widths, screen.columns_left(0))
@@ -51,7 +51,7 @@ def robot_lines(robots: Sequence[RobotInfo], screen: Screen, now: float) -> list
     return [screen.coloured(heading, None), *(_format_row(cells, widths, screen) for cells in rows)]
 
 
-def _cells(robot: RobotInfo, screen: Screen, now: float) -> dict[str, Cell]:
+def _row_cells(robot: RobotInfo, screen: Screen, now: float) -> dict[str, Cell]:
     """Return the cells of a robot's row, by column name."""
     presence, status = robot.presence, robot.status or RobotStatus()
     cells = dict.fromkeys(COLUMN_NAMES, _EMPTY_CELL)
@@ -86,6 +86,7 @@ def _boot(presence: Presence) -> str:
 
 
 def _speaking_cell(status: RobotStatus, screen: Screen) -> Cell:
+    """Return the cell that shows the active goal, or whether speech is paused."""
     if status.active is None:
         return ("PAUSED", State.PREEMPTING) if status.paused else _EMPTY_CELL
     words = screen.goal_id(status.active) if status.text is None else f'"{printable(status.text)}"'
@@ -93,6 +94,7 @@ def _speaking_cell(status: RobotStatus, screen: Screen) -> Cell:
 
 
 def _last_cell(goal: LastGoal, now: float) -> Cell:
+    """Return the cell that shows how the last goal ended, and how long ago."""
     age = "" if goal.at is None else f" {_format_age(now - goal.at)}"
     return f"{goal.state.name}{age}", goal.state
 
@@ -110,7 +112,7 @@ def _format_age(seconds: float) -> str:
 
 
 def _fit_columns(widths: dict[str, int], room: int | None) -> None:
-    """Shrink the column SPEAKING and remove other columns until a line has at most `room` characters."""
+    """Make a line fit into `room` characters: shrink SPEAKING in `widths`, and remove other columns."""
     longest = widths["SPEAKING"]
     if room is None:
         widths["SPEAKING"] = min(longest, _USUAL_TEXT_CHARS)
@@ -124,6 +126,7 @@ def _fit_columns(widths: dict[str, int], room: int | None) -> None:
 
 
 def _format_row(cells: dict[str, Cell], widths: dict[str, int], screen: Screen) -> str:
+    """Format cells as a line with aligned columns. On a terminal, a long text in SPEAKING is shortened."""
     shown = []
     for name, columns in widths.items():
         text, state = cells[name]
@@ -146,7 +149,7 @@ class FleetTranscript:
         self._boots: dict[str, str] = {}
 
     def begin(self, robots: Sequence[Presence], broker: str, screen: Screen, now: float) -> list[str]:
-        """Return the first line, which shows the number of robots and the URL of the broker."""
+        """Return the first line, which shows how many robots there are. Align later lines for these robots."""
         for each in robots:
             self._columns.pad_robot(each.name, screen)  # All names must be known first, so that all lines are aligned.
             self._boots[each.name] = _boot(each)
@@ -165,8 +168,8 @@ class FleetTranscript:
             )
         return self._transcripts[name].lines(event, screen, now)
 
-    def change(self, before: Presence | None, robot: Presence, screen: Screen, now: float) -> list[str]:
-        """Return the line that reports a change of a robot or its server. This forgets the robot's earlier goals.
+    def change_lines(self, before: Presence | None, robot: Presence, screen: Screen, now: float) -> list[str]:
+        """Return the line that reports a change of a robot or its server. Also forget the robot's earlier goals.
 
         Args:
             before: the presence before the change, or None if the robot was unknown.

@@ -96,7 +96,7 @@ FleetEvent = FleetSnapshot | RobotChanged | RobotEvent | EventsMissed | BrokerAw
 def read_robots(
     broker: Broker, timeout: float, name: str | None = None, *, with_status: bool = True
 ) -> list[RobotInfo]:
-    """Return the robots of a fleet, sorted by name. This includes robots that are offline.
+    """Read the robots of a fleet from the broker, sorted by name. This includes robots that are offline.
 
     Args:
         broker: the broker of the fleet.
@@ -116,27 +116,29 @@ def read_robots(
         desk.wait_for_retained(timeout, lambda: bool(reader.messages))
     finally:
         desk.close()
-    return _robots_in(reader.messages)
+    return _read_states(reader.messages)
 
 
 class _RetainedReader:
-    """Subscribes to some topics, and collects all messages."""
+    """Subscriber to some topics that collects all messages."""
 
     def __init__(self, wanted: list[str]) -> None:
         self._wanted = wanted
         self.messages: list[Message] = []
 
     def on_connected(self, link: Link) -> None:
+        """Subscribe to the topics."""
         link.subscribe(*self._wanted, retained=True)
 
     def on_disconnected(self, why: str) -> None:
-        pass  # `wait_for_retained` raises the error instead.
+        """Do nothing, because `wait_for_retained` raises the error."""
 
     def on_message(self, message: Message) -> None:
+        """Store a message in `messages`."""
         self.messages.append(message)
 
 
-def _robots_in(messages: list[Message]) -> list[RobotInfo]:
+def _read_states(messages: list[Message]) -> list[RobotInfo]:
     """Read the state of each robot from these messages, sorted by name. Omit robots without a presence."""
     payloads: dict[str, dict[str, bytes]] = {}
     for message in messages:
@@ -189,7 +191,7 @@ class FleetWatch:
             self._process_retained(self._retained or [], time.monotonic(), first=True)
             while True:
                 now = time.monotonic()
-                self._check_limits(now)
+                self._handle_due(now)
                 while self._events:
                     yield self._events.popleft()
                 self._desk.poll(_LIMIT_CHECK_INTERVAL_S, interrupt)
@@ -213,7 +215,7 @@ class FleetWatch:
             self._events.append(BrokerAway(why, ABSENCE_LIMIT_S))
 
     def on_message(self, message: Message) -> None:
-        """Process a robot's presence, status or event."""
+        """Process a robot's presence, status or event. On a new connection, first collect all retained messages."""
         if self._retained is not None:
             self._retained.append(message)
             return
@@ -230,12 +232,13 @@ class FleetWatch:
             self._report(event)
 
     def _selects(self, presence: Presence) -> bool:
+        """Return whether the watch includes this robot."""
         return self._selection is None or self._selection.includes(presence)
 
     # -- time limits
 
-    def _check_limits(self, now: float) -> None:
-        """Check all time limits, and handle those that have passed."""
+    def _handle_due(self, now: float) -> None:
+        """Process retained messages once all have arrived, and handle time limits that have passed."""
         if self._retained is not None and self._desk.retained_received:
             self._process_retained(self._retained, now)
         if self._away_since is not None and now - self._away_since >= ABSENCE_LIMIT_S:
@@ -249,7 +252,7 @@ class FleetWatch:
     def _process_retained(self, messages: list[Message], now: float, *, first: bool = False) -> None:
         """Report the first snapshot, or the changes that happened while the connection was lost."""
         self._retained = None
-        robots = {each.presence.name: each for each in _robots_in(messages) if self._selects(each.presence)}
+        robots = {each.presence.name: each for each in _read_states(messages) if self._selects(each.presence)}
         events = [event for each in messages if (event := _read_event(each))]
         if first:
             self._presences = {name: each.presence for name, each in robots.items()}
@@ -298,7 +301,7 @@ class FleetWatch:
             self._events.append(EventsMissed(RobotInfo(presence, status), tuple(missed)))
 
     def _report(self, robot_event: RobotEvent) -> None:
-        """Report an event of a robot if the robot is selected."""
+        """Report an event of a robot if the robot is selected, and remember which goal it was about."""
         name, event = robot_event.name, robot_event.event
         if self._selection and name not in self._presences:
             return
