@@ -282,8 +282,8 @@ def test_the_holders_of_a_pipe_are_looked_for_no_longer_than_it_is_held(monkeypa
             os.close(writing)
         return []
 
-    monkeypatch.setattr(processes, "_links", links)
-    monkeypatch.setattr(processes, "processes", lambda: [-1, -2, -3, -4])
+    monkeypatch.setattr(processes, "_read_links", links)
+    monkeypatch.setattr(processes, "process_ids", lambda: [-1, -2, -3, -4])
     assert not processes.kill_holders(reading)
     assert looked == ["/proc/-1/fd", "/proc/-2/fd"]
     os.close(reading)

@@ -374,7 +374,7 @@ class Playback:
     # -- choosing a player
 
     def _with_player(self, step: Callable[[PlayerFeed], None]) -> None:
-        """Call `step` with the current player, and repeat it with the next player if necessary.
+        """Call `step` with the current player. If that player fails or was released, repeat it with the next.
 
         It is repeated if the player fails before any sound was heard, or if the player was released during a pause.
         """
@@ -399,7 +399,7 @@ class Playback:
         player = next(self._untried)()
         self._sent = self._begin
         self._silent_at = None
-        lead_in = self._players.lead_in_seconds(begins=self._begin == self._skipped)
+        lead_in = self._players.lead_in_seconds(at_beginning=self._begin == self._skipped)
         return PlayerFeed(player, self._rate, self._clock, self._seconds(self._begin), lead_in)
 
     def _handle_player_error(self, error: CannotSpeak) -> None:

@@ -368,6 +368,7 @@ class GoalRunner:
             self._fail_goal(Reason.ENGINE_FAILED, f"{type(error).__name__}: {error}")
 
     def _fail_goal(self, reason: Reason, message: str) -> None:
+        """End the current goal as failed, and tell the server why."""
         self._end_goal(protocol.OUTCOME_FAILED, reason, message)
 
     def _end_goal(self, outcome: str, reason: Reason | None = None, message: str | None = None) -> None:

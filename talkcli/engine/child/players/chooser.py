@@ -157,16 +157,16 @@ class PlayerChooser:
         elif player.proven and before.player != player.name and not before.muted:
             self.output = None  # the new player doesn't know its output
 
-    def lead_in_seconds(self, begins: bool = True) -> float:
-        """Return how many seconds of silence a newly opened player has to play first.
+    def lead_in_seconds(self, at_beginning: bool = True) -> float:
+        """Return how many seconds of silence a newly opened player has to play before its samples.
 
         Args:
-            begins: Whether the player plays the beginning of the sentence. Otherwise, it continues the sentence after a
-                long pause, and a lead-in is needed only if the device is idle.
+            at_beginning: Whether the player plays the beginning of the sentence. Otherwise, it continues the sentence
+                after a long pause, and a lead-in is needed only if the device is idle.
         """
         idle = self.silent_since is None or time.monotonic() - self.silent_since >= IDLE_AFTER_S
         own = self._own_lead_in
-        milliseconds, due = (self._configure.lead_in, idle) if own is None else (own, begins or idle)
+        milliseconds, due = (self._configure.lead_in, idle) if own is None else (own, at_beginning or idle)
         return milliseconds / 1000 if due else 0.0
 
     def find_first_player(self) -> str | None:
