@@ -21,7 +21,7 @@ _MAX_COMMAND_LINE_CHARS = 200
 #: comes from.
 _WRAPPER_PROGRAMS = frozenset({b"timeout", b"time", b"flock", b"xargs", b"sudo"})
 #: Maximum number of a process's ancestors to examine. A shell that was started by a script is three levels below cron.
-_MAX_PARENTS_COUNT = 8
+_MAX_ANCESTORS_COUNT = 8
 
 _LOCAL_PEERCRED = 0x001  # <sys/un.h> on macOS
 _LOCAL_PEERPID = 0x002
@@ -54,7 +54,7 @@ def command_name(pid: int) -> str | None:
 
 def ancestors(pid: int) -> Iterator[int]:
     """Yield the process ids of a process's parent, grandparent and so on, at most eight of them."""
-    for _ in range(_MAX_PARENTS_COUNT):
+    for _ in range(_MAX_ANCESTORS_COUNT):
         stat = process_stat(pid)
         pid = int(stat[1]) if stat else 0
         if pid == 0:

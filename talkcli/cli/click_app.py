@@ -261,7 +261,7 @@ class _CommandGroup(_HelpfulCommand, click.Group):
 @click.version_option(__version__, prog_name="talk", message="%(prog)s %(version)s")
 @click.pass_context
 def talk(context: click.Context) -> None:
-    """Parse the common options and, if no command follows, print the first screen."""
+    """Print an overview if no command is given. Click calls this before it runs a command."""
     if context.invoked_subcommand is None:
         click.echo(_first_screen(context))
 

@@ -177,7 +177,7 @@ def reader_is_gone(error: OSError) -> bool:
 
 
 def handle_output_error(error: Exception) -> int | None:
-    """Return the exit code for an error of standard output, and discard further output.
+    """Discard further output after an output error, and return its exit code. Return None for other errors.
 
     A full or broken disk is reported.
 

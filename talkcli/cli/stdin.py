@@ -226,7 +226,7 @@ class LineSpeaker:
         self._failure: tuple[int, int] | None = None
 
     def run(self) -> int:
-        """Send all lines and, with --wait, wait until their goals have ended. Return the exit code."""
+        """Connect, send all lines and, with --wait, wait until their goals have ended. Return the exit code."""
         interrupts = self._interrupts
         try:
             with (

@@ -190,7 +190,7 @@ def _goal_table(label: str, goals: Sequence[Goal], id_columns: int, screen: Scre
 
 
 def _head_columns(goal: Goal, id_columns: int, screen: Screen) -> str:
-    """Return the columns before a goal's text: its end time, id and state."""
+    """Return the columns before a goal's text: its end time if it has ended, its id and its state."""
     goal_id = pad(screen.goal_id(goal.id), id_columns)
     head = f"{goal_id}{COLUMN_GAP}{screen.coloured(pad(goal.state.name, 9), goal.state)}{COLUMN_GAP}"
     return f"{clock_time(goal.ended_at)}{COLUMN_GAP}{head}" if goal.state.terminal else head

@@ -91,13 +91,13 @@ class Screen:
         return self.fit_name(number if number.isdecimal() else goal_id, _MIN_ID_COLUMNS, 8)
 
     def coloured(self, text: str, state: State | None) -> str:
-        """Return the text in the colour of a state, or in bold if the state is None."""
+        """Return the text in the colour of a state, or in bold if the state is None, if the output has colours."""
         code = _STATE_COLOURS.get(state) if state is not None else "1"
         return f"\x1b[{code}m{text}\x1b[0m" if self.colour and code else text
 
 
 def printable(text: str, limit: int | None = None) -> str:
-    """Escape all invisible characters in a text, and cut it after `limit` characters."""
+    """Cut a text after `limit` characters, and escape all invisible characters and backslashes in it."""
     kept = text[:limit]
     if not (kept.isascii() and kept.isprintable() and "\\" not in kept):
         kept = "".join(map(_escape, kept))
