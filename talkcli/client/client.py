@@ -131,7 +131,7 @@ class Client:
         patient: bool = False,
         block: bool = True,
     ) -> GoalHandle:
-        """Send a goal, and return its handle after the server has accepted or REJECTED the goal.
+        """Send a goal, and return its handle. With `block`, wait until the server has accepted or REJECTED it.
 
         Args:
             text: the text to speak, up to 10,000 characters.
@@ -235,7 +235,7 @@ class Client:
         before: str | None = None,
         key: str | None = None,
     ) -> Canceled:
-        """Cancel goals, and return when they are silent. Without arguments, cancel all goals.
+        """Cancel goals, and return them when they are silent. Without arguments, cancel all goals.
 
         A goal is cancelled if any of the arguments selects it.
 

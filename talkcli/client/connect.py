@@ -109,7 +109,7 @@ def _check_owner(connected: _socket.socket) -> None:
 def send_early(
     attempt: ConnectionAttempt, hello: JsonObject, request: JsonObject, before: Callable[[], None]
 ) -> ConnectionAttempt | None:
-    """Send hello, wait briefly for the server's greeting, and then send the first request.
+    """Send hello, and the first request if the greeting arrives soon. Return the new state, or None if disconnected.
 
     The request is not sent if the greeting is late or unexpected.
 
@@ -197,7 +197,7 @@ def connect(
     keep_trying: float = 0.0,
     end: float | None = None,
 ) -> ConnectionAttempt:
-    """Connect to the first usable server, and read its greeting.
+    """Connect to the first usable server, trying again for a limited time, and read its greeting.
 
     Args:
         named: path of the only socket to try; None for the usual places.

@@ -139,7 +139,7 @@ IDS = Kind("list", (list, tuple), f"must be a list of at most {MAX_IDS} ids", "[
 
 @frozen
 class Setting:
-    """The server's default value for a goal option."""
+    """The server's default value for a goal option, and how to describe it."""
 
     initial: Any
     #: value that means "none" and is shown as null

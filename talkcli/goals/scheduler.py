@@ -49,7 +49,7 @@ class Now:
 
 @frozen
 class StateChange:
-    """An effect that publishes the new state of a goal."""
+    """An effect for the caller to carry out: publish the new state of a goal."""
 
     record: Record
     state: State
@@ -70,7 +70,7 @@ class Order(Enum):
 
 @frozen
 class EngineOrder:
-    """An effect that sends the engine an order."""
+    """An effect for the caller to carry out: send the engine an order."""
 
     record: Record
     order: Order
@@ -320,7 +320,7 @@ class Scheduler:
         return effects + self.failed(record.id, Reason.ENGINE_FAILED, message, None, now) if record else effects
 
     def word_heard(self, goal_id: str, end: int) -> None:
-        """Record that a word of the active goal is being played.
+        """Record that the active goal has been heard up to this offset in its text.
 
         Args:
             goal_id: the id of the goal.
@@ -415,7 +415,7 @@ class Scheduler:
         return min(self._active_deadline(), self.pending.next_expiry(), self._next_deadline())
 
     def tick(self, now: Now) -> list[Effect]:
-        """Handle all time limits that have been reached.
+        """Handle the time limits that have been reached: end expired goals, and start the next one if possible.
 
         Expired goals are recalled. If the active goal was stopped and did not become silent in time, it is aborted. The
         next goal starts if it no longer has to wait for its voice.

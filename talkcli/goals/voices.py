@@ -68,7 +68,7 @@ class NeuralVoice:
 
 @frozen
 class VoiceLoadOrder:
-    """An effect that makes the engine load a voice, after unloading others to make room."""
+    """An effect for the caller to carry out: have the engine load a voice, after unloading some others."""
 
     voice: str
     dropped: tuple[str, ...] = ()
@@ -76,14 +76,14 @@ class VoiceLoadOrder:
 
 @frozen
 class VoiceDropOrder:
-    """An effect that makes the engine unload a voice to save memory."""
+    """An effect for the caller to carry out: have the engine unload a voice to save memory."""
 
     voice: str
 
 
 @frozen
 class VoiceWarning:
-    """An effect that logs a problem with a voice."""
+    """An effect for the caller to carry out: log a problem with a voice."""
 
     message: str
 
@@ -116,7 +116,7 @@ class VoiceScheduler:
     # -- requests from goals
 
     def request(self, voice: str, now: float) -> None:
-        """Request a voice for a goal. A voice that failed to load is tried again only after a delay."""
+        """Record that a goal asks for a voice, and plan to load it. A failed voice is retried after a delay."""
         found = self._voices.pop(voice, None) or self._new_voice(voice)
         self._voices[voice] = found
         if found.state is VoiceState.FAILED and voice != self._loading and now >= found.retry_at:

@@ -71,7 +71,7 @@ class Listener:
         return _identity(self.path) == self._identity and _is_lock_of(self.path, self._lock)
 
     def bind_again(self) -> socket.socket | None:
-        """Recreate a missing socket file or lock file, with the same checks as at the start.
+        """Recreate a missing socket file or lock file. Return the old socket if the caller must close it.
 
         Returns:
             The old socket, which the caller must close, or None if it is still in use.

@@ -93,7 +93,7 @@ class Requests:
         self._speech.notifications.add(notifications)
 
     async def _carry_out(self, pending: PendingRequest) -> None:
-        """Carry out a request, after waiting for the list of voices if necessary. Reply to errors, too."""
+        """Wait for the list of voices if necessary, carry out a request, and reply with an error if it fails."""
         request = pending.request
         try:
             if isinstance(request, Cancel | Pause):
@@ -406,7 +406,7 @@ def _unknown_message(*ids: str) -> str:
 
 
 def _goal_items(name: str, records: Iterable[Record]) -> Iterator[JsonObject]:
-    """Return the list items for some goals, each under this field name, made when the item is sent."""
+    """Yield a list item for each goal, with a copy of the goal in the field `name`, made when it is sent."""
     return ({name: each.snapshot().to_json()} for each in records)
 
 

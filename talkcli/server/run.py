@@ -179,7 +179,7 @@ class Server:
             raise self._fatal_error
 
     def _prepare_voice(self) -> str | None:
-        """Return the configured voice if the engine must check it. Return None for a neural voice or none.
+        """Return the configured voice if the engine must check it. Check and set a neural voice, and return None.
 
         A neural voice is checked here. It becomes a setting and is loaded later, so that it doesn't delay speech.
 
@@ -196,7 +196,7 @@ class Server:
         return None
 
     def _maintain_socket(self) -> None:
-        """Bind the socket again if clients can't find it, and schedule the next check. Shut down if it can't."""
+        """Bind the socket again if clients can't find it, or shut down if that fails. Schedule the next check."""
         self._socket_check = self._loop.call_later(SOCKET_CHECK_S, self._maintain_socket)
         if self._listener.in_place():
             self._unreachable = ""

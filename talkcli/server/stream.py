@@ -52,7 +52,7 @@ _NO_CONNECTION = {errno.EAGAIN, errno.ECONNABORTED, errno.EPROTO, errno.EINTR}
 
 
 class ClientStreams:
-    """The streams of all clients of one event loop.
+    """The streams of all clients, which send their output together and share a limit for unread output.
 
     It sends their output at the end of each iteration of the event loop, and limits the unread output of all clients
     together. All streams share one callback per iteration. This saves a third of the time if fifty clients watch the
@@ -170,14 +170,14 @@ class ClientStream:
         return len(self._unread)
 
     def count_held(self, size_bytes: int) -> None:
-        """Add to the counted size of the output that the receiver holds back. The argument may be negative."""
+        """Add to the size of the output that the receiver holds back (may be negative), and enforce the limits."""
         if self in self._streams.open:
             self.held_bytes += size_bytes
             self._streams.unread_bytes += size_bytes
             self._streams.shed_load()
 
     def write(self, data: bytes) -> None:
-        """Send data at the end of this iteration, or later if the client reads slowly."""
+        """Queue data to be sent soon. If too much output is unread in total, disconnect the slowest clients."""
         if self.closing:
             return
         self._unread += data
