@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.support.documents import README, SPEED, tables
+from tests.support.documents import BENCHMARK, README, tables
 from tests.support.real_voice import real_voice
 from tests.support.sink import PROGRAMS
 from tests.support.surroundings import needs, needs_packages
@@ -18,7 +18,7 @@ from tests.tools.bench.stage import TALK, Options, Stage
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-TABLES = tables(SPEED.text)
+TABLES = tables(BENCHMARK.text)
 
 
 def form(name: str, goal: str) -> tuple[str, str]:
@@ -51,7 +51,7 @@ def test_the_rows_of_a_group_measure_something(stage: Stage, group: str, monkeyp
     assert all(len(each.cells()) == len(TABLES[0][0]) and each.values for each in rows)
     if group not in ("neural", "marathon"):  # which no table shows
         known = {form(row[0], row[7]) for table in TABLES for row in table[1:]}
-        assert {form(each.name, each.goal) for each in rows} <= known, f"a table in {SPEED.name} is out of date"
+        assert {form(each.name, each.goal) for each in rows} <= known, f"a table in {BENCHMARK.name} is out of date"
 
 
 def test_readme_tells_what_the_table_has() -> None:

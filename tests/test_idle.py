@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from tests.support.census import descendants
+from tests.support.usage import descendants
 from tests.tools.bench.machine import taken_in
 
 if TYPE_CHECKING:

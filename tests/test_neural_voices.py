@@ -410,7 +410,7 @@ def test_the_text_of_a_voice_s_file_never_reaches_the_terminal_raw(env: dict[str
     told = tiny_voice.description(voice=evil, language=evil, speakers=2, dataset=evil * 100, speaker_id_map={evil: 0})
     told["audio"] = {"sample_rate": 22050, "quality": evil}
     tiny_voice.put(tmp_path / "voices", "evil", tiny_voice.model(speakers=2), told)
-    tiny_voice.put(tmp_path / "voices", "type", beside=tiny_voice.description(phoneme_type=evil))
+    tiny_voice.put(tmp_path / "voices", "type", config=tiny_voice.description(phoneme_type=evil))
     with serving(env) as server:
         shown = [
             run([*TALK, "voices"], env),

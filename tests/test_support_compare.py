@@ -12,7 +12,15 @@ import pytest
 from tests.conformance import stopped
 from tests.conformance.hearing import LONG, QUICK
 from tests.conformance.hearing import LOW as BATTERY
-from tests.support.compare import alike, assert_begun, assert_heard, assert_resumed, assert_silent, compare, extent
+from tests.support.compare import (
+    assert_heard,
+    assert_only_beginning,
+    assert_resumed,
+    assert_silent,
+    compare,
+    extent,
+    similarity,
+)
 from tests.support.recording import LOUD
 from tests.support.reference import RATE, Sentence, render
 from tests.support.surroundings import clean_environment, needs
@@ -156,16 +164,16 @@ def test_a_stopped_or_held_sentence_is_recognised_though_it_ran_dry_before(low: 
     (left,) = render([LEFT])
     gap, dry = zeros(900 if dry else 0), dry or 0
     begun = np.concatenate([low[:dry], gap, low[dry:20000]])
-    assert assert_begun(recorded(begun), low) == pytest.approx(20000 / RATE, abs=0.1)
+    assert assert_only_beginning(recorded(begun), low) == pytest.approx(20000 / RATE, abs=0.1)
     for wrong in ([low[:dry], gap, left[dry:20000]], [begun, low[-20000:]]):
         with pytest.raises(AssertionError):
-            assert_begun(recorded(*wrong), low)
+            assert_only_beginning(recorded(*wrong), low)
     with pytest.raises(AssertionError, match="nothing was heard"):
-        assert_begun(SILENCE, low)
+        assert_only_beginning(SILENCE, low)
     at = 16000 - len(gap)
     held = assert_resumed(recorded(begun[:16000], PAUSE, low[at:]), low, 1.9)
     assert held == pytest.approx(2, abs=0.3)
-    assert_resumed(recorded(begun[:16000], PAUSE, low[at - 800 :]), low, 1.9, twice=0.05)
+    assert_resumed(recorded(begun[:16000], PAUSE, low[at - 800 :]), low, 1.9, repeated=0.05)
     for pause, rest in (
         *((PAUSE, low[at + 900 :]), (PAUSE, low[at - 1100 :]), (PAUSE, low[:0]), (PAUSE[:RATE], low[at:])),
         *((low[:0], low[at:]), (PAUSE, without_end(low, 0.1)[at:])),
@@ -184,10 +192,10 @@ def test_quiet_samples_beside_a_pause_belong_to_the_sentence() -> None:
     for at in (each for place in quiet for each in (place + 1, place + 100)):
         begun = np.concatenate([sentence[:5000], zeros(900), sentence[5000:at]])
         assert_resumed(recorded(begun, PAUSE, sentence[at:]), sentence, 1.9)
-        assert_resumed(recorded(begun, PAUSE, sentence[at - 800 :]), sentence, 1.9, twice=0.05)
+        assert_resumed(recorded(begun, PAUSE, sentence[at - 800 :]), sentence, 1.9, repeated=0.05)
         for wrong in (sentence[at + 1500 :], sentence[at - 1500 :]):
             with pytest.raises(AssertionError):
-                assert_resumed(recorded(begun, PAUSE, wrong), sentence, 1.9, twice=0.05)
+                assert_resumed(recorded(begun, PAUSE, wrong), sentence, 1.9, repeated=0.05)
 
 
 def test_a_sentence_that_is_not_repeated_to_the_sample_is_told_from_others() -> None:
@@ -196,8 +204,8 @@ def test_a_sentence_that_is_not_repeated_to_the_sample_is_told_from_others() -> 
     first, *_, again = render([low, left, right, left, low])
     gap = zeros(RATE // 40)
     for at in (4_000, 13_000):
-        assert alike(recorded(again[:at], gap, again[at:]), first) > ALIKE
-        assert alike(recorded(first[:at], gap, first[at:]), first) > 0.8
+        assert similarity(recorded(again[:at], gap, again[at:]), first) > ALIKE
+        assert similarity(recorded(first[:at], gap, first[at:]), first) > 0.8
         for other in render([left, right]):
-            assert alike(recorded(other[:at], gap, other[at:]), first) < ALIKE
-    assert alike(SILENCE, first) == 0.0
+            assert similarity(recorded(other[:at], gap, other[at:]), first) < ALIKE
+    assert similarity(SILENCE, first) == 0.0

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.support.forking import Forked, forks
+from tests.support.forking import Forked, can_fork
 from tests.support.surroundings import clean_environment, short_directory
 
 if TYPE_CHECKING:
@@ -131,9 +131,9 @@ def test_it_is_killed_with_the_process_that_forks(env: dict[str, str]) -> None:
 
 
 def test_another_interpreter_library_or_locale_is_not_forked(env: dict[str, str]) -> None:
-    assert forks(env)
-    assert forks({**env, "TALK_PLAYER": "null", "HOME": "/elsewhere"})
+    assert can_fork(env)
+    assert can_fork({**env, "TALK_PLAYER": "null", "HOME": "/elsewhere"})
     for name, value in (("PYTHONPATH", "/elsewhere"), ("PYTHONUTF8", "0"), ("LD_PRELOAD", "lib.so")):
-        assert not forks({**env, name: value}), name
+        assert not can_fork({**env, name: value}), name
     for name in ("LC_ALL", "LANG"):
-        assert not forks({**env, name: "C"}), name
+        assert not can_fork({**env, name: "C"}), name

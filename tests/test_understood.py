@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from tests.support.espeak import RATE
-from tests.support.listener import PACKAGE, understand
-from tests.support.loaded import serve_with
+from tests.support.neural_server import serve_with_voice
 from tests.support.real_voice import REAL_VOICE, real_voice
+from tests.support.recognizer import PACKAGE, recognize
 from tests.support.surroundings import needs_packages
 
 if TYPE_CHECKING:
@@ -60,13 +60,13 @@ def test_ten_sentences_of_a_neural_voice_are_understood(make_talk: MakeTalk, tmp
     needs_packages(PACKAGE)
     path = tmp_path / "speech.wav"
     env = {"XDG_CACHE_HOME": str(tmp_path / "cache")}
-    talk = serve_with(make_talk, REAL_VOICE, "--player", f"file:{path}", sink=None, env=env)
+    talk = serve_with_voice(make_talk, REAL_VOICE, "--player", f"file:{path}", sink=None, env=env)
     before, understood = 0, []
     for sentence in SENTENCES[::2]:
         say(talk, sentence)
         with wave.open(str(path)) as file:
             samples = np.frombuffer(file.readframes(file.getnframes()), "<i2").astype(np.int16)
-        understood.append(understand(samples[before:], SENTENCES))
+        understood.append(recognize(samples[before:], SENTENCES))
         before = len(samples)
     assert understood == SENTENCES[::2]
 
@@ -76,13 +76,13 @@ def test_a_neural_voice_is_understood_no_worse_than_espeak(make_talk: MakeTalk, 
     real_voice()
     needs_packages(PACKAGE)
     env = {"XDG_CACHE_HOME": str(tmp_path / "cache")}
-    talk = serve_with(make_talk, REAL_VOICE, sink=sink, env=env)
+    talk = serve_with_voice(make_talk, REAL_VOICE, sink=sink, env=env)
     wrong: dict[str, list[tuple[str, str]]] = {ESPEAK: [], REAL_VOICE: []}
     for sentence in SENTENCES:
         for voice, told in wrong.items():
             with sink.record() as recording:
                 say(talk, sentence, voice)
-            found = understand(recording.samples, SENTENCES)
+            found = recognize(recording.samples, SENTENCES)
             if found != sentence:
                 told.append((sentence, found))
     assert len(wrong[REAL_VOICE]) <= min(1, len(wrong[ESPEAK])), wrong
@@ -90,4 +90,4 @@ def test_a_neural_voice_is_understood_no_worse_than_espeak(make_talk: MakeTalk, 
 
 def test_noise_is_understood_as_nothing() -> None:
     noise = np.random.default_rng(3).normal(0, 3000, 2 * RATE).astype(np.int16)
-    assert understand(noise, SENTENCES) == ""
+    assert recognize(noise, SENTENCES) == ""

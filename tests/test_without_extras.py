@@ -15,9 +15,9 @@ from talkcli import install
 from talkcli.install import NEURAL_PACKAGES
 from tests.conformance.bareserve import TALK, environment, run, serving
 from tests.engine.test_neural import NEURAL_MODULES
-from tests.support import census, tiny_voice
+from tests.support import tiny_voice, usage
+from tests.support.import_recorder import imported, record_imports
 from tests.support.processes import children
-from tests.support.spied import imported, spied
 from tests.support.surroundings import needs_packages, short_directory
 
 if TYPE_CHECKING:
@@ -34,7 +34,9 @@ COMMANDS = (["status"], ["say", "--wait", "hello"], ["--json", "log"], ["doctor"
 def test_neither_server_nor_clients_import_anything_for_fleets(tmp_path: Path) -> None:
     with short_directory() as home:
         os.mkdir(f"{home}/run", 0o700)
-        env = spied(tmp_path, environment(home, XDG_RUNTIME_DIR=f"{home}/run"))  # as a user who names no socket
+        env = record_imports(
+            tmp_path, environment(home, XDG_RUNTIME_DIR=f"{home}/run")
+        )  # as a user who names no socket
         with serving(env):
             for command in COMMANDS:
                 done = run([*TALK, *command], env)
@@ -51,7 +53,9 @@ def test_neither_server_nor_clients_import_anything_for_fleets(tmp_path: Path) -
     [["--robot", "anna", "status"], ["say", "--robot", "anna", "hello"], ["--robot", "anna", "doctor"], ["watch"]],
 )
 def test_without_the_extra_a_fleet_tells_what_to_install(words: list[str], tmp_path: Path) -> None:
-    env = spied(tmp_path, environment(str(tmp_path), TALK_ROBOT="anna", TALK_BROKER="mqtt://127.0.0.1"), ["paho"])
+    env = record_imports(
+        tmp_path, environment(str(tmp_path), TALK_ROBOT="anna", TALK_BROKER="mqtt://127.0.0.1"), ["paho"]
+    )
     done = run([*TALK, *words], env)
     assert (done.code, done.out) == (2, "")
     assert done.err == f"talk: a fleet needs paho-mqtt; install it with: {install.command('paho-mqtt')}\n"
@@ -74,7 +78,7 @@ class Cost:
     server: frozenset[str]
     engine: frozenset[str]
     clients: frozenset[str]
-    counted: census.Census
+    counted: usage.Usage
     threads: int  # of the engine process
 
 
@@ -83,7 +87,7 @@ def measure(directory: Path, *options: str, without: Sequence[str] = ()) -> Cost
     tiny_voice.put(directory / "voices", "tiny")
     with short_directory() as home:
         env = environment(home, TALK_SOCKET=f"{home}/s", TALK_VOICES=str(directory / "voices"))
-        env = spied(directory, env, without)
+        env = record_imports(directory, env, without)
         with serving(env, *options) as server:
             for command in ASKED:
                 done = run([*TALK, *command], env)
@@ -91,7 +95,7 @@ def measure(directory: Path, *options: str, without: Sequence[str] = ()) -> Cost
                 assert command != ["voices"] or "piper/tiny" in done.out
             pid = server.process.pid
             (engine,) = children(pid)
-            counted = census.settled(pid, lambda now: now.processes == 2)
+            counted = usage.wait_until(pid, lambda now: now.processes == 2)
             threads = len(os.listdir(f"/proc/{engine}/task"))
     found = imported(directory)
     clients = frozenset().union(*(names for each, names in found.items() if each not in {pid, engine}))

@@ -11,7 +11,7 @@ import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from tests.support.forking import Forked, forks
+from tests.support.forking import Forked, can_fork
 from tests.support.processes import SCRIPTED, run_talk
 from tests.support.surroundings import clean_environment, dying_with_parent, short_directory
 
@@ -135,7 +135,7 @@ def alone(*words: str, **extra: str) -> Ended:
 
 def _forked(command: Sequence[str], env: Mapping[str, str]) -> list[str] | None:
     """Return the arguments of `talk` in a command that can be forked, else None."""
-    if not forks(env):
+    if not can_fork(env):
         return None
     if list(command[:2]) == [sys.executable, SCRIPTED]:
         return ["serve", *command[2:]]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.conformance.voices import ESPEAK, Joe
-from tests.support.real_voice import real_voice, silence_noise
+from tests.support.real_voice import link_without_noise, real_voice
 
 if TYPE_CHECKING:
     from tests.conformance.voices import Voice
@@ -23,7 +23,7 @@ def joe(tmp_path_factory: pytest.TempPathFactory) -> Joe:
     place = tmp_path_factory.mktemp("voices")
     place.chmod(0o755)
     path = real_voice()
-    silence_noise(path, place)
+    link_without_noise(path, place)
     beside = place / f"{path.name}.json"
     told = json.loads(beside.read_text())
     numbers = told["phoneme_id_map"]

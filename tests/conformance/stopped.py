@@ -20,7 +20,7 @@ import numpy as np
 
 from tests.conformance.hearing import QUICK
 from tests.conformance.voices import ESPEAK
-from tests.support.compare import assert_begun, assert_heard, assert_silent, extent, same_until
+from tests.support.compare import assert_heard, assert_only_beginning, assert_silent, extent, matching_length
 from tests.support.espeak import Library
 from tests.support.recording import LOUD
 from tests.support.reference import run
@@ -62,10 +62,10 @@ def assert_heard_after_stop(
     turns = [voice.render(following, QUICK)] if voice.repeats else _render_after_stop((stopped, *following), QUICK)
     beginning = voice.render([stopped], QUICK)[0]
     # The sound server may join the rest of the first sentence and the next one, with no silence between them.
-    for start, references in likeliest(samples, turns, [same_until(samples, beginning)] if begun else []):
+    for start, references in likeliest(samples, turns, [matching_length(samples, beginning)] if begun else []):
         try:
             if begun:
-                assert_begun(samples[:start], beginning)
+                assert_only_beginning(samples[:start], beginning)
             elif start:  # otherwise it is the first recorded sample
                 assert_silent(samples[:start])
             return assert_heard(samples[start:], references)

@@ -17,8 +17,8 @@ from tests.conformance.hearing import HELP, PRECISION
 from tests.conformance.stopped import DROPPED
 from tests.conformance.told import assert_told_in_order
 from tests.conformance.witness import ends
-from tests.support import census
-from tests.support.compare import alike, compare
+from tests.support import usage
+from tests.support.compare import compare, similarity
 from tests.support.recording import LOUD
 from tests.support.reference import RATE, render
 from tests.support.timing import assert_within, limits
@@ -166,7 +166,7 @@ def _assert_alike(heard: Samples, reference: Samples) -> None:
     compared = compare(sound, wanted)
     assert abs(compared.heard - compared.expected) <= 0.02, compared
     # Of another sentence they are about 0.1 and 0.2; the first is low as well where the monitor dropped something.
-    assert max(compared.correlation, alike(sound, wanted)) > 0.5, compared
+    assert max(compared.correlation, similarity(sound, wanted)) > 0.5, compared
     heard_from, begin = (int(np.flatnonzero(np.abs(each.astype(np.int32)) > LOUD)[0]) for each in (sound, wanted))
     # What it is longer by stands before it: scraps of the sentences that it has preempted.
     heard_from += max(0, round((compared.heard - compared.expected) * RATE))
@@ -192,7 +192,7 @@ def test_an_engine_that_reads_nothing_for_a_second_while_goals_come_and_go_is_no
     """The engine may miss updates about waiting goals if its socket is full."""
     goal = scripted.run("say", "length=1").id
     scripted.watcher.wait_for_word(goal)
-    (engine,) = census.descendants(scripted.pid)
+    (engine,) = usage.descendants(scripted.pid)
     with scripted.connect() as wire:
         os.kill(engine, signal.SIGSTOP)
         try:

@@ -31,7 +31,7 @@ from tests.conformance.hearing import (
 )
 from tests.conformance.told import assert_recalled, assert_rejected, assert_told_in_order, submit
 from tests.conformance.voices import with_both
-from tests.support.compare import assert_begun, assert_heard, assert_silent, compare, loudness
+from tests.support.compare import assert_heard, assert_only_beginning, assert_silent, compare, loudness
 from tests.support.reference import Sentence
 from tests.support.timing import assert_within, limits
 
@@ -199,7 +199,7 @@ def test_row_03_cancel_by_id_is_silent_when_it_returns(talk: Talk, voice: Voice)
     assert (canceled.code, canceled.id, canceled.err) == (0, goal, "")
     samples = heard(talk)
     _assert_last_sound_before(talk, returned)
-    assert_begun(samples, voice.render([LONG])[0])
+    assert_only_beginning(samples, voice.render([LONG])[0])
     assert talk.watcher.states(goal) == STOPPED
     ended = talk.goal(goal)
     assert (ended["reason"], ended["message"]) == ("canceled", "Talk preempted")
@@ -239,7 +239,7 @@ def test_row_16_a_server_that_is_terminated_answers_every_waiter(talk: Talk, voi
     assert {each["reason"] for each in told} == {"shutdown"}
     assert talk.watcher.states(goals[0]) == STOPPED
     assert [talk.watcher.states(each) for each in goals[1:]] == [["PENDING", "RECALLED"]] * 3
-    assert_begun(heard(talk), voice.render([LONG])[0])
+    assert_only_beginning(heard(talk), voice.render([LONG])[0])
     _assert_last_sound_before(talk, ended)
 
 

@@ -23,7 +23,7 @@ from tests.conformance.hearing import (
 )
 from tests.conformance.told import assert_recalled, assert_told_in_order, submit
 from tests.conformance.voices import with_both
-from tests.support.compare import SAME, assert_heard, assert_resumed, assert_silent, compare, extent, follow
+from tests.support.compare import SAME, assert_heard, assert_resumed, assert_silent, compare, extent, find_part
 from tests.support.recording import LOUD
 from tests.support.reference import RATE
 from tests.support.timing import assert_within, limits
@@ -101,7 +101,7 @@ def test_row_43_a_sentence_that_is_held_goes_on_where_it_was(
         going = resume(talk)["goal"]
         assert (going["id"], going["state"], going["paused"]) == (goal, "ACTIVE", False)
         assert talk.watcher.wait_for_terminal(goal) == "SUCCEEDED"
-        assert_resumed(heard(talk), reference, pause=seconds - SILENT, twice=TWICE)
+        assert_resumed(heard(talk), reference, pause=seconds - SILENT, repeated=TWICE)
         assert talk.watcher.states(goal) == SPOKEN
         numbers = [each["number"] for each in talk.watcher.words(goal)]
         assert numbers == list(range(1, len(numbers) + 1))
@@ -217,7 +217,7 @@ def test_row_43_the_watchdog_leaves_a_sentence_alone_that_is_held_for_longer_tha
     assert talk.goal(goal)["paused"] is True
     resume(talk)
     assert talk.watcher.wait_for_terminal(goal) == "SUCCEEDED"
-    assert_resumed(heard(talk), voice.render([LONG])[0], pause=5, twice=TWICE)
+    assert_resumed(heard(talk), voice.render([LONG])[0], pause=5, repeated=TWICE)
 
 
 def _assert_held_twice(samples: Samples, reference: Samples) -> None:
@@ -232,7 +232,7 @@ def _assert_held_twice(samples: Samples, reference: Samples) -> None:
     wanted = reference[begin:end]
     reached = 0
     for part in (samples[start : stop + 1] for start, stop in zip(starts, ends, strict=True)):
-        place = follow(part, wanted, reached, round(TWICE * RATE) + SLACK)
+        place = find_part(part, wanted, reached, round(TWICE * RATE) + SLACK)
         if place is None:
             found = compare(wanted, part)
             assert found.correlation > SAME, found

@@ -16,10 +16,10 @@ import pytest
 
 from tests.conformance.hearing import QUICK
 from tests.support.espeak import RATE
-from tests.support.listener import WORD, align
-from tests.support.loaded import serve_with
+from tests.support.neural_server import serve_with_voice
 from tests.support.processes import run_talk
 from tests.support.real_voice import REAL_VOICE
+from tests.support.recognizer import WORD, align
 from tests.support.reference import Rendering, Sentence, render, render_with_words
 from tests.support.surroundings import clean_environment
 
@@ -75,7 +75,7 @@ class Joe:
 
     def serve(self, make_talk: MakeTalk, sink: Sink, *options: str, rate: int = QUICK, env: Environment = None) -> Talk:
         env = {**self.places, **(env or {})}
-        return serve_with(make_talk, REAL_VOICE, "--rate", str(rate), *options, sink=sink, env=env)
+        return serve_with_voice(make_talk, REAL_VOICE, "--rate", str(rate), *options, sink=sink, env=env)
 
     def render(self, sentences: Sequence[str | Sentence], rate: int = QUICK) -> list[Samples]:
         return [self._rendered(each if isinstance(each, Sentence) else Sentence(each, rate)) for each in sentences]

@@ -17,7 +17,7 @@ from talkcli.engine.child.synthesizers.inference import CONTEXT_FRAMES, Model, M
 from talkcli.engine.models import VoiceFileError, read_description
 from talkcli.install import NEURAL_PACKAGES
 from tests.support import tiny_voice
-from tests.support.real_voice import real_voice, silence_noise
+from tests.support.real_voice import link_without_noise, real_voice
 from tests.support.surroundings import needs_packages
 from tests.support.timing import assert_within, limits
 
@@ -40,7 +40,7 @@ def _needs_the_extra() -> None:
 def joe(tmp_path_factory: pytest.TempPathFactory) -> Model:
     """Return a real voice's model, without noise."""
     place = tmp_path_factory.mktemp("voices")
-    silence_noise(real_voice(), place)
+    link_without_noise(real_voice(), place)
     return _loaded(place / real_voice().name)
 
 
@@ -161,9 +161,9 @@ def test_kept_halves_that_are_damaged_are_made_anew(tmp_path: Path, damage: byte
         (tiny_voice.model()[:-200], {}, "is truncated"),
         (tiny_voice.model(nodes=tiny_voice.node("Evil", ["input"], "x", domain="evil")), {}, "custom operators"),
         (tiny_voice.model(weights=tiny_voice.weight("w", [1], 1, more=OUTSIDE)), {}, "its weights in another file"),
-        (tiny_voice.model(loud=float("nan")), {}, "not numbers"),
-        (tiny_voice.model(lasting=1e4), {}, "more than 200 frames for 5 phonemes"),
-        (tiny_voice.model(lasting=1e12), {}, "there is not enough memory; end another program"),
+        (tiny_voice.model(amplitude=float("nan")), {}, "not numbers"),
+        (tiny_voice.model(sound_frames=1e4), {}, "more than 200 frames for 5 phonemes"),
+        (tiny_voice.model(sound_frames=1e12), {}, "there is not enough memory; end another program"),
         (tiny_voice.model(hop=5000), {}, "not a Piper model .it makes [0-9]+ samples for"),
         (tiny_voice.model(sounds=5), {}, "do not belong together"),
         (tiny_voice.model(speakers=3), {}, "do not belong together .only one of them has several speakers"),

@@ -119,7 +119,7 @@ def test_a_neural_voice_speaks_with_its_words_and_espeak_before_and_after(engine
 
 @pytest.mark.parametrize("rate", [8000, 48000])
 def test_any_rate_of_samples_goes_into_a_file(place: Path, tmp_path: Path, rate: int) -> None:
-    tiny_voice.put(place, "other", beside=tiny_voice.description(rate=rate))
+    tiny_voice.put(place, "other", config=tiny_voice.description(rate=rate))
     target = tmp_path / "out.wav"
     with _engine(place, f"file:{target}") as engine:
         ended = engine.spoken(TEXT, voice="piper/other")
@@ -167,7 +167,7 @@ def test_unknown_sounds_are_left_out_and_a_text_of_nothing_else_fails(place: Pat
     """Several in a row: the thread that makes sound is handed the next piece for each of them."""
     about = tiny_voice.description()
     about["phoneme_id_map"] = {"_": [0], "^": [1], "$": [2], "a": [3], "\u00e6": [4]}
-    tiny_voice.put(place, "few", beside=about)
+    tiny_voice.put(place, "few", config=about)
     text = "Cat! " + "See! " * 12 + "Cat!"
     assert engine.spoken(text, "g1", voice="piper/few").outcome == protocol.OUTCOME_COMPLETED
     # It lacks the first sound of "cat", and all of "see". A sentence of which a part is heard tells all of its words.
@@ -218,7 +218,7 @@ def test_without_the_extra_a_voice_says_what_to_install(tmp_path: Path, package:
 WRONG: dict[str, tuple[bytes, dict[str, Any], str]] = {
     "no json": (tiny_voice.model(), {}, "wrong.onnx.json does not exist; download it from the source of the model"),
     "truncated": (tiny_voice.model()[:-300], {}, "is truncated, or not an ONNX model; download the voice again"),
-    "silent": (tiny_voice.model(loud=0.0), {}, "made no sound from a text; download the voice again"),
+    "silent": (tiny_voice.model(amplitude=0.0), {}, "made no sound from a text; download the voice again"),
     "unknown language": (
         tiny_voice.model(),
         {"voice": "tlh"},
@@ -522,7 +522,7 @@ def test_voices_are_loaded_one_at_a_time_beside_the_speech_and_told_once_each(pl
 
 def test_a_voice_that_is_not_loaded_or_was_dropped_is_spoken_by_espeak_in_its_language(place: Path) -> None:
     about = tiny_voice.description(voice="de")
-    tiny_voice.put(place, "deutsch", beside=about)
+    tiny_voice.put(place, "deutsch", config=about)
     tiny_voice.put(place, "second")
     _put_wrong(place, "silent")
     with _engine(place) as engine:

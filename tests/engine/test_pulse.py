@@ -188,11 +188,11 @@ def test_an_error_at_any_step_is_the_end_in_words(rig: MakeRig, number: int) -> 
 def test_a_connection_that_ends_anywhere_is_the_end_in_words(rig: MakeRig, hush: bool) -> None:
     with rig() as behind:
         assert behind.end() is None
-        whole = behind.relay.handed_on
+        whole = behind.relay.forwarded
     for at in range(0, whole // 2, 61):  # how often it tells the time is by chance; in the half of it nothing has ended
         with rig() as behind:
             if hush:
-                behind.relay.hushed_at = at
+                behind.relay.silent_at = at
                 behind.limit = 0.05
             else:
                 behind.relay.cut_at = at
@@ -207,7 +207,7 @@ def test_a_move_told_together_with_the_end_is_seen(rig: MakeRig, sink: Sink) -> 
         player = PulsePlayer(RATE)
         try:
             behind.feed(player)
-            behind.relay.hushed_at = behind.relay.handed_on
+            behind.relay.silent_at = behind.relay.forwarded
             player.close()
             behind.relay.pump()
             # the newest: that of a test before this one may not be gone yet
@@ -219,7 +219,7 @@ def test_a_move_told_together_with_the_end_is_seen(rig: MakeRig, sink: Sink) -> 
                 behind.relay.register(waiting)
                 waiting.poll(rest * 1000)
                 behind.relay.pump()
-            behind.relay.hushed_at = None
+            behind.relay.silent_at = None
             with pytest.raises(CannotSpeak, match="only a dummy output left") as error:
                 behind.await_end(player)
             assert (error.value.reason, error.value.final) == ("audio_lost", True)

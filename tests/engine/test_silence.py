@@ -16,7 +16,7 @@ from talkcli.engine.child.players.chooser import MAX_CUT_S, MAX_HANDOVER_S, MAX_
 from tests.engine.programs import SWALLOWS, Player
 from tests.engine.spawned import FAST, SOON, Spawned
 from tests.support.processes import children
-from tests.support.reference import RATE, played, render
+from tests.support.reference import RATE, render, without_leading_zeros
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def _silence(milliseconds: int) -> bytes:
 
 
 def _sentence() -> bytes:
-    return played(render([TEXT], rate=FAST)[0]).astype("<i2").tobytes()
+    return without_leading_zeros(render([TEXT], rate=FAST)[0]).astype("<i2").tobytes()
 
 
 def _idle_after(seconds: float) -> str:
@@ -56,7 +56,7 @@ def test_a_player_gets_the_lead_in_uncounted_and_words_wait_for_it(
     player: Player, servers: int, idle_after: float, own: list[int | None], expected: list[int]
 ) -> None:
     texts = [TEXT, SECOND, SECOND][: len(own)]
-    sentences = [played(each).astype("<i2").tobytes() for each in render(texts, rate=FAST)]
+    sentences = [without_leading_zeros(each).astype("<i2").tobytes() for each in render(texts, rate=FAST)]
     with Spawned(player.plays(), lead_in=servers, before=_idle_after(idle_after)) as engine:
         for number, (text, lead_in, sentence) in enumerate(zip(texts, own, sentences, strict=True)):
             began, lead = time.monotonic(), expected[number] / 1000
@@ -185,7 +185,7 @@ _SAYS_SO = _CUTS.format(LEFT_OUT)
 def _all_played(rate: int = FAST) -> list[bytes]:
     """Return the samples played of each sentence if nothing is cut."""
     first, *others = render(TEXTS, rate=rate)
-    return [each.tobytes() for each in (played(first), *others)]
+    return [each.tobytes() for each in (without_leading_zeros(first), *others)]
 
 
 def _changed(gap: HandoverTimes, took: float, player: str = "aplay", *, neural: bool = False) -> None:

@@ -29,7 +29,7 @@ from talkcli.engine.voices import UnknownVoice
 from talkcli.goals.reasons import Reason
 from talkcli.install import NEURAL_PACKAGES
 from tests.support import tiny_voice
-from tests.support.real_voice import REAL_VOICE, real_voice, silence_noise
+from tests.support.real_voice import REAL_VOICE, link_without_noise, real_voice
 from tests.support.surroundings import needs_packages
 from tests.support.timing import assert_within, limits
 
@@ -112,7 +112,7 @@ def _piper(voice: str = "piper/tiny") -> Synthesizer:
 
 def _joe() -> Synthesizer:
     """Return a synthesizer with a real voice, without its noise."""
-    silence_noise(real_voice(), Path(os.environ["TALK_VOICES"]))
+    link_without_noise(real_voice(), Path(os.environ["TALK_VOICES"]))
     return _piper(f"piper/{real_voice().stem}")
 
 

@@ -94,7 +94,7 @@ def test_only_models_that_can_be_named_are_voices(home: Path) -> None:
 
 
 def test_a_voice_is_listed_with_language_quality_and_speakers(home: Path) -> None:
-    tiny_voice.put(home / "v", "a", beside=tiny_voice.description(speakers=3, language="de_DE"))
+    tiny_voice.put(home / "v", "a", config=tiny_voice.description(speakers=3, language="de_DE"))
     (home / "v" / "b.onnx").touch()
     tiny_voice.put(home / "v", "c")
     assert [*installed_voices()] == [
@@ -106,7 +106,7 @@ def test_a_voice_is_listed_with_language_quality_and_speakers(home: Path) -> Non
 
 def test_a_speaker_without_a_name_to_type_goes_by_its_number(home: Path) -> None:
     names = {"amused": 0, "\x1b[31m": 1, "x" * 65: 2, "": 3, "calm": 5, "beyond": 6}
-    tiny_voice.put(home / "v", "a", beside=tiny_voice.description(num_speakers=6, speaker_id_map=names))
+    tiny_voice.put(home / "v", "a", config=tiny_voice.description(num_speakers=6, speaker_id_map=names))
     (voice,) = installed_voices()
     assert voice.speakers == ("amused", "1", "2", "3", "4", "calm")
 
@@ -115,7 +115,7 @@ def test_a_very_long_name_in_a_json_is_cut_if_it_is_told(home: Path) -> None:
     told = tiny_voice.description(language="l" * 1000, dataset="d" * 1000)
     told["audio"] = {"sample_rate": 8000, "quality": "q" * 1000}
     told["espeak"] = {"voice": "e" * 1000}
-    path = tiny_voice.put(home / "v", "a", beside=told)
+    path = tiny_voice.put(home / "v", "a", config=told)
     assert read_description(str(path)).espeak_voice == f"{'e' * 40}…"
     (voice,) = installed_voices()
     assert voice.name == f"{'d' * 40}…, {'q' * 40}…"

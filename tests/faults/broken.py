@@ -12,7 +12,7 @@ import numpy as np
 import talkcli
 from tests.conformance.hearing import HELP, QUICK, render_quick
 from tests.conformance.stopped import likeliest
-from tests.support import census
+from tests.support import usage
 from tests.support.compare import assert_heard, extent
 from tests.support.reference import RATE
 from tests.support.timing import assert_within
@@ -55,9 +55,9 @@ def await_end(talk: Talk, goal_id: str, within: float) -> str:
 def nothing_left(talk: Talk) -> Iterator[None]:
     """Assert that an idle server has no process, descriptor or thread more than before, once it is idle again."""
     assert talk.run("voices").code == 0  # so that the engine is ready
-    before = census.count(talk.pid)
+    before = usage.count(talk.pid)
     yield
-    census.assert_as_before(talk.pid, before, GROWTH)
+    usage.assert_not_grown(talk.pid, before, GROWTH)
 
 
 def began(recording: Recording, whole: Samples) -> float:

@@ -20,7 +20,7 @@ import pytest
 from tests.conformance.bareserve import SERVE, TALK, environment, run, serving
 from tests.conformance.rawsocket import Raw
 from tests.faults.broken import assert_answers
-from tests.support import census, processes
+from tests.support import processes, usage
 from tests.support.connection import Wire
 from tests.support.processes import children
 from tests.support.timing import assert_within, limits
@@ -151,12 +151,12 @@ def test_50_waiters_that_are_frozen_take_no_memory_while_10000_words_pass(
         line = json.dumps({"seq": 1, "request": "watch"})
         with crowd(talk, waiters, line) as frozen:
             frozen.send_signal(signal.SIGSTOP)
-            idle = census.count(talk.pid)
+            idle = usage.count(talk.pid)
             speak_words(talk, seconds)
-            before = census.settled(talk.pid, lambda now: now.descriptors <= idle.descriptors)
+            before = usage.wait_until(talk.pid, lambda now: now.descriptors <= idle.descriptors)
             speak_words(talk, seconds)
             # After 5,000 words the server owes clients as many as it ever does. The next 5,000 are 840 kB for each.
-            census.assert_as_before(talk.pid, before, memory=waiters * FROZEN)
+            usage.assert_not_grown(talk.pid, before, memory=waiters * FROZEN)
             frozen.send_signal(signal.SIGCONT)
 
 
@@ -182,14 +182,14 @@ def test_500_waiters_that_are_killed_leave_nothing_and_their_goal_goes_on(make_t
     goal = talk.run("say", text).id
     talk.watcher.wait_for_word(goal)
     line = json.dumps({"seq": 1, "request": "wait", "ids": [goal], "feedback": True})
-    before = census.count(talk.pid)
+    before = usage.count(talk.pid)
     for _ in range(2):
         with contextlib.ExitStack() as stack:
             crowds = [stack.enter_context(crowd(talk, 50, line)) for _ in range(10)]
-            assert census.count(talk.pid).descriptors >= 500
+            assert usage.count(talk.pid).descriptors >= 500
             for each in crowds:
                 os.kill(each.pid, signal.SIGKILL)
-        census.assert_as_before(talk.pid, before, memory=8 * 1024)
+        usage.assert_not_grown(talk.pid, before, memory=8 * 1024)
     assert talk.goal(goal)["state"] == "ACTIVE"
     began = time.monotonic()
     assert talk.run("cancel", goal).code == 0
@@ -288,7 +288,7 @@ def assert_status(client: socket.SocketIO) -> None:
 
 
 def wait_for_descriptors(pid: int, most: int) -> None:
-    assert census.settled(pid, lambda now: now.descriptors <= most).descriptors <= most, census.told(pid)
+    assert usage.wait_until(pid, lambda now: now.descriptors <= most).descriptors <= most, usage.describe(pid)
 
 
 def test_limit_of_40_and_60_clients_leave_the_engine_what_it_needs(home: str) -> None:
@@ -298,7 +298,7 @@ def test_limit_of_40_and_60_clients_leave_the_engine_what_it_needs(home: str) ->
         pid = server.process.pid
         assert run([*TALK, "say", "--wait", "hello"], env).code == 0
         wait_for_descriptors(pid, 20)
-        before = len(census.descriptors(pid))
+        before = len(usage.descriptors(pid))
         with connected(path) as clients:
             inside = greeted(clients)
             assert 5 <= len(inside) < CLIENTS
@@ -337,7 +337,7 @@ def test_descriptors_that_something_else_has_used_up(home: str) -> None:
         assert wire.request("hello")["ok"]  # else the connection is closed after a while
         pid = server.process.pid
         assert run([*TALK, "say", "--wait", "length=0"], env).code == 0
-        before = len(census.descriptors(pid))
+        before = len(usage.descriptors(pid))
         most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
         resource.prlimit(pid, resource.RLIMIT_NOFILE, (3, most))  # it has more, and gets no new one
         lines = server.log.count("\n")

@@ -28,8 +28,8 @@ from tests.conformance.hearing import (
 )
 from tests.faults import trapped
 from tests.faults.broken import await_end, began, heard_again, nothing_left, python_path, write
-from tests.support import census
-from tests.support.compare import assert_begun
+from tests.support import usage
+from tests.support.compare import assert_only_beginning
 from tests.support.reference import render
 from tests.support.surroundings import MARK, command_line, needs, short_directory
 from tests.support.timing import assert_within, limits
@@ -80,7 +80,7 @@ def test_engine_process_is_signalled(make_talk: MakeTalk, sink: Sink, activity: 
             if activity == "idle" and number is STOP:
                 goal = send(talk, LONG)  # nothing shows that it is frozen before it is given a goal, which is lost
             elif activity == "idle":
-                census.settled(talk.pid, lambda now: now.processes == 2 and engine_process(talk) != engine)
+                usage.wait_until(talk.pid, lambda now: now.processes == 2 and engine_process(talk) != engine)
             following = following or send(talk, LOW, rate=RATE)
             if goal:
                 spoken = _assert_lost(talk, goal, number)["spoken"]
@@ -95,7 +95,7 @@ def test_engine_process_is_signalled(make_talk: MakeTalk, sink: Sink, activity: 
         talk.stop()
         next_one = _assert_next(recording, since, SIGNALS[number][2], f"{number.name}, {activity}")
         if activity == "in synthesis":
-            assert_begun(recording.between(0, next_one - PRECISION), render([LONG])[0])
+            assert_only_beginning(recording.between(0, next_one - PRECISION), render([LONG])[0])
 
 
 def _bring_to(talk: Talk, activity: str, recording: Recording) -> str | None:
@@ -137,7 +137,7 @@ def test_what_a_player_started_in_a_session_of_its_own_ends_with_it(make_talk: M
     talk = make_talk("--player", APART, sink=sink)
     with nothing_left(talk):
         goal = begin(talk, LONG, number=1)
-        playing = [pid for pid in census.descendants(talk.pid) if command_line(pid).startswith("aplay")]
+        playing = [pid for pid in usage.descendants(talk.pid) if command_line(pid).startswith("aplay")]
         assert playing
         following = send(talk, LOW, rate=RATE)
         if ends == "ABORTED":
@@ -192,7 +192,7 @@ def test_complaints_of_the_engine_are_logged_fit_for_a_terminal(make_talk: MakeT
 def _feeding(talk: Talk, player: int) -> bool:
     """Return whether the engine still has samples for the player: it holds the other end of its standard input."""
     pipe = os.readlink(f"/proc/{player}/fd/0")
-    return pipe in census.descriptors(engine_process(talk)).values()
+    return pipe in usage.descriptors(engine_process(talk)).values()
 
 
 def _assert_lost(talk: Talk, goal_id: str, number: signal.Signals) -> Message:
@@ -302,7 +302,7 @@ def test_process_that_cannot_be_reaped(make_talk: MakeTalk, sink: Sink, tmp_path
             heard_again(talk, sink)
             assert os.path.exists(f"/proc/{player}"), "the next goal waited for it"
         for player in players.values():
-            for tracer in census.descendants(player):
+            for tracer in usage.descendants(player):
                 os.kill(tracer, signal.SIGKILL)  # which lets go of it
 
 

@@ -20,7 +20,7 @@ from talkcli.engine.parent.supervisor import RESTART_DELAYS_S
 from tests.conformance.bareserve import SERVE, environment, run
 from tests.conformance.hearing import LONG, LOW, assert_aborted, begin, engine_process, send
 from tests.faults.broken import assert_answers, heard_again, python_path, write
-from tests.support import census
+from tests.support import usage
 from tests.support.connection import PATIENCE
 from tests.support.timing import assert_within, limits
 
@@ -136,7 +136,7 @@ def too_few_descriptors(talk: Talk) -> Iterator[None]:
 
 
 def _scripted_engine(talk: Talk) -> int:
-    (engine,) = census.descendants(talk.pid)
+    (engine,) = usage.descendants(talk.pid)
     return engine
 
 
@@ -144,7 +144,7 @@ def _replaced(talk: Talk, engine: int, number: signal.Signals = signal.SIGKILL) 
     """Kill the engine process, and return the next one, once it is there."""
     os.kill(engine, number)
     end = time.monotonic() + PATIENCE
-    while not (found := set(census.descendants(talk.pid)) - {engine}):
+    while not (found := set(usage.descendants(talk.pid)) - {engine}):
         assert time.monotonic() < end, talk.log
         time.sleep(0.002)  # the start of a process sends no event
     (next_one,) = found

@@ -19,11 +19,11 @@ import pytest
 from talkcli.engine.child.players.pulse import SUSPENDED_LIMIT_S
 from talkcli.engine.players import DUMMY_SINK
 from tests.conformance.hearing import LONG, LOW, assert_aborted, begin, engine_process, send
-from tests.support.census import descendants
 from tests.support.pipewire import PipeWire
 from tests.support.processes import Talk
 from tests.support.sink import Sink
 from tests.support.timing import assert_within, limits
+from tests.support.usage import descendants
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -25,7 +25,7 @@ from talkcli.install import NEURAL_PACKAGES
 from tests.conformance.bareserve import SERVE, TALK, BareServe, environment, run, serving
 from tests.faults.broken import write
 from tests.faults.supervisor import Supervisor
-from tests.support import census, processes, tiny_voice
+from tests.support import processes, tiny_voice, usage
 from tests.support.connection import Wire
 from tests.support.processes import children
 from tests.support.surroundings import needs, needs_packages
@@ -272,7 +272,7 @@ def test_socket_that_is_passed_is_served_until_the_end_and_left(home: str) -> No
                 if os.path.isdir("/proc/self/fd"):
                     (engine,) = children(server.process.pid)
                     inode = os.readlink(f"/proc/{server.process.pid}/fd/3")
-                    assert inode not in census.descriptors(engine).values()
+                    assert inode not in usage.descriptors(engine).values()
                 assert server.end(signal.SIGTERM) == 0
             assert os.path.exists(path)
             assert not os.path.exists(f"{path}.lock")

@@ -18,7 +18,7 @@ import pytest
 
 from talkcli.server.run import SOCKET_CHECK_S
 from tests.conformance.bareserve import SERVE, TALK, BareServe, environment, run, serving
-from tests.support import census, processes
+from tests.support import processes, usage
 from tests.support.connection import Wire
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ def test_lock_alone_that_was_removed_is_made_again_and_no_descriptor_is_left_ope
     with serving(environment(home, TALK_SOCKET=path), command=HASTY) as server:
         await_true(lambda: "engine ready" in server.log)  # the engine's pipes are opened once, after the socket
         found_again(path, server.process.pid)
-        before = len(census.descriptors(server.process.pid))
+        before = len(usage.descriptors(server.process.pid))
         socket_file = os.stat(path).st_ino
         os.unlink(f"{path}.lock")
         await_true(lambda: os.path.exists(f"{path}.lock"))
@@ -135,7 +135,7 @@ def test_lock_alone_that_was_removed_is_made_again_and_no_descriptor_is_left_ope
         for _ in range(5):
             unlink_both(path)
             found_again(path, server.process.pid)
-        await_true(lambda: len(census.descriptors(server.process.pid)) <= before)  # the last client takes its time
+        await_true(lambda: len(usage.descriptors(server.process.pid)) <= before)  # the last client takes its time
 
 
 def ends_with_11(server: BareServe, words: str) -> None:

@@ -32,7 +32,7 @@ from tests.conformance.hearing import (
     send,
 )
 from tests.faults.broken import await_end, heard_again, nothing_left, write
-from tests.support.compare import assert_begun, assert_heard
+from tests.support.compare import assert_heard, assert_only_beginning
 from tests.support.reference import render
 from tests.support.sink import Sink
 from tests.support.timing import assert_within, limits
@@ -141,7 +141,7 @@ def _lose(fault: Fault, player: str, talk: Talk, sink: Sink) -> tuple[float, flo
     assert (done.code, talk.goal(goal)["message"] in done.err) == (4, True), done
     assert "two three" in talk.goal(goal)["spoken"] != LONG
     if first.reason == "audio_lost":
-        assert_begun(talk.recording, render([LONG])[0], shortest=0.2)
+        assert_only_beginning(talk.recording, render([LONG])[0], shortest=0.2)
     meanwhile = _assert_ended(talk, send(talk, LOW), second, time.monotonic())
     fault.mends(sink)
     returned = time.monotonic()

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tests.fleet.conftest import MakeRobot
     from tests.support.broker import Broker
     from tests.support.processes import Finished
-    from tests.support.proxy import Way
+    from tests.support.proxy import Direction
 
 #: Seconds in which a desk knows that a bridge was killed, and that a robot's network is gone.
 KILLED, CUT_OFF = 1.0, 20.0
@@ -93,7 +93,7 @@ def test_a_broker_that_is_killed_in_mid_sentence_costs_no_result(robot: Robot) -
 
 
 @pytest.mark.parametrize("way", ["to_client", "to_broker"])
-def test_a_goal_whose_acceptance_was_lost_on_the_way_is_asked_for_and_spoken_once(robot: Robot, way: Way) -> None:
+def test_a_goal_whose_acceptance_was_lost_on_the_way_is_asked_for_and_spoken_once(robot: Robot, way: Direction) -> None:
     with Proxy(robot.broker.port) as proxy, Fleet(robot.broker.url_at(proxy.port)).robot("anna") as client:
         proxy.hold(way)
         said: list[str] = []

@@ -16,8 +16,8 @@ from talkcli.fleet import topics
 from tests.conformance.bareserve import TALK, environment, run, serving
 from tests.faults.supervisor import Supervisor
 from tests.fleet.remote_client import RemoteClient
+from tests.support.import_recorder import record_imports
 from tests.support.processes import run_talk
-from tests.support.spied import spied
 from tests.support.surroundings import needs
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def test_a_mistake_is_named_with_the_next_step(home: str, words: str, env: dict[
 
 
 def test_without_paho_it_says_what_to_install_but_prints_all_the_same(home: str, tmp_path: Path) -> None:
-    env = spied(tmp_path, environment(home, TALK_BROKER="mqtt://127.0.0.1:1"), ["paho"])
+    env = record_imports(tmp_path, environment(home, TALK_BROKER="mqtt://127.0.0.1:1"), ["paho"])
     done = run([*TALK, "bridge", "--name", "anna"], env)
     assert (done.code, done.out) == (2, "")
     assert done.err == f"talk: a fleet needs paho-mqtt; install it with: {install.command('paho-mqtt')}\n"

@@ -114,7 +114,7 @@ def test_a_cancel_arrives_after_a_flood(robot: Robot) -> None:
         robot.bridge.stop_process()
         for _ in range(1500):
             olga.send("flood " * 3333, kind="say", response=None)
-        robot.bridge.go_on()
+        robot.bridge.resume_process()
         end = time.monotonic() + PATIENCE
         while not olga.lines:  # the broker drops messages until its queue has room again
             assert time.monotonic() < end, "no cancel is answered"

@@ -37,7 +37,7 @@ def stall(stalled: tuple[Robot, Proxy], how: str) -> Callable[[], None]:
     robot, proxy = stalled
     if how == "suspended":
         robot.bridge.stop_process()
-        return robot.bridge.go_on
+        return robot.bridge.resume_process
     proxy.hold("to_client" if how == "to_client" else "to_broker")
     return proxy.release
 

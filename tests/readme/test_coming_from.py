@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 from talkcli import Client
 from tests.readme.shell import wait_until
-from tests.support.documents import COMMAND_LINE, tables, words
+from tests.support.documents import COMMAND_LINE, code_spans, tables
 
 if TYPE_CHECKING:
     from tests.readme.shell import Shell
     from tests.support.processes import Talk
 
-NOW = [each for row in tables(COMMAND_LINE.section("Coming from something else"))[0][1:] for each in words(row[2])]
+NOW = [each for row in tables(COMMAND_LINE.section("Coming from something else"))[0][1:] for each in code_spans(row[2])]
 COMMANDS = [each for each in NOW if re.match("talk [a-z]", each)]
 (PIPE, LOOP) = sorted(each for each in NOW if re.search("[;|] ", each))
 PYTHON = [each for each in NOW if each not in {*COMMANDS, PIPE, LOOP}]

@@ -11,7 +11,7 @@ import pytest
 from talkcli.cli.click_app import talk
 from talkcli.cli.commands import COMMANDS
 from tests.readme import reference
-from tests.support.documents import COMMAND_LINE, CONTRIBUTING, DOCUMENTS, HOUSE, ROOT, Document, tables, words
+from tests.support.documents import COMMAND_LINE, CONTRIBUTING, DOCUMENTS, INTERNALS, ROOT, Document, code_spans, tables
 
 #: Variables that `talk` sets for its own processes.
 INTERNAL = {"TALK_LIVENESS_FD"}
@@ -36,7 +36,7 @@ def test_generated_tables_are_current(name: str) -> None:
 def test_variables_are_in_the_table() -> None:
     sources = [each.read_text(encoding="utf-8") for each in (ROOT / "talkcli").rglob("*.py")]
     read = {name for each in sources for form in READ for name in re.findall(form, each, re.MULTILINE)}
-    documented = [each for row in tables(COMMAND_LINE.section("Variables"))[0][1:] for each in words(row[0])]
+    documented = [each for row in tables(COMMAND_LINE.section("Variables"))[0][1:] for each in code_spans(row[0])]
     assert sorted(documented) == sorted(read - INTERNAL)
 
 
@@ -70,7 +70,7 @@ def test_every_document_is_tested() -> None:
 
 def test_links_and_files_are_found() -> None:
     assert len({link for document in DOCUMENTS for link in LINK.findall(document.prose)}) > 10
-    assert len({path for document in (HOUSE, CONTRIBUTING) for path in PATH.findall(document.text)}) > 10
+    assert len({path for document in (INTERNALS, CONTRIBUTING) for path in PATH.findall(document.text)}) > 10
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda each: each.name)
@@ -84,7 +84,7 @@ def test_links_lead_somewhere(document: Document) -> None:
         assert not anchor or anchor in BY_PATH[path].anchors, link
 
 
-@pytest.mark.parametrize("document", [HOUSE, CONTRIBUTING], ids=lambda each: each.name)
+@pytest.mark.parametrize("document", [INTERNALS, CONTRIBUTING], ids=lambda each: each.name)
 def test_files_that_are_named_exist(document: Document) -> None:
     for path in PATH.findall(document.text):
         assert (ROOT / path).exists() or (ROOT / "talkcli" / path).exists(), path

@@ -11,7 +11,7 @@ import time
 import uuid
 from typing import TYPE_CHECKING, Any
 
-from tests.support.forking import Forked, forks
+from tests.support.forking import Forked, can_fork
 from tests.support.mqtt import Listener
 from tests.support.processes import Clients, Finished
 from tests.support.surroundings import MARK, assert_none_left, clean_environment, dying_with_parent, short_directory
@@ -90,7 +90,7 @@ class Bridge(contextlib.AbstractContextManager["Bridge"]):
         self._earlier = set(self._sessions)
         with open(f"{self._directory}/log", "ab") as log:
             to = log.fileno()
-            if forks(self._env):
+            if can_fork(self._env):
                 self._process = Forked(self._words, self._env, stdout=to, stderr=to)
             else:
                 command = dying_with_parent([sys.executable, "-m", "talkcli", *self._words])
@@ -148,7 +148,7 @@ class Bridge(contextlib.AbstractContextManager["Bridge"]):
         while self._state() not in "TZ":
             time.sleep(0.001)  # the kernel tells only the parent
 
-    def go_on(self) -> None:
+    def resume_process(self) -> None:
         os.kill(self.pid, signal.SIGCONT)
 
     def _state(self) -> str:

@@ -30,7 +30,7 @@ SAME = 0.95
 #: The worst tenth of a second of the right sentence has 1.0; of one with a word cut or changed, less than this.
 SAME_PART = 0.8
 #: Seconds by which the extent of the right sound may differ: the monitor's loss and a block of silence.
-EXTENT = 0.02
+EXTENT_TOLERANCE_S = 0.02
 _PART = RATE // 10
 #: Samples by which a part may sit beside the place of the one before it.
 _SLACK = 48
@@ -61,7 +61,11 @@ class Comparison:
     @property
     def same(self) -> bool:
         """Whether it is this sentence, whole, and nothing more."""
-        return self.correlation >= SAME and self.worst >= SAME_PART and abs(self.heard - self.expected) <= EXTENT
+        return (
+            self.correlation >= SAME
+            and self.worst >= SAME_PART
+            and abs(self.heard - self.expected) <= EXTENT_TOLERANCE_S
+        )
 
     @property
     def end(self) -> int:
@@ -205,7 +209,7 @@ def _places(runs: Sequence[tuple[int, int, int]]) -> tuple[npt.NDArray[np.intp],
     return np.concatenate(heard), np.concatenate(own)
 
 
-def assert_begun(heard: Recording | Samples, reference: Samples, shortest: float = 0.1) -> float:
+def assert_only_beginning(heard: Recording | Samples, reference: Samples, shortest: float = 0.1) -> float:
     """Assert that only a beginning of the reference was heard, at least `shortest` seconds; return its seconds."""
     samples = _samples(heard)
     found = extent(samples)
@@ -223,17 +227,17 @@ def assert_begun(heard: Recording | Samples, reference: Samples, shortest: float
     return seconds
 
 
-def same_until(samples: Samples, reference: Samples) -> int:
+def matching_length(samples: Samples, reference: Samples) -> int:
     """Return the place behind the last sample, from the first sound on, that is the same as the reference; else 0."""
     found = extent(samples)
     last = _walk(samples, _sound(reference), found[0])[-1:] if found else []
     return last[0][0] + last[0][2] if last else 0
 
 
-def assert_resumed(heard: Recording | Samples, reference: Samples, pause: float, twice: float = 0.0) -> float:
+def assert_resumed(heard: Recording | Samples, reference: Samples, pause: float, repeated: float = 0.0) -> float:
     """Assert that the reference was heard whole, held once in its middle for at least `pause` seconds.
 
-    At most `twice` seconds may have been said again after the pause. Returns the seconds of the pause.
+    At most `repeated` seconds may have been said again after the pause. Returns the seconds of the pause.
     """
     samples = _samples(heard)
     loud = np.flatnonzero(np.abs(samples.astype(np.int32)) > LOUD)
@@ -247,17 +251,17 @@ def assert_resumed(heard: Recording | Samples, reference: Samples, pause: float,
     assert held >= pause, f"held for {held:.3f} s: {_told(samples, [])}"
     wanted = _sound(reference)
     try:
-        _assert_parts(first, second, wanted, twice)
+        _assert_parts(first, second, wanted, repeated)
     except AssertionError as error:
         # Zeros of the sentence beside the pause look like the pause.
-        if not _ran_dry(first, samples[end : loud[-1] + 1], wanted, round(twice * RATE)):
+        if not _ran_dry(first, samples[end : loud[-1] + 1], wanted, round(repeated * RATE)):
             runs = [_walk(each, wanted, 0, ahead=len(wanted)) for each in (first, second)]
             told = f"parts of {len(first)} and {len(second)} samples, sample by sample (heard at, its own, so many)"
             raise AssertionError(f"{error}; {told}: {runs[0]} and {runs[1]} of {len(wanted)}") from error
     return held
 
 
-def follow(part: Samples, wanted: Samples, reached: int, back: int) -> tuple[int, int] | None:
+def find_part(part: Samples, wanted: Samples, reached: int, back: int) -> tuple[int, int] | None:
     """Return the places in a sentence's sound where a part of it begins and ends; None if it is no part.
 
     `reached`: samples that were heard before, of which it may say the last `back` again.
@@ -269,22 +273,22 @@ def follow(part: Samples, wanted: Samples, reached: int, back: int) -> tuple[int
     return begins + runs[0][1], begins + runs[-1][1] + runs[-1][2]
 
 
-def _ran_dry(first: Samples, second: Samples, wanted: Samples, twice: int) -> bool:
+def _ran_dry(first: Samples, second: Samples, wanted: Samples, repeated: int) -> bool:
     """Return whether these are the two parts of a sentence in which a player ran dry, see `_exact`."""
     runs = _walk(first, wanted, 0)
     if not runs or runs[-1][0] + runs[-1][2] < len(first):
         return False
     reached = runs[-1][1] + runs[-1][2]
-    back = min(reached, twice + _SLACK)
+    back = min(reached, repeated + _SLACK)
     rest = _walk(second, wanted[reached - back :], 0, ahead=back)
     if not rest or len(wanted) - (reached - back + rest[-1][1] + rest[-1][2]) > _LOST:
         return False
     # A stream that goes on loses nothing at the pause; a stream that was started again or ran dry may.
     between = int(np.count_nonzero(wanted[reached : reached - back + rest[0][1]]))
-    return between <= (_LOST if twice or len(runs) + len(rest) > 2 else 2 * _SLACK)
+    return between <= (_LOST if repeated or len(runs) + len(rest) > 2 else 2 * _SLACK)
 
 
-def _assert_parts(first: Samples, second: Samples, wanted: Samples, twice: float) -> None:
+def _assert_parts(first: Samples, second: Samples, wanted: Samples, repeated: float) -> None:
     assert max(len(first), len(second)) <= len(wanted), "more was heard than the sentence"
     # The monitor may have dropped the first samples.
     lost = next((own for _, own, _ in _walk(first, wanted, 0)), 0)
@@ -294,7 +298,7 @@ def _assert_parts(first: Samples, second: Samples, wanted: Samples, twice: float
     missing = wanted[reached + _SLACK : -len(second) - _SLACK]
     assert extent(missing) is None, f"{len(missing) / RATE:.3f} s at the pause were never heard"
     again = (reached + len(second) - len(wanted)) / RATE
-    assert again <= twice + _SLACK / RATE, f"{again:.3f} s at the pause were heard twice"
+    assert again <= repeated + _SLACK / RATE, f"{again:.3f} s at the pause were heard twice"
 
 
 def time_heard(recording: Recording, compared: Comparison, reference: Samples, position: float) -> float:
@@ -308,7 +312,7 @@ def time_heard(recording: Recording, compared: Comparison, reference: Samples, p
     return recording.time_of(int(heard[min(int(np.searchsorted(own, place)), len(heard) - 1)]))
 
 
-def alike(heard: Recording | Samples, reference: Samples) -> float:
+def similarity(heard: Recording | Samples, reference: Samples) -> float:
     """Return how a sound resembles a reference by quarter seconds, each at the best place nearby; 0.0 for silence.
 
     This is for sound that can't be the same: a library that has spoken already does not repeat itself, and a player

@@ -49,12 +49,12 @@ WIRE = Document("talkcli/protocol/README.md")
 DOCTOR = Document("talkcli/doctor/README.md")
 SERVICES = Document("talkcli/daemon/README.md")
 FLEET = Document("talkcli/fleet/README.md")
-HOUSE = Document("talkcli/README.md")
-SPEED = Document("tests/tools/bench/README.md")
+INTERNALS = Document("talkcli/README.md")
+BENCHMARK = Document("tests/tools/bench/README.md")
 CONTRIBUTING = Document(".github/CONTRIBUTING.md")
 #: All of them.
 DOCUMENTS = (
-    *(README, COMMAND_LINE, DOCTOR, SERVICES, WIRE, FLEET, HOUSE, SPEED, CONTRIBUTING),
+    *(README, COMMAND_LINE, DOCTOR, SERVICES, WIRE, FLEET, INTERNALS, BENCHMARK, CONTRIBUTING),
     *(Document(each) for each in ("tests/faults/README.md", "tests/fleet/README.md", "tests/fresh/README.md")),
 )
 
@@ -70,11 +70,11 @@ def tables(text: str) -> list[list[Row]]:
     return found
 
 
-def words(cell: str) -> list[str]:
+def code_spans(cell: str) -> list[str]:
     """Return the code in a cell."""
     return re.findall(r"`([^`]+)`", cell)
 
 
 def first_column(table: list[Row]) -> list[str]:
     """Return the one name that stands as code at the beginning of each row."""
-    return [words(row[0])[0] for row in table[1:] if words(row[0])]
+    return [code_spans(row[0])[0] for row in table[1:] if code_spans(row[0])]

@@ -3,7 +3,7 @@
 It is a process with its own environment, descriptors and session, killed with the tests. Only its command line and
 first environment in /proc are different, it has nothing to import, and its interpreter isn't cleaned up at the end. A
 test of these, of signals or limits at a start, of closed streams or of another interpreter starts a program of its own;
-see also `forks()`.
+see also `can_fork()`.
 """
 
 from __future__ import annotations
@@ -156,7 +156,7 @@ class Forked:
         return self.returncode
 
 
-def forks(env: Mapping[str, str]) -> bool:
+def can_fork(env: Mapping[str, str]) -> bool:
     """Return whether a process with this environment may be forked: it changes nothing for the interpreter."""
     return hasattr(os, "pidfd_open") and _told(env) == _told(clean_environment("/"))
 

@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 from tests.support.connection import PATIENCE
 from tests.support.processes import Finished
 from tests.support.surroundings import clean_environment, dying_with_parent, find_program, needs, needs_packages
-from tests.support.watcher import first
+from tests.support.watcher import wait_for_first
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -150,7 +150,7 @@ class Listener(contextlib.AbstractContextManager["Listener"]):
 
     def find(self, wanted: Callable[[Message], bool], within: float = 0.0) -> Message | None:
         """Return the first wanted message, None if it doesn't come in time or the connection ends."""
-        return first(self._messages, wanted, self._changed, within, lambda: self._ended is not None)
+        return wait_for_first(self._messages, wanted, self._changed, within, lambda: self._ended is not None)
 
     def _await(self, come: Callable[[], bool], what: str) -> None:
         with self._changed:

@@ -17,7 +17,7 @@ class Port(contextlib.AbstractContextManager["Port"]):
     """
 
     def __init__(self) -> None:
-        self._held = bound(0)
+        self._held = bound_socket(0)
         self.number: int = self._held.getsockname()[1]
         if sys.platform != "linux":  # elsewhere the one that holds it would keep it from all others
             self._held.close()
@@ -26,7 +26,7 @@ class Port(contextlib.AbstractContextManager["Port"]):
         self._held.close()
 
 
-def bound(port: int) -> socket.socket:
+def bound_socket(port: int) -> socket.socket:
     """Return a socket that is bound to a port of this machine's own, any if it is 0."""
     result = socket.socket()
     try:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from tests.support.connection import PATIENCE, Message, Wire
-from tests.support.forking import Forked, forks
+from tests.support.forking import Forked, can_fork
 from tests.support.surroundings import MARK, assert_none_left, clean_environment, dying_with_parent, short_directory
 from tests.support.watcher import Watcher
 
@@ -64,7 +64,7 @@ def children(pid: int) -> list[int]:
 
 def start_talk(words: Sequence[str], env: Mapping[str, str], stdin: int = subprocess.DEVNULL) -> Process:
     """Start `talk` with these words, its output in pipes."""
-    if forks(env):
+    if can_fork(env):
         return Forked(words, env, stdin=stdin, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     return subprocess.Popen(
         [sys.executable, "-m", "talkcli", *words],
@@ -221,7 +221,7 @@ class Talk(Clients):
         """
         env = self._environment(self._mark)
         with open(f"{self.directory}/log", "ab") as log:
-            if self._forked and forks(env):
+            if self._forked and can_fork(env):
                 words, scripted, to = ["serve", *self._words], self._program == SCRIPTED, log.fileno()
                 self._server = Forked(words, env, scripted=scripted, stdout=to, stderr=to, start_new_session=True)
             else:

@@ -13,14 +13,14 @@ import threading
 from typing import TYPE_CHECKING, Literal
 
 from tests.support.connection import PATIENCE
-from tests.support.ports import HOST, Port, bound
+from tests.support.ports import HOST, Port, bound_socket
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
 
-    Way = Literal["to_client", "to_broker"]
+    Direction = Literal["to_client", "to_broker"]
 
-WAYS: tuple[Way, Way] = ("to_client", "to_broker")
+DIRECTIONS: tuple[Direction, Direction] = ("to_client", "to_broker")
 _PIECE_BYTES = 65536
 #: The value of SO_LINGER with which closing a socket sends a reset.
 _RESET = struct.pack("ii", 1, 0)
@@ -34,8 +34,8 @@ class Proxy(contextlib.AbstractContextManager["Proxy"]):
 
     def __init__(self, to: int) -> None:
         self._to = to
-        self._passing = {way: asyncio.Event() for way in WAYS}
-        self._awaited: tuple[Way, bytes, threading.Event] | None = None
+        self._passing = {way: asyncio.Event() for way in DIRECTIONS}
+        self._awaited: tuple[Direction, bytes, threading.Event] | None = None
         self._writers: set[asyncio.StreamWriter] = set()
         self._server: asyncio.Server | None = None
         self._loop = asyncio.new_event_loop()
@@ -57,12 +57,12 @@ class Proxy(contextlib.AbstractContextManager["Proxy"]):
     def close(self) -> None:
         self._stack.close()
 
-    def hold(self, *ways: Way) -> None:
+    def hold(self, *ways: Direction) -> None:
         """Hold one way, or both if none is named. The end of a connection is held, too."""
-        for way in ways or WAYS:
+        for way in ways or DIRECTIONS:
             self._do(self._passing[way].clear)
 
-    def hold_from(self, way: Way, words: bytes) -> threading.Event:
+    def hold_from(self, way: Direction, words: bytes) -> threading.Event:
         """Hold this way from the first data with these bytes on, and return an event that is set then."""
         held = threading.Event()
         self._awaited = way, words, held
@@ -94,7 +94,7 @@ class Proxy(contextlib.AbstractContextManager["Proxy"]):
 
     async def _listen(self) -> None:
         if self._server is None:
-            self._server = await asyncio.start_server(self._serve, sock=bound(self.port))
+            self._server = await asyncio.start_server(self._serve, sock=bound_socket(self.port))
 
     def _refuse(self) -> None:
         if self._server is not None:
@@ -135,7 +135,7 @@ class Proxy(contextlib.AbstractContextManager["Proxy"]):
             else:
                 writer.close()
 
-    async def _pump(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, way: Way) -> None:
+    async def _pump(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, way: Direction) -> None:
         while data := await self._read(reader, way):
             if self._awaited and self._awaited[0] == way and self._awaited[1] in data:
                 self._passing[way].clear()
@@ -146,7 +146,7 @@ class Proxy(contextlib.AbstractContextManager["Proxy"]):
             await writer.drain()
         writer.write_eof()
 
-    async def _read(self, reader: asyncio.StreamReader, way: Way) -> bytes:
+    async def _read(self, reader: asyncio.StreamReader, way: Direction) -> bytes:
         data = b""
         try:
             data = await reader.read(_PIECE_BYTES)

@@ -28,7 +28,7 @@ def real_voice() -> Path:
     return Path(spec.origin).parent / "data" / f"{REAL_VOICE.removeprefix('piper/')}.onnx"
 
 
-def silence_noise(path: Path, directory: Path) -> None:
+def link_without_noise(path: Path, directory: Path) -> None:
     """Put the voice into a directory as it is without noise: it speaks a text the same each time then."""
     (directory / path.name).symlink_to(path)
     told = json.loads((path.parent / f"{path.name}.json").read_text())

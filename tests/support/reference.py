@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     Samples = npt.NDArray[np.int16]
 
-__all__ = ["RATE", "Rendering", "Sentence", "played", "render", "render_with_words"]
+__all__ = ["RATE", "Rendering", "Sentence", "render", "render_with_words", "without_leading_zeros"]
 
 _PROGRAM = os.path.join(os.path.dirname(os.path.abspath(__file__)), "espeak.py")
 
@@ -70,7 +70,7 @@ def render(
     return [each.samples for each in render_with_words(asked, timeout=timeout)]
 
 
-def played(samples: Samples) -> Samples:
+def without_leading_zeros(samples: Samples) -> Samples:
     """Return the first sentence of a server as it is played: from the first sample on that is not zero."""
     return samples[np.argmax(samples != 0) :]
 

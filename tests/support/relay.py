@@ -27,11 +27,11 @@ class Relay(contextlib.AbstractContextManager["Relay"]):
         self.piece = 65536
         #: bytes from the server after which the connection is cut, or becomes silent
         self.cut_at: int | None = None
-        self.hushed_at: int | None = None
+        self.silent_at: int | None = None
         #: the number, from 0, of the reply that becomes an error, and the code of the error
         self.error: tuple[int, int] | None = None
         #: bytes from the server that were forwarded, and replies
-        self.handed_on = self.answers = 0
+        self.forwarded = self.replies = 0
         self._server = server
         self._listening = socket.socket(socket.AF_UNIX)
         self._listening.bind(path)
@@ -56,11 +56,11 @@ class Relay(contextlib.AbstractContextManager["Relay"]):
             self._frames += _read(self._up)
             self._take_frames()
             _write(self._up, self._to_server, self.piece)
-            limits = [each - self.handed_on for each in (self.cut_at, self.hushed_at) if each is not None]
-            self.handed_on += _write(self._client, self._to_client, max(0, min([self.piece, *limits])))
+            limits = [each - self.forwarded for each in (self.cut_at, self.silent_at) if each is not None]
+            self.forwarded += _write(self._client, self._to_client, max(0, min([self.piece, *limits])))
         except ConnectionError:
             self._hang_up()
-        if self.cut_at is not None and self.handed_on >= self.cut_at:
+        if self.cut_at is not None and self.forwarded >= self.cut_at:
             self._hang_up()
 
     def register(self, poll: select.poll) -> None:
@@ -95,7 +95,7 @@ class Relay(contextlib.AbstractContextManager["Relay"]):
         (_, command), (_, tag) = _NUMBER.iter_unpack(frame[_HEADER.size : _HEADER.size + 2 * _NUMBER.size])
         if command != _REPLY:
             return frame
-        number, self.answers = self.answers, self.answers + 1
+        number, self.replies = self.replies, self.replies + 1
         if self.error is None or number != self.error[0]:
             return frame
         told = b"".join(_NUMBER.pack(b"L", each) for each in (_ERROR, tag, self.error[1]))

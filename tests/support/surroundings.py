@@ -121,7 +121,7 @@ def stop_child(pid: int) -> None:
     os.waitid(os.P_PID, pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)
 
 
-def marked(mark: str) -> list[int]:
+def find_marked(mark: str) -> list[int]:
     """Return the ids of the living processes whose environment has this mark (none without /proc)."""
     wanted = f"{MARK}={mark}".encode()
     found = []
@@ -161,6 +161,6 @@ def assert_none_left(mark: str, within: float) -> None:
 
 def _left(mark: str, within: float) -> list[int]:
     end = time.monotonic() + within
-    while (left := marked(mark)) and time.monotonic() < end:
+    while (left := find_marked(mark)) and time.monotonic() < end:
         time.sleep(0.01)  # only a child's end is an event
     return left

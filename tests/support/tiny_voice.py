@@ -71,8 +71,8 @@ def model(
     *,
     hop: int = 256,
     period: int = 100,
-    loud: float = 0.5,
-    lasting: float = SOUND_FRAMES,
+    amplitude: float = 0.5,
+    sound_frames: float = SOUND_FRAMES,
     speakers: int = 1,
     sounds: int = len(SOUNDS),
     nodes: bytes = b"",
@@ -80,14 +80,21 @@ def model(
     fields: bytes = b"",
     cut: str = "dec.conv_pre.weight",
 ) -> bytes:
-    """Return a model: `hop` samples a frame, each period of so many samples half up and half down.
+    """Return a model that plays a square wave.
 
-    `loud` is of full scale, NaN for no number; each further speaker is a little louder. `lasting`: the frames of each
-    sound. The last four are for what a model must not be: nodes and weights that are added to its graph, fields to the
-    whole, and the name of its cut.
+    Args:
+        hop: Samples per frame.
+        period: Samples per period of the wave.
+        amplitude: Part of full scale, or NaN for a sound that isn't numbers. Each further speaker is a little louder.
+        sound_frames: Frames per phoneme.
+        sounds: Number of phonemes.
+        nodes: More nodes of the graph.
+        weights: More weights of the graph.
+        fields: More fields of the model.
+        cut: Name of the weight at which talk splits the model.
     """
-    frames = [BLANK_FRAMES, *([lasting] * (sounds - 1))]
-    wave = [loud if place % period < period / 2 else -loud for place in range(hop)]
+    frames = [BLANK_FRAMES, *([sound_frames] * (sounds - 1))]
+    wave = [amplitude if place % period < period / 2 else -amplitude for place in range(hop)]
     several = speakers > 1
     graph = [
         # the encoder: how long each sound lasts, and a frame for each of its frames
@@ -137,7 +144,7 @@ def model(
 def description(
     *, rate: int = 22050, voice: str = "en-us", speakers: int = 1, language: str = "en_US", **more: object
 ) -> dict[str, object]:
-    """Return what stands in the JSON beside a model; the noise is 0, so that a text is the same each time."""
+    """Return the JSON config of a model. Its noise is 0, so it renders a text the same each time."""
     return {
         "audio": {"sample_rate": rate, "quality": "low"},
         "espeak": {"voice": voice},
@@ -152,13 +159,13 @@ def description(
     }
 
 
-def put(directory: Path, name: str, content: bytes | None = None, beside: dict[str, object] | None = None) -> Path:
-    """Put a voice into a directory, and return its model's path; `content` is the model, `beside` the JSON."""
+def put(directory: Path, name: str, content: bytes | None = None, config: dict[str, object] | None = None) -> Path:
+    """Put a voice into a directory, and return its model's path; `content` is the model, `config` the JSON."""
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / f"{name}.onnx"
     path.write_bytes(model() if content is None else content)
     told = directory / f"{name}.onnx.json"
-    told.write_text(json.dumps(description() if beside is None else beside))
+    told.write_text(json.dumps(description() if config is None else config))
     directory.chmod(0o755)  # whatever the umask is: others may not write
     for each in (path, told):
         each.chmod(0o644)

@@ -86,7 +86,7 @@ class Watcher:
 
     def wait_until(self, wanted: Callable[[Message], bool], timeout: float = PATIENCE, what: str = "event") -> Message:
         """Return the first wanted event, also of those that came before."""
-        found = first(self._events, wanted, self._changed, timeout, lambda: self._ended is not None)
+        found = wait_for_first(self._events, wanted, self._changed, timeout, lambda: self._ended is not None)
         events = ", ".join(f"{each.get('id')} {each.get('state', each.get('event'))}" for each in self._events)
         assert found, f"{what}: not within {timeout} s: {self._ended or 'still connected'}; events: {events}"
         return found
@@ -149,7 +149,7 @@ class Watcher:
                 self._changed.notify_all()
 
 
-def first(
+def wait_for_first(
     items: Sequence[T],
     wanted: Callable[[T], bool],
     changed: threading.Condition,

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from talkcli import Client
 from talkcli.goals.states import State
-from tests.support import census
+from tests.support import usage
 from tests.support.bridge import Bridge
 from tests.support.broker import Broker
 from tests.support.processes import Talk
@@ -77,8 +77,8 @@ class FleetSoak:
         assert took <= _LAST_GOAL_LIMIT_S, f"the last goal took {took:.1f} s"
         for name, process in self._processes.items():
             least = calm[name].descriptors
-            now = census.settled(process.pid, lambda now, least=least: now.descriptors <= least, _FORGET_LIMIT_S)  # type: ignore[misc]
-            assert now.descriptors <= least, f"the {name} has more than before: {census.told(process.pid)}"
+            now = usage.wait_until(process.pid, lambda now, least=least: now.descriptors <= least, _FORGET_LIMIT_S)  # type: ignore[misc]
+            assert now.descriptors <= least, f"the {name} has more than before: {usage.describe(process.pid)}"
         self._judge(warm)
         assert self._bridge.terminate() == 0, self._bridge.log[-2000:]
         self._talk.stop()
@@ -89,8 +89,8 @@ class FleetSoak:
     def _processes(self) -> dict[str, Talk | Bridge]:
         return {"server": self._talk, "bridge": self._bridge}
 
-    def _count(self) -> dict[str, census.Census]:
-        return {name: census.count(process.pid) for name, process in self._processes.items()}
+    def _count(self) -> dict[str, usage.Usage]:
+        return {name: usage.count(process.pid) for name, process in self._processes.items()}
 
     @contextlib.contextmanager
     def _desks(self, phase: str) -> Iterator[Workers]:
@@ -102,7 +102,7 @@ class FleetSoak:
             desks.stop(f"after {self.faults.done}, the last was {self.faults.last}")
         self._judge({})
 
-    def _over(self, end: float, desks: Workers, warm: dict[str, census.Census]) -> Callable[[], bool]:
+    def _over(self, end: float, desks: Workers, warm: dict[str, usage.Usage]) -> Callable[[], bool]:
         """Return the check between two faults. Now and then it looks at everything."""
         due = time.monotonic() + _JUDGE_EVERY_S
 
@@ -115,13 +115,13 @@ class FleetSoak:
 
         return over
 
-    def _judge(self, warm: dict[str, census.Census]) -> None:
+    def _judge(self, warm: dict[str, usage.Usage]) -> None:
         judge(self.ledger, self._witness, self._overheard, self.faults.outages)
         assert not self._witness.faults, self._witness.faults
         for name, process in self._processes.items():
             assert process.running, f"the {name} has ended, after {self.faults.last}: {process.log[-3000:]}"
             limit = warm[name].memory + _GROWTH_LIMIT_KB[name] if warm else float("inf")
-            assert (now := census.count(process.pid)).memory <= limit, f"the {name} has grown: {now}, before {warm}"
+            assert (now := usage.count(process.pid)).memory <= limit, f"the {name} has grown: {now}, before {warm}"
 
     def _speak(self) -> float:
         """Send a goal from a desk of its own, and return the seconds that it took."""

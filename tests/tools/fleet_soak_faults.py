@@ -22,14 +22,14 @@ if TYPE_CHECKING:
     from tests.support.bridge import Bridge
     from tests.support.broker import Broker
     from tests.support.processes import Talk
-    from tests.support.proxy import Proxy, Way
+    from tests.support.proxy import Direction, Proxy
     from tests.tools.fleet_soak_desks import Ledger
     from tests.tools.witness import Witness
 
 _AWAY_S = (0.1, 3.0)
 #: Within 6 s the robot accepts what was sent meanwhile, after that it is stale.
 _HELD_S = ((1.0, 5.5), (8.0, 9.0))
-_WAYS: tuple[tuple[Way, ...], ...] = ((), ("to_client",), ("to_broker",))
+_DIRECTIONS: tuple[tuple[Direction, ...], ...] = ((), ("to_client",), ("to_broker",))
 #: Seconds in which a new bridge has asked its server for the goals that it knows.
 _REMEMBERING_S = 6.0
 #: Seconds after which everything that has happened was noted.
@@ -121,7 +121,7 @@ class FleetFaults(FaultsInTurn):
     def bridge_stopped(self) -> None:
         self._bridge.stop_process()
         time.sleep(self.chance.uniform(*self.chance.choice(_HELD_S)))
-        self._bridge.go_on()
+        self._bridge.resume_process()
 
     def server_killed(self) -> None:
         self.outages.server.append(time.time())
@@ -130,7 +130,7 @@ class FleetFaults(FaultsInTurn):
         self._talk.start_server()
 
     def link_held(self) -> None:
-        self._proxy.hold(*self.chance.choice(_WAYS))
+        self._proxy.hold(*self.chance.choice(_DIRECTIONS))
         time.sleep(self.chance.uniform(*self.chance.choice(_HELD_S)))
         self._proxy.release()
 

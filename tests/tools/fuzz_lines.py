@@ -16,7 +16,7 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 from tests.conformance.rawsocket import Raw
-from tests.support import census
+from tests.support import usage
 from tests.support.processes import Talk
 
 if TYPE_CHECKING:
@@ -78,13 +78,13 @@ def fuzz(seed: int, *, count: float = float("inf"), seconds: float = float("inf"
     with contextlib.closing(Talk(scripted=True, watched=False)) as talk:
         end = time.monotonic() + seconds
         _speak(talk, "length=0")
-        before = census.count(talk.pid)  # with a running engine
+        before = usage.count(talk.pid)  # with a running engine
         while replies.total() < 2 * count and time.monotonic() < end:
             _send_batch(talk, list(islice(lines, BATCH)), replies)
         assert talk.request("resume")["ok"]
         assert talk.request("cancel")["ok"]
         _speak(talk, "still here")
-        census.assert_as_before(talk.pid, before, memory=_GROWTH_LIMIT_KB)
+        usage.assert_not_grown(talk.pid, before, memory=_GROWTH_LIMIT_KB)
         talk.stop()
         assert "a bug" not in talk.log, talk.log[-2000:]
     return replies

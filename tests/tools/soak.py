@@ -17,7 +17,7 @@ import time
 from collections import Counter
 from dataclasses import dataclass
 
-from tests.support import census
+from tests.support import usage
 from tests.support.processes import Talk
 from tests.support.sink import Sink
 from tests.support.surroundings import short_directory
@@ -64,13 +64,13 @@ class Soak:
         assert witness.wait_for(_WARM_UP_GOALS, _WARM_UP_LIMIT_S), f"only {witness.ended} goals in the warm-up"
         senders.stop()
         self._settle()
-        before, files, known = census.count(talk.pid), self._files(), Counter(witness.ends)
+        before, files, known = usage.count(talk.pid), self._files(), Counter(witness.ends)
         report = self._disturb(seconds, every, least)
         report.ends = witness.ends - known
         lost = sum(count for (state, reason), count in report.ends.items() if state == "ABORTED" and reason in _LOST)
         assert every is not None or lost <= report.faults.total(), f"{report.faults} cost {lost} goals"
         self._settle()
-        census.assert_as_before(talk.pid, before, memory=_GROWTH_LIMIT_KB)
+        usage.assert_not_grown(talk.pid, before, memory=_GROWTH_LIMIT_KB)
         left = self._files()
         assert len(left) <= len(files), f"files are left: {left - files}"
         lines, limit = talk.log.count("\n"), witness.ended + _LOG_LINES_PER_FAULT * report.faults.total() + 10

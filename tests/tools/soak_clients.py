@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tests.support.compare import alike
+from tests.support.compare import similarity
 from tests.support.recording import LOUD
 from tests.support.reference import RATE, render
 
@@ -30,7 +30,7 @@ _SENTENCES = (
     "please step back from the moving platform",
     "battery is at twenty percent and falling",
 )
-#: How much the sound may be shorter or longer than the reference, and the least result of `alike`.
+#: How much the sound may be shorter or longer than the reference, and the least result of `similarity`.
 _LENGTH_TOLERANCE_S = 0.06
 ALIKE = 0.3
 _FRAME_SAMPLES = RATE // 100
@@ -126,7 +126,7 @@ class Narrator:
         # By the times of the server: this thread may be late, and the next sentence follows at once.
         samples = recording.between(times["ACTIVE"] - _BLOCK_S, times["SUCCEEDED"] + _BLOCK_S)
         heard, wanted = _seconds_of_sound(samples), _seconds_of_sound(self._references[text])
-        likeness = alike(samples, self._references[text])
+        likeness = similarity(samples, self._references[text])
         told = f"{goal['id']} SUCCEEDED, but {heard:.2f} of {wanted:.2f} s were heard, {likeness:.2f} alike"
         assert abs(heard - wanted) <= _LENGTH_TOLERANCE_S, told
         assert likeness >= ALIKE, told

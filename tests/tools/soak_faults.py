@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 from tests.conformance.rawsocket import Raw
 from tests.faults.test_clients_many import crowd
-from tests.support.census import descendants
 from tests.support.surroundings import command_line
+from tests.support.usage import descendants
 
 if TYPE_CHECKING:
     import random

@@ -14,7 +14,7 @@ from talkcli.goals.goal import Goal
 from talkcli.goals.reasons import Reason
 from talkcli.goals.states import State
 from talkcli.protocol.lines import encode
-from tests.support.documents import WIRE, tables, words
+from tests.support.documents import WIRE, code_spans, tables
 
 #: Additional reasons that the doctor reports for its own sentence.
 OF_THE_DOCTOR = {"late", "paused"}
@@ -33,7 +33,7 @@ def test_a_reason_is_the_string_that_is_sent(reason: Reason) -> None:
 
 
 def test_the_document_has_every_reason_and_the_doctor_advises_on_no_other() -> None:
-    documented = [(words(row[0])[0], *row[1:]) for row in tables(WIRE.section("States"))[1][1:]]
+    documented = [(code_spans(row[0])[0], *row[1:]) for row in tables(WIRE.section("States"))[1][1:]]
     assert documented == [(each.value, ", ".join(map(str, each.states)), each.meaning) for each in Reason]
     assert sentence.ADVICE.keys() - OF_THE_DOCTOR <= {*Reason}
     aborted = {each for each in Reason if State.ABORTED in each.states}

@@ -20,7 +20,7 @@ from talkcli.protocol.requests import REQUEST_TYPES
 from talkcli.server import connection, stream
 from talkcli.server.requests import MAX_CLIENT_REQUESTS, MAX_KEPT_REQUEST_BYTES, RECENT_GOALS, REQUEST_BYTES
 from talkcli.server.run import ServerSettings
-from tests.support.documents import FLEET, README, ROOT, WIRE, first_column, tables, words
+from tests.support.documents import FLEET, README, ROOT, WIRE, code_spans, first_column, tables
 from tests.support.surroundings import needs_packages
 
 if TYPE_CHECKING:
@@ -33,9 +33,9 @@ ERRORS, LIMITS = tables(WIRE.section("Errors and limits"))
 
 def test_states_and_replies_are_in_the_tables() -> None:
     states = tables(WIRE.section("States"))[0]
-    documented = {words(row[0])[0]: (int(row[1]), row[3] == "yes") for row in states[1:]}
+    documented = {code_spans(row[0])[0]: (int(row[1]), row[3] == "yes") for row in states[1:]}
     assert documented == {each.name: (int(each), each.terminal) for each in State}
-    answered = {each for row in tables(WIRE.section("Requests"))[1][1:] for each in words(row[0])[:1]}
+    answered = {each for row in tables(WIRE.section("Requests"))[1][1:] for each in code_spans(row[0])[:1]}
     assert answered == set(REQUEST_TYPES)
 
 
@@ -56,7 +56,7 @@ def test_keys_and_error_codes_of_the_tables_are_those_of_the_code() -> None:
 
 def test_server_has_the_keys_of_the_text(scripted: Talk) -> None:
     (listed,) = re.findall(r"^`server` has (.*?)\.$", WIRE.section("Requests"), re.MULTILINE | re.DOTALL)
-    assert words(listed) == list(scripted.request("status")["server"])
+    assert code_spans(listed) == list(scripted.request("status")["server"])
 
 
 def test_numbers_of_kept_goals_are_in_the_text() -> None:
@@ -117,14 +117,14 @@ def test_places_are_those_of_the_code(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv(name, value)
     monkeypatch.setattr("sys.platform", "linux")
     (paragraph,) = re.findall(r"^\*\*Connecting\..*?\n\n", WIRE.text, re.MULTILINE | re.DOTALL)
-    places = [each for each in words(paragraph) if each.endswith(".sock")]
+    places = [each for each in code_spans(paragraph) if each.endswith(".sock")]
     for name, value in variables.items():
         places = [each.replace(f"${name}/", f"{value}/") for each in places]
     assert [each.replace("UID", str(os.getuid())) for each in places] == paths.client_sockets(None)
 
 
 def test_events_are_in_the_table() -> None:
-    table = {words(row[0])[0]: set(words(row[2])) for row in tables(WIRE.section("Events"))[0][1:]}
+    table = {code_spans(row[0])[0]: set(code_spans(row[2])) for row in tables(WIRE.section("Events"))[0][1:]}
     sent = {kind: set(each.__annotations__) for kind, each in events._EVENTS_BY_KIND.items() if kind != "snapshot"}
     assert set(table) == {*sent, "alive"}
     assert all(fields <= table[kind] for kind, fields in sent.items())

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from talkcli import Client, State
-from tests.support.census import descendants
 from tests.support.compare import extent
 from tests.support.espeak import RATE
-from tests.support.loaded import await_loaded
+from tests.support.neural_server import await_voice
 from tests.support.real_voice import REAL_VOICE
 from tests.support.recording import LOUD
 from tests.support.reference import render
 from tests.support.surroundings import short_directory
+from tests.support.usage import descendants
 from tests.tools.bench.machine import megabytes
 from tests.tools.bench.stage import PYTHON, SHORT, TALK, VOICED, finish, serving
 from tests.tools.bench.table import Limit, Row
@@ -210,14 +210,14 @@ def neural(stage: Stage) -> list[Row]:
     """Measure a neural voice beside espeak-ng's: the onset, and the memory of the engine process."""
     rows = []
     with serving("--voice", REAL_VOICE, sink=stage.sink) as talk, Client(talk.socket) as client:
-        await_loaded(talk.socket, REAL_VOICE)
+        await_voice(talk.socket, REAL_VOICE)
         for text, later in _NEURAL_LATER_MS.items():
             say = {each: partial(_say_and_cancel, client, text, each) for each in (REAL_VOICE, _ESPEAK)}
             times = stage.in_turn({voice: partial(stage.until_sound, each) for voice, each in say.items()})
             name = f"`Client.say()` of {len(text.split())} words → first sample, joe"
             rows.append(Row(name, "ms", times[REAL_VOICE], "espeak", times[_ESPEAK], (Limit("above", later),)))
     with short_directory() as place, serving("--voice", REAL_VOICE, "--player", f"file:{place}/x.wav") as talk:
-        await_loaded(talk.socket, REAL_VOICE)
+        await_voice(talk.socket, REAL_VOICE)
         (engine,) = descendants(talk.pid)
         name, limit = "memory of the engine process with joe (Pss)", Limit("median", _LOADED_MB)
         rows.append(Row(name, "MB", [megabytes(engine, "Pss")], limits=(limit,)))

@@ -21,7 +21,7 @@ from talkcli.goals.options import Cancel, Say
 from talkcli.goals.scheduler import Now, Scheduler
 from talkcli.protocol import events
 from talkcli.protocol.lines import encode
-from tests.support import census
+from tests.support import usage
 from tests.tools.bench.stage import serving
 from tests.tools.bench.table import Limit, Row
 
@@ -208,9 +208,9 @@ def _memory_of_a_goal() -> float:
     with serving("--max-queue", str(PENDING + _FIRST), scripted=True) as talk, Wires(talk.socket, 1) as wires:
         texts = ["never-ends", *(f"goal {each} is waiting" for each in range(PENDING + _FIRST))]
         wires.exchange(_says(texts[: _FIRST + 1]), b'"ok"', _FIRST + 1)
-        before = census.count(talk.pid).memory
+        before = usage.count(talk.pid).memory
         wires.exchange(_says(texts[_FIRST + 1 :]), b'"ok"', PENDING)
-        grown = census.count(talk.pid).memory - before
+        grown = usage.count(talk.pid).memory - before
         talk.request("cancel")
     return grown * 1024 / PENDING
 

@@ -6,7 +6,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from talkcli import Client
-from tests.support.census import count, descendants
+from tests.support.usage import count, descendants
 from tests.tools.bench.machine import taken_in
 from tests.tools.bench.stage import PYTHON, TALK, serving
 from tests.tools.bench.table import Limit, Row

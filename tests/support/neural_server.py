@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 _PATIENCE = 30.0
 
 
-def serve_with(make_talk: MakeTalk, voice: str, *options: str, sink: Sink | None, env: dict[str, str]) -> Talk:
+def serve_with_voice(make_talk: MakeTalk, voice: str, *options: str, sink: Sink | None, env: dict[str, str]) -> Talk:
     """Start a server that speaks with this voice, and return it when the voice is loaded."""
     talk = make_talk("--voice", voice, *options, sink=sink, env=env)
-    await_loaded(talk.socket, voice)
+    await_voice(talk.socket, voice)
     return talk
 
 
-def await_loaded(socket: str, voice: str) -> None:
+def await_voice(socket: str, voice: str) -> None:
     """Wait until a server has loaded its voice; AssertionError if it fails."""
     end = time.monotonic() + _PATIENCE
     with Wire(socket) as wire:

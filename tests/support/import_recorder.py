@@ -30,7 +30,7 @@ sys.meta_path[sys.meta_path.index(Path)] = Hiding
 """
 
 
-def spied(directory: Path, env: Mapping[str, str], without: Sequence[str] = ()) -> dict[str, str]:
+def record_imports(directory: Path, env: Mapping[str, str], without: Sequence[str] = ()) -> dict[str, str]:
     """Return the environment of processes that are spied on, and that find none of these packages."""
     for each in ("site", "spied"):
         (directory / each).mkdir(parents=True)

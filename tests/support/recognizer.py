@@ -42,7 +42,7 @@ _RANGE = (-32768, 32767)
 _NO_WORD = re.compile(r"[<\[]")
 
 
-class Heard(NamedTuple):
+class HeardWord(NamedTuple):
     """A word, and when it begins and ends, in seconds from the first sample."""
 
     word: str
@@ -50,7 +50,7 @@ class Heard(NamedTuple):
     end: float
 
 
-def understand(samples: Samples, sentences: Iterable[str]) -> str:
+def recognize(samples: Samples, sentences: Iterable[str]) -> str:
     """Return which of the sentences, of small letters and blanks, was said; "" where it is none of them."""
     rules = " | ".join(sentences)
     listener = _listener()
@@ -61,7 +61,7 @@ def understand(samples: Samples, sentences: Iterable[str]) -> str:
     return str(found.hypstr) if found else ""
 
 
-def align(samples: Samples, text: str) -> list[Heard]:
+def align(samples: Samples, text: str) -> list[HeardWord]:
     """Return when each word of a sentence was said; AssertionError where it was not, as far as it can be heard.
 
     What is silent before a word counts as a part of it, to the recognizer; here it doesn't.
@@ -71,7 +71,7 @@ def align(samples: Samples, text: str) -> list[Heard]:
     listener.set_align_text(" ".join(words))
     _hear(listener, samples)
     found = [
-        Heard(
+        HeardWord(
             re.sub(r"\(\d+\)$", "", each.word),
             _behind_silence(samples, _seconds(each.start_frame)),
             _seconds(each.end_frame + 1),
@@ -94,7 +94,7 @@ def _listener() -> Any:
 
 def _hear(listener: Any, samples: Samples) -> None:
     beside = np.zeros(int(_BESIDE * _HEARS), np.int16)
-    sound = np.concatenate([beside, resampled(samples, RATE, _HEARS), beside])
+    sound = np.concatenate([beside, resample(samples, RATE, _HEARS), beside])
     room = np.random.default_rng(1).normal(0, _ROOM, len(sound))
     listener.start_utt()
     listener.process_raw(np.clip(sound + room, *_RANGE).astype("<i2").tobytes(), full_utt=True)
@@ -115,7 +115,7 @@ def _seconds(frame: int) -> float:
     return frame / _FRAMES - _BESIDE
 
 
-def resampled(samples: Samples, rate: int, wanted: int) -> Samples:
+def resample(samples: Samples, rate: int, wanted: int) -> Samples:
     """Return a sound with another number of samples per second, without what such a one can't hold."""
     length = round(len(samples) * wanted / rate)
     spectrum = np.fft.rfft(samples.astype(np.float64))

@@ -18,7 +18,7 @@ _SETTLED = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Census:
+class Usage:
     """One count of a server."""
 
     processes: int  # the server and all below it
@@ -27,10 +27,10 @@ class Census:
     memory: int  # kB that each of them has written to and does not share
 
 
-def count(pid: int) -> Census:
+def count(pid: int) -> Usage:
     """Count a running server."""
     family = descendants(pid)
-    return Census(
+    return Usage(
         processes=1 + len(family),
         descriptors=len(os.listdir(f"/proc/{pid}/fd")),
         threads=len(os.listdir(f"/proc/{pid}/task")),
@@ -38,7 +38,7 @@ def count(pid: int) -> Census:
     )
 
 
-def settled(pid: int, wanted: Callable[[Census], bool], within: float = _SETTLED) -> Census:
+def wait_until(pid: int, wanted: Callable[[Usage], bool], within: float = _SETTLED) -> Usage:
     """Return the first count that is as wanted, or the last one within these seconds."""
     end = time.monotonic() + within
     while not wanted(found := count(pid)) and time.monotonic() < end:
@@ -46,14 +46,14 @@ def settled(pid: int, wanted: Callable[[Census], bool], within: float = _SETTLED
     return found
 
 
-def assert_as_before(pid: int, before: Census, memory: int) -> Census:
+def assert_not_grown(pid: int, before: Usage, memory: int) -> Usage:
     """Assert that a server has no more processes, descriptors and threads than before, and at most so many kB more."""
 
-    def fits(now: Census) -> bool:
+    def fits(now: Usage) -> bool:
         return all(getattr(now, each) <= getattr(before, each) for each in ("processes", "descriptors", "threads"))
 
-    found = settled(pid, fits)
-    assert fits(found), f"before: {before}; now: {found}; {told(pid)}"
+    found = wait_until(pid, fits)
+    assert fits(found), f"before: {before}; now: {found}; {describe(pid)}"
     assert found.memory <= before.memory + memory, f"before: {before}; now: {found}"
     return found
 
@@ -90,7 +90,7 @@ def _own(pid: int) -> int:
     return 0  # it has ended
 
 
-def told(pid: int) -> str:
+def describe(pid: int) -> str:
     """Return the descendants and descriptors of a process, for messages."""
     targets = [f"{number} → {target}" for number, target in descriptors(pid).items()]
     return "; ".join([*(command_line(each) for each in descendants(pid)), *sorted(targets)])
