@@ -103,5 +103,5 @@ def handle_loop_error(_loop: object, context: Mapping[str, Any]) -> None:
 
 
 def sanitize(text: str) -> str:
-    """Make untrusted text safe for the log, by escaping and shortening it."""
+    """Return untrusted text in a form that is safe for the log: escaped and shortened."""
     return printable(text, _MAX_LOGGED_TEXT_CHARS)

@@ -83,7 +83,7 @@ class SocketPlace:
 
 
 def connect(option: str | None, interrupt: Mapping[int, int] | None) -> tuple[Client | None, Finding]:
-    """Connect to the server. Return the client, and the finding about the server's socket.
+    """Connect to the server. Return the client, or None, and the finding about the server's socket.
 
     The client is None if no connection was possible.
 
@@ -134,7 +134,7 @@ def _probe_path(path: str, trusted: Container[str | None]) -> SocketPlace:
 
 
 def request_status_and_log(client: Client) -> tuple[JsonObject, list[Goal]]:
-    """Ask a server for its description of itself and its recently ended goals, oldest first.
+    """Request and return a server's status and its recently ended goals, oldest first.
 
     If the server has just started, wait a moment until its engine has reported the player.
     """
@@ -236,7 +236,7 @@ def judge_server(server: JsonObject, log: Sequence[Goal], now: float) -> list[Fi
 
 
 def _judge_state(server: JsonObject) -> Finding:
-    """Return the finding about a server's version, engine and pause."""
+    """Return the finding about whether a server is paused, its engine works, and its version is the installed one."""
     version, words = server.get("version"), summarize_server(server)
     if server.get("paused") is True:
         return failure("server", f"speech is paused; {words}", "talk resume")

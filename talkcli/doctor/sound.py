@@ -505,7 +505,7 @@ def check_player(env: Mapping[str, str], configured: str | None, used: str | Non
 
 
 def check_device(env: Mapping[str, str], player: str, configured: str | None) -> Finding:
-    """Check whether the player can use the configured device, and return the finding.
+    """List the player's devices, and return the finding about whether the configured one is among them.
 
     Args:
         env: the environment of the player.

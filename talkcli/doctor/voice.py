@@ -280,7 +280,7 @@ def _split_advice(message: str) -> tuple[str, str]:
 
 
 def _try_voice(voice: str, options: EngineOptions, limit: float) -> VoiceTrial:
-    """Load a voice, and measure how fast it speaks a sentence. Nothing is played."""
+    """Load a voice, and return how fast it speaks a sentence, or why it failed. Nothing is played."""
     try:
         with open(os.devnull, "wb") as output, start_engine(options, limit, output.fileno()) as engine:
             engine.wait_for(protocol.Ready)

@@ -119,7 +119,7 @@ class Fleet:
         return self._send_request(to, Wait(None if ids is None else tuple(ids)))
 
     def status(self, to: str) -> FleetRequest:
-        """Get the status of each robot's server. The details are in the `said["status"]` field of each outcome."""
+        """Request the status of each robot's server. Each outcome has it in `said["status"]`."""
         return self._send_request(to, Status())
 
     def pause(self, to: str) -> FleetRequest:
@@ -131,7 +131,7 @@ class Fleet:
         return self._send_request(to, Resume())
 
     def set(self, to: str, **settings: Any) -> FleetRequest:
-        """Change the settings of each robot's server. The robot's bridge must allow it.
+        """Change the settings of each robot's server, if its bridge allows it. Return the request with the outcomes.
 
         The arguments are those of `Client.set`.
         """

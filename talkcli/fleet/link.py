@@ -336,11 +336,11 @@ class Link:
         if acknowledged:
             acknowledged(code.value)
 
-    def _on_log(self, _client: paho.Client, _data: object, _level: int, words: str) -> None:
+    def _on_log(self, _client: paho.Client, _data: object, _level: int, text: str) -> None:
         """Store the TLS alert from a line that paho logs during the login."""
         # With TLS 1.3, the broker's alert about a missing certificate arrives in the first read, and paho only logs it.
-        if "ALERT" in words and self._answer is None:
-            self._alert = words.rpartition("] ")[2].partition(" (")[0]
+        if "ALERT" in text and self._answer is None:
+            self._alert = text.rpartition("] ")[2].partition(" (")[0]
 
 
 @lru_cache(maxsize=32)

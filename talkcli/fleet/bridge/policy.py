@@ -249,7 +249,7 @@ class RemoteGoals:
         return not (say.preempt or say.flush)
 
     def has_room(self, say: Say) -> bool:
-        """Return whether a goal may be sent to the server now.
+        """Return whether the limit for remote goals allows a goal to be sent to the server now.
 
         There is always room for a goal that replaces another goal with the same key.
         """

@@ -144,7 +144,7 @@ class Publisher:
                 log.write_limited("line", f"the server sent a malformed message: {log.sanitize(str(error))}")
 
     def _on_watch_reply(self, server: LocalConnection, reply: JsonObject, items: list[JsonObject]) -> None:
-        """Replace the state of the server by the state in its reply to `watch`."""
+        """Store the server's state from its reply to `watch`, and report that the server is connected."""
         status = ServerStatus.from_reply(reply, items)
         self._retry_s = _FIRST_SERVER_RETRY_S
         for each in unfinished(status):

@@ -98,7 +98,7 @@ class DeskLink:
 
     @property
     def retained_received(self) -> bool:
-        """Whether enough time has passed for all retained messages to arrive."""
+        """Whether the retained messages have arrived, because the marker after them came back some time ago."""
         return self.marker_at is not None and time.monotonic() > self.marker_at + RETAINED_GRACE_S
 
     def reply_topic(self, robot: str) -> str:
@@ -137,7 +137,7 @@ class DeskLink:
         return descriptor in ready
 
     def _receive(self, message: Message) -> None:
-        """Pass a message to the handler. If it is the marker message, record instead that it has come back."""
+        """Pass a message to the handler. If it is the marker after the retained messages, record that it arrived."""
         if message.topic == self.reply_topic(topics.MARKER):
             self.marker_at = time.monotonic()
         else:

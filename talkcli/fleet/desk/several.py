@@ -301,7 +301,7 @@ class FleetRequest:
             robot.send()
 
     def _on_reply(self, name: str, message: Message) -> None:
-        """Process lines from a robot's server.
+        """Process lines from a robot's server, and include the robot if it answers a request to its group.
 
         If a robot answers a request to a group, it is a member of the group, even if it seemed to be absent.
         """

@@ -238,7 +238,7 @@ class FleetWatch:
     # -- time limits
 
     def _handle_due(self, now: float) -> None:
-        """Process retained messages once all have arrived, and handle time limits that have passed."""
+        """Process retained messages if complete, forget missing robots, and raise Lost if the broker stays away."""
         if self._retained is not None and self._desk.retained_received:
             self._process_retained(self._retained, now)
         if self._away_since is not None and now - self._away_since >= ABSENCE_LIMIT_S:
