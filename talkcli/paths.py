@@ -89,9 +89,19 @@ def sudo_caller(environment: Mapping[str, str]) -> int | None:
 
 
 def sudo_caller_socket() -> str | None:
-    """Return the usual socket path of the user who called sudo, or None if this process isn't root under sudo."""
+    """Return the socket path of the user who called sudo, or None if they have no socket or didn't call sudo."""
     caller = sudo_caller(os.environ)
-    return None if caller is None else f"/run/user/{caller}/talk/{SOCKET_NAME}"
+    if caller is None:
+        return None
+    for directory in _runtime_directories(caller):
+        path = f"{directory}/talk/{SOCKET_NAME}"
+        try:
+            owner = os.stat(path).st_uid
+        except OSError:
+            continue
+        if owner == caller:
+            return path
+    return None
 
 
 def server_socket(named: str | None) -> str:

@@ -360,9 +360,9 @@ _ROWS = (
         List the id, language and name of each voice. The option --voice takes any of them, a locale such as de_DE, or
         a language such as german.
 
-        Variants such as f3 can be added to the other voices: en-us+f3. Neural voices come last, and any unambiguous
-        part of their id works: joe for piper/en_US-joe-medium. NAME#3 selects a speaker by number or name. If the
-        server uses a neural voice, the voice's language selects it, too.
+        Variants such as f3 can be added to an id: en-us+f3. Neural voices come last, and have no variants. Any
+        unambiguous part of their id works: joe for piper/en_US-joe-medium. NAME#3 selects a speaker by number or
+        name. If the server uses a neural voice, its language selects it, too.
         """,
         examples="""
         talk voices --language en
@@ -385,8 +385,8 @@ _ROWS = (
         comes, which takes at most 20 seconds. If no server runs, the command starts an engine with TALK_PLAYER and
         TALK_VOICE.
 
-        With --silent, such an engine plays silence through the server's player. No goal is delayed, and nothing is
-        logged.
+        With --silent, the command always starts its own engine, which plays silence through the server's player. No
+        goal is delayed, and nothing is logged.
 
         With --robot, the command checks the way to a robot of a fleet: broker, certificate, login, permissions, and
         the robot's answer.
@@ -415,8 +415,8 @@ _ROWS = (
         Everybody who may write to the robot's topics can then make it speak. The bridge logs to standard error.
 
         TALK_BROKER is the address of the broker: mqtts://HOST, or mqtt://HOST without TLS. TALK_MQTT_USER and
-        TALK_MQTT_PASSWORD_FILE are the login. TALK_MQTT_CA, TALK_MQTT_CERT and TALK_MQTT_KEY are the files of
-        certificates.
+        TALK_MQTT_PASSWORD_FILE are the login. TALK_MQTT_CA, TALK_MQTT_CERT and TALK_MQTT_KEY name
+        certificate files.
         """,
         function="services:bridge",
         uses_server=False,

@@ -312,7 +312,7 @@ def unreachable(attempt: ConnectionAttempt, named: str | None) -> TalkError:
     if named:
         step = _advice_for_named_socket(named, found, denied=denied)
     hint = paths.sudo_caller_socket()
-    if hint and not os.environ.get("TALK_SOCKET"):
+    if hint and not os.environ.get("TALK_SOCKET") and hint not in dict(attempt.failures):
         step += f"\nto use the server of the user who called sudo, run: talk --socket {hint}"
     if denied:
         return AccessDenied(f"no server that you may use; tried:\n{tried}{step}")

@@ -190,6 +190,8 @@ def advise(
         return _BUSY_STEP
     if reason == Reason.AUDIO_DEVICE and ("denied" in said or "not permitted" in said):
         return "for the server's user: sudo usermod -aG audio USER; then log in again, and restart the server"
+    if reason == Reason.NO_PLAYER and player == "pulse":
+        return "start PulseAudio or PipeWire, or use ALSA: talk serve --player aplay"
     if reason == Reason.ENGINE_FAILED and "libespeak-ng is missing" in message:
         return INSTALL_LIBRARY
     if reason in _PLAYER_REASONS and isinstance(player, str) and is_custom(player):

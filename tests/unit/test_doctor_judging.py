@@ -368,6 +368,8 @@ def test_every_reason_of_an_aborted_goal_has_a_remedy_of_its_own() -> None:
     assert reasons <= sentence.ADVICE.keys()
     assert "apt-get install -y libespeak-ng1" in sentence.advise("engine_failed", MISSING)
     assert sentence.advise("engine_failed", "no module named pyttsx3") == sentence.ADVICE["engine_failed"]
+    assert "PulseAudio" in sentence.advise("no_player", "no sound server is running", "pulse")
+    assert sentence.advise("no_player", "no player found", "aplay") == sentence.ADVICE["no_player"]
 
 
 FOUND = [

@@ -1,0 +1,32 @@
+"""Paths: the socket of the user who called sudo."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+from talkcli import paths
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import pytest
+
+
+def test_the_socket_of_the_user_who_called_sudo_is_named_only_if_it_exists(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    uid = os.getuid()
+    monkeypatch.setattr(os, "getuid", lambda: 0)
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setenv("SUDO_UID", str(uid))
+    assert paths.sudo_caller_socket() is None
+    socket = tmp_path / f"runtime-{uid}" / "talk" / paths.SOCKET_NAME
+    socket.parent.mkdir(parents=True)
+    socket.touch()
+    assert paths.sudo_caller_socket() == str(socket)
+    monkeypatch.setenv("SUDO_UID", str(uid + 1))
+    socket.parent.parent.rename(tmp_path / f"runtime-{uid + 1}")
+    assert paths.sudo_caller_socket() is None  # somebody else made it
+    monkeypatch.delenv("SUDO_UID")
+    assert paths.sudo_caller_socket() is None
