@@ -70,8 +70,8 @@ class BareServe:
 
     def end(self, *signals: signal.Signals) -> int:
         """Send signals one after another, and return the exit code."""
-        for each in signals:
-            self.process.send_signal(each)
+        for number in signals:
+            self.process.send_signal(number)
         code = self.process.wait(LIMIT)
         self._reader.join(LIMIT)
         return code

@@ -55,7 +55,7 @@ def send(talk: Talk, text: str, **fields: Any) -> str:
 def await_word(talk: Talk, goal_id: str, number: int = 3) -> None:
     """Wait until this word of a goal is heard; the third is in mid-sentence."""
     wanted = {"event": "word", "id": goal_id, "number": number}
-    talk.watcher.wait_until(lambda each: wanted.items() <= each.items(), what=f"word {number} of {goal_id}")
+    talk.watcher.wait_until(lambda event: wanted.items() <= event.items(), what=f"word {number} of {goal_id}")
 
 
 def begin(talk: Talk, text: str, *, number: int = 3, **fields: Any) -> str:
@@ -69,7 +69,7 @@ def begin_with_client(talk: Talk, text: str, *options: str) -> tuple[str, Proces
     """Start a client that waits for its goal, wait until its third word is heard, and return the id and the client."""
     known = {None, *talk.watcher.goals()}
     client = talk.start("say", "--wait", *options, "--", text)
-    goal_id = str(talk.watcher.wait_until(lambda each: each.get("id") not in known)["id"])
+    goal_id = str(talk.watcher.wait_until(lambda event: event.get("id") not in known)["id"])
     await_word(talk, goal_id)
     return goal_id, client
 
@@ -91,8 +91,8 @@ def assert_aborted(goal: Message, reason: str, *words: str) -> None:
     """Assert that a goal was ABORTED for that reason, with these words in its message."""
     assert (goal["state"], goal["reason"]) == ("ABORTED", reason), goal
     assert goal["message"].startswith("speech failed: "), goal
-    for each in words:
-        assert each in goal["message"], goal
+    for word in words:
+        assert word in goal["message"], goal
 
 
 def engine_process(talk: Talk) -> int:

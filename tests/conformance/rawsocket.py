@@ -71,7 +71,7 @@ class Raw(contextlib.AbstractContextManager["Raw"]):
 
     @property
     def lines(self) -> list[dict[str, Any]]:
-        return [json.loads(each) for each in bytes(self.received).split(b"\n")[:-1]]
+        return [json.loads(line) for line in bytes(self.received).split(b"\n")[:-1]]
 
 
 class FakeServer(contextlib.AbstractContextManager["FakeServer"]):
@@ -95,8 +95,8 @@ class FakeServer(contextlib.AbstractContextManager["FakeServer"]):
     def __exit__(self, *_error: object) -> None:
         self._socket.shutdown(socket.SHUT_RDWR)  # which ends `accept`
         self._thread.join()
-        for each in (self._socket, *self._clients):
-            each.close()
+        for connection in (self._socket, *self._clients):
+            connection.close()
 
     def wait_for_client(self) -> None:
         """Wait until one more client has sent something."""

@@ -95,7 +95,7 @@ def likeliest(
         for begin, quiet in zip(begins.tolist(), before.tolist(), strict=True):
             same = _same(samples[begin : begin + len(wanted)], wanted)
             found += [(same, max(0, begin - quiet), references)] if same else []
-    for _, start, references in sorted(found, key=lambda each: -each[0]):
+    for _, start, references in sorted(found, key=lambda place: -place[0]):
         yield start, references
 
 
@@ -121,8 +121,8 @@ def _render_after_stop(texts: tuple[str, ...], rate: int) -> list[list[Samples]]
         end = 2 * int(line)
         found.append(np.frombuffer(rest[:end], "<i2").astype(np.int16))
         rest = rest[end:]
-    each = len(texts) - 1
-    return [found[start : start + each] for start in range(0, len(found), each)]
+    count = len(texts) - 1
+    return [found[start : start + count] for start in range(0, len(found), count)]
 
 
 def main() -> None:

@@ -39,7 +39,7 @@ def speaking(talk: Talk, *words: str) -> tuple[Process, str]:
 def test_row_07_server_that_is_killed_loses_the_goal(scripted: Talk) -> None:
     sayer, goal_id = speaking(scripted, "--wait")
     behind = scripted.start("--json", "say", "--wait", "behind it")
-    pending_id = scripted.watcher.wait_until(lambda each: bool(each["id"] != goal_id))["id"]
+    pending_id = scripted.watcher.wait_until(lambda event: bool(event["id"] != goal_id))["id"]
     scripted.kill()
     for client in (sayer, behind):
         done = scripted.finish(client)
@@ -129,7 +129,7 @@ def test_row_15_client_that_is_gone_at_once_is_spoken_for(scripted: Talk) -> Non
     scripted.watcher.wait_for_terminal(last)  # then all the events before it have come
     goals = scripted.watcher.goals()
     assert len(goals) == count + 1
-    assert {scripted.watcher.wait_for_terminal(each) for each in goals} == {"SUCCEEDED"}
+    assert {scripted.watcher.wait_for_terminal(goal_id) for goal_id in goals} == {"SUCCEEDED"}
     for line in scripted.log.splitlines():
         assert " SUCCEEDED after " in line or " ready" in line, line  # nothing about clients that are gone
 
@@ -247,7 +247,7 @@ def test_row_46_server_that_is_frozen_for_good(scripted: Talk) -> None:
     try:
         second = scripted.start("serve")
         others = [scripted.start(*words) for words in (["status"], ["cancel"], ["say", "hello"], ["--json", "wait"])]
-        ended = [scripted.finish(each) for each in others]
+        ended = [scripted.finish(client) for client in others]
         assert time.monotonic() - began < 6
         for done in ended:
             assert (done.code, done.out) == (3, ""), done
@@ -263,4 +263,4 @@ def test_row_46_server_that_is_frozen_for_good(scripted: Talk) -> None:
     finally:
         scripted.thaw()
     assert scripted.watcher.wait_for_terminal(scripted.request("say", text="length=0", preempt=True)["goal"]["id"])
-    assert [each for each in scripted.watcher.goals() if "hello" in str(scripted.goal(each)["text"])] == []
+    assert [goal_id for goal_id in scripted.watcher.goals() if "hello" in str(scripted.goal(goal_id)["text"])] == []

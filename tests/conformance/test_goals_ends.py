@@ -106,7 +106,7 @@ def test_row_09_each_message_belongs_to_its_own_goal(scripted: Talk) -> None:
     with scripted.connect() as wire:
         good = submit(wire, "length=0.2 all is well", wait=True)
         bad = submit(wire, "fail=audio_device message=no_such_card", wait=True)
-        results = {(each := wire.receive_event("result")["goal"])["id"]: each for _ in range(2)}
+        results = {(goal := wire.receive_event("result")["goal"])["id"]: goal for _ in range(2)}
     assert list(results) == [good, bad]
     assert (results[good]["state"], results[good]["message"]) == ("SUCCEEDED", "Talk completed successfully")
     assert (results[bad]["state"], results[bad]["message"]) == ("ABORTED", "speech failed: no such card")
@@ -118,8 +118,8 @@ def test_row_11_cancel_without_an_id_ends_everything(scripted: Talk) -> None:
     scripted.watcher.wait_for_word(ids[0])
     done = scripted.run("cancel")
     assert (done.code, sorted(done.out.split()), done.err) == (0, sorted(ids), "")
-    assert [scripted.goal(each)["state"] for each in ids] == ["PREEMPTED", "RECALLED", "RECALLED", "RECALLED"]
-    assert {scripted.goal(each)["reason"] for each in ids} == {"canceled"}
+    assert [scripted.goal(goal_id)["state"] for goal_id in ids] == ["PREEMPTED", "RECALLED", "RECALLED", "RECALLED"]
+    assert {scripted.goal(goal_id)["reason"] for goal_id in ids} == {"canceled"}
     assert ends(scripted, *ids) == [1, 1, 1, 1]
     assert states(scripted, ids[1]) == ["PENDING", "RECALLED"]  # never ACTIVE in between
 
@@ -134,14 +134,14 @@ def test_row_12_feedback_belongs_to_its_goal_and_comes_before_the_result(make_ta
         events: list[Message] = [*watching.events]
         while not events or events[-1].get("id") != ids[-1] or events[-1].get("state") != "SUCCEEDED":
             events.append(watching.receive())
-    assert [each["n"] for each in events if "n" in each] == list(range(1, 1 + len(events)))  # nothing was dropped
+    assert [event["n"] for event in events if "n" in event] == list(range(1, 1 + len(events)))  # nothing was dropped
     for goal_id, text in zip(ids, texts, strict=True):
-        own = [each for each in events if each.get("id") == goal_id]
-        assert [each.get("state") for each in own] == ["PENDING", "ACTIVE", *[None] * 6, "SUCCEEDED"]
-        words = [each for each in own if each["event"] == "word"]
-        assert [each["word"] for each in words] == text.split()
-        assert all(text[each["start"] : each["end"]] == each["word"] for each in words)
-        assert [each["number"] for each in words] == [1, 2, 3, 4, 5, 6]
+        own = [event for event in events if event.get("id") == goal_id]
+        assert [event.get("state") for event in own] == ["PENDING", "ACTIVE", *[None] * 6, "SUCCEEDED"]
+        words = [event for event in own if event["event"] == "word"]
+        assert [word["word"] for word in words] == text.split()
+        assert all(text[word["start"] : word["end"]] == word["word"] for word in words)
+        assert [word["number"] for word in words] == [1, 2, 3, 4, 5, 6]
 
 
 def test_row_14_nothing_to_cancel_is_success(scripted: Talk) -> None:
@@ -153,7 +153,7 @@ def test_row_14_nothing_to_cancel_is_success(scripted: Talk) -> None:
 def test_row_19_ids_that_are_unknown_or_have_ended(scripted: Talk) -> None:
     ended = scripted.run("say", "--wait", "length=0").id
     before = scripted.goal(ended)
-    active, pending = (scripted.run("say", f"never-ends {each}").id for each in ("active", "pending"))
+    active, pending = (scripted.run("say", f"never-ends {name}").id for name in ("active", "pending"))
     for words in (["cancel", "none-7"], ["wait", "none-7"], ["status", "none-7"], ["cancel", "--before", "none-7"]):
         done = scripted.run(*words)
         assert (done.code, done.out) == (8, ""), done
@@ -182,8 +182,8 @@ def test_row_20_cancel_before_a_goal_ends_exactly_those_accepted_up_to_it(script
     number = ids[6].rpartition("-")[2]
     done = scripted.run("cancel", "--before", number)  # a number alone means this server's
     assert (done.code, sorted(done.out.split())) == (0, sorted(ids[:7]))
-    assert [states(scripted, each)[-1] for each in ids[:7]] == ["PREEMPTED", *["RECALLED"] * 6]
-    assert [scripted.goal(each)["state"] for each in ids[7:]] == ["PENDING", "PENDING", "ACTIVE"]
+    assert [states(scripted, goal_id)[-1] for goal_id in ids[:7]] == ["PREEMPTED", *["RECALLED"] * 6]
+    assert [scripted.goal(goal_id)["state"] for goal_id in ids[7:]] == ["PENDING", "PENDING", "ACTIVE"]
     more = scripted.run("cancel", ids[8].rpartition("-")[2], "--current")  # selectors add up
     assert sorted(more.out.split()) == sorted(ids[8:])
     assert scripted.run("cancel").id == ids[7]

@@ -48,7 +48,7 @@ def does(word, said):
         assert isinstance(next(arriving), protocol.Stop)
 
 commands = (protocol.decode(line.rstrip(b"\\n"), protocol.COMMAND_CLASSES) for line in open(0, "rb", closefd=False))
-arriving = (each for each in commands if not isinstance(each, protocol.NextGoal))
+arriving = (command for command in commands if not isinstance(command, protocol.NextGoal))
 for command in arriving:
     if isinstance(command, protocol.Configure):
         send(protocol.Ready("scripted", None, None))
@@ -88,7 +88,7 @@ def test_row_44_messages_for_goals_that_are_not_active_change_nothing(talk: Talk
         first, active, pending = (wire.request("say", text=text)["goal"]["id"] for text in texts)
         talk.watcher.wait_for_word(active)
         assert talk.goal(first)["state"] == "SUCCEEDED"
-        assert [talk.goal(each)["state"] for each in (active, pending)] == ["ACTIVE", "PENDING"]
+        assert [talk.goal(goal_id)["state"] for goal_id in (active, pending)] == ["ACTIVE", "PENDING"]
         assert talk.goal(active)["spoken"] == "sta"
         assert wire.request("cancel", ids=[pending])["ok"]
     assert states(talk, first) == ["PENDING", "ACTIVE", "SUCCEEDED"]

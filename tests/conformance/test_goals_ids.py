@@ -36,14 +36,14 @@ def test_row_22_the_same_id_twice_is_spoken_once_and_both_see_the_result(scripte
         second = two.request("say", text=TEXT, id="front-door.1", wait=True)
         assert (first["goal"]["id"], first["goal"]["state"], "attached" in first) == ("front-door.1", "PENDING", False)
         assert (second["goal"]["id"], second["goal"]["state"], second["attached"]) == ("front-door.1", "ACTIVE", True)
-        results = [each.receive_event("result")["goal"] for each in (one, two)]
+        results = [wire.receive_event("result")["goal"] for wire in (one, two)]
         assert results[0] == results[1]
         assert results[0]["state"] == "SUCCEEDED"
         late = two.request("say", text=TEXT, id="front-door.1", wait=True)
         assert (late["attached"], late["goal"]) == (True, results[0])
         assert two.receive_event("result")["goal"] == results[0]
     assert states(scripted, "front-door.1") == ["PENDING", "ACTIVE", "SUCCEEDED"]
-    assert len([each for each in scripted.watcher.words("front-door.1") if each["number"] == 1]) == 1
+    assert len([word for word in scripted.watcher.words("front-door.1") if word["number"] == 1]) == 1
 
 
 def test_row_22_a_sender_that_attached_and_leaves_ends_nothing(scripted: Talk) -> None:

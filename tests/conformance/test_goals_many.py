@@ -74,13 +74,13 @@ def test_row_17_five_clients_that_send_wait_and_cancel_meet_no_deadlock(make_tal
             over.set()
 
     threads = [threading.Thread(target=loop, args=(number,)) for number in range(CLIENTS)]
-    for each in threads:
-        each.start()
+    for thread in threads:
+        thread.start()
     over.wait(seconds)
     over.set()
-    for each in threads:
-        each.join(20)
-        assert not each.is_alive(), f"a client hangs: {talk.log}"
+    for thread in threads:
+        thread.join(20)
+        assert not thread.is_alive(), f"a client hangs: {talk.log}"
     if failures:
         raise failures[0]
     with talk.connect() as wire:
@@ -88,10 +88,10 @@ def test_row_17_five_clients_that_send_wait_and_cancel_meet_no_deadlock(make_tal
         assert wire.receive_event("result")["goal"]["state"] == "SUCCEEDED"
         status = wire.request("status")
         assert (status["active"], status["server"]["pending"]) == (None, 0)
-    known = [each for client in sent for each in client]
+    known = [goal_id for client in sent for goal_id in client]
     assert sorted([*known, goal]) == sorted(talk.watcher.goals())
-    rejected = [each for each in known if talk.watcher.states(each) == ["REJECTED"]]
-    assert set(ends(talk, *(each for each in known if each not in rejected))) == {1}
+    rejected = [goal_id for goal_id in known if talk.watcher.states(goal_id) == ["REJECTED"]]
+    assert set(ends(talk, *(goal_id for goal_id in known if goal_id not in rejected))) == {1}
     assert min(len(client) for client in sent) > seconds, "a client was starved"
     assert_told_in_order(talk)
 
@@ -115,14 +115,14 @@ def test_row_26_the_last_of_a_thousand_preempting_goals_in_a_second_is_spoken_wh
         end = talk.recording.wait_until_quiet(0.2)
         assert end is not None
         _assert_alike(talk.recording.between(active - PRECISION, end + PRECISION), reference)
-        words = [each["word"] for each in talk.watcher.words(last)]
+        words = [word["word"] for word in talk.watcher.words(last)]
         assert (words[0], words[-1]) == ("please", "stuck")
         *others, newest = talk.watcher.goals()
         assert (len(others), newest) == (BURST - 1, last)
         assert set(ends(talk, *others)) == {1}
-        told = {each["id"]: each["goal"] for each in talk.watcher.events() if each.get("goal")}
-        assert {told[each]["state"] for each in others} <= {"PREEMPTED", "RECALLED"}
-        assert {told[each]["reason"] for each in others} == {"preempted"}
+        told = {event["id"]: event["goal"] for event in talk.watcher.events() if event.get("goal")}
+        assert {told[goal_id]["state"] for goal_id in others} <= {"PREEMPTED", "RECALLED"}
+        assert {told[goal_id]["reason"] for goal_id in others} == {"preempted"}
         assert_told_in_order(talk)
         talk.stop()
         assert_within(seconds, 1.0, "taking a thousand goals")
@@ -130,11 +130,11 @@ def test_row_26_the_last_of_a_thousand_preempting_goals_in_a_second_is_spoken_wh
 
 def _send_batch(wire: Wire, numbers: range) -> None:
     """Send preempting goals, and then read their replies."""
-    lines = [{"seq": each, "request": "say", "text": f"number {each}", "preempt": True} for each in numbers]
-    wire.send_raw(b"".join(json.dumps(each).encode() + b"\n" for each in lines))
-    for each in numbers:
+    lines = [{"seq": number, "request": "say", "text": f"number {number}", "preempt": True} for number in numbers]
+    wire.send_raw(b"".join(json.dumps(line).encode() + b"\n" for line in lines))
+    for number in numbers:
         reply = wire.receive()
-        assert (reply["seq"], reply["goal"]["state"]) == (each, "PENDING"), reply
+        assert (reply["seq"], reply["goal"]["state"]) == (number, "PENDING"), reply
 
 
 def _send_and_cancel(wire: Wire, chance: random.Random, over: threading.Event, sent: list[str]) -> None:
@@ -166,8 +166,8 @@ def _assert_alike(heard: Samples, reference: Samples) -> None:
     compared = compare(sound, wanted)
     assert abs(compared.heard - compared.expected) <= 0.02, compared
     # Of another sentence they are about 0.1 and 0.2; the first is low as well where the monitor dropped something.
-    assert max(compared.correlation, similarity(sound, wanted)) > 0.5, compared
-    heard_from, begin = (int(np.flatnonzero(np.abs(each.astype(np.int32)) > LOUD)[0]) for each in (sound, wanted))
+    assert max(compared.correlation, alike(sound, wanted)) > 0.5, compared
+    heard_from, begin = (int(np.flatnonzero(np.abs(samples.astype(np.int32)) > LOUD)[0]) for samples in (sound, wanted))
     # What it is longer by stands before it: scraps of the sentences that it has preempted.
     heard_from += max(0, round((compared.heard - compared.expected) * RATE))
     frame = RATE // 20
@@ -175,7 +175,7 @@ def _assert_alike(heard: Samples, reference: Samples) -> None:
     own = np.array([_loudness(wanted[begin + start :][:frame]) for start in starts])
     shifts = range(-DROPPED, DROPPED + 1, 16)
     padded = np.pad(sound[heard_from:], DROPPED)
-    shifted = [[_loudness(padded[DROPPED + start + each :][:frame]) for start in starts] for each in shifts]
+    shifted = [[_loudness(padded[DROPPED + start + shift :][:frame]) for start in starts] for shift in shifts]
     assert np.max(np.min(np.abs(np.array(shifted) - own), axis=0)) < 0.1 * np.max(own), compared
 
 
@@ -197,10 +197,10 @@ def test_an_engine_that_reads_nothing_for_a_second_while_goals_come_and_go_is_no
         os.kill(engine, signal.SIGSTOP)
         try:
             for start in range(0, 800, BATCH):
-                names = [f"behind.{start + each}" for each in range(BATCH)]
-                for each in names:
-                    wire.send({"request": "say", "text": "behind it", "id": each})
-                    wire.send({"request": "cancel", "ids": [each]})
+                names = [f"behind.{start + number}" for number in range(BATCH)]
+                for name in names:
+                    wire.send({"request": "say", "text": "behind it", "id": name})
+                    wire.send({"request": "cancel", "ids": [name]})
                 replies: list[bool] = []
                 while len(replies) < 2 * BATCH:
                     message = wire.receive()

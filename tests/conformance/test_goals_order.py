@@ -34,7 +34,9 @@ def begin(talk: Talk, text: str = "never-ends words=1", **fields: object) -> str
 
 def queue(talk: Talk, *priorities: int, text: str = "length=0 waits") -> list[str]:
     """Send goals of these priorities, which wait; return their ids."""
-    return [str(submit(talk, f"{text} {number}", priority=each)["id"]) for number, each in enumerate(priorities)]
+    return [
+        str(submit(talk, f"{text} {number}", priority=priority)["id"]) for number, priority in enumerate(priorities)
+    ]
 
 
 def fill(make_talk: MakeTalk) -> tuple[Talk, str, str]:
@@ -54,12 +56,12 @@ def pending(talk: Talk) -> list[str]:
     """Return the ids of the goals that wait, in their order."""
     with talk.connect() as wire:
         assert wire.request("status")["ok"]
-        return [each["pending"]["id"] for each in wire.items if "pending" in each]
+        return [item["pending"]["id"] for item in wire.items if "pending" in item]
 
 
 def spoken(talk: Talk) -> list[str]:
     """Return the ids of the goals that became ACTIVE, in their order."""
-    return [each["id"] for each in talk.watcher.events() if each.get("state") == "ACTIVE"]
+    return [event["id"] for event in talk.watcher.events() if event.get("state") == "ACTIVE"]
 
 
 def test_row_47_in_a_full_queue_the_newest_of_the_lowest_priority_gives_way(make_talk: MakeTalk) -> None:
@@ -124,9 +126,9 @@ def test_patient_goals_keep_the_order_in_which_they_were_sent(make_talk: MakeTal
             waits(wire, f"line {number}")
         assert talk.request("cancel", ids=[active])["ok"]
         results = [wire.receive_event("result")["goal"] for _ in range(5)]
-    assert [each["state"] for each in results] == ["SUCCEEDED"] * 5
-    assert [each["text"] for each in results] == [f"length=0 line {number}" for number in range(5)]
-    assert spoken(talk) == [active, waiting, *(each["id"] for each in results)]
+    assert [goal["state"] for goal in results] == ["SUCCEEDED"] * 5
+    assert [goal["text"] for goal in results] == [f"length=0 line {number}" for number in range(5)]
+    assert spoken(talk) == [active, waiting, *(goal["id"] for goal in results)]
     assert_told_in_order(talk)
 
 
@@ -137,8 +139,8 @@ def test_a_goal_that_comes_later_does_not_take_the_room_of_one_that_waits(make_t
         cancel = {"seq": 2, "request": "cancel", "ids": [waiting]}
         late = {"seq": 3, "request": "say", "text": "length=0 late"}
         # In one piece: they are taken one after the other, before anything else happens.
-        wire.send_raw(b"".join(json.dumps(each).encode() + b"\n" for each in (cancel, late)))
-        replies = {each["seq"]: each for each in (wire.receive() for _ in range(4)) if "ok" in each}
+        wire.send_raw(b"".join(json.dumps(request).encode() + b"\n" for request in (cancel, late)))
+        replies = {message["seq"]: message for message in (wire.receive() for _ in range(4)) if "ok" in message}
     assert replies[2]["count"] == 1
     assert replies[1]["goal"]["state"] == "PENDING"
     assert_rejected(replies[3]["goal"], "queue_full")
@@ -158,23 +160,23 @@ def test_a_thousand_goals_of_one_connection_wait_for_room_and_no_more(make_talk:
         # It is read from all the while; and another connection's goals may wait, too.
         began = time.monotonic()
         assert wire.request("status")["server"]["pending"] == 1
-        refused = [each for each in wire.items if each.get("ok")]
-        assert [each["seq"] for each in refused] == [6_001, 6_002]
-        for each in refused:
-            assert_rejected(each["goal"], "queue_full", "1,000 ")
+        refused = [reply for reply in wire.items if reply.get("ok")]
+        assert [reply["seq"] for reply in refused] == [6_001, 6_002]
+        for reply in refused:
+            assert_rejected(reply["goal"], "queue_full", "1,000 ")
         waits(other, "another's")
         assert_within(time.monotonic() - began, 0.5, "answers to who sends more than has room")
         wire.items.clear()
         wire.events.clear()
         assert wire.request("cancel")["count"] == 1_003
         assert other.receive_event("result")["goal"]["state"] == "RECALLED"
-        replies = [each["seq"] for each in wire.items if each.get("ok")]
-        ends = [each["goal"]["text"] for each in wire.events if each["event"] == "result"]
+        replies = [reply["seq"] for reply in wire.items if reply.get("ok")]
+        ends = [event["goal"]["text"] for event in wire.events if event["event"] == "result"]
     assert replies == list(range(5_001, 6_001))
     assert ends == [f"length=0 line {number}" for number in replies]
     assert len(spoken(talk)) == 1
     assert_told_in_order(talk)
-    told = [each["state"] for each in talk.watcher.events() if each["event"] == "state"]
+    told = [event["state"] for event in talk.watcher.events() if event["event"] == "state"]
     # What is being spoken is stopped before a thousand are told that they never will be.
     assert told.index("PREEMPTING") < told.index("PENDING", 3)
 
@@ -193,8 +195,8 @@ def test_all_hear_of_a_cancel_that_ends_more_than_may_wait_for_them(make_talk: M
             goals = [sender.receive_event("result")["goal"]]  # the server has this cancel before it gets the other
             replies += [pool.submit(other.request, "cancel", timeout=10, ids=[f"goal/{count - 1}"])]
             goals += [sender.receive_event("result")["goal"] for _ in range(count - 1)]
-            ends = [(each["id"], each["state"]) for each in goals]
-            assert all(each.result()["ok"] for each in replies), "one that is being ended is known"
+            ends = [(goal["id"], goal["state"]) for goal in goals]
+            assert all(reply.result()["ok"] for reply in replies), "one that is being ended is known"
     assert ends == [(f"goal/{number}", "RECALLED") for number in range(count)]
     talk.watcher.wait_for(f"goal/{count - 1}", "RECALLED")
     assert_told_in_order(talk)
@@ -264,9 +266,9 @@ def test_a_cancel_ends_the_selected_goals_that_wait_for_room(
             waits(wire, name, **({"id": "two"} if name == "two" else {}))
         reply = canceling.request("cancel", **selection)
         assert reply["ok"] == ("ids" not in selection)
-        ended = [each["canceled"]["text"].split()[-1] for each in canceling.items if "canceled" in each]
-        assert [each for each in ended if each in wires] == chosen
-        assert not [each for each in canceling.items if "ended" in each]
+        ended = [item["canceled"]["text"].split()[-1] for item in canceling.items if "canceled" in item]
+        assert [text for text in ended if text in wires] == chosen
+        assert not [item for item in canceling.items if "ended" in item]
         for name in chosen:
             goal = wires[name].receive_event("result")["goal"]
             assert (goal["state"], goal["reason"], goal["started_at"]) == ("RECALLED", "canceled", None)
@@ -302,13 +304,13 @@ def test_words_reach_those_who_asked_for_them_before_the_result(scripted: Talk) 
             assert wire.request("wait", ids=[goal], feedback=feedback)["ok"]
         quiet = _until_result(sender)
         assert (quiet[-1]["goal"]["id"], "word" in _shapes(quiet)) == (other, False)
-        told = {name: _until_result(each) for name, each in (("s", sender), ("w", waiter), ("d", deaf))}
+        told = {name: _until_result(wire) for name, wire in (("s", sender), ("w", waiter), ("d", deaf))}
     words = scripted.watcher.words(goal)
-    assert [each["word"] for each in words] == text.split()
-    assert [each for each in told["s"] if each["event"] == "word"] == words
+    assert [word["word"] for word in words] == text.split()
+    assert [event for event in told["s"] if event["event"] == "word"] == words
     assert _shapes(told["s"])[-7:] == ["ACTIVE", *["word"] * 4, "SUCCEEDED", "result"]
     # It may have come a word late, and hears all the words from then on.
-    heard = [each for each in told["w"] if each["event"] == "word"]
+    heard = [event for event in told["w"] if event["event"] == "word"]
     assert heard == words[len(words) - len(heard) :]
     assert len(heard) >= 2
     assert _shapes(told["w"])[-3:] == ["word", "SUCCEEDED", "result"]
@@ -323,7 +325,7 @@ def _until_result(wire: Wire) -> list[Message]:
 
 
 def _shapes(told: list[Message]) -> list[str]:
-    return [str(each.get("state", each["event"])) for each in told]
+    return [str(event.get("state", event["event"])) for event in told]
 
 
 def test_row_50_all_of_it_is_told_once_and_in_order(make_talk: MakeTalk) -> None:
@@ -356,29 +358,29 @@ def test_row_50_all_of_it_is_told_once_and_in_order(make_talk: MakeTalk) -> None
         say("REJECTED queue_full", priority=-1)
         talk.watcher.wait_for_terminal(late)
         recalled = say("RECALLED canceled", "length=0 not this one")
-        for each in (recalled, canceled):
-            wire.send({"request": "cancel", "ids": [each]})
+        for goal_id in (recalled, canceled):
+            wire.send({"request": "cancel", "ids": [goal_id]})
             while "ok" not in _take(wire, told):
                 pass
             # The goal's end is told before the answer that depends on it.
-            assert any(one.get("state") in {"RECALLED", "PREEMPTED"} and one.get("id") == each for one in told)
-        while sum(each.get("event") == "result" for each in told) < len(wanted):
+            assert any(one.get("state") in {"RECALLED", "PREEMPTED"} and one.get("id") == goal_id for one in told)
+        while sum(message.get("event") == "result" for message in told) < len(wanted):
             _take(wire, told)
         active = say("PREEMPTED preempted", "length=20 words=1")
         talk.watcher.wait_for_word(active)
         say("RECALLED preempted")
         talk.watcher.wait_for_word(say("PREEMPTED preempted", "length=20 words=1", flush=True))
         say("SUCCEEDED", "length=0 the last", preempt=True)
-        while sum(each.get("event") == "result" for each in told) < len(wanted):
+        while sum(message.get("event") == "result" for message in told) < len(wanted):
             _take(wire, told)
     _check_replies_first(told)
-    results = {each["goal"]["id"]: each["goal"] for each in told if each.get("event") == "result"}
-    ended = {each: " ".join(filter(None, (goal["state"], goal["reason"]))) for each, goal in results.items()}
+    results = {message["goal"]["id"]: message["goal"] for message in told if message.get("event") == "result"}
+    ended = {goal_id: " ".join(filter(None, (goal["state"], goal["reason"]))) for goal_id, goal in results.items()}
     assert ended == wanted
     assert_told_in_order(talk)
     assert sorted(talk.watcher.goals()) == sorted(wanted)
-    last = {each["id"]: each["state"] for each in talk.watcher.events() if each["event"] == "state"}
-    assert last == {each: reason.split()[0] for each, reason in wanted.items()}
+    last = {event["id"]: event["state"] for event in talk.watcher.events() if event["event"] == "state"}
+    assert last == {goal_id: reason.split()[0] for goal_id, reason in wanted.items()}
 
 
 def _take(wire: Wire, told: list[Message]) -> Message:
@@ -390,13 +392,13 @@ def _take(wire: Wire, told: list[Message]) -> Message:
 def _check_replies_first(told: list[Message]) -> None:
     """Assert of a connection: the reply to `say` comes before all events of its goal, and PENDING is the first."""
     known: dict[str, str] = {}
-    for each in told:
-        if "ok" in each and "goal" in each:
-            assert each["goal"]["id"] not in known, each
-            known[each["goal"]["id"]] = "reply"
-        elif each.get("event") == "state":
-            first = known[each["id"]] == "reply"
-            assert first == (each["state"] in {"PENDING", "REJECTED"}), each
-            known[each["id"]] = each["state"]
-        elif each.get("event") == "result":
-            assert known[each["goal"]["id"]] == each["goal"]["state"], each
+    for message in told:
+        if "ok" in message and "goal" in message:
+            assert message["goal"]["id"] not in known, message
+            known[message["goal"]["id"]] = "reply"
+        elif message.get("event") == "state":
+            first = known[message["id"]] == "reply"
+            assert first == (message["state"] in {"PENDING", "REJECTED"}), message
+            known[message["id"]] = message["state"]
+        elif message.get("event") == "result":
+            assert known[message["goal"]["id"]] == message["goal"]["state"], message

@@ -31,12 +31,12 @@ class Bystanders:
     def __init__(self, talk: Talk) -> None:
         self._talk = talk
         with talk.connect() as wire:
-            self._ids = [wire.request("say", text=f"never-ends {each}")["goal"]["id"] for each in ("active", "pending")]
+            self._ids = [wire.request("say", text=f"never-ends {name}")["goal"]["id"] for name in ("active", "pending")]
         talk.watcher.wait_for_word(self._ids[0])
 
     def assert_untouched(self) -> None:
-        assert [self._talk.goal(each)["state"] for each in self._ids] == ["ACTIVE", "PENDING"]
-        active = {each["id"] for each in self._talk.watcher.events() if each.get("state") == "ACTIVE"}
+        assert [self._talk.goal(goal_id)["state"] for goal_id in self._ids] == ["ACTIVE", "PENDING"]
+        active = {event["id"] for event in self._talk.watcher.events() if event.get("state") == "ACTIVE"}
         assert active == {self._ids[0]}
 
 
@@ -114,7 +114,7 @@ def test_bytes_that_are_no_utf8_are_left_out_and_named(scripted: Talk) -> None:
 def test_bytes_that_are_no_utf8_are_silent_and_no_words(talk: Talk) -> None:
     line: list[str | bytes] = [*TALK, "say", "--feedback", "--", b"battery \xff low, it\xffs \xff", "now"]
     done = subprocess.run(line, env=talk.env, capture_output=True, text=True, timeout=20, check=False)
-    said = [each.split()[-1] for each in done.stdout.splitlines() if " word " in each]
+    said = [line.split()[-1] for line in done.stdout.splitlines() if " word " in line]
     assert (done.returncode, said) == (0, ["battery", "low", "it", "s", "now"])
     alone = talk.run("say", "--wait", "--", "\udcff")
     assert (alone.code, alone.err.splitlines()[-1].endswith("nothing in the text can be spoken")) == (4, True)

@@ -59,9 +59,9 @@ def busy(talk: Talk, **fields: Any) -> str:
 
 def end(talk: Talk, *goals: str) -> None:
     """Wait until these goals have ended; all must have been spoken."""
-    for each in goals:
-        assert talk.watcher.wait_for_terminal(each, 20) == "SUCCEEDED"
-        assert talk.watcher.states(each) == SPOKEN
+    for goal_id in goals:
+        assert talk.watcher.wait_for_terminal(goal_id, 20) == "SUCCEEDED"
+        assert talk.watcher.states(goal_id) == SPOKEN
 
 
 def test_row_28_half_the_volume_is_heard_as_half(make_talk: MakeTalk, sink: Sink, voice: Voice) -> None:
@@ -131,9 +131,9 @@ def test_row_38_only_a_goal_that_was_heard_throttles_the_next(make_talk: MakeTal
     while_spoken = submit(talk, NEVER, key="battery", throttle=60)
     end(talk, low, home)
     after = submit(talk, NEVER, key="battery", throttle=60, flush=True)
-    for each in (while_spoken, after):
-        assert_rejected(each, "throttled")
-        assert each["by"] == {"goal": low}
+    for goal in (while_spoken, after):
+        assert_rejected(goal, "throttled")
+        assert goal["by"] == {"goal": low}
     done = talk.run("say", "--wait", "--key", "home", "--throttle", "60", "--", NEVER)
     assert (done.code, done.out) == (0, "")
     stopped.assert_heard_after_stop(heard(talk), LONG, [LOW, HOME], voice=voice)
@@ -143,7 +143,7 @@ def test_row_39_higher_priorities_go_first_equal_ones_in_the_order_in_which_they
     long = busy(talk)
     texts = ["battery zero", "coming five", "battery one", "coming five again"]
     zero, five, one, five_again = [
-        send(talk, text, priority=each) for text, each in zip(texts, (0, 5, 1, 5), strict=True)
+        send(talk, text, priority=priority) for text, priority in zip(texts, (0, 5, 1, 5), strict=True)
     ]
     end(talk, long, five, five_again, one, zero)
     assert_heard(heard(talk), voice.render([HELP, texts[1], texts[3], texts[2], texts[0]]))
@@ -154,7 +154,7 @@ def test_row_40_a_lower_priority_does_not_interrupt_and_goes_first_among_its_own
     long = busy(talk, priority=5)
     zero = send(talk, HOME)
     high = send(talk, "coming now", priority=3, preempt=True)
-    lower, same = (send(talk, NEVER, priority=each, preempt=True) for each in (-1, 0))
+    lower, same = (send(talk, NEVER, priority=priority, preempt=True) for priority in (-1, 0))
     low = send(talk, LOW, preempt=True)
     assert talk.watcher.states(long) == ["PENDING", "ACTIVE"]
     assert_recalled(talk, lower, "preempted", by=same)
@@ -230,16 +230,16 @@ def test_row_16_a_server_that_is_terminated_answers_every_waiter(talk: Talk, voi
     await_word(talk, goals[0])
     talk.stop(timeout=2)
     ended = time.monotonic()
-    done = [talk.finish(each, timeout=1) for each in waiters]
-    assert [each.code for each in done] == [7, 6, 6, 6]
-    told = [json.loads(each.out) for each in done]
-    assert [each["id"] for each in told] == goals
-    assert [each["text"] for each in told] == texts
-    assert [each["state"] for each in told] == ["PREEMPTED", *["RECALLED"] * 3]
-    assert {each["reason"] for each in told} == {"shutdown"}
+    done = [talk.finish(client, timeout=1) for client in waiters]
+    assert [client.code for client in done] == [7, 6, 6, 6]
+    told = [json.loads(client.out) for client in done]
+    assert [goal["id"] for goal in told] == goals
+    assert [goal["text"] for goal in told] == texts
+    assert [goal["state"] for goal in told] == ["PREEMPTED", *["RECALLED"] * 3]
+    assert {goal["reason"] for goal in told} == {"shutdown"}
     assert talk.watcher.states(goals[0]) == STOPPED
-    assert [talk.watcher.states(each) for each in goals[1:]] == [["PENDING", "RECALLED"]] * 3
-    assert_only_beginning(heard(talk), voice.render([LONG])[0])
+    assert [talk.watcher.states(goal_id) for goal_id in goals[1:]] == [["PENDING", "RECALLED"]] * 3
+    assert_begun(heard(talk), voice.render([LONG])[0])
     _assert_last_sound_before(talk, ended)
 
 
@@ -269,7 +269,7 @@ def test_row_25_a_goal_that_preempts_goes_before_those_that_wait(talk: Talk, voi
     assert (newcomer.code, newcomer.err) == (0, "")
     assert talk.run("wait", *waiting).code == 0
     assert talk.watcher.states(first) == STOPPED
-    assert all(talk.watcher.states(each) == SPOKEN for each in waiting)
+    assert all(talk.watcher.states(goal_id) == SPOKEN for goal_id in waiting)
     stopped.assert_heard_after_stop(heard(talk), LONG, [HELP, LOW, HOME], voice=voice)
 
 

@@ -103,7 +103,7 @@ def test_row_43_a_sentence_that_is_held_goes_on_where_it_was(
         assert talk.watcher.wait_for_terminal(goal) == "SUCCEEDED"
         assert_resumed(heard(talk), reference, pause=seconds - SILENT, repeated=TWICE)
         assert talk.watcher.states(goal) == SPOKEN
-        numbers = [each["number"] for each in talk.watcher.words(goal)]
+        numbers = [word["number"] for word in talk.watcher.words(goal)]
         assert numbers == list(range(1, len(numbers) + 1))
         assert talk.goal(goal)["spoken"] == LONG
         assert_told_in_order(talk)
@@ -129,11 +129,11 @@ def test_row_43_a_sentence_that_is_held_twice_is_heard_whole_and_all_are_told(ta
         assert follower.receive_event("result")["goal"]["state"] == "SUCCEEDED"
     _assert_held_twice(heard(talk), voice.render([LONG])[0])
     words = talk.watcher.words(goal)
-    assert [each["number"] for each in words] == list(range(1, len(words) + 1))
-    assert [each["word"] for each in words] == LONG.split()
-    assert [(each["paused"], each["id"]) for each in told] == [(True, goal), (False, goal)] * 2
-    assert all(each["by"]["client"]["pid"] for each in told)
-    assert [each for each in talk.watcher.events() if each["event"] == "paused"] == told
+    assert [word["number"] for word in words] == list(range(1, len(words) + 1))
+    assert [word["word"] for word in words] == LONG.split()
+    assert [(event["paused"], event["id"]) for event in told] == [(True, goal), (False, goal)] * 2
+    assert all(event["by"]["client"]["pid"] for event in told)
+    assert [event for event in talk.watcher.events() if event["event"] == "paused"] == told
     assert_told_in_order(talk)
 
 

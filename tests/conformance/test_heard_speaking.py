@@ -65,8 +65,8 @@ def test_row_23_goals_are_spoken_in_the_order_in_which_they_came(make_talk: Make
     sent = [talk.run("say", "--", text).id for text in texts]
     done = talk.run("wait", *sent)
     assert (done.code, done.err) == (0, "")
-    for each in sent:
-        assert talk.watcher.states(each) == SPOKEN
+    for goal_id in sent:
+        assert talk.watcher.states(goal_id) == SPOKEN
     assert_heard(heard(talk), voice.render(texts))
 
 
@@ -104,9 +104,9 @@ def test_row_30_a_text_is_spoken_and_never_executed(
     refused = talk.run("say", "--wiat", LOW)
     assert (refused.code, refused.out, "talk say -- " in refused.err) == (2, "", True)
     said = [talk.run("say", "--", text) for text in texts]
-    assert [(each.code, each.err) for each in said] == [(0, "")] * len(texts)
-    assert talk.run("wait", *(each.id for each in said)).code == 0
-    assert [talk.goal(each.id)["text"] for each in said] == texts
+    assert [(client.code, client.err) for client in said] == [(0, "")] * len(texts)
+    assert talk.run("wait", *(client.id for client in said)).code == 0
+    assert [talk.goal(client.id)["text"] for client in said] == texts
     assert talk.run("say", "--wait", *LOW.split()).code == 0  # words are joined
     assert_heard(heard(talk), voice.render([*texts, LOW]))
     assert os.listdir(tmp_path) == []
@@ -133,7 +133,7 @@ def test_only_silence_is_left_out_between_queued_sentences_and_never_too_much(ta
     references = render(texts)
     found = assert_heard(heard(talk), references)
     for number in range(len(texts) - 1):
-        before, after = (extent(each) for each in references[number : number + 2])
+        before, after = (extent(reference) for reference in references[number : number + 2])
         assert before is not None
         assert after is not None
         own = (len(references[number]) - before[1] + after[0]) / RATE
@@ -250,12 +250,12 @@ def measure(talk: Talk, text: str, rate: int, *, exact: bool = True, voice: Voic
         assert_within(compared.heard - compared.expected, EXTENT_TOLERANCE_S, "the gaps in a sentence")
         return Measured(words, [], [])  # behind a gap, no word is in its place
     assert compared.same or (not exact and compared.correlation > ALIKE), compared
-    begins = (len(reference.samples) - len(without_leading_zeros(reference.samples))) / RATE
-    positions = [max(begins, position(reference, each["start"])) for each in words]
-    moments = [time_heard(talk.recording, compared, reference.samples, each) for each in positions]
+    begins = (len(reference.samples) - len(played(reference.samples))) / RATE
+    positions = [max(begins, position(reference, word["start"])) for word in words]
+    moments = [time_heard(talk.recording, compared, reference.samples, offset) for offset in positions]
     talk.stop()
-    received = [talk.watcher.arrived(each) - moment for each, moment in zip(words, moments, strict=True)]
-    stamped = [each["at"] - wall - moment for each, moment in zip(words, moments, strict=True)]
+    received = [talk.watcher.arrived(word) - moment for word, moment in zip(words, moments, strict=True)]
+    stamped = [word["at"] - wall - moment for word, moment in zip(words, moments, strict=True)]
     return Measured(words, received, stamped)
 
 
@@ -278,7 +278,7 @@ def test_thirty_words_are_told_as_they_are_heard(make_talk: MakeTalk, sink: Sink
     with limits():
         talk = make_talk("--rate", str(rate), "--player", player, sink=sink)
         measured = measure(talk, THIRTY, rate)
-        assert [THIRTY[each["start"] : each["end"]] for each in measured.words] == TOLD
+        assert [THIRTY[word["start"] : word["end"]] for word in measured.words] == TOLD
         measured.assert_in_time()
 
 
@@ -289,10 +289,10 @@ def test_thirty_words_of_a_neural_voice_are_told_as_they_are_heard(
 ) -> None:
     with limits():
         measured = measure(joe.serve(make_talk, sink, rate=rate), THIRTY, rate, voice=joe)
-        assert [THIRTY[each["start"] : each["end"]] for each in measured.words] == TOLD
+        assert [THIRTY[word["start"] : word["end"]] for word in measured.words] == TOLD
         # How busy the machine is doesn't change where in the sound a word is said to be.
         reference = joe.render_with_words(Sentence(THIRTY, rate))
-        beside = [abs(each["time"] - position(reference, each["start"])) for each in measured.words]
+        beside = [abs(word["time"] - position(reference, word["start"])) for word in measured.words]
         assert statistics.median(beside) <= MEDIAN, beside
         assert max(beside) <= WORST, beside
         measured.assert_in_time()
@@ -325,11 +325,11 @@ def test_row_42_ten_words_of_any_script_are_told_once_each_by_a_neural_voice(
 
 
 def _assert_ten(words: list[Message]) -> None:
-    assert [each["word"] for each in words] == ["coming", "from", "café", "東京", "is", "😀", "naïve", "this"]
-    assert [each["start"] for each in words] == [TEN.index(each["word"]) for each in words]
-    assert [each["end"] - each["start"] for each in words] == [len(each["word"]) for each in words]
-    assert [each["number"] for each in words] == list(range(1, 9))
-    times = [each["time"] for each in words]
+    assert [word["word"] for word in words] == ["coming", "from", "café", "東京", "is", "😀", "naïve", "this"]
+    assert [word["start"] for word in words] == [TEN.index(word["word"]) for word in words]
+    assert [word["end"] - word["start"] for word in words] == [len(word["word"]) for word in words]
+    assert [word["number"] for word in words] == list(range(1, 9))
+    times = [word["time"] for word in words]
     assert times == sorted(times)
 
 

@@ -25,7 +25,12 @@ def home(home: str) -> str:
 @pytest.mark.filterwarnings("ignore::platformdirs.RuntimeDirWarning")
 @pytest.mark.parametrize(
     "variables",
-    [*({"XDG_RUNTIME_DIR": each} for each in ("run", "gone", "")), {"TMPDIR": "run"}, {"TMP": "run"}, {"TMPDIR": ""}],
+    [
+        *({"XDG_RUNTIME_DIR": folder} for folder in ("run", "gone", "")),
+        {"TMPDIR": "run"},
+        {"TMP": "run"},
+        {"TMPDIR": ""},
+    ],
     ids=str,
 )
 def test_client_looks_where_platformdirs_puts_the_socket(

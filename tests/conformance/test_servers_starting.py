@@ -25,7 +25,7 @@ def test_row_45_of_two_servers_started_at_once_exactly_one_serves(times: int) ->
         for attempt in range(times):
             servers = [BareServe(scripted, env) for _ in range(2)]
             try:
-                assert sorted(each.serves() for each in servers) == [False, True], f"attempt {attempt}"
+                assert sorted(server.serves() for server in servers) == [False, True], f"attempt {attempt}"
                 loser, winner = sorted(servers, key=BareServe.serves)
                 assert loser.end() == 11, loser.log
                 assert f"(pid {winner.process.pid}) is already running at {home}/s;" in loser.log
@@ -34,8 +34,8 @@ def test_row_45_of_two_servers_started_at_once_exactly_one_serves(times: int) ->
                 assert winner.end(signal.SIGTERM) == 0, f"attempt {attempt}: {winner.log}"
                 assert not os.path.exists(f"{home}/s")
             finally:
-                for each in servers:
-                    each.close()
+                for server in servers:
+                    server.close()
 
 
 def test_second_server_says_who_serves_and_takes_nothing_away(scripted: Talk) -> None:
@@ -50,14 +50,14 @@ def test_row_48_ids_from_before_a_restart_are_unknown(scripted: Talk) -> None:
     before = [scripted.run("say", "--wait", "length=0").id for _ in range(2)]
     scripted.stop()
     scripted.start_server()
-    active, pending = (scripted.run("say", f"never-ends {each}").id for each in ("active", "pending"))
+    active, pending = (scripted.run("say", f"never-ends {name}").id for name in ("active", "pending"))
     scripted.watcher.wait_for_word(active)
-    assert {each.rpartition("-")[0] for each in before} != {active.rpartition("-")[0]}
+    assert {goal_id.rpartition("-")[0] for goal_id in before} != {active.rpartition("-")[0]}
     for goal_id in before:
         for words in (["wait", goal_id], ["cancel", goal_id], ["cancel", "--before", goal_id], ["status", goal_id]):
             done = scripted.run(*words)
             assert (done.code, done.out) == (8, ""), done
-    assert [scripted.goal(each)["state"] for each in (active, pending)] == ["ACTIVE", "PENDING"]
+    assert [scripted.goal(goal_id)["state"] for goal_id in (active, pending)] == ["ACTIVE", "PENDING"]
     assert scripted.run("say", "third").code == 0  # a later goal has no id from before either
     assert scripted.request("status")["server"]["pending"] == 2
     assert not set(before) & set(scripted.watcher.goals())

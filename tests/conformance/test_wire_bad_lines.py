@@ -76,10 +76,10 @@ def talk(scripted: Talk) -> Iterator[Talk]:
         before = descriptors(scripted)
         yield scripted
         assert wire.request("status")["active"] is None
-        assert [each["recent"]["id"] for each in wire.items] == [spoken]
+        assert [item["recent"]["id"] for item in wire.items] == [spoken]
         last = speak(wire)
         scripted.watcher.wait_for_terminal(last)
-        rejected = [each for each in scripted.watcher.goals() if scripted.watcher.states(each) == ["REJECTED"]]
+        rejected = [goal_id for goal_id in scripted.watcher.goals() if scripted.watcher.states(goal_id) == ["REJECTED"]]
         assert scripted.watcher.goals() == [spoken, *rejected, last]
         end = time.monotonic() + 2
         while descriptors(scripted) > before and time.monotonic() < end:
@@ -107,7 +107,7 @@ def test_bad_lines_are_answered_with_their_code(talk: Talk) -> None:
             _, error, *status = raw.receive_lines(4)
             assert_error(error, code)
             assert "seq" not in error, "no number could be read"
-            assert [each.keys() - {"recent"} for each in status[:-1]] == [{"seq"}], f"{name}: {status}"
+            assert [message.keys() - {"recent"} for message in status[:-1]] == [{"seq"}], f"{name}: {status}"
             assert (status[-1]["seq"], status[-1]["ok"]) == (7, True), name
 
 
@@ -163,7 +163,7 @@ def test_requests_before_an_overlong_line_are_answered_and_none_after_it(talk: T
     with Raw(talk.socket) as raw:
         raw.send(b"".join([*requests[:100], b"a" * MAX_LINE, b"\n", requests[100]]))
         _, *answers, error = raw.receive_all()
-        assert [each["seq"] for each in answers] == list(range(100))
+        assert [reply["seq"] for reply in answers] == list(range(100))
         assert_error(error, "line_too_long")
 
 
@@ -198,8 +198,8 @@ def test_descriptors_that_are_passed_are_not_kept(talk: Talk) -> None:
         for _ in range(20):
             passed = array.array("i", [file.fileno()] * 5)
             raw.socket.sendmsg([STATUS], [(socket.SOL_SOCKET, socket.SCM_RIGHTS, passed)])
-        replies = [each for each in raw.receive_lines(1 + 2 * 20) if "ok" in each]
-        assert [each["ok"] for each in replies] == [True] * 20
+        replies = [message for message in raw.receive_lines(1 + 2 * 20) if "ok" in message]
+        assert [reply["ok"] for reply in replies] == [True] * 20
 
 
 def test_requests_of_a_refused_client_are_not_carried_out(make_talk: MakeTalk) -> None:
@@ -214,7 +214,7 @@ def test_requests_of_a_refused_client_are_not_carried_out(make_talk: MakeTalk) -
         with Raw(talk.socket) as last:  # once it is answered, the clients before it have been served
             last.receive_all()
         after = asking.request("status")["server"]
-    changed = {each for each in ("volume", "preempt", "paused") if before[each] != after[each]}
+    changed = {setting for setting in ("volume", "preempt", "paused") if before[setting] != after[setting]}
     assert not changed
     assert "a bug" not in talk.log
 
@@ -227,7 +227,7 @@ def test_request_after_ten_bad_lines_is_ignored_even_if_the_client_has_left(scri
 def send_and_go(talk: Talk, *lines: bytes) -> None:
     """Connect, send and close once for each of these lines, while the server is frozen."""
     talk.freeze()
-    for each in lines:
+    for line in lines:
         with Raw(talk.socket) as client:
-            client.send(each)
+            client.send(line)
     talk.thaw()

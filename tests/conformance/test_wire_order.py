@@ -39,12 +39,12 @@ def test_row_50_reply_comes_first_and_the_result_last(scripted: Talk, text: str)
         raw.send(line(seq=1, request="say", text=text, wait=True))
         _, reply, *events = raw.receive_lines(6)
     state = "ABORTED" if "crash" in text else "SUCCEEDED"
-    assert [shape(each) for each in (reply, *events)] == ["reply", "PENDING", "ACTIVE", state, "result"]
+    assert [shape(message) for message in (reply, *events)] == ["reply", "PENDING", "ACTIVE", state, "result"]
     assert reply["goal"].keys() == events[-1]["goal"].keys() == KEYS
     assert reply["goal"]["state"] == "PENDING"  # as accepted: states that a client is told never go backwards
-    numbers = [each["n"] for each in events[:-1]]
+    numbers = [event["n"] for event in events[:-1]]
     assert numbers == sorted(set(numbers))
-    moments = [each["at"] for each in events[:-1]]
+    moments = [event["at"] for event in events[:-1]]
     assert moments == sorted(moments)
     assert abs(moments[0] - time.time()) < 10
     result = events[-1]["goal"]
@@ -54,7 +54,7 @@ def test_row_50_reply_comes_first_and_the_result_last(scripted: Talk, text: str)
 def test_row_50_a_watcher_learns_with_its_first_event_what_a_goal_is(scripted: Talk) -> None:
     for text in ("length=0.2 first, at once", "length=0 behind it", ""):
         goal_id = scripted.request("say", text=text)["goal"]["id"]
-        first = scripted.watcher.wait_until(lambda each, goal_id=goal_id: each.get("id") == goal_id)  # type: ignore[misc]
+        first = scripted.watcher.wait_until(lambda event, goal_id=goal_id: event.get("id") == goal_id)  # type: ignore[misc]
         assert first["state"] == ("PENDING" if text else "REJECTED")
         assert (first["goal"]["text"], first["goal"]["state"]) == (text, first["state"])
 
@@ -65,7 +65,7 @@ def test_row_50_end_of_a_displaced_goal_comes_before_the_newcomer_is_active(scri
         scripted.watcher.wait_for_word(first)
         second = wire.request("say", text="length=0", preempt=True)["goal"]["id"]
     scripted.watcher.wait_for(second, "SUCCEEDED")
-    told = [(each["id"], each["state"]) for each in scripted.watcher.events() if each["event"] == "state"]
+    told = [(event["id"], event["state"]) for event in scripted.watcher.events() if event["event"] == "state"]
     assert told[2:] == [
         (second, "PENDING"),
         (first, "PREEMPTING"),
@@ -85,8 +85,8 @@ def test_row_50_events_come_before_the_reply_that_depends_on_them(scripted: Talk
         wire.events.clear()
         reply = wire.request("cancel")
         assert reply["count"] == 2
-        told = [(each.get("id") or each["goal"]["id"], shape(each)) for each in wire.events]
-        assert sorted(each["canceled"]["id"] for each in wire.items) == sorted([active, pending])
+        told = [(event.get("id") or event["goal"]["id"], shape(event)) for event in wire.events]
+        assert sorted(item["canceled"]["id"] for item in wire.items) == sorted([active, pending])
     assert told[-5:] == [
         (pending, "RECALLED"), (pending, "result"), (active, "PREEMPTING"), (active, "PREEMPTED"), (active, "result")
     ]  # fmt: skip
@@ -97,7 +97,7 @@ def test_two_requests_in_one_segment_are_two_requests(scripted: Talk) -> None:
         requests = [line(seq=1, request="say", text="length=0"), line(seq=2, request="say", text="length=0 two")]
         raw.send(b"".join([*requests, line(seq=3, request="status")[:10]]))
         _, one, two = raw.receive_lines(3)
-        assert [each["seq"] for each in (one, two)] == [1, 2]
+        assert [reply["seq"] for reply in (one, two)] == [1, 2]
         raw.send(line(seq=3, request="status")[10:])
         assert raw.receive_lines(4)[3]["seq"] == 3
     for reply in (one, two):
@@ -126,7 +126,7 @@ def test_replies_that_are_owed_reach_a_client_that_has_closed_its_half(scripted:
     with Raw(scripted.socket) as raw:
         raw.send(line(seq=1, request="cancel") + line(seq=2, request="voices") + line(seq=3, request="status"))
         raw.half_close()
-        replies = [each["seq"] for each in raw.receive_all() if "ok" in each]
+        replies = [message["seq"] for message in raw.receive_all() if "ok" in message]
     assert sorted(replies) == [1, 2, 3]
 
 
@@ -144,12 +144,12 @@ def test_requests_that_wait_for_the_voices_keep_their_order(make_talk: MakeTalk,
         wire.send({"seq": 6_001, "request": "wait", "ids": ["last"]})
         wire.send({"seq": 6_002, "request": "set", "rate": 100})
         assert wire.request("cancel" if behind == "cancel" else "status")["ok"]
-        told = [(each["seq"], each) for each in wire.items if "ok" in each]
+        told = [(reply["seq"], reply) for reply in wire.items if "ok" in reply]
     assert [seq for seq, _ in told] == [*range(5_000, 5_000 + count), 6_000, 6_001, 6_002]
-    assert all(each["ok"] for _, each in told)
-    assert [each["goal"]["id"] for _, each in told[:count]] == [f"{boot}-{number + 1}" for number in range(count)]
+    assert all(reply["ok"] for _, reply in told)
+    assert [reply["goal"]["id"] for _, reply in told[:count]] == [f"{boot}-{number + 1}" for number in range(count)]
     await_ends(talk, talk.watcher.goals())
-    spoken = [each["id"] for each in talk.watcher.events() if each.get("state") == "ACTIVE"]
+    spoken = [event["id"] for event in talk.watcher.events() if event.get("state") == "ACTIVE"]
     expected = [f"{boot}-{number + 1}" for number in range(count)]
     assert spoken == ([*expected, "last"] if behind == "nothing" else expected[: len(spoken)])
 
@@ -164,7 +164,7 @@ def test_a_cancel_or_a_pause_does_not_hurry_what_others_wait_for(make_talk: Make
             {"request": "say", "text": "length=0 two", "voice": "nonsense", "id": "two", "wait": True},
             {"request": "say", "text": "length=0 three", "voice": "nonsense"},
         ]
-        asking.send_raw(b"".join(line(seq=seq, **each) for seq, each in enumerate(requests, 5_000)))
+        asking.send_raw(b"".join(line(seq=seq, **request) for seq, request in enumerate(requests, 5_000)))
         assert canceling.request("cancel", key="nobody")["count"] == 0
         assert canceling.request("cancel", ids=["two"])["count"] == 1
         assert asking.receive_event("result")["goal"]["state"] == "RECALLED"
@@ -190,8 +190,8 @@ def test_a_rejected_goal_has_a_state_and_a_result_if_the_client_waits(scripted: 
         raw.send(line(request="say", text="", **extra))
         raw.half_close()
         _, reply, *events = raw.receive_all()
-    assert [shape(each) for each in events] == (["REJECTED", "result"] if extra else [])
-    assert {each["goal"]["state"] for each in (reply, *events[1:])} == {"REJECTED"}
+    assert [shape(event) for event in events] == (["REJECTED", "result"] if extra else [])
+    assert {message["goal"]["state"] for message in (reply, *events[1:])} == {"REJECTED"}
 
 
 def test_request_is_not_handled_while_a_goal_is_ending(scripted: Talk) -> None:

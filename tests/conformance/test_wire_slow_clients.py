@@ -85,7 +85,7 @@ def test_10000_requests_without_reading_the_replies(scripted: Talk) -> None:
             while len(numbers) < count:
                 raw.receive()
                 done, _, rest = bytes(raw.received).rpartition(b"\n")
-                numbers += [each["seq"] for each in map(json.loads, done.split(b"\n")) if each.get("ok")]
+                numbers += [message["seq"] for message in map(json.loads, done.split(b"\n")) if message.get("ok")]
                 raw.received = bytearray(rest)
             sender.join()
         assert numbers == list(range(count))
@@ -111,7 +111,7 @@ def test_requests_that_come_faster_than_they_are_answered_do_not_pile_up(scripte
 def peak_memory(pid: int) -> int:
     """Return the most memory that a process has had, in kB."""
     with open(f"/proc/{pid}/status", encoding="utf-8") as file:
-        return next(int(each.split()[1]) for each in file if each.startswith("VmHWM:"))
+        return next(int(line.split()[1]) for line in file if line.startswith("VmHWM:"))
 
 
 def test_watcher_that_does_not_read_loses_feedback_alone(scripted: Talk) -> None:
@@ -124,12 +124,12 @@ def test_watcher_that_does_not_read_loses_feedback_alone(scripted: Talk) -> None
         assert stuck.request("hello")["ok"]  # by its reply, all waiting events have been sent
         events = stuck.events
     everything = scripted.watcher.events()
-    seen = [each for each in events if "n" in each]
+    seen = [event for event in events if "n" in event]
     assert len(seen) < everything[-1]["n"], "this watcher was not behind: the test must send more"
     assert max(times) < 1
-    unordered = [each for last, each in itertools.pairwise(seen) if each["n"] < last["n"]]
+    unordered = [event for last, event in itertools.pairwise(seen) if event["n"] < last["n"]]
     assert not unordered, f"{len(unordered)} events came late, as {unordered[0]}"
-    assert [each["state"] for each in seen if each["event"] == "state"] == ["PENDING", "ACTIVE", "SUCCEEDED"]
+    assert [event["state"] for event in seen if event["event"] == "state"] == ["PENDING", "ACTIVE", "SUCCEEDED"]
     assert_told_in_order(scripted)  # to a client that reads
 
 
@@ -143,13 +143,13 @@ def test_lists_that_nobody_reads_take_no_more_memory_than_what_may_wait_of_them(
     with talk.connect() as wire, contextlib.ExitStack() as stack:
         wire.send_raw(line(request="pause") + line(request="say", text="length=0") * count)
         assert wire.request("cancel")["count"] == count
-        ids = [each["canceled"]["id"] for each in wire.items if "canceled" in each]
+        ids = [item["canceled"]["id"] for item in wire.items if "canceled" in item]
         before = peak_memory(talk.pid)
         raws = [stack.enter_context(Raw(talk.socket)) for _ in range(clients)]
-        for each in raws:
-            each.send(line(request=asked, ids=ids))
-        for each in raws:
-            each.socket.recv(4_096, socket.MSG_WAITALL)  # its list has begun
+        for raw in raws:
+            raw.send(line(request=asked, ids=ids))
+        for raw in raws:
+            raw.socket.recv(4_096, socket.MSG_WAITALL)  # its list has begun
         assert wire.request("status")["ok"]
         grown = (peak_memory(talk.pid) - before) / 1024
     # A quarter of a megabyte waits for each client, and at most half a megabyte while it is sent.
@@ -171,8 +171,8 @@ def test_slow_clients_are_closed_by_the_limits(make_talk: MakeTalk, tmp_path: pa
         raws = [stack.enter_context(Raw(talk.socket)) for _ in range(100)]
         silent, begun, idle, waiting, tls, *dripping = raws
         dripping_later = dripping[:45]
-        for each in (begun, idle, waiting, *dripping_later):
-            each.send(HELLO)
+        for raw in (begun, idle, waiting, *dripping_later):
+            raw.send(HELLO)
         begun.send(b'{"request": "sa')
         waiting.send(b'{"request": "say", "text": "never-ends", "wait": true}\n')
         tls.send(b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(range(11, 255)))
@@ -180,18 +180,18 @@ def test_slow_clients_are_closed_by_the_limits(make_talk: MakeTalk, tmp_path: pa
         times = stack.enter_context(others_served(talk))
         while time.monotonic() < began + 1.2 * line or len(closed) < len(raws) - 2:
             assert time.monotonic() < began + line + 2 * LATE, "they are not closed"
-            for each in dripping:
-                each.send(b"x")
+            for raw in dripping:
+                raw.send(b"x")
             _collect(raws, closed, began, share)
         assert_within(max(times), 1, "status for another client")
         for limit, clients in ((first, (silent, tls, *dripping[45:])), (line, (begun, *dripping_later))):
-            for each in clients:
-                assert closed[id(each)] >= limit - 0.1
-                assert_within(closed[id(each)], limit + LATE, "the end of a slow client")
-        for each in (silent, begun, tls, *dripping):
-            assert each.lines[-1]["error"]["code"] == "too_slow"
+            for raw in clients:
+                assert closed[id(raw)] >= limit - 0.1
+                assert_within(closed[id(raw)], limit + LATE, "the end of a slow client")
+        for raw in (silent, begun, tls, *dripping):
+            assert raw.lines[-1]["error"]["code"] == "too_slow"
         assert not {id(idle), id(waiting)} & closed.keys()
-        alive = [each for each in waiting.lines if each.get("event") == "alive"]
+        alive = [message for message in waiting.lines if message.get("event") == "alive"]
         assert 1.2 * line // every <= len(alive) <= (time.monotonic() - began) / every + 1
         assert len(idle.lines) == 2  # an idle client doesn't wait
         idle.send(b'{"seq": 3, "request": "cancel"}\n')  # a connection may idle for ever
@@ -205,8 +205,8 @@ def _collect(raws: list[Raw], closed: dict[int, float], began: float, seconds: f
     """Read from all connections for so long, and record when each was closed."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
-        for each in [each for each in raws if id(each) not in closed]:
+        for raw in [raw for raw in raws if id(raw) not in closed]:
             with contextlib.suppress(TimeoutError, BlockingIOError):
-                if not each.receive(0.0):
-                    closed[id(each)] = time.monotonic() - began
+                if not raw.receive(0.0):
+                    closed[id(raw)] = time.monotonic() - began
         time.sleep(0.02)

@@ -39,8 +39,8 @@ def assert_rejected(goal: Message, reason: str, *words: str) -> None:
     """Assert that a goal was REJECTED for that reason, with these words in its message."""
     assert (goal["state"], goal["reason"]) == ("REJECTED", reason), goal
     assert goal["message"].startswith("not spoken: "), goal
-    for each in words:
-        assert each in goal["message"], goal
+    for word in words:
+        assert word in goal["message"], goal
 
 
 def assert_recalled(talk: Talk, goal_id: str, reason: str, by: str | None = None) -> None:
@@ -57,54 +57,54 @@ def assert_told_in_order(talk: Talk) -> None:
     """Assert the order of section 9 of all goals that there were; all of them must have ended."""
     await_ends(talk, talk.watcher.goals())
     events = talk.watcher.events()
-    numbers = [each["n"] for each in events]
+    numbers = [event["n"] for event in events]
     assert numbers == list(range(1, len(events) + 1)), "events are missing"
     goals: dict[str, list[Message]] = {}
-    for each in events:
-        if each.get("id") is not None:
-            goals.setdefault(each["id"], []).append(each)
+    for event in events:
+        if event.get("id") is not None:
+            goals.setdefault(event["id"], []).append(event)
     for own in goals.values():
-        _check_goal([each for each in own if each["event"] != "paused"])
+        _check_goal([event for event in own if event["event"] != "paused"])
     _check_one_at_a_time(events)
     _check_newcomers(events)
 
 
 def _check_goal(events: list[Message]) -> None:
     """One goal: its states are one of the ways, its words are between ACTIVE and its end."""
-    told = [each.get("state", "word") for each in events]
-    states = [each for each in told if each != "word"]
+    told = [event.get("state", "word") for event in events]
+    states = [state for state in told if state != "word"]
     assert states in WAYS, events
     assert told[0] != "word" != told[-1], told
     assert "word" not in told or told.index("word") > told.index("ACTIVE"), told
-    for each in (each for each in events if each["event"] == "state"):
-        with_goal = each["state"] == "PENDING" or each["state"] in TERMINAL
-        assert ("goal" in each) == with_goal, each
-        assert not with_goal or (each["goal"]["id"], each["goal"]["state"]) == (each["id"], each["state"]), each
-    words = [each["number"] for each in events if each["event"] == "word"]
+    for event in (event for event in events if event["event"] == "state"):
+        with_goal = event["state"] == "PENDING" or event["state"] in TERMINAL
+        assert ("goal" in event) == with_goal, event
+        assert not with_goal or (event["goal"]["id"], event["goal"]["state"]) == (event["id"], event["state"]), event
+    words = [event["number"] for event in events if event["event"] == "word"]
     assert words == sorted(set(words)), words
 
 
 def _check_one_at_a_time(events: Iterable[Message]) -> None:
     """No goal becomes ACTIVE before the one before it has ended."""
     active = None
-    for each in events:
-        if each.get("state") == "ACTIVE":
-            assert active is None, f"{each['id']} became ACTIVE while {active} was"
-            active = each["id"]
-        elif each.get("state") in TERMINAL and each["id"] == active:
+    for event in events:
+        if event.get("state") == "ACTIVE":
+            assert active is None, f"{event['id']} became ACTIVE while {active} was"
+            active = event["id"]
+        elif event.get("state") in TERMINAL and event["id"] == active:
             active = None
 
 
 def _check_newcomers(events: Iterable[Message]) -> None:
     """A goal that another one replaced, preempted or displaced: told between that one's PENDING and its ACTIVE."""
     seen: dict[str, str] = {}
-    for each in events:
-        if each["event"] != "state":
+    for event in events:
+        if event["event"] != "state":
             continue
-        seen[each["id"]] = each["state"]
-        newcomer = (each.get("goal", {}).get("by") or {}).get("goal")
-        if newcomer is not None and each["state"] in {"RECALLED", "PREEMPTED"}:
-            told = f"{each['id']} ended by {newcomer}, which was {seen.get(newcomer)}"
+        seen[event["id"]] = event["state"]
+        newcomer = (event.get("goal", {}).get("by") or {}).get("goal")
+        if newcomer is not None and event["state"] in {"RECALLED", "PREEMPTED"}:
+            told = f"{event['id']} ended by {newcomer}, which was {seen.get(newcomer)}"
             # One that was stopped may end long after the newcomer was recalled in its turn.
-            allowed = {"PENDING"} if each["state"] == "RECALLED" else {"PENDING", "RECALLED"}
+            allowed = {"PENDING"} if event["state"] == "RECALLED" else {"PENDING", "RECALLED"}
             assert seen.get(newcomer) in allowed, told

@@ -78,15 +78,18 @@ class Joe:
         return serve_with_voice(make_talk, REAL_VOICE, "--rate", str(rate), *options, sink=sink, env=env)
 
     def render(self, sentences: Sequence[str | Sentence], rate: int = QUICK) -> list[Samples]:
-        return [self._rendered(each if isinstance(each, Sentence) else Sentence(each, rate)) for each in sentences]
+        return [
+            self._rendered(sentence if isinstance(sentence, Sentence) else Sentence(sentence, rate))
+            for sentence in sentences
+        ]
 
     def render_with_words(self, sentence: Sentence) -> Rendering:
         """Return the samples with the words at the places that a speech recognizer hears, behind a pause."""
         samples = self._rendered(sentence)
         words = WORD.finditer(sentence.text.lower())
         heard = align(samples, sentence.text)
-        ends = [*(each.begin for each in heard[1:]), len(samples) / RATE]
-        begins = [_behind_a_pause(samples, each.begin, end) for each, end in zip(heard, ends, strict=True)]
+        ends = [*(word.begin for word in heard[1:]), len(samples) / RATE]
+        begins = [_behind_a_pause(samples, word.begin, end) for word, end in zip(heard, ends, strict=True)]
         return Rendering(samples, tuple((*at.span(), begin) for at, begin in zip(words, begins, strict=True)))
 
     @property

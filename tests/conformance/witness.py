@@ -22,15 +22,15 @@ def ends(talk: Talk, *goal_ids: str) -> list[int]:
     """Return how many terminal states each of these goals has had, which have ended."""
     await_ends(talk, goal_ids)
     counts = talk.watcher.terminal_counts()
-    return [counts[each] for each in goal_ids]
+    return [counts[goal_id] for goal_id in goal_ids]
 
 
 def await_ends(talk: Talk, goal_ids: Iterable[str]) -> None:
     """Wait until these goals have ended, if they were accepted; a thousand that have are seen at one look."""
-    told = {(each.get("id"), each.get("state")) for each in talk.watcher.events()}
+    told = {(event.get("id"), event.get("state")) for event in talk.watcher.events()}
     ended = {goal_id for goal_id, state in told if state in TERMINAL - {"REJECTED"}}
     rejected = {goal_id for goal_id, state in told if state == "REJECTED" and (goal_id, "PENDING") not in told}
     done = ended | rejected
-    for each in goal_ids:
-        if each not in done:
-            talk.watcher.wait_for_terminal(each)
+    for goal_id in goal_ids:
+        if goal_id not in done:
+            talk.watcher.wait_for_terminal(goal_id)

@@ -82,7 +82,7 @@ def heard_again(talk: Talk, sink: Sink) -> float:
     heard, expected = recording.samples[start:], render_quick([HELP])[0]
     found = extent(heard)
     assert found
-    seconds, usual = (np.count_nonzero(each) / RATE for each in (heard, expected))
+    seconds, usual = (np.count_nonzero(samples) / RATE for samples in (heard, expected))
     assert abs(seconds - usual) < ALIKE, (seconds, usual)
     return recording.time_of(start + found[0])
 

@@ -30,8 +30,8 @@ class Supervisor(contextlib.AbstractContextManager["Supervisor"]):
         """Return the time of a message of this name that came after a time."""
         end = time.monotonic() + PATIENCE
         while True:
-            for each, value, at in self.told:
-                if each == name and containing in value and at > since:
+            for sent, value, at in self.told:
+                if sent == name and containing in value and at > since:
                     return at
             assert self.hear(end - time.monotonic()), f"{name} {containing!r} was never told: {self.told}"
 

@@ -43,13 +43,13 @@ _CROWD = """
 import socket, sys
 path, count, line = sys.argv[1], int(sys.argv[2]), sys.argv[3].encode()
 crowd = [socket.socket(socket.AF_UNIX) for _ in range(count)]
-for each in crowd:
-    each.connect(path)
-    each.sendall(line + b"\\n")
-for each in crowd:
+for client in crowd:
+    client.connect(path)
+    client.sendall(line + b"\\n")
+for client in crowd:
     received = b""
     while received.count(b"\\n") < 2:
-        received += each.recv(4096) or sys.exit("closed: " + received.decode())
+        received += client.recv(4096) or sys.exit("closed: " + received.decode())
 print("ready", flush=True)
 sys.stdin.read()
 """
@@ -85,15 +85,15 @@ def test_300_clients_at_once_are_served_or_told_that_the_server_is_busy(
 ) -> None:
     with contextlib.ExitStack() as stack:
         clients = [stack.enter_context(Raw(scripted.socket)) for _ in range(300)]
-        for each in clients:
-            each.send(b'{"seq": 1, "request": "hello"}\n')
-        lines = [each.receive_lines(1) for each in clients]
+        for client in clients:
+            client.send(b'{"seq": 1, "request": "hello"}\n')
+        lines = [client.receive_lines(1) for client in clients]
         greeted = [client for client, said in zip(clients, lines, strict=True) if "error" not in said[0]]
         busy = [said[0] for said in lines if "error" in said[0]]
         # The watcher of this test is one client of 256.
         assert (len(greeted), len(busy)) == (255, 45)
-        assert all((each["talk"], each["error"]) == (1, "busy") for each in busy)
-        assert all(each.receive_lines(2)[1] == {"seq": 1, "ok": True} for each in greeted)
+        assert all((greeting["talk"], greeting["error"]) == (1, "busy") for greeting in busy)
+        assert all(client.receive_lines(2)[1] == {"seq": 1, "ok": True} for client in greeted)
         full = scripted.run("--json", "say", "--wait", *patience, "length=0")
         assert (full.code, json.loads(full.err)["error"]["code"]) == (5, "busy")
         assert scripted.run("status").code == 0  # places are kept for `status` and `cancel`
@@ -127,17 +127,17 @@ def test_500_say_processes_at_once(make_talk: MakeTalk, processes: int, max_queu
     talk = make_talk("--max-queue", str(max_queue), scripted=True)
     first = talk.run("say", "never-ends").id
     clients = [talk.start("say", "--", f"length=0 number {number}") for number in range(processes)]
-    done = [talk.finish(each, timeout=120) for each in clients]
-    accepted = [each.id for each in done if each.code == 0]
-    assert {each.code for each in done} == ({0} if max_queue == 1000 else {0, 5}), [each.err for each in done]
+    done = [talk.finish(client, timeout=120) for client in clients]
+    accepted = [client.id for client in done if client.code == 0]
+    assert {client.code for client in done} == ({0} if max_queue == 1000 else {0, 5}), [client.err for client in done]
     assert len(accepted) == min(processes, max_queue)
     assert len(set(accepted)) == len(accepted)
     for client in done:
         assert client.code == 0 or f"the queue is full ({max_queue} goals)" in client.err
     talk.run("cancel", first)
-    for each in accepted:
-        assert talk.watcher.wait_for_terminal(each, timeout=30) == "SUCCEEDED"
-    spoken = [each["id"] for each in talk.watcher.events() if each.get("state") == "SUCCEEDED"]
+    for goal_id in accepted:
+        assert talk.watcher.wait_for_terminal(goal_id, timeout=30) == "SUCCEEDED"
+    spoken = [event["id"] for event in talk.watcher.events() if event.get("state") == "SUCCEEDED"]
     assert sorted(spoken) == sorted(accepted)
 
 
@@ -186,10 +186,10 @@ def test_500_waiters_that_are_killed_leave_nothing_and_their_goal_goes_on(make_t
     for _ in range(2):
         with contextlib.ExitStack() as stack:
             crowds = [stack.enter_context(crowd(talk, 50, line)) for _ in range(10)]
-            assert usage.count(talk.pid).descriptors >= 500
-            for each in crowds:
-                os.kill(each.pid, signal.SIGKILL)
-        usage.assert_not_grown(talk.pid, before, memory=8 * 1024)
+            assert census.count(talk.pid).descriptors >= 500
+            for process in crowds:
+                os.kill(process.pid, signal.SIGKILL)
+        census.assert_as_before(talk.pid, before, memory=8 * 1024)
     assert talk.goal(goal)["state"] == "ACTIVE"
     began = time.monotonic()
     assert talk.run("cancel", goal).code == 0
@@ -266,11 +266,11 @@ def receive(client: socket.SocketIO) -> dict[str, Any]:
 def greeted(clients: list[socket.SocketIO]) -> list[socket.SocketIO]:
     """Return the clients that were let in; the others must have been told that descriptors are missing."""
     inside = []
-    for each in clients:
-        greeting = receive(each)
+    for client in clients:
+        greeting = receive(client)
         if "boot" in greeting:
-            each.write(b'{"request": "hello"}\n')
-            inside.append(each)
+            client.write(b'{"request": "hello"}\n')
+            inside.append(client)
         else:
             assert greeting["error"] == "busy"
             assert "LimitNOFILE" in greeting["message"]
@@ -307,8 +307,8 @@ def test_limit_of_40_and_60_clients_leave_the_engine_what_it_needs(home: str) ->
             with processes.start_talk(["say", "--wait", "late"], env) as late:
                 time.sleep(0.5)
                 assert late.poll() is None
-                for each in inside[1:]:
-                    each.close()
+                for client in inside[1:]:
+                    client.close()
                 assert late.wait(SOON) == 0
         wait_for_descriptors(pid, before)
         with connected(path) as clients:
@@ -325,7 +325,7 @@ def test_limit_of_40_and_60_clients_leave_the_engine_what_it_needs(home: str) ->
         wait_for_descriptors(pid, before)
         assert run([*TALK, "say", "--wait", "hello"], env).code == 0
         lines = server.log.splitlines()
-        about = [each for each in lines if "files may be open" in each or "Traceback" in each or "bug" in each]
+        about = [line for line in lines if "files may be open" in line or "Traceback" in line or "bug" in line]
         assert len(about) <= 2, server.log  # at the start, and once for all that were turned away
         assert len(lines) < 12, server.log
 

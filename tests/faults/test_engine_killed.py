@@ -66,8 +66,8 @@ RATE = 450
 
 @pytest.mark.parametrize(
     ("activity", "number"),
-    [*ALWAYS, *(pytest.param(*each, marks=pytest.mark.slow) for each in ALL if each not in ALWAYS)],
-    ids=lambda each: each if isinstance(each, str) else signal.Signals(each).name,
+    [*ALWAYS, *(pytest.param(*case, marks=pytest.mark.slow) for case in ALL if case not in ALWAYS)],
+    ids=lambda value: value if isinstance(value, str) else signal.Signals(value).name,
 )
 def test_engine_process_is_signalled(make_talk: MakeTalk, sink: Sink, activity: str, number: signal.Signals) -> None:
     with limits():

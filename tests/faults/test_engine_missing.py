@@ -98,7 +98,7 @@ def _await_attempts(path: Path, count: int) -> list[float]:
     while len(times := path.read_text(encoding="utf-8").splitlines()) < count:
         assert time.monotonic() < end, times
         time.sleep(0.01)  # the attempts of another process send no event
-    return [float(each) for each in times]
+    return [float(line) for line in times]
 
 
 def _assert_aborted_at_once(talk: Talk, words: str) -> float:
@@ -109,8 +109,8 @@ def _assert_aborted_at_once(talk: Talk, words: str) -> float:
     asked = time.monotonic()
     goal_id = send(talk, LOW)
     ended = talk.watcher.arrived(talk.watcher.wait_for(goal_id, "ABORTED"))
-    for each in (done.id, goal_id):
-        goal = talk.goal(each)
+    for ended_id in (done.id, goal_id):
+        goal = talk.goal(ended_id)
         assert_aborted(goal, "engine_failed", words)
         assert goal["spoken"] == ""
     return ended - asked
@@ -152,8 +152,8 @@ def _replaced(talk: Talk, engine: int, number: signal.Signals = signal.SIGKILL) 
 
 
 def _ends(talk: Talk, goals: list[str]) -> list[tuple[str, str | None]]:
-    for each in goals:
-        talk.watcher.wait_for_terminal(each)
+    for goal_id in goals:
+        talk.watcher.wait_for_terminal(goal_id)
     return [(goal["state"], goal["reason"]) for goal in map(talk.goal, goals)]
 
 
@@ -176,7 +176,9 @@ def test_a_moment_without_descriptors_costs_the_goal_whose_engine_was_killed_and
             assert talk.watcher.wait_for_terminal(first) == "ABORTED"
             _await_engine(wire, "the engine process could not be started: Too many open files")
             assert talk.watcher.wait_for_terminal(brief) == "RECALLED"  # a goal that waits for an engine has its time
-            assert [wire.request("status", id=each)["goal"]["state"] for each in goals] == ["PENDING"] * len(goals)
+            assert [wire.request("status", id=goal_id)["goal"]["state"] for goal_id in goals] == ["PENDING"] * len(
+                goals
+            )
         assert _ends(talk, goals) == [("SUCCEEDED", None)] * len(goals)
     assert (talk.goal(first)["reason"], talk.goal(brief)["reason"]) == ("engine_crashed", "expired")
     assert talk.log.count("could not be started") == 1, talk.log
@@ -233,7 +235,7 @@ def test_an_engine_that_does_not_come_for_long_costs_a_goal_each_time_it_is_trie
     assert waited >= 0.4, "it is waited for first"
     ends = _ends(talk, goals)
     assert (ends[:2], ends[-1]) == ([("ABORTED", "engine_failed")] * 2, ("SUCCEEDED", None))
-    times = [talk.goal(each)["ended_at"] for each in goals[:2]]
+    times = [talk.goal(goal_id)["ended_at"] for goal_id in goals[:2]]
     assert times[1] - times[0] >= 0.09, "one goal for one start"
     assert "the engine crashed: it was killed by SIGSEGV" in talk.goal(goals[0])["message"]
 

@@ -95,7 +95,7 @@ def _loaded(server: Server, name: str) -> Iterator[str]:
     try:
         yield module
     finally:
-        if module in {each.split("\t")[0] for each in server.pactl("list", "short", "modules").splitlines()}:
+        if module in {line.split("\t")[0] for line in server.pactl("list", "short", "modules").splitlines()}:
             server.pactl("unload-module", module)
 
 
@@ -109,8 +109,8 @@ def _make_default(server: Server, name: str) -> None:
 
 def _move(server: Server, name: str) -> None:
     """Move the only stream to this sink. A session manager takes its time, and a busy one may miss the request."""
-    sinks = [each.split("\t")[:2] for each in server.pactl("list", "short", "sinks").splitlines()]
-    (wanted,) = [number for number, each in sinks if each == name]
+    sinks = [line.split("\t")[:2] for line in server.pactl("list", "short", "sinks").splitlines()]
+    (wanted,) = [number for number, sink_name in sinks if sink_name == name]
     asked = 0.0
     while True:
         (stream,) = server.pactl("list", "short", "sink-inputs").splitlines()
@@ -217,7 +217,7 @@ def test_a_muted_sentence_is_told_and_not_begun_if_it_must_be_audible(
     assert (done.code, goal["state"], goal["message"]) == (0, "SUCCEEDED", words)
     assert goal["output"]["muted"] is True
     assert done.err == f"talk: {done.id}: {words}\n"
-    assert any(re.search(rf'"{LOW}" +muted$', each) for each in talk.run("status").out.splitlines())
+    assert any(re.search(rf'"{LOW}" +muted$', line) for line in talk.run("status").out.splitlines())
     assert f"output   {card.name}, by pulse, volume " in talk.run("status", done.id).out
     done = talk.run("say", "--wait", "--audible", "--", LOW)
     goal = talk.goal(done.id)
@@ -251,8 +251,8 @@ def test_a_server_that_takes_no_more_clients_ends_the_sentence_in_words(make_tal
     talk = make_talk("--player", "pulse", "--rate", "450", env=server.env)
     with contextlib.ExitStack() as crowd:
         for _ in range(CLIENTS):
-            each = crowd.enter_context(socket.socket(socket.AF_UNIX))
-            each.connect(server.socket)
+            client = crowd.enter_context(socket.socket(socket.AF_UNIX))
+            client.connect(server.socket)
         done = talk.run("say", "--wait", "--", LOW)
         assert_aborted(talk.goal(done.id), "audio_device", "the sound server rejected the connection")
     assert talk.run("say", "--wait", "--", LOW).code == 0

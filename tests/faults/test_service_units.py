@@ -62,7 +62,7 @@ def values(unit: str, name: str) -> list[str]:
 def command_of(unit: str) -> list[str]:
     """Return the command that systemd would run: its quotes are a shell's, its other signs are doubled."""
     (line,) = values(unit, "ExecStart")
-    return [each.replace("%%", "%").replace("$$", "$") for each in shlex.split(line)]
+    return [word.replace("%%", "%").replace("$$", "$") for word in shlex.split(line)]
 
 
 def passing(passed: socket.socket, *words: str) -> list[str]:
@@ -89,9 +89,9 @@ def test_unit_says_where_it_goes_and_how_to_enable_it_and_systemd_finds_nothing_
     folder = "/etc/systemd/system" if name.startswith("system") else "~/.config/systemd/user"
     head = unit.partition("\n[Unit]\n")[0].splitlines()
     assert head[0].startswith(f"# {folder}/talk.{kind}: ")
-    assert any(f"talk serve --print-unit {name} " in each for each in head)
-    assert any("daemon-reload" in each and "enable --now" in each for each in head)
-    assert all(each.startswith("#") and len(each) <= 120 for each in head)
+    assert any(f"talk serve --print-unit {name} " in line for line in head)
+    assert any("daemon-reload" in line and "enable --now" in line for line in head)
+    assert all(line.startswith("#") and len(line) <= 120 for line in head)
     assert "\n[Install]\nWantedBy=" in unit
     assert unit.endswith("\n")
     service = printed(home, name.removesuffix("-socket"))
@@ -430,7 +430,7 @@ def test_engine_and_player_know_nothing_of_the_supervisor(make_talk: MakeTalk, h
         talk.run("say", "--wait", "hello")
         inherited = {line.partition("=")[0] for line in seen.read_text().splitlines()}
         assert "PATH" in inherited
-        assert not [each for each in inherited if each.startswith(("NOTIFY_", "WATCHDOG_", "LISTEN_"))]
+        assert not [name for name in inherited if name.startswith(("NOTIFY_", "WATCHDOG_", "LISTEN_"))]
 
 
 def test_server_that_cannot_start_never_says_that_it_is_ready(home: str) -> None:

@@ -79,7 +79,7 @@ def test_socket_file_is_checked_at_least_every_15_seconds() -> None:
 @pytest.mark.parametrize(
     "fault",
     [os.unlink, unlink_both, remove_directory, replace_by_stale_socket, move_directory],
-    ids=lambda each: str(each.__name__),
+    ids=lambda fault: str(fault.__name__),
 )
 def test_socket_that_was_removed_or_replaced_is_bound_again(home: str, fault: Callable[[str], None]) -> None:
     path = f"{home}/talk/s"
@@ -164,8 +164,8 @@ def test_server_whose_place_another_one_took_ends_for_its_supervisor(home: str) 
             found_again(path, second.process.pid)  # which lost nothing
 
 
-def any_ended(*each: Process) -> bool:
-    return any(process.poll() is not None for process in each)
+def any_ended(*processes: Process) -> bool:
+    return any(process.poll() is not None for process in processes)
 
 
 def test_two_servers_whose_files_were_removed_together_are_one_in_the_end(home: str) -> None:
@@ -180,8 +180,8 @@ def test_two_servers_whose_files_were_removed_together_are_one_in_the_end(home: 
                 os.kill(first.process.pid, signal.SIGCONT)
                 both = (first.process, second.process)
                 await_true(functools.partial(any_ended, *both))
-                assert sorted([each.poll() for each in both], key=str) == [11, None]
-                found_again(path, next(each.pid for each in both if each.poll() is None))
+                assert sorted([server.poll() for server in both], key=str) == [11, None]
+                found_again(path, next(server.pid for server in both if server.poll() is None))
 
 
 def test_program_that_listens_in_its_place_keeps_its_socket(home: str) -> None:
@@ -290,7 +290,7 @@ def open_to_all(home: str) -> None:
 
 @pytest.mark.usefixtures("_as_tmp")
 @pytest.mark.parametrize(
-    "fault", [dangling_link, link, link_inside, open_to_all, open_inside], ids=lambda each: str(each.__name__)
+    "fault", [dangling_link, link, link_inside, open_to_all, open_inside], ids=lambda fault: str(fault.__name__)
 )
 def test_place_that_somebody_prepared_is_refused_with_the_reason(home: str, fault: Callable[[str], None]) -> None:
     fault(home)

@@ -222,7 +222,7 @@ BROKEN = {
 }
 #: The slowest of the players. The others are tested side by side, as the engine waits for some until a limit.
 LONGEST = "never reads"
-OTHERS = [each for each in BROKEN if each != LONGEST]
+OTHERS = [fault for fault in BROKEN if fault != LONGEST]
 
 
 @pytest.mark.parametrize("whats", [OTHERS, pytest.param([LONGEST], marks=pytest.mark.slow)], ids=" and ".join)
@@ -230,8 +230,8 @@ def test_player_is_broken(make_talk: MakeTalk, sink: Sink, tmp_path: Path, whats
     program = {what: _script(tmp_path / what.replace(" ", "-"), BROKEN[what][0]) for what in whats}
 
     with limits(), contextlib.ExitStack() as idle:
-        for each in program.values():
-            (each.parent / "broken").touch()
+        for path in program.values():
+            (path.parent / "broken").touch()
         talks = {what: make_talk("--player", str(program[what]), sink=sink) for what in whats}
         for talk in talks.values():
             idle.enter_context(nothing_left(talk))

@@ -108,7 +108,7 @@ def test_no_directory_or_a_read_only_one_for_the_socket_is_a_clear_error(home: s
 
 @pytest.mark.parametrize(
     "missing",
-    [VARIABLES, *(pytest.param((each,), marks=pytest.mark.slow) for each in VARIABLES if each != "HOME"), "/proc", ""],
+    [VARIABLES, *(pytest.param((name,), marks=pytest.mark.slow) for name in VARIABLES if name != "HOME"), "/proc", ""],
     ids=str,
 )
 def test_speech_goes_on_without_a_variable_or_with_a_home_that_is_not_there(

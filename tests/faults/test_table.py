@@ -18,7 +18,7 @@ _HEAD = re.compile(r"\| (---|fault|it covers|line|text) \|")
 @functools.cache
 def functions(path: Path) -> set[str]:
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    return {each.name for each in ast.walk(tree) if isinstance(each, ast.FunctionDef)}
+    return {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
 
 
 @pytest.mark.parametrize("folder", ["tests/faults", "tests/fleet"])
@@ -37,11 +37,11 @@ def test_every_row_names_tests_that_exist(folder: str) -> None:
 
 def test_each_module_of_faults_is_named_in_a_row() -> None:
     rows = "\n".join(_rows("tests/faults"))
-    modules = {each.name for each in Path(__file__).parent.glob("test_*.py")}
+    modules = {path.name for path in Path(__file__).parent.glob("test_*.py")}
     # Units for systemd and this table are no faults.
-    assert {each for each in modules if f"`{each}" not in rows} == {"test_service_units.py", "test_table.py"}
+    assert {module for module in modules if f"`{module}" not in rows} == {"test_service_units.py", "test_table.py"}
 
 
 def _rows(folder: str) -> list[str]:
     lines = (ROOT / folder / "README.md").read_text(encoding="utf-8").splitlines()
-    return [each for each in lines if each.startswith("| ") and not _HEAD.match(each)]
+    return [line for line in lines if line.startswith("| ") and not _HEAD.match(line)]

@@ -118,7 +118,7 @@ def _every_character(common: bool) -> Iterator[str]:
     found = [
         chr(code)
         for code in range(1, sys.maxunicode + 1)
-        if unicodedata.category(chr(code)) not in {"Cn", "Co", "Cs"} and common != any(code in each for each in large)
+        if unicodedata.category(chr(code)) not in {"Cn", "Co", "Cs"} and common != any(code in block for block in large)
     ]
     found = found[:: _FEW if common else _FEWER]
     texts = ("".join(found[at : at + _MANY]) for at in range(0, len(found), _MANY))
@@ -142,7 +142,7 @@ def test_numbers_of_any_length_are_said(voice: str) -> None:
     chance = random.Random(voice)
     numbers = ["".join(chance.choices("1234567890", k=digits)) for digits in range(1, 21)]
     numbers += ["1111111111111", "1,111,111,111,111"]
-    tally = speak_all([Case(voice, each) for each in numbers], guarded=True)
+    tally = speak_all([Case(voice, number) for number in numbers], guarded=True)
     assert (tally.texts, tally.deaths, tally.faults) == (len(numbers), [], [])
     assert set(tally.outcomes) == {"completed"}
 
@@ -154,12 +154,12 @@ def test_the_longest_words_and_writing_from_right_to_left_are_spoken_whole(tmp_p
 
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize(
-    "names", [_SOON, *(pytest.param([each], marks=pytest.mark.slow) for each in ENDLESS if each not in _SOON)]
+    "names", [_SOON, *(pytest.param([name], marks=pytest.mark.slow) for name in ENDLESS if name not in _SOON)]
 )
 def test_thousands_of_characters_of_one_kind_end(names: list[str]) -> None:
-    texts = [ENDLESS[each] for each in names]
-    assert [bad_text(each) for each in texts] == [None] * len(texts)
-    tally = speak_all([Case("gmw/en", each) for each in [*texts, LOW]], guarded=True)
+    texts = [ENDLESS[name] for name in names]
+    assert [bad_text(text) for text in texts] == [None] * len(texts)
+    tally = speak_all([Case("gmw/en", text) for text in [*texts, LOW]], guarded=True)
     assert (tally.texts, tally.deaths, tally.faults) == (len(texts) + 1, [], [])
     assert set(tally.outcomes) <= {"completed", "nothing_to_say"}
 
@@ -209,7 +209,7 @@ def test_terminal_escapes_in_texts_ids_keys_and_names_are_shown_escaped(scripted
     shown = [scripted.run(*words) for words in commands]
     scripted.stop()
     out, err = watch.communicate(timeout=10)
-    for text in [out, err, scripted.log, failed.err, own.err, *(each.out + each.err for each in shown)]:
+    for text in [out, err, scripted.log, failed.err, own.err, *(command.out + command.err for command in shown)]:
         assert not re.search("[\x00-\x09\x0b-\x1f\x7f-\x9f\u202a-\u202e]", text), ascii(text)
         assert "\nfake line" not in text
     assert r"\x1b[31mred\x07\x9b2J\u202egnp.exe\r\nfake line" in out
@@ -241,7 +241,7 @@ def test_a_crashing_text_in_the_middle_of_ten_goals(make_talk: MakeTalk, sink: S
             states.append(await_end(talk, goal, PATIENCE))
     assert states == ["SUCCEEDED"] * 5 + ["ABORTED"] + ["SUCCEEDED"] * 4
     assert talk.watcher.states(goals[5]) == ["PENDING", "ACTIVE", "ABORTED"]  # never tried again
-    assert [each["id"] for each in talk.watcher.events() if each.get("state") == "ACTIVE"] == goals
+    assert [event["id"] for event in talk.watcher.events() if event.get("state") == "ACTIVE"] == goals
     assert_aborted(talk.goal(goals[5]), "engine_crashed", "SIG")
     talk.recording.wait_until_quiet(0.2)
     # Spoken by two processes, of which the second begins anew: the goals before the crash, and those after it.
@@ -275,7 +275,7 @@ def test_crash_loop_of_100_texts(make_talk: MakeTalk, sink: Sink, texts: int) ->
 
 
 @pytest.mark.parametrize(
-    "voice", ["gmw/en", *(pytest.param(each, marks=pytest.mark.slow) for each in ("gmq/da", "zls/mk", "aav/vi"))]
+    "voice", ["gmw/en", *(pytest.param(voice, marks=pytest.mark.slow) for voice in ("gmq/da", "zls/mk", "aav/vi"))]
 )
 def test_with_the_guard_known_crashing_texts_are_spoken(voice: str) -> None:
     texts = [
@@ -291,6 +291,6 @@ def test_with_the_guard_known_crashing_texts_are_spoken(voice: str) -> None:
 
 
 def test_text_that_crashes_only_a_few_voices_is_spoken_by_all_of_them() -> None:
-    voices = [each for each in list_voices() if each.split("/")[0] in {"gmq", "aav", "inc", "dra"}]
+    voices = [voice for voice in list_voices() if voice.split("/")[0] in {"gmq", "aav", "inc", "dra"}]
     tally = speak_all([Case(voice, text) for voice in voices for text in ("'-o", ".-す", "…-o x")], guarded=True)
     assert (tally.deaths, tally.faults) == ([], [])

@@ -124,14 +124,14 @@ def test_members_of_the_group_are_let_in_by_the_socket_s_mode_and_others_are_not
         wire.receive_event("state", state="ACTIVE")
         pending = wire.request("say", text="waits")["goal"]
         told = replies(stranger(path, {"seq": 1, "request": "cancel"}, groups=[GROUP]))
-        assert {each["canceled"]["id"] for each in told if "canceled" in each} == {goal["id"], pending["id"]}
+        assert {message["canceled"]["id"] for message in told if "canceled" in message} == {goal["id"], pending["id"]}
         ended = wire.receive_event("result")["goal"]
         assert (ended["state"], ended["by"]["client"]["uid"]) == ("PREEMPTED", NOBODY)
         others: list[dict[str, object]] = [{"request": "pause"}, {"request": "resume"}, {"request": "set", "rate": 150}]
-        told = replies(stranger(path, *({"seq": 1, **each} for each in others), groups=[GROUP]))
-        assert [each["ok"] for each in told if "ok" in each] == [True] * 3
+        told = replies(stranger(path, *({"seq": 1, **request} for request in others), groups=[GROUP]))
+        assert [message["ok"] for message in told if "ok" in message] == [True] * 3
         assert server.end(signal.SIGTERM) == 0
-    line = next(each for each in server.log.splitlines() if f"{goal['id']} PREEMPTED" in each)
+    line = next(line for line in server.log.splitlines() if f"{goal['id']} PREEMPTED" in line)
     assert f"(canceled by uid {NOBODY}, pid " in line
 
 
