@@ -24,11 +24,11 @@ def joe(tmp_path_factory: pytest.TempPathFactory) -> Joe:
     place.chmod(0o755)
     path = real_voice()
     link_without_noise(path, place)
-    beside = place / f"{path.name}.json"
-    told = json.loads(beside.read_text())
-    numbers = told["phoneme_id_map"]
+    config_path = place / f"{path.name}.json"
+    config = json.loads(config_path.read_text())
+    numbers = config["phoneme_id_map"]
     numbers["^"] += [*numbers["_"], *numbers[","]]
-    beside.write_text(json.dumps(told))
+    config_path.write_text(json.dumps(config))
     return Joe(str(place), str(tmp_path_factory.mktemp("cache")))
 
 
@@ -40,5 +40,5 @@ def voice(request: pytest.FixtureRequest) -> Voice:
     """
     if request.param == "espeak":
         return ESPEAK
-    found: Joe = request.getfixturevalue("joe")
-    return found
+    joe_voice: Joe = request.getfixturevalue("joe")
+    return joe_voice

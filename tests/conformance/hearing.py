@@ -105,9 +105,9 @@ def player_process(talk: Talk) -> int:
     return _only_child(lambda: engine_process(talk), "player")
 
 
-def _only_child(parent: Callable[[], int], what: str) -> int:
+def _only_child(parent: Callable[[], int], name: str) -> int:
     end = time.monotonic() + _PATIENCE
-    while len(found := children(parent())) != 1:
-        assert time.monotonic() < end, f"not one {what}: {found}"
+    while len(processes := children(parent())) != 1:
+        assert time.monotonic() < end, f"not one {name}: {processes}"
         time.sleep(0.005)  # the child of a child sends no event
-    return found[0]
+    return processes[0]

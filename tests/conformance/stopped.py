@@ -88,14 +88,14 @@ def likeliest(
     may[[place for place in np.searchsorted(loud, ends) if place < len(loud)]] = True
     begins = loud[may]
     before = np.minimum(silence[may] - 1, DROPPED)
-    found = []
+    candidates = []
     for references in turns:
         first, last = extent(references[0]) or (0, 0)
         wanted = references[0][first:last]
         for begin, quiet in zip(begins.tolist(), before.tolist(), strict=True):
             same = _same(samples[begin : begin + len(wanted)], wanted)
-            found += [(same, max(0, begin - quiet), references)] if same else []
-    for _, start, references in sorted(found, key=lambda place: -place[0]):
+            candidates += [(same, max(0, begin - quiet), references)] if same else []
+    for _, start, references in sorted(candidates, key=lambda place: -place[0]):
         yield start, references
 
 
@@ -114,15 +114,15 @@ def _same(samples: Samples, wanted: Samples) -> int:
 @functools.cache
 def _render_after_stop(texts: tuple[str, ...], rate: int) -> list[list[Samples]]:
     """Return the sentences that follow the first text, for each place where it can be stopped."""
-    found: list[Samples] = []
+    sentences: list[Samples] = []
     rest = run(["-m", __name__], json.dumps([rate, *texts]), timeout=60)
     while rest:
         line, _, rest = rest.partition(b"\n")
         end = 2 * int(line)
-        found.append(np.frombuffer(rest[:end], "<i2").astype(np.int16))
+        sentences.append(np.frombuffer(rest[:end], "<i2").astype(np.int16))
         rest = rest[end:]
     count = len(texts) - 1
-    return [found[start : start + count] for start in range(0, len(found), count)]
+    return [sentences[start : start + count] for start in range(0, len(sentences), count)]
 
 
 def main() -> None:

@@ -36,7 +36,7 @@ def speaking(talk: Talk, *words: str) -> tuple[Process, str]:
 
 
 @limits()
-def test_row_07_server_that_is_killed_loses_the_goal(scripted: Talk) -> None:
+def test_row_07_clients_of_a_killed_server_report_their_goals_lost(scripted: Talk) -> None:
     sayer, goal_id = speaking(scripted, "--wait")
     behind = scripted.start("--json", "say", "--wait", "behind it")
     pending_id = scripted.watcher.wait_until(lambda event: bool(event["id"] != goal_id))["id"]
@@ -58,15 +58,15 @@ def _until_connected(wire: Wire, clients: int) -> None:
         assert time.monotonic() < end, "the clients have not connected"
 
 
-def test_row_08_timeout_holds_while_the_server_is_frozen(scripted: Talk) -> None:
+def test_row_08_a_client_times_out_while_the_server_is_frozen(scripted: Talk) -> None:
     with limits():
-        began = time.monotonic()
+        started_at = time.monotonic()
         client = scripted.start("say", "--wait", "--timeout", "2", "--", "never-ends words=1")
         goal_id = scripted.watcher.wait_for(None, "ACTIVE")["id"]
         scripted.freeze()
         try:
             done = scripted.finish(client)
-            seconds = time.monotonic() - began
+            seconds = time.monotonic() - started_at
         finally:
             scripted.thaw()
         assert done.code == 124
@@ -77,20 +77,20 @@ def test_row_08_timeout_holds_while_the_server_is_frozen(scripted: Talk) -> None
         assert_within(seconds, 2 + 1 + START, "a timeout of 2 s, and 1 s for silence")
 
 
-def test_row_10_timeout_cancels_the_goal(scripted: Talk) -> None:
+def test_row_10_a_timeout_cancels_the_goal(scripted: Talk) -> None:
     with limits():
-        began = time.time()
+        started_at = time.time()
         done = scripted.run("--json", "say", "--wait", "--timeout", "2", "length=10 words=1")
         goal = json.loads(done.out)
         assert (done.code, goal["state"], goal["reason"]) == (124, "PREEMPTED", "canceled")
         error = {"code": "timeout", "exit": 124, "message": "timed out after 2 s"}
         assert json.loads(done.err.splitlines()[-1]) == {"error": error}
-        assert goal["ended_at"] - began >= 2
-        assert_within(goal["ended_at"] - began, 2 + 0.3, "a timeout of 2 s")
+        assert goal["ended_at"] - started_at >= 2
+        assert_within(goal["ended_at"] - started_at, 2 + 0.3, "a timeout of 2 s")
         assert_within(done.seconds, 2 + START, "a client with a timeout of 2 s")
 
 
-def test_row_10_timeout_counts_the_time_in_the_queue(scripted: Talk) -> None:
+def test_row_10_a_timeout_includes_the_time_in_the_queue(scripted: Talk) -> None:
     scripted.run("say", "never-ends")
     done = scripted.run("--json", "say", "--wait", "--timeout", "0.5", "behind it")
     goal = json.loads(done.out)
@@ -102,11 +102,11 @@ def test_row_10_timeout_counts_the_time_in_the_queue(scripted: Talk) -> None:
 
 @pytest.mark.parametrize("says", [GREETING, b""], ids=["after the greeting", "before it"])
 @limits()
-def test_timeout_holds_whatever_the_server_does_not_say(says: bytes) -> None:
+def test_a_client_times_out_if_the_server_does_not_answer(says: bytes) -> None:
     with short_directory() as home, FakeServer(f"{home}/s", [says]):
-        began = time.monotonic()
+        started_at = time.monotonic()
         done = _talk(home, "say", "--wait", "--timeout", "0.5", "--", "hello")
-        seconds = time.monotonic() - began
+        seconds = time.monotonic() - started_at
     # Nothing was sent to a server that did not greet: that is no server.
     assert done.code == (124 if says else 3), done
     assert ("timed out after 0.5 s: the say request was sent" in done.err) == bool(says)
@@ -118,7 +118,7 @@ def _talk(home: str, *words: str) -> Ended:
     return run([*TALK, *words], environment(home, TALK_SOCKET=f"{home}/s"), cwd="/")
 
 
-def test_row_15_client_that_is_gone_at_once_is_spoken_for(scripted: Talk) -> None:
+def test_row_15_a_goal_is_spoken_even_if_its_client_disconnects_at_once(scripted: Talk) -> None:
     count = 20
     for number in range(count):
         with Raw(scripted.socket) as raw:
@@ -134,7 +134,7 @@ def test_row_15_client_that_is_gone_at_once_is_spoken_for(scripted: Talk) -> Non
         assert " SUCCEEDED after " in line or " ready" in line, line  # nothing about clients that are gone
 
 
-def test_row_15_client_that_is_killed_leaves_its_goal(scripted: Talk) -> None:
+def test_row_15_a_goal_is_spoken_even_if_its_client_is_killed(scripted: Talk) -> None:
     client = scripted.start("say", "--wait", "--", "length=0.5")
     goal_id = scripted.watcher.wait_for(None, "ACTIVE")["id"]
     client.kill()
@@ -142,7 +142,7 @@ def test_row_15_client_that_is_killed_leaves_its_goal(scripted: Talk) -> None:
     assert scripted.watcher.wait_for_terminal(goal_id) == "SUCCEEDED"
 
 
-def test_row_31_goal_that_ended_is_known_to_any_process(scripted: Talk) -> None:
+def test_row_31_any_process_can_get_the_result_of_an_ended_goal(scripted: Talk) -> None:
     texts = {"length=0 fine": 0, "fail=audio_lost": 4, "length=0 too": 0, "crash": 4}
     ids = [scripted.run("say", "--", text).id for text in texts]
     for goal_id in ids:
@@ -162,7 +162,7 @@ def test_row_31_goal_that_ended_is_known_to_any_process(scripted: Talk) -> None:
 
 @pytest.mark.parametrize("command", ["say", "wait"])
 @limits()
-def test_row_33_ctrl_c_cancels_the_client_s_own_goal_alone(scripted: Talk, command: str) -> None:
+def test_row_33_ctrl_c_cancels_only_the_clients_own_goal(scripted: Talk, command: str) -> None:
     client, goal_id = speaking(scripted, "--wait") if command == "say" else speaking(scripted)
     with scripted.connect() as wire:
         if command == "wait":
@@ -182,7 +182,7 @@ def test_row_33_ctrl_c_cancels_the_client_s_own_goal_alone(scripted: Talk, comma
 
 
 @limits()
-def test_row_33_signal_ends_a_client_whose_server_does_not_greet() -> None:
+def test_row_33_a_signal_stops_a_client_that_waits_for_the_greeting() -> None:
     with short_directory() as home, FakeServer(f"{home}/s", []) as server:
         for words in (["status"], ["wait"], ["say", "--wait", "hello"]):
             with subprocess.Popen(
@@ -193,14 +193,14 @@ def test_row_33_signal_ends_a_client_whose_server_does_not_greet() -> None:
             ) as client:
                 server.wait_for_client()
                 client.send_signal(signal.SIGINT)
-                began = time.monotonic()
+                started_at = time.monotonic()
                 _, err = client.communicate(timeout=20)
             assert client.returncode == 130, (words, err)
-            assert_within(time.monotonic() - began, 1 + START, f"the end of {words} after a signal")
+            assert_within(time.monotonic() - started_at, 1 + START, f"the end of {words} after a signal")
             assert "Traceback" not in err
 
 
-def test_row_34_sigterm_to_a_background_job_of_a_script(scripted: Talk) -> None:
+def test_row_34_sigterm_to_a_background_client_cancels_its_goal(scripted: Talk) -> None:
     script = """"$0" -m talkcli say --wait -- "never-ends words=1" & pid=$!
     read line; kill -TERM $pid; wait $pid; echo "code $?" """
     with subprocess.Popen(
@@ -221,17 +221,17 @@ def test_row_34_sigterm_to_a_background_job_of_a_script(scripted: Talk) -> None:
 
 def _version() -> float:
     """Return the seconds of the shortest command, a control for a client that finds no server."""
-    began = time.monotonic()
+    started_at = time.monotonic()
     assert _talk("/", "--version").code == 0
-    return time.monotonic() - began
+    return time.monotonic() - started_at
 
 
 @pytest.mark.parametrize("words", [["status"], ["say", "-w", "hello"], ["wait"]])
-def test_row_35_no_server_is_told_at_once(words: Sequence[str]) -> None:
+def test_row_35_a_missing_server_is_reported_at_once(words: Sequence[str]) -> None:
     with short_directory() as home, limits(_version):
-        began = time.monotonic()
+        started_at = time.monotonic()
         done = _talk(home, *words)
-        seconds = time.monotonic() - began
+        seconds = time.monotonic() - started_at
         assert (done.code, done.out) == (3, "")
         assert f"{home}/s: not found" in done.err
         assert "talk serve" in done.err
@@ -239,16 +239,16 @@ def test_row_35_no_server_is_told_at_once(words: Sequence[str]) -> None:
 
 
 @pytest.mark.slow
-def test_row_46_server_that_is_frozen_for_good(scripted: Talk) -> None:
+def test_row_46_clients_do_not_wait_forever_for_a_frozen_server(scripted: Talk) -> None:
     """All clients wait together for the limit of silence, 16 s."""
     waiter, goal_id = speaking(scripted, "--wait")
     scripted.freeze()
-    began = time.monotonic()
+    started_at = time.monotonic()
     try:
         second = scripted.start("serve")
         others = [scripted.start(*words) for words in (["status"], ["cancel"], ["say", "hello"], ["--json", "wait"])]
         ended = [scripted.finish(client) for client in others]
-        assert time.monotonic() - began < 6
+        assert time.monotonic() - started_at < 6
         for done in ended:
             assert (done.code, done.out) == (3, ""), done
             assert "doesn't respond" in done.err
@@ -257,7 +257,7 @@ def test_row_46_server_that_is_frozen_for_good(scripted: Talk) -> None:
         assert refused.code == 11
         assert f"pid {scripted.pid}" in refused.err
         lost = scripted.finish(waiter, timeout=25)
-        assert time.monotonic() - began < 20
+        assert time.monotonic() - started_at < 20
         assert (lost.code, lost.id) == (12, goal_id)
         assert "may still be spoken" in lost.err
     finally:

@@ -27,7 +27,7 @@ def submit(wire: Wire, text: str, *, wait: bool = False) -> str:
     return str(reply["goal"]["id"])
 
 
-def test_row_02_engine_that_fails_in_the_middle_aborts_its_goal_alone(scripted: Talk) -> None:
+def test_row_02_an_engine_failure_aborts_only_the_current_goal(scripted: Talk) -> None:
     text = "length=0.6 fail=audio_lost message=the_cable_is_out one two three four"
     done = scripted.run("--json", "say", "--wait", "--", text)
     goal = json.loads(done.out)
@@ -41,7 +41,7 @@ def test_row_02_engine_that_fails_in_the_middle_aborts_its_goal_alone(scripted: 
 
 
 @pytest.mark.parametrize("end", ["crash", "exit"])
-def test_row_04_engine_process_that_ends_without_a_result_is_replaced(scripted: Talk, end: str) -> None:
+def test_row_04_an_engine_that_exits_during_a_goal_is_replaced(scripted: Talk, end: str) -> None:
     with limits():
         with scripted.connect() as wire:
             first = submit(wire, f"length=0.2 {end} and more", wait=True)
@@ -57,7 +57,7 @@ def test_row_04_engine_process_that_ends_without_a_result_is_replaced(scripted: 
     assert scripted.running
 
 
-def test_row_05_sentence_that_ends_before_the_stop_has_succeeded(scripted: Talk) -> None:
+def test_row_05_a_sentence_that_completes_despite_a_stop_has_succeeded(scripted: Talk) -> None:
     waiter = scripted.start("say", "--wait", "--", "length=20 on-stop=complete words=1")
     goal_id = scripted.watcher.wait_for(None, "ACTIVE")["id"]
     scripted.watcher.wait_for_word(goal_id)
@@ -70,7 +70,7 @@ def test_row_05_sentence_that_ends_before_the_stop_has_succeeded(scripted: Talk)
 
 
 @pytest.mark.parametrize("how", ["ignore-stop never-ends", "length=20 on-stop=hang"])
-def test_row_06_engine_that_ignores_stop_is_killed(scripted: Talk, how: str) -> None:
+def test_row_06_an_engine_that_ignores_a_stop_is_killed(scripted: Talk, how: str) -> None:
     with limits(), scripted.connect() as asker, scripted.connect() as canceler, scripted.connect() as speaker:
         ended = submit(speaker, "length=0", wait=True)
         speaker.receive_event("result", timeout=10)
@@ -78,17 +78,17 @@ def test_row_06_engine_that_ignores_stop_is_killed(scripted: Talk, how: str) -> 
         following = submit(speaker, "length=0 the next one", wait=True)
         scripted.watcher.wait_for_word(goal_id)
         times: dict[str, float] = {"status": 0.0, "cancel": 0.0}
-        began = time.monotonic()
+        started_at = time.monotonic()
         canceler.send({"seq": 0, "request": "cancel", "ids": [goal_id]})
         while scripted.watcher.states(goal_id)[-1] != "PREEMPTED":
-            assert time.monotonic() - began < 2, scripted.watcher.states(goal_id)
+            assert time.monotonic() - started_at < 2, scripted.watcher.states(goal_id)
             for request in ("status", "cancel"):
-                asked = time.monotonic()
+                sent_at = time.monotonic()
                 reply = asker.request("status") if request == "status" else asker.request("cancel", ids=[ended])
                 assert reply["ok"]
-                times[request] = max(times[request], time.monotonic() - asked)
+                times[request] = max(times[request], time.monotonic() - sent_at)
             time.sleep(0.02)  # without a pause, the requests alone would keep a processor busy
-        silent = scripted.watcher.arrived(scripted.watcher.wait_for(goal_id, "PREEMPTED")) - began
+        silent = scripted.watcher.arrived(scripted.watcher.wait_for(goal_id, "PREEMPTED")) - started_at
         reply = canceler.receive()
         assert reply["canceled"]["id"] == goal_id
         assert (reply["canceled"]["state"], reply["canceled"]["reason"]) == ("PREEMPTED", "canceled")
@@ -102,7 +102,7 @@ def test_row_06_engine_that_ignores_stop_is_killed(scripted: Talk, how: str) -> 
         assert_within(silent, 0.15 + 0.35, "the end of a process that ignores stop")
 
 
-def test_row_09_each_message_belongs_to_its_own_goal(scripted: Talk) -> None:
+def test_row_09_each_goal_gets_its_own_message(scripted: Talk) -> None:
     with scripted.connect() as wire:
         good = submit(wire, "length=0.2 all is well", wait=True)
         bad = submit(wire, "fail=audio_device message=no_such_card", wait=True)
@@ -113,7 +113,7 @@ def test_row_09_each_message_belongs_to_its_own_goal(scripted: Talk) -> None:
     assert results[good]["text"] == "length=0.2 all is well"
 
 
-def test_row_11_cancel_without_an_id_ends_everything(scripted: Talk) -> None:
+def test_row_11_a_cancel_without_an_id_ends_all_goals(scripted: Talk) -> None:
     ids = [scripted.run("say", "never-ends", f"number {number}").id for number in range(4)]
     scripted.watcher.wait_for_word(ids[0])
     done = scripted.run("cancel")
@@ -124,7 +124,7 @@ def test_row_11_cancel_without_an_id_ends_everything(scripted: Talk) -> None:
     assert states(scripted, ids[1]) == ["PENDING", "RECALLED"]  # never ACTIVE in between
 
 
-def test_row_12_feedback_belongs_to_its_goal_and_comes_before_the_result(make_talk: MakeTalk) -> None:
+def test_row_12_feedback_names_its_goal_and_precedes_the_result(make_talk: MakeTalk) -> None:
     talk = make_talk(scripted=True)
     texts = [f"length=0.15 this is goal number {number}" for number in range(4)]
     with talk.connect() as watching, talk.connect() as one, talk.connect() as two:
@@ -144,13 +144,13 @@ def test_row_12_feedback_belongs_to_its_goal_and_comes_before_the_result(make_ta
         assert [word["number"] for word in words] == [1, 2, 3, 4, 5, 6]
 
 
-def test_row_14_nothing_to_cancel_is_success(scripted: Talk) -> None:
+def test_row_14_a_cancel_without_any_goals_succeeds(scripted: Talk) -> None:
     for words in ([], ["--current"]):
         done = scripted.run("cancel", *words)
         assert (done.code, done.out, done.err) == (0, "", "")
 
 
-def test_row_19_ids_that_are_unknown_or_have_ended(scripted: Talk) -> None:
+def test_row_19_unknown_ids_are_errors_and_ended_goals_do_not_change(scripted: Talk) -> None:
     ended = scripted.run("say", "--wait", "length=0").id
     before = scripted.goal(ended)
     active, pending = (scripted.run("say", f"never-ends {name}").id for name in ("active", "pending"))
@@ -172,7 +172,7 @@ def test_row_19_ids_that_are_unknown_or_have_ended(scripted: Talk) -> None:
     assert scripted.run("cancel", "--current").id == active
 
 
-def test_row_20_cancel_before_a_goal_ends_exactly_those_accepted_up_to_it(scripted: Talk) -> None:
+def test_row_20_cancel_before_ends_all_goals_accepted_up_to_that_goal(scripted: Talk) -> None:
     with scripted.connect() as wire:
         ids = [
             str(wire.request("say", text=f"never-ends number {number}", priority=priority)["goal"]["id"])
@@ -189,7 +189,7 @@ def test_row_20_cancel_before_a_goal_ends_exactly_those_accepted_up_to_it(script
     assert scripted.run("cancel").id == ids[7]
 
 
-def test_row_32_goals_shorter_than_any_poll_are_seen_in_all_their_states(scripted: Talk) -> None:
+def test_row_32_a_watcher_sees_all_states_of_very_short_goals(scripted: Talk) -> None:
     with scripted.connect() as wire:
         ids = [submit(wire, "length=0") for _ in range(50)]
         assert wire.request("wait", ids=ids[-1:])["ok"]

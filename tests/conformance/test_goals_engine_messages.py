@@ -77,7 +77,7 @@ def talk(make_talk: MakeTalk, tmp_path: pathlib.Path) -> Talk:
     return make_talk(program=str(serve))
 
 
-def test_row_44_messages_for_goals_that_are_not_active_change_nothing(talk: Talk) -> None:
+def test_row_44_engine_messages_for_inactive_goals_change_nothing(talk: Talk) -> None:
     others = ("1", "3", "99")  # one that has ended, one that is pending, one that nobody knows
     strange = " ".join(
         f"started:{other} alive:{other} word=7:{other} ended={outcome}:{other}"
@@ -97,7 +97,7 @@ def test_row_44_messages_for_goals_that_are_not_active_change_nothing(talk: Talk
 
 
 @pytest.mark.parametrize("outcome", ["completed", "failed", "stopped"])
-def test_row_44_what_comes_after_the_end_changes_nothing(talk: Talk, outcome: str) -> None:
+def test_row_44_engine_messages_after_the_end_change_nothing(talk: Talk, outcome: str) -> None:
     with talk.connect() as wire:
         text = f"started word=5 ended=completed ended={outcome} word=7 started alive ended=failed ready"
         goal_id = wire.request("say", text=text, wait=True)["goal"]["id"]
@@ -110,7 +110,7 @@ def test_row_44_what_comes_after_the_end_changes_nothing(talk: Talk, outcome: st
     assert ends(talk, goal_id, following) == [1, 1]
 
 
-def test_row_44_a_goal_that_nobody_stopped_cannot_have_been_stopped(talk: Talk) -> None:
+def test_row_44_an_unrequested_stop_aborts_the_goal(talk: Talk) -> None:
     with talk.connect() as wire:
         goal_id = wire.request("say", text="started ended=stopped", wait=True)["goal"]["id"]
         goal = wire.receive_event("result")["goal"]
@@ -118,7 +118,7 @@ def test_row_44_a_goal_that_nobody_stopped_cannot_have_been_stopped(talk: Talk) 
     assert states(talk, goal_id) == ["PENDING", "ACTIVE", "ABORTED"]
 
 
-def test_row_44_malformed_engine_message_affects_no_other_goal(talk: Talk) -> None:
+def test_row_44_a_malformed_engine_message_affects_no_other_goal(talk: Talk) -> None:
     lines = ("no-json", "[]", "{}", '{"kind":"sing"}', '{"kind":"Word","id":7}', "\x01", '{"kind":"Ended"}')
     with talk.connect() as wire:
         for line in lines:

@@ -14,7 +14,7 @@ TEXT = "length=0.3 the door is open"
 SHORT = "length=0 the door is open"
 
 
-def test_row_21_a_cancel_that_comes_before_its_goal_recalls_it(scripted: Talk) -> None:
+def test_row_21_a_cancel_that_arrives_before_its_goal_recalls_it(scripted: Talk) -> None:
     early = scripted.request("cancel", ids=["front-door.1"])
     assert (early["ok"], early["error"]["code"]) == (False, "unknown_goal")
     with scripted.connect() as wire:
@@ -29,7 +29,7 @@ def test_row_21_a_cancel_that_comes_before_its_goal_recalls_it(scripted: Talk) -
     assert_told_in_order(scripted)
 
 
-def test_row_22_the_same_id_twice_is_spoken_once_and_both_see_the_result(scripted: Talk) -> None:
+def test_row_22_a_goal_sent_twice_is_spoken_once_for_both_senders(scripted: Talk) -> None:
     with scripted.connect() as one, scripted.connect() as two:
         first = one.request("say", text=TEXT, id="front-door.1", wait=True)
         scripted.watcher.wait_for_word("front-door.1")
@@ -46,7 +46,7 @@ def test_row_22_the_same_id_twice_is_spoken_once_and_both_see_the_result(scripte
     assert len([word for word in scripted.watcher.words("front-door.1") if word["number"] == 1]) == 1
 
 
-def test_row_22_a_sender_that_attached_and_leaves_ends_nothing(scripted: Talk) -> None:
+def test_row_22_an_attached_sender_that_disconnects_ends_nothing(scripted: Talk) -> None:
     with scripted.connect() as one:
         one.request("say", text=TEXT, id="front-door.1", wait=True)
         with scripted.connect() as two:
@@ -54,7 +54,7 @@ def test_row_22_a_sender_that_attached_and_leaves_ends_nothing(scripted: Talk) -
         assert one.receive_event("result")["goal"]["state"] == "SUCCEEDED"
 
 
-def test_row_22_the_commands_take_the_id_that_ros_gives_a_goal(scripted: Talk) -> None:
+def test_row_22_the_commands_accept_ids_of_ros_goals(scripted: Talk) -> None:
     own = "/patrol/goal-1-1712.25"
     assert scripted.run("say", "--id", own, "--", "").code == 5  # a rejected goal does not use up its id
     done = scripted.run("say", "--wait", "--id", own, "--", SHORT)

@@ -64,7 +64,7 @@ def spoken(talk: Talk) -> list[str]:
     return [event["id"] for event in talk.watcher.events() if event.get("state") == "ACTIVE"]
 
 
-def test_row_47_in_a_full_queue_the_newest_of_the_lowest_priority_gives_way(make_talk: MakeTalk) -> None:
+def test_row_47_a_full_queue_displaces_its_newest_goal_of_lowest_priority(make_talk: MakeTalk) -> None:
     talk = make_talk("--max-queue", "3", scripted=True)
     active = begin(talk)
     first, second, third = queue(talk, 0, 0, 0)
@@ -80,7 +80,7 @@ def test_row_47_in_a_full_queue_the_newest_of_the_lowest_priority_gives_way(make
     assert_told_in_order(talk)
 
 
-def test_row_47_a_goal_that_brings_preempt_displaces_the_newest_that_does_not(make_talk: MakeTalk) -> None:
+def test_row_47_a_preempting_goal_displaces_the_newest_queued_goal(make_talk: MakeTalk) -> None:
     """Not even a logger that keeps every place taken silences it."""
     talk = make_talk("--max-queue", "3", scripted=True)
     active = begin(talk)
@@ -97,7 +97,7 @@ def test_row_47_a_goal_that_brings_preempt_displaces_the_newest_that_does_not(ma
     assert_told_in_order(talk)
 
 
-def test_a_patient_goal_is_answered_when_there_is_room(make_talk: MakeTalk) -> None:
+def test_a_patient_goal_is_accepted_when_there_is_room(make_talk: MakeTalk) -> None:
     talk = make_talk("--max-queue", "2", scripted=True)
     active = begin(talk)
     first, second = queue(talk, 0, 0, text="never-ends")
@@ -119,7 +119,7 @@ def test_a_patient_goal_is_answered_when_there_is_room(make_talk: MakeTalk) -> N
     assert_told_in_order(talk)
 
 
-def test_patient_goals_keep_the_order_in_which_they_were_sent(make_talk: MakeTalk) -> None:
+def test_patient_goals_are_spoken_in_the_order_they_were_sent(make_talk: MakeTalk) -> None:
     talk, active, waiting = fill(make_talk)
     with talk.connect() as wire:
         for number in range(5):
@@ -132,7 +132,7 @@ def test_patient_goals_keep_the_order_in_which_they_were_sent(make_talk: MakeTal
     assert_told_in_order(talk)
 
 
-def test_a_goal_that_comes_later_does_not_take_the_room_of_one_that_waits(make_talk: MakeTalk) -> None:
+def test_a_later_goal_does_not_take_the_place_of_a_patient_goal(make_talk: MakeTalk) -> None:
     talk, _, waiting = fill(make_talk)
     with talk.connect() as wire:
         wire.send({"seq": 1, "request": "say", "text": "length=0 patient", "patient": True})
@@ -149,7 +149,7 @@ def test_a_goal_that_comes_later_does_not_take_the_room_of_one_that_waits(make_t
     assert_told_in_order(talk)
 
 
-def test_a_thousand_goals_of_one_connection_wait_for_room_and_no_more(make_talk: MakeTalk) -> None:
+def test_at_most_a_thousand_goals_of_a_connection_wait_for_room(make_talk: MakeTalk) -> None:
     talk, _, _ = fill(make_talk)
     lines = [
         json.dumps({"seq": number, "request": "say", "text": f"length=0 line {number}", "patient": True, "wait": True})
@@ -158,14 +158,14 @@ def test_a_thousand_goals_of_one_connection_wait_for_room_and_no_more(make_talk:
     with talk.connect() as wire, talk.connect() as other, limits():
         wire.send_raw("\n".join(lines).encode() + b"\n")
         # It is read from all the while; and another connection's goals may wait, too.
-        began = time.monotonic()
+        started_at = time.monotonic()
         assert wire.request("status")["server"]["pending"] == 1
         refused = [reply for reply in wire.items if reply.get("ok")]
         assert [reply["seq"] for reply in refused] == [6_001, 6_002]
         for reply in refused:
             assert_rejected(reply["goal"], "queue_full", "1,000 ")
         waits(other, "another's")
-        assert_within(time.monotonic() - began, 0.5, "answers to who sends more than has room")
+        assert_within(time.monotonic() - started_at, 0.5, "answers to who sends more than has room")
         wire.items.clear()
         wire.events.clear()
         assert wire.request("cancel")["count"] == 1_003
@@ -176,12 +176,12 @@ def test_a_thousand_goals_of_one_connection_wait_for_room_and_no_more(make_talk:
     assert ends == [f"length=0 line {number}" for number in replies]
     assert len(spoken(talk)) == 1
     assert_told_in_order(talk)
-    told = [event["state"] for event in talk.watcher.events() if event["event"] == "state"]
+    states_seen = [event["state"] for event in talk.watcher.events() if event["event"] == "state"]
     # What is being spoken is stopped before a thousand are told that they never will be.
-    assert told.index("PREEMPTING") < told.index("PENDING", 3)
+    assert states_seen.index("PREEMPTING") < states_seen.index("PENDING", 3)
 
 
-def test_all_hear_of_a_cancel_that_ends_more_than_may_wait_for_them(make_talk: MakeTalk) -> None:
+def test_a_cancel_reports_more_goals_than_the_output_buffer_holds(make_talk: MakeTalk) -> None:
     count = 800
     talk, _, _ = fill(make_talk)
     text = "length=0 " + "w" * 9_900  # 20 kB are told of each, four times what may wait in all
@@ -226,7 +226,9 @@ scripted_serve.main()
 """
 
 
-def test_room_is_looked_for_only_when_the_queue_has_changed(make_talk: MakeTalk, tmp_path: pathlib.Path) -> None:
+def test_the_server_looks_for_room_only_after_the_queue_has_changed(
+    make_talk: MakeTalk, tmp_path: pathlib.Path
+) -> None:
     program = tmp_path / "serve.py"
     program.write_text(COUNTING.format(root=ROOT))
     talk = make_talk("--max-queue", "1", program=str(program))
@@ -282,7 +284,7 @@ def test_a_cancel_ends_the_selected_goals_that_wait_for_room(
     assert_told_in_order(talk)
 
 
-def test_settings_are_changed_all_together_or_not_at_all(scripted: Talk) -> None:
+def test_settings_are_changed_together_or_not_at_all(scripted: Talk) -> None:
     before = scripted.request("set")["settings"]
     assert scripted.request("set", rate=300, volume=7)["error"]["code"] == "bad_option"
     assert scripted.request("set", rate=300, voice="klingon")["error"]["code"] == "unknown_voice"
@@ -295,7 +297,7 @@ def test_settings_are_changed_all_together_or_not_at_all(scripted: Talk) -> None
     assert scripted.request("set", ttl=0, preempt=False)["settings"]["ttl"] is None
 
 
-def test_words_reach_those_who_asked_for_them_before_the_result(scripted: Talk) -> None:
+def test_subscribers_get_the_words_before_the_result(scripted: Talk) -> None:
     text = "length=0.2 one two three"
     with scripted.connect() as sender, scripted.connect() as waiter, scripted.connect() as deaf:
         other = sender.request("say", text="length=0 not followed", wait=True)["goal"]["id"]
@@ -304,40 +306,40 @@ def test_words_reach_those_who_asked_for_them_before_the_result(scripted: Talk) 
             assert wire.request("wait", ids=[goal], feedback=feedback)["ok"]
         quiet = _until_result(sender)
         assert (quiet[-1]["goal"]["id"], "word" in _shapes(quiet)) == (other, False)
-        told = {name: _until_result(wire) for name, wire in (("s", sender), ("w", waiter), ("d", deaf))}
+        events = {name: _until_result(wire) for name, wire in (("s", sender), ("w", waiter), ("d", deaf))}
     words = scripted.watcher.words(goal)
     assert [word["word"] for word in words] == text.split()
-    assert [event for event in told["s"] if event["event"] == "word"] == words
-    assert _shapes(told["s"])[-7:] == ["ACTIVE", *["word"] * 4, "SUCCEEDED", "result"]
+    assert [event for event in events["s"] if event["event"] == "word"] == words
+    assert _shapes(events["s"])[-7:] == ["ACTIVE", *["word"] * 4, "SUCCEEDED", "result"]
     # It may have come a word late, and hears all the words from then on.
-    heard = [event for event in told["w"] if event["event"] == "word"]
+    heard = [event for event in events["w"] if event["event"] == "word"]
     assert heard == words[len(words) - len(heard) :]
     assert len(heard) >= 2
-    assert _shapes(told["w"])[-3:] == ["word", "SUCCEEDED", "result"]
-    assert "word" not in _shapes(told["d"])
+    assert _shapes(events["w"])[-3:] == ["word", "SUCCEEDED", "result"]
+    assert "word" not in _shapes(events["d"])
 
 
 def _until_result(wire: Wire) -> list[Message]:
-    found: list[Message] = []
-    while not found or found[-1]["event"] != "result":
-        found.append(wire.events.pop(0) if wire.events else wire.receive())
-    return found
+    events: list[Message] = []
+    while not events or events[-1]["event"] != "result":
+        events.append(wire.events.pop(0) if wire.events else wire.receive())
+    return events
 
 
-def _shapes(told: list[Message]) -> list[str]:
-    return [str(event.get("state", event["event"])) for event in told]
+def _shapes(events: list[Message]) -> list[str]:
+    return [str(event.get("state", event["event"])) for event in events]
 
 
-def test_row_50_all_of_it_is_told_once_and_in_order(make_talk: MakeTalk) -> None:
+def test_row_50_every_event_is_sent_once_and_in_order(make_talk: MakeTalk) -> None:
     """One of each way to end, seen by a watcher from before the first goal, and by those who sent them."""
     talk = make_talk("--max-queue", "4", scripted=True)
     wanted: dict[str, str] = {}
     with talk.connect() as wire:
-        told: list[Message] = []
+        messages: list[Message] = []
 
         def say(reason: str, text: str = "length=0", **fields: object) -> str:
             wire.send({"request": "say", "text": text, "wait": True, **fields})
-            while "ok" not in (message := _take(wire, told)):
+            while "ok" not in (message := _take(wire, messages)):
                 pass
             goal = str(message["goal"]["id"])
             wanted[goal] = reason
@@ -360,21 +362,21 @@ def test_row_50_all_of_it_is_told_once_and_in_order(make_talk: MakeTalk) -> None
         recalled = say("RECALLED canceled", "length=0 not this one")
         for goal_id in (recalled, canceled):
             wire.send({"request": "cancel", "ids": [goal_id]})
-            while "ok" not in _take(wire, told):
+            while "ok" not in _take(wire, messages):
                 pass
             # The goal's end is told before the answer that depends on it.
-            assert any(one.get("state") in {"RECALLED", "PREEMPTED"} and one.get("id") == goal_id for one in told)
-        while sum(message.get("event") == "result" for message in told) < len(wanted):
-            _take(wire, told)
+            assert any(one.get("state") in {"RECALLED", "PREEMPTED"} and one.get("id") == goal_id for one in messages)
+        while sum(message.get("event") == "result" for message in messages) < len(wanted):
+            _take(wire, messages)
         active = say("PREEMPTED preempted", "length=20 words=1")
         talk.watcher.wait_for_word(active)
         say("RECALLED preempted")
         talk.watcher.wait_for_word(say("PREEMPTED preempted", "length=20 words=1", flush=True))
         say("SUCCEEDED", "length=0 the last", preempt=True)
-        while sum(message.get("event") == "result" for message in told) < len(wanted):
-            _take(wire, told)
-    _check_replies_first(told)
-    results = {message["goal"]["id"]: message["goal"] for message in told if message.get("event") == "result"}
+        while sum(message.get("event") == "result" for message in messages) < len(wanted):
+            _take(wire, messages)
+    _check_replies_first(messages)
+    results = {message["goal"]["id"]: message["goal"] for message in messages if message.get("event") == "result"}
     ended = {goal_id: " ".join(filter(None, (goal["state"], goal["reason"]))) for goal_id, goal in results.items()}
     assert ended == wanted
     assert_told_in_order(talk)
@@ -383,16 +385,16 @@ def test_row_50_all_of_it_is_told_once_and_in_order(make_talk: MakeTalk) -> None
     assert last == {goal_id: reason.split()[0] for goal_id, reason in wanted.items()}
 
 
-def _take(wire: Wire, told: list[Message]) -> Message:
+def _take(wire: Wire, messages: list[Message]) -> Message:
     message = wire.receive()
-    told.append(message)
+    messages.append(message)
     return message
 
 
-def _check_replies_first(told: list[Message]) -> None:
+def _check_replies_first(messages: list[Message]) -> None:
     """Assert of a connection: the reply to `say` comes before all events of its goal, and PENDING is the first."""
     known: dict[str, str] = {}
-    for message in told:
+    for message in messages:
         if "ok" in message and "goal" in message:
             assert message["goal"]["id"] not in known, message
             known[message["goal"]["id"]] = "reply"

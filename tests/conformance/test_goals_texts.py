@@ -47,7 +47,7 @@ def assert_rejected(done: Finished, reason: str) -> None:
     assert "not spoken: " in done.err
 
 
-def test_row_13_text_that_cannot_be_spoken_is_rejected_on_the_wire(scripted: Talk) -> None:
+def test_row_13_a_text_that_cannot_be_spoken_is_rejected_on_the_wire(scripted: Talk) -> None:
     bystanders = Bystanders(scripted)
     cases = [(name, text, "invalid_text") for name, text in INVALID.items()]
     cases += [(name, text, "text_too_long") for name, text in TOO_LONG.items()]
@@ -68,7 +68,7 @@ def test_row_13_text_that_cannot_be_spoken_is_rejected_on_the_wire(scripted: Tal
             bystanders.assert_untouched()
 
 
-def test_row_13_text_that_cannot_be_spoken_is_rejected_on_the_command_line(scripted: Talk) -> None:
+def test_row_13_a_text_that_cannot_be_spoken_is_rejected_by_say(scripted: Talk) -> None:
     bystanders = Bystanders(scripted)
     for text in ("", "  ", "\u200b"):
         assert_rejected(scripted.run("--json", "say", "--preempt", "--wait", "--", text), "invalid_text")
@@ -83,7 +83,7 @@ def test_row_13_text_that_cannot_be_spoken_is_rejected_on_the_command_line(scrip
     bystanders.assert_untouched()
 
 
-def test_error_for_an_oversized_input_is_accurate(scripted: Talk) -> None:
+def test_the_error_for_an_oversized_input_is_accurate(scripted: Talk) -> None:
     longest = "😀" * 10_000
     for text in (f"{longest}\n", f"{longest}\r\n"):
         assert json.loads(scripted.run("--json", "say", "-", stdin=text).out)["text"] == longest
@@ -98,29 +98,29 @@ def test_error_for_an_oversized_input_is_accurate(scripted: Talk) -> None:
     assert (event["event"], event["goal"]["reason"], done.code) == ("result", "text_too_long", 5)
 
 
-def test_bytes_that_are_no_utf8_are_left_out_and_named(scripted: Talk) -> None:
+def test_invalid_utf8_bytes_are_skipped_and_reported(scripted: Talk) -> None:
     data = "length=0 Grüße:\n日本\n".encode() + "Grüße".encode("latin-1") + b" \xed\xa0\x80!"
     text = "length=0 Grüße:\n日本\nGr\ufffd\ufffde \ufffd\ufffd\ufffd!"
     note = "talk: line 3, column 3: the byte 0xfc is not valid UTF-8, so it is not spoken (4 more like it)\n"
-    for options, told in ((["--json"], note), (["--json", "-q"], "")):
+    for options, expected in ((["--json"], note), (["--json", "-q"], "")):
         for words, typed in (([b"--", data], b""), ([b"-"], data)):
             line: list[str | bytes] = [*TALK, *options, "say", "--wait", *words]
             done = subprocess.run(line, input=typed, env=scripted.env, capture_output=True, timeout=20, check=False)
             goal = json.loads(done.stdout)
             assert (done.returncode, goal["state"], goal["text"]) == (0, "SUCCEEDED", text)
-            assert done.stderr.decode() == told
+            assert done.stderr.decode() == expected
 
 
-def test_bytes_that_are_no_utf8_are_silent_and_no_words(talk: Talk) -> None:
+def test_invalid_utf8_bytes_are_silent_and_are_not_words(talk: Talk) -> None:
     line: list[str | bytes] = [*TALK, "say", "--feedback", "--", b"battery \xff low, it\xffs \xff", "now"]
     done = subprocess.run(line, env=talk.env, capture_output=True, text=True, timeout=20, check=False)
-    said = [line.split()[-1] for line in done.stdout.splitlines() if " word " in line]
-    assert (done.returncode, said) == (0, ["battery", "low", "it", "s", "now"])
+    words = [line.split()[-1] for line in done.stdout.splitlines() if " word " in line]
+    assert (done.returncode, words) == (0, ["battery", "low", "it", "s", "now"])
     alone = talk.run("say", "--wait", "--", "\udcff")
     assert (alone.code, alone.err.splitlines()[-1].endswith("nothing in the text can be spoken")) == (4, True)
 
 
-def test_row_13_100_kilobytes_on_the_wire_are_refused_and_do_nothing(scripted: Talk) -> None:
+def test_row_13_a_line_of_100_kilobytes_is_refused(scripted: Talk) -> None:
     bystanders = Bystanders(scripted)
     with Raw(scripted.socket) as raw:
         raw.send(json.dumps({"request": "say", "text": "a" * 100_000, "preempt": True}).encode() + b"\n")
@@ -129,7 +129,7 @@ def test_row_13_100_kilobytes_on_the_wire_are_refused_and_do_nothing(scripted: T
     bystanders.assert_untouched()
 
 
-def test_whole_texts_are_spoken_as_they_are(scripted: Talk) -> None:
+def test_texts_are_spoken_unchanged(scripted: Talk) -> None:
     for text in WHOLE:
         by_wire = scripted.request("say", text=text)["goal"]
         by_input = json.loads(scripted.run("--json", "say", "--wait", "-", stdin=f"{text}\n").out)

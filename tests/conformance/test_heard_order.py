@@ -64,29 +64,29 @@ def end(talk: Talk, *goals: str) -> None:
         assert talk.watcher.states(goal_id) == SPOKEN
 
 
-def test_row_28_half_the_volume_is_heard_as_half(make_talk: MakeTalk, sink: Sink, voice: Voice) -> None:
-    found = []
+def test_row_28_half_the_volume_sounds_half_as_loud(make_talk: MakeTalk, sink: Sink, voice: Voice) -> None:
+    volumes = []
     for volume in (0.5, 1.0):
         talk = voice.serve(make_talk, sink, "--volume", str(volume))
         end(talk, send(talk, HELP))
         samples = heard(talk)
         assert_same(samples, voice.render([Sentence(HELP, QUICK, volume)])[0])
-        found.append(loudness(samples))
-    assert found[0] / found[1] == pytest.approx(0.5, abs=0.1)
+        volumes.append(loudness(samples))
+    assert volumes[0] / volumes[1] == pytest.approx(0.5, abs=0.1)
     refused = talk.run("--socket", f"{talk.directory}/other", "serve", "--volume", "1.5")
     assert (refused.code, refused.out, "--volume" in refused.err) == (2, "", True)
 
 
 def test_row_29_half_the_rate_takes_twice_as_long(make_talk: MakeTalk, sink: Sink, voice: Voice) -> None:
-    found = []
+    durations = []
     for rate in (100, 200):
         talk = voice.serve(make_talk, sink, rate=rate)
         end(talk, send(talk, HOME))
-        found.append(assert_same(heard(talk), voice.render([HOME], rate)[0]).heard)
-    assert found[0] / found[1] == pytest.approx(2, abs=0.4)
+        durations.append(assert_same(heard(talk), voice.render([HOME], rate)[0]).heard)
+    assert durations[0] / durations[1] == pytest.approx(2, abs=0.4)
 
 
-def test_row_36_a_goal_whose_time_is_over_is_never_heard(talk: Talk, voice: Voice) -> None:
+def test_row_36_an_expired_goal_is_never_heard(talk: Talk, voice: Voice) -> None:
     """The goal ends the moment its time runs out, while the sentence of 3 s before it is still being spoken."""
     long = send(talk, LONG, rate=200)
     goal = send(talk, NEVER, ttl=1)
@@ -101,9 +101,7 @@ def test_row_36_a_goal_whose_time_is_over_is_never_heard(talk: Talk, voice: Voic
     assert_told_in_order(talk)
 
 
-def test_row_37_of_three_goals_with_one_key_the_newest_is_heard_in_the_first_ones_place(
-    talk: Talk, voice: Voice
-) -> None:
+def test_row_37_a_newer_goal_with_the_same_key_takes_the_old_ones_place(talk: Talk, voice: Voice) -> None:
     """The goal being spoken is not replaced, although it has the same key."""
     long = busy(talk, key="battery")
     first = send(talk, "never the first", key="battery")
@@ -139,7 +137,7 @@ def test_row_38_only_a_goal_that_was_heard_throttles_the_next(make_talk: MakeTal
     stopped.assert_heard_after_stop(heard(talk), LONG, [LOW, HOME], voice=voice)
 
 
-def test_row_39_higher_priorities_go_first_equal_ones_in_the_order_in_which_they_came(talk: Talk, voice: Voice) -> None:
+def test_row_39_goals_are_ordered_by_priority_and_then_by_arrival(talk: Talk, voice: Voice) -> None:
     long = busy(talk)
     texts = ["battery zero", "coming five", "battery one", "coming five again"]
     zero, five, one, five_again = [
@@ -150,7 +148,7 @@ def test_row_39_higher_priorities_go_first_equal_ones_in_the_order_in_which_they
     assert_told_in_order(talk)
 
 
-def test_row_40_a_lower_priority_does_not_interrupt_and_goes_first_among_its_own(talk: Talk, voice: Voice) -> None:
+def test_row_40_a_preempting_goal_does_not_interrupt_a_higher_priority(talk: Talk, voice: Voice) -> None:
     long = busy(talk, priority=5)
     zero = send(talk, HOME)
     high = send(talk, "coming now", priority=3, preempt=True)
@@ -164,9 +162,9 @@ def test_row_40_a_lower_priority_does_not_interrupt_and_goes_first_among_its_own
     assert_told_in_order(talk)
 
 
-def test_settings_are_read_when_a_goal_starts_and_its_own_are_gone_after_it(talk: Talk, voice: Voice) -> None:
+def test_a_goal_uses_the_settings_at_its_start_except_its_own(talk: Talk, voice: Voice) -> None:
     """A change holds for the goals that have not begun, except for the values that they were sent with."""
-    asked = [
+    sentences = [
         Sentence(HELP, rate=QUICK),
         Sentence(LOW, rate=300, volume=0.2),
         Sentence(HOME, rate=350, volume=0.5),
@@ -177,14 +175,14 @@ def test_settings_are_read_when_a_goal_starts_and_its_own_are_gone_after_it(talk
     goals = [send(talk, LOW, rate=300, volume=0.2), send(talk, HOME), send(talk, HELP, volume=0), send(talk, LOW)]
     assert talk.request("set", rate=350, volume=0.5)["settings"]["rate"] == 350
     end(talk, first, *goals)
-    references = voice.render(asked)
+    references = voice.render(sentences)
     assert loudness(references[1]) < 0.6 * loudness(references[4])
     del references[3]
     assert_heard(heard(talk), references)
 
 
 @pytest.mark.parametrize("voice", ["espeak"], indirect=True)
-def test_a_goals_own_pitch_and_voice_are_heard_and_gone_after_it(talk: Talk) -> None:
+def test_a_goals_own_pitch_and_voice_apply_only_to_it(talk: Talk) -> None:
     end(talk, send(talk, LOW, pitch=80), send(talk, HOME, voice="de"), send(talk, LOW))
     own = Sentence(LOW, QUICK, pitch=80)
     assert_heard(heard(talk), render_quick([own, Sentence(HOME, QUICK, voice="de"), LOW]))
@@ -192,7 +190,7 @@ def test_a_goals_own_pitch_and_voice_are_heard_and_gone_after_it(talk: Talk) -> 
 
 
 @with_both
-def test_row_03_cancel_by_id_is_silent_when_it_returns(talk: Talk, voice: Voice) -> None:
+def test_row_03_the_cancel_command_returns_after_the_sound_has_stopped(talk: Talk, voice: Voice) -> None:
     goal = begin(talk, LONG)
     canceled = talk.run("cancel", goal)
     returned = time.monotonic()
@@ -207,20 +205,20 @@ def test_row_03_cancel_by_id_is_silent_when_it_returns(talk: Talk, voice: Voice)
     assert "two" in ended["spoken"] != LONG
 
 
-def test_row_03_the_reply_to_a_cancel_comes_within_150_ms_when_it_is_silent(talk: Talk) -> None:
+def test_row_03_a_cancel_is_confirmed_within_150_ms_and_after_the_sound(talk: Talk) -> None:
     with limits():
         for number in (1, 4):
             goal = begin(talk, LONG, number=number)
-            asked = time.monotonic()
+            sent_at = time.monotonic()
             reply = talk.request("cancel", ids=[goal])
-            replied = time.monotonic()
+            replied_at = time.monotonic()
             assert reply["ok"]
-            talk.recording.wait_until(replied + 0.1)
-            assert_silent(talk.recording.between(replied + PRECISION, replied + 0.1))
-            assert_within(replied - asked, 0.15, f"the cancel after {number} words")
+            talk.recording.wait_until(replied_at + 0.1)
+            assert_silent(talk.recording.between(replied_at + PRECISION, replied_at + 0.1))
+            assert_within(replied_at - sent_at, 0.15, f"the cancel after {number} words")
 
 
-def test_row_16_a_server_that_is_terminated_answers_every_waiter(talk: Talk, voice: Voice) -> None:
+def test_row_16_a_terminated_server_answers_every_waiting_client(talk: Talk, voice: Voice) -> None:
     texts = [LONG, LOW, HOME, HELP]
     waiters = []
     for number, text in enumerate(texts, 1):
@@ -232,18 +230,18 @@ def test_row_16_a_server_that_is_terminated_answers_every_waiter(talk: Talk, voi
     ended = time.monotonic()
     done = [talk.finish(client, timeout=1) for client in waiters]
     assert [client.code for client in done] == [7, 6, 6, 6]
-    told = [json.loads(client.out) for client in done]
-    assert [goal["id"] for goal in told] == goals
-    assert [goal["text"] for goal in told] == texts
-    assert [goal["state"] for goal in told] == ["PREEMPTED", *["RECALLED"] * 3]
-    assert {goal["reason"] for goal in told} == {"shutdown"}
+    results = [json.loads(client.out) for client in done]
+    assert [goal["id"] for goal in results] == goals
+    assert [goal["text"] for goal in results] == texts
+    assert [goal["state"] for goal in results] == ["PREEMPTED", *["RECALLED"] * 3]
+    assert {goal["reason"] for goal in results} == {"shutdown"}
     assert talk.watcher.states(goals[0]) == STOPPED
     assert [talk.watcher.states(goal_id) for goal_id in goals[1:]] == [["PENDING", "RECALLED"]] * 3
-    assert_begun(heard(talk), voice.render([LONG])[0])
+    assert_only_beginning(heard(talk), voice.render([LONG])[0])
     _assert_last_sound_before(talk, ended)
 
 
-def test_row_24_a_newcomer_is_heard_when_the_one_before_it_is_silent(
+def test_row_24_a_preempting_goal_is_heard_after_the_old_one_is_silent(
     make_talk: MakeTalk, sink: Sink, voice: Voice
 ) -> None:
     talk = voice.serve(make_talk, sink, "--preempt")
@@ -262,7 +260,7 @@ def test_row_24_a_newcomer_is_heard_when_the_one_before_it_is_silent(
     stopped.assert_heard_after_stop(heard(talk), LONG, [LOW], voice=voice)
 
 
-def test_row_25_a_goal_that_preempts_goes_before_those_that_wait(talk: Talk, voice: Voice) -> None:
+def test_row_25_a_preempting_goal_goes_before_the_queued_ones(talk: Talk, voice: Voice) -> None:
     first, *waiting = [send(talk, text) for text in (LONG, LOW, HOME)]
     await_word(talk, first)
     newcomer = talk.run("say", "--preempt", "--wait", "--", HELP)
@@ -273,7 +271,7 @@ def test_row_25_a_goal_that_preempts_goes_before_those_that_wait(talk: Talk, voi
     stopped.assert_heard_after_stop(heard(talk), LONG, [HELP, LOW, HOME], voice=voice)
 
 
-def test_row_27_a_goal_is_cancelled_without_preempt(talk: Talk, voice: Voice) -> None:
+def test_row_27_cancel_current_stops_a_goal_and_the_next_is_spoken(talk: Talk, voice: Voice) -> None:
     goal, waiter = begin_with_client(talk, LONG, "--queue")
     waiting = send(talk, LOW)
     canceled = talk.run("cancel", "--current")

@@ -82,7 +82,7 @@ def assert_silent_since(talk: Talk, moment: float, seconds: float) -> None:
         ),
     ],
 )
-def test_row_43_a_sentence_that_is_held_goes_on_where_it_was(
+def test_row_43_a_paused_sentence_resumes_where_it_stopped(
     make_talk: MakeTalk, sink: Sink, player: str, word: int, seconds: float, voice: Voice
 ) -> None:
     (reference,) = voice.render([LONG])
@@ -91,15 +91,15 @@ def test_row_43_a_sentence_that_is_held_goes_on_where_it_was(
         talk = voice.serve(make_talk, sink, "--player", player)
         goal = send(talk, LONG)
         await_word(talk, goal, word)
-        asked = time.monotonic()
-        held = pause(talk)["goal"]
-        silent = time.monotonic()
-        assert (held["id"], held["state"], held["paused"]) == (goal, "ACTIVE", True)
-        assert_silent_since(talk, silent, seconds)
+        sent_at = time.monotonic()
+        paused = pause(talk)["goal"]
+        paused_at = time.monotonic()
+        assert (paused["id"], paused["state"], paused["paused"]) == (goal, "ACTIVE", True)
+        assert_silent_since(talk, paused_at, seconds)
         status = talk.request("status")
         assert (status["server"]["paused"], status["active"]["id"], status["active"]["paused"]) == (True, goal, True)
-        going = resume(talk)["goal"]
-        assert (going["id"], going["state"], going["paused"]) == (goal, "ACTIVE", False)
+        resumed = resume(talk)["goal"]
+        assert (resumed["id"], resumed["state"], resumed["paused"]) == (goal, "ACTIVE", False)
         assert talk.watcher.wait_for_terminal(goal) == "SUCCEEDED"
         assert_resumed(heard(talk), reference, pause=seconds - SILENT, repeated=TWICE)
         assert talk.watcher.states(goal) == SPOKEN
@@ -108,11 +108,11 @@ def test_row_43_a_sentence_that_is_held_goes_on_where_it_was(
         assert talk.goal(goal)["spoken"] == LONG
         assert_told_in_order(talk)
         talk.stop()
-        assert_within(silent - asked, SILENT, f"the silence after a pause at word {word}")
+        assert_within(paused_at - sent_at, SILENT, f"the silence after a pause at word {word}")
 
 
 @with_both
-def test_row_43_a_sentence_that_is_held_twice_is_heard_whole_and_all_are_told(talk: Talk, voice: Voice) -> None:
+def test_row_43_a_sentence_paused_twice_is_heard_whole_and_reported(talk: Talk, voice: Voice) -> None:
     with talk.connect() as follower:
         goal = follower.request("say", text=LONG, feedback=True)["goal"]["id"]
         await_word(talk, goal)
@@ -125,19 +125,19 @@ def test_row_43_a_sentence_that_is_held_twice_is_heard_whole_and_all_are_told(ta
         assert_silent_since(talk, time.monotonic(), 0.5)
         resume(talk)
         assert resume(talk)["goal"]["id"] == goal
-        told = [follower.receive_event("paused") for _ in range(4)]
+        events = [follower.receive_event("paused") for _ in range(4)]
         assert follower.receive_event("result")["goal"]["state"] == "SUCCEEDED"
     _assert_held_twice(heard(talk), voice.render([LONG])[0])
     words = talk.watcher.words(goal)
     assert [word["number"] for word in words] == list(range(1, len(words) + 1))
     assert [word["word"] for word in words] == LONG.split()
-    assert [(event["paused"], event["id"]) for event in told] == [(True, goal), (False, goal)] * 2
-    assert all(event["by"]["client"]["pid"] for event in told)
-    assert [event for event in talk.watcher.events() if event["event"] == "paused"] == told
+    assert [(event["paused"], event["id"]) for event in events] == [(True, goal), (False, goal)] * 2
+    assert all(event["by"]["client"]["pid"] for event in events)
+    assert [event for event in talk.watcher.events() if event["event"] == "paused"] == events
     assert_told_in_order(talk)
 
 
-def test_row_43_nothing_starts_while_paused_and_pending_goals_end_in_time(talk: Talk, voice: Voice) -> None:
+def test_row_43_nothing_starts_while_paused_but_pending_goals_can_end(talk: Talk, voice: Voice) -> None:
     assert pause(talk)["goal"] is None
     reply = talk.request("say", text=HOME)
     assert (reply["paused"], reply["goal"]["state"]) == (True, "PENDING")
@@ -156,13 +156,13 @@ def test_row_43_nothing_starts_while_paused_and_pending_goals_end_in_time(talk: 
     heard(talk)
 
 
-def test_row_43_a_held_goal_is_cancelled_in_time_and_is_never_heard_again(talk: Talk, voice: Voice) -> None:
+def test_row_43_a_cancelled_paused_goal_ends_at_once_and_stays_silent(talk: Talk, voice: Voice) -> None:
     with limits():
         goal = begin(talk, LONG)
         pause(talk)
-        began = time.monotonic()
+        started_at = time.monotonic()
         assert talk.request("cancel")["count"] == 1
-        seconds = time.monotonic() - began
+        seconds = time.monotonic() - started_at
         assert talk.watcher.states(goal) == STOPPED
         ended = talk.goal(goal)
         assert (ended["reason"], ended["paused"]) == ("canceled", False)
@@ -174,15 +174,15 @@ def test_row_43_a_held_goal_is_cancelled_in_time_and_is_never_heard_again(talk: 
         assert_within(seconds, SILENT, "the cancel of a held goal")
 
 
-def test_row_43_the_timeout_of_a_client_runs_out_while_paused(talk: Talk) -> None:
+def test_row_43_a_client_times_out_while_speech_is_paused(talk: Talk) -> None:
     """The client owns the goal: that is cancelled, and the client ends at its time."""
 
     with limits():
-        began = time.monotonic()
+        started_at = time.monotonic()
         goal, client = begin_with_client(talk, LONG, "--timeout", "1")
         pause(talk)
         done = talk.finish(client)
-        took = time.monotonic() - began
+        took = time.monotonic() - started_at
         assert (done.code, done.id) == (124, goal)
         assert took >= 1
         assert talk.watcher.states(goal) == STOPPED
@@ -190,14 +190,14 @@ def test_row_43_the_timeout_of_a_client_runs_out_while_paused(talk: Talk) -> Non
         assert_within(took, 1.7, "a timeout of 1 s")
 
 
-def test_row_43_a_goal_that_preempts_ends_the_held_one_and_waits(talk: Talk, voice: Voice) -> None:
-    held = begin(talk, LONG, priority=1)
+def test_row_43_a_preempting_goal_ends_the_paused_one_and_waits(talk: Talk, voice: Voice) -> None:
+    paused = begin(talk, LONG, priority=1)
     pause(talk)
     lower = submit(talk, HOME, preempt=True)["id"]
-    assert talk.goal(held)["paused"] is True  # a lower priority leaves it
+    assert talk.goal(paused)["paused"] is True  # a lower priority leaves it
     newcomer = send(talk, LOW, preempt=True, priority=1)
-    assert talk.watcher.wait_for_terminal(held) == "PREEMPTED"
-    assert talk.goal(held)["by"] == {"goal": newcomer}
+    assert talk.watcher.wait_for_terminal(paused) == "PREEMPTED"
+    assert talk.goal(paused)["by"] == {"goal": newcomer}
     assert_silent_since(talk, time.monotonic(), 0.5)
     assert talk.goal(newcomer)["state"] == "PENDING"
     resume(talk)
@@ -208,9 +208,7 @@ def test_row_43_a_goal_that_preempts_ends_the_held_one_and_waits(talk: Talk, voi
 
 
 @pytest.mark.slow
-def test_row_43_the_watchdog_leaves_a_sentence_alone_that_is_held_for_longer_than_its_limits(
-    talk: Talk, voice: Voice
-) -> None:
+def test_row_43_a_long_pause_does_not_trigger_the_watchdog(talk: Talk, voice: Voice) -> None:
     goal = begin(talk, LONG)
     pause(talk)
     assert_silent_since(talk, time.monotonic(), 5)
@@ -234,9 +232,9 @@ def _assert_held_twice(samples: Samples, reference: Samples) -> None:
     for part in (samples[start : stop + 1] for start, stop in zip(starts, ends, strict=True)):
         place = find_part(part, wanted, reached, round(TWICE * RATE) + SLACK)
         if place is None:
-            found = compare(wanted, part)
-            assert found.correlation > SAME, found
-            place = found.offset, found.offset + len(part)
+            compared = compare(wanted, part)
+            assert compared.correlation > SAME, compared
+            place = compared.offset, compared.offset + len(part)
         first, last = place
         assert first >= reached - TWICE * RATE - SLACK, f"{(reached - first) / RATE:.3f} s heard twice"
         assert extent(wanted[reached + SLACK : max(0, first - SLACK)]) is None, f"missing before {first / RATE:.3f} s"

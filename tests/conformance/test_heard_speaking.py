@@ -46,7 +46,7 @@ SPOKEN = ["PENDING", "ACTIVE", "SUCCEEDED"]
 LOST = 0.012
 
 
-def test_row_01_a_goal_is_spoken_and_its_end_is_told(talk: Talk) -> None:
+def test_row_01_a_goal_is_spoken_and_its_end_is_reported(talk: Talk) -> None:
     done = talk.run("say", "--wait", "--", LOW)
     assert (done.code, done.err) == (0, "")
     goal = talk.goal(done.id)
@@ -59,7 +59,7 @@ def test_row_01_a_goal_is_spoken_and_its_end_is_told(talk: Talk) -> None:
 
 
 @with_both
-def test_row_23_goals_are_spoken_in_the_order_in_which_they_came(make_talk: MakeTalk, sink: Sink, voice: Voice) -> None:
+def test_row_23_goals_are_spoken_in_the_order_they_were_sent(make_talk: MakeTalk, sink: Sink, voice: Voice) -> None:
     talk = voice.serve(make_talk, sink)
     texts = [HELP, LOW, HOME]
     sent = [talk.run("say", "--", text).id for text in texts]
@@ -70,7 +70,7 @@ def test_row_23_goals_are_spoken_in_the_order_in_which_they_came(make_talk: Make
     assert_heard(heard(talk), voice.render(texts))
 
 
-def test_row_18_a_pending_goal_that_is_cancelled_is_never_spoken(make_talk: MakeTalk, sink: Sink, voice: Voice) -> None:
+def test_row_18_a_cancelled_pending_goal_is_never_spoken(make_talk: MakeTalk, sink: Sink, voice: Voice) -> None:
     talk = voice.serve(make_talk, sink)
     texts = [LONG, LOW, "never to be heard", HOME]
     active, first, second, third = [send(talk, text) for text in texts]
@@ -103,10 +103,10 @@ def test_row_30_a_text_is_spoken_and_never_executed(
     talk = voice.serve(make_talk, sink)
     refused = talk.run("say", "--wiat", LOW)
     assert (refused.code, refused.out, "talk say -- " in refused.err) == (2, "", True)
-    said = [talk.run("say", "--", text) for text in texts]
-    assert [(client.code, client.err) for client in said] == [(0, "")] * len(texts)
-    assert talk.run("wait", *(client.id for client in said)).code == 0
-    assert [talk.goal(client.id)["text"] for client in said] == texts
+    clients = [talk.run("say", "--", text) for text in texts]
+    assert [(client.code, client.err) for client in clients] == [(0, "")] * len(texts)
+    assert talk.run("wait", *(client.id for client in clients)).code == 0
+    assert [talk.goal(client.id)["text"] for client in clients] == texts
     assert talk.run("say", "--wait", *LOW.split()).code == 0  # words are joined
     assert_heard(heard(talk), voice.render([*texts, LOW]))
     assert os.listdir(tmp_path) == []
@@ -125,19 +125,19 @@ def test_the_wheels_library_speaks_if_the_system_has_none(
     assert_same(heard(talk), render([LOW])[0])
 
 
-def test_only_silence_is_left_out_between_queued_sentences_and_never_too_much(talk: Talk) -> None:
+def test_only_a_limited_silence_is_cut_between_queued_sentences(talk: Talk) -> None:
     """The time that a change of goals takes is a matter of speed; that enough of the pause stays is not."""
     texts = [LOW, HOME, LOW]
     goals = [send(talk, text) for text in texts]
     assert talk.watcher.wait_for_terminal(goals[-1], 20) == "SUCCEEDED"
     references = render(texts)
-    found = assert_heard(heard(talk), references)
+    comparisons = assert_heard(heard(talk), references)
     for number in range(len(texts) - 1):
         before, after = (extent(reference) for reference in references[number : number + 2])
         assert before is not None
         assert after is not None
         own = (len(references[number]) - before[1] + after[0]) / RATE
-        pause = (found[number + 1].offset - found[number].offset) / RATE - found[number].expected
+        pause = (comparisons[number + 1].offset - comparisons[number].offset) / RATE - comparisons[number].expected
         assert pause > own - MAX_CUT_S - LOST
         whole = len(references[number]) / RATE
         assert whole - MAX_CUT_S <= talk.goal(goals[number])["duration"] <= whole + 0.001
@@ -148,7 +148,7 @@ def test_only_silence_is_left_out_between_queued_sentences_and_never_too_much(ta
 NO_CARD = "pcm.!default { type hw card 31 }\nctl.!default { type hw card 31 }\n"
 
 
-def test_row_41_without_a_player_a_goal_is_aborted_until_one_is_installed(
+def test_row_41_goals_are_aborted_until_a_player_is_installed(
     make_talk: MakeTalk, sink: Sink, tmp_path: pathlib.Path, voice: Voice
 ) -> None:
     env = {"PATH": str(tmp_path), "PULSE_SERVER": f"unix:{tmp_path}/none"}  # aplay does not use it here
@@ -161,7 +161,7 @@ def test_row_41_without_a_player_a_goal_is_aborted_until_one_is_installed(
     stopped.assert_heard_after_stop(heard(talk), LOW, [HOME], begun=False, voice=voice)
 
 
-def test_row_41_without_a_device_the_players_line_is_told_within_a_second(
+def test_row_41_a_missing_device_is_reported_within_a_second(
     make_talk: MakeTalk, sink: Sink, tmp_path: pathlib.Path, voice: Voice
 ) -> None:
     configuration = tmp_path / ".asoundrc"
@@ -185,7 +185,7 @@ def test_row_41_without_a_device_the_players_line_is_told_within_a_second(
         ("pulse", 'the sound server has no sink "nonesuch"; list them with: pactl list short sinks'),
     ],
 )
-def test_row_41_a_device_of_another_name_is_told(make_talk: MakeTalk, sink: Sink, player: str, line: str) -> None:
+def test_row_41_an_unknown_device_name_is_reported(make_talk: MakeTalk, sink: Sink, player: str, line: str) -> None:
     talk = make_talk("--player", player, "--device", "nonesuch", sink=sink)
     _assert_aborted(talk, "audio_device", line)
     assert_silent(heard(talk))
@@ -250,7 +250,7 @@ def measure(talk: Talk, text: str, rate: int, *, exact: bool = True, voice: Voic
         assert_within(compared.heard - compared.expected, EXTENT_TOLERANCE_S, "the gaps in a sentence")
         return Measured(words, [], [])  # behind a gap, no word is in its place
     assert compared.same or (not exact and compared.correlation > ALIKE), compared
-    begins = (len(reference.samples) - len(played(reference.samples))) / RATE
+    begins = (len(reference.samples) - len(without_leading_zeros(reference.samples))) / RATE
     positions = [max(begins, position(reference, word["start"])) for word in words]
     moments = [time_heard(talk.recording, compared, reference.samples, offset) for offset in positions]
     talk.stop()
@@ -274,7 +274,7 @@ def position(reference: Rendering, start: int) -> float:
         *(pytest.param("pulse", rate, marks=pytest.mark.slow) for rate in (100, 200)),
     ],
 )
-def test_thirty_words_are_told_as_they_are_heard(make_talk: MakeTalk, sink: Sink, player: str, rate: int) -> None:
+def test_word_events_arrive_as_the_words_are_heard(make_talk: MakeTalk, sink: Sink, player: str, rate: int) -> None:
     with limits():
         talk = make_talk("--rate", str(rate), "--player", player, sink=sink)
         measured = measure(talk, THIRTY, rate)
@@ -284,7 +284,7 @@ def test_thirty_words_are_told_as_they_are_heard(make_talk: MakeTalk, sink: Sink
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rate", [200, 300])
-def test_thirty_words_of_a_neural_voice_are_told_as_they_are_heard(
+def test_word_events_of_a_neural_voice_arrive_as_the_words_are_heard(
     make_talk: MakeTalk, sink: Sink, joe: Joe, rate: int
 ) -> None:
     with limits():
@@ -298,14 +298,14 @@ def test_thirty_words_of_a_neural_voice_are_told_as_they_are_heard(
         measured.assert_in_time()
 
 
-def test_words_are_told_as_they_are_heard_by_an_output_that_is_late(make_talk: MakeTalk, sink: Sink) -> None:
+def test_word_events_wait_for_an_output_with_high_latency(make_talk: MakeTalk, sink: Sink) -> None:
     """By a clock of the engine's own they would be told 200 ms before."""
     with limits(), DistantSink(sink) as distant:
         talk = make_talk("--rate", "350", sink=sink, env=distant.env)
         measure(talk, THIRTY, 350, exact=False).assert_in_time()
 
 
-def test_row_42_ten_words_of_any_script_are_told_once_each_in_their_place(make_talk: MakeTalk, sink: Sink) -> None:
+def test_row_42_words_of_any_script_are_reported_once_with_their_place(make_talk: MakeTalk, sink: Sink) -> None:
     with limits():
         measured = measure(make_talk(sink=sink), TEN, 200)
         _assert_ten(measured.words)
@@ -314,9 +314,7 @@ def test_row_42_ten_words_of_any_script_are_told_once_each_in_their_place(make_t
 
 
 @pytest.mark.slow
-def test_row_42_ten_words_of_any_script_are_told_once_each_by_a_neural_voice(
-    make_talk: MakeTalk, sink: Sink, joe: Joe
-) -> None:
+def test_row_42_a_neural_voice_reports_words_of_any_script_once(make_talk: MakeTalk, sink: Sink, joe: Joe) -> None:
     """Nothing else knows when they are heard: the recognizer knows English words alone."""
     talk = joe.serve(make_talk, sink, rate=200)
     done = talk.run("say", "--wait", "--", TEN)
@@ -333,7 +331,7 @@ def _assert_ten(words: list[Message]) -> None:
     assert times == sorted(times)
 
 
-def test_row_42_a_stopped_goal_has_spoken_what_was_heard_of_it(make_talk: MakeTalk, sink: Sink, voice: Voice) -> None:
+def test_row_42_a_stopped_goal_reports_the_words_that_were_heard(make_talk: MakeTalk, sink: Sink, voice: Voice) -> None:
     reference = voice.render_with_words(Sentence(LONG))
     begins = extent(reference.samples)
     assert begins is not None

@@ -33,7 +33,7 @@ def home(home: str) -> str:
     ],
     ids=str,
 )
-def test_client_looks_where_platformdirs_puts_the_socket(
+def test_a_client_looks_where_platformdirs_puts_the_socket(
     home: str, monkeypatch: pytest.MonkeyPatch, variables: dict[str, str]
 ) -> None:
     for name in ("XDG_RUNTIME_DIR", "TMPDIR", "TEMP", "TMP"):
@@ -50,7 +50,7 @@ def test_client_looks_where_platformdirs_puts_the_socket(
 
 @pytest.mark.usefixtures("nobody_serves")
 @pytest.mark.parametrize("runtime", ["run", "", None])
-def test_server_and_client_meet_without_naming_a_socket(home: str, runtime: str | None) -> None:
+def test_a_client_finds_the_server_without_naming_a_socket(home: str, runtime: str | None) -> None:
     env = environment(home) if runtime is None else environment(home, XDG_RUNTIME_DIR=runtime and f"{home}/{runtime}")
     if not runtime and os.path.isdir(f"/run/user/{os.getuid()}"):
         pytest.skip("this user has a runtime directory, which is the place then")
@@ -67,7 +67,7 @@ def test_server_and_client_meet_without_naming_a_socket(home: str, runtime: str 
 
 
 @pytest.mark.usefixtures("nobody_serves")
-def test_error_names_every_place_in_its_order(home: str) -> None:
+def test_the_error_lists_every_path_in_search_order(home: str) -> None:
     os.makedirs(f"{home}/run/talk", 0o700)
     done = run([*TALK, "status"], environment(home, XDG_RUNTIME_DIR=f"{home}/run"))
     places = [line.strip().partition(": ")[0] for line in done.err.splitlines() if line.startswith("  ")]
@@ -79,19 +79,19 @@ def test_error_names_every_place_in_its_order(home: str) -> None:
 
 
 @pytest.mark.usefixtures("nobody_serves")
-def test_system_service_serves_in_the_directory_that_systemd_made(home: str) -> None:
+def test_the_system_service_serves_in_its_runtime_directory(home: str) -> None:
     with serving(environment(home, RUNTIME_DIRECTORY=f"{home}/run")) as server:
         assert f"ready on {home}/run/talk.sock" in server.log
 
 
-def test_unknown_voice_ends_the_server_with_2(home: str) -> None:
+def test_an_unknown_voice_stops_the_server_with_exit_code_2(home: str) -> None:
     done = run([*TALK, "serve", "--player", "null", "--socket", f"{home}/s", "--voice", "germn"], environment(home))
     assert (done.code, done.out) == (2, "")
     assert ('"germn"' in done.err, "'German'" in done.err) == (True, True)
     assert not os.path.exists(f"{home}/s")
 
 
-def test_greeting_is_spoken_at_the_start(make_talk: MakeTalk) -> None:
+def test_the_greeting_is_spoken_at_the_start(make_talk: MakeTalk) -> None:
     talk = make_talk("--greeting", "length=0 at your service", scripted=True, watched=False)
     with talk.connect() as wire:
         goal_id = f"{wire.greeting['boot']}-1"

@@ -38,7 +38,7 @@ def test_row_45_of_two_servers_started_at_once_exactly_one_serves(times: int) ->
                     server.close()
 
 
-def test_second_server_says_who_serves_and_takes_nothing_away(scripted: Talk) -> None:
+def test_a_second_server_names_the_first_and_leaves_it_running(scripted: Talk) -> None:
     for options in ([], ["--socket", scripted.socket]):
         done = run([*TALK, "serve", *options], scripted.env)
         assert (done.code, done.out) == (11, "")

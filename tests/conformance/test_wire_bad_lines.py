@@ -100,7 +100,7 @@ def assert_error(reply: dict[str, Any], code: str) -> None:
     assert reply.keys() <= {"ok", "error", "seq"}
 
 
-def test_bad_lines_are_answered_with_their_code(talk: Talk) -> None:
+def test_bad_lines_are_answered_with_an_error_code(talk: Talk) -> None:
     for name, (line, code) in REFUSED.items():
         with Raw(talk.socket) as raw:
             raw.send(line + b"\n" + STATUS)
@@ -111,7 +111,7 @@ def test_bad_lines_are_answered_with_their_code(talk: Talk) -> None:
             assert (status[-1]["seq"], status[-1]["ok"]) == (7, True), name
 
 
-def test_wrong_types_are_refused_and_do_nothing(talk: Talk) -> None:
+def test_fields_of_the_wrong_type_are_refused(talk: Talk) -> None:
     with talk.connect() as wire:
         for kind, field, value in WRONG_TYPES:
             text = {"text": "hello"} if kind == "say" else {}
@@ -122,7 +122,7 @@ def test_wrong_types_are_refused_and_do_nothing(talk: Talk) -> None:
             assert wire.request("status")["ok"]  # a valid one in between: ten bad ones in a row end the connection
 
 
-def test_row_49_a_field_that_the_server_does_not_know_is_an_error(talk: Talk) -> None:
+def test_row_49_an_unknown_field_is_an_error(talk: Talk) -> None:
     kinds = ("hello", "say", "cancel", "watch")
     names = ("loudness", "Text", "", "x" * 1000, "\ud800")
     with talk.connect() as wire:
@@ -133,7 +133,7 @@ def test_row_49_a_field_that_the_server_does_not_know_is_an_error(talk: Talk) ->
             assert wire.request("status")["active"] is None
 
 
-def test_nested_data_is_taken_or_refused_at_any_depth(talk: Talk) -> None:
+def test_nested_data_of_any_depth_is_accepted_or_refused(talk: Talk) -> None:
     with talk.connect() as wire:
         for depth in (*range(160, 180), *range(960, 1_010)):
             data = '{"":' * depth + "1" + "}" * depth
@@ -146,7 +146,7 @@ def test_nested_data_is_taken_or_refused_at_any_depth(talk: Talk) -> None:
             assert wire.request("status")["ok"]
 
 
-def test_line_that_is_too_long_ends_the_connection(talk: Talk) -> None:
+def test_an_overlong_line_closes_the_connection(talk: Talk) -> None:
     longest = say("").ljust(MAX_LINE - 1) + b"\n"
     for bad in (b" " + longest, b"a" * MAX_LINE, b"a" * 10_000_000, STATUS[:-1].ljust(MAX_LINE) + b"\n"):
         with Raw(talk.socket) as raw:
@@ -158,7 +158,7 @@ def test_line_that_is_too_long_ends_the_connection(talk: Talk) -> None:
         assert raw.receive_lines(3)[2]["ok"]
 
 
-def test_requests_before_an_overlong_line_are_answered_and_none_after_it(talk: Talk) -> None:
+def test_only_requests_before_an_overlong_line_are_answered(talk: Talk) -> None:
     requests = [b'{"seq": %d, "request": "resume"}\n' % number for number in range(101)]
     with Raw(talk.socket) as raw:
         raw.send(b"".join([*requests[:100], b"a" * MAX_LINE, b"\n", requests[100]]))
@@ -167,7 +167,7 @@ def test_requests_before_an_overlong_line_are_answered_and_none_after_it(talk: T
         assert_error(error, "line_too_long")
 
 
-def test_nothing_but_bad_lines_end_the_connection(talk: Talk) -> None:
+def test_ten_bad_lines_in_a_row_close_the_connection(talk: Talk) -> None:
     for lines in (b"\n" * 10_000, b"GET / HTTP/1.1\r\nHost: robot\r\n" + b"X: y\r\n" * 20 + b"\r\n"):
         with Raw(talk.socket) as raw:
             raw.send(lines)
@@ -177,7 +177,7 @@ def test_nothing_but_bad_lines_end_the_connection(talk: Talk) -> None:
                 assert_error(error, "bad_json")
 
 
-def test_connection_that_ends_early_is_nothing(talk: Talk) -> None:
+def test_a_connection_that_closes_early_changes_nothing(talk: Talk) -> None:
     talk.request("status")  # by its reply, all earlier events are in the log
     before = talk.log
     for data in (b"", b"{", say(""), b"\n", b'{"request": "say", "text": "hel'):
@@ -193,7 +193,7 @@ def test_connection_that_ends_early_is_nothing(talk: Talk) -> None:
 
 
 @pytest.mark.skipif(not hasattr(socket, "SCM_RIGHTS"), reason="descriptors cannot be passed here")
-def test_descriptors_that_are_passed_are_not_kept(talk: Talk) -> None:
+def test_passed_descriptors_are_not_kept(talk: Talk) -> None:
     with Raw(talk.socket) as raw, open(os.devnull, "rb") as file:
         for _ in range(20):
             passed = array.array("i", [file.fileno()] * 5)
@@ -202,7 +202,7 @@ def test_descriptors_that_are_passed_are_not_kept(talk: Talk) -> None:
         assert [reply["ok"] for reply in replies] == [True] * 20
 
 
-def test_requests_of_a_refused_client_are_not_carried_out(make_talk: MakeTalk) -> None:
+def test_requests_of_a_refused_client_are_ignored(make_talk: MakeTalk) -> None:
     talk = make_talk("--max-clients", "1", scripted=True, watched=False)
     with contextlib.ExitStack() as stack:
         asking = stack.enter_context(talk.connect())
@@ -219,7 +219,7 @@ def test_requests_of_a_refused_client_are_not_carried_out(make_talk: MakeTalk) -
     assert "a bug" not in talk.log
 
 
-def test_request_after_ten_bad_lines_is_ignored_even_if_the_client_has_left(scripted: Talk) -> None:
+def test_a_request_after_ten_bad_lines_is_ignored(scripted: Talk) -> None:
     send_and_go(scripted, b"garbage\n" * 10 + b'{"request":"pause"}\n')
     assert scripted.request("status")["server"]["paused"] is False
 

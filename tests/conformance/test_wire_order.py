@@ -34,7 +34,7 @@ def shape(message: Message) -> str:
 
 
 @pytest.mark.parametrize("text", ["length=0.1 one two", "length=0.1 crash"])
-def test_row_50_reply_comes_first_and_the_result_last(scripted: Talk, text: str) -> None:
+def test_row_50_the_reply_comes_first_and_the_result_last(scripted: Talk, text: str) -> None:
     with Raw(scripted.socket) as raw:
         raw.send(line(seq=1, request="say", text=text, wait=True))
         _, reply, *events = raw.receive_lines(6)
@@ -51,7 +51,7 @@ def test_row_50_reply_comes_first_and_the_result_last(scripted: Talk, text: str)
     assert result["queued_at"] <= result["started_at"] <= result["ended_at"]
 
 
-def test_row_50_a_watcher_learns_with_its_first_event_what_a_goal_is(scripted: Talk) -> None:
+def test_row_50_the_first_event_of_a_goal_describes_it(scripted: Talk) -> None:
     for text in ("length=0.2 first, at once", "length=0 behind it", ""):
         goal_id = scripted.request("say", text=text)["goal"]["id"]
         first = scripted.watcher.wait_until(lambda event, goal_id=goal_id: event.get("id") == goal_id)  # type: ignore[misc]
@@ -59,14 +59,14 @@ def test_row_50_a_watcher_learns_with_its_first_event_what_a_goal_is(scripted: T
         assert (first["goal"]["text"], first["goal"]["state"]) == (text, first["state"])
 
 
-def test_row_50_end_of_a_displaced_goal_comes_before_the_newcomer_is_active(scripted: Talk) -> None:
+def test_row_50_a_preempted_goal_ends_before_the_new_goal_becomes_active(scripted: Talk) -> None:
     with scripted.connect() as wire:
         first = wire.request("say", text="length=20 slow-stop=0.05")["goal"]["id"]
         scripted.watcher.wait_for_word(first)
         second = wire.request("say", text="length=0", preempt=True)["goal"]["id"]
     scripted.watcher.wait_for(second, "SUCCEEDED")
-    told = [(event["id"], event["state"]) for event in scripted.watcher.events() if event["event"] == "state"]
-    assert told[2:] == [
+    events = [(event["id"], event["state"]) for event in scripted.watcher.events() if event["event"] == "state"]
+    assert events[2:] == [
         (second, "PENDING"),
         (first, "PREEMPTING"),
         (first, "PREEMPTED"),
@@ -85,14 +85,14 @@ def test_row_50_events_come_before_the_reply_that_depends_on_them(scripted: Talk
         wire.events.clear()
         reply = wire.request("cancel")
         assert reply["count"] == 2
-        told = [(event.get("id") or event["goal"]["id"], shape(event)) for event in wire.events]
+        events = [(event.get("id") or event["goal"]["id"], shape(event)) for event in wire.events]
         assert sorted(item["canceled"]["id"] for item in wire.items) == sorted([active, pending])
-    assert told[-5:] == [
+    assert events[-5:] == [
         (pending, "RECALLED"), (pending, "result"), (active, "PREEMPTING"), (active, "PREEMPTED"), (active, "result")
     ]  # fmt: skip
 
 
-def test_two_requests_in_one_segment_are_two_requests(scripted: Talk) -> None:
+def test_two_requests_in_one_segment_are_both_handled(scripted: Talk) -> None:
     with Raw(scripted.socket) as raw:
         requests = [line(seq=1, request="say", text="length=0"), line(seq=2, request="say", text="length=0 two")]
         raw.send(b"".join([*requests, line(seq=3, request="status")[:10]]))
@@ -104,7 +104,7 @@ def test_two_requests_in_one_segment_are_two_requests(scripted: Talk) -> None:
         assert scripted.watcher.wait_for_terminal(reply["goal"]["id"]) == "SUCCEEDED"
 
 
-def test_request_in_segments_of_one_byte_is_a_request(scripted: Talk) -> None:
+def test_a_request_sent_byte_by_byte_is_handled(scripted: Talk) -> None:
     with Raw(scripted.socket) as raw:
         for byte in line(seq=1, request="say", text="length=0 é", wait=True):
             raw.send(bytes([byte]))
@@ -112,7 +112,7 @@ def test_request_in_segments_of_one_byte_is_a_request(scripted: Talk) -> None:
     assert (result["goal"]["state"], result["goal"]["text"]) == ("SUCCEEDED", "length=0 é")
 
 
-def test_result_is_delivered_to_a_client_that_has_closed_its_half(scripted: Talk) -> None:
+def test_a_client_that_has_closed_its_sending_half_gets_the_result(scripted: Talk) -> None:
     with Raw(scripted.socket) as raw:
         raw.send(line(request="say", text="length=0.5", wait=True))
         raw.half_close()
@@ -120,7 +120,7 @@ def test_result_is_delivered_to_a_client_that_has_closed_its_half(scripted: Talk
     assert (shape(result), result["goal"]["state"]) == ("result", "SUCCEEDED")
 
 
-def test_replies_that_are_owed_reach_a_client_that_has_closed_its_half(scripted: Talk) -> None:
+def test_a_client_that_has_closed_its_sending_half_gets_its_replies(scripted: Talk) -> None:
     scripted.request("say", text="length=20 slow-stop=0.1")
     scripted.watcher.wait_for(None, "ACTIVE")
     with Raw(scripted.socket) as raw:
@@ -144,17 +144,17 @@ def test_requests_that_wait_for_the_voices_keep_their_order(make_talk: MakeTalk,
         wire.send({"seq": 6_001, "request": "wait", "ids": ["last"]})
         wire.send({"seq": 6_002, "request": "set", "rate": 100})
         assert wire.request("cancel" if behind == "cancel" else "status")["ok"]
-        told = [(reply["seq"], reply) for reply in wire.items if "ok" in reply]
-    assert [seq for seq, _ in told] == [*range(5_000, 5_000 + count), 6_000, 6_001, 6_002]
-    assert all(reply["ok"] for _, reply in told)
-    assert [reply["goal"]["id"] for _, reply in told[:count]] == [f"{boot}-{number + 1}" for number in range(count)]
+        replies = [(reply["seq"], reply) for reply in wire.items if "ok" in reply]
+    assert [seq for seq, _ in replies] == [*range(5_000, 5_000 + count), 6_000, 6_001, 6_002]
+    assert all(reply["ok"] for _, reply in replies)
+    assert [reply["goal"]["id"] for _, reply in replies[:count]] == [f"{boot}-{number + 1}" for number in range(count)]
     await_ends(talk, talk.watcher.goals())
     spoken = [event["id"] for event in talk.watcher.events() if event.get("state") == "ACTIVE"]
     expected = [f"{boot}-{number + 1}" for number in range(count)]
     assert spoken == ([*expected, "last"] if behind == "nothing" else expected[: len(spoken)])
 
 
-def test_a_cancel_or_a_pause_does_not_hurry_what_others_wait_for(make_talk: MakeTalk) -> None:
+def test_a_cancel_or_a_pause_does_not_answer_waiting_requests_early(make_talk: MakeTalk) -> None:
     talk = make_talk(scripted=True, env={"SCRIPTED_START": "slow=0.5"})
     with talk.connect() as asking, talk.connect() as canceling, talk.connect() as pausing:
         requests: list[dict[str, Any]] = [
@@ -194,7 +194,7 @@ def test_a_rejected_goal_has_a_state_and_a_result_if_the_client_waits(scripted: 
     assert {message["goal"]["state"] for message in (reply, *events[1:])} == {"REJECTED"}
 
 
-def test_request_is_not_handled_while_a_goal_is_ending(scripted: Talk) -> None:
+def test_no_request_is_handled_while_a_goal_is_ending(scripted: Talk) -> None:
     count = 60
     with scripted.connect() as wire:
         for _ in range(count):

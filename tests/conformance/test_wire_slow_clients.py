@@ -48,9 +48,9 @@ def others_served(talk: Talk, speak: str | None = None) -> Iterator[list[float]]
         with talk.connect() as wire:
             while not done.is_set():
                 wire.items.clear()
-                began = time.monotonic()
+                started_at = time.monotonic()
                 assert wire.request("status", timeout=20)["ok"]
-                times.append(time.monotonic() - began)
+                times.append(time.monotonic() - started_at)
                 done.wait(0.005)
 
     thread = threading.Thread(target=ask)
@@ -71,7 +71,7 @@ def others_served(talk: Talk, speak: str | None = None) -> Iterator[list[float]]
     assert times
 
 
-def test_10000_requests_without_reading_the_replies(scripted: Talk) -> None:
+def test_10000_requests_with_unread_replies_do_not_delay_other_clients(scripted: Talk) -> None:
     count = 10_000
 
     with limits(), Raw(scripted.socket) as raw:
@@ -93,7 +93,7 @@ def test_10000_requests_without_reading_the_replies(scripted: Talk) -> None:
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="the memory of a process is not told here")
-def test_requests_that_come_faster_than_they_are_answered_do_not_pile_up(scripted: Talk) -> None:
+def test_unanswered_requests_do_not_fill_the_servers_memory(scripted: Talk) -> None:
     with Raw(scripted.socket) as raw:
         before = peak_memory(scripted.pid)
         sender = threading.Thread(target=raw.send, args=(HELLO * 1_500_000,))
@@ -114,7 +114,7 @@ def peak_memory(pid: int) -> int:
         return next(int(line.split()[1]) for line in file if line.startswith("VmHWM:"))
 
 
-def test_watcher_that_does_not_read_loses_feedback_alone(scripted: Talk) -> None:
+def test_a_watcher_that_does_not_read_loses_only_feedback(scripted: Talk) -> None:
     text = "length=1 " + "a " * 4_900
     with scripted.connect() as stuck:
         assert stuck.request("watch")["ok"]
@@ -134,10 +134,8 @@ def test_watcher_that_does_not_read_loses_feedback_alone(scripted: Talk) -> None
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="the memory of a process is not told here")
-@pytest.mark.parametrize("asked", ["wait", "cancel"])
-def test_lists_that_nobody_reads_take_no_more_memory_than_what_may_wait_of_them(
-    make_talk: MakeTalk, asked: str
-) -> None:
+@pytest.mark.parametrize("kind", ["wait", "cancel"])
+def test_unread_lists_use_limited_memory(make_talk: MakeTalk, kind: str) -> None:
     count, clients = 1_000, 40
     talk = make_talk("--max-queue", str(count), scripted=True)
     with talk.connect() as wire, contextlib.ExitStack() as stack:
@@ -147,7 +145,7 @@ def test_lists_that_nobody_reads_take_no_more_memory_than_what_may_wait_of_them(
         before = peak_memory(talk.pid)
         raws = [stack.enter_context(Raw(talk.socket)) for _ in range(clients)]
         for raw in raws:
-            raw.send(line(request=asked, ids=ids))
+            raw.send(line(request=kind, ids=ids))
         for raw in raws:
             raw.socket.recv(4_096, socket.MSG_WAITALL)  # its list has begun
         assert wire.request("status")["ok"]
@@ -157,7 +155,9 @@ def test_lists_that_nobody_reads_take_no_more_memory_than_what_may_wait_of_them(
 
 
 @pytest.mark.parametrize("share", [0.1, pytest.param(1.0, marks=pytest.mark.slow)])
-def test_slow_clients_are_closed_by_the_limits(make_talk: MakeTalk, tmp_path: pathlib.Path, share: float) -> None:
+def test_slow_clients_are_disconnected_after_their_time_limit(
+    make_talk: MakeTalk, tmp_path: pathlib.Path, share: float
+) -> None:
     """All kinds of slow clients at once, for 12 s or a tenth of it. The longest limit is 10 s."""
     first, line, every = share * FIRST_REQUEST, share * LINE, share * ALIVE_EVERY
     constants = {
@@ -167,7 +167,7 @@ def test_slow_clients_are_closed_by_the_limits(make_talk: MakeTalk, tmp_path: pa
     }
     talk = make_talk(program=patched_serve(tmp_path, **constants))
     with limits(), contextlib.ExitStack() as stack:
-        began = time.monotonic()
+        started_at = time.monotonic()
         raws = [stack.enter_context(Raw(talk.socket)) for _ in range(100)]
         silent, begun, idle, waiting, tls, *dripping = raws
         dripping_later = dripping[:45]
@@ -178,11 +178,11 @@ def test_slow_clients_are_closed_by_the_limits(make_talk: MakeTalk, tmp_path: pa
         tls.send(b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(range(11, 255)))
         closed: dict[int, float] = {}
         times = stack.enter_context(others_served(talk))
-        while time.monotonic() < began + 1.2 * line or len(closed) < len(raws) - 2:
-            assert time.monotonic() < began + line + 2 * LATE, "they are not closed"
+        while time.monotonic() < started_at + 1.2 * line or len(closed) < len(raws) - 2:
+            assert time.monotonic() < started_at + line + 2 * LATE, "they are not closed"
             for raw in dripping:
                 raw.send(b"x")
-            _collect(raws, closed, began, share)
+            _collect(raws, closed, started_at, share)
         assert_within(max(times), 1, "status for another client")
         for limit, clients in ((first, (silent, tls, *dripping[45:])), (line, (begun, *dripping_later))):
             for raw in clients:
@@ -192,7 +192,7 @@ def test_slow_clients_are_closed_by_the_limits(make_talk: MakeTalk, tmp_path: pa
             assert raw.lines[-1]["error"]["code"] == "too_slow"
         assert not {id(idle), id(waiting)} & closed.keys()
         alive = [message for message in waiting.lines if message.get("event") == "alive"]
-        assert 1.2 * line // every <= len(alive) <= (time.monotonic() - began) / every + 1
+        assert 1.2 * line // every <= len(alive) <= (time.monotonic() - started_at) / every + 1
         assert len(idle.lines) == 2  # an idle client doesn't wait
         idle.send(b'{"seq": 3, "request": "cancel"}\n')  # a connection may idle for ever
         assert idle.receive_lines(4)[-1] == {"seq": 3, "ok": True, "count": 1}
@@ -201,12 +201,12 @@ def test_slow_clients_are_closed_by_the_limits(make_talk: MakeTalk, tmp_path: pa
         assert waiting.lines[-1]["goal"]["state"] == "PREEMPTED"
 
 
-def _collect(raws: list[Raw], closed: dict[int, float], began: float, seconds: float) -> None:
+def _collect(raws: list[Raw], closed: dict[int, float], started_at: float, seconds: float) -> None:
     """Read from all connections for so long, and record when each was closed."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         for raw in [raw for raw in raws if id(raw) not in closed]:
             with contextlib.suppress(TimeoutError, BlockingIOError):
                 if not raw.receive(0.0):
-                    closed[id(raw)] = time.monotonic() - began
+                    closed[id(raw)] = time.monotonic() - started_at
         time.sleep(0.02)

@@ -71,11 +71,11 @@ def assert_told_in_order(talk: Talk) -> None:
 
 def _check_goal(events: list[Message]) -> None:
     """One goal: its states are one of the ways, its words are between ACTIVE and its end."""
-    told = [event.get("state", "word") for event in events]
-    states = [state for state in told if state != "word"]
+    steps = [event.get("state", "word") for event in events]
+    states = [state for state in steps if state != "word"]
     assert states in WAYS, events
-    assert told[0] != "word" != told[-1], told
-    assert "word" not in told or told.index("word") > told.index("ACTIVE"), told
+    assert steps[0] != "word" != steps[-1], steps
+    assert "word" not in steps or steps.index("word") > steps.index("ACTIVE"), steps
     for event in (event for event in events if event["event"] == "state"):
         with_goal = event["state"] == "PENDING" or event["state"] in TERMINAL
         assert ("goal" in event) == with_goal, event
@@ -104,7 +104,7 @@ def _check_newcomers(events: Iterable[Message]) -> None:
         seen[event["id"]] = event["state"]
         newcomer = (event.get("goal", {}).get("by") or {}).get("goal")
         if newcomer is not None and event["state"] in {"RECALLED", "PREEMPTED"}:
-            told = f"{event['id']} ended by {newcomer}, which was {seen.get(newcomer)}"
+            error = f"{event['id']} ended by {newcomer}, which was {seen.get(newcomer)}"
             # One that was stopped may end long after the newcomer was recalled in its turn.
             allowed = {"PENDING"} if event["state"] == "RECALLED" else {"PENDING", "RECALLED"}
-            assert seen.get(newcomer) in allowed, told
+            assert seen.get(newcomer) in allowed, error

@@ -27,9 +27,9 @@ def ends(talk: Talk, *goal_ids: str) -> list[int]:
 
 def await_ends(talk: Talk, goal_ids: Iterable[str]) -> None:
     """Wait until these goals have ended, if they were accepted; a thousand that have are seen at one look."""
-    told = {(event.get("id"), event.get("state")) for event in talk.watcher.events()}
-    ended = {goal_id for goal_id, state in told if state in TERMINAL - {"REJECTED"}}
-    rejected = {goal_id for goal_id, state in told if state == "REJECTED" and (goal_id, "PENDING") not in told}
+    seen = {(event.get("id"), event.get("state")) for event in talk.watcher.events()}
+    ended = {goal_id for goal_id, state in seen if state in TERMINAL - {"REJECTED"}}
+    rejected = {goal_id for goal_id, state in seen if state == "REJECTED" and (goal_id, "PENDING") not in seen}
     done = ended | rejected
     for goal_id in goal_ids:
         if goal_id not in done:

@@ -36,9 +36,9 @@ GROWTH = 4096
 
 def assert_answers(talk: Talk) -> None:
     """Assert that the server answers in time, whatever is broken."""
-    asked = time.monotonic()  # before it connects: the greeting takes its time as well
+    started_at = time.monotonic()  # before it connects: the greeting takes its time as well
     assert talk.request("status")["ok"]
-    assert_within(time.monotonic() - asked, ANSWER, "`status`")
+    assert_within(time.monotonic() - started_at, ANSWER, "`status`")
 
 
 def await_end(talk: Talk, goal_id: str, within: float) -> str:
@@ -80,11 +80,11 @@ def heard_again(talk: Talk, sink: Sink) -> float:
         assert talk.run("say", "--wait", "--rate", str(QUICK), "--", HELP).code == 0
         recording.wait_until_quiet(0.2)
     heard, expected = recording.samples[start:], render_quick([HELP])[0]
-    found = extent(heard)
-    assert found
-    seconds, usual = (np.count_nonzero(samples) / RATE for samples in (heard, expected))
-    assert abs(seconds - usual) < ALIKE, (seconds, usual)
-    return recording.time_of(start + found[0])
+    bounds = extent(heard)
+    assert bounds
+    seconds, expected_seconds = (np.count_nonzero(samples) / RATE for samples in (heard, expected))
+    assert abs(seconds - expected_seconds) < ALIKE, (seconds, expected_seconds)
+    return recording.time_of(start + bounds[0])
 
 
 def python_path(first: Path) -> dict[str, str]:

@@ -17,7 +17,7 @@ class Supervisor(contextlib.AbstractContextManager["Supervisor"]):
     def __init__(self, address: str) -> None:
         self.address = address
         #: all messages so far: name, value, time
-        self.told: list[tuple[str, str, float]] = []
+        self.messages: list[tuple[str, str, float]] = []
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.bind(f"\0{address[1:]}" if address.startswith("@") else address)
 
@@ -30,12 +30,12 @@ class Supervisor(contextlib.AbstractContextManager["Supervisor"]):
         """Return the time of a message of this name that came after a time."""
         end = time.monotonic() + PATIENCE
         while True:
-            for sent, value, at in self.told:
+            for sent, value, at in self.messages:
                 if sent == name and containing in value and at > since:
                     return at
-            assert self.hear(end - time.monotonic()), f"{name} {containing!r} was never told: {self.told}"
+            assert self.receive(end - time.monotonic()), f"{name} {containing!r} was never told: {self.messages}"
 
-    def hear(self, timeout: float) -> bool:
+    def receive(self, timeout: float) -> bool:
         """Take one datagram; False if none comes."""
         self._socket.settimeout(max(0.001, timeout))
         try:
@@ -45,7 +45,7 @@ class Supervisor(contextlib.AbstractContextManager["Supervisor"]):
         now = time.monotonic()
         for line in data.decode().splitlines():
             name, _, value = line.partition("=")
-            self.told.append((name, value, now))
+            self.messages.append((name, value, now))
         return True
 
     def fill(self) -> None:
@@ -58,5 +58,5 @@ class Supervisor(contextlib.AbstractContextManager["Supervisor"]):
 
     def drain(self) -> None:
         """Take the messages that have come already."""
-        while self.hear(0):
+        while self.receive(0):
             pass

@@ -80,16 +80,14 @@ def crowd(talk: Talk, count: int, line: str) -> Iterator[subprocess.Popen[str]]:
 @pytest.mark.parametrize(
     "patience", [("--timeout", "0.5"), pytest.param((), marks=pytest.mark.slow)], ids=["its own", "the usual 5 s"]
 )
-def test_300_clients_at_once_are_served_or_told_that_the_server_is_busy(
-    scripted: Talk, patience: tuple[str, ...]
-) -> None:
+def test_clients_over_the_limit_get_busy_and_are_served_later(scripted: Talk, patience: tuple[str, ...]) -> None:
     with contextlib.ExitStack() as stack:
         clients = [stack.enter_context(Raw(scripted.socket)) for _ in range(300)]
         for client in clients:
             client.send(b'{"seq": 1, "request": "hello"}\n')
         lines = [client.receive_lines(1) for client in clients]
-        greeted = [client for client, said in zip(clients, lines, strict=True) if "error" not in said[0]]
-        busy = [said[0] for said in lines if "error" in said[0]]
+        greeted = [client for client, messages in zip(clients, lines, strict=True) if "error" not in messages[0]]
+        busy = [messages[0] for messages in lines if "error" in messages[0]]
         # The watcher of this test is one client of 256.
         assert (len(greeted), len(busy)) == (255, 45)
         assert all((greeting["talk"], greeting["error"]) == (1, "busy") for greeting in busy)
@@ -122,7 +120,7 @@ def many_files() -> Iterator[None]:
         pytest.param(500, 100, marks=pytest.mark.slow),
     ],
 )
-def test_500_say_processes_at_once(make_talk: MakeTalk, processes: int, max_queue: int) -> None:
+def test_500_say_processes_at_once_lose_no_accepted_goal(make_talk: MakeTalk, processes: int, max_queue: int) -> None:
     """With room for all none is lost. Otherwise the accepted goals are spoken, and the other clients know."""
     talk = make_talk("--max-queue", str(max_queue), scripted=True)
     first = talk.run("say", "never-ends").id
@@ -142,7 +140,7 @@ def test_500_say_processes_at_once(make_talk: MakeTalk, processes: int, max_queu
 
 
 @pytest.mark.parametrize(("waiters", "seconds"), [(10, 1), pytest.param(50, 16, marks=pytest.mark.slow)])
-def test_50_waiters_that_are_frozen_take_no_memory_while_10000_words_pass(
+def test_50_frozen_waiters_use_no_more_memory_during_10000_words(
     make_talk: MakeTalk, waiters: int, seconds: int
 ) -> None:
     talk = make_talk(scripted=True, watched=False)
@@ -176,7 +174,7 @@ def speak_words(talk: Talk, seconds: int) -> None:
     ["never-ends length=60 " + "a " * 600, pytest.param("never-ends", marks=pytest.mark.slow)],
     ids=["with a word now and then", "in silence"],
 )
-def test_500_waiters_that_are_killed_leave_nothing_and_their_goal_goes_on(make_talk: MakeTalk, text: str) -> None:
+def test_500_killed_waiters_leak_nothing_and_their_goal_continues(make_talk: MakeTalk, text: str) -> None:
     """The server notices at the next message: a word, or every 5 s the sign that it is alive."""
     talk = make_talk("--max-clients", "600", scripted=True)
     goal = talk.run("say", text).id
@@ -186,14 +184,14 @@ def test_500_waiters_that_are_killed_leave_nothing_and_their_goal_goes_on(make_t
     for _ in range(2):
         with contextlib.ExitStack() as stack:
             crowds = [stack.enter_context(crowd(talk, 50, line)) for _ in range(10)]
-            assert census.count(talk.pid).descriptors >= 500
+            assert usage.count(talk.pid).descriptors >= 500
             for process in crowds:
                 os.kill(process.pid, signal.SIGKILL)
-        census.assert_as_before(talk.pid, before, memory=8 * 1024)
+        usage.assert_not_grown(talk.pid, before, memory=8 * 1024)
     assert talk.goal(goal)["state"] == "ACTIVE"
-    began = time.monotonic()
+    started_at = time.monotonic()
     assert talk.run("cancel", goal).code == 0
-    assert time.monotonic() - began < 5
+    assert time.monotonic() - started_at < 5
     assert talk.watcher.wait_for_terminal(goal) == "PREEMPTED"
 
 
@@ -206,7 +204,7 @@ def test_500_waiters_that_are_killed_leave_nothing_and_their_goal_goes_on(make_t
     ],
     ids=["its own patience", "the usual 5 s"],
 )
-def test_server_that_takes_no_connection_at_all_holds_no_client(scripted: Talk, commands: list[list[str]]) -> None:
+def test_a_server_with_a_full_backlog_does_not_block_clients(scripted: Talk, commands: list[list[str]]) -> None:
     """Frozen, with its backlog full, so that `connect` itself would wait."""
     scripted.freeze()
     try:
@@ -280,18 +278,18 @@ def greeted(clients: list[socket.SocketIO]) -> list[socket.SocketIO]:
 def assert_status(client: socket.SocketIO) -> None:
     """Assert that a client that was let in gets the status in time."""
     with limits():
-        began = time.monotonic()
+        started_at = time.monotonic()
         client.write(b'{"seq": 7, "request": "status"}\n')
         while receive(client).get("seq") != 7:
             pass
-        assert_within(time.monotonic() - began, 0.1, "status without descriptors")
+        assert_within(time.monotonic() - started_at, 0.1, "status without descriptors")
 
 
 def wait_for_descriptors(pid: int, most: int) -> None:
     assert usage.wait_until(pid, lambda now: now.descriptors <= most).descriptors <= most, usage.describe(pid)
 
 
-def test_limit_of_40_and_60_clients_leave_the_engine_what_it_needs(home: str) -> None:
+def test_60_clients_leave_the_engine_enough_of_40_descriptors(home: str) -> None:
     path = f"{home}/s"
     env = environment(home, TALK_SOCKET=path)
     with serving(env, command=limited(40, [*SERVE, "--rate", "450"])) as server:
@@ -330,7 +328,7 @@ def test_limit_of_40_and_60_clients_leave_the_engine_what_it_needs(home: str) ->
         assert len(lines) < 12, server.log
 
 
-def test_descriptors_that_something_else_has_used_up(home: str) -> None:
+def test_a_server_without_free_descriptors_recovers(home: str) -> None:
     path = f"{home}/s"
     env = environment(home, TALK_SOCKET=path)
     with serving(env, command=SCRIPTED) as server, Wire(path) as wire:
@@ -345,9 +343,9 @@ def test_descriptors_that_something_else_has_used_up(home: str) -> None:
             kill_engine(pid)
             time.sleep(2)  # twice as long as it waits to look again; and four starts of the engine
             with limits():
-                began = time.monotonic()
+                started_at = time.monotonic()
                 assert wire.request("status")["ok"]
-                assert_within(time.monotonic() - began, 0.1, "status without descriptors")
+                assert_within(time.monotonic() - started_at, 0.1, "status without descriptors")
             goal = wire.request("say", text="length=0", wait=True)["goal"]
             assert goal["state"] == "PENDING"
             assert "could not be started" in wire.request("status")["server"]["engine"]
@@ -361,7 +359,7 @@ def test_descriptors_that_something_else_has_used_up(home: str) -> None:
         assert "bug" not in server.log
 
 
-def test_more_clients_than_a_process_usually_has_descriptors(home: str) -> None:
+def test_the_server_raises_its_descriptor_limit_for_max_clients(home: str) -> None:
     if resource.getrlimit(resource.RLIMIT_NOFILE)[1] < 1500:
         pytest.skip("this user may not open 1,500 files")
     path = f"{home}/s"
@@ -383,7 +381,7 @@ AHEAD = 50
 
 
 @pytest.mark.parametrize("goals", [500, pytest.param(10_000, marks=pytest.mark.slow)])
-def test_cancel_that_races_with_the_natural_end_10000_times(make_talk: MakeTalk, goals: int) -> None:
+def test_a_cancel_racing_with_the_end_gives_exactly_one_end_state(make_talk: MakeTalk, goals: int) -> None:
     talk = make_talk(scripted=True, watched=False)
     witness = Witness(talk.socket)
     over = threading.Event()

@@ -69,7 +69,9 @@ RATE = 450
     [*ALWAYS, *(pytest.param(*case, marks=pytest.mark.slow) for case in ALL if case not in ALWAYS)],
     ids=lambda value: value if isinstance(value, str) else signal.Signals(value).name,
 )
-def test_engine_process_is_signalled(make_talk: MakeTalk, sink: Sink, activity: str, number: signal.Signals) -> None:
+def test_a_killed_or_frozen_engine_loses_at_most_one_goal(
+    make_talk: MakeTalk, sink: Sink, activity: str, number: signal.Signals
+) -> None:
     with limits():
         talk = make_talk("--player", PLAYERS[activity], sink=sink)
         with nothing_left(talk), sink.record() as recording:
@@ -132,7 +134,9 @@ exec pacat --server=unix:{folder}/pulse --raw --format=s16le --channels=1 --rate
 
 
 @pytest.mark.parametrize("ends", ["ABORTED", "PREEMPTED"])
-def test_what_a_player_started_in_a_session_of_its_own_ends_with_it(make_talk: MakeTalk, sink: Sink, ends: str) -> None:
+def test_processes_that_a_player_started_in_another_session_are_killed(
+    make_talk: MakeTalk, sink: Sink, ends: str
+) -> None:
     needs("setsid")
     talk = make_talk("--player", APART, sink=sink)
     with nothing_left(talk):
@@ -149,7 +153,7 @@ def test_what_a_player_started_in_a_session_of_its_own_ends_with_it(make_talk: M
         assert talk.watcher.wait_for_terminal(following) == "SUCCEEDED"
 
 
-def test_a_sound_server_that_a_player_has_started_is_left_alone(make_talk: MakeTalk, tmp_path: Path) -> None:
+def test_a_sound_server_started_by_a_player_keeps_running(make_talk: MakeTalk, tmp_path: Path) -> None:
     needs("pulseaudio", "pacat")
     with short_directory() as folder:
         player = write(tmp_path / "player", STARTS_A_SERVER.format(folder=folder, mark=MARK))
@@ -182,7 +186,7 @@ if "talkcli.engine.child.main" in "".join(sys.orig_argv):
 """
 
 
-def test_complaints_of_the_engine_are_logged_fit_for_a_terminal(make_talk: MakeTalk, tmp_path: Path) -> None:
+def test_terminal_escapes_in_engine_errors_are_logged_escaped(make_talk: MakeTalk, tmp_path: Path) -> None:
     write(tmp_path / "sitecustomize.py", COMPLAINS)
     talk = make_talk("--player", "null", env=python_path(tmp_path))
     assert talk.run("say", "--wait", "--", "yes").code == 0
@@ -204,11 +208,11 @@ def _assert_lost(talk: Talk, goal_id: str, number: signal.Signals) -> Message:
     return goal
 
 
-def _assert_next(recording: Recording, hit: float, limit: float, what: str) -> float:
+def _assert_next(recording: Recording, signalled_at: float, limit: float, case: str) -> float:
     """Assert that LOW was heard in time after the signal, and return when."""
-    moment = began(recording, render([LOW], rate=RATE)[0])
-    assert_within(moment - hit, limit, f"the next goal after {what}")
-    return moment
+    heard_at = began(recording, render([LOW], rate=RATE)[0])
+    assert_within(heard_at - signalled_at, limit, f"the next goal after {case}")
+    return heard_at
 
 
 #: Seconds in which the thread acts and the watcher is told.
@@ -247,57 +251,59 @@ STUCK: dict[str, tuple[Callable[[Talk], object], float]] = {
 
 
 @pytest.mark.parametrize("limit", [1.5, pytest.param(HANG_LIMIT_S, marks=pytest.mark.slow)])
-def test_synthesis_without_progress(make_talk: MakeTalk, sink: Sink, tmp_path: Path, limit: float) -> None:
+def test_a_synthesis_without_progress_is_aborted(make_talk: MakeTalk, sink: Sink, tmp_path: Path, limit: float) -> None:
     write(tmp_path / "sitecustomize.py", STUCK_SYNTHESIS.format(limit=limit))
 
     with limits():
         talk = make_talk(sink=sink, env=python_path(tmp_path))
         with nothing_left(talk), sink.record() as recording:
-            asked = time.monotonic()
+            sent_at = time.monotonic()
             goal = send(talk, "this takes forever")
             following = send(talk, LOW, rate=RATE)
             assert await_end(talk, goal, limit + SLACK + 2) == "ABORTED"
             assert_aborted(talk.goal(goal), "engine_hung", f"the engine did not respond for {limit:g} s")
             assert talk.watcher.wait_for_terminal(following) == "SUCCEEDED"
         talk.stop()
-        seconds = began(recording, render([LOW], rate=RATE)[0]) - asked
+        seconds = began(recording, render([LOW], rate=RATE)[0]) - sent_at
         assert seconds > limit
         assert_within(seconds, limit + RESTART, "the next goal after a synthesis without progress")
 
 
 @pytest.mark.parametrize(
-    "whats",
+    "cases",
     [["its engine killed", "stopped"], pytest.param(["its player killed"], marks=pytest.mark.slow)],
     ids=" and ".join,
 )
-def test_process_that_cannot_be_reaped(make_talk: MakeTalk, sink: Sink, tmp_path: Path, whats: list[str]) -> None:
+def test_a_player_that_cannot_be_reaped_does_not_block_the_next_goal(
+    make_talk: MakeTalk, sink: Sink, tmp_path: Path, cases: list[str]
+) -> None:
     play = "aplay -q -t raw -f S16_LE -r 22050 -c 1 --buffer-time=60000"
     program = f"#!/bin/sh\nexec {sys.executable} -S {trapped.__file__} {HELD} {play}\n"
     command = str(write(tmp_path / "player", program, 0o755))
 
     with limits(), contextlib.ExitStack() as idle:
-        talks = {what: make_talk("--player", command, sink=sink) for what in whats}
+        talks = {case: make_talk("--player", command, sink=sink) for case in cases}
         for talk in talks.values():
             idle.enter_context(nothing_left(talk))
-        goals = {what: send(talk, LONG) for what, talk in talks.items()}
-        players, hits = {}, {}
-        for what, talk in talks.items():
-            await_word(talk, goals[what])
-            players[what] = player_process(talk)
-            if "TracerPid:\t0\n" in Path(f"/proc/{players[what]}/status").read_text():
+        goals = {case: send(talk, LONG) for case, talk in talks.items()}
+        players, started_at = {}, {}
+        for case, talk in talks.items():
+            await_word(talk, goals[case])
+            players[case] = player_process(talk)
+            if "TracerPid:\t0\n" in Path(f"/proc/{players[case]}/status").read_text():
                 pytest.skip("this system does not let a killed process be held: ptrace is forbidden")
-        for what, talk in talks.items():
-            hits[what] = time.monotonic()
-            STUCK[what][0](talk)
-        for what in whats:
-            talk, goal, limit = talks[what], goals[what], STUCK[what][1]
+        for case, talk in talks.items():
+            started_at[case] = time.monotonic()
+            STUCK[case][0](talk)
+        for case in cases:
+            talk, goal, limit = talks[case], goals[case], STUCK[case][1]
             assert await_end(talk, goal, limit + 2) == "ABORTED"
-            ended = talk.watcher.arrived(talk.watcher.wait_for(goal, "ABORTED")) - hits[what]
-            words = "silence was not confirmed" if what == "stopped" else "the player could not be stopped"
+            ended = talk.watcher.arrived(talk.watcher.wait_for(goal, "ABORTED")) - started_at[case]
+            words = "silence was not confirmed" if case == "stopped" else "the player could not be stopped"
             assert_aborted(talk.goal(goal), "not_silent", words)
-            assert_within(ended, limit, f"the end of a goal that was {what}")
-        for what, talk in talks.items():
-            player = players[what]
+            assert_within(ended, limit, f"the end of a goal that was {case}")
+        for case, talk in talks.items():
+            player = players[case]
             assert os.path.exists(f"/proc/{player}"), "it could be reaped, so nothing was tested"
             heard_again(talk, sink)
             assert os.path.exists(f"/proc/{player}"), "the next goal waited for it"
@@ -306,7 +312,7 @@ def test_process_that_cannot_be_reaped(make_talk: MakeTalk, sink: Sink, tmp_path
                 os.kill(tracer, signal.SIGKILL)  # which lets go of it
 
 
-#: By hand: `TALK_TEST_KILLS=1000 pytest -s -m slow -k server_is_killed tests/faults/test_engine_killed.py`.
+#: By hand: `TALK_TEST_KILLS=1000 pytest -s -m slow -k server_killed tests/faults/test_engine_killed.py`.
 FEW, KILLS = 3, int(os.environ.get("TALK_TEST_KILLS", "20"))
 #: Seconds from the kill to the last sound and to the end of the last process; from a start to its greeting.
 SILENT, SERVES = 0.3, 1.0
@@ -316,7 +322,9 @@ WORDS = (2, 5)
 
 @pytest.mark.timeout(60 + 10 * KILLS)
 @pytest.mark.parametrize("kills", [FEW, pytest.param(KILLS, marks=pytest.mark.slow)])
-def test_server_is_killed_in_mid_sentence(make_talk: MakeTalk, sink: Sink, kills: int) -> None:
+def test_a_server_killed_in_mid_sentence_is_silent_and_starts_again(
+    make_talk: MakeTalk, sink: Sink, kills: int
+) -> None:
     talk = make_talk(sink=sink, forked=False)  # its start is timed
     chance = random.Random(kills)
     files = set(os.listdir(talk.directory))

@@ -67,21 +67,21 @@ MISSING = {
 }
 
 
-@pytest.mark.parametrize("what", MISSING)
-def test_without_a_part_of_the_engine_goals_end_at_once_until_it_is_installed(
-    make_talk: MakeTalk, sink: Sink, tmp_path: Path, what: str
+@pytest.mark.parametrize("missing", MISSING)
+def test_goals_are_aborted_at_once_while_a_dependency_is_missing(
+    make_talk: MakeTalk, sink: Sink, tmp_path: Path, missing: str
 ) -> None:
-    name, module, words = MISSING[what]
+    name, module, error = MISSING[missing]
     attempts = write(tmp_path / "attempts", "")
     with limits():
         shadow = write(tmp_path / f"{name}.py", module.format(real=WHEEL, empty=tmp_path, attempts=str(attempts)))
         library = write(tmp_path / "libespeak-ng.so.1", "no library")
         talk = make_talk(sink=sink, env={**python_path(tmp_path), "LD_LIBRARY_PATH": str(tmp_path)})
-        took = _assert_aborted_at_once(talk, words)
-        assert talk.log.count(words) == 3, f"once for the engine, once for each goal: {talk.log}"
+        took = _assert_aborted_at_once(talk, error)
+        assert talk.log.count(error) == 3, f"once for the engine, once for each goal: {talk.log}"
         assert_answers(talk)
-        times = _await_attempts(attempts, 3 if what == "pyttsx3" else 0)
-        (shadow if what == "pyttsx3" else library).unlink()
+        times = _await_attempts(attempts, 3 if missing == "pyttsx3" else 0)
+        (shadow if missing == "pyttsx3" else library).unlink()
         with talk.connect() as wire:
             _await_engine(wire, "ready")
             times.append(time.monotonic())
@@ -101,19 +101,19 @@ def _await_attempts(path: Path, count: int) -> list[float]:
     return [float(line) for line in times]
 
 
-def _assert_aborted_at_once(talk: Talk, words: str) -> float:
+def _assert_aborted_at_once(talk: Talk, error: str) -> float:
     """Assert that goals are ABORTED, and say what to install; return after how many seconds one is."""
     done = talk.run("say", "--wait", "--", LOW)
     assert done.code == 4
-    assert words in done.err
-    asked = time.monotonic()
+    assert error in done.err
+    sent_at = time.monotonic()
     goal_id = send(talk, LOW)
     ended = talk.watcher.arrived(talk.watcher.wait_for(goal_id, "ABORTED"))
     for ended_id in (done.id, goal_id):
         goal = talk.goal(ended_id)
-        assert_aborted(goal, "engine_failed", words)
+        assert_aborted(goal, "engine_failed", error)
         assert goal["spoken"] == ""
-    return ended - asked
+    return ended - sent_at
 
 
 #: Goals that wait behind the one that loses its engine.
@@ -144,10 +144,10 @@ def _replaced(talk: Talk, engine: int, number: signal.Signals = signal.SIGKILL) 
     """Kill the engine process, and return the next one, once it is there."""
     os.kill(engine, number)
     end = time.monotonic() + PATIENCE
-    while not (found := set(usage.descendants(talk.pid)) - {engine}):
+    while not (replacement := set(usage.descendants(talk.pid)) - {engine}):
         assert time.monotonic() < end, talk.log
         time.sleep(0.002)  # the start of a process sends no event
-    (next_one,) = found
+    (next_one,) = replacement
     return next_one
 
 
@@ -157,14 +157,14 @@ def _ends(talk: Talk, goals: list[str]) -> list[tuple[str, str | None]]:
     return [(goal["state"], goal["reason"]) for goal in map(talk.goal, goals)]
 
 
-def _await_engine(wire: Wire, words: str) -> None:
+def _await_engine(wire: Wire, expected: str) -> None:
     end = time.monotonic() + 10
-    while (told := wire.request("status")["server"]["engine"]) != words:
-        assert time.monotonic() < end, told
+    while (state := wire.request("status")["server"]["engine"]) != expected:
+        assert time.monotonic() < end, state
         time.sleep(0.005)  # how the engine is, is published to nobody
 
 
-def test_a_moment_without_descriptors_costs_the_goal_whose_engine_was_killed_and_no_other(make_talk: MakeTalk) -> None:
+def test_a_brief_lack_of_descriptors_aborts_only_the_current_goal(make_talk: MakeTalk) -> None:
     talk = make_talk("--player", "null")
     assert talk.run("voices").code == 0
     first = begin(talk, LONG, number=1)
@@ -184,7 +184,7 @@ def test_a_moment_without_descriptors_costs_the_goal_whose_engine_was_killed_and
     assert talk.log.count("could not be started") == 1, talk.log
 
 
-def test_a_kill_in_a_goal_and_two_in_the_starts_behind_it_cost_one_goal(scripted: Talk) -> None:
+def test_an_engine_killed_again_during_its_restarts_costs_one_goal(scripted: Talk) -> None:
     talk = scripted
     with limits():
         first = begin(talk, "never-ends", number=1)
@@ -201,7 +201,7 @@ def test_a_kill_in_a_goal_and_two_in_the_starts_behind_it_cost_one_goal(scripted
         assert_within(speaking, SPEAKING, "the next goal after an engine was killed in its start")
 
 
-def test_an_engine_that_was_killed_while_idle_costs_no_goal_that_comes_at_once(make_talk: MakeTalk) -> None:
+def test_an_engine_killed_while_idle_costs_no_goal(make_talk: MakeTalk) -> None:
     talk = make_talk("--player", "null")
     assert talk.run("voices").code == 0
     for _ in range(3):
@@ -210,7 +210,7 @@ def test_an_engine_that_was_killed_while_idle_costs_no_goal_that_comes_at_once(m
         assert _ends(talk, [goal]) == [("SUCCEEDED", None)], talk.goal(goal)
 
 
-def test_engines_that_have_spoken_and_are_killed_while_idle_are_replaced_at_once(scripted: Talk) -> None:
+def test_engines_killed_after_a_goal_are_replaced_without_delay(scripted: Talk) -> None:
     assert RESTART_DELAYS_S == WAITS
     assert RESTART_DELAYS_S[-1] > PATIENCE, "a goal that has to wait so long is not awaited"
     engine = _scripted_engine(scripted)
@@ -219,18 +219,16 @@ def test_engines_that_have_spoken_and_are_killed_while_idle_are_replaced_at_once
         assert _ends(scripted, [send(scripted, "length=0")]) == [("SUCCEEDED", None)]
 
 
-def test_an_engine_that_does_not_come_for_long_costs_a_goal_each_time_it_is_tried(
-    make_talk: MakeTalk, tmp_path: Path
-) -> None:
+def test_after_a_wait_each_failed_engine_start_aborts_one_goal(make_talk: MakeTalk, tmp_path: Path) -> None:
     write(tmp_path / "sitecustomize.py", HASTY.format(patience=0.5))
     talk = make_talk(scripted=True, env=python_path(tmp_path))
     assert talk.run("voices").code == 0
     talk.script_start("crash")
-    began = time.monotonic()
+    started_at = time.monotonic()
     os.kill(_scripted_engine(talk), signal.SIGKILL)
     goals = [send(talk, "length=0.5") for _ in range(4)]
     talk.watcher.wait_for_terminal(goals[1])
-    waited = time.monotonic() - began
+    waited = time.monotonic() - started_at
     talk.script_start("")
     assert waited >= 0.4, "it is waited for first"
     ends = _ends(talk, goals)
@@ -240,7 +238,7 @@ def test_an_engine_that_does_not_come_for_long_costs_a_goal_each_time_it_is_trie
     assert "the engine crashed: it was killed by SIGSEGV" in talk.goal(goals[0])["message"]
 
 
-def test_a_lasting_cause_and_then_a_passing_one_leave_no_goal_waiting(make_talk: MakeTalk, tmp_path: Path) -> None:
+def test_goals_end_if_a_temporary_failure_follows_a_permanent_one(make_talk: MakeTalk, tmp_path: Path) -> None:
     """This happens if pyttsx3 is missing, and then half installed."""
     write(tmp_path / "sitecustomize.py", HASTY.format(patience=0.3))
     talk = make_talk(scripted=True, env=python_path(tmp_path))
@@ -259,7 +257,7 @@ def test_a_lasting_cause_and_then_a_passing_one_leave_no_goal_waiting(make_talk:
 
 
 @pytest.mark.parametrize("option", [("--driver", "parrot"), ("--driver", "nsss"), ("--voice", "parrot")], ids=" ".join)
-def test_an_unknown_driver_or_voice_ends_the_server_before_it_is_ready(tmp_path: Path, option: tuple[str, str]) -> None:
+def test_an_unknown_driver_or_voice_stops_the_server_at_start(tmp_path: Path, option: tuple[str, str]) -> None:
     place = str(tmp_path / "s")
     done = run([*SERVE, "--socket", place, *option], environment(str(tmp_path)))
     assert done.code == 2
@@ -269,10 +267,10 @@ def test_an_unknown_driver_or_voice_ends_the_server_before_it_is_ready(tmp_path:
     assert not os.path.exists(place)
 
 
-def test_a_server_that_awaits_its_engine_ends_when_it_is_told_to(make_talk: MakeTalk) -> None:
+def test_a_server_waiting_for_its_engine_can_be_stopped(make_talk: MakeTalk) -> None:
     talk = make_talk("--voice", "en", scripted=True, env={"SCRIPTED_START": "hang"})
     with limits():
-        began = time.monotonic()
+        started_at = time.monotonic()
         talk.stop()
-        assert_within(time.monotonic() - began, 1, "the end of a server whose engine hangs in its start")
+        assert_within(time.monotonic() - started_at, 1, "the end of a server whose engine hangs in its start")
     assert "ready on" not in talk.log

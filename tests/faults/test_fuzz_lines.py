@@ -13,12 +13,12 @@ SECONDS = float(os.environ.get("TALK_TEST_FUZZ") or (30 if os.environ.get("CI") 
 
 
 @pytest.mark.parametrize("count", [2_000, pytest.param(20_000, marks=pytest.mark.slow)])
-def test_20000_mutated_lines_have_one_reply_each(count: int) -> None:
+def test_every_mutated_line_gets_one_reply(count: int) -> None:
     replies = fuzz(20, count=count)
     assert len(replies) > 8, f"hardly any errors: {replies}"
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(int(SECONDS) + 300)
-def test_mutated_lines_of_today_have_one_reply_each() -> None:
+def test_every_line_mutated_with_todays_seed_gets_one_reply() -> None:
     assert fuzz(today(), seconds=SECONDS).total() > 400 * SECONDS

@@ -46,19 +46,19 @@ Server = Sink | PipeWire
 
 @pytest.fixture(scope="module", params=[Sink, PipeWire], ids=["PulseAudio", "PipeWire"])
 def server(request: pytest.FixtureRequest) -> Iterator[Server]:
-    with request.param() as found:
-        yield found
+    with request.param() as sound_server:
+        yield sound_server
 
 
 @pytest.fixture(scope="module")
 def shared(server: Server) -> Iterator[Talk]:
     """A server for all tests at this sound server."""
-    found = Talk(("--rate", "450"), env=server.env)
+    talk = Talk(("--rate", "450"), env=server.env)
     try:
-        yield found
-        found.stop()
+        yield talk
+        talk.stop()
     finally:
-        found.close()
+        talk.close()
 
 
 @pytest.fixture
@@ -111,15 +111,15 @@ def _move(server: Server, name: str) -> None:
     """Move the only stream to this sink. A session manager takes its time, and a busy one may miss the request."""
     sinks = [line.split("\t")[:2] for line in server.pactl("list", "short", "sinks").splitlines()]
     (wanted,) = [number for number, sink_name in sinks if sink_name == name]
-    asked = 0.0
+    requested_at = 0.0
     while True:
         (stream,) = server.pactl("list", "short", "sink-inputs").splitlines()
         number, sink, *_ = stream.split("\t")
         if sink == wanted:
             return
-        if time.monotonic() - asked > 0.5:
+        if time.monotonic() - requested_at > 0.5:
             server.pactl("move-sink-input", number, name)
-            asked = time.monotonic()
+            requested_at = time.monotonic()
 
 
 def _mute(server: Server, name: str, on: str = "1") -> None:
@@ -135,7 +135,7 @@ def _ended(talk: Talk, goal_id: str) -> Message:
     return talk.goal(goal_id)
 
 
-def test_a_goal_says_where_it_goes_and_how_loud_that_is(talk: Talk, server: Server, card: Card) -> None:
+def test_a_goal_reports_its_device_and_volume(talk: Talk, server: Server, card: Card) -> None:
     server.pactl("set-sink-volume", card.name, "40%")
     goal = begin(talk, LONG)
     wanted = {"player": "pulse", "device": card.name, "volume": 0.4, "muted": False}
@@ -146,7 +146,7 @@ def test_a_goal_says_where_it_goes_and_how_loud_that_is(talk: Talk, server: Serv
     assert (ended["state"], ended["output"]) == ("SUCCEEDED", {**wanted, "volume": 0.2})
 
 
-def test_a_stream_that_is_moved_to_another_device_goes_on_there(talk: Talk, server: Server, card: Card) -> None:
+def test_a_stream_moved_to_another_device_continues_there(talk: Talk, server: Server, card: Card) -> None:
     """Another default device in mid-sentence ends nothing, either."""
     with _loaded(server, OTHER):
         goal = begin(talk, f"{LONG}, {LONG}")
@@ -158,7 +158,7 @@ def test_a_stream_that_is_moved_to_another_device_goes_on_there(talk: Talk, serv
         assert (ended["state"], ended["output"]["device"]) == ("SUCCEEDED", OTHER)
 
 
-def test_a_dummy_is_no_output_unless_it_is_named(make_talk: MakeTalk, server: Server, card: Card) -> None:
+def test_a_dummy_output_is_used_only_if_it_is_named(make_talk: MakeTalk, server: Server, card: Card) -> None:
     with contextlib.ExitStack() as stack:
         if DUMMY_SINK not in server.pactl("list", "short", "sinks"):
             stack.enter_context(_loaded(server, DUMMY_SINK))
@@ -172,16 +172,14 @@ def test_a_dummy_is_no_output_unless_it_is_named(make_talk: MakeTalk, server: Se
         server.pactl("set-default-sink", card.name)
 
 
-def test_a_device_that_is_unplugged_ends_the_sentence_and_the_next_is_heard(
-    talk: Talk, server: Server, card: Card
-) -> None:
+def test_speech_works_again_after_the_device_was_unplugged(talk: Talk, server: Server, card: Card) -> None:
     with limits():
         goal = begin(talk, LONG)
-        unplugged = time.monotonic()
+        unplugged_at = time.monotonic()
         server.pactl("unload-module", card.module)
         if isinstance(server, PipeWire):
             ended = talk.watcher.wait_for(goal, "ABORTED")
-            assert_within(talk.watcher.arrived(ended) - unplugged, TOLD, "the end of a goal whose device is gone")
+            assert_within(talk.watcher.arrived(ended) - unplugged_at, TOLD, "the end of a goal whose device is gone")
             assert_aborted(talk.goal(goal), "audio_lost", "the sound server has only a dummy output left")
             assert_aborted(_ended(talk, send(talk, LOW)), "audio_device", "only a dummy output")
         else:  # PulseAudio moves the stream to its other sink
@@ -192,31 +190,31 @@ def test_a_device_that_is_unplugged_ends_the_sentence_and_the_next_is_heard(
 
 
 @pytest.mark.parametrize("server", [Sink], indirect=True, ids=["PulseAudio"])  # PipeWire suspends nothing that plays
-def test_a_suspended_device_ends_the_sentence_within_a_second(talk: Talk, server: Server, card: Card) -> None:
+def test_a_suspended_device_aborts_the_sentence_in_time(talk: Talk, server: Server, card: Card) -> None:
     with limits():
         goal = begin(talk, LONG)
-        suspended = time.monotonic()
+        suspended_at = time.monotonic()
         server.pactl("suspend-sink", card.name, "1")
         ended = talk.watcher.wait_for(goal, "ABORTED")
         server.pactl("suspend-sink", card.name, "0")
         assert_within(
-            talk.watcher.arrived(ended) - suspended, SUSPENDED_LIMIT_S + TOLD, "the end of a goal that stands still"
+            talk.watcher.arrived(ended) - suspended_at, SUSPENDED_LIMIT_S + TOLD, "the end of a goal that stands still"
         )
         assert_aborted(talk.goal(goal), "audio_stalled", f"the sound server has suspended {card.name}")
         assert talk.run("say", "--wait", "--", LOW).code == 0
 
 
 @pytest.mark.parametrize("mute", [_mute, _turn_down])
-def test_a_muted_sentence_is_told_and_not_begun_if_it_must_be_audible(
+def test_a_muted_output_is_reported_or_aborts_an_audible_goal(
     talk: Talk, server: Server, mute: Callable[[Server, str], None], card: Card
 ) -> None:
     mute(server, card.name)
     done = talk.run("say", "--wait", "--", LOW)
     goal = talk.goal(done.id)
-    words = f"Talk completed successfully, but the output was muted: {card.name}"
-    assert (done.code, goal["state"], goal["message"]) == (0, "SUCCEEDED", words)
+    message = f"Talk completed successfully, but the output was muted: {card.name}"
+    assert (done.code, goal["state"], goal["message"]) == (0, "SUCCEEDED", message)
     assert goal["output"]["muted"] is True
-    assert done.err == f"talk: {done.id}: {words}\n"
+    assert done.err == f"talk: {done.id}: {message}\n"
     assert any(re.search(rf'"{LOW}" +muted$', line) for line in talk.run("status").out.splitlines())
     assert f"output   {card.name}, by pulse, volume " in talk.run("status", done.id).out
     done = talk.run("say", "--wait", "--audible", "--", LOW)
@@ -225,29 +223,29 @@ def test_a_muted_sentence_is_told_and_not_begun_if_it_must_be_audible(
     assert (done.code, goal["spoken"], goal["duration"]) == (4, "", None)
 
 
-def test_a_sentence_that_becomes_muted_ends_if_it_must_be_audible_and_is_told_otherwise(
+def test_muting_in_mid_sentence_is_reported_or_aborts_an_audible_goal(
     make_talk: MakeTalk, server: Server, card: Card
 ) -> None:
     talk = make_talk("--rate", "450", "--audible", env=server.env)
     with limits():
         goal = begin(talk, LONG)
-        muted = time.monotonic()
+        muted_at = time.monotonic()
         _mute(server, card.name)
         ended = talk.watcher.wait_for(goal, "ABORTED")
-        assert_within(talk.watcher.arrived(ended) - muted, TOLD, "the end of a goal that became muted")
+        assert_within(talk.watcher.arrived(ended) - muted_at, TOLD, "the end of a goal that became muted")
         assert_aborted(talk.goal(goal), "muted")
         _mute(server, card.name, "0")
-        own = begin(talk, LONG, audible=False)
+        second = begin(talk, LONG, audible=False)
         _mute(server, card.name)
-        while not talk.goal(own)["output"]["muted"] and talk.goal(own)["state"] == "ACTIVE":
+        while not talk.goal(second)["output"]["muted"] and talk.goal(second)["state"] == "ACTIVE":
             pass
         _mute(server, card.name, "0")
-        told = _ended(talk, own)
-        assert (told["state"], told["output"]["muted"]) == ("SUCCEEDED", True)  # a moment of it is told as well
+        result = _ended(talk, second)
+        assert (result["state"], result["output"]["muted"]) == ("SUCCEEDED", True)  # a moment of it is told as well
 
 
 @pytest.mark.usefixtures("card")
-def test_a_server_that_takes_no_more_clients_ends_the_sentence_in_words(make_talk: MakeTalk, server: Server) -> None:
+def test_a_full_sound_server_aborts_the_goal_with_a_clear_message(make_talk: MakeTalk, server: Server) -> None:
     talk = make_talk("--player", "pulse", "--rate", "450", env=server.env)
     with contextlib.ExitStack() as crowd:
         for _ in range(CLIENTS):
@@ -259,7 +257,7 @@ def test_a_server_that_takes_no_more_clients_ends_the_sentence_in_words(make_tal
 
 
 @pytest.mark.usefixtures("card")
-def test_no_stream_is_left_by_a_cancel_or_by_an_engine_that_is_killed(talk: Talk, server: Server) -> None:
+def test_no_stream_remains_after_a_cancel_or_a_killed_engine(talk: Talk, server: Server) -> None:
     begin(talk, LONG)
     assert descendants(engine_process(talk)) == []  # no player's process, which could be left
     talk.run("cancel")

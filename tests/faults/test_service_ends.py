@@ -58,23 +58,23 @@ def stalled(path: str, count: int = 100) -> Iterator[None]:
         yield
 
 
-def test_sigterm_with_100_stalled_clients_ends_it_within_3_seconds(home: str) -> None:
+def test_sigterm_stops_a_server_with_100_stalled_clients_in_3_seconds(home: str) -> None:
     path, mark = f"{home}/s", uuid.uuid4().hex
     with limits():
         with serving(environment(home, TALK_SOCKET=path, **{MARK: mark})) as server, Wire(path) as wire, stalled(path):
             wire.request("say", text="a sentence that is long enough to be in the middle of it", wait=True)
             wire.receive_event("state", state="ACTIVE")
-            began = time.monotonic()
+            started_at = time.monotonic()
             server.process.send_signal(signal.SIGTERM)
             result = wire.receive_event("result")["goal"]
             assert (result["state"], result["reason"]) == ("PREEMPTED", "shutdown")
             assert server.end() == 0
-            assert_within(time.monotonic() - began, 3, "the end after SIGTERM")
+            assert_within(time.monotonic() - started_at, 3, "the end after SIGTERM")
         assert not os.path.exists(path)
         assert_none_left(mark, 0.5)
 
 
-def test_second_sigterm_with_100_stalled_clients_ends_it_at_once(home: str) -> None:
+def test_a_second_sigterm_stops_a_server_with_stalled_clients_at_once(home: str) -> None:
     path, mark = f"{home}/s", uuid.uuid4().hex
     env = environment(home, TALK_SOCKET=path, **{MARK: mark})
     with limits():
@@ -84,14 +84,14 @@ def test_second_sigterm_with_100_stalled_clients_ends_it_at_once(home: str) -> N
             wire.receive_event("word")
             server.process.send_signal(signal.SIGTERM)
             wire.receive_event("state", state="PREEMPTING")
-            began = time.monotonic()
+            started_at = time.monotonic()
             assert server.end(signal.SIGTERM) == 143
-            assert_within(time.monotonic() - began, 0.1, "the end after a second SIGTERM")
+            assert_within(time.monotonic() - started_at, 0.1, "the end after a second SIGTERM")
         assert not os.path.exists(path)
         assert_none_left(mark, 0.5)
 
 
-def test_storm_of_signals_is_survived(home: str) -> None:
+def test_a_server_survives_thousands_of_sighups_and_sigpipes(home: str) -> None:
     path = f"{home}/s"
     with serving(environment(home, TALK_SOCKET=path), command=FAST) as server, Wire(path) as wire:
         goal = wire.request("say", text="spoken to its end, whatever comes", wait=True)["goal"]
@@ -100,9 +100,9 @@ def test_storm_of_signals_is_survived(home: str) -> None:
             for number in [signal.SIGHUP, signal.SIGPIPE] * 3:
                 for _ in range(1000):
                     server.process.send_signal(number)
-                began = time.monotonic()
+                started_at = time.monotonic()
                 assert wire.request("status")["ok"]
-                assert_within(time.monotonic() - began, 0.1, "status in a storm of signals")
+                assert_within(time.monotonic() - started_at, 0.1, "status in a storm of signals")
         ended = wire.receive_event("result", timeout=10)["goal"]
         assert (ended["id"], ended["state"]) == (goal["id"], "SUCCEEDED")
 
@@ -117,7 +117,7 @@ os.execv(sys.executable, [sys.executable, "-m", "talkcli", "serve", *sys.argv[1:
 """
 
 
-def test_a_server_sets_the_signals_that_it_needs_whoever_starts_it(make_talk: MakeTalk, tmp_path: Path) -> None:
+def test_a_server_resets_inherited_signal_settings(make_talk: MakeTalk, tmp_path: Path) -> None:
     talk = make_talk("--player", "null", program=str(write(tmp_path / "start.py", STARTED_BADLY)))
     goal = begin(talk, "a sentence that is long enough to be in the middle of it", number=1)
     os.kill(engine_process(talk), signal.SIGKILL)
@@ -128,14 +128,14 @@ def test_a_server_sets_the_signals_that_it_needs_whoever_starts_it(make_talk: Ma
     talk.stop()
 
 
-def test_too_little_memory_for_a_server_is_told_in_words_that_name_the_limit(home: str) -> None:
+def test_the_error_for_too_little_memory_names_the_limit(home: str) -> None:
     """It is enough for the imports, but not for the stack of a thread, or just not enough for the server."""
     kib = 22_000
     command = ["sh", "-c", f'ulimit -d {kib}; exec "$@"', "sh", *TALK, "serve", "--player", "null"]
     done = run(command, environment(home, TALK_SOCKET=f"{home}/s"))
-    what = "(can't start the engine's thread|not enough memory for talk)"
+    error = "(can't start the engine's thread|not enough memory for talk)"
     limit = re.escape(f"the limit is {kib * 1024:,} bytes of memory (ulimit -d, LimitDATA=)")
-    assert (done.code, bool(re.fullmatch(f"talk: {what}: {limit}\n", done.err))) == (1, True), done
+    assert (done.code, bool(re.fullmatch(f"talk: {error}: {limit}\n", done.err))) == (1, True), done
 
 
 @contextlib.contextmanager
@@ -171,7 +171,7 @@ def speaks(wire: Wire, *texts: str) -> None:
 
 
 @pytest.mark.parametrize("redirection", ["2>&-", "<&- >&- 2>&-", "2>/dev/full"])
-def test_speech_goes_on_with_standard_error_closed(home: str, redirection: str) -> None:
+def test_speech_continues_with_standard_error_closed_or_full(home: str, redirection: str) -> None:
     with serving_with(home, redirection) as wire:
         speaks(wire, "one", "two")
         wire.request("cancel")
@@ -187,7 +187,7 @@ def _fill(writing: int) -> None:
     os.set_blocking(writing, True)
 
 
-def test_speech_goes_on_while_nobody_reads_a_full_standard_error_and_when_its_reader_is_gone(home: str) -> None:
+def test_speech_continues_while_standard_error_is_a_full_or_broken_pipe(home: str) -> None:
     reading, writing = os.pipe()
     _fill(writing)
     with serving_with(home, "", writing) as wire:
@@ -195,16 +195,16 @@ def test_speech_goes_on_while_nobody_reads_a_full_standard_error_and_when_its_re
         speaks(wire, "one", "two", "three")
         os.read(reading, 1 << 20)  # all that the pipe holds
         speaks(wire, "four")
-        said = ""
-        while '"four"' not in said:
-            said += os.read(reading, 65536).decode()
+        log_text = ""
+        while '"four"' not in log_text:
+            log_text += os.read(reading, 65536).decode()
         # The loss is told as soon as there is room.
-        assert "lines before this one could not be written)" in said.splitlines()[0]
+        assert "lines before this one could not be written)" in log_text.splitlines()[0]
         os.close(reading)
         speaks(wire, "five", "six")
 
 
-def test_lines_of_the_log_are_whole_and_one_each(home: str) -> None:
+def test_a_log_message_is_one_line_of_limited_length(home: str) -> None:
     path = f"{home}/s"
     with serving(environment(home, TALK_SOCKET=path), command=SCRIPTED) as server, Wire(path) as wire:
         wire.request("say", text=f"length=0 {'word ' * 1900}\ntalk: forged\n", wait=True)
@@ -214,7 +214,7 @@ def test_lines_of_the_log_are_whole_and_one_each(home: str) -> None:
     assert "talk: forged" not in server.log.splitlines()
 
 
-def test_sigint_that_a_shell_had_ignored_stays_so(home: str) -> None:
+def test_sigint_stays_ignored_if_the_shell_ignored_it(home: str) -> None:
     env = environment(home, TALK_SOCKET=f"{home}/s")
     with serving(env, command=["sh", "-c", "trap '' INT; exec \"$@\"", "sh", *SCRIPTED]) as server:
         server.process.send_signal(signal.SIGINT)
@@ -222,7 +222,7 @@ def test_sigint_that_a_shell_had_ignored_stays_so(home: str) -> None:
         assert server.process.poll() is None
 
 
-def test_storm_of_the_same_message_is_a_line_a_minute_with_a_number(
+def test_a_repeated_message_is_logged_once_a_minute_with_a_count(
     capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = 1000.0

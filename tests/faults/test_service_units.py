@@ -82,7 +82,7 @@ def verify(home: str, name: str, **units: str) -> None:
 
 
 @pytest.mark.parametrize("name", UNITS)
-def test_unit_says_where_it_goes_and_how_to_enable_it_and_systemd_finds_nothing_wrong(home: str, name: str) -> None:
+def test_a_unit_is_valid_and_explains_its_installation(home: str, name: str) -> None:
     needs("systemd-analyze")
     unit = printed(home, name)
     kind = "socket" if name.endswith("socket") else "service"
@@ -98,7 +98,7 @@ def test_unit_says_where_it_goes_and_how_to_enable_it_and_systemd_finds_nothing_
     verify(home, name, **{"service": service, kind: unit})
 
 
-def test_services_are_supervised_and_the_system_s_lets_the_audio_group_in(home: str) -> None:
+def test_services_are_supervised_and_the_system_one_admits_group_audio(home: str) -> None:
     user, system = printed(home, "user"), printed(home, "system")
     both = {
         "Type": "notify",
@@ -127,7 +127,7 @@ def test_services_are_supervised_and_the_system_s_lets_the_audio_group_in(home: 
 
 
 @pytest.mark.parametrize("name", ["user", "system"])
-def test_command_is_absolute_and_has_the_options_that_were_given(home: str, name: str) -> None:
+def test_the_command_is_absolute_and_keeps_the_given_options(home: str, name: str) -> None:
     greeting = 'I\'m "here", at 100 % of $HOME \\ now; --really'
     options = ["--rate", "150", "--preempt", "--ttl=2.5", "--greeting", greeting, "--device", "plughw:1,0"]
     command = command_of(printed(home, name, "--player", "aplay", *options))
@@ -140,7 +140,7 @@ def test_command_is_absolute_and_has_the_options_that_were_given(home: str, name
 
 
 @pytest.mark.parametrize("name", ["user", "system"])
-def test_controls_in_an_option_are_read_by_systemd_as_they_were_given(home: str, name: str) -> None:
+def test_control_characters_in_an_option_survive_systemds_quoting(home: str, name: str) -> None:
     needs("systemd-analyze")
     greeting = 'one\rtwo\nthree\tfour \x01\x7f\x85\u2028 "five" \\\n'
     unit = printed(home, name, "--greeting", greeting, "--socket", f"{home}/a\nb")
@@ -152,30 +152,35 @@ def test_controls_in_an_option_are_read_by_systemd_as_they_were_given(home: str,
     verify(home, name, service=unit)
 
 
-def test_socket_s_unit_has_the_place_where_clients_look(home: str) -> None:
-    def told(name: str, *options: str) -> list[str]:
+def test_a_socket_unit_listens_where_clients_look(home: str) -> None:
+    def socket_settings(name: str, *options: str) -> list[str]:
         unit = printed(home, name, *options)
         return values(unit, "ListenStream") + values(unit, "SocketMode") + values(unit, "SocketGroup")
 
-    assert told("user-socket") == ["%t/talk/talk.sock", "0600"]
-    assert told("system-socket") == ["/run/talk/talk.sock", "0660", "audio"]
-    assert told("user-socket", "--socket", f"{home}/100%", "--socket-mode", "0666") == [f"{home}/100%%", "0666"]
-    assert told("user-socket", "--socket", f"{home}/a b")[0] == f"{home}/a b"
+    assert socket_settings("user-socket") == ["%t/talk/talk.sock", "0600"]
+    assert socket_settings("system-socket") == ["/run/talk/talk.sock", "0660", "audio"]
+    assert socket_settings("user-socket", "--socket", f"{home}/100%", "--socket-mode", "0666") == [
+        f"{home}/100%%",
+        "0666",
+    ]
+    assert socket_settings("user-socket", "--socket", f"{home}/a b")[0] == f"{home}/a b"
 
 
-def test_units_that_cannot_be_printed_are_usage_errors(home: str) -> None:
-    cases = [(words, "--print-unit") for words in (["--print-unit"], ["--print-unit", "launchd"], ["--print-unit="])]
+def test_a_unit_that_cannot_be_printed_is_a_usage_error(home: str) -> None:
+    cases = [
+        (options, "--print-unit") for options in (["--print-unit"], ["--print-unit", "launchd"], ["--print-unit="])
+    ]
     cases += [
         (["--print-unit", name, "--socket", f"{home}/{path}"], "a socket unit can't contain the path")
         for path in ("a\nb", "a\rb", "a ", "a\\")
         for name in ("user-socket", "system-socket")
     ]
-    for words, said in cases:
-        done = run([*TALK, "serve", *words], environment(home))
-        assert (done.code, done.out, said in done.err) == (2, "", True), done
+    for options, error in cases:
+        done = run([*TALK, "serve", *options], environment(home))
+        assert (done.code, done.out, error in done.err) == (2, "", True), done
 
 
-def test_installed_script_is_the_command_however_it_was_called(home: str) -> None:
+def test_the_unit_names_the_installed_script_however_it_was_called(home: str) -> None:
     os.mkdir(f"{home}/a place")
     script = str(write(Path(home, "a place", "talk"), SCRIPT, 0o755))
     env = environment(home, PATH=f"{home}/a place:{os.environ['PATH']}")
@@ -184,7 +189,7 @@ def test_installed_script_is_the_command_however_it_was_called(home: str) -> Non
         assert command_of(done.out) == [script, "serve"], done
 
 
-def test_system_s_unit_warns_if_the_service_s_user_can_t_read_the_program(home: str) -> None:
+def test_printing_the_system_unit_warns_if_its_user_cannot_run_talk(home: str) -> None:
     private = f"{home}/private"
     os.mkdir(private, 0o700)
     script = str(write(Path(private, "talk"), SCRIPT, 0o755))
@@ -199,19 +204,19 @@ def test_system_s_unit_warns_if_the_service_s_user_can_t_read_the_program(home: 
     assert run([script, "serve", "--print-unit", "user"], environment(home)).err == ""
 
 
-def test_system_s_service_is_exposed_to_little(home: str) -> None:
+def test_systemd_rates_the_system_service_as_well_protected(home: str) -> None:
     needs("systemd-analyze")
     unit = write(Path(home, "talk.service"), printed(home, "system"))
     done = run(["systemd-analyze", "security", "--offline=true", "--no-pager", str(unit)], environment(home))
     if "unrecognized option" in done.err:
         pytest.skip("this systemd-analyze judges no unit that is not loaded: version 250 does")
-    found = re.search(r"Overall exposure level for talk.service: ([\d.]+)", done.out)
-    assert found, done
-    assert float(found[1]) <= 2.0
+    match = re.search(r"Overall exposure level for talk.service: ([\d.]+)", done.out)
+    assert match, done
+    assert float(match[1]) <= 2.0
 
 
 @pytest.mark.usefixtures("nobody_serves")
-def test_command_serves_in_the_environment_that_systemd_gives_it(home: str) -> None:
+def test_the_command_serves_in_the_environment_that_systemd_sets(home: str) -> None:
     needs("setpriv")
     os.mkdir(f"{home}/talk", 0o755)
     with Supervisor(f"{home}/n") as supervisor:
@@ -234,7 +239,7 @@ def test_command_serves_in_the_environment_that_systemd_gives_it(home: str) -> N
         supervisor.wait_for("STOPPING", "1")
 
 
-def test_system_s_service_keeps_the_halves_of_a_voice_in_the_cache_directory(home: str) -> None:
+def test_the_system_service_caches_a_split_voice(home: str) -> None:
     needs_packages(*NEURAL_PACKAGES)
     tiny_voice.put(Path(home) / "voices", "tiny")
     # As for each service with a user of its own: the variable names a link to a private directory.
@@ -256,7 +261,7 @@ def listening_at(path: str, kind: socket.SocketKind = socket.SOCK_STREAM) -> Ite
         yield passed
 
 
-def test_socket_that_is_passed_is_served_until_the_end_and_left(home: str) -> None:
+def test_a_passed_socket_is_served_and_its_file_is_kept(home: str) -> None:
     path = f"{home}/s"
     with Supervisor(f"{home}/n") as supervisor, listening_at(path) as passed:
         os.chmod(path, 0o666)
@@ -278,7 +283,7 @@ def test_socket_that_is_passed_is_served_until_the_end_and_left(home: str) -> No
             assert not os.path.exists(f"{path}.lock")
 
 
-def test_socket_that_cannot_be_served_is_refused_in_words(home: str) -> None:
+def test_an_unusable_passed_socket_is_refused_with_a_reason(home: str) -> None:
     def refused(passed: socket.socket, count: str = "1", code: int = 2) -> str:
         done = run(passing(passed), environment(home, LISTEN_FDS=count), pass_fds=[passed.fileno()])
         assert (done.code, done.out, "Traceback" in done.err) == (code, "", False), done
@@ -302,7 +307,7 @@ def test_socket_that_cannot_be_served_is_refused_in_words(home: str) -> None:
             assert "has no path" in refused(passed)
 
 
-def test_named_socket_wins_and_descriptors_of_another_process_are_not_taken(home: str) -> None:
+def test_a_passed_socket_is_ignored_if_it_is_not_meant_for_this_server(home: str) -> None:
     with listening_at(f"{home}/passed") as passed:
         for place, pid in (("own", {}), ("passed", {}), ("third", {"LISTEN_PID": "1"})):
             env = environment(home, LISTEN_FDS="1", TALK_SOCKET=f"{home}/{place}", **pid)
@@ -316,7 +321,7 @@ def supervised(home: str, supervisor: Supervisor, **extra: str) -> dict[str, str
     return environment(home, TALK_SOCKET=f"{home}/s", NOTIFY_SOCKET=supervisor.address, **extra)
 
 
-def test_supervisor_is_told_of_begin_doings_and_end(home: str) -> None:
+def test_the_supervisor_is_notified_of_start_status_and_stop(home: str) -> None:
     with Supervisor(f"{home}/n") as supervisor, serving(supervised(home, supervisor), command=SCRIPTED) as server:
         ready = supervisor.wait_for("READY", "1")
         with Wire(f"{home}/s") as wire:  # it was told no earlier than clients are served
@@ -329,16 +334,16 @@ def test_supervisor_is_told_of_begin_doings_and_end(home: str) -> None:
             supervisor.wait_for("STATUS", "paused, 1 waiting")
             wire.request("resume")
             wire.request("cancel")
-            supervisor.wait_for("STATUS", "idle; ", since=supervisor.told[-1][2])
+            supervisor.wait_for("STATUS", "idle; ", since=supervisor.messages[-1][2])
         assert server.end(signal.SIGTERM) == 0
         supervisor.wait_for("STOPPING", "1")
         supervisor.drain()
-    told = [name for name, _, _ in supervisor.told]
-    assert (told.count("READY"), told.count("STOPPING"), told.count("WATCHDOG")) == (1, 1, 0)
-    assert "secret" not in str(supervisor.told)  # anybody may read a unit's status
+    names = [name for name, _, _ in supervisor.messages]
+    assert (names.count("READY"), names.count("STOPPING"), names.count("WATCHDOG")) == (1, 1, 0)
+    assert "secret" not in str(supervisor.messages)  # anybody may read a unit's status
 
 
-def test_status_says_why_the_engine_cannot_start(home: str) -> None:
+def test_the_unit_status_names_the_engines_problem(home: str) -> None:
     write(Path(home, "start"), "fail=engine_failed")
     with Supervisor(f"{home}/n") as supervisor:
         env = supervised(home, supervisor, SCRIPTED_START_FILE=f"{home}/start")
@@ -349,7 +354,7 @@ def test_status_says_why_the_engine_cannot_start(home: str) -> None:
             supervisor.wait_for("STATUS", "idle; ")
 
 
-def test_watchdog_is_fed_by_the_event_loop_and_not_by_the_loudspeaker(home: str) -> None:
+def test_the_watchdog_depends_on_the_event_loop_and_not_on_the_engine(home: str) -> None:
     limit = 0.6
     with Supervisor(f"{home}/n") as supervisor:
         env = supervised(home, supervisor, WATCHDOG_USEC=str(int(limit * 1e6)))
@@ -358,33 +363,33 @@ def test_watchdog_is_fed_by_the_event_loop_and_not_by_the_loudspeaker(home: str)
             second = supervisor.wait_for("WATCHDOG", since=first)
             assert limit / 3 - 0.05 <= second - first <= limit
             wire.request("say", text="hang")  # another watchdog looks after an engine that hangs
-            began = time.monotonic()
-            while (last := supervisor.wait_for("WATCHDOG", since=second)) < began + limit * 2:
+            started_at = time.monotonic()
+            while (last := supervisor.wait_for("WATCHDOG", since=second)) < started_at + limit * 2:
                 assert last - second <= limit
                 second = last
             os.kill(server.process.pid, signal.SIGSTOP)
             try:
                 time.sleep(0.01)
                 supervisor.drain()
-                assert not supervisor.hear(limit)  # an event loop that stands still feeds nothing
+                assert not supervisor.receive(limit)  # an event loop that stands still feeds nothing
             finally:
                 os.kill(server.process.pid, signal.SIGCONT)
             supervisor.wait_for("WATCHDOG", since=time.monotonic())
 
 
 @pytest.mark.parametrize("extra", [{"WATCHDOG_USEC": "0"}, {"WATCHDOG_USEC": "200000", "WATCHDOG_PID": "1"}])
-def test_watchdog_of_nobody_or_of_another_process_is_not_fed(home: str, extra: dict[str, str]) -> None:
+def test_a_disabled_or_foreign_watchdog_is_not_fed(home: str, extra: dict[str, str]) -> None:
     with Supervisor(f"{home}/n") as supervisor:
         with serving(supervised(home, supervisor, **extra), command=SCRIPTED) as server:
             supervisor.wait_for("STATUS", "idle; ")
-            assert not supervisor.hear(0.3)
+            assert not supervisor.receive(0.3)
             assert server.end(signal.SIGTERM) == 0
         supervisor.drain()
-    assert {name for name, _, _ in supervisor.told} == {"READY", "STATUS", "STOPPING"}
+    assert {name for name, _, _ in supervisor.messages} == {"READY", "STATUS", "STOPPING"}
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux has abstract sockets")
-def test_watchdog_that_watches_this_process_is_fed_at_an_abstract_address(home: str) -> None:
+def test_the_watchdog_is_fed_at_an_abstract_address(home: str) -> None:
     with Supervisor(f"@talk-{uuid.uuid4().hex}") as supervisor:
         # The shell's process is the server's, as systemd's child is.
         command = ["sh", "-c", 'WATCHDOG_PID=$$ exec "$@"', "sh", *SCRIPTED]
@@ -393,7 +398,7 @@ def test_watchdog_that_watches_this_process_is_fed_at_an_abstract_address(home: 
 
 
 @pytest.mark.parametrize("address", ["relative", "/nowhere/at/all"])
-def test_supervisor_that_is_not_there_is_no_obstacle(home: str, address: str) -> None:
+def test_a_server_works_if_its_supervisor_cannot_be_reached(home: str, address: str) -> None:
     env = environment(home, TALK_SOCKET=f"{home}/s", NOTIFY_SOCKET=address, WATCHDOG_USEC="100000")
     with serving(env, command=SCRIPTED) as server, Wire(f"{home}/s") as wire:
         wire.request("say", text="length=0", wait=True)
@@ -404,7 +409,7 @@ def test_supervisor_that_is_not_there_is_no_obstacle(home: str, address: str) ->
 
 
 @limits()
-def test_supervisor_that_reads_late_is_told_all_the_same_without_a_wait(home: str) -> None:
+def test_a_slow_supervisor_delays_no_client_and_misses_no_status(home: str) -> None:
     with Supervisor(f"{home}/n") as supervisor:
         env = supervised(home, supervisor, WATCHDOG_USEC="100000")
         with serving(env, command=SCRIPTED) as server, Wire(f"{home}/s") as wire:
@@ -412,28 +417,28 @@ def test_supervisor_that_reads_late_is_told_all_the_same_without_a_wait(home: st
             supervisor.fill()
             goal = wire.request("say", text="never-ends")["goal"]
             time.sleep(STATUS_DELAY_S + 0.2)  # its signs of life, and the news, find no room
-            began = time.monotonic()
+            started_at = time.monotonic()
             wire.request("status")
-            assert_within(time.monotonic() - began, 0.5, "`status`")
+            assert_within(time.monotonic() - started_at, 0.5, "`status`")
             supervisor.wait_for("STATUS", f"speaking {goal['id']}")
             supervisor.wait_for("WATCHDOG", since=time.monotonic())
             supervisor.fill()
             assert server.end(signal.SIGTERM) == 0
 
 
-def test_engine_and_player_know_nothing_of_the_supervisor(make_talk: MakeTalk, home: str) -> None:
+def test_engine_and_player_do_not_inherit_the_supervisors_variables(make_talk: MakeTalk, home: str) -> None:
     with Supervisor(f"{home}/n") as supervisor:
-        told = {"NOTIFY_SOCKET": supervisor.address, "WATCHDOG_USEC": "9000000", "LISTEN_FDNAMES": "talk"}
+        env = {"NOTIFY_SOCKET": supervisor.address, "WATCHDOG_USEC": "9000000", "LISTEN_FDNAMES": "talk"}
         seen = Path(home, "environment")
         player = write(Path(home, "player"), f"#!/bin/sh\nenv > {seen}\ncat >&2\n", 0o700)
-        talk = make_talk("--player", str(player), env=told)
+        talk = make_talk("--player", str(player), env=env)
         talk.run("say", "--wait", "hello")
         inherited = {line.partition("=")[0] for line in seen.read_text().splitlines()}
         assert "PATH" in inherited
         assert not [name for name in inherited if name.startswith(("NOTIFY_", "WATCHDOG_", "LISTEN_"))]
 
 
-def test_server_that_cannot_start_never_says_that_it_is_ready(home: str) -> None:
+def test_a_server_that_cannot_start_never_reports_ready(home: str) -> None:
     with Supervisor(f"{home}/n") as supervisor, serving(environment(home, TALK_SOCKET=f"{home}/s"), command=SCRIPTED):
         second = BareServe(SCRIPTED, supervised(home, supervisor))
         try:
@@ -441,11 +446,11 @@ def test_server_that_cannot_start_never_says_that_it_is_ready(home: str) -> None
             assert second.end() == 11
         finally:
             second.close()
-        assert not supervisor.hear(0.1)
+        assert not supervisor.receive(0.1)
 
 
 @pytest.mark.slow
-def test_idle_server_under_a_supervisor_wakes_less_than_once_a_second(home: str) -> None:
+def test_an_idle_supervised_server_wakes_less_than_once_a_second(home: str) -> None:
     with Supervisor(f"{home}/n") as supervisor:
         env = supervised(home, supervisor, WATCHDOG_USEC="30000000")
         with serving(env, command=SCRIPTED) as server:

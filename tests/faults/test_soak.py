@@ -14,7 +14,7 @@ SECONDS = float(os.environ.get("TALK_TEST_SOAK") or (60 if os.environ.get("CI") 
 
 @pytest.mark.slow
 @pytest.mark.timeout(int(SECONDS) + 400)
-def test_random_goals_with_a_fault_every_few_seconds() -> None:
+def test_random_goals_survive_a_fault_every_few_seconds() -> None:
     report = soak(SECONDS, seed=random.randrange(1 << 30), every=3, least=int(SECONDS / 12) + 1)
     print(report)
     assert report.ends.total() > 5 * SECONDS
@@ -23,7 +23,7 @@ def test_random_goals_with_a_fault_every_few_seconds() -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(int(SECONDS) + 400)
-def test_engines_that_are_killed_again_and_again_cost_no_more_than_a_goal_each() -> None:
+def test_repeatedly_killed_engines_cost_at_most_one_goal_per_kill() -> None:
     report = soak(SECONDS / 2, seed=random.randrange(1 << 30), every=None)
     print(report)
     assert report.ends.total() > SECONDS / 2

@@ -72,7 +72,7 @@ def move_directory(path: str) -> None:
     os.mkdir(os.path.dirname(path), 0o700)
 
 
-def test_socket_file_is_checked_at_least_every_15_seconds() -> None:
+def test_the_socket_file_is_checked_at_least_every_15_seconds() -> None:
     assert SOCKET_CHECK_S <= 15  # so that two checks, if the disk is full at the first, fit in the 30 s promised
 
 
@@ -81,7 +81,7 @@ def test_socket_file_is_checked_at_least_every_15_seconds() -> None:
     [os.unlink, unlink_both, remove_directory, replace_by_stale_socket, move_directory],
     ids=lambda fault: str(fault.__name__),
 )
-def test_socket_that_was_removed_or_replaced_is_bound_again(home: str, fault: Callable[[str], None]) -> None:
+def test_a_removed_or_replaced_socket_is_bound_again(home: str, fault: Callable[[str], None]) -> None:
     path = f"{home}/talk/s"
     env = environment(home, TALK_SOCKET=path)
     with serving(env, "--socket-mode", "0660", command=HASTY) as server, Wire(path) as old:
@@ -108,7 +108,7 @@ def test_socket_that_was_removed_or_replaced_is_bound_again(home: str, fault: Ca
     assert server.log.count("created the socket") == 2
 
 
-def test_socket_named_from_the_working_directory_is_bound_again_where_that_was(home: str) -> None:
+def test_a_relative_socket_path_is_bound_again_at_the_same_place(home: str) -> None:
     """The directory from which its name was to be read is gone."""
     path = f"{home}/here/s"
     os.mkdir(f"{home}/here", 0o700)
@@ -121,7 +121,7 @@ def test_socket_named_from_the_working_directory_is_bound_again_where_that_was(h
     assert "a bug" not in server.log
 
 
-def test_lock_alone_that_was_removed_is_made_again_and_no_descriptor_is_left_open(home: str) -> None:
+def test_a_removed_lock_file_is_created_again_without_leaking_descriptors(home: str) -> None:
     path = f"{home}/s"
     with serving(environment(home, TALK_SOCKET=path), command=HASTY) as server:
         await_true(lambda: "engine ready" in server.log)  # the engine's pipes are opened once, after the socket
@@ -145,7 +145,7 @@ def ends_with_11(server: BareServe, words: str) -> None:
     assert "Traceback" not in server.log
 
 
-def test_server_whose_place_another_one_took_ends_for_its_supervisor(home: str) -> None:
+def test_a_server_replaced_by_another_one_exits_with_code_11(home: str) -> None:
     path = f"{home}/s"
     env = environment(home, TALK_SOCKET=path)
     with serving(env, command=HASTY) as first, Wire(path) as wire:
@@ -168,7 +168,7 @@ def any_ended(*processes: Process) -> bool:
     return any(process.poll() is not None for process in processes)
 
 
-def test_two_servers_whose_files_were_removed_together_are_one_in_the_end(home: str) -> None:
+def test_of_two_servers_whose_files_were_removed_one_remains(home: str) -> None:
     path = f"{home}/s"
     env = environment(home, TALK_SOCKET=path)
     for _ in range(2):
@@ -184,7 +184,7 @@ def test_two_servers_whose_files_were_removed_together_are_one_in_the_end(home: 
                 found_again(path, next(server.pid for server in both if server.poll() is None))
 
 
-def test_program_that_listens_in_its_place_keeps_its_socket(home: str) -> None:
+def test_a_socket_that_another_program_puts_there_is_left_intact(home: str) -> None:
     path = f"{home}/s"
     with serving(environment(home, TALK_SOCKET=path), command=HASTY) as server, socket.socket(socket.AF_UNIX) as other:
         other.bind(f"{path}new")
@@ -218,7 +218,7 @@ def open_directory(path: str) -> None:
         (open_directory, "chmod go-w "),
     ],
 )
-def test_place_that_is_no_longer_the_server_s_ends_it_and_is_left(
+def test_a_server_exits_if_its_socket_path_can_no_longer_be_used(
     home: str, fault: Callable[[str], None], words: str
 ) -> None:
     path = f"{home}/talk/s"
@@ -228,7 +228,7 @@ def test_place_that_is_no_longer_the_server_s_ends_it_and_is_left(
     assert os.path.lexists(path) == (fault is not open_directory)
 
 
-def test_file_of_a_passed_socket_is_missed_but_not_made(home: str) -> None:
+def test_a_removed_file_of_a_passed_socket_is_only_reported(home: str) -> None:
     path = f"{home}/passed"
     with socket.socket(socket.AF_UNIX) as listening:
         listening.bind(path)
@@ -292,7 +292,7 @@ def open_to_all(home: str) -> None:
 @pytest.mark.parametrize(
     "fault", [dangling_link, link, link_inside, open_to_all, open_inside], ids=lambda fault: str(fault.__name__)
 )
-def test_place_that_somebody_prepared_is_refused_with_the_reason(home: str, fault: Callable[[str], None]) -> None:
+def test_an_unsafe_runtime_directory_is_refused_with_the_reason(home: str, fault: Callable[[str], None]) -> None:
     fault(home)
     before = sorted(Path(home).rglob("*"))
     done = run(SERVE, environment(home))
@@ -304,9 +304,9 @@ def test_place_that_somebody_prepared_is_refused_with_the_reason(home: str, faul
 
 @pytest.mark.usefixtures("_as_tmp")
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can make what is another user's")
-@pytest.mark.parametrize("theirs", [["talk"], [""], ["", "talk"]], ids=["inside", "whole", "both"])
-def test_place_that_another_user_made_is_refused(home: str, theirs: list[str]) -> None:
-    for name in theirs:
+@pytest.mark.parametrize("names", [["talk"], [""], ["", "talk"]], ids=["inside", "whole", "both"])
+def test_a_runtime_directory_of_another_user_is_refused(home: str, names: list[str]) -> None:
+    for name in names:
         os.makedirs(f"{place(home)}/{name}", 0o700)
         os.chown(f"{place(home)}/{name}", NOBODY, NOBODY)
     done = run(SERVE, environment(home))
@@ -315,7 +315,7 @@ def test_place_that_another_user_made_is_refused(home: str, theirs: list[str]) -
 
 
 @pytest.mark.usefixtures("_as_tmp", "nobody_serves")
-def test_place_that_is_made_by_the_server_is_nobody_else_s(home: str) -> None:
+def test_a_new_runtime_directory_is_private_whatever_the_umask(home: str) -> None:
     env = environment(home)
     with serving(env, command=["sh", "-c", 'umask 0; exec "$@"', "sh", *SERVE]):
         for path in (place(home), f"{place(home)}/talk"):

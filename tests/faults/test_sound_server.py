@@ -113,7 +113,7 @@ PLAYERS = [
 
 
 @pytest.mark.parametrize("players", PLAYERS)
-def test_row_41_sound_is_lost_and_comes_back(make_talk: MakeTalk, players: tuple[str, ...]) -> None:
+def test_row_41_goals_are_aborted_until_lost_sound_returns(make_talk: MakeTalk, players: tuple[str, ...]) -> None:
     with limits(), contextlib.ExitStack() as stack:
         pool = stack.enter_context(ThreadPoolExecutor(len(FAULTS)))
         sinks = list(pool.map(lambda _: stack.enter_context(Sink()), FAULTS))
@@ -122,9 +122,9 @@ def test_row_41_sound_is_lost_and_comes_back(make_talk: MakeTalk, players: tuple
             for talk in talks:
                 idle.enter_context(nothing_left(talk))
             times = list(pool.map(_lose, FAULTS.values(), players, talks, sinks))
-        for what, player, talk, (lost, meanwhile, again) in zip(FAULTS, players, talks, times, strict=True):
+        for name, player, talk, (lost, meanwhile, again) in zip(FAULTS, players, talks, times, strict=True):
             talk.stop()
-            ends, case = FAULTS[what].ends(player), f"{what}, {player}"
+            ends, case = FAULTS[name].ends(player), f"{name}, {player}"
             assert_within(lost, ends[0].within, f"the end of a goal, {case}")
             assert_within(meanwhile, ends[1].within, f"the end of a goal meanwhile, {case}")
             assert_within(again, AGAIN, f"the next goal, {case}")
@@ -157,7 +157,7 @@ def _assert_ended(talk: Talk, goal_id: str, end: End, since: float) -> float:
     return talk.watcher.arrived(talk.watcher.wait_for(goal_id, "ABORTED")) - since
 
 
-def test_sound_server_that_hangs_while_the_engine_starts(make_talk: MakeTalk, tmp_path: Path) -> None:
+def test_a_hanging_sound_server_does_not_delay_the_engines_start(make_talk: MakeTalk, tmp_path: Path) -> None:
     """libespeak-ng looks for PulseAudio when it is initialised, and would wait half a minute for a frozen one."""
     with socket.socket(socket.AF_UNIX) as frozen:
         frozen.bind(str(tmp_path / "s"))
@@ -168,7 +168,7 @@ def test_sound_server_that_hangs_while_the_engine_starts(make_talk: MakeTalk, tm
 
 
 @pytest.mark.parametrize("hangs", [False, True], ids=["absent", "hangs"])
-def test_a_sound_server_that_takes_no_stream_is_no_reason_for_silence(
+def test_another_player_is_used_if_the_sound_server_takes_no_stream(
     make_talk: MakeTalk, sink: Sink, tmp_path: Path, hangs: bool
 ) -> None:
     """ALSA has its own way to the device here."""
@@ -179,9 +179,9 @@ def test_a_sound_server_that_takes_no_stream_is_no_reason_for_silence(
         env = {"PULSE_SERVER": f"unix:{tmp_path / 's'}", "ALSA_CONFIG_PATH": f"{sink.directory}/.asoundrc"}
         talk = make_talk(sink=sink, env=env)
         assert talk.run("voices").code == 0  # the engine is ready
-        asked = time.monotonic()
+        started_at = time.monotonic()
         done = talk.run("say", "--wait", "--rate", "450", "--", LOW)
-        took = time.monotonic() - asked
+        took = time.monotonic() - started_at
         goal = talk.goal(done.id)
         assert (done.code, goal["output"]) == (0, None)
         assert_same(heard(talk), render_quick([LOW])[0])
@@ -225,26 +225,30 @@ LONGEST = "never reads"
 OTHERS = [fault for fault in BROKEN if fault != LONGEST]
 
 
-@pytest.mark.parametrize("whats", [OTHERS, pytest.param([LONGEST], marks=pytest.mark.slow)], ids=" and ".join)
-def test_player_is_broken(make_talk: MakeTalk, sink: Sink, tmp_path: Path, whats: list[str]) -> None:
-    program = {what: _script(tmp_path / what.replace(" ", "-"), BROKEN[what][0]) for what in whats}
+@pytest.mark.parametrize("faults", [OTHERS, pytest.param([LONGEST], marks=pytest.mark.slow)], ids=" and ".join)
+def test_a_broken_player_aborts_its_goal_in_time(
+    make_talk: MakeTalk, sink: Sink, tmp_path: Path, faults: list[str]
+) -> None:
+    programs = {fault: _script(tmp_path / fault.replace(" ", "-"), BROKEN[fault][0]) for fault in faults}
 
     with limits(), contextlib.ExitStack() as idle:
-        for path in program.values():
+        for path in programs.values():
             (path.parent / "broken").touch()
-        talks = {what: make_talk("--player", str(program[what]), sink=sink) for what in whats}
+        talks = {fault: make_talk("--player", str(programs[fault]), sink=sink) for fault in faults}
         for talk in talks.values():
             idle.enter_context(nothing_left(talk))
-        goals = {what: (time.monotonic(), send(talk, LOW)) for what, talk in talks.items()}
-        for what, talk in talks.items():
-            (_, end), (began, goal) = BROKEN[what], goals[what]
-            assert_within(_assert_ended(talk, goal, end, began), end.within, f"the end of a goal whose player {what}")
-        for what, talk in talks.items():
-            (program[what].parent / "broken").unlink()
+        goals = {fault: (time.monotonic(), send(talk, LOW)) for fault, talk in talks.items()}
+        for fault, talk in talks.items():
+            (_, end), (sent_at, goal) = BROKEN[fault], goals[fault]
+            assert_within(
+                _assert_ended(talk, goal, end, sent_at), end.within, f"the end of a goal whose player {fault}"
+            )
+        for fault, talk in talks.items():
+            (programs[fault].parent / "broken").unlink()
             heard_again(talk, sink)
 
 
-def test_player_that_writes_underrun_and_goes_on_is_no_error(make_talk: MakeTalk, sink: Sink, tmp_path: Path) -> None:
+def test_a_player_that_only_reports_underruns_is_not_an_error(make_talk: MakeTalk, sink: Sink, tmp_path: Path) -> None:
     complains = "while echo 'underrun!!! (at least 1.234 ms long)'; do sleep 0.02; done"
     program = _script(tmp_path, f"({complains}) >&2 & sleep 100 & exec {PLAY}")
     (tmp_path / "broken").touch()

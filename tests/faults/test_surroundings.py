@@ -72,7 +72,7 @@ def speaks(env: dict[str, str]) -> None:
 
 
 @pytest.mark.parametrize("fault", [full, read_only], ids=["full", "read-only"])
-def test_speech_goes_on_with_a_temporary_directory_that_takes_nothing(
+def test_speech_works_with_a_full_or_read_only_temporary_directory(
     home: str, sink: Sink, fault: Callable[[str], AbstractContextManager[None]]
 ) -> None:
     with fault(f"{home}/tmp"):
@@ -83,7 +83,7 @@ def test_speech_goes_on_with_a_temporary_directory_that_takes_nothing(
             speaks(env)
 
 
-def test_socket_in_a_full_directory_is_served_and_its_lock_holds(home: str) -> None:
+def test_a_socket_in_a_full_directory_is_served_and_locked(home: str) -> None:
     with full(f"{home}/tmp"):
         env = environment(home, TALK_SOCKET=f"{home}/tmp/s")
         with serving(env, command=QUIET):
@@ -95,7 +95,7 @@ def test_socket_in_a_full_directory_is_served_and_its_lock_holds(home: str) -> N
             speaks(env)
 
 
-def test_no_directory_or_a_read_only_one_for_the_socket_is_a_clear_error(home: str) -> None:
+def test_an_unusable_socket_directory_is_reported_clearly(home: str) -> None:
     with read_only(f"{home}/tmp"):
         done = run(SERVE, environment(home, TALK_SOCKET=f"{home}/tmp/s"))
         assert done.code == 11
@@ -111,7 +111,7 @@ def test_no_directory_or_a_read_only_one_for_the_socket_is_a_clear_error(home: s
     [VARIABLES, *(pytest.param((name,), marks=pytest.mark.slow) for name in VARIABLES if name != "HOME"), "/proc", ""],
     ids=str,
 )
-def test_speech_goes_on_without_a_variable_or_with_a_home_that_is_not_there(
+def test_speech_works_with_missing_variables_or_a_missing_home(
     home: str, sink: Sink, missing: tuple[str, ...] | str
 ) -> None:
     env = environment(home, **{**sink.env, "TALK_SOCKET": f"{home}/s"})
@@ -129,14 +129,14 @@ def test_speech_goes_on_without_a_variable_or_with_a_home_that_is_not_there(
         assert "engine ready" in server.log
 
 
-def test_path_without_players_is_a_clear_error_and_no_silence(home: str) -> None:
+def test_a_path_without_players_is_a_clear_error(home: str) -> None:
     env = environment(home, TALK_SOCKET=f"{home}/s", PATH="")
     with serving(env, command=AUDIBLE):
-        began = time.monotonic()
+        started_at = time.monotonic()
         done = run([*TALK, "say", "--wait", "--", "battery low"], env)
         assert done.code == 4
         assert "no player found; install alsa-utils (aplay)" in done.err
-        assert time.monotonic() - began < 5
+        assert time.monotonic() - started_at < 5
         assert run([*TALK, "status"], env).code == 0
 
 
@@ -166,17 +166,17 @@ time.time = _jumped
 
 
 @pytest.mark.parametrize("seconds", [HOUR, -HOUR])
-def test_no_timer_and_no_throttle_moves_when_the_wall_clock_jumps(
+def test_a_jump_of_the_wall_clock_changes_no_timer_or_throttle(
     make_talk: MakeTalk, tmp_path: Path, seconds: int
 ) -> None:
     offset = write(tmp_path / "offset", "0")
     write(tmp_path / "sitecustomize.py", SITE_CUSTOMIZE.format(offset=str(offset)))
     talk = make_talk(scripted=True, env=python_path(tmp_path))
     assert talk.run("say", "--wait", "length=0.05 battery low").code == 0
-    said = time.monotonic()
+    spoken_at = time.monotonic()
     active = talk.run("say", "never-ends").id
     talk.watcher.wait_for_word(active)
-    began = time.monotonic()
+    started_at = time.monotonic()
     with talk.connect() as wire:
         short = wire.request("say", text="one", ttl=1)["goal"]["id"]
         long = wire.request("say", text="two", ttl=20)["goal"]["id"]
@@ -186,10 +186,10 @@ def test_no_timer_and_no_throttle_moves_when_the_wall_clock_jumps(
     refused = talk.request("say", text="length=0.05 battery low", throttle=60)["goal"]
     assert (refused["state"], refused["reason"]) == ("REJECTED", "throttled")
     assert talk.watcher.wait_for_terminal(short, 10) == "RECALLED"
-    assert 1 - 0.05 <= time.monotonic() - began <= 1 + LATE
+    assert 1 - 0.05 <= time.monotonic() - started_at <= 1 + LATE
     assert talk.goal(long)["state"] == "PENDING"
     assert talk.request("status")["server"]["uptime"] < 60
-    throttle = time.monotonic() - said - 0.1
+    throttle = time.monotonic() - spoken_at - 0.1
     assert talk.request("say", text="length=0.05 battery low", throttle=throttle)["goal"]["state"] == "PENDING"
     os.replace(write(tmp_path / "new", "0"), offset)
     assert talk.run("cancel").code == 0

@@ -35,7 +35,7 @@ def test_every_row_names_tests_that_exist(folder: str) -> None:
         assert path, f"no test: {row}"
 
 
-def test_each_module_of_faults_is_named_in_a_row() -> None:
+def test_every_module_of_faults_is_named_in_a_row() -> None:
     rows = "\n".join(_rows("tests/faults"))
     modules = {path.name for path in Path(__file__).parent.glob("test_*.py")}
     # Units for systemd and this table are no faults.

@@ -97,7 +97,7 @@ def test_markup_and_phonemes_are_spoken_as_text(tmp_path: Path) -> None:
         assert_rendered(tmp_path / "x.wav", text)
 
 
-def test_commands_of_the_library_in_a_text_are_none(talk: Talk) -> None:
+def test_libespeak_commands_in_a_text_are_ignored(talk: Talk) -> None:
     text = "\x01s \x01100A\x0180S battery \x01VDe\x02[\x02low"
     goal = send(talk, text, rate=450)
     assert talk.watcher.wait_for_terminal(goal) == "SUCCEEDED"
@@ -106,7 +106,7 @@ def test_commands_of_the_library_in_a_text_are_none(talk: Talk) -> None:
     assert talk.goal(goal)["spoken"] == text
 
 
-def test_ordinary_sentences_are_what_the_library_makes_of_them(tmp_path: Path) -> None:
+def test_the_guard_does_not_change_ordinary_sentences(tmp_path: Path) -> None:
     voices = ["gmw/en", "gmw/en", "gmw/de", "roa/fr"]
     for voice, text in [*zip(voices, SENTENCES, strict=False), ("zle/ru", SENTENCES[9])]:
         assert_rendered(tmp_path / "x.wav", text, voice)
@@ -115,20 +115,20 @@ def test_ordinary_sentences_are_what_the_library_makes_of_them(tmp_path: Path) -
 def _every_character(common: bool) -> Iterator[str]:
     """Return texts of all assigned characters: of the 32,000 common ones, or of the large sets of East Asia."""
     large = (range(0x3400, 0xA000), range(0xAC00, 0xD7A4), range(0x17000, 0x19000), range(0x20000, 0xE0000))
-    found = [
+    characters = [
         chr(code)
         for code in range(1, sys.maxunicode + 1)
         if unicodedata.category(chr(code)) not in {"Cn", "Co", "Cs"} and common != any(code in block for block in large)
     ]
-    found = found[:: _FEW if common else _FEWER]
-    texts = ("".join(found[at : at + _MANY]) for at in range(0, len(found), _MANY))
+    characters = characters[:: _FEW if common else _FEWER]
+    texts = ("".join(characters[at : at + _MANY]) for at in range(0, len(characters), _MANY))
     return (text for text in texts if bad_text(text) is None)  # one of controls alone says nothing
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("common", [True, False], ids=["all scripts", "East Asia"])
-def test_every_assigned_character_once(common: bool) -> None:
+def test_every_assigned_character_can_be_spoken(common: bool) -> None:
     texts = list(_every_character(common))
     tally = speak_all([Case("gmw/en", text) for text in texts], guarded=True)
     print(tally)
@@ -137,7 +137,7 @@ def test_every_assigned_character_once(common: bool) -> None:
 
 
 @pytest.mark.parametrize("voice", ["tai/shn", pytest.param("sit/yue", marks=pytest.mark.slow)])
-def test_numbers_of_any_length_are_said(voice: str) -> None:
+def test_numbers_of_up_to_20_digits_are_spoken(voice: str) -> None:
     """Without the guard these voices die of those with thirteen and fourteen digits."""
     chance = random.Random(voice)
     numbers = ["".join(chance.choices("1234567890", k=digits)) for digits in range(1, 21)]
@@ -147,7 +147,7 @@ def test_numbers_of_any_length_are_said(voice: str) -> None:
     assert set(tally.outcomes) == {"completed"}
 
 
-def test_the_longest_words_and_writing_from_right_to_left_are_spoken_whole(tmp_path: Path) -> None:
+def test_very_long_words_and_right_to_left_scripts_are_spoken_whole(tmp_path: Path) -> None:
     for voice, text in [*LONGEST_WORDS.items(), *RIGHT_TO_LEFT.items()]:
         assert_rendered(tmp_path / "x.wav", text, voice)
 
@@ -156,7 +156,7 @@ def test_the_longest_words_and_writing_from_right_to_left_are_spoken_whole(tmp_p
 @pytest.mark.parametrize(
     "names", [_SOON, *(pytest.param([name], marks=pytest.mark.slow) for name in ENDLESS if name not in _SOON)]
 )
-def test_thousands_of_characters_of_one_kind_end(names: list[str]) -> None:
+def test_thousands_of_characters_of_one_kind_do_not_hang(names: list[str]) -> None:
     texts = [ENDLESS[name] for name in names]
     assert [bad_text(text) for text in texts] == [None] * len(texts)
     tally = speak_all([Case("gmw/en", text) for text in [*texts, LOW]], guarded=True)
@@ -230,7 +230,7 @@ def unguarded(make_talk: MakeTalk, sink: Sink, *options: str) -> Talk:
     return make_talk(*options, program=UNGUARDED, sink=sink)
 
 
-def test_a_crashing_text_in_the_middle_of_ten_goals(make_talk: MakeTalk, sink: Sink) -> None:
+def test_a_crashing_text_among_ten_goals_aborts_only_itself(make_talk: MakeTalk, sink: Sink) -> None:
     talk = unguarded(make_talk, sink, "--rate", "450")
     texts = [LOW, HOME, "battery two", "coming three", "battery four", CRASHING]
     texts += ["coming six", "battery seven", "coming eight", "battery nine"]
@@ -249,13 +249,13 @@ def test_a_crashing_text_in_the_middle_of_ten_goals(make_talk: MakeTalk, sink: S
 
 
 @pytest.mark.parametrize("texts", [10, pytest.param(100, marks=pytest.mark.slow)])
-def test_crash_loop_of_100_texts(make_talk: MakeTalk, sink: Sink, texts: int) -> None:
+def test_after_100_crashing_texts_the_next_goal_is_heard_in_time(make_talk: MakeTalk, sink: Sink, texts: int) -> None:
     talk = unguarded(make_talk, sink, "--max-queue", "200")
 
     with limits():
         assert talk.run("voices").code == 0  # the engine is ready
         with sink.record() as recording:
-            began = time.monotonic()
+            started_at = time.monotonic()
             with talk.connect() as wire:
                 replies = [wire.request("say", text=CRASHING)["goal"]["id"] for _ in range(texts)]
             last = send(talk, LOW)
@@ -266,8 +266,8 @@ def test_crash_loop_of_100_texts(make_talk: MakeTalk, sink: Sink, texts: int) ->
         for goal in replies:
             assert_aborted(talk.goal(goal), "engine_crashed", "SIG")
         assert [talk.watcher.states(goal) for goal in replies] == [["PENDING", "ACTIVE", "ABORTED"]] * texts
-        print(f"{texts} crashing texts and a good one: {heard_at - began:.1f} s")
-        assert_within(heard_at - began, texts * LOOP_LIMIT, f"the goal behind {texts} crashing texts")
+        print(f"{texts} crashing texts and a good one: {heard_at - started_at:.1f} s")
+        assert_within(heard_at - started_at, texts * LOOP_LIMIT, f"the goal behind {texts} crashing texts")
 
     # Each had a process that was ready, so the next one needed no wait.
     assert talk.log.count("talk: the engine crashed: it was killed by ") == texts
@@ -277,7 +277,7 @@ def test_crash_loop_of_100_texts(make_talk: MakeTalk, sink: Sink, texts: int) ->
 @pytest.mark.parametrize(
     "voice", ["gmw/en", *(pytest.param(voice, marks=pytest.mark.slow) for voice in ("gmq/da", "zls/mk", "aav/vi"))]
 )
-def test_with_the_guard_known_crashing_texts_are_spoken(voice: str) -> None:
+def test_known_crashing_texts_are_spoken_with_the_guard(voice: str) -> None:
     texts = [
         *("a." * 85, "e.g. " * 60, "http://" + "x." * 100, CRASHING, "y.," * 220, "a." + "b" * 170, "I." + "'s" * 90),
         *("A." * 20 + "\u200d" * 60, "a" * 163 + "ing", "é" * 85 + "s", "'-o", "xin! (-o", "№-o", ".-o", "०." * 90),
@@ -290,7 +290,7 @@ def test_with_the_guard_known_crashing_texts_are_spoken(voice: str) -> None:
     assert without.deaths, "this library needs no guard: look for what still kills it"
 
 
-def test_text_that_crashes_only_a_few_voices_is_spoken_by_all_of_them() -> None:
+def test_texts_that_crash_some_voices_are_spoken_by_all_of_them() -> None:
     voices = [voice for voice in list_voices() if voice.split("/")[0] in {"gmq", "aav", "inc", "dra"}]
     tally = speak_all([Case(voice, text) for voice in voices for text in ("'-o", ".-す", "…-o x")], guarded=True)
     assert (tally.deaths, tally.faults) == ([], [])

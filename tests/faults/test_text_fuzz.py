@@ -17,7 +17,7 @@ OF_EACH_KIND = 12
 
 @pytest.mark.parametrize("count", [25, pytest.param(None, marks=pytest.mark.slow)])
 @pytest.mark.timeout(int(SECONDS) + 300)
-def test_mutated_texts_have_one_end_each_and_none_overflows(count: int | None) -> None:
+def test_mutated_texts_end_once_and_never_overflow_a_buffer(count: int | None) -> None:
     before = len(os.listdir("/proc/self/fd"))
     tally = speak_all(itertools.islice(cases(7, list_voices()), count), guarded=True, seconds=SECONDS)
     print(tally, *tally.deaths, sep="\n")
@@ -29,7 +29,7 @@ def test_mutated_texts_have_one_end_each_and_none_overflows(count: int | None) -
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_crashing_texts_of_today_are_spoken_with_the_guard() -> None:
+def test_crashing_texts_with_todays_seed_are_spoken_with_the_guard() -> None:
     voices = list_voices()
     source = random.Random(today())
     texts = [

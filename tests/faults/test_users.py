@@ -91,13 +91,13 @@ def stranger(path: str, *requests: dict[str, object], groups: Sequence[int] = ()
 def impostor(path: str) -> Iterator[Callable[[], bytes]]:
     """Run another user's server there; gives a function that waits for a client and returns its first bytes."""
     command = [*as_user(NOBODY), PYTHON, "-u", "-c", IMPOSTOR, path]
-    with subprocess.Popen(command, cwd="/", stdout=subprocess.PIPE) as theirs:
+    with subprocess.Popen(command, cwd="/", stdout=subprocess.PIPE) as process:
         try:
-            assert theirs.stdout
-            assert theirs.stdout.readline()
-            yield theirs.stdout.readline
+            assert process.stdout
+            assert process.stdout.readline()
+            yield process.stdout.readline
         finally:
-            theirs.kill()
+            process.kill()
 
 
 def replies(done: subprocess.CompletedProcess[str]) -> list[dict[str, Any]]:
@@ -109,7 +109,7 @@ def group_server() -> list[str]:
     return ["setpriv", f"--regid={GROUP}", "--clear-groups", *SCRIPTED, "--socket-mode", "0660"]
 
 
-def test_members_of_the_group_are_let_in_by_the_socket_s_mode_and_others_are_not(home: str) -> None:
+def test_the_socket_mode_admits_only_members_of_the_group(home: str) -> None:
     """A member may silence everybody, and the log tells the user."""
     path = f"{home}/s"
     with serving(environment(home, TALK_SOCKET=path), command=group_server()) as server, Wire(path) as wire:
@@ -117,38 +117,47 @@ def test_members_of_the_group_are_let_in_by_the_socket_s_mode_and_others_are_not
         assert (status.st_uid, status.st_gid, stat.S_IMODE(status.st_mode)) == (0, GROUP, 0o660)
         assert stranger(path).stderr.strip() == "PermissionError"
         assert stranger(path, groups=[4343]).stderr.strip() == "PermissionError"
-        told = replies(stranger(path, {"seq": 1, "request": "say", "text": "length=0", "wait": True}, groups=[GROUP]))
-        assert told[-1]["goal"]["state"] == "SUCCEEDED"
-        assert told[-1]["goal"]["client"]["uid"] == NOBODY
+        messages = replies(
+            stranger(path, {"seq": 1, "request": "say", "text": "length=0", "wait": True}, groups=[GROUP])
+        )
+        assert messages[-1]["goal"]["state"] == "SUCCEEDED"
+        assert messages[-1]["goal"]["client"]["uid"] == NOBODY
         goal = wire.request("say", text="never-ends", wait=True)["goal"]
         wire.receive_event("state", state="ACTIVE")
         pending = wire.request("say", text="waits")["goal"]
-        told = replies(stranger(path, {"seq": 1, "request": "cancel"}, groups=[GROUP]))
-        assert {message["canceled"]["id"] for message in told if "canceled" in message} == {goal["id"], pending["id"]}
+        messages = replies(stranger(path, {"seq": 1, "request": "cancel"}, groups=[GROUP]))
+        assert {message["canceled"]["id"] for message in messages if "canceled" in message} == {
+            goal["id"],
+            pending["id"],
+        }
         ended = wire.receive_event("result")["goal"]
         assert (ended["state"], ended["by"]["client"]["uid"]) == ("PREEMPTED", NOBODY)
-        others: list[dict[str, object]] = [{"request": "pause"}, {"request": "resume"}, {"request": "set", "rate": 150}]
-        told = replies(stranger(path, *({"seq": 1, **request} for request in others), groups=[GROUP]))
-        assert [message["ok"] for message in told if "ok" in message] == [True] * 3
+        requests: list[dict[str, object]] = [
+            {"request": "pause"},
+            {"request": "resume"},
+            {"request": "set", "rate": 150},
+        ]
+        messages = replies(stranger(path, *({"seq": 1, **request} for request in requests), groups=[GROUP]))
+        assert [message["ok"] for message in messages if "ok" in message] == [True] * 3
         assert server.end(signal.SIGTERM) == 0
     line = next(line for line in server.log.splitlines() if f"{goal['id']} PREEMPTED" in line)
     assert f"(canceled by uid {NOBODY}, pid " in line
 
 
-def test_another_user_is_refused_before_a_request_is_read_whatever_the_file_says(home: str) -> None:
+def test_another_user_is_refused_even_if_the_socket_file_is_writable(home: str) -> None:
     path = f"{home}/s"
     with serving(environment(home, TALK_SOCKET=path), command=SCRIPTED) as server, Wire(path) as wire:
         os.chmod(path, 0o666)  # the server was not told to let others in
-        (told,) = replies(stranger(path, {"request": "say", "text": "somebody else"}))
-        assert told["error"] == "permission_denied"
-        assert "--socket-mode" in told["message"]
+        (reply,) = replies(stranger(path, {"request": "say", "text": "somebody else"}))
+        assert reply["error"] == "permission_denied"
+        assert "--socket-mode" in reply["message"]
         wire.request("status")
         assert wire.items == []
     assert "somebody else" not in server.log
 
 
 @pytest.mark.usefixtures("nobody_serves")
-def test_client_tells_nothing_to_a_server_of_another_user_except_where_it_was_named(home: str) -> None:
+def test_a_client_trusts_another_users_server_only_if_it_was_named(home: str) -> None:
     os.makedirs(f"{home}/run/talk")
     os.chmod(f"{home}/run/talk", 0o777)
     path = f"{home}/run/talk/talk.sock"
@@ -163,7 +172,7 @@ def test_client_tells_nothing_to_a_server_of_another_user_except_where_it_was_na
 
 
 @pytest.mark.usefixtures("nobody_serves")
-def test_server_at_run_talk_is_trusted_whoever_runs_it(home: str) -> None:
+def test_a_server_at_run_talk_is_trusted_whoever_runs_it(home: str) -> None:
     """The user of the system's service is neither root nor the client's."""
     script = f"""
         set -e
@@ -186,7 +195,7 @@ def test_server_at_run_talk_is_trusted_whoever_runs_it(home: str) -> None:
         assert '"hello"' in file.read(), done
 
 
-def test_user_s_server_lets_root_in_and_no_third_user(home: str) -> None:
+def test_a_users_server_admits_root_and_refuses_other_users(home: str) -> None:
     needs("/usr/bin/python3")  # they may be able to read neither this checkout nor its interpreter
     for package in (talkcli, click):
         folder = os.path.dirname(str(package.__file__))
@@ -195,11 +204,11 @@ def test_user_s_server_lets_root_in_and_no_third_user(home: str) -> None:
     os.mkdir(f"{home}/theirs")
     os.chown(f"{home}/theirs", 4141, 4141)
     path = f"{home}/theirs/s"
-    theirs = environment(home, TALK_SOCKET=path, PYTHONPATH=f"{home}/lib", PYTHONDONTWRITEBYTECODE="1")
+    env = environment(home, TALK_SOCKET=path, PYTHONPATH=f"{home}/lib", PYTHONDONTWRITEBYTECODE="1")
     command = [*as_user(4141), "/usr/bin/python3", "-m", "talkcli", "serve", "--player", "null"]
-    with serving(theirs, command=command):
+    with serving(env, command=command):
         assert run([*TALK, "--socket", path, "status"], environment(home)).code == 0
         os.chmod(path, 0o666)
-        (told,) = replies(stranger(path, {"request": "status"}))
-        assert told["error"] == "permission_denied"
-        assert "uid 4141, who can let you in" in told["message"]
+        (reply,) = replies(stranger(path, {"request": "status"}))
+        assert reply["error"] == "permission_denied"
+        assert "uid 4141, who can let you in" in reply["message"]

@@ -152,7 +152,7 @@ def test_a_supervisor_is_told_the_state_with_and_without_a_broker(home: str, scr
                     client.ask("cancel")
                 supervisor.wait_for("STATUS", "0 goals waiting", since=pending)
                 supervisor.wait_for("WATCHDOG", "1", since=pending)
-                assert not any("secret" in value for _, value, _ in supervisor.told)
+                assert not any("secret" in value for _, value, _ in supervisor.messages)
                 process.send_signal(signal.SIGINT)
                 supervisor.wait_for("STOPPING", "1")
                 assert process.wait(5) == 0
