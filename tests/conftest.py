@@ -1,4 +1,4 @@
-"""Fixtures: sound servers, servers with the real and the scripted engine, and the checks at the end of each."""
+"""Fixtures for all tests: sound servers, and servers with the real or the scripted engine."""
 
 from __future__ import annotations
 
@@ -20,31 +20,29 @@ if TYPE_CHECKING:
     from collections.abc import Generator, Iterator
 
 
-#: The name of late measurements in a test's report.
+#: Outcome of tests whose results were late together with their control.
 _UNMEASURED = "not measured"
-
-
-#: Starts a server for a test, greeted and watched: `make_talk("--preempt", sink=sink)`; see `Talk` for its parameters.
+#: Starts a server: `make_talk("--preempt", sink=sink)`. See `Talk` for the parameters.
 MakeTalk = Callable[..., Talk]
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _interruptible() -> None:
-    """Start clients with the signals of a terminal, which may be ignored if the tests run in the background."""
+    """Give clients the signal handling of a terminal, even if the tests run in the background with ignored signals."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.fixture
 def nobody_serves() -> None:
-    """Skip the test on a machine where a server runs, or left its socket, at a place where clients look."""
+    """Skip the test if clients on this machine would find a server or the socket of an earlier one."""
     needs_no_server()
 
 
 def pytest_configure() -> None:
-    """Time the control of limits while the machine is quiet; the workers of a run inherit the result.
+    """Time the control of limits while the machine is quiet, and keep numpy from starting threads.
 
-    They also inherit that numpy starts no threads, which would only wait.
+    The workers inherit both through the environment.
     """
     calibrate()
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
@@ -52,7 +50,7 @@ def pytest_configure() -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
-    """Import the tests without looking for garbage, and never look for garbage among them."""
+    """Disable garbage collection during the import of the tests, and exclude their objects from later collections."""
     gc.disable()
     result = yield
     gc.freeze()
@@ -62,17 +60,17 @@ def pytest_collection() -> Generator[None, object, object]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Report the parts of a test that were late together with their control."""
+    """Add late results to the report if their control was late, too."""
     report = yield
     if report.when == "call":
-        found = take_unmeasured()
-        if found and report.passed:
-            report.user_properties.append((_UNMEASURED, "; ".join(found)))
+        late = take_unmeasured()
+        if late and report.passed:
+            report.user_properties.append((_UNMEASURED, "; ".join(late)))
     return report
 
 
 def pytest_report_teststatus(report: pytest.TestReport) -> tuple[str, str, str] | None:
-    """Count tests that were not measured as neither passed nor failed."""
+    """Count tests that were not measured separately."""
     if report.when == "call" and report.passed and _UNMEASURED in dict(report.user_properties):
         return _UNMEASURED, "m", _UNMEASURED.upper()
     return None
@@ -89,21 +87,21 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 @pytest.fixture(scope="session")
 def sink() -> Iterator[Sink]:
-    """A sound server for all tests that leave it as it is."""
+    """A sound server shared by all tests that don't change it."""
     with Sink() as result:
         yield result
 
 
 @pytest.fixture
 def private_sink() -> Iterator[Callable[[], Sink]]:
-    """Starts sound servers for a test that breaks them."""
+    """Starts sound servers that the test may break."""
     with contextlib.ExitStack() as stack:
         yield lambda: stack.enter_context(Sink())
 
 
 @pytest.fixture
 def home() -> Iterator[str]:
-    """The home of programs that a test starts: a new directory that other users may enter, short enough for sockets."""
+    """A new home directory for the programs of a test, with a path short enough for sockets. All users may enter it."""
     with short_directory() as path:
         os.chmod(path, 0o755)
         yield path
@@ -111,11 +109,11 @@ def home() -> Iterator[str]:
 
 @pytest.fixture
 def make_talk() -> Iterator[MakeTalk]:
-    """Starts servers; each is stopped at the end, if the test did not end it, and its watcher is checked."""
+    """Starts servers. After the test, stops those that still run, and checks the watcher of each server."""
     servers: list[Talk] = []
 
-    def make(*options: str, **how: Any) -> Talk:
-        servers.append(Talk(options, **how))
+    def make(*options: str, **arguments: Any) -> Talk:
+        servers.append(Talk(options, **arguments))
         return servers[-1]
 
     try:
@@ -125,18 +123,18 @@ def make_talk() -> Iterator[MakeTalk]:
                 talk.stop()
             else:
                 talk.check()
-    finally:  # whichever of them fails its check
+    finally:  # even if a check fails
         for talk in servers:
             talk.close()
 
 
 @pytest.fixture
 def talk(make_talk: MakeTalk, sink: Sink) -> Talk:
-    """A server with the real engine at the recorded sink."""
+    """A server with the real engine, which plays to the recorded sink."""
     return make_talk(sink=sink)
 
 
 @pytest.fixture
 def scripted(make_talk: MakeTalk) -> Talk:
-    """A server with the scripted engine, without sound: goals say how it behaves, see `tests.support.script`."""
+    """A server with the scripted engine, without sound. The texts of goals control it (see `tests.support.script`)."""
     return make_talk(scripted=True)

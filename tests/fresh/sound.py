@@ -1,12 +1,12 @@
-"""A loudspeaker for a machine that has none, and a check of the sound that it played.
+"""A loudspeaker for machines that have none, and checks of the sound that it has played.
 
-ALSA's file plugin, which every machine with `aplay` has, writes what it plays into a FIFO; `listen` takes it from there
-as fast as a sound card would, and no faster: so a player ends when its sound is over, as in real life. It hears what is
-played and nothing between, so two sentences follow each other without a pause.
+ALSA's file plugin, which every machine with `aplay` has, writes the sound to a FIFO. `listen` reads it at the speed of
+a sound card, so a player ends when its sound is over. Nothing is written between sounds, so sentences are recorded
+without a pause between them.
 
-    python3 tests/fresh/sound.py listen FIFO FILE     # until SIGTERM; then the times of the first and last sound
-    python3 tests/fresh/sound.py compare FILE WAV     # FILE must begin with all samples of WAV, one by one
-    python3 tests/fresh/sound.py length FILE WAV      # FILE must be as long as WAV: a neural voice is never the same
+    python3 tests/fresh/sound.py listen FIFO FILE     # until SIGTERM, then print the times of the first and last sound
+    python3 tests/fresh/sound.py compare FILE WAV     # FILE must begin with exactly the samples of WAV
+    python3 tests/fresh/sound.py length FILE WAV      # FILE must be about as long as WAV (for neural voices)
 """
 
 from __future__ import annotations
@@ -19,38 +19,38 @@ import sys
 import time
 import wave
 
-#: Samples a second, 16 bit, one channel: libespeak-ng's own.
+#: Samples per second, 16 bit, one channel, as libespeak-ng renders them.
 RATE = 22050
-#: Bytes that the FIFO holds, the least that Linux has: 93 ms, which is what a player ends too early here.
-HELD = 4096
-#: Seconds between two looks; what a look was late for is made up for, up to as much as a sound card's buffer.
-EVERY, BUFFER = 0.01, 0.1
-#: Above this a sample is sound.
+#: Size of the FIFO, the smallest that Linux allows: 93 ms of sound, so a player ends 93 ms too early.
+FIFO_BYTES = 4096
+#: Time between two reads. A late read catches up, but at most by the length of a sound card's buffer.
+INTERVAL_S, BUFFER_S = 0.01, 0.1
+#: Samples above this level are sound.
 LOUD = 50
-#: Part by which two renderings by a neural voice may differ in length. Those of one sentence differed by up to 0.07.
+#: Relative difference in length allowed between two renderings by a neural voice. Up to 0.07 was measured.
 LENGTH_TOLERANCE = 0.15
 
 
 def listen(fifo: str, path: str) -> str:
-    """Take samples from the FIFO into the file until SIGTERM; return when the first and the last was heard (epoch)."""
+    """Copy samples from the FIFO to the file until SIGTERM. Return the Unix times of the first and the last sound."""
     ended: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, _frame: ended.append(number))
-    # For reading and writing: players come and go, and none of them makes an end of file.
+    # Also open for writing, so that there is no end of file when a player ends.
     source = os.open(fifo, os.O_RDWR | os.O_NONBLOCK)
-    fcntl.fcntl(source, fcntl.F_SETPIPE_SZ, HELD)
+    fcntl.fcntl(source, fcntl.F_SETPIPE_SZ, FIFO_BYTES)
     first = last = 0.0
     due = time.monotonic()
     with open(path, "wb", buffering=0) as file:
         while not ended:
-            time.sleep(EVERY)
-            due = max(due, time.monotonic() - BUFFER)
+            time.sleep(INTERVAL_S)
+            due = max(due, time.monotonic() - BUFFER_S)
             taken = _read(source, int((time.monotonic() - due) * RATE) * 2)
             file.write(taken)
             due += len(taken) / 2 / RATE
             if any(abs(sample) > LOUD for sample in array.array("h", taken)):
                 last = time.time()
                 first = first or last
-        file.write(_read(source, HELD))  # what the player left in the FIFO when it ended
+        file.write(_read(source, FIFO_BYTES))  # the end of the last player's sound
     return f"{first:.2f} {last:.2f}"
 
 
@@ -62,25 +62,25 @@ def _read(source: int, most: int) -> bytes:
 
 
 def compare(path: str, reference: str) -> str:
-    """Return what was heard, in words; SystemExit if the file doesn't begin with all the reference's samples."""
+    """Check that the file begins with exactly the reference's samples, or exit. Return a readable result."""
     heard, wanted = _samples(path, reference)
     seconds = len(wanted) / RATE
     for place, sample in enumerate(wanted):
         if place == len(heard) or heard[place] != sample:
-            sys.exit(f"FAILED: of {seconds:.2f} s of sound the first {place / RATE:.2f} s were heard as they should be")
-    return f"{seconds:.2f} s of sound, each of {len(wanted)} samples as it should be"
+            sys.exit(f"FAILED: only the first {place / RATE:.2f} of {seconds:.2f} s of sound were correct")
+    return f"{seconds:.2f} s of sound, all {len(wanted)} samples correct"
 
 
 def compare_length(path: str, reference: str) -> str:
-    """Return how long the sound in both files is. SystemExit if the lengths differ by more than the tolerance."""
-    heard, wanted = (_seconds_of_sound(each) for each in _samples(path, reference))
+    """Check that both sounds have about the same length, or exit. Return a readable result."""
+    heard, wanted = (_seconds_of_sound(samples) for samples in _samples(path, reference))
     if abs(heard - wanted) > LENGTH_TOLERANCE * wanted:
         sys.exit(f"FAILED: {heard:.2f} s of sound were heard; the sentence has {wanted:.2f} s")
     return f"{heard:.2f} s of sound, {wanted:.2f} s in another rendering; the samples were not compared"
 
 
 def _samples(path: str, reference: str) -> tuple[array.array[int], array.array[int]]:
-    """Return what was heard and what the WAV file has, each from its first sound on. SystemExit if one is silent."""
+    """Return the samples of both files from their first sound on, or exit if one is silent."""
     heard = array.array("h")
     with open(path, "rb") as file:
         heard.frombytes(file.read())

@@ -1,7 +1,7 @@
 # shellcheck shell=bash
-# What a machine does with the wheel: made and installed once, in PLACE, from CHECKOUT; tried each time. LIBRARY is
-# where `talk doctor` must say that libespeak-ng came from, or empty. BEFORE_PIP is "linux32" on a 32-bit system, else
-# empty. bash runs the script with these four as variables.
+# Test the wheel with bash and these variables. The first run builds it from CHECKOUT and installs it in PLACE.
+# LIBRARY is the source of libespeak-ng that `talk doctor` must print, or empty. BEFORE_PIP is "linux32" on a 32-bit
+# system, otherwise empty.
 set -euo pipefail
 cd "$(dirname "$PLACE")"
 if [ ! -d "$PLACE" ]; then
@@ -12,7 +12,7 @@ fi
 talk=$PLACE/bin/talk
 "$talk" --version
 
-# serve OPTION…: starts a server, and returns when it answers; its process is $server.
+# serve OPTION…: starts a server and waits until it answers. $server is its process id.
 serve() {
     "$talk" serve "$@" &
     server=$!
@@ -26,7 +26,7 @@ kill "$server"
 wait "$server"
 
 serve --player null
-# Three times: in the first sentence after the start, the events come in other groups than later.
+# Three times, because libespeak-ng groups the events of the first sentence differently.
 for _ in 1 2 3; do
     words=$("$talk" --json say -wf -- "battery low" | sed -n 's/.*"event": "word".* "word": "\([^"]*\)".*/\1/p')
     echo "words: ${words//$'\n'/ }"
