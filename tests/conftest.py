@@ -50,7 +50,7 @@ def pytest_configure() -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
-    """Disable garbage collection during the import of the tests, and exclude their objects from later collections."""
+    """Import the tests without garbage collection, and exclude their objects from later collections."""
     gc.disable()
     result = yield
     gc.freeze()
@@ -101,7 +101,7 @@ def private_sink() -> Iterator[Callable[[], Sink]]:
 
 @pytest.fixture
 def home() -> Iterator[str]:
-    """A new home directory for the programs of a test, with a path short enough for sockets. All users may enter it."""
+    """A new home directory for programs, with a path short enough for sockets. All users may enter it."""
     with short_directory() as path:
         os.chmod(path, 0o755)
         yield path

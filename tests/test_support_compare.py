@@ -109,7 +109,7 @@ def test_a_wrong_sentence_is_noticed(low: Samples) -> None:
     twice = np.delete(low, [*range(9000, 9072), *range(15000, 15072)])
     wrong = [(each, low) for each in (*ends, gap, stutter, lost, twice, low_it)]
     for heard, expected in [*wrong, (right, left)]:
-        with pytest.raises(AssertionError, match="not heard as it should"):
+        with pytest.raises(AssertionError, match="not heard correctly"):
             assert_heard(recorded(heard), [expected])
     for heard, expected in ((ends[0], low), (low_it, low), (right, left)):
         assert not compare(recorded(heard), expected).same
@@ -132,7 +132,7 @@ def test_silence_is_no_sentence_and_a_missing_recording_is_no_silence(low: Sampl
 def test_sentences_are_recognised_in_order_and_each_once(low: Samples) -> None:
     with pytest.raises(AssertionError, match="more was heard"):
         assert_heard(recorded(low, low), [low])
-    with pytest.raises(AssertionError, match="not heard as it should"):
+    with pytest.raises(AssertionError, match="not heard correctly"):
         assert_heard(recorded(*render([LOW, LOW])), render([LOW, LEFT]))
     first, second, third = references = render([LOW, LEFT, LOW_IT])
     assert_heard(recorded(*references), references)

@@ -41,8 +41,8 @@ class Pretended(Listener):
             self.publish(f"talk/robot/{self._robot}/presence", b"", retain=True)
         super().close()
 
-    def _take(self, message: MQTTMessage) -> None:
-        super()._take(message)
+    def _receive(self, message: MQTTMessage) -> None:
+        super()._receive(message)
         request = self.messages[-1]
         if not request.payload or request.response is None:  # a goodbye
             return

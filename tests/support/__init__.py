@@ -1,5 +1,4 @@
-"""What the tests stand on: a sound server of their own, reference renderings, a scripted engine, servers and watchers.
+"""Helpers for the tests: sound servers, reference renderings, a scripted engine, servers, brokers and watchers.
 
-Nothing here tests anything. `tests/test_support_*.py` test what other tests trust most: sound, limits and forking.
-No module here imports talk's server or engine.
+`tests/test_support_*.py` test the most important helpers: comparisons of sound, limits and forking.
 """

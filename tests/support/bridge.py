@@ -1,4 +1,4 @@
-"""A robot's `talk bridge` and a desk, as processes of a test."""
+"""A robot's `talk bridge` and a desk, as processes."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ if TYPE_CHECKING:
     from tests.support.mqtt import Message
     from tests.support.processes import Process, Talk
 
-#: Seconds in which a started bridge is online: it may have to ask whether another one has its name.
+#: Time for a bridge to come online. It may have to ask whether another bridge has its name.
 ONLINE_LIMIT = 10.0
-#: Seconds in which it ends after SIGTERM.
+#: Time for a bridge to end after SIGTERM.
 STOP_LIMIT = 5.0
 
 
 class Bridge(contextlib.AbstractContextManager["Bridge"]):
-    """A `talk bridge`, started. It is online after `await_online()`, and killed by `close()` or `with`.
+    """A running `talk bridge`, which may not be online before `await_online()`. `close()` and `with` kill it.
 
-    The user, the password and the certificate are as in `Broker.env`. The test looks at the robot's presence as the
-    user `observer`. The port is that of a proxy before the broker.
+    `user`, `password` and `cert` are as in `Broker.env`. `observer` is the user with whom the test reads the robot's
+    presence. `port` is the port of a proxy in front of the broker.
     """
 
     def __init__(
@@ -53,11 +53,11 @@ class Bridge(contextlib.AbstractContextManager["Bridge"]):
         self.name = name
         self._broker, self._observer = broker, observer
         self._mark = uuid.uuid4().hex
-        self._words = ["bridge", "--name", name, *(["--group", ",".join(groups)] if groups else []), *options]
-        to = {"TALK_BROKER": broker.url_at(port)} if port else {}
-        self._env = talk.env | broker.env(user, password, cert) | to | dict(env or {}) | {MARK: self._mark}
+        self._arguments = ["bridge", "--name", name, *(["--group", ",".join(groups)] if groups else []), *options]
+        proxy = {"TALK_BROKER": broker.url_at(port)} if port else {}
+        self._env = talk.env | broker.env(user, password, cert) | proxy | dict(env or {}) | {MARK: self._mark}
         self._process: Process | None = None
-        #: the sessions that were seen online, and those of them from before the last start
+        #: all sessions that were online, and those before the last start
         self._sessions: set[str] = set()
         self._earlier: set[str] = set()
         with contextlib.ExitStack() as stack:
@@ -86,43 +86,44 @@ class Bridge(contextlib.AbstractContextManager["Bridge"]):
             return file.read()
 
     def start(self) -> None:
-        assert not self.running, f"the bridge {self.name} runs"
+        assert not self.running, f"the bridge {self.name} is running already"
         self._earlier = set(self._sessions)
         with open(f"{self._directory}/log", "ab") as log:
-            to = log.fileno()
+            output = log.fileno()
             if can_fork(self._env):
-                self._process = Forked(self._words, self._env, stdout=to, stderr=to)
+                self._process = Forked(self._arguments, self._env, stdout=output, stderr=output)
             else:
-                command = dying_with_parent([sys.executable, "-m", "talkcli", *self._words])
+                command = dying_with_parent([sys.executable, "-m", "talkcli", *self._arguments])
                 self._process = subprocess.Popen(
-                    command, env=self._env, stdin=subprocess.DEVNULL, stdout=to, stderr=to, text=True
+                    command, env=self._env, stdin=subprocess.DEVNULL, stdout=output, stderr=output, text=True
                 )
 
     def await_online(self, within: float = ONLINE_LIMIT) -> dict[str, Any]:
-        """Wait until the robot is online with a server after the last start, and return its presence."""
+        """Wait until the bridge is online with a server after its last start, and return the robot's presence."""
         end = time.monotonic() + within
 
         def online(message: Message) -> bool:
-            told = message.json if message.payload else {}
-            return bool(told.get("online") and told.get("server") and told["session"] not in self._earlier)
+            presence = message.json if message.payload else {}
+            new = presence.get("session") not in self._earlier
+            return bool(presence.get("online") and presence.get("server") and new)
 
         with Listener(self._broker, f"talk/robot/{self.name}/presence", user=self._observer) as listener:
-            # The broker doesn't tell that the process has ended.
-            while not (found := listener.find(online, 0.1)):
+            # The broker doesn't report the end of the process.
+            while not (message := listener.find(online, 0.1)):
                 code = self._started().poll()
                 assert code is None, f"the bridge {self.name} ended with {code}: {self.log}"
-                told = f"{self.log}{listener.messages}"
-                assert time.monotonic() < end, f"{self.name} is not online within {within} s: {told}"
-        self._sessions.add(found.json["session"])
-        return found.json
+                details = f"{self.log}{listener.messages}"
+                assert time.monotonic() < end, f"{self.name} is not online within {within} s: {details}"
+        self._sessions.add(message.json["session"])
+        return message.json
 
-    def await_log(self, words: str, within: float = ONLINE_LIMIT) -> str:
-        """Return the first line of the log with these words."""
+    def await_log(self, text: str, within: float = ONLINE_LIMIT) -> str:
+        """Wait for this text in the log, and return the first line that contains it."""
         end = time.monotonic() + within
-        while not (found := [each for each in self.log.splitlines() if words in each]):
-            assert time.monotonic() < end, f"no '{words}' of the bridge {self.name} within {within} s: {self.log}"
-            time.sleep(0.01)  # nothing tells when a file grows
-        return found[0]
+        while not (lines := [line for line in self.log.splitlines() if text in line]):
+            assert time.monotonic() < end, f"no '{text}' of the bridge {self.name} within {within} s: {self.log}"
+            time.sleep(0.01)  # a growing file sends no event
+        return lines[0]
 
     def wait(self, timeout: float = STOP_LIMIT) -> int:
         try:
@@ -131,7 +132,7 @@ class Bridge(contextlib.AbstractContextManager["Bridge"]):
             raise AssertionError(f"the bridge {self.name} did not end within {timeout} s: {self.log}") from None
 
     def terminate(self) -> int:
-        """End the bridge by SIGTERM, check that nothing is left of it, and return the exit code."""
+        """End the bridge with SIGTERM, check that no process is left behind, and return the exit code."""
         self._started().terminate()
         code = self.wait()
         assert_none_left(self._mark, STOP_LIMIT)
@@ -146,7 +147,7 @@ class Bridge(contextlib.AbstractContextManager["Bridge"]):
         """Stop the process (SIGSTOP), and wait until it has stopped."""
         os.kill(self.pid, signal.SIGSTOP)
         while self._state() not in "TZ":
-            time.sleep(0.001)  # the kernel tells only the parent
+            time.sleep(0.001)  # the kernel reports this only to the parent
 
     def resume_process(self) -> None:
         os.kill(self.pid, signal.SIGCONT)
@@ -166,7 +167,7 @@ class Bridge(contextlib.AbstractContextManager["Bridge"]):
 
 
 class Desk(Clients, contextlib.AbstractContextManager["Desk"]):
-    """Clients with a broker and without a server. `close()` or `with` ends those that still run."""
+    """Clients that have a broker, but no server. `close()` and `with` kill those that still run."""
 
     def __init__(
         self,
@@ -183,9 +184,9 @@ class Desk(Clients, contextlib.AbstractContextManager["Desk"]):
         with contextlib.ExitStack() as stack:
             home = stack.enter_context(short_directory("desk-"))
             stack.callback(self._end_clients)
-            to = {"TALK_BROKER": broker.url_at(port)} if port else {}
-            own = {"TALK_SOCKET": f"{home}/nobody"} | broker.env(user, password, cert) | to
-            self._env = clean_environment(home, own | dict(env or {}))
+            proxy = {"TALK_BROKER": broker.url_at(port)} if port else {}
+            variables = {"TALK_SOCKET": f"{home}/nobody"} | broker.env(user, password, cert) | proxy
+            self._env = clean_environment(home, variables | dict(env or {}))
             self._stack = stack.pop_all()
 
     def __exit__(self, *_error: object) -> None:
@@ -203,7 +204,7 @@ class Desk(Clients, contextlib.AbstractContextManager["Desk"]):
         return self._broker.log
 
 
-def desk(broker: Broker, robot: str, *words: str, user: str | None = None, timeout: float = 20) -> Finished:
-    """Run one command at a desk: `desk(broker, "anna", "say", "--wait", "--", "battery low")`."""
-    with Desk(broker, user=user) as somebody:
-        return somebody.run("--robot", robot, *words, timeout=timeout)
+def desk(broker: Broker, robot: str, *arguments: str, user: str | None = None, timeout: float = 20) -> Finished:
+    """Run one command at a new desk: `desk(broker, "anna", "say", "--wait", "--", "battery low")`."""
+    with Desk(broker, user=user) as clients:
+        return clients.run("--robot", robot, *arguments, timeout=timeout)

@@ -1,4 +1,4 @@
-"""A private broker: a real mosquitto on 127.0.0.1, which a test may kill and start again."""
+"""A private broker: a real mosquitto on 127.0.0.1 that tests can kill and restart."""
 
 from __future__ import annotations
 
@@ -22,16 +22,21 @@ from tests.support.surroundings import (
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-#: Seconds in which a broker must listen.
+#: Time limit until a broker listens, in seconds.
 _START = 10.0
 
 
 class Broker(contextlib.AbstractContextManager["Broker"]):
-    """A running broker that keeps nothing on disk; `close()` or `with` ends it and removes its directory.
+    """A running broker that stores nothing on disk. `close()` and `with` end it and remove its directory.
 
-    `secure`: by TLS alone. `users`: passwords by name; nobody else is let in, unless `anonymous`. `certificates`: a
-    client's certificate names the user (implies `secure`). `acl`: the text of an access control list. `max_packet`:
-    bytes. `expired`: an expired certificate of its own. `settings`: more lines of mosquitto's configuration.
+    Args:
+        secure: Accept only TLS.
+        users: Passwords by user name. Other users are refused, unless `anonymous`.
+        certificates: Require client certificates, which name the user. Implies `secure`.
+        acl: Text of an access control list.
+        max_packet: Size of the largest packet in bytes.
+        expired: Use an expired server certificate.
+        settings: More lines for mosquitto's configuration.
     """
 
     def __init__(
@@ -57,7 +62,7 @@ class Broker(contextlib.AbstractContextManager["Broker"]):
             if anonymous is None:
                 anonymous = not (users or certificates)
             lines.append(f"allow_anonymous {str(anonymous).lower()}")
-            if os.getuid() == 0:  # else it becomes the user mosquitto, who may read nothing here
+            if os.getuid() == 0:  # otherwise it becomes the user mosquitto, who may not read this directory
                 lines.append("user root")
             if max_packet is not None:
                 lines.append(f"max_packet_size {max_packet}")
@@ -66,8 +71,8 @@ class Broker(contextlib.AbstractContextManager["Broker"]):
             if acl is not None:
                 lines.append(f"acl_file {self._write('acl', acl)}")
             if self.secure:
-                own = authority().expired if expired else authority().server
-                lines += [f"certfile {own.file}", f"keyfile {own.key}"]
+                certificate = authority().expired if expired else authority().server
+                lines += [f"certfile {certificate.file}", f"keyfile {certificate.key}"]
             if certificates:
                 lines += [f"cafile {authority().file}", "require_certificate true", "use_identity_as_username true"]
             self._settings = self._write("mosquitto.conf", "\n".join(lines) + "\n")
@@ -79,46 +84,52 @@ class Broker(contextlib.AbstractContextManager["Broker"]):
         self.close()
 
     def close(self) -> None:
-        """End the broker and remove its directory; a second time is nothing."""
+        """End the broker and remove its directory. Closing twice is allowed."""
         self._stack.close()
 
     @property
     def url(self) -> str:
-        """The URL for a client."""
+        """The URL for clients."""
         return self.url_at(self.port)
 
     @property
     def log(self) -> str:
-        """What the broker wrote so far."""
+        """The broker's log so far."""
         with open(f"{self.directory}/log", encoding="utf-8", errors="replace") as file:
             return file.read()
 
     @property
     def pid(self) -> int:
-        """Process id of the broker."""
+        """The process id of the broker."""
         return self._running().pid
 
     def url_at(self, port: int) -> str:
-        """Return the URL for a client that connects by another port, such as a proxy's."""
+        """Return the URL for clients that use another port, such as that of a proxy."""
         return f"mqtts://localhost:{port}" if self.secure else f"mqtt://{HOST}:{port}"
 
     def env(self, user: str | None = None, password: str | bool = True, cert: str | None = None) -> dict[str, str]:
-        """Return a client's variables: a user, the user's password (False for none), the name of a certificate."""
+        """Return the environment variables of a client.
+
+        Args:
+            user: Name of the user.
+            password: True for the user's own password, False for none.
+            cert: Name in the client's certificate.
+        """
         result = {"TALK_BROKER": self.url}
         if self.secure:
             result["TALK_MQTT_CA"] = authority().file
         if user is not None:
             result["TALK_MQTT_USER"] = user
             if password is not False:
-                told = self._users[user] if password is True else password
-                result["TALK_MQTT_PASSWORD_FILE"] = self._write(f"{user}.password", f"{told}\n")
+                secret = self._users[user] if password is True else password
+                result["TALK_MQTT_PASSWORD_FILE"] = self._write(f"{user}.password", f"{secret}\n")
         if cert is not None:
-            own = authority().client(cert)
-            result |= {"TALK_MQTT_CERT": own.file, "TALK_MQTT_KEY": own.key}
+            certificate = authority().client(cert)
+            result |= {"TALK_MQTT_CERT": certificate.file, "TALK_MQTT_KEY": certificate.key}
         return result
 
     def start(self) -> None:
-        """Start the broker and wait until it listens; again, at the same port, after `kill()`."""
+        """Start the broker and wait until it listens. After `kill()`, it uses the same port."""
         with open(f"{self.directory}/log", "ab") as log:
             self._process = subprocess.Popen(
                 dying_with_parent([find_program("mosquitto") or "mosquitto", "-c", self._settings]),
@@ -133,17 +144,17 @@ class Broker(contextlib.AbstractContextManager["Broker"]):
                 code = self._process.poll()
                 assert code is None, f"mosquitto ended with {code}: {self.log}"
                 assert time.monotonic() < end, f"mosquitto does not listen within {_START} s: {self.log}"
-                time.sleep(0.005)  # it says nowhere when it begins to listen
+                time.sleep(0.005)  # mosquitto doesn't report when it listens
 
     def kill(self) -> None:
-        """Kill the broker, as if it had crashed: its clients' connections end, all that it kept is gone."""
+        """Kill the broker as if it had crashed. Its connections and its retained messages are lost."""
         self._running().kill()
         self._running().wait()
         self._process = None
 
     def _running(self) -> subprocess.Popen[bytes]:
         if self._process is None:
-            raise RuntimeError("the broker was killed, and not started again")
+            raise RuntimeError("the broker was killed and not restarted")
         return self._process
 
     def _write_passwords(self, users: Mapping[str, str]) -> str:

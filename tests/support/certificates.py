@@ -1,4 +1,4 @@
-"""Certificates for brokers and clients, made by openssl once a process: an authority of the tests' own, and another."""
+"""Certificates for brokers and clients. openssl makes them once per process."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from tests.support.surroundings import needs, short_directory
 
-#: Extensions that Python 3.13's strict verification asks for.
+#: Extensions that Python 3.13 requires.
 _EXTENSIONS = """
 [req]
 distinguished_name = name
@@ -40,14 +40,14 @@ _LIMIT = 20.0
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """Paths of a certificate and of its key."""
+    """The paths of a certificate and its key."""
 
     file: str
     key: str
 
 
 class Authority:
-    """A certificate authority; `file` is its own certificate."""
+    """A certificate authority. `file` is the path of its own certificate."""
 
     def __init__(self, directory: str, name: str) -> None:
         needs("openssl")
@@ -67,11 +67,11 @@ class Authority:
 
     @property
     def expired(self) -> Certificate:
-        """The same, which was good until yesterday."""
+        """A server certificate that expired yesterday."""
         return self._sign("localhost", "server", -1)
 
     def client(self, name: str) -> Certificate:
-        """Return the certificate of a client of this name."""
+        """Return the certificate of the client with this name."""
         return self._sign(name, "client", 2)
 
     def _sign(self, name: str, kind: str, days: int) -> Certificate:
@@ -82,14 +82,14 @@ class Authority:
         made = Certificate(f"{base}.crt", f"{base}.key")
         subject = ["-subj", f"/CN={name}", "-keyout", made.key, "-out", f"{base}.csr"]
         self._openssl("req", "-new", *_KEY, *subject, "-config", self._settings)
-        by = ["-CA", self.file, "-CAkey", f"{self._base}.key", "-set_serial", str(len(self._made) + 1)]
-        how = ["-days", str(days), "-extfile", self._settings, "-extensions", kind]
-        self._openssl("x509", "-req", "-in", f"{base}.csr", *by, *how, "-out", made.file)
+        ca = ["-CA", self.file, "-CAkey", f"{self._base}.key", "-set_serial", str(len(self._made) + 1)]
+        options = ["-days", str(days), "-extfile", self._settings, "-extensions", kind]
+        self._openssl("x509", "-req", "-in", f"{base}.csr", *ca, *options, "-out", made.file)
         self._made[name, f"{kind}{days}"] = made
         return made
 
-    def _openssl(self, *words: str) -> None:
-        command = ["openssl", *words]
+    def _openssl(self, *arguments: str) -> None:
+        command = ["openssl", *arguments]
         done = subprocess.run(command, capture_output=True, text=True, timeout=_LIMIT, check=False)
         assert done.returncode == 0, f"{' '.join(command)}: {done.stderr}"
 
@@ -102,7 +102,7 @@ def authority() -> Authority:
 
 @functools.cache
 def stranger() -> Authority:
-    """Return another one, which no broker and no client trusts."""
+    """Return an authority that no broker and no client trusts."""
     return Authority(_directory(), "stranger")
 
 

@@ -1,10 +1,15 @@
-"""Compares recorded sound with reference renderings, sample by sample, including the ends.
+"""Compare recorded sound with reference renderings, sample by sample, including both ends.
 
-Three traps decide how. A correlation over a whole sentence hardly shows a short last word that was cut, so the worst of
-its tenths of a second counts as well, and the place where the sound ends. The monitor drops samples at the start of a
-stream, so each tenth may sit a little beside its place. On a busy machine a player sometimes runs dry: the sink puts
-zeros between two samples of the sentence, and the monitor drops some of those behind, although the sentence is whole.
-So the sound is first followed sample by sample, which forgives just these, and otherwise judged by its correlation.
+Three problems make this difficult:
+
+- The correlation of a whole sentence hardly changes if a short last word is cut. So each tenth of a second is also
+  compared, and the place where the sound ends.
+- The monitor drops samples at the start of a stream. So each tenth of a second may be slightly displaced.
+- On a busy machine, a player sometimes runs dry. The sink then inserts zeros into the sentence, and the monitor may
+  drop some of the samples after them, although the sentence is complete.
+
+So the samples are first compared one by one, except for inserted zeros and dropped samples. If this fails, the
+correlation decides.
 """
 
 from __future__ import annotations
@@ -25,42 +30,42 @@ if TYPE_CHECKING:
     Samples = npt.NDArray[np.int16]
     Floats = npt.NDArray[np.float64]
 
-#: The right sentence has 1.0, one with another word about 0.4.
+#: Correlation of the right sentence. It is usually 1.0, and about 0.4 if a word is different.
 SAME = 0.95
-#: The worst tenth of a second of the right sentence has 1.0; of one with a word cut or changed, less than this.
+#: Correlation of the worst tenth of a second of the right sentence. It is lower if a word was cut or changed.
 SAME_PART = 0.8
-#: Seconds by which the extent of the right sound may differ: the monitor's loss and a block of silence.
+#: Difference in length that the monitor's dropped samples and a block of silence can cause.
 EXTENT_TOLERANCE_S = 0.02
 _PART = RATE // 10
-#: Samples by which a part may sit beside the place of the one before it.
+#: Samples by which a part may be displaced, relative to the part before it.
 _SLACK = 48
-#: Samples in a row that are the same when the sentence goes on after a player ran dry, and zeros that show that it did.
+#: Equal samples that show where the sentence continues, and zeros that show that a player ran dry.
 _RUN = 32
-#: Samples by which a quarter of a second may come later, if a player ran dry before it.
+#: Samples by which a quarter of a second may be late because a player ran dry before it.
 _NEARBY = RATE // 20
-#: Samples of silence that players that ran dry may put into one sentence.
+#: Most samples of silence that may be inserted into one sentence because players ran dry.
 _DRY = RATE // 2
-#: Samples that the monitor may lose at the start of a stream, and when a player ran dry: up to 217 were seen. And those
-#: that it may lose once in a sentence without any zeros: up to 110 were seen, when a busy machine kept the engine
-#: waiting for 48 ms. The sound server ran dry for 0.3 ms, and took back the sound that it had rendered.
+#: Samples that the monitor may drop at the start of a stream, or after a player ran dry (up to 217 were measured), and
+#: samples that it may drop once in a sentence without inserted zeros. Up to 110 were measured when the engine had
+#: waited 48 ms for the processor: the sound server ran dry for 0.3 ms and discarded the sound that it had rendered.
 _LOST, _LOST_ONCE = 256, 128
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """How a recorded sound resembles a reference."""
+    """The result of comparing a recorded sound with a reference."""
 
-    correlation: float  # normalised, over all of the reference; 1.0 is the same
-    worst: float  # the same of its worst tenth of a second that is sound
-    offset: int  # sample of the recording at which the reference's first sound is
-    heard: float  # seconds from the first to the last sample that is sound
-    expected: float  # the same of the reference
-    #: the compared samples of the recording and of the reference's sound, if zeros were left out of both
+    correlation: float  # normalised, over the whole reference; 1.0 if equal
+    worst: float  # lowest correlation of a tenth of a second that isn't silent
+    offset: int  # sample of the recording at which the reference's sound starts
+    heard: float  # seconds from the first to the last sound in the recording
+    expected: float  # seconds from the first to the last sound in the reference
+    #: indexes of the equal samples in the recording and in the reference's sound, if they were compared one by one
     places: tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]] | None = None
 
     @property
     def same(self) -> bool:
-        """Whether it is this sentence, whole, and nothing more."""
+        """Whether exactly this sentence was heard, complete."""
         return (
             self.correlation >= SAME
             and self.worst >= SAME_PART
@@ -69,7 +74,7 @@ class Comparison:
 
     @property
     def end(self) -> int:
-        """The sample of the recording after the last that was compared."""
+        """The index after the last compared sample of the recording."""
         return int(self.places[0][-1]) + 1 if self.places else self.offset + round(self.expected * RATE)
 
 
@@ -78,13 +83,13 @@ def _samples(heard: Recording | Samples) -> Samples:
 
 
 def extent(samples: Samples, loud: int = LOUD) -> tuple[int, int] | None:
-    """Return the first sample that is sound and the one after the last; None if there is no sound."""
-    found = np.flatnonzero(np.abs(samples.astype(np.int32)) > loud)
-    return (int(found[0]), int(found[-1]) + 1) if len(found) else None
+    """Return the index of the first sound and the index after the last sound, or None for silence."""
+    sound = np.flatnonzero(np.abs(samples.astype(np.int32)) > loud)
+    return (int(sound[0]), int(sound[-1]) + 1) if len(sound) else None
 
 
 def compare(heard: Recording | Samples, reference: Samples) -> Comparison:
-    """Compare all that was heard with one reference, aligned where they resemble each other most."""
+    """Compare the whole recording with one reference, at the offset where they are most similar."""
     samples = _samples(heard)
     wanted = _sound(reference)
     found = extent(samples)
@@ -98,9 +103,9 @@ def compare(heard: Recording | Samples, reference: Samples) -> Comparison:
 
 
 def assert_heard(heard: Recording | Samples, references: Sequence[Samples]) -> list[Comparison]:
-    """Assert that these references were heard whole, in order, once each, with only silence beside them.
+    """Assert that these references were heard completely, once and in order, and nothing else. Return the comparisons.
 
-    Returns how each compares. A pause at the end of a sentence may be shorter.
+    The silence at the end of a sentence may be shorter.
     """
     samples = _samples(heard)
     result: list[Comparison] = []
@@ -108,23 +113,23 @@ def assert_heard(heard: Recording | Samples, references: Sequence[Samples]) -> l
     for number, reference in enumerate(references, 1):
         wanted = _sound(reference)
         found = extent(samples[cursor:])
-        assert found is not None, f"sentence {number} of {len(references)} was not heard: {_told(samples, result)}"
+        assert found is not None, f"sentence {number} of {len(references)} was not heard: {_describe(samples, result)}"
         start = cursor + found[0]
-        each = _next(samples, wanted, start)
-        assert each.same, (
-            f"sentence {number} of {len(references)} was not heard as it should: {_told(samples, [each])}; "
-            f"sample by sample (heard at, its own, so many): {_walk(samples, wanted, start)} of {len(wanted)}"
+        comparison = _compare_next(samples, wanted, start)
+        assert comparison.same, (
+            f"sentence {number} of {len(references)} was not heard correctly: {_describe(samples, [comparison])}; "
+            f"equal samples (recording, reference, count): {_walk(samples, wanted, start)} of {len(wanted)}"
         )
-        cursor = min(len(samples), each.end + _SLACK)
-        result.append(each)
+        cursor = min(len(samples), comparison.end + _SLACK)
+        result.append(comparison)
     assert extent(samples[cursor:]) is None, (
-        f"more was heard than {len(references)} sentences: {_told(samples[cursor:], [])}"
+        f"more was heard than {len(references)} sentences: {_describe(samples[cursor:], [])}"
     )
     return result
 
 
-def _next(samples: Samples, wanted: Samples, start: int) -> Comparison:
-    """Compare the sentence that begins with the sound at `start`, behind silence."""
+def _compare_next(samples: Samples, wanted: Samples, start: int) -> Comparison:
+    """Compare the sentence whose first sound is at `start`, after silence."""
     exact = _exact(samples, wanted, start)
     if exact:
         return exact
@@ -136,9 +141,9 @@ def _next(samples: Samples, wanted: Samples, start: int) -> Comparison:
 
 
 def _exact(samples: Samples, wanted: Samples, start: int) -> Comparison | None:
-    """Compare the sound at `start` sample by sample; None if it is not the whole sentence.
+    """Compare the sound at `start` sample by sample. Return None if it isn't the complete sentence.
 
-    If a player ran dry, zeros were put in, and the monitor may have lost some samples behind them.
+    If a player ran dry, zeros were inserted, and the monitor may have dropped some samples after them.
     """
     runs = _walk(samples, wanted, start)
     if not runs or not _nearly_whole(runs, wanted):
@@ -148,10 +153,10 @@ def _exact(samples: Samples, wanted: Samples, start: int) -> Comparison | None:
 
 
 def _walk(samples: Samples, wanted: Samples, place: int, ahead: int = 0) -> list[tuple[int, int, int]]:
-    """Return the runs in which both are the same: the place of each in the samples, its own place, and its length.
+    """Return the runs of equal samples: their start in the recording, their start in the reference, and their length.
 
-    Between two of them there are only zeros in the samples, and at most the lost samples are left out of those wanted.
-    The first run may begin `ahead` samples later in the latter.
+    Between two runs, the recording only has zeros, and at most the samples that the monitor may drop are missing. The
+    first run may start up to `ahead` samples later in the reference.
     """
     runs: list[tuple[int, int, int]] = []
     own = 0
@@ -169,27 +174,27 @@ def _walk(samples: Samples, wanted: Samples, place: int, ahead: int = 0) -> list
 
 
 def _nearly_whole(runs: Sequence[tuple[int, int, int]], wanted: Samples) -> bool:
-    """Return whether no more was lost and put in than a busy machine does to a sentence."""
+    """Return whether no more samples were dropped and inserted than on a busy machine."""
     reached = [0, *(own + length for _, own, length in runs)]
-    begins = [*(own for _, own, _ in runs), len(wanted)]
-    lost = [int(np.count_nonzero(wanted[a:b])) for a, b in zip(reached, begins, strict=True)]
+    starts = [*(own for _, own, _ in runs), len(wanted)]
+    lost = [int(np.count_nonzero(wanted[a:b])) for a, b in zip(reached, starts, strict=True)]
     longer = runs[-1][0] - runs[0][0] - (runs[-1][1] - runs[0][1])
-    # Without zeros between them, samples are missing that the player had: few, which the monitor lost.
-    wet = [
+    # Samples that are missing without inserted zeros: the monitor dropped them, although no player ran dry.
+    lost_without_zeros = [
         missing
         for missing, before, after in zip(lost[1:-1], runs, runs[1:], strict=False)
         if missing and after[0] - before[0] - before[2] < _RUN
     ]
-    return max(lost) <= _LOST and sum(lost) <= 3 * _LOST and len(wet) <= 1 and longer <= _DRY
+    return max(lost) <= _LOST and sum(lost) <= 3 * _LOST and len(lost_without_zeros) <= 1 and longer <= _DRY
 
 
 def _leading_zeros(samples: Samples) -> int:
-    found = np.flatnonzero(samples)
-    return int(found[0]) if len(found) else len(samples)
+    others = np.flatnonzero(samples)
+    return int(others[0]) if len(others) else len(samples)
 
 
 def _find(piece: Samples, wanted: Samples, last: int) -> int | None:
-    """Return the first place, up to `last`, of the piece in `wanted`, at whose end it may be shorter."""
+    """Return the first index, up to `last`, of the piece in `wanted`. The end of `wanted` may cut the piece off."""
     for place in np.flatnonzero(wanted[: last + 1] == piece[0]) if len(piece) else ():
         rest = wanted[place : place + len(piece)]
         if np.array_equal(piece[: len(rest)], rest):
@@ -198,7 +203,7 @@ def _find(piece: Samples, wanted: Samples, last: int) -> int | None:
 
 
 def _same_length(samples: Samples, wanted: Samples) -> int:
-    """Return for how many samples both are the same."""
+    """Return the number of equal samples at the start."""
     length = min(len(samples), len(wanted))
     different = np.flatnonzero(samples[:length] != wanted[:length])
     return int(different[0]) if len(different) else length
@@ -210,7 +215,7 @@ def _places(runs: Sequence[tuple[int, int, int]]) -> tuple[npt.NDArray[np.intp],
 
 
 def assert_only_beginning(heard: Recording | Samples, reference: Samples, shortest: float = 0.1) -> float:
-    """Assert that only a beginning of the reference was heard, at least `shortest` seconds; return its seconds."""
+    """Assert that only a beginning of the reference was heard, of at least `shortest` seconds. Return its length."""
     samples = _samples(heard)
     found = extent(samples)
     assert found is not None, "nothing was heard"
@@ -220,7 +225,7 @@ def assert_only_beginning(heard: Recording | Samples, reference: Samples, shorte
     if last and last[0][0] + last[0][2] == len(sound):
         seconds = (last[0][1] + last[0][2]) / RATE
     else:
-        assert len(sound) <= len(wanted) + _SLACK, f"more was heard than the sentence: {_told(samples, [])}"
+        assert len(sound) <= len(wanted) + _SLACK, f"more was heard than the sentence: {_describe(samples, [])}"
         assert_heard(sound, [wanted[: len(sound)]])
         seconds = len(sound) / RATE
     assert seconds >= shortest, f"only {seconds:.3f} s were heard"
@@ -228,53 +233,53 @@ def assert_only_beginning(heard: Recording | Samples, reference: Samples, shorte
 
 
 def matching_length(samples: Samples, reference: Samples) -> int:
-    """Return the place behind the last sample, from the first sound on, that is the same as the reference; else 0."""
+    """Return the index in the recording up to which it is equal to the reference, or 0 if it isn't from the start."""
     found = extent(samples)
     last = _walk(samples, _sound(reference), found[0])[-1:] if found else []
     return last[0][0] + last[0][2] if last else 0
 
 
 def assert_resumed(heard: Recording | Samples, reference: Samples, pause: float, repeated: float = 0.0) -> float:
-    """Assert that the reference was heard whole, held once in its middle for at least `pause` seconds.
+    """Assert that the reference was heard completely, with one pause of at least `pause` seconds. Return its length.
 
-    At most `repeated` seconds may have been said again after the pause. Returns the seconds of the pause.
+    At most `repeated` seconds may be heard again after the pause.
     """
     samples = _samples(heard)
     loud = np.flatnonzero(np.abs(samples.astype(np.int32)) > LOUD)
-    assert len(loud) > 1, f"no sentence was heard: {_told(samples, [])}"
-    # A pause is only zeros; other quiet samples belong to the sentence.
+    assert len(loud) > 1, f"no sentence was heard: {_describe(samples, [])}"
+    # A pause consists of zeros. Other quiet samples belong to the sentence.
     sound = loud[0] + np.flatnonzero(samples[loud[0] : loud[-1] + 1])
     gap = int(np.argmax(np.diff(sound)))
     end, again = int(sound[gap]) + 1, int(sound[gap + 1])
     first, second = samples[loud[0] : end], samples[again : loud[-1] + 1]
-    held = (again - end + 1) / RATE
-    assert held >= pause, f"held for {held:.3f} s: {_told(samples, [])}"
+    length = (again - end + 1) / RATE
+    assert length >= pause, f"paused for only {length:.3f} s: {_describe(samples, [])}"
     wanted = _sound(reference)
     try:
         _assert_parts(first, second, wanted, repeated)
     except AssertionError as error:
-        # Zeros of the sentence beside the pause look like the pause.
+        # Zeros of the sentence next to the pause look like a part of the pause.
         if not _ran_dry(first, samples[end : loud[-1] + 1], wanted, round(repeated * RATE)):
-            runs = [_walk(each, wanted, 0, ahead=len(wanted)) for each in (first, second)]
-            told = f"parts of {len(first)} and {len(second)} samples, sample by sample (heard at, its own, so many)"
-            raise AssertionError(f"{error}; {told}: {runs[0]} and {runs[1]} of {len(wanted)}") from error
-    return held
+            runs = [_walk(part, wanted, 0, ahead=len(wanted)) for part in (first, second)]
+            parts = f"parts of {len(first)} and {len(second)} samples, equal samples (recording, reference, count)"
+            raise AssertionError(f"{error}; {parts}: {runs[0]} and {runs[1]} of {len(wanted)}") from error
+    return length
 
 
 def find_part(part: Samples, wanted: Samples, reached: int, back: int) -> tuple[int, int] | None:
-    """Return the places in a sentence's sound where a part of it begins and ends; None if it is no part.
+    """Return where a part of a sentence's sound starts and ends, or None if it isn't a part of it.
 
-    `reached`: samples that were heard before, of which it may say the last `back` again.
+    `reached` is the number of samples that were heard before. The part may repeat the last `back` of them.
     """
-    begins = max(0, reached - back)
-    runs = _walk(part, wanted[begins:], 0, ahead=reached - begins)
+    start = max(0, reached - back)
+    runs = _walk(part, wanted[start:], 0, ahead=reached - start)
     if not runs or runs[-1][0] + runs[-1][2] < len(part):
         return None
-    return begins + runs[0][1], begins + runs[-1][1] + runs[-1][2]
+    return start + runs[0][1], start + runs[-1][1] + runs[-1][2]
 
 
 def _ran_dry(first: Samples, second: Samples, wanted: Samples, repeated: int) -> bool:
-    """Return whether these are the two parts of a sentence in which a player ran dry, see `_exact`."""
+    """Return whether these are the two parts of a sentence in which a player ran dry (see `_exact`)."""
     runs = _walk(first, wanted, 0)
     if not runs or runs[-1][0] + runs[-1][2] < len(first):
         return False
@@ -283,7 +288,7 @@ def _ran_dry(first: Samples, second: Samples, wanted: Samples, repeated: int) ->
     rest = _walk(second, wanted[reached - back :], 0, ahead=back)
     if not rest or len(wanted) - (reached - back + rest[-1][1] + rest[-1][2]) > _LOST:
         return False
-    # A stream that goes on loses nothing at the pause; a stream that was started again or ran dry may.
+    # A stream that continues drops nothing at the pause. A stream that was restarted or ran dry may drop samples.
     between = int(np.count_nonzero(wanted[reached : reached - back + rest[0][1]]))
     return between <= (_LOST if repeated or len(runs) + len(rest) > 2 else 2 * _SLACK)
 
@@ -296,13 +301,13 @@ def _assert_parts(first: Samples, second: Samples, wanted: Samples, repeated: fl
     assert_heard(first, [wanted[lost:reached]])
     assert_heard(second, [wanted[-len(second) :]])
     missing = wanted[reached + _SLACK : -len(second) - _SLACK]
-    assert extent(missing) is None, f"{len(missing) / RATE:.3f} s at the pause were never heard"
+    assert extent(missing) is None, f"{len(missing) / RATE:.3f} s at the pause were not heard"
     again = (reached + len(second) - len(wanted)) / RATE
     assert again <= repeated + _SLACK / RATE, f"{again:.3f} s at the pause were heard twice"
 
 
 def time_heard(recording: Recording, compared: Comparison, reference: Samples, position: float) -> float:
-    """Return the monotonic time at which a position of the reference, in seconds from its start, was heard."""
+    """Return the monotonic time at which a position of the reference (in seconds) was heard."""
     found = extent(reference)
     assert found is not None, "the reference is silence"
     place = round(position * RATE) - found[0]
@@ -313,11 +318,11 @@ def time_heard(recording: Recording, compared: Comparison, reference: Samples, p
 
 
 def similarity(heard: Recording | Samples, reference: Samples) -> float:
-    """Return how a sound resembles a reference by quarter seconds, each at the best place nearby; 0.0 for silence.
+    """Return the correlation of a sound with a reference, or 0.0 for silence. Each quarter of a second is aligned.
 
-    This is for sound that can't be the same: a library that has spoken already does not repeat itself, and a player
-    that ran dry plays the rest later. At 450 words a minute the same sentence has 0.35 to 1.0, another one 0.27 at most
-    (250 of each, with a gap of 10 to 40 ms somewhere in it); at 200 another one reached 0.31.
+    Use this for sound that can't be equal: libespeak-ng renders a sentence differently after another one, and a player
+    that ran dry plays the rest later. At 450 words per minute, the same sentence had 0.35 to 1.0, and another sentence
+    at most 0.27 (250 of each, with a gap of 10 to 40 ms). At 200 words per minute, another sentence reached 0.31.
     """
     samples = _samples(heard)
     wanted = _sound(reference)
@@ -341,11 +346,11 @@ def assert_silent(heard: Recording | Samples) -> None:
     """Assert that nothing was heard."""
     samples = _samples(heard)
     assert len(samples), "nothing was recorded, not even silence"
-    assert extent(samples) is None, f"sound where silence should be: {_told(samples, [])}"
+    assert extent(samples) is None, f"something was heard: {_describe(samples, [])}"
 
 
 def loudness(samples: Samples) -> float:
-    """Return the root mean square of a sound, from its first to its last sample that is sound; 0.0 for silence."""
+    """Return the root mean square of a sound without the silence at its ends, or 0.0 for silence."""
     found = extent(samples)
     return 0.0 if found is None else float(np.sqrt(np.mean(samples[found[0] : found[1]].astype(np.float64) ** 2)))
 
@@ -357,7 +362,7 @@ def _sound(reference: Samples) -> Samples:
 
 
 def _align(samples: Floats, wanted: Samples, last: int | None = None) -> int:
-    """Return the offset, up to `last`, at which samples resemble `wanted` most (cross-correlation by FFT)."""
+    """Return the offset, up to `last`, at which samples are most similar to `wanted` (cross-correlation by FFT)."""
     size = 1 << (len(samples) + len(wanted)).bit_length()
     product = np.fft.rfft(samples, size) * np.conj(np.fft.rfft(wanted.astype(np.float64), size))
     correlation = np.fft.irfft(product, size)
@@ -365,28 +370,28 @@ def _align(samples: Floats, wanted: Samples, last: int | None = None) -> int:
 
 
 def _at(samples: Samples, wanted: Samples, offset: int, heard: float) -> Comparison:
-    """Compare `wanted` with the samples at an offset, part by part, each close to the one before it."""
+    """Compare `wanted` with the samples at an offset, part by part. Each part may be slightly displaced."""
     reference = wanted.astype(np.float64)
     dots, energies, worst = 0.0, 0.0, 1.0
     place = offset
     for start in range(0, len(reference), _PART):
         part = reference[start : start + _PART]
         around = _around(samples, place + start, len(part), _SLACK)
-        product, energy, beside = _best(around, part)
-        own = float(part @ part)
-        if product < SAME_PART * np.sqrt(own * energy):
-            product, energy, beside = _best_in_two(around, part)
+        product, energy, best = _best(around, part)
+        expected = float(part @ part)
+        if product < SAME_PART * np.sqrt(expected * energy):
+            product, energy, best = _best_in_two(around, part)
         dots += product
         energies += energy
-        if own > len(part) * LOUD**2:
-            worst = min(worst, product / float(np.sqrt(own * max(energy, 1.0))))
-            place += min(0, beside - _SLACK)  # lost samples never come back
+        if expected > len(part) * LOUD**2:
+            worst = min(worst, product / float(np.sqrt(expected * max(energy, 1.0))))
+            place += min(0, best - _SLACK)  # after dropped samples, all later parts come earlier
     whole = float(np.sqrt(float(reference @ reference) * max(energies, 1.0)))
     return Comparison(dots / whole, worst, offset, heard, len(wanted) / RATE)
 
 
 def _around(samples: Samples | Floats, offset: int, length: int, slack: int) -> Floats:
-    """Return the samples from an offset on, with `slack` of them on either side, filled up with zeros."""
+    """Return the samples at an offset with `slack` samples on both sides. Missing samples are zeros."""
     padded = np.zeros(length + 2 * slack)
     begin = max(0, offset - slack)
     piece = samples[begin : offset + length + slack]
@@ -395,7 +400,7 @@ def _around(samples: Samples | Floats, offset: int, length: int, slack: int) -> 
 
 
 def _best(around: Floats, part: Floats) -> tuple[float, float, int]:
-    """Return the product with a part at the best place, the energy of the samples there, and that place."""
+    """Return the product with a part at the best index, the energy of the samples there, and the index."""
     products = np.correlate(around, part, "valid")
     squares = np.concatenate([[0.0], np.cumsum(around**2)])
     energy = squares[len(part) :] - squares[: -len(part)]
@@ -404,16 +409,16 @@ def _best(around: Floats, part: Floats) -> tuple[float, float, int]:
 
 
 def _best_in_two(around: Floats, part: Floats) -> tuple[float, float, int]:
-    """Return the same as `_best` for a part in whose middle the monitor may have dropped samples."""
-    found = []
+    """Do the same as `_best` for a part in which the monitor may have dropped samples."""
+    results = []
     for cut in range(max(1, len(part) // 8), len(part), max(1, len(part) // 8)):
         first = _best(around[: cut + 2 * _SLACK], part[:cut])
         second = _best(around[cut:], part[cut:])
-        found.append((first[0] + second[0], first[1] + second[1], second[2]))
-    return max(found or [_best(around, part)], key=lambda each: each[0] / float(np.sqrt(max(each[1], 1.0))))
+        results.append((first[0] + second[0], first[1] + second[1], second[2]))
+    return max(results or [_best(around, part)], key=lambda result: result[0] / float(np.sqrt(max(result[1], 1.0))))
 
 
-def _told(samples: Samples, compared: Sequence[Comparison]) -> str:
+def _describe(samples: Samples, comparisons: Sequence[Comparison]) -> str:
     found = extent(samples)
     sound = f"sound from {found[0] / RATE:.3f} to {found[1] / RATE:.3f} s" if found else "silence"
-    return "; ".join([f"{sound} in {len(samples) / RATE:.3f} s recorded", *(str(each) for each in compared)])
+    return "; ".join([f"{sound} in a recording of {len(samples) / RATE:.3f} s", *map(str, comparisons)])

@@ -1,6 +1,6 @@
-"""A raw connection to a server: one JSON object a line, sent and received as it stands, whatever it says.
+"""A raw connection to a server, which sends and receives one JSON object per line.
 
-It knows nothing of talk's own client or wire module, so that it tests them instead of repeating them.
+It shares no code with talk, so that mistakes in talk's own code can't hide.
 """
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-#: Seconds in which anything that a server owes must have come.
+#: Time limit for a server's messages, in seconds.
 PATIENCE = 5.0
 
 Message = dict[str, Any]
 
 
 class Wire(contextlib.AbstractContextManager["Wire"]):
-    """A connection, greeted. `greeting` is the server's first line. Close it, or use `with`."""
+    """A connection that has received the server's greeting. Close it, or use `with`."""
 
     def __init__(self, path: str) -> None:
         self._socket = socket.socket(socket.AF_UNIX)
         self._buffer = bytearray()
         self._seq = 0
-        #: what came before the reply to a `request`: events in `events`, items of lists in `items`
+        #: messages that came before the reply to a `request`: events, and items of lists
         self.events: list[Message] = []
         self.items: list[Message] = []
         try:
@@ -42,7 +42,7 @@ class Wire(contextlib.AbstractContextManager["Wire"]):
         self.close()
 
     def send(self, message: Mapping[str, object]) -> None:
-        """Send an object as a line."""
+        """Send an object as one line."""
         self.send_raw(json.dumps(message, ensure_ascii=False).encode() + b"\n")
 
     def send_raw(self, data: bytes) -> None:
@@ -51,7 +51,7 @@ class Wire(contextlib.AbstractContextManager["Wire"]):
         self._socket.sendall(data)
 
     def receive(self, timeout: float | None = PATIENCE) -> Message:
-        """Return the next line's object. TimeoutError if none comes, EOFError if the server has closed."""
+        """Return the next message. Raise TimeoutError if none comes, or EOFError if the server has closed."""
         end = None if timeout is None else time.monotonic() + timeout
         while b"\n" not in self._buffer:
             self._socket.settimeout(None if end is None else max(0.001, end - time.monotonic()))
@@ -71,7 +71,7 @@ class Wire(contextlib.AbstractContextManager["Wire"]):
         return message
 
     def request(self, request: str, /, timeout: float = PATIENCE, **fields: object) -> Message:
-        """Send a request and return its reply; what comes before that is kept in `events` and `items`."""
+        """Send a request and return its reply. Earlier messages are kept in `events` and `items`."""
         self._seq += 1
         self.send({"seq": self._seq, "request": request, **fields})
         end = time.monotonic() + timeout
@@ -82,9 +82,9 @@ class Wire(contextlib.AbstractContextManager["Wire"]):
             (self.events if "event" in message else self.items).append(message)
 
     def receive_event(self, event: str, timeout: float = PATIENCE, **fields: object) -> Message:
-        """Return the next event of that kind whose fields are these, one that came already included.
+        """Return the next event of this kind with these fields, including those that have come already.
 
-        Events that come before it are dropped, `alive` and those of other goals among them.
+        All events before it are dropped.
         """
         end = time.monotonic() + timeout
         while True:
@@ -93,7 +93,7 @@ class Wire(contextlib.AbstractContextManager["Wire"]):
                 return message
 
     def shut_down(self) -> None:
-        """End the connection for both sides; a `receive` in another thread returns at once, with EOFError."""
+        """Shut down both directions. A `receive` in another thread raises EOFError at once."""
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
 

@@ -1,4 +1,4 @@
-"""The project's documents, taken apart: their sections, their tables and their examples."""
+"""The project's documents with their sections, tables and examples."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Row = tuple[str, ...]
 
 
 class Document:
-    """A document in Markdown, by its path from the top of the project."""
+    """A Markdown document. Its path is relative to the project."""
 
     def __init__(self, path: str) -> None:
         self.name = path
@@ -19,30 +19,29 @@ class Document:
         self.text = self.path.read_text(encoding="utf-8")
 
     def section(self, title: str) -> str:
-        """Return the text under a heading, with its own subsections."""
-        found = re.search(rf"^(##+) {re.escape(title)}\n(.*?)(?=^## |^\1 |\Z)", self.text, re.MULTILINE | re.DOTALL)
-        assert found, f"{self.name} has no section {title!r}"
-        return found[2]
+        """Return the text under a heading, including its subsections."""
+        match = re.search(rf"^(##+) {re.escape(title)}\n(.*?)(?=^## |^\1 |\Z)", self.text, re.MULTILINE | re.DOTALL)
+        assert match, f"{self.name} has no section {title!r}"
+        return match[2]
 
     def examples(self, language: str, title: str | None = None) -> list[str]:
-        """Return the blocks of code in a language: of one section, or all."""
+        """Return the code blocks in a language, of one section or of all."""
         text = self.text if title is None else self.section(title)
         return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
 
     @property
     def prose(self) -> str:
-        """The text without its blocks of code."""
+        """The text without code blocks."""
         fenced = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
         return re.sub(r"^    .*$", "", fenced.sub("", self.text), flags=re.MULTILINE)
 
     @property
     def anchors(self) -> set[str]:
-        """What a link behind a # may name: the headings, as forges make names of them."""
+        """The anchors that GitHub makes from the headings."""
         headings = re.findall(r"^#+ (.+)$", self.prose, re.MULTILINE)
-        return {re.sub(r"[^\w -]", "", each.lower()).replace(" ", "-") for each in headings}
+        return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-#: The document for users, and those beside the code that they describe.
 README = Document("README.md")
 COMMAND_LINE = Document("talkcli/cli/README.md")
 WIRE = Document("talkcli/protocol/README.md")
@@ -52,29 +51,28 @@ FLEET = Document("talkcli/fleet/README.md")
 INTERNALS = Document("talkcli/README.md")
 BENCHMARK = Document("tests/tools/bench/README.md")
 CONTRIBUTING = Document(".github/CONTRIBUTING.md")
-#: All of them.
 DOCUMENTS = (
     *(README, COMMAND_LINE, DOCTOR, SERVICES, WIRE, FLEET, INTERNALS, BENCHMARK, CONTRIBUTING),
-    *(Document(each) for each in ("tests/faults/README.md", "tests/fleet/README.md", "tests/fresh/README.md")),
+    *(Document(path) for path in ("tests/faults/README.md", "tests/fleet/README.md", "tests/fresh/README.md")),
 )
 
 
 def tables(text: str) -> list[list[Row]]:
-    """Return the tables of a text as rows of cells, headings first, the line under these left out."""
-    found = []
+    """Return the tables of a text as rows of cells. The first row has the headings."""
+    result = []
     for table in re.findall(r"^(?:\|.*\|\n)+", text, re.MULTILINE):
         lines = [re.split(r"(?<!\\)\|", row[1:-1]) for row in table.splitlines()]
         rows = [tuple(cell.strip().replace("\\|", "|") for cell in line) for line in lines]
         assert {len(row) for row in rows} == {len(rows[0])}, f"cells are missing: {table}"
-        found.append([rows[0], *rows[2:]])
-    return found
+        result.append([rows[0], *rows[2:]])
+    return result
 
 
 def code_spans(cell: str) -> list[str]:
-    """Return the code in a cell."""
+    """Return the code spans in a cell."""
     return re.findall(r"`([^`]+)`", cell)
 
 
 def first_column(table: list[Row]) -> list[str]:
-    """Return the one name that stands as code at the beginning of each row."""
+    """Return the first code span of each row, if its first cell has one."""
     return [code_spans(row[0])[0] for row in table[1:] if code_spans(row[0])]

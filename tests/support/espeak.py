@@ -1,10 +1,10 @@
-"""Renders sentences with libespeak-ng itself, without talk: a program that `reference` runs in a fresh process.
+"""A program that renders sentences with libespeak-ng, without talk. `reference` runs it in a new process.
 
-Reads a JSON list of `{"text", "rate", "volume", "voice", "pitch"}` on standard input; writes for each a line of JSON,
-`{"samples": NUMBER, "words": [[START, END, SECONDS], …]}`, then the samples, 16 bit little endian.
+It reads a JSON list of `{"text", "rate", "volume", "voice", "pitch"}` from standard input. For each sentence, it
+writes a line of JSON, `{"samples": NUMBER, "words": [[START, END, SECONDS], …]}`, and then the samples (s16le).
 
-The calls and their order are those of the program `espeak-ng -w`, so that the first sentence is the same bit for bit.
-It uses nothing but the standard library, so that its start is quick.
+It calls the library in the same order as `espeak-ng -w`, so the first sentence has exactly the same samples. It only
+uses the standard library, so it starts fast.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    #: A word: offset of its first character in the text, the offset after its last, and its seconds into the samples.
+    #: Start and end of a word in the text, and the time of its sound in seconds.
     Word = tuple[int, int, float]
 
 RATE = 22050
@@ -45,7 +45,7 @@ _Callback = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.POINTER(ctypes.c_short), ctype
 
 
 def load() -> tuple[ctypes.CDLL, bytes | None]:
-    """Return the library and the path of its data: the system's, else the wheel's."""
+    """Return the library and the path of its data (None for the system's), from the system or else from the wheel."""
     try:
         return ctypes.CDLL("libespeak-ng.so.1"), None
     except OSError:
@@ -55,14 +55,14 @@ def load() -> tuple[ctypes.CDLL, bytes | None]:
 
 
 class Library:
-    """The library with a function that takes its sound, piece by piece, with its words, and may stop it."""
+    """The library. It calls `take` with each block of sound and its words, and stops if `take` returns True."""
 
     def __init__(self, take: Callable[[bytes, list[Word]], bool]) -> None:
         self._library, data = load()
         if self._library.espeak_Initialize(_SYNCHRONOUS, 0, data, _DONT_EXIT) <= 0:
-            sys.exit("libespeak-ng cannot be initialised: its data is missing")
+            sys.exit("libespeak-ng can't be initialised: its data is missing")
 
-        def called(wav: ctypes._Pointer[ctypes.c_short], count: int, events: ctypes._Pointer[_Event]) -> int:
+        def receive(wav: ctypes._Pointer[ctypes.c_short], count: int, events: ctypes._Pointer[_Event]) -> int:
             words: list[Word] = []
             for event in iter(events):
                 if event.type == 0:
@@ -72,11 +72,11 @@ class Library:
                     words.append((start, start + event.length, event.audio_position / 1000))
             return int(take(ctypes.string_at(wav, count * 2) if wav and count > 0 else b"", words))
 
-        self._callback = _Callback(called)  # kept for as long as the library may call it
+        self._callback = _Callback(receive)  # must live as long as the library may call it
         self._library.espeak_SetSynthCallback(self._callback)
 
     def speak(self, text: str, *, rate: int, volume: float = 1.0, voice: str = "en", pitch: int = 50) -> None:
-        """Make the sound of a text."""
+        """Render a text."""
         if self._library.espeak_SetVoiceByName(voice.encode()) != 0:
             sys.exit(f"libespeak-ng has no voice {voice!r}")
         self._library.espeak_SetParameter(_PARAMETER_RATE, rate, 0)
@@ -85,17 +85,17 @@ class Library:
         data = text.encode()
         size = ctypes.c_size_t(len(data) + 1)
         if self._library.espeak_Synth(data, size, 0, 0, 0, _UTF8_AND_END_PAUSE, None, None) != 0:
-            sys.exit(f"libespeak-ng cannot render {text!r}")
+            sys.exit(f"libespeak-ng can't render {text!r}")
 
 
 def main() -> None:
-    """Render the sentences of standard input."""
+    """Render the sentences from standard input."""
     samples = bytearray()
     words: list[Word] = []
 
-    def take(sound: bytes, told: list[Word]) -> bool:
+    def take(sound: bytes, new_words: list[Word]) -> bool:
         samples.extend(sound)
-        words.extend(told)
+        words.extend(new_words)
         return False
 
     library = Library(take)

@@ -1,9 +1,9 @@
-"""Starts `talk` as a fork of a process that has imported it: a few ms of processor instead of 45, or 90 for a server.
+"""Start `talk` as a fork of a process that has imported it. This takes a few ms instead of 45 (or 90 for a server).
 
-It is a process with its own environment, descriptors and session, killed with the tests. Only its command line and
-first environment in /proc are different, it has nothing to import, and its interpreter isn't cleaned up at the end. A
-test of these, of signals or limits at a start, of closed streams or of another interpreter starts a program of its own;
-see also `can_fork()`.
+The new process has its own environment, descriptors and session, and is killed with the tests. It differs from other
+processes in three ways: /proc shows another command line and environment, the process imports nothing, and its
+interpreter isn't cleaned up at the end. If a test needs one of these, or a start with special signals, limits, closed
+streams or another interpreter, it must start a real process. See also `can_fork()`.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from tests.support.surroundings import clean_environment
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-#: Variables that a forked process can't have of its own: the interpreter's settings, libraries, the locale.
+#: Variables that only work at the start of an interpreter: its settings, libraries and the locale.
 _INTERPRETER = ("PYTHON", "LD_", "LC_", "LANG", "COVERAGE")
 
 
 class Forked:
-    """A process with the part of `subprocess.Popen`'s interface that tests use."""
+    """A forked process with the part of `subprocess.Popen`'s interface that tests use."""
 
     def __init__(
         self,
-        words: Sequence[str],
+        arguments: Sequence[str],
         env: Mapping[str, str],
         *,
         scripted: bool = False,
@@ -45,52 +45,52 @@ class Forked:
         stderr: int = subprocess.DEVNULL,
         start_new_session: bool = False,
     ) -> None:
-        """Start it; streams are as in `Popen`: a number, PIPE, DEVNULL or STDOUT; pipes are text."""
-        self.args = [sys.executable, "-m", "talkcli", *words]
+        """Start the process. As in `Popen`, a stream is a descriptor, PIPE (text), DEVNULL or STDOUT."""
+        self.args = [sys.executable, "-m", "talkcli", *arguments]
         self.returncode: int | None = None
         self.stdin: IO[str] | None = None
         self.stdout: IO[str] | None = None
         self.stderr: IO[str] | None = None
-        asked = {"words": list(words), "env": dict(env), "scripted": scripted, "session": start_new_session}
-        theirs: list[int] = []
+        request = {"arguments": list(arguments), "env": dict(env), "scripted": scripted, "session": start_new_session}
+        streams: list[int] = []
         close: list[int] = []
         try:
-            for number, wanted in enumerate((stdin, stdout, stderr)):
-                if wanted == subprocess.PIPE:
+            for number, stream in enumerate((stdin, stdout, stderr)):
+                if stream == subprocess.PIPE:
                     reading, writing = os.pipe()
-                    theirs.append(writing if number else reading)
-                    close.append(theirs[-1])
+                    streams.append(writing if number else reading)
+                    close.append(streams[-1])
                     self._open(number, reading if number else writing)
-                elif wanted == subprocess.DEVNULL:
-                    theirs.append(os.open(os.devnull, os.O_RDWR))
-                    close.append(theirs[-1])
+                elif stream == subprocess.DEVNULL:
+                    streams.append(os.open(os.devnull, os.O_RDWR))
+                    close.append(streams[-1])
                 else:
-                    theirs.append(theirs[1] if wanted == subprocess.STDOUT else wanted)
-            self._ended, told = os.pipe()
-            close.append(told)
-            self.pid = _server.fork(asked, [*theirs, told])
+                    streams.append(streams[1] if stream == subprocess.STDOUT else stream)
+            self._status, status_writer = os.pipe()
+            close.append(status_writer)
+            self.pid = _server.fork(request, [*streams, status_writer])
         finally:
-            for each in close:
-                os.close(each)
+            for descriptor in close:
+                os.close(descriptor)
         self._lock = threading.Lock()
         self._readers: list[threading.Thread] = []
-        self._found = ["", ""]
+        self._output = ["", ""]
 
     def __enter__(self) -> Forked:
         return self
 
     def __exit__(self, *_error: object) -> None:
-        for each in (self.stdin, self.stdout, self.stderr):
-            if each:
-                each.close()
+        for stream in (self.stdin, self.stdout, self.stderr):
+            if stream:
+                stream.close()
         self.wait()
 
     def poll(self) -> int | None:
-        """Return the exit code, negative for a signal; None while it runs."""
+        """Return the exit code (negative for a signal), or None while the process runs."""
         return self._wait(0)
 
     def wait(self, timeout: float | None = None) -> int:
-        """Wait for the end, and return the exit code; `subprocess.TimeoutExpired` if it takes longer."""
+        """Wait for the end and return the exit code, or raise `subprocess.TimeoutExpired`."""
         code = self._wait(timeout)
         if code is None:
             assert timeout is not None
@@ -98,34 +98,34 @@ class Forked:
         return code
 
     def communicate(self, input: str | None = None, timeout: float | None = None) -> tuple[str, str]:  # noqa: A002
-        """Send input, read all output, wait for the end."""
-        if not self._readers:  # otherwise this is called again after a timeout
+        """Send input, read all output, and wait for the end."""
+        if not self._readers:  # otherwise, this is a second call after a timeout
             for number, file in enumerate((self.stdout, self.stderr)):
                 if file:
                     reader = threading.Thread(target=self._read, args=(number, file), daemon=True)
                     self._readers.append(reader)
                     reader.start()
             if self.stdin:
-                with contextlib.suppress(BrokenPipeError):  # it closed its input
+                with contextlib.suppress(BrokenPipeError):  # the process has closed its input
                     self.stdin.write(input or "")
                     self.stdin.flush()
                 with contextlib.suppress(BrokenPipeError):
                     self.stdin.close()
         self.wait(timeout)
-        for each in self._readers:
-            each.join(timeout)
-            if each.is_alive():  # a child of the process has the pipe
+        for reader in self._readers:
+            reader.join(timeout)
+            if reader.is_alive():  # a child of the process holds the pipe open
                 raise subprocess.TimeoutExpired(self.args, timeout or 0)
         for file in (self.stdout, self.stderr):
             if file:
                 file.close()
-        return self._found[0], self._found[1]
+        return self._output[0], self._output[1]
 
     def _read(self, number: int, file: IO[str]) -> None:
-        self._found[number] += file.read()
+        self._output[number] += file.read()
 
     def send_signal(self, number: int) -> None:
-        """Send a signal, if it runs."""
+        """Send a signal if the process runs."""
         if self.poll() is None:
             os.kill(self.pid, number)
 
@@ -144,57 +144,57 @@ class Forked:
     def _wait(self, timeout: float | None) -> int | None:
         if self.returncode is None:
             poll = select.poll()
-            poll.register(self._ended, select.POLLIN)
+            poll.register(self._status, select.POLLIN)
             if not poll.poll(None if timeout is None else max(0.0, timeout) * 1000):
                 return None
             with self._lock:
-                if self.returncode is None:  # no other thread was sooner
-                    status = os.read(self._ended, 4)
+                if self.returncode is None:  # otherwise, another thread was faster
+                    status = os.read(self._status, 4)
                     assert status, "the forking process has ended"
-                    os.close(self._ended)
+                    os.close(self._status)
                     self.returncode = os.waitstatus_to_exitcode(struct.unpack("<i", status)[0])
         return self.returncode
 
 
 def can_fork(env: Mapping[str, str]) -> bool:
-    """Return whether a process with this environment may be forked: it changes nothing for the interpreter."""
-    return hasattr(os, "pidfd_open") and _told(env) == _told(clean_environment("/"))
+    """Return whether a process with this environment can be forked: its interpreter needs no special variables."""
+    return hasattr(os, "pidfd_open") and _interpreter_variables(env) == _interpreter_variables(clean_environment("/"))
 
 
-def _told(env: Mapping[str, str]) -> dict[str, str]:
+def _interpreter_variables(env: Mapping[str, str]) -> dict[str, str]:
     return {name: value for name, value in env.items() if name.startswith(_INTERPRETER)}
 
 
 class _Server:
-    """The process that forks, started by the first request; it ends when its socket is closed, or with us."""
+    """The process that forks. The first request starts it, and it ends with its socket."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._channel: socket.socket | None = None
         self._process: subprocess.Popen[bytes] | None = None
 
-    def fork(self, asked: dict[str, object], descriptors: list[int]) -> int:
-        """Have a process forked, and return its id."""
+    def fork(self, request: dict[str, object], descriptors: list[int]) -> int:
+        """Fork a process, and return its id."""
         with self._lock:
             channel = self._channel or self._start()
-            asked["directory"] = os.getcwd()
-            text = json.dumps(asked).encode()
+            request["directory"] = os.getcwd()
+            text = json.dumps(request).encode()
             socket.send_fds(channel, [struct.pack("<q", len(text))], descriptors)
             channel.sendall(text)
-            answer = channel.recv(8)
-            assert answer, "the forking process has ended"
-            child: int = struct.unpack("<q", answer)[0]
+            reply = channel.recv(8)
+            assert reply, "the forking process has ended"
+            child: int = struct.unpack("<q", reply)[0]
             return child
 
     def _start(self) -> socket.socket:
-        self._channel, theirs = socket.socketpair()
-        with theirs:
+        self._channel, server_end = socket.socketpair()
+        with server_end:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "tests.support.fork_server", str(theirs.fileno())],
+                [sys.executable, "-m", "tests.support.fork_server", str(server_end.fileno())],
                 cwd=os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))),
                 env=clean_environment(tempfile.gettempdir()),
                 stdin=subprocess.DEVNULL,
-                pass_fds=[theirs.fileno()],
+                pass_fds=[server_end.fileno()],
                 start_new_session=True,
             )
         atexit.register(self._end)

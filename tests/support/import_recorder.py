@@ -1,4 +1,4 @@
-"""Python processes that write down what they import, and that may find some packages missing, installed or not."""
+"""Record what Python processes import, and hide packages from them."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-#: Runs first in each Python process, which then writes down what it imports, or tries to.
-_SPY = """
+#: Code that each Python process runs first. It records all imports, including failed ones.
+_RECORD = """
 import os, sys
-def spy(event, details):
+def record(event, details):
     if event == "import":
-        with open(f"{os.environ['SPIED']}/{os.getpid()}", "a") as file:
+        with open(f"{os.environ['RECORDED_IMPORTS']}/{os.getpid()}", "a") as file:
             file.write(f"{details[0]}\\n")
-sys.addaudithook(spy)
+sys.addaudithook(record)
 """
-#: … and finds none of these packages; it imports nothing itself, so that nothing else is different.
-_HIDING = """
+#: Code that hides packages. It must not import anything.
+_HIDE = """
 import sys
-(Path,) = [each for each in sys.meta_path if getattr(each, "__name__", "") == "PathFinder"]
+(Path,) = [finder for finder in sys.meta_path if getattr(finder, "__name__", "") == "PathFinder"]
 class Hiding(Path):
     @classmethod
     def find_spec(cls, name, *rest):
@@ -31,14 +31,14 @@ sys.meta_path[sys.meta_path.index(Path)] = Hiding
 
 
 def record_imports(directory: Path, env: Mapping[str, str], without: Sequence[str] = ()) -> dict[str, str]:
-    """Return the environment of processes that are spied on, and that find none of these packages."""
-    for each in ("site", "spied"):
-        (directory / each).mkdir(parents=True)
-    (directory / "site" / "sitecustomize.py").write_text(_SPY + _HIDING.format(names=[*without]))
+    """Return an environment in which processes record their imports and don't find these packages."""
+    for name in ("site", "imports"):
+        (directory / name).mkdir(parents=True)
+    (directory / "site" / "sitecustomize.py").write_text(_RECORD + _HIDE.format(names=[*without]))
     path = [str(directory / "site"), *filter(None, [env.get("PYTHONPATH")])]
-    return {**env, "PYTHONPATH": os.pathsep.join(path), "SPIED": str(directory / "spied")}
+    return {**env, "PYTHONPATH": os.pathsep.join(path), "RECORDED_IMPORTS": str(directory / "imports")}
 
 
 def imported(directory: Path) -> dict[int, frozenset[str]]:
-    """Return what each of these processes has imported so far, or tried to, by its process id."""
-    return {int(each.name): frozenset(each.read_text().split()) for each in (directory / "spied").iterdir()}
+    """Return the recorded imports of each process, by process id."""
+    return {int(file.name): frozenset(file.read_text().split()) for file in (directory / "imports").iterdir()}

@@ -1,4 +1,4 @@
-"""Tests that are coroutines."""
+"""Support for tests that are coroutines."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _P = ParamSpec("_P")
 
 
 def in_loop(test: Callable[_P, Coroutine[Any, Any, None]]) -> Callable[_P, None]:
-    """Run a test in an event loop of its own."""
+    """Run a coroutine test in a new event loop."""
 
     @functools.wraps(test)
     def run(*args: _P.args, **kwargs: _P.kwargs) -> None:

@@ -1,4 +1,4 @@
-"""A client of a broker that keeps all messages and publishes anything. It shares no code with talk."""
+"""An MQTT client that keeps all messages and can publish anything. It shares no code with talk."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ if TYPE_CHECKING:
 
     from tests.support.broker import Broker
 
-#: A reason code of MQTT 5, which only mosquitto sends.
+#: Reason code of MQTT 5 that mosquitto sends if a message has no subscribers.
 NO_SUBSCRIBERS = 0x10
 _QOS = 1
 
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A message as it came."""
+    """A received message."""
 
     topic: str
     payload: bytes
     qos: int
-    retain: bool  # as its sender set it, or because the broker has kept it
+    retain: bool  # set by the sender, or because the broker had retained the message
     response: str | None  # the response topic
     correlation: bytes | None
-    expiry: int | None  # the seconds that are left
+    expiry: int | None  # remaining seconds
     user: tuple[tuple[str, str], ...]  # user properties
     arrived: float  # monotonic time
 
@@ -51,16 +51,16 @@ class Message:
     @property
     def json(self) -> dict[str, Any]:
         """The payload as a JSON object."""
-        found = json.loads(self.payload)
-        assert isinstance(found, dict), self
-        return found
+        value = json.loads(self.payload)
+        assert isinstance(value, dict), self
+        return value
 
 
 class Listener(contextlib.AbstractContextManager["Listener"]):
-    """A connection that keeps all messages of its topics. It never connects again.
+    """A connection that keeps all messages of its topics. It never reconnects.
 
-    The user, the password and the certificate are as in `Broker.env`. The constructor raises ConnectionRefusedError if
-    the broker refuses the client, and ssl.SSLError if one side doesn't trust the other.
+    `user`, `password` and `cert` are as in `Broker.env`. The constructor raises ConnectionRefusedError if the broker
+    refuses the client, and ssl.SSLError if one side doesn't trust the other.
     """
 
     def __init__(
@@ -74,18 +74,18 @@ class Listener(contextlib.AbstractContextManager["Listener"]):
         needs_packages("paho")
         self._changed = threading.Condition()
         self._messages: list[Message] = []
-        #: the reason codes of acknowledgements, by the numbers of the packets
+        #: reason codes of acknowledgements, by packet number
         self._codes: dict[int, int] = {}
-        self._answer: str | None = None
+        self._connected: str | None = None
         self._ended: str | None = None
         variables = broker.env(user, password, cert)
         self._client = self._make(variables)
         with contextlib.ExitStack() as stack:
             stack.callback(self._end)
             self._connect(variables)
-            for each in topics:
-                code = self.subscribe(each)
-                assert code <= _QOS, f"{each}: refused with {code:#x}"
+            for topic in topics:
+                code = self.subscribe(topic)
+                assert code <= _QOS, f"{topic}: refused with {code:#x}"
             self._stack = stack.pop_all()
 
     def __exit__(self, *_error: object) -> None:
@@ -101,14 +101,14 @@ class Listener(contextlib.AbstractContextManager["Listener"]):
 
     @property
     def ended(self) -> str | None:
-        """Why the connection has ended, None while it is open."""
+        """The reason why the connection has ended, or None while it is open."""
         return self._ended
 
     def subscribe(self, topic: str) -> int:
-        """Subscribe, and return the reason code: the quality of service, or 0x80 and more if it is refused."""
+        """Subscribe, and return the reason code: the quality of service, or at least 0x80 if it was refused."""
         from paho.mqtt.subscribeoptions import SubscribeOptions
 
-        # Without this option, new retained messages would come without their flag.
+        # Without this option, new retained messages would lose their flag.
         options = SubscribeOptions(qos=_QOS, retainAsPublished=True)
         _, number = self._client.subscribe([(topic, options)])
         assert number is not None, f"{topic}: not subscribed: {self._ended}"
@@ -126,7 +126,7 @@ class Listener(contextlib.AbstractContextManager["Listener"]):
         correlation: bytes | None = None,
         expiry: int | None = None,
     ) -> int:
-        """Publish, and return the reason code of the acknowledgement, 0 with `qos` 0."""
+        """Publish, and return the reason code of the acknowledgement, or 0 with `qos` 0."""
         from paho.mqtt.packettypes import PacketTypes
         from paho.mqtt.properties import Properties
 
@@ -143,23 +143,23 @@ class Listener(contextlib.AbstractContextManager["Listener"]):
         return self._codes.pop(number)
 
     def await_message(self, wanted: Callable[[Message], bool], within: float = PATIENCE) -> Message:
-        """Return the first wanted message, also of those that came before."""
-        found = self.find(wanted, within)
-        assert found, f"no message within {within} s: {self._told()}"
-        return found
+        """Return the first wanted message, including messages that have come already."""
+        message = self.find(wanted, within)
+        assert message, f"no message within {within} s: {self._describe()}"
+        return message
 
     def find(self, wanted: Callable[[Message], bool], within: float = 0.0) -> Message | None:
-        """Return the first wanted message, None if it doesn't come in time or the connection ends."""
+        """Return the first wanted message, or None if it doesn't come in time or the connection ends."""
         return wait_for_first(self._messages, wanted, self._changed, within, lambda: self._ended is not None)
 
-    def _await(self, come: Callable[[], bool], what: str) -> None:
+    def _await(self, condition: Callable[[], bool], description: str) -> None:
         with self._changed:
-            self._changed.wait_for(lambda: come() or self._ended is not None, PATIENCE)
-            assert come(), f"no {what}: {self._told()}"
+            self._changed.wait_for(lambda: condition() or self._ended is not None, PATIENCE)
+            assert condition(), f"no {description}: {self._describe()}"
 
-    def _told(self) -> str:
-        why = "connected" if self._ended is None else f"the connection ended: {self._ended}"
-        return "; ".join([why, *(f"{each.topic}: {each.payload!r}" for each in self._messages)])
+    def _describe(self) -> str:
+        state = "connected" if self._ended is None else f"the connection ended: {self._ended}"
+        return "; ".join([state, *(f"{message.topic}: {message.payload!r}" for message in self._messages)])
 
     def _make(self, env: Mapping[str, str]) -> Client:
         from paho.mqtt import client as paho
@@ -181,9 +181,9 @@ class Listener(contextlib.AbstractContextManager["Listener"]):
             _shake_hands(context, env["TALK_BROKER"])
             result.tls_set_context(context)
         result.on_socket_open = lambda _client, _data, connection: _send_at_once(connection)
-        result.on_connect = lambda _client, _data, _flags, reason, _properties: self._note("_answer", str(reason))
+        result.on_connect = lambda _client, _data, _flags, reason, _properties: self._note("_connected", str(reason))
         result.on_disconnect = lambda _client, _data, _flags, reason, _properties: self._note("_ended", str(reason))
-        result.on_message = lambda _client, _data, message: self._take(message)
+        result.on_message = lambda _client, _data, message: self._receive(message)
         result.on_publish = lambda _client, _data, number, reason, _properties: self._note(number, reason.value)
         result.on_subscribe = lambda _client, _data, number, reasons, _properties: self._note(number, reasons[0].value)
         return result
@@ -194,11 +194,11 @@ class Listener(contextlib.AbstractContextManager["Listener"]):
         assert url.port
         self._client.connect(url.hostname, url.port, clean_start=True)
         self._client.loop_start()
-        self._await(lambda: self._answer is not None or self._ended is not None, "answer from the broker")
-        if self._answer != "Success":
-            raise ConnectionRefusedError(self._answer or self._ended)
+        self._await(lambda: self._connected is not None or self._ended is not None, "reply from the broker")
+        if self._connected != "Success":
+            raise ConnectionRefusedError(self._connected or self._ended)
 
-    def _take(self, message: MQTTMessage) -> None:
+    def _receive(self, message: MQTTMessage) -> None:
         arrived = time.monotonic()
         properties = message.properties
         new = Message(
@@ -217,38 +217,38 @@ class Listener(contextlib.AbstractContextManager["Listener"]):
             self._messages.append(new)
             self._changed.notify_all()
 
-    def _note(self, what: int | str, value: Any) -> None:
-        """Note the reason code of an acknowledgement by its number, or set an attribute."""
+    def _note(self, key: int | str, value: Any) -> None:
+        """Store the reason code of a packet number, or set the attribute with this name."""
         self._acknowledge()
         with self._changed:
-            if isinstance(what, int):
-                self._codes[what] = value
+            if isinstance(key, int):
+                self._codes[key] = value
             else:
-                setattr(self, what, value)
+                setattr(self, key, value)
             self._changed.notify_all()
 
     def _acknowledge(self) -> None:
-        """Have the system acknowledge data at once: otherwise mosquitto delays its next message for 40 ms."""
+        """Make the system acknowledge data at once. Otherwise, mosquitto delays its next message by 40 ms."""
         connection = self._client.socket()
         if isinstance(connection, socket.socket) and hasattr(socket, "TCP_QUICKACK"):
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)  # Linux forgets it with each packet
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)  # Linux resets this option
 
     def _end(self) -> None:
         client = self._client
         client.disconnect()
         client.loop_stop()
-        # The callbacks would keep the client, which closes its sockets only when it is deleted.
+        # The client only closes its sockets when it is deleted, and the callbacks would keep it alive.
         client.on_socket_open = client.on_connect = client.on_disconnect = None
         client.on_message = client.on_publish = client.on_subscribe = client.on_log = None
         del self._client
 
 
-def mosquitto(broker: Broker, program: str, *words: str) -> Finished:
-    """Run one of mosquitto's own clients: `mosquitto(broker, "pub", "-t", "a/topic", "-n")`."""
+def mosquitto(broker: Broker, program: str, *arguments: str) -> Finished:
+    """Run one of mosquitto's clients: `mosquitto(broker, "pub", "-t", "a/topic", "-n")`."""
     needs(f"mosquitto_{program}")
     command = [find_program(f"mosquitto_{program}") or "", "-V", "5", "-p", str(broker.port)]
-    command += ["-h", urlsplit(broker.url).hostname or "", *words]
-    began = time.monotonic()
+    command += ["-h", urlsplit(broker.url).hostname or "", *arguments]
+    started_at = time.monotonic()
     done = subprocess.run(
         dying_with_parent(command),
         env=clean_environment(broker.directory),
@@ -258,16 +258,16 @@ def mosquitto(broker: Broker, program: str, *words: str) -> Finished:
         timeout=20,
         check=False,
     )
-    return Finished(tuple(command), done.returncode, done.stdout, done.stderr, time.monotonic() - began)
+    return Finished(tuple(command), done.returncode, done.stdout, done.stderr, time.monotonic() - started_at)
 
 
 def _shake_hands(context: ssl.SSLContext, url: str) -> None:
-    """Raise ssl.SSLError if a handshake fails, before paho would leave its socket open."""
+    """Raise ssl.SSLError if the handshake fails, because paho would then leave its socket open."""
     parts = urlsplit(url)
     with socket.create_connection((parts.hostname or "", parts.port or 0), PATIENCE) as plain:
         context.wrap_socket(plain, server_hostname=parts.hostname).close()
 
 
 def _send_at_once(connection: Any) -> None:
-    """Send acknowledgements at once, in spite of Nagle's algorithm."""
+    """Disable Nagle's algorithm, so that acknowledgements are sent at once."""
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

@@ -1,4 +1,4 @@
-"""Waits until a server has a neural voice loaded: a goal that is sent then is spoken at once, and with that voice."""
+"""Servers that have loaded a neural voice, so that goals are spoken with it at once."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ if TYPE_CHECKING:
     from tests.support.processes import Talk
     from tests.support.sink import Sink
 
-#: Seconds in which a voice is loaded on a busy machine.
-_PATIENCE = 30.0
+#: Time to load a voice on a busy machine.
+_LOAD_LIMIT_S = 30.0
 
 
 def serve_with_voice(make_talk: MakeTalk, voice: str, *options: str, sink: Sink | None, env: dict[str, str]) -> Talk:
-    """Start a server that speaks with this voice, and return it when the voice is loaded."""
+    """Start a server with this voice, and wait until the voice is loaded."""
     talk = make_talk("--voice", voice, *options, sink=sink, env=env)
     await_voice(talk.socket, voice)
     return talk
 
 
 def await_voice(socket: str, voice: str) -> None:
-    """Wait until a server has loaded its voice; AssertionError if it fails."""
-    end = time.monotonic() + _PATIENCE
+    """Wait until a server has loaded this voice, or raise AssertionError if that fails."""
+    end = time.monotonic() + _LOAD_LIMIT_S
     with Wire(socket) as wire:
-        while (told := _told(wire, voice))["state"] != "loaded":
-            assert told["state"] != "failed", f"{voice} was not loaded: {told['why']}"
-            assert time.monotonic() < end, f"{voice} is not loaded within {_PATIENCE:g} s"
-            time.sleep(0.01)  # no event on the wire tells that it is loaded
+        while (status := _voice_status(wire, voice))["state"] != "loaded":
+            assert status["state"] != "failed", f"{voice} was not loaded: {status['why']}"
+            assert time.monotonic() < end, f"{voice} is not loaded within {_LOAD_LIMIT_S:g} s"
+            time.sleep(0.01)  # the server sends no event for it
 
 
-def _told(wire: Wire, voice: str) -> Message:
+def _voice_status(wire: Wire, voice: str) -> Message:
     reply = wire.request("status")
     assert reply["ok"], reply
-    told: Message = reply["server"]["neural_voices"].get(voice, {"state": None})
-    return told
+    status: Message = reply["server"]["neural_voices"].get(voice, {"state": None})
+    return status

@@ -1,4 +1,4 @@
-"""A server with the scripted engine and other constants than talk's own."""
+"""A server with the scripted engine and changed constants."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""A private PipeWire with its pulse server and a session manager, without a card, apart from the user's.
+"""A private PipeWire with a PulseAudio server and a session manager, but without sound cards.
 
-Without a card its only output is a dummy. `load` adds a sink that counts as a device.
+Its only output is a dummy until `load` adds a sink that counts as a device.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from tests.support.surroundings import clean_environment, dying_with_parent, nee
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-#: The programs that it needs; wireplumber ends without a message bus.
+#: The programs that it needs. wireplumber needs a message bus.
 PROGRAMS = ("pipewire", "pipewire-pulse", "wireplumber", "dbus-daemon", "pactl")
-#: Seconds in which it must have started, or changed its default sink.
-_START = 20.0
+#: Time for a start, or for a change of the default sink.
+_LIMIT_S = 20.0
 
 
 class PipeWire(contextlib.AbstractContextManager["PipeWire"]):
-    """A running PipeWire; `with` ends all its processes and removes its directory."""
+    """A running PipeWire. `with` ends all its processes and removes its directory."""
 
     def __init__(self) -> None:
         needs(*PROGRAMS)
@@ -44,9 +44,9 @@ class PipeWire(contextlib.AbstractContextManager["PipeWire"]):
             }
             stack.callback(self._end)
             self._start("dbus-daemon", "--session", "--nofork", "--nopidfile", f"--address=unix:path={bus}")
-            self._await("its message bus", lambda: os.path.exists(bus))
+            self._await("the message bus", lambda: os.path.exists(bus))
             self._start("pipewire")
-            self._await("its socket", lambda: os.path.exists(f"{self.directory}/pipewire-0"))
+            self._await("the socket", lambda: os.path.exists(f"{self.directory}/pipewire-0"))
             self._start("wireplumber")
             self._start("pipewire-pulse")
             self._await("a sink", lambda: os.path.exists(self.socket) and self._default() not in {"", "@DEFAULT_SINK@"})
@@ -56,23 +56,23 @@ class PipeWire(contextlib.AbstractContextManager["PipeWire"]):
         self._stack.close()
 
     def load(self, name: str) -> str:
-        """Add a sink that is no dummy, wait until it is the default, and return its module."""
+        """Add a sink that isn't a dummy, wait until it is the default, and return its module."""
         module = self.pactl("load-module", "module-null-sink", f"sink_name={name}", "rate=22050", "channels=1").strip()
         self.pactl("set-default-sink", name)
         self._await(f"the sink {name}", lambda: self._default() == name)
         return module
 
-    def freeze(self, part: str = "pipewire-pulse") -> None:
-        """Stop one of its processes; all its threads have stopped when this returns."""
-        stop_child(self._running[part].pid)
+    def freeze(self, program: str = "pipewire-pulse") -> None:
+        """Stop one of its processes (SIGSTOP), and wait until all threads have stopped."""
+        stop_child(self._running[program].pid)
 
-    def thaw(self, part: str = "pipewire-pulse") -> None:
-        """Let it go on."""
-        self._running[part].send_signal(signal.SIGCONT)
+    def thaw(self, program: str = "pipewire-pulse") -> None:
+        """Continue a stopped process (SIGCONT)."""
+        self._running[program].send_signal(signal.SIGCONT)
 
-    def pactl(self, *words: str) -> str:
+    def pactl(self, *arguments: str) -> str:
         """Run pactl and return its output."""
-        return pactl(clean_environment(self.directory, self.env), *words)
+        return pactl(clean_environment(self.directory, self.env), *arguments)
 
     def _default(self) -> str:
         with contextlib.suppress(AssertionError):
@@ -88,15 +88,15 @@ class PipeWire(contextlib.AbstractContextManager["PipeWire"]):
                 dying_with_parent(list(command)), env=env, stdin=subprocess.DEVNULL, stdout=log, stderr=log
             )
 
-    def _await(self, what: str, there: Callable[[], bool]) -> None:
-        end = time.monotonic() + _START
-        while not there():
-            if time.monotonic() > end or any(each.poll() is not None for each in self._running.values()):
+    def _await(self, name: str, exists: Callable[[], bool]) -> None:
+        end = time.monotonic() + _LIMIT_S
+        while not exists():
+            if time.monotonic() > end or any(process.poll() is not None for process in self._running.values()):
                 with open(f"{self.directory}/log", encoding="utf-8", errors="replace") as log:
-                    raise AssertionError(f"PipeWire does not get {what}: {log.read()}")
-            time.sleep(0.02)  # it sends no event
+                    raise AssertionError(f"PipeWire: {name} is missing: {log.read()}")
+            time.sleep(0.02)  # PipeWire sends no event
 
     def _end(self) -> None:
-        for each in reversed(self._running.values()):
-            each.kill()
-            each.wait()
+        for process in reversed(self._running.values()):
+            process.kill()
+            process.wait()

@@ -1,7 +1,7 @@
-"""An independent listener: pocketsphinx, a recognizer of speech whose model is in its wheel; it knows nothing of us.
+"""Speech recognition with pocketsphinx: which of some sentences was spoken, and when was each word spoken?
 
-It hears 16,000 samples per second in steps of 10 ms. What it is asked is which of some sentences was said, and when
-each word of a sentence that is known was. CI installs it beside the extra; 29 MB are much for `.[test]`.
+pocketsphinx needs 16,000 samples per second, and has a resolution of 10 ms. Its wheel includes the model. Only CI
+installs it, because 29 MB are too much for `.[test]`.
 """
 
 from __future__ import annotations
@@ -23,27 +23,26 @@ if TYPE_CHECKING:
     Samples = npt.NDArray[np.int16]
 
 PACKAGE = "pocketsphinx"
-#: What it takes for a word, in small letters.
+#: A word in lower case.
 WORD = re.compile(r"[a-z']+")
-#: Samples per second that it hears, and how many of its frames are a second.
-_HEARS, _FRAMES = 16000, 100
-#: Seconds of silence put on either side of what it hears: its model wants some.
-_BESIDE = 0.3
-#: What a quiet room adds to all of it, in samples of 16 bit: 64 dB below full scale. Zeros are nothing that it was
-#: trained with: without this it understands 6 of 20 sentences of libespeak-ng's, which are silent between sounds.
-_ROOM = 20
-#: How unlikely what it has heard so far may be until it is given up: much, as it has few sentences to choose from.
+#: pocketsphinx's samples and frames per second.
+_RECOGNIZER_RATE, _FRAME_RATE = 16000, 100
+#: Silence that is added at both ends, because the model needs some.
+_PADDING_S = 0.3
+#: Level of the noise that is added, as in a quiet room: 64 dB below full scale. The model wasn't trained with digital
+#: silence. Without noise, it recognizes only 6 of 20 sentences by libespeak-ng, which is silent between sounds.
+_NOISE = 20
+#: Wide beams keep unlikely hypotheses. This is affordable, because there are only a few sentences.
 _BEAMS = {"beam": 1e-80, "pbeam": 1e-80, "wbeam": 1e-60}
-#: Samples no louder than this, for so many seconds, are silence: a hundredth of full scale; and longer than a closure
-#: within a word.
-_FAINT, _SILENCE = 327, 0.1
+#: Silence is quieter than this level (1/100 of full scale) for this time, which is longer than a closure in a word.
+_SILENCE_LEVEL, _SILENCE_S = 327, 0.1
 _RANGE = (-32768, 32767)
-#: What is told between words.
+#: Segments that aren't words.
 _NO_WORD = re.compile(r"[<\[]")
 
 
 class HeardWord(NamedTuple):
-    """A word, and when it begins and ends, in seconds from the first sample."""
+    """A word with its begin and end in seconds from the first sample."""
 
     word: str
     begin: float
@@ -51,77 +50,77 @@ class HeardWord(NamedTuple):
 
 
 def recognize(samples: Samples, sentences: Iterable[str]) -> str:
-    """Return which of the sentences, of small letters and blanks, was said; "" where it is none of them."""
+    """Return the sentence that was spoken, or "" if it is none of these. Sentences consist of words in lower case."""
     rules = " | ".join(sentences)
-    listener = _listener()
-    listener.add_jsgf_string("sentences", f"#JSGF V1.0;\ngrammar sentences;\npublic <one> = {rules} ;\n")
-    listener.activate_search("sentences")
-    _hear(listener, samples)
-    found = listener.hyp()
-    return str(found.hypstr) if found else ""
+    decoder = _decoder()
+    decoder.add_jsgf_string("sentences", f"#JSGF V1.0;\ngrammar sentences;\npublic <one> = {rules} ;\n")
+    decoder.activate_search("sentences")
+    _process(decoder, samples)
+    hypothesis = decoder.hyp()
+    return str(hypothesis.hypstr) if hypothesis else ""
 
 
 def align(samples: Samples, text: str) -> list[HeardWord]:
-    """Return when each word of a sentence was said; AssertionError where it was not, as far as it can be heard.
+    """Return the time of each word of a sentence. Raise AssertionError if the sentence wasn't recognized.
 
-    What is silent before a word counts as a part of it, to the recognizer; here it doesn't.
+    The recognizer counts the silence before a word as a part of it. This function doesn't.
     """
     words = WORD.findall(text.lower())
-    listener = _listener()
-    listener.set_align_text(" ".join(words))
-    _hear(listener, samples)
-    found = [
+    decoder = _decoder()
+    decoder.set_align_text(" ".join(words))
+    _process(decoder, samples)
+    heard = [
         HeardWord(
-            re.sub(r"\(\d+\)$", "", each.word),
-            _behind_silence(samples, _seconds(each.start_frame)),
-            _seconds(each.end_frame + 1),
+            re.sub(r"\(\d+\)$", "", segment.word),
+            _skip_silence(samples, _seconds(segment.start_frame)),
+            _seconds(segment.end_frame + 1),
         )
-        for each in listener.seg() or ()
-        if not _NO_WORD.match(each.word)
+        for segment in decoder.seg() or ()
+        if not _NO_WORD.match(segment.word)
     ]
-    assert [each.word for each in found] == words, f"{text!r} was not heard, but {found}"
-    return found
+    assert [word.word for word in heard] == words, f"{text!r} was not heard, but {heard}"
+    return heard
 
 
 @functools.cache
-def _listener() -> Any:
-    """Return the recognizer, without a language of its own; the test is skipped where it is not installed."""
+def _decoder() -> Any:
+    """Return a decoder without a language model, or skip the test if pocketsphinx is not installed."""
     needs_packages(PACKAGE)
     import pocketsphinx
 
-    return pocketsphinx.Decoder(samprate=_HEARS, lm=None, loglevel="FATAL", **_BEAMS)
+    return pocketsphinx.Decoder(samprate=_RECOGNIZER_RATE, lm=None, loglevel="FATAL", **_BEAMS)
 
 
-def _hear(listener: Any, samples: Samples) -> None:
-    beside = np.zeros(int(_BESIDE * _HEARS), np.int16)
-    sound = np.concatenate([beside, resample(samples, RATE, _HEARS), beside])
-    room = np.random.default_rng(1).normal(0, _ROOM, len(sound))
-    listener.start_utt()
-    listener.process_raw(np.clip(sound + room, *_RANGE).astype("<i2").tobytes(), full_utt=True)
-    listener.end_utt()
+def _process(decoder: Any, samples: Samples) -> None:
+    padding = np.zeros(int(_PADDING_S * _RECOGNIZER_RATE), np.int16)
+    sound = np.concatenate([padding, resample(samples, RATE, _RECOGNIZER_RATE), padding])
+    noise = np.random.default_rng(1).normal(0, _NOISE, len(sound))
+    decoder.start_utt()
+    decoder.process_raw(np.clip(sound + noise, *_RANGE).astype("<i2").tobytes(), full_utt=True)
+    decoder.end_utt()
 
 
-def _behind_silence(samples: Samples, begin: float) -> float:
-    """Return when the silence is over in which something begins; if there is none, when it begins."""
-    loud = np.flatnonzero(np.abs(samples.astype(np.int32)) > _FAINT)
+def _skip_silence(samples: Samples, begin: float) -> float:
+    """Return the end of the silence at this time, or the time itself if there is no silence."""
+    loud = np.flatnonzero(np.abs(samples.astype(np.int32)) > _SILENCE_LEVEL)
     place = int(np.searchsorted(loud, begin * RATE))
     if place == len(loud):
         return begin
     before = loud[place - 1] if place else -len(samples)
-    return float(loud[place]) / RATE if loud[place] - before > _SILENCE * RATE else begin
+    return float(loud[place]) / RATE if loud[place] - before > _SILENCE_S * RATE else begin
 
 
 def _seconds(frame: int) -> float:
-    return frame / _FRAMES - _BESIDE
+    return frame / _FRAME_RATE - _PADDING_S
 
 
 def resample(samples: Samples, rate: int, wanted: int) -> Samples:
-    """Return a sound with another number of samples per second, without what such a one can't hold."""
+    """Return a sound at another sample rate, without frequencies that are too high for it."""
     length = round(len(samples) * wanted / rate)
     spectrum = np.fft.rfft(samples.astype(np.float64))
-    kept = np.zeros(length // 2 + 1, np.complex128)
-    both = min(len(spectrum), len(kept))
-    kept[:both] = spectrum[:both]
-    sound = np.fft.irfft(kept, length) * (length / len(samples))
+    result = np.zeros(length // 2 + 1, np.complex128)
+    common = min(len(spectrum), len(result))
+    result[:common] = spectrum[:common]
+    sound = np.fft.irfft(result, length) * (length / len(samples))
     limited: Samples = np.clip(np.round(sound), *_RANGE).astype(np.int16)
     return limited

@@ -1,4 +1,4 @@
-"""The resources of a server and its processes, counted from outside: from /proc, on Linux alone."""
+"""The resources that a server and its processes use, read from /proc (Linux only)."""
 
 from __future__ import annotations
 
@@ -13,84 +13,84 @@ from tests.support.surroundings import command_line
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-#: Seconds in which ended processes have been cleared away.
-_SETTLED = 5.0
+#: Time for ended processes and connections to disappear.
+_SETTLE_LIMIT_S = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """One count of a server."""
+    """The resources that a server uses at one time."""
 
-    processes: int  # the server and all below it
+    processes: int  # the server and all its descendants
     descriptors: int  # of the server
     threads: int  # of the server
-    memory: int  # kB that each of them has written to and does not share
+    memory: int  # kB of private memory of all processes
 
 
 def count(pid: int) -> Usage:
-    """Count a running server."""
-    family = descendants(pid)
+    """Return the resources that a running server uses."""
+    below = descendants(pid)
     return Usage(
-        processes=1 + len(family),
+        processes=1 + len(below),
         descriptors=len(os.listdir(f"/proc/{pid}/fd")),
         threads=len(os.listdir(f"/proc/{pid}/task")),
-        memory=sum(_own(each) for each in (pid, *family)),
+        memory=sum(_private_kb(process) for process in (pid, *below)),
     )
 
 
-def wait_until(pid: int, wanted: Callable[[Usage], bool], within: float = _SETTLED) -> Usage:
-    """Return the first count that is as wanted, or the last one within these seconds."""
+def wait_until(pid: int, wanted: Callable[[Usage], bool], within: float = _SETTLE_LIMIT_S) -> Usage:
+    """Wait until the usage is as wanted, and return it. After the time limit, return the last one."""
     end = time.monotonic() + within
-    while not wanted(found := count(pid)) and time.monotonic() < end:
+    while not wanted(now := count(pid)) and time.monotonic() < end:
         time.sleep(0.05)  # the end of a connection sends no event to others
-    return found
+    return now
 
 
 def assert_not_grown(pid: int, before: Usage, memory: int) -> Usage:
-    """Assert that a server has no more processes, descriptors and threads than before, and at most so many kB more."""
+    """Assert that a server has no more processes, descriptors and threads, and at most `memory` kB more than before."""
 
     def fits(now: Usage) -> bool:
-        return all(getattr(now, each) <= getattr(before, each) for each in ("processes", "descriptors", "threads"))
+        return all(getattr(now, name) <= getattr(before, name) for name in ("processes", "descriptors", "threads"))
 
-    found = wait_until(pid, fits)
-    assert fits(found), f"before: {before}; now: {found}; {describe(pid)}"
-    assert found.memory <= before.memory + memory, f"before: {before}; now: {found}"
-    return found
+    now = wait_until(pid, fits)
+    assert fits(now), f"before: {before}; now: {now}; {describe(pid)}"
+    assert now.memory <= before.memory + memory, f"before: {before}; now: {now}"
+    return now
 
 
 def descriptors(pid: int) -> dict[int, str]:
     """Return the open descriptors of a process with their targets."""
     folder = f"/proc/{pid}/fd"
-    found = {}
+    targets = {}
     for name in os.listdir(folder):
         with contextlib.suppress(FileNotFoundError):
-            found[int(name)] = os.readlink(f"{folder}/{name}")
-    return found
+            targets[int(name)] = os.readlink(f"{folder}/{name}")
+    return targets
 
 
 def descendants(pid: int) -> list[int]:
-    """Return the ids of all processes below one."""
+    """Return the ids of all processes that descend from a process."""
     parents: dict[int, list[int]] = {}
     for name in os.listdir("/proc"):
         if name.isdigit():
             with contextlib.suppress(OSError), open(f"/proc/{name}/stat", "rb") as file:
-                # The name in brackets may hold any character, even brackets.
+                # The name in brackets may contain any character, even brackets.
                 parents.setdefault(int(file.read().rpartition(b")")[2].split()[1]), []).append(int(name))
-    found, due = [], [pid]
+    below, due = [], [pid]
     while due:
-        below = parents.get(due.pop(), [])
-        found += below
-        due += below
-    return found
+        children = parents.get(due.pop(), [])
+        below += children
+        due += children
+    return below
 
 
-def _own(pid: int) -> int:
+def _private_kb(pid: int) -> int:
     with contextlib.suppress(OSError), open(f"/proc/{pid}/smaps_rollup", encoding="utf-8") as file:
-        return next((int(each.split()[1]) for each in file if each.startswith("Private_Dirty:")), 0)
+        return next((int(line.split()[1]) for line in file if line.startswith("Private_Dirty:")), 0)
     return 0  # it has ended
 
 
 def describe(pid: int) -> str:
     """Return the descendants and descriptors of a process, for messages."""
     targets = [f"{number} → {target}" for number, target in descriptors(pid).items()]
-    return "; ".join([*(command_line(each) for each in descendants(pid)), *sorted(targets)])
+    return "; ".join([*(command_line(child) for child in descendants(pid)), *sorted(targets)])
