@@ -279,6 +279,7 @@ class Ended:
     gaps: int = 0  # number of silent gaps caused by audio that was synthesized too late
     gap_seconds: float = 0.0  # total length of the silent gaps, in seconds
     player: str | None = None  # the player that worked last, if it was chosen automatically
+    heard: float | None = None  # seconds of the audio that were heard; None if unknown
 
 
 #: Commands that start a goal. There is one for each kind of goal.

@@ -109,8 +109,12 @@ class Goal:
     #: human-readable description of how the goal ended
     message: str | None = None
     format: str = "text"
-    #: part of the text that has been heard
+    #: text up to the end of the last word that has started
     spoken: str | None = None
+    #: offset in the text of the end of the last word that was heard to its end
+    spoken_end: int | None = None
+    #: seconds of the audio that were heard
+    heard: float | None = None
     priority: int = 0
     key: str | None = None
     ttl: float | None = None
@@ -144,6 +148,8 @@ class Goal:
             "text": self.text,
             "format": self.format,
             "spoken": self.spoken,
+            "spoken_end": self.spoken_end,
+            "heard": self.heard,
             "priority": self.priority,
             "key": self.key,
             "ttl": self.ttl,

@@ -47,8 +47,12 @@ class Record:
     reason: Reason | None = None
     by: By | None = None
     message: str | None = None
-    #: offset in the text up to which the goal has been heard
+    #: offset of the end of the last word that has started, or 0 if nothing was heard
+    begun_end: int = 0
+    #: offset of the end of the last word that was heard to its end
     spoken_end: int = 0
+    #: seconds of the audio that were heard, as far as known
+    heard: float = 0.0
     #: whether the goal is paused
     paused: bool = False
     #: how often the goal has been paused
@@ -97,8 +101,9 @@ class Record:
         shown = {name: getattr(self.say, name) for name in SHOWN_OPTIONS}
         if state is not State.PENDING:
             shown |= {name: getattr(self, name) for name in _LATER}
-            if self.started_at is not None and text is not None:
-                shown["spoken"] = text[: self.spoken_end]
+            if self.started_at is not None:
+                shown |= {"spoken_end": self.spoken_end, "heard": self.heard}
+                shown["spoken"] = None if text is None else text[: self.begun_end]
         return Goal(
             id=self.id,
             state=state,

@@ -319,15 +319,27 @@ class Scheduler:
         record, effects = self._activate_next(now)
         return effects + self.failed(record.id, Reason.ENGINE_FAILED, message, None, now) if record else effects
 
-    def word_heard(self, goal_id: str, end: int) -> None:
-        """Record that the active goal has been heard up to this offset in its text.
+    def word_heard(self, goal_id: str, start: int, end: int, seconds: float) -> None:
+        """Record that a word of the active goal has started, so that all words before it were heard to their end.
 
         Args:
             goal_id: the id of the goal.
+            start: the offset in the text at which the word starts.
             end: the offset in the text at which the word ends.
+            seconds: the position of the word in the audio.
         """
         record = self._require_active(goal_id)
-        record.spoken_end = max(record.spoken_end, end)
+        if start >= record.begun_end:
+            between = record.say.text[record.begun_end : start]  # may have a word that is spoken with the one before it
+            opening = [] if between[-1:].isspace() else between.split()[-1:]  # a quotation mark before the new word
+            record.spoken_end = record.begun_end + len(between.removesuffix("".join(opening)).rstrip())
+        record.begun_end = max(record.begun_end, end)
+        self.audio_heard(goal_id, seconds)
+
+    def audio_heard(self, goal_id: str, seconds: float) -> None:
+        """Record how many seconds of the active goal's audio were heard."""
+        record = self._require_active(goal_id)
+        record.heard = max(record.heard, seconds)
 
     def voice_chosen(self, goal_id: str, voice: str, now: Now) -> list[Effect]:
         """Record which voice speaks the active goal, and load the next voice if possible."""
@@ -352,7 +364,7 @@ class Scheduler:
         """
         record = self._require_active(goal_id)
         record.duration = duration
-        record.spoken_end = len(record.say.text)
+        record.spoken_end = record.begun_end = len(record.say.text)
         words = "Talk completed successfully"
         if record.output and record.output.muted:
             words += f", but the output was muted: {record.output.device}"
@@ -591,7 +603,7 @@ class Scheduler:
             return inf
         if goal.stop_requested_at is not None:
             return goal.stop_requested_at + CONFIRM_SILENCE_S
-        return inf if self.has_engine or goal.spoken_end else goal.expires_at
+        return inf if self.has_engine or goal.begun_end else goal.expires_at
 
     def _next_deadline(self) -> float:
         """Return the monotonic time at which `tick` must try to start the next goal, or inf if none can start."""
@@ -663,7 +675,7 @@ class Scheduler:
         record.change_state(state)
         record.reason, record.message, record.by = reason, message, by
         record.ended_at, record.paused = now.wall, False
-        if record.spoken_end and state is not State.ABORTED:
+        if record.begun_end and state is not State.ABORTED:
             self._speech_times.add(record)
         self._by_id.pop(record.id)
         self.history.add(record)

@@ -281,7 +281,7 @@ class Speech:
         scheduler = self.scheduler
         match event:
             case protocol.Word():
-                scheduler.word_heard(event.id, event.end)
+                scheduler.word_heard(event.id, event.start, event.end, event.time)
                 text = active.say.text[event.start : event.end]
                 self.notifications.add([partial(self.subscribers.word_heard, event, text, time.time())])
             case protocol.Ended():
@@ -339,6 +339,8 @@ class Speech:
         scheduler = self.scheduler
         if self.ready and ended.player:  # let `status` show the player that was used
             self.ready = replace(self.ready, player=ended.player)
+        if ended.heard is not None:
+            scheduler.audio_heard(ended.id, ended.heard)
         if ended.outcome == protocol.OUTCOME_COMPLETED:
             effects = scheduler.completed(ended.id, ended.duration, now, ended.gaps, ended.gap_seconds)
         elif ended.outcome == protocol.OUTCOME_STOPPED and active.stop_requested_at is not None:

@@ -93,6 +93,7 @@ def goal_lines(goal: Goal, screen: Screen, now: float) -> list[str]:
         ("ended", _describe_cause(goal.by) if goal.by else None),
         ("text", _quote(goal.text)),
         ("spoken", _quote(goal.spoken)),
+        ("heard", goal.heard and goal.heard != goal.duration and f"{goal.heard:.2f} s of audio"),
         ("from", _describe_sender(goal.client)),
         ("priority", str(goal.priority)),
         ("key", _quote(goal.key or None)),

@@ -105,7 +105,7 @@ class Robot:
         """Report an event of a goal as the engine."""
         match event:
             case "heard":
-                self.scheduler.word_heard(goal_id, 4)
+                self.scheduler.word_heard(goal_id, 0, 4, 0.25)
             case "completed":
                 self.see(self.scheduler.completed(goal_id, 1.5, self.now))
             case "failed":

@@ -80,7 +80,7 @@ def test_bytes_count_not_characters() -> None:
 
 def test_a_text_without_words_spoken_is_forgotten_with_them() -> None:
     record = ended(1)
-    record.started_at, record.spoken_end = 2.0, 4
+    record.started_at, record.begun_end = 2.0, 4
     assert record.snapshot().spoken == "door"
     record.drop_text()
     assert (record.snapshot().text, record.snapshot().spoken) == (None, None)

@@ -11,7 +11,7 @@ from talkcli.goals.goal import By, Output
 from talkcli.goals.history import EARLY_CANCEL_S, MAX_EARLY_CANCELS, MAX_SPEECH_TIMES
 from talkcli.goals.options import Cancel, Say
 from talkcli.goals.reasons import Reason
-from talkcli.goals.scheduler import CONFIRM_SILENCE_S, Cancellation, Now
+from talkcli.goals.scheduler import CONFIRM_SILENCE_S, Cancellation, Now, Scheduler
 from talkcli.goals.states import State
 from tests.unit.robot import ARM, DOOR, Robot, play
 
@@ -112,10 +112,38 @@ def test_what_was_heard_only_moves_forward_and_stays_after_a_failure() -> None:
     assert robot.goals["a"].snapshot().spoken == ""
     assert robot.goals["b"].snapshot().spoken is None
     for end, spoken in ((4, "door"), (2, "door"), (0, "door"), (9, "door_open"), (4, "door_open")):
-        robot.scheduler.word_heard("4k7f-1", end)
+        robot.scheduler.word_heard("4k7f-1", 0, end, 0.0)
         assert robot.goals["a"].snapshot().spoken == spoken
     goal = play("a text=door_open; heard a; failed a").goals["a"].snapshot()
     assert (goal.spoken, goal.duration) == ("door", 1.5)
+
+
+@pytest.mark.parametrize(
+    ("text", "words", "spoken_end"),
+    [
+        ("one two three", ["one"], ""),
+        ("one two three", ["one", "two"], "one"),
+        ('He said: "go", and left.', ["He", "said", "go"], "He said:"),
+        ('He said: "go", and left.', ["He", "said", "go", "and"], 'He said: "go",'),
+        ("in the box", ["in", "box"], "in the"),
+        ("well-known", ["well", "known"], "well"),
+        ("你好，世界", ["你好", "世界"], "你好"),
+    ],
+)
+def test_a_word_is_heard_to_its_end_when_the_next_word_starts(text: str, words: list[str], spoken_end: str) -> None:
+    scheduler = Scheduler("4k7f", max_queue=1)
+    scheduler.engine_ready(Now(0, 0))
+    record, _ = scheduler.submit(Say(text), ARM, Now(0, 0))
+    for number, word in enumerate(words):
+        start = text.index(word)
+        scheduler.word_heard(record.id, start, start + len(word), number * 0.5)
+    scheduler.audio_heard(record.id, 0.0)  # less than is known already
+    goal = record.snapshot()
+    assert (text[: goal.spoken_end], goal.heard) == (spoken_end, (len(words) - 1) * 0.5)
+    scheduler.audio_heard(record.id, 7.25)
+    scheduler.completed(record.id, 7.25, Now(0, 0))
+    goal = record.snapshot()
+    assert (goal.spoken_end, goal.heard) == (len(text), 7.25)
 
 
 @pytest.mark.parametrize(

@@ -332,6 +332,7 @@ class Driver:
             pass
         except Exception as error:  # noqa: BLE001 - pyttsx3 would drop any exception
             self._proxy.notify("error", exception=error)
+        runner.heard = round(playback.heard(), 3) if runner.duration is None else runner.duration
         playback.silence()
         self._playback = None
         self._proxy.notify("finished-utterance", completed=runner.duration is not None)

@@ -270,6 +270,8 @@ class Playback:
         self.gaps: list[float] = []
         #: time at which the player began to play silence during a pause
         self._silent_at: float | None = None
+        #: seconds of the sentence that were heard, once the player was killed
+        self._heard: float | None = None
 
     # -- methods for the synthesizer
 
@@ -344,8 +346,20 @@ class Playback:
             self._players.handovers.sentence_ended(feed.player.name, now + feed.time_left(feed.written, now))
         return self._seconds(self._sent - self._skipped)
 
+    def heard(self) -> float:
+        """Return how many seconds of the sentence were heard, including the part that a file has received."""
+        if self._heard is not None:
+            return self._heard
+        if not self._rate:
+            return 0.0
+        position = self._seconds(self._sent)
+        if self._feed is not None and self._feed.player.real_time:
+            position = min(position, self._clock.heard_position(time.monotonic()))
+        return max(0.0, position - self._seconds(self._skipped))
+
     def stop(self) -> None:
         """Stop playing at once. The method that is currently running raises Stopped."""
+        self._heard = self.heard()
         self._stopped = True
         if self._feed is not None:
             self._feed.player.kill()

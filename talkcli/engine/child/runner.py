@@ -115,6 +115,10 @@ class ActiveGoal:
         #: whether a log message has reported that the driver takes too long
         self.overdue_logged = False
 
+    def speech_seconds(self, now: float) -> float:
+        """Return how many seconds a third-party driver has spoken the goal, without pauses."""
+        return self.spoken_s + (now - self.resumed_at if self.with_driver else 0.0)
+
 
 class GoalRunner:
     """Executes the server's commands, and speaks its goals. Call `attach_engine` once, and then `run`."""
@@ -140,6 +144,8 @@ class GoalRunner:
         self.position: float | None = None
         #: length of the last sentence in seconds; None if it wasn't heard completely
         self.duration: float | None = None
+        #: seconds of the last sentence that were heard; None if unknown
+        self.heard: float | None = None
         #: lengths in seconds of the gaps in the last sentence
         self.gaps: list[float] = []
 
@@ -277,7 +283,7 @@ class GoalRunner:
     def _begin_goal(self, command: protocol.Speak) -> None:
         """Make this the current goal, which `run` speaks next, and tell the server that it has started."""
         self._goal = ActiveGoal(command, time.monotonic())
-        self.hold_number, self.duration, self.gaps = 0, None, []
+        self.hold_number, self.duration, self.heard, self.gaps = 0, None, None, []
         self.players.begin(command)
         self._channel.send(protocol.Started(command.id))
 
@@ -337,8 +343,7 @@ class GoalRunner:
         if found is not None:
             start, end, number = found
             goal.last_word, goal.progress_at = start, time.monotonic()
-            spoken_s = goal.spoken_s + goal.progress_at - goal.resumed_at
-            seconds = spoken_s if self.position is None else self.position
+            seconds = goal.speech_seconds(goal.progress_at) if self.position is None else self.position
             self._channel.send(protocol.Word(goal.id, start, end, number, round(seconds, 3)))
 
     def _record_error(self, exception: Exception, **_: object) -> None:
@@ -353,8 +358,8 @@ class GoalRunner:
             return
         error = goal.error
         if goal.interrupted and not (completed or goal.stop_requested or error):
+            goal.spoken_s = goal.speech_seconds(time.monotonic())
             goal.with_driver = False
-            goal.spoken_s += time.monotonic() - goal.resumed_at
         elif completed:
             self._end_goal(protocol.OUTCOME_COMPLETED)
         elif isinstance(error, CannotSpeak):
@@ -376,8 +381,10 @@ class GoalRunner:
         assert self._goal is not None
         self._report_output()
         goal, self._goal = self._goal, None
+        heard = self.heard if self._pump is None else round(goal.speech_seconds(time.monotonic()), 3)
         gaps = len(self.gaps), round(sum(self.gaps), 3)
-        ended = protocol.Ended(goal.id, outcome, reason, message, self.duration, *gaps, self.players.last_player)
+        player = self.players.last_player
+        ended = protocol.Ended(goal.id, outcome, reason, message, self.duration, *gaps, player, heard)
         self._channel.send(ended)
 
     def _alive_due(self) -> float:
