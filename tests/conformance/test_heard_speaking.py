@@ -346,12 +346,14 @@ def test_row_42_a_stopped_goal_reports_the_words_that_were_heard(make_talk: Make
         last = talk.watcher.words(goal_id)[-1]
         assert last["number"] >= 5
         assert goal["spoken"] == LONG[: last["end"]]
+        assert LONG[: goal["spoken_end"]] == LONG[: last["start"]].rstrip()
         heard(talk)
         # When the sound ended, the last word that was told had begun, and the next one had not.
         until = begins[0] / RATE + assert_only_beginning(talk.recording, reference.samples)
         later = [seconds for start, _, seconds in reference.words if start > last["start"]]
         following = min(later, default=len(reference.samples) / RATE)
         talk.stop()
+        assert_within(abs(goal["heard"] - until), WORST, "the end of the sound, as reported")
         assert_within(
             position(reference, last["start"]) - until, WORST, f"the word {last['word']!r}, before its sound,"
         )
