@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 GOAL = {
     "id", "state", "status", "reason", "by", "message", "text", "format", "spoken", "spoken_end",
-    "heard", "priority", "key", "ttl", "data", "client", "paused", "queued_at", "started_at", "ended_at", "duration",
+    "heard", "priority", "key", "ttl", "data", "client", "paused", "more", "waits", "queued_at", "started_at", "ended_at", "duration",
     "voice", "output",
 }  # fmt: skip
 #: ESC, a bidi override, a line of its own, a bell, a NEL: none of these may reach a terminal.

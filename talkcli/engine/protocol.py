@@ -8,8 +8,8 @@ The engine process follows this sequence:
 
 1. It receives one `Configure`.
 2. It sends `Ready`, or it sends `StartFailed` and exits.
-3. For each `Speak`, it sends one `Started`, then any number of `Word`, `Alive`, `OutputChanged`, `VoiceChosen` and
-   `Held` messages, and finally exactly one `Ended`.
+3. For each `Speak`, it sends one `Started`, then any number of `Word`, `Alive`, `TextMissing`, `OutputChanged`,
+   `VoiceChosen` and `Held` messages, and finally exactly one `Ended`.
 
 It answers each `LoadVoice` with one `VoiceLoaded`, which may be sent at any time. If the server closes its end of the
 socket, the engine process stops speaking and exits.
@@ -106,6 +106,18 @@ class Speak:
     lead_in: int | None = None  # milliseconds of silence to play before the text; None to use `Configure.lead_in`
     audible: bool | None = None  # whether to fail if the output is muted; None to use `Configure.audible`
     voice_only: bool = False  # whether to wait for the neural voice to load, and fail if it can't be loaded
+    more: bool = False  # whether text will be added with `Append`
+    broken: bool = False  # whether the text broke off, so that an incomplete sentence at its end isn't spoken
+
+
+@frozen
+class Append:
+    """The command to add text to a goal that was sent with `Speak.more`. It is ignored if the goal has ended."""
+
+    id: str
+    text: str
+    end: bool  # whether the text is now complete
+    broken: bool = False  # whether the text broke off, so that an incomplete sentence at its end isn't spoken
 
 
 @frozen
@@ -243,6 +255,14 @@ class Word:
 
 
 @frozen
+class TextMissing:
+    """Everything was heard, and the next part of the text is missing, or the goal continues after that."""
+
+    id: str
+    missing: bool
+
+
+@frozen
 class OutputChanged:
     """The device, volume and mute state of the current output. Sent when they become known or change."""
 
@@ -284,9 +304,9 @@ class Ended:
 
 #: Commands that start a goal. There is one for each kind of goal.
 GoalCommand = Speak
-Command = Configure | GoalCommand | Stop | Hold | Continue | NextGoal | LoadVoice | DropVoice
+Command = Configure | GoalCommand | Append | Stop | Hold | Continue | NextGoal | LoadVoice | DropVoice
 #: Events about the goal with the given `id`.
-GoalEvent = Started | Alive | Word | OutputChanged | VoiceChosen | Held | Ended
+GoalEvent = Started | Alive | Word | TextMissing | OutputChanged | VoiceChosen | Held | Ended
 VoiceEvent = VoiceList | VoiceLoaded | VoiceUnloaded | VoiceMemory
 Event = Ready | StartFailed | VoiceEvent | GoalEvent
 

@@ -121,6 +121,10 @@ class Goal:
     data: JsonObject | None = None
     client: Sender | None = None
     paused: bool = False
+    #: whether the text may still grow
+    more: bool = False
+    #: whether nothing is heard because the next part of the text is missing
+    waits: bool = False
     queued_at: float | None = None
     started_at: float | None = None
     ended_at: float | None = None
@@ -156,6 +160,8 @@ class Goal:
             "data": self.data,
             "client": None if self.client is None else self.client.to_json(),
             "paused": self.paused,
+            "more": self.more,
+            "waits": self.waits,
             "queued_at": self.queued_at,
             "started_at": self.started_at,
             "ended_at": self.ended_at,

@@ -35,6 +35,11 @@ MAX_LOG_GOALS = 2_200
 MAX_TEXT_CHARS = 10_000
 #: Maximum size of a text. 10,000 characters of four bytes each still fit into a request.
 MAX_TEXT_BYTES = 40_000
+#: How many times longer than other texts a growing text may be. It can be interrupted, and its sender sees how far it
+#: was spoken.
+GROWTH_FACTOR = 5
+#: How long a growing text that was spoken completely waits for more text, by default and at least and at most.
+STALL_S, MIN_STALL_S, MAX_STALL_S = 5, 1, 60
 #: Highest priority. Every JSON parser can represent this number exactly.
 MAX_PRIORITY = 1_000_000
 #: Maximum length of a key, which is shown on one line.
@@ -479,6 +484,20 @@ OPTIONS = (
         form=f"up to {MAX_DATA_BYTES:,} bytes of JSON in ASCII (`é` is `\\u00e9`)",
         in_goal=True,
     ),
+    Option(
+        "more",
+        FLAG,
+        "whether text will be added with `append` while the goal waits or is spoken. `text` is then the beginning",
+        default=False,
+    ),
+    Option(
+        "stall",
+        SECONDS,
+        "seconds for which a growing text waits for more text after all of it was spoken. After that, the goal is "
+        "aborted (`text_stalled`)",
+        default=STALL_S,
+        limits=(MIN_STALL_S, MAX_STALL_S),
+    ),
     Option("format", TEXT, "only `text` is supported", "text", check=_check_format, in_goal=True),
 )
 
@@ -519,7 +538,31 @@ class Say:
     lead_in: int | None = None
     audible: bool | None = None
     data: JsonObject | None = None
+    more: bool = False
+    stall: float = STALL_S
     format: str = "text"
+
+
+@frozen
+class Append:
+    """A request to add text to a goal that was sent with `more`."""
+
+    kind: ClassVar[str] = "append"
+    meaning: ClassVar[str] = (
+        "Add text to a goal that was sent with `more`. The reply comes when little of the text is still unheard"
+    )
+    options: ClassVar[tuple[Option, ...]] = (
+        Option("id", ID, "the goal", default="", default_words="required"),
+        Option("text", TEXT, "the text to add", default=""),
+        Option("at", INTEGER, "the length of the text so far. An addition that was sent before is then harmless"),
+        Option("end", FLAG, "whether the text is complete", default=False),
+        Option("broken", FLAG, "whether the sender gives up, so that the goal is stopped at once", default=False),
+    )
+    id: str
+    text: str = ""
+    at: int | None = None
+    end: bool = False
+    broken: bool = False
 
 
 @frozen
@@ -604,7 +647,7 @@ def require_fields(cls: type, options: Iterable[str]) -> None:
             raise TypeError(f"{cls.__name__} has no field for the option {name!r}")
 
 
-for _request in (Say, Set, Cancel):
+for _request in (Say, Append, Set, Cancel):
     require_fields(_request, (each.name for each in _request.options))
 
 #: Settings of a server that was started without options.
@@ -615,6 +658,8 @@ def bad_option(request: Say | Set) -> str | None:
     """Return an error message if a request contains a value that is not allowed, or None."""
     if isinstance(request, Say) and request.flush and request.preempt is False:
         return "flush can't be combined with preempt false, because it always interrupts"
+    if isinstance(request, Say) and request.more and request.throttle is not None and request.key is None:
+        return "a growing text can only be throttled by its key, because its whole text isn't known yet"
     for option in request.options:
         value = getattr(request, option.name)
         if value != option.default and (words := option.value_error(value)):
@@ -633,8 +678,26 @@ def bad_text(text: str, max_chars: int | None = MAX_TEXT_CHARS) -> Refusal | Non
 
     from talkcli.goals.reasons import Reason
 
-    if max_chars is not None and len(text) > max_chars:
-        return Reason.TEXT_TOO_LONG, f"the text is too long: {len(text):,} characters (at most {max_chars:,})"
+    if refused := bad_characters(text, max_chars):
+        return refused
+    if all(unicodedata.category(each) in _SILENT_CATEGORIES for each in text):
+        return Reason.INVALID_TEXT, "the text is empty" if not text.strip() else "the text has no visible characters"
+    return None
+
+
+def bad_characters(text: str, max_chars: int | None, before_chars: int = 0) -> Refusal | None:
+    """Return the reason why a text is too long or contains characters that aren't allowed, or None.
+
+    Args:
+        text: the text.
+        max_chars: the maximum number of characters, or None for no limit.
+        before_chars: the number of characters of a growing text before this one, which count, too.
+    """
+    from talkcli.goals.reasons import Reason
+
+    count = before_chars + len(text)
+    if max_chars is not None and count > max_chars:
+        return Reason.TEXT_TOO_LONG, f"the text is too long: {count:,} characters (at most {max_chars:,})"
     try:
         size = len(text.encode())
     except UnicodeEncodeError as error:
@@ -644,8 +707,6 @@ def bad_text(text: str, max_chars: int | None = MAX_TEXT_CHARS) -> Refusal | Non
         return Reason.TEXT_TOO_LONG, f"the text is too long: {size:,} bytes (at most {MAX_TEXT_BYTES:,})"
     if "\0" in text:
         return Reason.INVALID_TEXT, f"the text contains a NUL character (character {text.index(chr(0)) + 1})"
-    if all(unicodedata.category(each) in _SILENT_CATEGORIES for each in text):
-        return Reason.INVALID_TEXT, "the text is empty" if not text.strip() else "the text has no visible characters"
     return None
 
 

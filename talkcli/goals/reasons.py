@@ -65,6 +65,16 @@ class Reason(str, Enum):
     ENGINE_CRASHED = "engine_crashed", (_ABORTED,), "the engine process died"
     ENGINE_HUNG = "engine_hung", (_ABORTED,), "the engine process stopped responding"
     NOTHING_TO_SAY = "nothing_to_say", (_ABORTED,), "nothing in the text can be spoken"
+    TEXT_STALLED = (
+        "text_stalled",
+        (_ABORTED,),
+        "all of a growing text was spoken, and no more text arrived for `stall` seconds",
+    )
+    BROKEN_OFF = (
+        "broken_off",
+        (_RECALLED, _ABORTED),
+        "the sender of a growing text left, or gave up, before the text ended",
+    )
     NOT_SILENT = "not_silent", (_ABORTED,), "the goal was stopped, but silence was not confirmed within 2 s"
     # The next two reasons are set only by clients.
     NOT_SENT = "not_sent", (_REJECTED,), "the client could not send the goal, so it never reached a server"

@@ -39,7 +39,9 @@ class Record:
     preempt: bool = False
     #: monotonic time at which the goal expires if it hasn't started, or inf
     expires_at: float = inf
-    #: hash of the text if the text was dropped to free memory, otherwise None
+    #: number of characters with which the goal was sent; a growing text gets more
+    first_chars: int = 0
+    #: hash of these characters if the text was dropped to free memory, otherwise None
     text_hash: int | None = None
     state: State = State.PENDING
     #: sort position among the pending goals of the same priority, used only by the queue
@@ -53,6 +55,16 @@ class Record:
     spoken_end: int = 0
     #: seconds of the audio that were heard, as far as known
     heard: float = 0.0
+    #: whether the text may still grow
+    more: bool = False
+    #: whether the text broke off, so that the goal can't succeed
+    broken: bool = False
+    #: whether nothing is heard because the next part of the text is missing
+    waits: bool = False
+    #: monotonic time by which more text must arrive, or inf
+    stalls_at: float = inf
+    #: monotonic time by which another connection must continue the text of a sender that left, or inf
+    orphaned_until: float = inf
     #: whether the goal is paused
     paused: bool = False
     #: how often the goal has been paused
@@ -82,12 +94,14 @@ class Record:
         self.state = state
 
     def drop_text(self) -> None:
-        """Replace the text with its hash to save memory."""
-        self.text_hash, self.say = hash(self.say.text), replace(self.say, text="")
+        """Replace the text with a hash to save memory."""
+        self.text_hash, self.say = hash(self.say.text[: self.first_chars]), replace(self.say, text="")
 
-    def has_text(self, text: str) -> bool:
-        """Return whether the goal has this text. If the text was dropped, compare hashes."""
-        return text == self.say.text if self.text_hash is None else hash(text) == self.text_hash
+    def was_sent_as(self, text: str) -> bool:
+        """Return whether the goal was sent with this text. If the text was dropped, compare hashes."""
+        if self.text_hash is not None:
+            return hash(text) == self.text_hash
+        return text == self.say.text[: self.first_chars]
 
     def snapshot(self, state: State | None = None) -> Goal:
         """Return an immutable copy of the goal, with the current state or another one.
@@ -110,6 +124,8 @@ class Record:
             text=text,
             client=self.sender,
             paused=self.paused and state is self.state,
+            more=self.more,
+            waits=self.waits,
             queued_at=self.queued_at,
             **shown,
         )

@@ -16,6 +16,7 @@ from enum import Enum
 from math import inf
 from typing import TYPE_CHECKING
 
+from talkcli.errors import RequestRefused
 from talkcli.frozen import frozen, replace
 from talkcli.goals import options
 from talkcli.goals.goal import By, Output, Sender
@@ -29,8 +30,9 @@ from talkcli.goals.voices import VoiceDropOrder, VoiceLoadOrder, VoiceScheduler,
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from talkcli.goals.options import Cancel, Say, Set
+    from talkcli.goals.options import Append, Cancel, Say, Set
 
+_BROKEN_OFF = "its sender left before the text ended"
 #: Time limit for the engine to become silent after a stop. Every cancel must be answered within 2 s.
 CONFIRM_SILENCE_S = 1.9
 
@@ -61,6 +63,8 @@ class Order(Enum):
     START = "Start"
     #: become silent, then report that the goal has ended
     STOP = "Stop"
+    #: speak the text that was added, and stop waiting for more if the text has ended or broken off
+    APPEND = "Append"
     #: replace the engine process, because it did not become silent in time
     GIVE_UP = "GiveUp"
     #: pause the speech until RESUME
@@ -128,6 +132,8 @@ class Scheduler:
         self.paused = False
         #: whether goals can start, even if each one fails at once because no engine can be started
         self.has_engine = False
+        #: goals whose sender left before their text ended
+        self._orphans: list[Record] = []
         #: whether `shutdown` was called; if so, new goals are rejected
         self.closing = False
         #: whether an engine process is running that can load voices
@@ -193,13 +199,14 @@ class Scheduler:
             without effects.
         """
         first = self.find(say.id) if say.id is not None and options.is_clients_id(say.id) else None
-        if first is not None and first.has_text(say.text):
+        if first is not None and first.was_sent_as(say.text):
             return first, []
         self._count += 1
         ttl = (self.settings.ttl if say.ttl is None else say.ttl) or None
         expires_at = inf if ttl is None else now.monotonic + ttl - waited_s
         number, asked = self._count, say if ttl == say.ttl else replace(say, ttl=ttl)
         record = Record(f"{self.boot}-{number}", number, asked, sender, now.wall, self._preempts(say), expires_at)
+        record.first_chars, record.more = len(say.text), say.more
         by = canceled or self._early_cancels.find(say.id, now.monotonic)
         refused = self._find_refusal(say, refusal, first) or (None if canceled else self._throttle(say, record, now))
         expired = expires_at <= now.monotonic
@@ -250,6 +257,61 @@ class Scheduler:
         result.effects += self._order_next_voice(now)
         return result
 
+    def append(self, record: Record, addition: Append, now: Now) -> list[Effect]:
+        """Add text to a goal whose text grows, or end its text. An addition that was sent before changes nothing.
+
+        Args:
+            record: the goal.
+            addition: the text to add, and whether it is the last one.
+            now: the current time.
+
+        Raises:
+            RequestRefused: the goal or its text has ended, or the addition doesn't fit. Its code is `goal_ended`,
+                `text_ended`, `text_missing`, `text_conflict`, `text_too_long` or `invalid_text`.
+        """
+        text = record.say.text
+        at = len(text) if addition.at is None else addition.at
+        known = text[at : at + len(addition.text)]
+        added = addition.text[len(known) :]
+        if record.state not in {State.PENDING, State.ACTIVE}:
+            raise RequestRefused(f"goal {record.id} has ended ({record.state})", "goal_ended")
+        if at > len(text):
+            words = f"the text of goal {record.id} has {len(text):,} characters, so nothing can be added at {at:,}"
+            raise RequestRefused(words, "text_missing")
+        if not addition.text.startswith(known):
+            raise RequestRefused(f"goal {record.id} has another text at {at:,}", "text_conflict")
+        if not record.more:
+            if added:
+                raise RequestRefused(f"the text of goal {record.id} has ended", "text_ended")
+            return []
+        if refused := options.bad_characters(added, self.max_text * options.GROWTH_FACTOR, len(text)):
+            raise RequestRefused(refused[1], refused[0])
+        self._adopt(record)
+        record.say, record.more = replace(record.say, text=text + added), not addition.end
+        self._restart_stall(record, now)
+        if addition.broken:
+            return self.break_off(record, now, at_once=True)
+        return [EngineOrder(record, Order.APPEND)] if record.state is State.ACTIVE and (added or addition.end) else []
+
+    def producer_left(self, record: Record, now: Now) -> list[Effect]:
+        """Break off a text whose sender has left, but wait for a new connection if the sender chose the goal's id."""
+        if not record.more or record.say.id is None:
+            return self.break_off(record, now)
+        if record not in self._orphans:
+            record.orphaned_until = now.monotonic + record.say.stall
+            self._orphans.append(record)
+        return []
+
+    def break_off(self, record: Record, now: Now, *, at_once: bool = False) -> list[Effect]:
+        """End a goal whose text will never be complete. Sentences that are complete are spoken, unless `at_once`."""
+        if not (record.more and record.state in {State.PENDING, State.ACTIVE}):
+            return []
+        self._adopt(record)
+        if record.state is State.PENDING:
+            return self._recall(record, Reason.BROKEN_OFF, _BROKEN_OFF, None, now) + self._order_next_voice(now)
+        record.more, record.broken = False, True
+        return self._stop(record, Reason.BROKEN_OFF, None, now) if at_once else [EngineOrder(record, Order.APPEND)]
+
     def change_settings(self, changes: dict[str, object], now: Now) -> list[Effect]:
         """Change the server's settings for goals that have not started, and request the new voice, if any.
 
@@ -281,6 +343,7 @@ class Scheduler:
         if not (self.active and self.active.paused):
             return self._start_next(now)
         self.active.paused = False
+        self._restart_stall(self.active, now)
         return [EngineOrder(self.active, Order.RESUME)]
 
     def shutdown(self, now: Now) -> list[Effect]:
@@ -341,6 +404,12 @@ class Scheduler:
         record = self._require_active(goal_id)
         record.heard = max(record.heard, seconds)
 
+    def text_missing(self, goal_id: str, now: Now, *, missing: bool) -> None:
+        """Record whether the active goal is silent because the next part of its text is missing."""
+        record = self._require_active(goal_id)
+        record.waits = missing
+        self._restart_stall(record, now)
+
     def voice_chosen(self, goal_id: str, voice: str, now: Now) -> list[Effect]:
         """Record which voice speaks the active goal, and load the next voice if possible."""
         self._require_active(goal_id).voice = voice
@@ -364,6 +433,8 @@ class Scheduler:
         """
         record = self._require_active(goal_id)
         record.duration = duration
+        if record.broken:
+            return self._end(record, State.ABORTED, Reason.BROKEN_OFF, f"speech failed: {_BROKEN_OFF}", None, now)
         record.spoken_end = record.begun_end = len(record.say.text)
         words = "Talk completed successfully"
         if record.output and record.output.muted:
@@ -387,8 +458,15 @@ class Scheduler:
         return self._end(record, State.ABORTED, reason, f"speech failed: {message}", record.by, now)
 
     def stopped(self, goal_id: str, now: Now) -> list[Effect]:
-        """End the active goal as PREEMPTED, because it was stopped and the engine is silent."""
+        """End the active goal as PREEMPTED, because it was stopped and the engine is silent.
+
+        If it was stopped because its text is incomplete, it ends as ABORTED.
+        """
         record = self._require_active(goal_id)
+        if record.reason in {Reason.BROKEN_OFF, Reason.TEXT_STALLED}:
+            stalled = f"no more text arrived for {options.format_number(record.say.stall)} s"
+            words = f"speech failed: {stalled if record.reason is Reason.TEXT_STALLED else _BROKEN_OFF}"
+            return self._end(record, State.ABORTED, record.reason, words, None, now)
         return self._end(record, State.PREEMPTED, record.reason, "Talk preempted", record.by, now)
 
     def voice_load_ended(self, voice: str, error: str | None, now: Now, *, has_libraries: bool) -> list[Effect]:
@@ -424,7 +502,8 @@ class Scheduler:
 
     def deadline(self) -> float:
         """Return the monotonic time at which `tick` must be called, or inf if there is no time limit."""
-        return min(self._active_deadline(), self.pending.next_expiry(), self._next_deadline())
+        orphans = min((each.orphaned_until for each in self._orphans), default=inf)
+        return min(self._active_deadline(), self.pending.next_expiry(), self._next_deadline(), orphans)
 
     def tick(self, now: Now) -> list[Effect]:
         """Handle the time limits that have been reached: end expired goals, and start the next one if possible.
@@ -436,11 +515,14 @@ class Scheduler:
         record = self.active
         if record is not None and now.monotonic >= self._active_deadline():
             if record.stop_requested_at is None:
-                effects = self._stop(record, Reason.EXPIRED, None, now)
+                stalled = now.monotonic >= record.stalls_at
+                effects = self._stop(record, Reason.TEXT_STALLED if stalled else Reason.EXPIRED, None, now)
             else:
                 words = f"speech failed: it was stopped, but silence was not confirmed within {CONFIRM_SILENCE_S:g} s"
                 effects = [EngineOrder(record, Order.GIVE_UP)]
                 effects += self._end(record, State.ABORTED, Reason.NOT_SILENT, words, record.by, now)
+        for each in [each for each in self._orphans if now.monotonic >= each.orphaned_until]:
+            effects += self.break_off(each, now)
         return effects + self._expire(now) + self._start_next(now) + self._order_next_voice(now)
 
     # -- selecting and accepting goals
@@ -484,7 +566,8 @@ class Scheduler:
             return Reason.BAD_OPTION, words
         if same_id is not None:
             return Reason.ID_CONFLICT, f"the id {say.id} was already used for another text"
-        return options.bad_text(say.text, self.max_text) or refusal
+        limit = self.max_text * options.GROWTH_FACTOR if say.more else self.max_text
+        return options.bad_text(say.text, limit) or refusal
 
     def _throttle(self, say: Say, record: Record, now: Now) -> Refusal | None:
         """Return the reason to reject a goal that repeats another too soon, and set `record.by`, or return None.
@@ -603,6 +686,8 @@ class Scheduler:
             return inf
         if goal.stop_requested_at is not None:
             return goal.stop_requested_at + CONFIRM_SILENCE_S
+        if goal.stalls_at < inf and not self.paused:
+            return goal.stalls_at
         return inf if self.has_engine or goal.begun_end else goal.expires_at
 
     def _next_deadline(self) -> float:
@@ -662,6 +747,16 @@ class Scheduler:
         record.paused = False
         return [StateChange(record, State.PREEMPTING), EngineOrder(record, Order.STOP)]
 
+    def _adopt(self, record: Record) -> None:
+        """Stop waiting for another connection that continues the text of a goal."""
+        if record in self._orphans:
+            self._orphans.remove(record)
+        record.orphaned_until = inf
+
+    def _restart_stall(self, record: Record, now: Now) -> None:
+        """Allow the sender of a growing text its whole time again if the text is missing."""
+        record.stalls_at = now.monotonic + record.say.stall if record.waits else inf
+
     def _require_active(self, goal_id: str) -> Record:
         """Return the active goal. Raises IllegalTransition if it doesn't have this id."""
         if self.active is None or self.active.id != goal_id:
@@ -674,7 +769,8 @@ class Scheduler:
         """Set a goal's final state and move it to the history. If it was the active goal, start the next one."""
         record.change_state(state)
         record.reason, record.message, record.by = reason, message, by
-        record.ended_at, record.paused = now.wall, False
+        record.ended_at, record.paused, record.more, record.waits = now.wall, False, False, False
+        self._adopt(record)
         if record.begun_end and state is not State.ABORTED:
             self._speech_times.add(record)
         self._by_id.pop(record.id)

@@ -49,7 +49,7 @@ EXIT_CODES: dict[State, int] = {
 }
 
 #: Allowed next states for each state. New goals are PENDING or REJECTED. PREEMPTING becomes ABORTED only with the
-#: reason `not_silent`. A client may change any state that isn't terminal to LOST.
+#: reasons `not_silent`, `text_stalled` and `broken_off`. A client may change any state that isn't terminal to LOST.
 TRANSITIONS: dict[State, frozenset[State]] = {
     State.PENDING: frozenset({State.ACTIVE, State.RECALLING, State.LOST}),
     State.RECALLING: frozenset({State.RECALLED, State.LOST}),

@@ -125,6 +125,37 @@ class WordHeard:
 
 
 @frozen
+class TextAdded:
+    """Event sent to watching clients when a text has grown."""
+
+    id: str
+    #: position of the new text in the goal's text
+    start: int
+    text: str
+    at: float | None = None
+    n: int | None = None
+
+    def to_json(self) -> JsonObject:
+        """Return the event's JSON object."""
+        return _event_json("text", self)
+
+
+@frozen
+class TextMissing:
+    """Event sent when a goal becomes silent because the next part of its text is missing, and when it continues."""
+
+    id: str
+    #: whether the goal waits for text
+    waits: bool
+    at: float | None = None
+    n: int | None = None
+
+    def to_json(self) -> JsonObject:
+        """Return the event's JSON object."""
+        return _event_json("waits", self)
+
+
+@frozen
 class PausedChanged:
     """Event sent when all speech is paused or resumed."""
 
@@ -163,11 +194,18 @@ class Snapshot:
         return {"event": "snapshot", **self.status.to_json()}
 
 
-Event = StateChanged | WordHeard | PausedChanged | Result | Snapshot
+Event = StateChanged | WordHeard | TextAdded | TextMissing | PausedChanged | Result | Snapshot
 
 #: Event classes by kind. Snapshot is missing, because its fields differ from those of its message.
 _EVENTS_BY_KIND: dict[str, type[Event]]
-_EVENTS_BY_KIND = {"state": StateChanged, "word": WordHeard, "paused": PausedChanged, "result": Result}
+_EVENTS_BY_KIND = {
+    "state": StateChanged,
+    "word": WordHeard,
+    "text": TextAdded,
+    "waits": TextMissing,
+    "paused": PausedChanged,
+    "result": Result,
+}
 
 
 def from_json(message: JsonObject) -> Event | None:
@@ -192,7 +230,7 @@ def from_json(message: JsonObject) -> Event | None:
     return event(**found)
 
 
-def _event_json(kind: str, event: StateChanged | WordHeard | PausedChanged) -> JsonObject:
+def _event_json(kind: str, event: StateChanged | WordHeard | TextAdded | TextMissing | PausedChanged) -> JsonObject:
     """Return an event's JSON object, without its goal."""
     own = {name: value for name, value in fields(event).items() if name not in {"at", "n", "goal"}}
     return {"event": kind, **own, "n": event.n, "at": event.at}
@@ -249,9 +287,9 @@ def ok(seq: int | None, **fields: object) -> JsonObject:
     return item(seq, ok=True, **fields)
 
 
-def failure(seq: int | None, code: str, message: str) -> JsonObject:
-    """Return the reply to a request that failed, with an error code and a message for the user."""
-    return item(seq, ok=False, error={"code": code, "message": message})
+def failure(seq: int | None, code: str, message: str, **fields: object) -> JsonObject:
+    """Return the reply to a request that failed, with an error code, a message for the user, and these fields."""
+    return item(seq, ok=False, error={"code": code, "message": message}, **fields)
 
 
 def take_seq(message: JsonObject) -> int | None:

@@ -1,9 +1,9 @@
 """The requests that a client can send, and how they are read from JSON.
 
 Rules for this file: it only defines the form of requests. The scheduler decides whether a goal is admitted. A request
-is a class with a row for each of its fields. The classes of `say`, `cancel` and `set` are in `goals.options`. Fields
-may be added, but never renamed or given another meaning. A field without a row is refused and never ignored, because a
-client must know that a server doesn't support it. `meaning` is the text in the wire's table.
+is a class with a row for each of its fields. The classes of `say`, `append`, `cancel` and `set` are in `goals.options`.
+Fields may be added, but never renamed or given another meaning. A field without a row is refused and never ignored,
+because a client must know that a server doesn't support it. `meaning` is the text in the wire's table.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from talkcli.goals.options import (
     MAX_IDS,
     MAX_LOG_GOALS,
     MAX_SENDER_NAME_CHARS,
+    Append,
     Cancel,
     Kind,
     Option,
@@ -137,7 +138,7 @@ class Resume:
     options: ClassVar[tuple[Option, ...]] = ()
 
 
-Request = Hello | Say | Wait | Cancel | Status | Voices | Watch | Log | Set | Pause | Resume
+Request = Hello | Say | Append | Wait | Cancel | Status | Voices | Watch | Log | Set | Pause | Resume
 
 REQUEST_TYPES: dict[str, type[Request]] = {each.kind: each for each in Request.__args__}
 
@@ -169,6 +170,7 @@ def read_request(message: JsonObject) -> Request:
             raise BadRequest(f"{kind}: {name!r} {fault}", "bad_field")
         if isinstance(value, list):
             fields[name] = tuple(value)
-    if request is Say and "text" not in fields:
-        raise BadRequest("say: 'text' is missing", "bad_field")
+    required = {Say: "text", Append: "id"}.get(request)
+    if required and required not in fields:
+        raise BadRequest(f"{kind}: {required!r} is missing", "bad_field")
     return request(**fields)  # type: ignore[arg-type]

@@ -66,6 +66,9 @@ class Handler(Protocol):
     def handle(self, connection: ClientConnection, seq: int | None, request: Request) -> None:
         """Start to carry out a client's request. The reply may be sent later."""
 
+    def input_ended(self, connection: ClientConnection) -> None:
+        """Break off the texts that a client has not completed, because it will send nothing more."""
+
     def is_waiting(self, connection: ClientConnection) -> bool:
         """Return whether a client is still waiting for a reply or an event."""
 
@@ -134,15 +137,16 @@ class PendingRequest:
         """
         self._reply(ok(self.seq, **fields), items, events)
 
-    def refuse(self, code: str, message: str, items: Iterable[JsonObject] = ()) -> None:
+    def refuse(self, code: str, message: str, items: Iterable[JsonObject] = (), **fields: object) -> None:
         """Send an error reply, with list items before it.
 
         Args:
             code: the machine-readable error.
             message: the human-readable error.
             items: the lines of a list to send before the reply.
+            fields: further fields of the reply.
         """
-        self._reply(failure(self.seq, code, message), items)
+        self._reply(failure(self.seq, code, message, **fields), items)
 
     def _reply(self, reply: JsonObject, items: Iterable[JsonObject], events: Iterable[JsonObject] = ()) -> None:
         """Send the list items, then the reply, and then the events."""
@@ -356,6 +360,8 @@ class ClientConnection(asyncio.Protocol):
                 break
         else:
             self._schedule_work()
+        if self._half_closed and not self._lines:
+            self._handler.input_ended(self)
         idle = not (self._outbox or self._lines or self.stream.congested)
         if idle and (self._finishing or (self._half_closed and not self._handler.is_waiting(self))):
             self.stream.close()

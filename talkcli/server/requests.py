@@ -18,14 +18,14 @@ from talkcli.errors import RequestRefused, UnknownGoal
 from talkcli.frozen import fields, replace
 from talkcli.goals import options
 from talkcli.goals.goal import By, JsonObject
-from talkcli.goals.options import Cancel, Say, Set
+from talkcli.goals.options import Append, Cancel, Say, Set
 from talkcli.goals.reasons import Reason, Refusal
 from talkcli.goals.states import State
 from talkcli.protocol.events import Result
 from talkcli.protocol.lines import encode
 from talkcli.protocol.requests import Log, Pause, Request, Resume, Status, Voices, Wait, Watch
 from talkcli.server.connection import PendingRequest, resume_all
-from talkcli.server.speech import describe_sender
+from talkcli.server.speech import MAX_UNHEARD_CHARS, describe_sender, unheard_chars
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -67,6 +67,8 @@ class Requests:
         #: memory counted for all waiting requests
         self._waiting_bytes = 0
         self._room_check: asyncio.Handle | None = None
+        #: the connections that may add text to goals
+        self._producers: dict[Record, ClientConnection] = {}
         speech.on_queue_change = self._schedule_room_check
 
     def handle(self, connection: ClientConnection, seq: int | None, request: Request) -> None:
@@ -84,6 +86,13 @@ class Requests:
         for each in list(connection.unanswered):
             each.drop()
         self._speech.subscribers.left(connection)
+        self.input_ended(connection)
+
+    def input_ended(self, connection: ClientConnection) -> None:
+        """Break off the texts that a client has not completed, because it will send nothing more."""
+        for record in [record for record, producer in self._producers.items() if producer is connection]:
+            del self._producers[record]
+            self._speech.apply(self._scheduler.producer_left(record, self._speech.advance_time()))
 
     def shut_down(self) -> None:
         """End all goals, including those that wait for room in the queue, and reject new ones."""
@@ -230,12 +239,50 @@ class Requests:
                 pending.canceled_goal = record
         goal = record.snapshot(state).to_json()
         ended = attached and state.terminal
+        if record.more and (effects or self._lacks_producer(record)):
+            self._producers = {each: producer for each, producer in self._producers.items() if each.more}
+            self._producers[record] = connection
         if (say.wait or say.feedback) and not ended:
             speech.subscribers.subscribe_to_goal(record.id, connection, feedback=say.feedback)
         pending.answer(goal=goal, **extra)
         if ended and (say.wait or say.feedback):
             connection.publish(encode({"event": "result", "goal": goal}))
         speech.apply(effects)
+
+    async def _append(self, pending: PendingRequest, request: Append) -> None:
+        """Add text to a goal, and reply when little of the text is still unheard."""
+        speech, now = self._speech, self._speech.advance_time()
+        record = self._require_goal(request.id)
+        length = len(record.say.text)
+        try:
+            self._require_producer(record, pending.connection)
+            effects = self._scheduler.append(record, request, now)
+        except RequestRefused as error:
+            pending.refuse(error.code, str(error), state=record.state.name)
+            return
+        if added := record.say.text[length:]:
+            speech.notifications.add([partial(speech.subscribers.text_added, record.id, length, added, time.time())])
+        speech.apply(effects)
+        while unheard_chars(record) > MAX_UNHEARD_CHARS and not record.state.terminal:
+            speech.subscribers.schedule_keep_alive()
+            await pending.wait(speech.waiting_for_hearing(record))
+        pending.answer(length=len(record.say.text), state=record.state.name)
+
+    def _require_producer(self, record: Record, connection: ClientConnection) -> None:
+        """Record that a connection adds text to a goal. Raises RequestRefused if another connection does so.
+
+        A new connection may continue a text if the old one is gone and the sender chose the goal's id.
+        """
+        if not record.more or self._producers.get(record) is connection:
+            return
+        if record.say.id is None or not self._lacks_producer(record):
+            raise RequestRefused(f"the text of goal {record.id} comes from another connection", "not_sender")
+        self._producers[record] = connection
+
+    def _lacks_producer(self, record: Record) -> bool:
+        """Return whether the connection that added text to a goal is gone."""
+        producer = self._producers.get(record)
+        return producer is None or producer.detect_hang_up()
 
     def _check_goal(self, pending: PendingRequest, say: Say) -> tuple[Say, Refusal | None]:
         """Return the goal with the id of its voice, and the server's reason to refuse the goal, or None.

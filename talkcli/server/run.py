@@ -112,6 +112,7 @@ class Server:
         self.speech.on_status_change = self._systemd.schedule_status
         self._requests = Requests(self.speech, self._describe)
         self.handle, self.is_waiting = self._requests.handle, self._requests.is_waiting
+        self.input_ended = self._requests.input_ended
         self.greeting = encode(greeting(__version__, os.getpid(), self._scheduler.boot))
         self.connections: set[ClientConnection] = set()
         #: set while no client is connected

@@ -11,6 +11,7 @@ import contextlib
 import time
 from collections import deque
 from functools import partial
+from itertools import chain
 from math import inf
 from typing import TYPE_CHECKING
 
@@ -34,12 +35,12 @@ from talkcli.server.voices import VoiceCatalog
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from talkcli.engine.parent.supervisor import Supervisor
     from talkcli.goals.record import Record
     from talkcli.goals.scheduler import Scheduler
-    from talkcli.server.connection import WaitingList
+    from talkcli.server.connection import ClientConnection, WaitingList
 
 #: A clock that keeps running while the machine is suspended. On Linux, the usual monotonic clock stops.
 _CLOCK = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
@@ -53,8 +54,15 @@ REPORTS_PER_TURN = 8
 #: Maximum length of a program's name or command line in the log.
 _MAX_LOGGED_COMMAND_CHARS = 80
 _NO_PLAYER_NEEDED = "no player needed"
+#: An `append` is answered when no more characters of the text than this are still unheard.
+MAX_UNHEARD_CHARS = 10_000
 
 require_fields(protocol.Speak, ENGINE_OPTIONS)
+
+
+def unheard_chars(record: Record) -> int:
+    """Return how many characters of a goal's text have not been heard yet."""
+    return len(record.say.text) - record.begun_end
 
 
 def elapsed() -> float:
@@ -98,13 +106,15 @@ class Speech:
         #: set when an engine is ready or can't be started, and when the server shuts down
         self.engine_known = asyncio.Event()
         self._loop = asyncio.get_running_loop()
-        self.subscribers = Subscribers(lambda: (each.connection for each in self.waiting_for_room))
+        self.subscribers = Subscribers(self._waiting_for_room)
         self.streams = ClientStreams()
         self.notifications = Notifications(self.streams)
         self.notifications.on_done = self._finish_if_all_ended
         self._timer: asyncio.TimerHandle | None = None
         #: requests that are waiting for a goal to become silent or to end
         self._waiting_for_silence: dict[Record, WaitingList] = {}
+        #: `append` requests that are waiting until more of their goal's text has been heard
+        self._waiting_for_hearing: dict[Record, WaitingList] = {}
         #: the paused goal, if the engine has confirmed that it is silent
         self.silent_goal: Record | None = None
         #: unprocessed reports from the engine thread
@@ -135,6 +145,21 @@ class Speech:
     def waiting_for_silence(self, record: Record) -> WaitingList:
         """Return the requests that wait for this goal to become silent, to continue or to end."""
         return self._waiting_for_silence.setdefault(record, {})
+
+    def waiting_for_hearing(self, record: Record) -> WaitingList:
+        """Return the requests that wait until more of this goal's text has been heard, or until it has ended."""
+        return self._waiting_for_hearing.setdefault(record, {})
+
+    def _waiting_for_room(self) -> Iterator[ClientConnection]:
+        """Yield the connections whose goals wait for room in the queue, or whose texts wait until they are heard."""
+        for each in chain(self.waiting_for_room, *self._waiting_for_hearing.values()):
+            yield each.connection
+
+    def _resume_appends(self, record: Record) -> None:
+        """Resume the waiting `append` requests of a goal if little of its text is still unheard."""
+        waiting = self._waiting_for_hearing.get(record)
+        if waiting and unheard_chars(record) <= MAX_UNHEARD_CHARS:
+            resume_all(waiting)
 
     # -- the scheduler's effects
 
@@ -167,16 +192,8 @@ class Speech:
     def _carry_out(self, effect: EngineOrder | VoiceLoadOrder | VoiceDropOrder | VoiceWarning) -> None:
         """Give the engine an order, or log a warning about a voice."""
         match effect:
-            case EngineOrder(record=record, order=Order.START):
-                self._start_speaking(record)
-            case EngineOrder(record=record, order=Order.STOP):
-                self.engine.stop(record.id)
-            case EngineOrder(record=record, order=Order.GIVE_UP):
-                self.engine.give_up(record.id)
-            case EngineOrder(record=record, order=Order.HOLD):
-                self.engine.pause(record.id, record.pause_count)
-            case EngineOrder(record=record, order=Order.RESUME):
-                self.engine.resume(record.id)
+            case EngineOrder(record=record, order=order):
+                self._give_order(record, order)
             case VoiceLoadOrder(voice=voice, dropped=dropped):
                 for each in dropped:
                     log.write(f"unloaded voice {log.sanitize(each)} to make room for {log.sanitize(voice)}")
@@ -187,6 +204,22 @@ class Speech:
                 self.engine.drop(voice)
             case VoiceWarning(message=message):
                 log.write(log.sanitize(message))
+
+    def _give_order(self, record: Record, order: Order) -> None:
+        """Give the engine an order concerning a goal."""
+        match order:
+            case Order.START:
+                self._start_speaking(record)
+            case Order.APPEND:
+                self.engine.append(record.id, record.say.text, end=not record.more, broken=record.broken)
+            case Order.STOP:
+                self.engine.stop(record.id)
+            case Order.GIVE_UP:
+                self.engine.give_up(record.id)
+            case Order.HOLD:
+                self.engine.pause(record.id, record.pause_count)
+            case Order.RESUME:
+                self.engine.resume(record.id)
 
     def _start_speaking(self, record: Record) -> None:
         """Tell the engine to speak a goal, or report it as failed if a voice that it requires is unavailable."""
@@ -199,9 +232,15 @@ class Speech:
                 self.report(protocol.Ended(record.id, protocol.OUTCOME_FAILED, Reason.VOICE_FAILED, why))
                 return
             options["pitch"] = INITIAL.pitch  # neural voices don't support other pitches
-        self.engine.speak(
-            protocol.Speak(record.id, record.say.text, next_waits=next_waits, next_is_neural=next_is_neural, **options)
+        command = protocol.Speak(
+            record.id,
+            record.say.text,
+            next_waits=next_waits,
+            next_is_neural=next_is_neural,
+            more=record.more,
+            **options,
         )
+        self.engine.speak(command)
 
     def _announce_next(self) -> None:
         """Tell the engine whether another goal follows the active one, so that it can prepare for it."""
@@ -221,6 +260,7 @@ class Speech:
         if state.terminal:
             _log_goal_end(record, elapsed() - record.began_at)
             resume_all(self._waiting_for_silence.pop(record, {}))
+            resume_all(self._waiting_for_hearing.pop(record, {}))
 
     def _set_timer(self) -> None:
         """Schedule `_tick` for the scheduler's next time limit, and cancel the previous timer."""
@@ -280,8 +320,14 @@ class Speech:
         """Process the engine's report of a word, the output, the voice, a pause or the end of the active goal."""
         scheduler = self.scheduler
         match event:
+            case protocol.TextMissing():
+                scheduler.text_missing(event.id, now, missing=event.missing)
+                publish = partial(self.subscribers.text_missing, event.id, time.time(), waits=event.missing)
+                self.notifications.add([publish])
+                self._set_timer()
             case protocol.Word():
                 scheduler.word_heard(event.id, event.start, event.end, event.time)
+                self._resume_appends(active)
                 text = active.say.text[event.start : event.end]
                 self.notifications.add([partial(self.subscribers.word_heard, event, text, time.time())])
             case protocol.Ended():

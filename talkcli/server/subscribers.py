@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from talkcli.daemon import log
 from talkcli.frozen import replace
 from talkcli.goals.states import State
-from talkcli.protocol.events import PausedChanged, Result, StateChanged, WordHeard
+from talkcli.protocol.events import PausedChanged, Result, StateChanged, TextAdded, TextMissing, WordHeard
 from talkcli.protocol.lines import encode
 
 if TYPE_CHECKING:
@@ -48,8 +48,8 @@ class Subscribers:
         """Start with no subscribers.
 
         Args:
-            waiting_for_room: function that returns the connections whose goals wait for room. They also get keep-alive
-                messages.
+            waiting_for_room: function that returns the connections whose goals or texts wait for room. They also get
+                keep-alive messages.
         """
         self._loop = asyncio.get_running_loop()
         self._waiting_for_room = waiting_for_room
@@ -106,6 +106,16 @@ class Subscribers:
         """
         event = WordHeard(word.id, text, word.start, word.end, word.number, word.time, at, next(self._numbers))
         _publish(event.to_json(), self._feedback_receivers([self._waiters.get(word.id, {})]), feedback=True)
+
+    def text_added(self, goal_id: str, start: int, text: str, at: float) -> None:
+        """Publish to watching connections that a goal's text has grown. The new text begins at the offset `start`."""
+        if self._watchers:
+            _publish(TextAdded(goal_id, start, text, at, next(self._numbers)).to_json(), self._watchers)
+
+    def text_missing(self, goal_id: str, at: float, *, waits: bool) -> None:
+        """Publish whether a goal waits for text to the connections that want feedback."""
+        event = TextMissing(goal_id, waits, at, next(self._numbers))
+        _publish(event.to_json(), self._feedback_receivers([self._waiters.get(goal_id, {})]))
 
     def paused_changed(self, goal_id: str | None, *, paused: bool, by: By, at: float) -> None:
         """Publish that speech was paused or resumed. `goal_id` is the id of the affected goal, if any."""

@@ -92,6 +92,7 @@ class Server:
         speech.report(protocol.Ready("simulated", None, "none"))
         speech.report(protocol.VoiceList((protocol.Voice("en", "en", "simulated"),)))
         self._requests = Requests(speech, self._describe)
+        self.input_ended = self._requests.input_ended
         self.handle, self.is_waiting, self.left = self._requests.handle, self._requests.is_waiting, self._requests.left
         self.greeting = encode(greeting(__version__, os.getpid(), boot))
         self._socket = socket.socket(socket.AF_UNIX)

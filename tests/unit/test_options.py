@@ -35,6 +35,7 @@ from talkcli.goals.options import (
     SETTINGS,
     SHOWN_OPTIONS,
     SOUND_OPTIONS,
+    Append,
     Option,
     Say,
     Set,
@@ -161,7 +162,7 @@ TYPES = {
 @pytest.mark.parametrize("kind", REQUEST_TYPES)
 def test_the_fields_of_a_request_are_its_rows(kind: str) -> None:
     request = REQUEST_TYPES[kind]
-    empty = Say("") if issubclass(request, Say) else request()
+    empty = Say("") if issubclass(request, Say) else Append("") if issubclass(request, Append) else request()
     own = annotated(request)
     assert list(own) == [each.name for each in request.options]
     for each in request.options:

@@ -7,18 +7,21 @@ synthesizer and the players available through pyttsx3's interface.
 from __future__ import annotations
 
 import sys
+import time
 import types
 from importlib import import_module
 
 from talkcli import install
 from talkcli.engine import protocol, voices
+from talkcli.engine.child.cutting import GrowingText
 from talkcli.engine.child.playback import Playback
 from talkcli.engine.child.players.base import CannotSpeak, Stopped
 from talkcli.engine.child.synthesizers.base import NotInstalled, SpeechSettings
 from talkcli.engine.voices import SYNTHESIZERS, UnknownVoice, is_own_driver
 from talkcli.frozen import TYPE_CHECKING, fields, replace
-from talkcli.goals.options import is_neural, without_speaker
+from talkcli.goals.options import ENGINE_OPTIONS, is_neural, without_speaker
 from talkcli.goals.reasons import Reason
+from talkcli.polling import NEVER
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -157,7 +160,8 @@ class DriverProperties:
     def __init__(self, engine: Any, driver: str) -> None:
         self._engine = engine
         self._driver = driver
-        self._values = fields(SpeechSettings())  # pyttsx3's drivers start with these values
+        # pyttsx3's drivers start with these values.
+        self._values = {name: value for name, value in fields(SpeechSettings()).items() if name in ENGINE_OPTIONS}
         self._default_voice: Any = None
         self._voices: tuple[protocol.Voice, ...] = ()
         self._voice: str | None = None
@@ -325,7 +329,8 @@ class Driver:
         self._playback = playback = Playback(runner, self._notify_word)
         runner.duration = None
         try:
-            self._synthesizer.speak(text, self._sound, playback)
+            for part, is_last in self._parts(text, playback):
+                self._synthesizer.speak(part, replace(self._sound, ends_sentence=is_last), playback)
             runner.duration = round(playback.finish(), 6)
             runner.gaps = playback.gaps
         except Stopped:
@@ -336,6 +341,25 @@ class Driver:
         playback.silence()
         self._playback = None
         self._proxy.notify("finished-utterance", completed=runner.duration is not None)
+
+    def _parts(self, text: str, playback: Playback) -> Iterator[tuple[str, bool]]:
+        """Yield the parts of a text, each as soon as it can be spoken, and whether it is the last part.
+
+        A text that doesn't grow is a single part. While text is missing, the playback continues.
+        """
+        growing = self._runner.growing_text or GrowingText(text, ended=True)
+        while True:
+            now, buffered = time.monotonic(), playback.buffered()
+            part = growing.next_part(now, buffered)
+            if part is not None:
+                self._runner.report_text_missing(False)
+                playback.begin_part(part[0])
+                yield growing.text[slice(*part)], growing.finished
+            elif growing.finished:
+                return
+            else:
+                self._runner.report_text_missing(buffered <= 0)
+                playback.await_text(min(growing.due(now, buffered), now + buffered if buffered > 0 else NEVER))
 
     def _notify_word(self, word: TimedWord) -> None:
         """Notify pyttsx3 that a word is being heard, and store its position in the audio in the runner."""

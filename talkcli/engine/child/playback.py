@@ -266,6 +266,10 @@ class Playback:
         self._busy_until = 0.0
         #: whether the samples are synthesized in another thread, and may be late
         self._in_background = False
+        #: whether the player may have run dry because the text was missing, which doesn't count as a gap
+        self._text_was_missing = False
+        #: offset in the text, and in the samples, of the part of the text that is being synthesized
+        self._part_start = self._part_begin = 0
         #: lengths in seconds of the gaps caused by late samples
         self.gaps: list[float] = []
         #: time at which the player began to play silence during a pause
@@ -286,6 +290,8 @@ class Playback:
             fallback_reason: human-readable reason for a fallback voice, or None for the requested voice.
         """
         if self._feed is not None and rate != self._rate:
+            if self._part_begin:
+                raise CannotSpeak(Reason.ENGINE_FAILED, "the rest of the text would need another sample rate")
             self._release_player(0)  # the player was started with a different sample rate
         self._rate = rate
         self._runner.report_voice(voice, fallback_reason)
@@ -299,12 +305,12 @@ class Playback:
         """Schedule a word to be reported when it is heard.
 
         Args:
-            start: offset of the word in the text.
+            start: offset of the word in the current part of the text.
             length: number of characters.
-            position: start of the word in the audio, in seconds.
+            position: start of the word in the audio of this part, in seconds.
         """
         self._samples.audible = True
-        self._clock.add(TimedWord(start, length, position))
+        self._clock.add(TimedWord(self._part_start + start, length, self._seconds(self._part_begin) + position))
 
     def write(self, samples: bytes) -> None:
         """Play samples, and return once the player has accepted them.
@@ -324,12 +330,32 @@ class Playback:
         self._in_background = True
         more = (descriptor, select.POLLIN)
         if self._feed is not None:
-            self._with_player(lambda feed: self._await_samples(feed, more))
+            self._with_player(lambda feed: self._await_samples(feed, [more]))
             return
         self._wait_for_continue()
         self._wait((more,))
 
     # -- methods for the driver
+
+    def begin_part(self, start: int) -> None:
+        """Continue with another part of the text, which begins at this offset."""
+        self._part_start, self._part_begin = start, self._samples.end
+
+    def buffered(self) -> float:
+        """Return how many seconds of sound the player has left. The result is 0 if the sound goes into a file."""
+        if self._feed is None or not self._feed.player.real_time:
+            return 0.0
+        # The clock doesn't count the last milliseconds as heard until all samples have been sent.
+        return max(0.0, self._feed.buffered(time.monotonic()) - MIN_PLAYER_BUFFER_S)
+
+    def await_text(self, until: float) -> None:
+        """Keep playing until more text may have arrived, or until this monotonic time."""
+        self._text_was_missing = True
+        if self._feed is not None:
+            self._with_player(lambda feed: self._await_samples(feed, until=until))
+            return
+        self._wait_for_continue()
+        self._wait(until=until)
 
     def finish(self) -> float:
         """Play the sentence to its end, report its remaining words, and return its length in seconds.
@@ -479,12 +505,12 @@ class Playback:
             if time.monotonic() >= due and not self._runner.hold_number and not self._offer_next(feed):
                 raise CannotSpeak(Reason.AUDIO_STALLED, f"{feed.player.name} accepted no sound for {limit:g} s")
 
-    def _await_samples(self, feed: PlayerFeed, more: Interest) -> None:
-        """Keep playing until the descriptor `more` announces samples or the player needs attention."""
+    def _await_samples(self, feed: PlayerFeed, more: Sequence[Interest] = (), until: float = NEVER) -> None:
+        """Keep playing until a descriptor in `more` is ready, the time is reached or the player needs attention."""
         if self._runner.hold_number:
             self._keep_silent(feed)
         feed.player.ended()  # check for a failure here, because the wait below doesn't report it
-        self._wait_for_player(feed, NEVER, more)
+        self._wait_for_player(feed, until, more, has_samples=False)
         self._update_progress(feed)
         feed.progress_at = time.monotonic()  # until now, the player had nothing to play
 
@@ -540,8 +566,11 @@ class Playback:
         with self._samples.part(self._sent, min(self._sendable_end(feed), self._sent + feed.piece_bytes)) as part:
             silent = feed.silent_for(time.monotonic())
             taken = feed.offer(part)
-        if taken and silent > INAUDIBLE_GAP_S and self._in_background and feed.player.real_time:
-            self.gaps.append(silent)
+        if taken:
+            late = self._in_background and feed.player.real_time and not self._text_was_missing
+            self._text_was_missing = False
+            if late and silent > INAUDIBLE_GAP_S:
+                self.gaps.append(silent)
         self._sent += taken
         return taken
 
@@ -650,16 +679,19 @@ class Playback:
             self._runner.confirm_hold()
             self._wait()
 
-    def _wait_for_player(self, feed: PlayerFeed, until: float, more: Interest | None = None) -> None:
+    def _wait_for_player(
+        self, feed: PlayerFeed, until: float, more: Sequence[Interest] = (), *, has_samples: bool = True
+    ) -> None:
         """Wait until the player needs attention, a word is due or a time limit is reached.
 
         Args:
             feed: the stream of the player.
             until: the monotonic time.
-            more: the descriptor that announces more samples, if there are none to write.
+            more: further descriptors to wait for.
+            has_samples: whether there are samples to write.
         """
         player, now = feed.player, time.monotonic()
-        idle = more is not None or self._has_enough_silence(feed)
+        idle = not has_samples or self._has_enough_silence(feed)
         until = min(until, now + PIECE_S if idle else player.wake_at())
         if player.proven:
             until = min(until, self._clock.next_word_at())
@@ -667,8 +699,7 @@ class Playback:
             until = min(until, now + PROGRESS_CHECK_INTERVAL_S)
         # If there are no samples to write, don't wait for a writable player, because that would end the wait at once.
         interests = [each for each in player.interests() if not (idle and each[1] == select.POLLOUT)]
-        interests += [] if more is None else [more]
-        self._wait(interests, until)
+        self._wait([*interests, *more], until)
 
     def _wait(self, interests: Sequence[Interest] = (), until: float = NEVER) -> None:
         """Let the runner wait and execute commands. If the sentence has been stopped, raise Stopped."""

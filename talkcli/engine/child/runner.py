@@ -17,6 +17,7 @@ import time
 import traceback
 
 from talkcli.engine import protocol
+from talkcli.engine.child.cutting import GrowingText
 from talkcli.engine.child.players.base import CannotSpeak
 from talkcli.engine.child.words import WordFinder
 from talkcli.engine.voices import list_voices
@@ -87,6 +88,11 @@ class ActiveGoal:
     def __init__(self, command: protocol.Speak, now: float) -> None:
         self.id = command.id
         self.command = command
+        #: the text, if it may still grow
+        self.growing_text = GrowingText(command.text, ended=False) if command.more or command.broken else None
+        if self.growing_text and command.broken:
+            self.growing_text.drop_incomplete()
+        self.text_missing = False
         self.words = WordFinder(command.text)
         #: time at which the driver last received text
         self.resumed_at = now
@@ -114,6 +120,16 @@ class ActiveGoal:
         self.error: Exception | None = None
         #: whether a log message has reported that the driver takes too long
         self.overdue_logged = False
+
+    def append(self, command: protocol.Append, now: float) -> None:
+        """Add text to a text that grows, or end it."""
+        assert self.growing_text
+        self.growing_text.append(command.text, now)
+        self.words.append(command.text)
+        if command.broken:
+            self.growing_text.drop_incomplete()
+        elif command.end:
+            self.growing_text.end()
 
     def speech_seconds(self, now: float) -> float:
         """Return how many seconds a third-party driver has spoken the goal, without pauses."""
@@ -231,16 +247,22 @@ class GoalRunner:
             return
         elif isinstance(command, protocol.Stop):
             self._stop_goal()
+        elif isinstance(command, protocol.Append):
+            goal.append(command, time.monotonic())
         elif isinstance(command, protocol.NextGoal):
             handovers = self.players.handovers
             handovers.next_waits, handovers.next_is_neural = command.next_waits, command.next_is_neural
         elif isinstance(command, protocol.Continue):
             self.hold_number = 0
         elif not goal.stop_requested:
-            self.hold_number = command.number
-            if self._pump is not None and goal.with_driver and not goal.interrupted:
-                goal.interrupted = True
-                self._engine.stop()
+            self._pause(goal, command.number)
+
+    def _pause(self, goal: ActiveGoal, number: int) -> None:
+        """Pause the current goal. A third-party driver is stopped, because it can't be paused."""
+        self.hold_number = number
+        if self._pump is not None and goal.with_driver and not goal.interrupted:
+            goal.interrupted = True
+            self._engine.stop()
 
     def _stop_goal(self) -> None:
         """Stop the driver or, if it isn't speaking the current goal, end the goal at once."""
@@ -263,6 +285,18 @@ class GoalRunner:
         if goal is not None and voice != goal.reported_voice:
             goal.reported_voice = voice
             self._channel.send(protocol.VoiceChosen(goal.id, voice, fallback_reason or goal.fallback_reason))
+
+    @property
+    def growing_text(self) -> GrowingText | None:
+        """The text of the current goal if it may still grow, otherwise None."""
+        return self._goal.growing_text if self._goal else None
+
+    def report_text_missing(self, missing: bool) -> None:
+        """Tell the server whether the goal is silent because text is missing, unless the server already knows."""
+        goal = self._goal
+        if goal is not None and missing != goal.text_missing:
+            goal.text_missing = missing
+            self._channel.send(protocol.TextMissing(goal.id, missing))
 
     def confirm_hold(self) -> None:
         """Confirm to the server that the paused goal is silent. Each pause is confirmed only once."""
@@ -295,6 +329,8 @@ class GoalRunner:
             self._fail_goal(error.reason, str(error))
         if self._goal is goal and self._pump is not None and goal.command.lead_in:
             self._fail_goal(Reason.BAD_OPTION, "this driver plays the sound itself, so lead_in can't be used")
+        if self._goal is goal and self._pump is not None and goal.growing_text:
+            self._fail_goal(Reason.BAD_OPTION, "this driver can't speak a text that grows; send it when it is complete")
         goal.error = None
         while self._goal is goal:
             if goal.with_driver:

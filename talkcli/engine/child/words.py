@@ -45,6 +45,10 @@ class WordFinder:
         self._end = 0
         self._count = 0
 
+    def append(self, text: str) -> None:
+        """Add text at the end."""
+        self._text += text
+
     def find(self, location: int, length: int) -> tuple[int, int, int] | None:
         """Return the start, end and number of the word at a reported location, or None if no new word starts there.
 

@@ -20,7 +20,7 @@ from talkcli.daemon.log import RateLimit
 from talkcli.engine import protocol
 from talkcli.engine.parent.process import EngineProcess
 from talkcli.engine.protocol import HANG_LIMIT_S, HOLD_LIMIT_S, KILL_LIMIT_S, START_LIMIT_S, STOP_LIMIT_S
-from talkcli.frozen import frozen
+from talkcli.frozen import frozen, replace
 from talkcli.goals.reasons import Reason
 from talkcli.polling import NEVER, wait_ready
 
@@ -211,6 +211,17 @@ class Supervisor:
         """Submit a goal to be spoken. The previous goal must have ended or been given up."""
         self._actions.call(lambda: self._begin_goal(command))
 
+    def append(self, goal_id: str, text: str, *, end: bool, broken: bool) -> None:
+        """Replace the goal's text by a longer one.
+
+        Args:
+            goal_id: the id of the goal.
+            text: all of the text so far.
+            end: whether it is complete.
+            broken: whether it broke off, so that an incomplete sentence at its end isn't spoken.
+        """
+        self._actions.call(lambda: self._append_text(goal_id, text, end=end, broken=broken))
+
     def stop(self, goal_id: str) -> None:
         """Stop the goal."""
         self._actions.call(lambda: self._stop_goal(goal_id))
@@ -365,6 +376,16 @@ class Supervisor:
             self._lose_process("the engine does not accept commands", Reason.ENGINE_HUNG)
         return False
 
+    def _append_text(self, goal_id: str, text: str, *, end: bool, broken: bool) -> None:
+        """Send the process the new part of the text, and keep the whole text in case the goal must be sent again."""
+        goal = self._current_goal(goal_id)
+        if goal is None:
+            return
+        added = text[len(goal.command.text) :]
+        goal.command = replace(goal.command, text=text, more=not end, broken=broken)
+        if goal.sent:
+            self._send(protocol.Append(goal_id, added, end, broken))
+
     def _hold_goal(self, goal_id: str, number: int | None) -> None:
         """Pause the goal, or resume it if `number` is None."""
         goal = self._current_goal(goal_id)
@@ -471,7 +492,7 @@ class Supervisor:
             goal.started = True
         elif isinstance(event, protocol.Ended):
             self._end_goal(event)
-        elif isinstance(event, protocol.Word | protocol.OutputChanged | protocol.VoiceChosen):
+        elif isinstance(event, protocol.Word | protocol.TextMissing | protocol.OutputChanged | protocol.VoiceChosen):
             self._post(event)
         elif isinstance(event, protocol.Held) and event.number == goal.hold_number:
             goal.hold_due = NEVER

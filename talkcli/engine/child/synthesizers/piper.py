@@ -140,7 +140,8 @@ class Piper:
             sink.begin(description.rate, self.voice)
             with self._espeak.phonemizer(description.espeak_voice) as phonemizer:
                 run = ModelRun()
-                parts = _speak_parts(model, split_text(phonemizer, text), speaker, settings, run)
+                phonemes = split_text(phonemizer, text, ends_sentence=settings.ends_sentence)
+                parts = _speak_parts(model, phonemes, speaker, settings, run)
                 self._write_sound(parts, description.rate, run, sink)
         except MemoryError as error:
             raise CannotSpeak(Reason.VOICE_FAILED, str(no_memory_error(self._path))) from error
