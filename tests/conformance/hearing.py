@@ -58,14 +58,14 @@ def await_word(talk: Talk, goal_id: str, number: int = 3) -> None:
     talk.watcher.wait_until(lambda event: wanted.items() <= event.items(), what=f"word {number} of {goal_id}")
 
 
-def begin(talk: Talk, text: str, *, number: int = 3, **fields: Any) -> str:
+def start_goal(talk: Talk, text: str, *, number: int = 3, **fields: Any) -> str:
     """Send a goal, wait until this word of it is heard, and return its id."""
     goal_id = send(talk, text, **fields)
     await_word(talk, goal_id, number)
     return goal_id
 
 
-def begin_with_client(talk: Talk, text: str, *options: str) -> tuple[str, Process]:
+def start_goal_with_client(talk: Talk, text: str, *options: str) -> tuple[str, Process]:
     """Start a client that waits for its goal, wait until its third word is heard, and return the id and the client."""
     known = {None, *talk.watcher.goals()}
     client = talk.start("say", "--wait", *options, "--", text)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 START = 0.5
 
 
-def speaking(talk: Talk, *words: str) -> tuple[Process, str]:
+def start_speaking(talk: Talk, *words: str) -> tuple[Process, str]:
     """Start a client whose goal never ends, and return it with the goal's id once it is heard."""
     client = talk.start("say", *words, "--", "never-ends words=1")
     goal_id = str(talk.watcher.wait_for(None, "ACTIVE")["id"])
@@ -37,7 +37,7 @@ def speaking(talk: Talk, *words: str) -> tuple[Process, str]:
 
 @limits()
 def test_row_07_clients_of_a_killed_server_report_their_goals_lost(scripted: Talk) -> None:
-    sayer, goal_id = speaking(scripted, "--wait")
+    sayer, goal_id = start_speaking(scripted, "--wait")
     behind = scripted.start("--json", "say", "--wait", "behind it")
     pending_id = scripted.watcher.wait_until(lambda event: bool(event["id"] != goal_id))["id"]
     scripted.kill()
@@ -163,7 +163,7 @@ def test_row_31_any_process_can_get_the_result_of_an_ended_goal(scripted: Talk) 
 @pytest.mark.parametrize("command", ["say", "wait"])
 @limits()
 def test_row_33_ctrl_c_cancels_only_the_clients_own_goal(scripted: Talk, command: str) -> None:
-    client, goal_id = speaking(scripted, "--wait") if command == "say" else speaking(scripted)
+    client, goal_id = start_speaking(scripted, "--wait") if command == "say" else start_speaking(scripted)
     with scripted.connect() as wire:
         if command == "wait":
             assert scripted.finish(client).id == goal_id
@@ -241,7 +241,7 @@ def test_row_35_a_missing_server_is_reported_at_once(words: Sequence[str]) -> No
 @pytest.mark.slow
 def test_row_46_clients_do_not_wait_forever_for_a_frozen_server(scripted: Talk) -> None:
     """All clients wait together for the limit of silence, 16 s."""
-    waiter, goal_id = speaking(scripted, "--wait")
+    waiter, goal_id = start_speaking(scripted, "--wait")
     scripted.freeze()
     started_at = time.monotonic()
     try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from tests.conformance.told import assert_told_in_order
+from tests.conformance.told import assert_event_order
 from tests.conformance.witness import states
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ def test_row_21_a_cancel_that_arrives_before_its_goal_recalls_it(scripted: Talk)
     assert states(scripted, "front-door.1") == ["PENDING", "RECALLED"]
     again = scripted.request("say", text=TEXT, id="front-door.1")
     assert (again["attached"], again["goal"]["state"]) == (True, "RECALLED")
-    assert_told_in_order(scripted)
+    assert_event_order(scripted)
 
 
 def test_row_22_a_goal_sent_twice_is_spoken_once_for_both_senders(scripted: Talk) -> None:
@@ -66,4 +66,4 @@ def test_row_22_the_commands_accept_ids_of_ros_goals(scripted: Talk) -> None:
     assert scripted.run("cancel", own).code == 0
     assert scripted.run("cancel", f"{own}.later").code == 8
     assert scripted.run("say", "--wait", "--id", f"{own}.later", "--", SHORT).code == 6
-    assert_told_in_order(scripted)
+    assert_event_order(scripted)

@@ -15,7 +15,7 @@ import pytest
 
 from tests.conformance.hearing import HELP, PRECISION
 from tests.conformance.stopped import DROPPED
-from tests.conformance.told import assert_told_in_order
+from tests.conformance.told import assert_event_order
 from tests.conformance.witness import ends
 from tests.support import usage
 from tests.support.compare import compare, similarity
@@ -93,7 +93,7 @@ def test_row_17_five_clients_that_send_and_cancel_goals_do_not_deadlock(make_tal
     rejected = [goal_id for goal_id in known if talk.watcher.states(goal_id) == ["REJECTED"]]
     assert set(ends(talk, *(goal_id for goal_id in known if goal_id not in rejected))) == {1}
     assert min(len(client) for client in sent) > seconds, "a client was starved"
-    assert_told_in_order(talk)
+    assert_event_order(talk)
 
 
 def test_row_26_the_last_of_a_thousand_preempting_goals_is_spoken_whole(make_talk: MakeTalk, sink: Sink) -> None:
@@ -121,7 +121,7 @@ def test_row_26_the_last_of_a_thousand_preempting_goals_is_spoken_whole(make_tal
         goals = {event["id"]: event["goal"] for event in talk.watcher.events() if event.get("goal")}
         assert {goals[goal_id]["state"] for goal_id in others} <= {"PREEMPTED", "RECALLED"}
         assert {goals[goal_id]["reason"] for goal_id in others} == {"preempted"}
-        assert_told_in_order(talk)
+        assert_event_order(talk)
         talk.stop()
         assert_within(seconds, 1.0, "taking a thousand goals")
 

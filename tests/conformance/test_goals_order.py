@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from tests.conformance.told import assert_recalled, assert_rejected, assert_told_in_order, submit
+from tests.conformance.told import assert_event_order, assert_recalled, assert_rejected, submit
 from tests.conformance.witness import states
 from tests.support.timing import assert_within, limits
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 ROOT = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 
 
-def begin(talk: Talk, text: str = "never-ends words=1", **fields: object) -> str:
+def start_goal(talk: Talk, text: str = "never-ends words=1", **fields: object) -> str:
     """Send a goal and wait for its first word; return its id."""
     goal_id = str(submit(talk, text, **fields)["id"])
     talk.watcher.wait_for_word(goal_id)
@@ -34,72 +34,70 @@ def begin(talk: Talk, text: str = "never-ends words=1", **fields: object) -> str
 
 def queue(talk: Talk, *priorities: int, text: str = "length=0 waits") -> list[str]:
     """Send goals of these priorities, which wait; return their ids."""
-    return [
-        str(submit(talk, f"{text} {number}", priority=priority)["id"]) for number, priority in enumerate(priorities)
-    ]
+    return [str(submit(talk, f"{text} {number}", priority=level)["id"]) for number, level in enumerate(priorities)]
 
 
-def fill(make_talk: MakeTalk) -> tuple[Talk, str, str]:
+def start_full_server(make_talk: MakeTalk) -> tuple[Talk, str, str]:
     """Return a server without room, its active goal and the only pending one."""
     talk = make_talk("--max-queue", "1", scripted=True)
-    active = begin(talk)
+    active = start_goal(talk)
     return talk, active, queue(talk, 0)[0]
 
 
-def waits(wire: Wire, text: str, **fields: object) -> None:
+def send_patient(wire: Wire, text: str, **fields: object) -> None:
     """Send a goal that waits for room, and return when the server has taken it."""
     wire.send({"request": "say", "text": f"length=0 {text}", "patient": True, "wait": True, **fields})
     assert wire.request("hello")["ok"]
 
 
-def pending(talk: Talk) -> list[str]:
+def pending_ids(talk: Talk) -> list[str]:
     """Return the ids of the goals that wait, in their order."""
     with talk.connect() as wire:
         assert wire.request("status")["ok"]
         return [item["pending"]["id"] for item in wire.items if "pending" in item]
 
 
-def spoken(talk: Talk) -> list[str]:
+def spoken_ids(talk: Talk) -> list[str]:
     """Return the ids of the goals that became ACTIVE, in their order."""
     return [event["id"] for event in talk.watcher.events() if event.get("state") == "ACTIVE"]
 
 
 def test_row_47_a_full_queue_displaces_its_newest_goal_of_lowest_priority(make_talk: MakeTalk) -> None:
     talk = make_talk("--max-queue", "3", scripted=True)
-    active = begin(talk)
+    active = start_goal(talk)
     first, second, third = queue(talk, 0, 0, 0)
     high = submit(talk, "length=0 urgent", priority=5)
     assert high["state"] == "PENDING"
     assert_recalled(talk, third, "displaced", by=high["id"])
     low = talk.run("say", "--wait", "--", "length=0 not now")
     assert (low.code, "not spoken: " in low.err, "the queue is full (3 goals)" in low.err) == (5, True, True)
-    assert pending(talk) == [high["id"], first, second]
+    assert pending_ids(talk) == [high["id"], first, second]
     assert talk.request("cancel", ids=[active])["ok"]
     assert states(talk, second)[-1] == "SUCCEEDED"
-    assert spoken(talk) == [active, high["id"], first, second]
-    assert_told_in_order(talk)
+    assert spoken_ids(talk) == [active, high["id"], first, second]
+    assert_event_order(talk)
 
 
 def test_row_47_a_preempting_goal_displaces_the_newest_queued_goal(make_talk: MakeTalk) -> None:
     """Not even a logger that keeps every place taken silences it."""
     talk = make_talk("--max-queue", "3", scripted=True)
-    active = begin(talk)
+    active = start_goal(talk)
     with talk.connect() as logger:
         for number in range(5):
             logger.send({"request": "say", "text": f"length=0 line {number}", "patient": True})
         assert logger.request("hello")["ok"]
-        lines = pending(talk)
+        lines = pending_ids(talk)
         assert len(lines) == 3
         fire = submit(talk, "length=0 fire", preempt=True)["id"]
         assert_recalled(talk, lines[-1], "displaced", by=fire)
         assert states(talk, fire)[-1] == "SUCCEEDED"
         assert states(talk, active)[-1] == "PREEMPTED"
-    assert_told_in_order(talk)
+    assert_event_order(talk)
 
 
 def test_a_patient_goal_is_accepted_when_there_is_room(make_talk: MakeTalk) -> None:
     talk = make_talk("--max-queue", "2", scripted=True)
-    active = begin(talk)
+    active = start_goal(talk)
     first, second = queue(talk, 0, 0, text="never-ends")
     with talk.connect() as wire:
         wire.send({"seq": 1, "request": "say", "text": "length=0 patient", "patient": True, "wait": True})
@@ -111,29 +109,29 @@ def test_a_patient_goal_is_accepted_when_there_is_room(make_talk: MakeTalk) -> N
         reply = wire.receive()
         assert (reply["seq"], reply["goal"]["state"]) == (1, "PENDING")
         patient = reply["goal"]["id"]
-        assert pending(talk) == [second, patient]
+        assert pending_ids(talk) == [second, patient]
         assert talk.request("cancel", ids=[active, second])["ok"]
         assert wire.receive_event("result")["goal"]["state"] == "SUCCEEDED"
     recalled, queued = talk.watcher.wait_for(first, "RECALLED"), talk.watcher.wait_for(patient, "PENDING")
     assert recalled["n"] < queued["n"]
-    assert_told_in_order(talk)
+    assert_event_order(talk)
 
 
 def test_patient_goals_are_spoken_in_the_order_they_were_sent(make_talk: MakeTalk) -> None:
-    talk, active, waiting = fill(make_talk)
+    talk, active, waiting = start_full_server(make_talk)
     with talk.connect() as wire:
         for number in range(5):
-            waits(wire, f"line {number}")
+            send_patient(wire, f"line {number}")
         assert talk.request("cancel", ids=[active])["ok"]
         results = [wire.receive_event("result")["goal"] for _ in range(5)]
     assert [goal["state"] for goal in results] == ["SUCCEEDED"] * 5
     assert [goal["text"] for goal in results] == [f"length=0 line {number}" for number in range(5)]
-    assert spoken(talk) == [active, waiting, *(goal["id"] for goal in results)]
-    assert_told_in_order(talk)
+    assert spoken_ids(talk) == [active, waiting, *(goal["id"] for goal in results)]
+    assert_event_order(talk)
 
 
 def test_a_later_goal_does_not_take_the_place_of_a_patient_goal(make_talk: MakeTalk) -> None:
-    talk, _, waiting = fill(make_talk)
+    talk, _, waiting = start_full_server(make_talk)
     with talk.connect() as wire:
         wire.send({"seq": 1, "request": "say", "text": "length=0 patient", "patient": True})
         cancel = {"seq": 2, "request": "cancel", "ids": [waiting]}
@@ -144,13 +142,13 @@ def test_a_later_goal_does_not_take_the_place_of_a_patient_goal(make_talk: MakeT
     assert replies[2]["count"] == 1
     assert replies[1]["goal"]["state"] == "PENDING"
     assert_rejected(replies[3]["goal"], "queue_full")
-    assert pending(talk) == [replies[1]["goal"]["id"]]
+    assert pending_ids(talk) == [replies[1]["goal"]["id"]]
     assert talk.request("cancel")["count"] == 2
-    assert_told_in_order(talk)
+    assert_event_order(talk)
 
 
 def test_at_most_a_thousand_goals_of_a_connection_wait_for_room(make_talk: MakeTalk) -> None:
-    talk, _, _ = fill(make_talk)
+    talk, _, _ = start_full_server(make_talk)
     lines = [
         json.dumps({"seq": number, "request": "say", "text": f"length=0 line {number}", "patient": True, "wait": True})
         for number in range(5_001, 6_003)
@@ -164,7 +162,7 @@ def test_at_most_a_thousand_goals_of_a_connection_wait_for_room(make_talk: MakeT
         assert [reply["seq"] for reply in refused] == [6_001, 6_002]
         for reply in refused:
             assert_rejected(reply["goal"], "queue_full", "1,000 ")
-        waits(other, "another's")
+        send_patient(other, "another's")
         assert_within(time.monotonic() - started_at, 0.5, "answers to who sends more than has room")
         wire.items.clear()
         wire.events.clear()
@@ -174,8 +172,8 @@ def test_at_most_a_thousand_goals_of_a_connection_wait_for_room(make_talk: MakeT
         ends = [event["goal"]["text"] for event in wire.events if event["event"] == "result"]
     assert replies == list(range(5_001, 6_001))
     assert ends == [f"length=0 line {number}" for number in replies]
-    assert len(spoken(talk)) == 1
-    assert_told_in_order(talk)
+    assert len(spoken_ids(talk)) == 1
+    assert_event_order(talk)
     states_seen = [event["state"] for event in talk.watcher.events() if event["event"] == "state"]
     # What is being spoken is stopped before a thousand are told that they never will be.
     assert states_seen.index("PREEMPTING") < states_seen.index("PENDING", 3)
@@ -183,7 +181,7 @@ def test_at_most_a_thousand_goals_of_a_connection_wait_for_room(make_talk: MakeT
 
 def test_a_cancel_reports_more_goals_than_the_output_buffer_holds(make_talk: MakeTalk) -> None:
     count = 800
-    talk, _, _ = fill(make_talk)
+    talk, _, _ = start_full_server(make_talk)
     text = "length=0 " + "w" * 9_900  # 20 kB are told of each, four times what may wait in all
     with contextlib.ExitStack() as stack:
         sender, one, other = (stack.enter_context(talk.connect()) for _ in range(3))
@@ -199,22 +197,22 @@ def test_a_cancel_reports_more_goals_than_the_output_buffer_holds(make_talk: Mak
             assert all(reply.result()["ok"] for reply in replies), "one that is being ended is known"
     assert ends == [(f"goal/{number}", "RECALLED") for number in range(count)]
     talk.watcher.wait_for(f"goal/{count - 1}", "RECALLED")
-    assert_told_in_order(talk)
+    assert_event_order(talk)
 
 
 def test_all_clients_get_their_results_at_shutdown_even_beyond_the_output_limit(make_talk: MakeTalk) -> None:
     count = 150
-    talk, _, _ = fill(make_talk)
+    talk, _, _ = start_full_server(make_talk)
     with talk.connect() as wire, ThreadPoolExecutor() as pool:
         for _ in range(count):
-            waits(wire, "🤖" * 9_900)
+            send_patient(wire, "🤖" * 9_900)
         reasons = pool.submit(lambda: [wire.receive_event("result")["goal"]["reason"] for _ in range(count)])
         talk.stop()
         assert reasons.result() == ["shutdown"] * count
 
 
 #: Serves with the scripted engine, and logs how often it looks which goals have room.
-COUNTING = """
+COUNT_CHECKS = """
 import sys
 sys.path.insert(0, {root!r})
 from talkcli.daemon import log
@@ -226,16 +224,14 @@ scripted_serve.main()
 """
 
 
-def test_the_server_looks_for_room_only_after_the_queue_has_changed(
-    make_talk: MakeTalk, tmp_path: pathlib.Path
-) -> None:
+def test_room_is_checked_only_after_the_queue_has_changed(make_talk: MakeTalk, tmp_path: pathlib.Path) -> None:
     program = tmp_path / "serve.py"
-    program.write_text(COUNTING.format(root=ROOT))
+    program.write_text(COUNT_CHECKS.format(root=ROOT))
     talk = make_talk("--max-queue", "1", program=str(program))
-    begin(talk)
+    start_goal(talk)
     queue(talk, 0)
     with talk.connect() as wire:
-        waits(wire, "patient")
+        send_patient(wire, "patient")
         before = talk.log.count("looks for room")
         for _ in range(20):
             assert_rejected(submit(talk, "length=0"), "queue_full")
@@ -260,12 +256,12 @@ def test_a_cancel_ends_the_selected_goals_that_wait_for_room(
     make_talk: MakeTalk, selection: dict[str, Any], chosen: list[str]
 ) -> None:
     talk = make_talk("--max-queue", "1", scripted=True)
-    active = begin(talk, id="early")
+    active = start_goal(talk, id="early")
     (queued,) = queue(talk, 0)
     with talk.connect() as one, talk.connect() as two, talk.connect() as three, talk.connect() as canceling:
         wires = {"one": one, "two": two, "three": three}
         for name, wire in wires.items():
-            waits(wire, name, **({"id": "two"} if name == "two" else {}))
+            send_patient(wire, name, **({"id": "two"} if name == "two" else {}))
         reply = canceling.request("cancel", **selection)
         assert reply["ok"] == ("ids" not in selection)
         ended = [item["canceled"]["text"].split()[-1] for item in canceling.items if "canceled" in item]
@@ -281,7 +277,7 @@ def test_a_cancel_ends_the_selected_goals_that_wait_for_room(
         talk.request("cancel", ids=[active, queued])
         for name in wires.keys() - chosen:
             assert wires[name].receive_event("result")["goal"]["reason"] != "canceled"
-    assert_told_in_order(talk)
+    assert_event_order(talk)
 
 
 def test_settings_are_changed_together_or_not_at_all(scripted: Talk) -> None:
@@ -291,7 +287,7 @@ def test_settings_are_changed_together_or_not_at_all(scripted: Talk) -> None:
     assert scripted.request("set")["settings"] == before
     after = scripted.request("set", rate=300, preempt=True, ttl=5)["settings"]
     assert after == {**before, "rate": 300, "preempt": True, "ttl": 5}
-    active = begin(scripted)
+    active = start_goal(scripted)
     goal = submit(scripted, "length=0 preempts now")
     assert (goal["ttl"], states(scripted, active)[-1]) == (5, "PREEMPTED")
     assert scripted.request("set", ttl=0, preempt=False)["settings"]["ttl"] is None
@@ -379,7 +375,7 @@ def test_row_50_every_event_is_sent_once_and_in_order(make_talk: MakeTalk) -> No
     results = {message["goal"]["id"]: message["goal"] for message in messages if message.get("event") == "result"}
     ended = {goal_id: " ".join(filter(None, (goal["state"], goal["reason"]))) for goal_id, goal in results.items()}
     assert ended == wanted
-    assert_told_in_order(talk)
+    assert_event_order(talk)
     assert sorted(talk.watcher.goals()) == sorted(wanted)
     last = {event["id"]: event["state"] for event in talk.watcher.events() if event["event"] == "state"}
     assert last == {goal_id: reason.split()[0] for goal_id, reason in wanted.items()}

@@ -212,7 +212,7 @@ THIRTY = (
     "please bring the small red box from the table to me and then wait"
 )
 #: The words of it that are told: "in the", "from the" are said as one.
-TOLD = re.sub(r"\b(in|from|of) the\b", r"\1", re.sub("[,;]", "", THIRTY)).split()
+REPORTED_WORDS = re.sub(r"\b(in|from|of) the\b", r"\1", re.sub("[,;]", "", THIRTY)).split()
 #: Ten words with characters of one to four bytes; "from the" and "this one" are said as one, 東京 is told repeatedly.
 TEN = "coming from the café 東京 is 😀 naïve, this one"
 
@@ -278,7 +278,7 @@ def test_word_events_arrive_as_the_words_are_heard(make_talk: MakeTalk, sink: Si
     with limits():
         talk = make_talk("--rate", str(rate), "--player", player, sink=sink)
         measured = measure(talk, THIRTY, rate)
-        assert [THIRTY[word["start"] : word["end"]] for word in measured.words] == TOLD
+        assert [THIRTY[word["start"] : word["end"]] for word in measured.words] == REPORTED_WORDS
         measured.assert_in_time()
 
 
@@ -289,7 +289,7 @@ def test_word_events_of_a_neural_voice_arrive_as_the_words_are_heard(
 ) -> None:
     with limits():
         measured = measure(joe.serve(make_talk, sink, rate=rate), THIRTY, rate, voice=joe)
-        assert [THIRTY[word["start"] : word["end"]] for word in measured.words] == TOLD
+        assert [THIRTY[word["start"] : word["end"]] for word in measured.words] == REPORTED_WORDS
         # How busy the machine is doesn't change where in the sound a word is said to be.
         reference = joe.render_with_words(Sentence(THIRTY, rate))
         beside = [abs(word["time"] - position(reference, word["start"])) for word in measured.words]

@@ -25,12 +25,7 @@ def home(home: str) -> str:
 @pytest.mark.filterwarnings("ignore::platformdirs.RuntimeDirWarning")
 @pytest.mark.parametrize(
     "variables",
-    [
-        *({"XDG_RUNTIME_DIR": folder} for folder in ("run", "gone", "")),
-        {"TMPDIR": "run"},
-        {"TMP": "run"},
-        {"TMPDIR": ""},
-    ],
+    [*({"XDG_RUNTIME_DIR": name} for name in ("run", "gone", "")), {"TMPDIR": "run"}, {"TMP": "run"}, {"TMPDIR": ""}],
     ids=str,
 )
 def test_a_client_looks_where_platformdirs_puts_the_socket(

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.conformance.rawsocket import Raw
-from tests.conformance.told import assert_told_in_order
+from tests.conformance.told import assert_event_order
 from tests.support.patched_serve import patched_serve
 from tests.support.timing import assert_within, limits
 
@@ -39,7 +39,7 @@ def line(**fields: object) -> bytes:
 
 
 @contextlib.contextmanager
-def others_served(talk: Talk, speak: str | None = None) -> Iterator[list[float]]:
+def time_other_client(talk: Talk, speak: str | None = None) -> Iterator[list[float]]:
     """Time status requests on a connection of their own meanwhile, and speak this text at the end."""
     times: list[float] = []
     done = threading.Event()
@@ -77,7 +77,7 @@ def test_10000_requests_with_unread_replies_do_not_delay_other_clients(scripted:
     with limits(), Raw(scripted.socket) as raw:
         requests = b"".join(b'{"seq": %d, "request": "status"}'.ljust(200) % number + b"\n" for number in range(count))
         sender = threading.Thread(target=raw.send, args=(requests,))
-        with others_served(scripted, "length=0") as times:
+        with time_other_client(scripted, "length=0") as times:
             raw.socket.settimeout(30)
             sender.start()
             sender.join(0.5)
@@ -97,7 +97,7 @@ def test_unanswered_requests_do_not_fill_the_servers_memory(scripted: Talk) -> N
     with Raw(scripted.socket) as raw:
         before = peak_memory(scripted.pid)
         sender = threading.Thread(target=raw.send, args=(HELLO * 1_500_000,))
-        with others_served(scripted, "length=0"):
+        with time_other_client(scripted, "length=0"):
             raw.socket.settimeout(20)
             sender.start()
             sender.join(1)
@@ -118,7 +118,7 @@ def test_a_watcher_that_does_not_read_loses_only_feedback(scripted: Talk) -> Non
     text = "length=1 " + "a " * 4_900
     with scripted.connect() as stuck:
         assert stuck.request("watch")["ok"]
-        with others_served(scripted) as times:
+        with time_other_client(scripted) as times:
             goal_id = scripted.request("say", text=text)["goal"]["id"]
             scripted.watcher.wait_for(goal_id, "SUCCEEDED", timeout=30)
         assert stuck.request("hello")["ok"]  # by its reply, all waiting events have been sent
@@ -130,7 +130,7 @@ def test_a_watcher_that_does_not_read_loses_only_feedback(scripted: Talk) -> Non
     unordered = [event for last, event in itertools.pairwise(seen) if event["n"] < last["n"]]
     assert not unordered, f"{len(unordered)} events came late, as {unordered[0]}"
     assert [event["state"] for event in seen if event["event"] == "state"] == ["PENDING", "ACTIVE", "SUCCEEDED"]
-    assert_told_in_order(scripted)  # to a client that reads
+    assert_event_order(scripted)  # to a client that reads
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="the memory of a process is not told here")
@@ -155,9 +155,7 @@ def test_unread_lists_use_limited_memory(make_talk: MakeTalk, kind: str) -> None
 
 
 @pytest.mark.parametrize("share", [0.1, pytest.param(1.0, marks=pytest.mark.slow)])
-def test_slow_clients_are_disconnected_after_their_time_limit(
-    make_talk: MakeTalk, tmp_path: pathlib.Path, share: float
-) -> None:
+def test_slow_clients_are_disconnected_in_time(make_talk: MakeTalk, tmp_path: pathlib.Path, share: float) -> None:
     """All kinds of slow clients at once, for 12 s or a tenth of it. The longest limit is 10 s."""
     first, line, every = share * FIRST_REQUEST, share * LINE, share * ALIVE_EVERY
     constants = {
@@ -177,7 +175,7 @@ def test_slow_clients_are_disconnected_after_their_time_limit(
         waiting.send(b'{"request": "say", "text": "never-ends", "wait": true}\n')
         tls.send(b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(range(11, 255)))
         closed: dict[int, float] = {}
-        times = stack.enter_context(others_served(talk))
+        times = stack.enter_context(time_other_client(talk))
         while time.monotonic() < started_at + 1.2 * line or len(closed) < len(raws) - 2:
             assert time.monotonic() < started_at + line + 2 * LATE, "they are not closed"
             for raw in dripping:

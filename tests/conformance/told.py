@@ -53,7 +53,7 @@ def assert_recalled(talk: Talk, goal_id: str, reason: str, by: str | None = None
     assert by is None or goal["by"] == {"goal": by}, goal
 
 
-def assert_told_in_order(talk: Talk) -> None:
+def assert_event_order(talk: Talk) -> None:
     """Assert the order of section 9 of all goals that there were; all of them must have ended."""
     await_ends(talk, talk.watcher.goals())
     events = talk.watcher.events()

@@ -78,10 +78,7 @@ class Joe:
         return serve_with_voice(make_talk, REAL_VOICE, "--rate", str(rate), *options, sink=sink, env=env)
 
     def render(self, sentences: Sequence[str | Sentence], rate: int = QUICK) -> list[Samples]:
-        return [
-            self._rendered(sentence if isinstance(sentence, Sentence) else Sentence(sentence, rate))
-            for sentence in sentences
-        ]
+        return [self._rendered(text if isinstance(text, Sentence) else Sentence(text, rate)) for text in sentences]
 
     def render_with_words(self, sentence: Sentence) -> Rendering:
         """Return the samples with the words at the places that a speech recognizer hears, behind a pause."""
