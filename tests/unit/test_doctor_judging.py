@@ -152,20 +152,13 @@ def test_the_next_step_after_a_sentence_depends_on_the_earlier_checks() -> None:
     assert str(examine(STALLED, silent=True, server_pid=None).next).startswith("run talk doctor --silent there")
 
 
-def test_a_server_is_to_be_examined_by_the_user_who_runs_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_server_is_to_be_examined_by_the_user_who_runs_it(monkeypatch: pytest.MonkeyPatch) -> None:
     gone = SentenceResult(State.ABORTED, "audio_device", "aplay: audio open error: No such device")
     monkeypatch.setattr(sound, "file_owner", lambda path: 33 if path == "/proc/7" else None)
-    assert str(examine(gone, silent=True, session=UserSession(0, "root")).next).endswith(
-        ": sudo -u '#33' talk doctor --silent"
-    )
+    root = UserSession(0, "root")
+    assert str(examine(gone, silent=True, session=root).next).endswith(": sudo -u '#33' talk doctor --silent")
     monkeypatch.setattr(sound, "file_owner", lambda _: None)  # as if /proc were mounted with hidepid
-    assert (
-        examine(gone, silent=True, session=UserSession(0, "root")).next
-        == examine(gone, silent=True).next
-        == "restart it"
-    )
+    assert examine(gone, silent=True, session=root).next == examine(gone, silent=True).next == "restart it"
 
 
 def test_a_sentence_played_by_a_silent_player_is_reported_as_such() -> None:
@@ -223,17 +216,14 @@ def test_control_characters_are_escaped_in_every_finding() -> None:
         ("unknown_voice", 'unknown voice "x"', "voices", "talk voices"),
     ],
 )
-def test_an_engine_failure_is_reported_by_the_check_of_its_cause(
-    reason: str, message: str, check: str, step: str
-) -> None:
+def test_an_engine_failure_is_reported_by_the_right_check(reason: str, message: str, check: str, step: str) -> None:
     engine = EngineReport(reason=reason, message=message)
     finding = find(voice.judge_engine("2.99", engine, server=None), check)
     assert finding.state == FAILURE
     assert message in finding.message
     assert step in (finding.next or "")
-    assert find(voice.judge_engine("2.99", engine, server="ready"), check).state == WARNING, (
-        "the server has its own engine"
-    )
+    beside_server = voice.judge_engine("2.99", engine, server="ready")
+    assert find(beside_server, check).state == WARNING, "the server has its own engine"
 
 
 def test_a_working_engine_is_reported_with_its_version_and_voices() -> None:
@@ -394,10 +384,8 @@ def test_no_line_is_wider_than_the_terminal(columns: int) -> None:
         assert all("\x1b" not in line or line.endswith("\x1b[0m") or "\x1b[0m  " in line for line in lines)
         if finding.next is not None:
             assert any("-> " in line for line in lines)
-    assert (
-        max(map(len, report.format_conclusion(FINDINGS, screen).splitlines()), default=0) + len("talk: ")
-        <= columns + 12
-    )
+    conclusion = report.format_conclusion(FINDINGS, screen).splitlines()
+    assert max(map(len, conclusion), default=0) + len("talk: ") <= columns + 12
 
 
 def test_in_a_pipe_a_finding_is_one_line_without_colour() -> None:

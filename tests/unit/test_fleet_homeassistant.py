@@ -87,5 +87,5 @@ def test_each_name_has_its_own_topic() -> None:
     names = ["a" + "".join(characters) for length in range(5) for characters in product("._d", repeat=length)]
     assert len({topics.homeassistant_device(name) for name in names}) == len(names)
     assert all(TOPIC.fullmatch(topics.homeassistant_device(name)) for name in names)
-    for name in ("anna", "A_1", "wh-07"):  # must match the pattern of the access rules
+    for name in ("anna", "A_1", "wh-07"):  # their topics match the pattern in the access rules
         assert topics.homeassistant_device(name) == topics.homeassistant_device("%u").replace("%u", name)

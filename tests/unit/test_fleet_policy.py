@@ -76,9 +76,7 @@ def test_a_reply_is_sent_to_a_topic_with_the_robots_name(topic: str, response: s
         *((CANCEL, payload, Cancel()) for payload in (b"", b"anything", b"\xff", b"x" * 100_000)),
     ],
 )
-def test_plain_text_is_literal_and_any_cancel_payload_cancels_all_goals(
-    topic: str, payload: bytes, expected: object
-) -> None:
+def test_plain_text_is_literal_and_any_cancel_payload_cancels_all(topic: str, payload: bytes, expected: object) -> None:
     remote = accepted(decide(request(payload, topic, None)))
     assert (remote.request, remote.reply_topic) == (expected, None)
     assert remote.size_bytes == (0 if topic == CANCEL else len(payload))
@@ -209,7 +207,7 @@ def is_stale(rules: Policy, now: float) -> bool:
 
 
 def return_echo(rules: Policy, sent_at: float, now: float) -> bool:
-    """Return an echo to the robot, and return whether it is the newest one so far."""
+    """Let an echo come back, and return whether it is the newest one so far."""
     before = rules.newest_echo_at
     rules.record_echo(f"{sent_at}".encode(), now)
     return rules.newest_echo_at > before
@@ -247,7 +245,7 @@ def test_an_unknown_echo_is_ignored(unknown: bytes) -> None:
 
 @given(st.lists(st.tuples(st.sampled_from(["send", "return", "wait"]), st.integers(0, 12)), max_size=60))
 def test_messages_older_than_the_newest_echo_allows_are_refused(steps: list[tuple[str, int]]) -> None:
-    """A message that arrives after an echo left the broker after this echo was sent."""
+    """If a message arrives after an echo, the broker forwarded it after the echo was sent."""
     now, proved, rules = 0.0, 0.0, connected(0.0)
     sent: list[float] = []
     for action, number in steps:

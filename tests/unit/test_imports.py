@@ -25,7 +25,7 @@ PACKAGE = Path(talkcli.__file__).parent
 LAYERS = ["ground", "goals", "protocol", "terminal", "daemon", "engine", "client", "server", "fleet", "doctor", "cli"]
 #: The modules of the ground, which import only each other.
 GROUND = {"errors", "frozen", "install", "paths", "peers", "polling", "processes"}
-#: The package itself and its command, which only import other modules.
+#: The package itself and its command, which may import any layer.
 FACE = {"", "__main__"}
 #: The pure modules outside `goals`, `protocol` and `terminal`, which are all pure.
 PURE = [
@@ -45,7 +45,7 @@ FOR_GOALS = {
 }
 #: The files and folders at the top of the project, except hidden ones.
 TOP = {"pyproject.toml", "talkcli", "tests", "completions", "README.md", "CHANGELOG.md", "LICENSE"}
-#: Libraries, and the modules, layers or modules of the ground that may import them.
+#: Libraries, and the layers or modules that may import them.
 ALLOWED = {
     "pyttsx3": {"engine"},
     "espeakng_loader": {"engine"},
@@ -229,7 +229,7 @@ def test_only_the_server_gets_its_path_from_platformdirs() -> None:
 
 
 #: Modules of the commands and doctor that only fleets need. Other modules import them inside functions.
-OF_THE_FLEET = {"cli.fleet", "cli.several", "doctor.broker"}
+FLEET_ONLY = {"cli.fleet", "cli.several", "doctor.broker"}
 
 
 def test_server_doctor_and_fleet_are_imported_only_when_needed() -> None:
@@ -243,9 +243,9 @@ def test_server_doctor_and_fleet_are_imported_only_when_needed() -> None:
                 assert imported.function or imported.typing, f"{where}, which slows down the other commands"
             if part(module) == "fleet":
                 assert part(name) not in {"server", "engine"}, where
-            elif part(name) == "fleet" or name in OF_THE_FLEET:
+            elif part(name) == "fleet" or name in FLEET_ONLY:
                 assert part(module) in {"", "cli", "doctor"}, where
-                assert imported.function or imported.typing or module in OF_THE_FLEET, where
+                assert imported.function or imported.typing or module in FLEET_ONLY, where
 
 
 def test_only_the_engine_imports_its_child_modules() -> None:
@@ -275,7 +275,7 @@ def test_only_the_cli_prints_and_exits() -> None:
             continue
         names = {ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Attribute | ast.Name)}
         exits = names & {"print", "exit", "quit", "SystemExit", "sys.exit", "os._exit", "sys.stdout"}
-        assert exits <= EXITING.get(module, set()), f"talkcli.{module} has {exits}"
+        assert exits <= EXITING.get(module, set()), f"talkcli.{module} uses {exits}"
         assert "sys.stderr" not in names or module in WRITING_STDERR, f"talkcli.{module} writes to standard error"
 
 
@@ -372,7 +372,7 @@ def test_contributing_names_every_file_that_handles_an_option() -> None:
     steps = text.partition("**An option of `say`**")[2].partition("\n\nThe protocol, its checks")[0]
     named = {module_name(PACKAGE / path) for path in re.findall(r"talkcli/([\w/]+\.py)", steps)}
     having = {module for module in sources() if re.search(r"\bttl\b", ast.unparse(sources()[module]))}
-    # The fleet knows only this option, because messages of the broker have a ttl, too.
+    # In a fleet, a ttl is also the expiry of a message. No other option is handled there.
     having -= {module for module in having if part(module) == "fleet"}
     assert named - having == {"engine.protocol"}  # the engine does not get the ttl
     # Examples and help of commands, the doctor's sentence, requests that wait for room, and messages.

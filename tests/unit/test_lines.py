@@ -150,14 +150,9 @@ def test_any_segmentation_gives_the_same_lines(stream: bytes, places: list[int])
     assert unlimited.take_rest() == rest
     kept.append(limited.take_rest())
     assert kept == [line[:LIMIT] for line in (*whole, rest)]
-    assert [line.size if isinstance(line, TruncatedLine) else len(line) for line in kept] == [
-        *map(len, whole),
-        len(rest),
-    ]
-    assert all(
-        isinstance(kept_line, TruncatedLine) == (len(line) > LIMIT)
-        for kept_line, line in zip(kept, (*whole, rest), strict=True)
-    )
+    sizes = [*map(len, whole), len(rest)]
+    assert [line.size if isinstance(line, TruncatedLine) else len(line) for line in kept] == sizes
+    assert [isinstance(line, TruncatedLine) for line in kept] == [size > LIMIT for size in sizes]
 
 
 @pytest.mark.parametrize("limit", [LIMIT, 100])

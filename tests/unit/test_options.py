@@ -183,9 +183,7 @@ def test_the_librarys_parameters_agree_with_the_rows() -> None:
     assert parameters == {option.name: (own[option.name], option.default) for option in rows}
     typed = [option.name for option in rows if option.flags and option.name != "feedback"]
     assert [name for name in parameters if name in typed] == typed
-    assert list(declared(Client.set).items()) == [
-        (option.name, (annotated(Set)[option.name], None)) for option in SETTINGS
-    ]
+    assert list(declared(Client.set).items()) == [(row.name, (annotated(Set)[row.name], None)) for row in SETTINGS]
 
 
 def test_the_fields_of_a_goal_and_of_speak_agree_with_the_rows() -> None:
@@ -202,9 +200,7 @@ def test_the_fields_of_a_goal_and_of_speak_agree_with_the_rows() -> None:
 CARRIED = {"data", "format"}
 
 
-@pytest.mark.parametrize(
-    "option", [option for option in OPTIONS if option.name not in CARRIED], ids=lambda option: option.name
-)
+@pytest.mark.parametrize("option", [row for row in OPTIONS if row.name not in CARRIED], ids=lambda row: row.name)
 def test_every_option_is_used_by_the_code(option: Option) -> None:
     """The scheduler and the server read options from a `Say`, and the engine process reads them from a command."""
     places, owners = ["goals", "server"], {"say", "request"}
@@ -233,14 +229,8 @@ def test_settings_are_shown_with_null_for_unset_values() -> None:
     assert shown == {"rate": 200, "volume": 1.0, "voice": None, "pitch": 50, "preempt": False, "ttl": None}
     assert shown_settings(replace(INITIAL, voice=DEFAULT_VOICE, ttl=0.0)) == shown
     assert describe_settings({**shown, "volume": 0.1 + 0.2, "ttl": 1e6})[1::4] == ["volume 0.3", "ttl 1000000 s"]
-    assert describe_settings(shown) == [
-        "rate 200",
-        "volume 1",
-        "default voice",
-        "pitch 50",
-        "new goals wait",
-        "no ttl",
-    ]
+    defaults = ["rate 200", "volume 1", "default voice", "pitch 50", "new goals wait", "no ttl"]
+    assert describe_settings(shown) == defaults
     changed = shown_settings(replace(INITIAL, voice="de", ttl=2.5, preempt=True))
     assert describe_settings(changed)[2:] == ["voice de", "pitch 50", "new goals interrupt", "ttl 2.5 s"]
 
@@ -262,16 +252,8 @@ def test_the_engine_gets_the_goals_value_or_else_the_servers() -> None:
     general["voice_only"] = False
     assert engine_options(Say("hi"), settings) == general
     own = Say("hi", rate=80, volume=0.0, voice=DEFAULT_VOICE, pitch=0, lead_in=0, audible=False)
-    expected = {
-        "rate": 80,
-        "volume": 0.0,
-        "voice": None,
-        "pitch": 0,
-        "lead_in": 0,
-        "audible": False,
-        "voice_only": False,
-    }
-    assert engine_options(own, settings) == expected
+    expected = {"rate": 80, "volume": 0.0, "voice": None, "pitch": 0, "lead_in": 0, "audible": False}
+    assert engine_options(own, settings) == {**expected, "voice_only": False}
 
 
 def test_the_servers_defaults_agree_with_its_command() -> None:

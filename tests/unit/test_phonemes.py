@@ -16,7 +16,7 @@ PUNCTUATION = {"。": ".", "？": "?", "，": ",", "…": ".", "؟": "?", ";": "
 
 
 class Speller:
-    """A language whose phonemes are its letters. `joined` is spoken as one word, and `spoken` replaces words."""
+    """A language whose letters are phonemes. It speaks `joined` as one word, and replaces the words in `spoken`."""
 
     def __init__(self, joined: str = "", spoken: dict[str, str] | None = None) -> None:
         self._joined = joined
@@ -84,7 +84,7 @@ def test_words_start_at_their_phonemes(text: str, speller: Speller, words: list[
 
 
 def test_a_spelled_word_starts_once_and_later_words_are_not_shifted() -> None:
-    """The library reports a position for each letter of the word, and lengths that include the next word."""
+    """The library reports the position of such a word once per letter, and lengths that include the next word."""
 
     class Spelling(Speller):
         def word_positions(self, clause: str) -> list[tuple[int, int]]:

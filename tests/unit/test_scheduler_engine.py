@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from tests.unit.robot import Robot
 
 EVENTS = ["heard", "completed", "failed", "deaf", "stopped", "voice_chosen", "output_changed"]
-#: A script that ends with one active goal, and with goals in all other states. The stop of e was never confirmed.
+#: A script after which only g is active. The stop of e was never confirmed.
 SCRIPT = "a; completed a; b; failed b; c text=; d; cancel d; stopped d; e; f; cancel f; g; cancel e; pass 2; wait 0; h"
 OUTCOME = "g ACTIVE; h PENDING; a SUCCEEDED; b ABORTED audio_lost; c REJECTED invalid_text; "
 OUTCOME += "d PREEMPTED canceled by door; e ABORTED not_silent by door; f RECALLED canceled by door"

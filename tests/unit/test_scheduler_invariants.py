@@ -186,12 +186,9 @@ class Checked(Robot):
         scheduler = self.scheduler
         waiting = list(scheduler.pending)
         assert len(scheduler.pending) == len(waiting) <= scheduler.max_queue
-        assert [record.say.priority for record in waiting] == sorted(
-            (record.say.priority for record in waiting), reverse=True
-        )
-        plain = [
-            (-record.say.priority, record.number) for record in waiting if record.say.key is None and not record.preempt
-        ]
+        priorities = [goal.say.priority for goal in waiting]
+        assert priorities == sorted(priorities, reverse=True)
+        plain = [(-goal.say.priority, goal.number) for goal in waiting if goal.say.key is None and not goal.preempt]
         assert plain == sorted(plain), "goals of the same priority are not first in, first out"
         keys = [record.say.key for record in waiting if record.say.key is not None]
         assert len(keys) == len(set(keys)), "two pending goals have the same key"

@@ -18,11 +18,7 @@ PACKAGE = Path(talkcli.__file__).parent
 #: Attributes of the scheduler, of its records and of its other objects.
 STATE = {
     *(name for cls in (Record, NeuralVoice) for name in cls.__slots__),
-    *(
-        name
-        for instance in (Scheduler("4k7f", max_queue=1), History(), Queue(), VoiceScheduler())
-        for name in vars(instance)
-    ),
+    *(name for part in (Scheduler("4k7f", max_queue=1), History(), Queue(), VoiceScheduler()) for name in vars(part)),
 }
 #: Objects of the scheduler that other packages may read, with the methods that they may call.
 READ = {"history": {"find", "latest", "log"}, "pending": {"first"}, "voices": {"failure", "to_json"}}

@@ -64,10 +64,7 @@ def test_the_message_names_the_fault_and_counts_from_1(text: str, message: str) 
 @pytest.mark.parametrize(
     ("longest", "limit", "message"),
     [
-        *(
-            (character * 10_000, 10_000, "the text is too long: 10,001 characters (at most 10,000)")
-            for character in "aé日🤖"
-        ),
+        *((sign * 10_000, 10_000, "the text is too long: 10,001 characters (at most 10,000)") for sign in "aé日🤖"),
         ("a" * 5, 5, "the text is too long: 6 characters (at most 5)"),
         ("🤖" * 10_000, 50_000, "the text is too long: 40,001 bytes (at most 40,000)"),
         ("a" * 40_000, 50_000, "the text is too long: 40,001 bytes (at most 40,000)"),
