@@ -1,4 +1,4 @@
-"""Goals that wait for, stop or replace each other, and the settings of each, compared with the sound at the sink."""
+"""Goals that wait for, stop or replace each other, and their settings, compared with the recorded sound."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from tests.conformance import stopped
+from tests.conformance.checks import assert_event_order, assert_recalled, assert_rejected, submit
 from tests.conformance.hearing import (
     HELP,
     HOME,
@@ -29,7 +30,6 @@ from tests.conformance.hearing import (
     start_goal,
     start_goal_with_client,
 )
-from tests.conformance.told import assert_event_order, assert_recalled, assert_rejected, submit
 from tests.conformance.voices import with_both
 from tests.support.compare import assert_heard, assert_only_beginning, assert_silent, compare, loudness
 from tests.support.reference import Sentence
@@ -53,12 +53,12 @@ def talk(make_talk: MakeTalk, sink: Sink, voice: Voice) -> Talk:
 
 
 def start_short_goal(talk: Talk, **fields: Any) -> str:
-    """Send a goal and wait until it is spoken, which leaves half a second for others to come; return its id."""
+    """Send a goal of half a second, wait for its first word, and return its id."""
     return start_goal(talk, HELP, number=1, **fields)
 
 
 def await_spoken(talk: Talk, *goals: str) -> None:
-    """Wait until these goals have ended; all must have been spoken."""
+    """Wait until these goals have ended, and assert that all have SUCCEEDED."""
     for goal_id in goals:
         assert talk.watcher.wait_for_terminal(goal_id, 20) == "SUCCEEDED"
         assert talk.watcher.states(goal_id) == SPOKEN
@@ -87,7 +87,7 @@ def test_row_29_half_the_rate_takes_twice_as_long(make_talk: MakeTalk, sink: Sin
 
 
 def test_row_36_an_expired_goal_is_never_heard(talk: Talk, voice: Voice) -> None:
-    """The goal ends the moment its time runs out, while the sentence of 3 s before it is still being spoken."""
+    """The goal expires on time, while the 3 s sentence before it is still being spoken."""
     long = send(talk, LONG, rate=200)
     goal = send(talk, NEVER, ttl=1)
     after = send(talk, LOW)
@@ -102,7 +102,7 @@ def test_row_36_an_expired_goal_is_never_heard(talk: Talk, voice: Voice) -> None
 
 
 def test_row_37_a_newer_goal_with_the_same_key_takes_the_old_ones_place(talk: Talk, voice: Voice) -> None:
-    """The goal being spoken is not replaced, although it has the same key."""
+    """The active goal is not replaced, although it has the same key."""
     long = start_short_goal(talk, key="battery")
     first = send(talk, "never the first", key="battery")
     other = send(talk, HOME)
@@ -116,7 +116,7 @@ def test_row_37_a_newer_goal_with_the_same_key_takes_the_old_ones_place(talk: Ta
 
 
 def test_row_38_only_a_goal_that_was_heard_throttles_the_next(make_talk: MakeTalk, sink: Sink, voice: Voice) -> None:
-    """A throttled goal is silent and no failure for a script. One that expired or was aborted throttles nothing."""
+    """A throttled goal is silent, and its client exits with 0. An expired or aborted goal throttles nothing."""
     talk = voice.serve(make_talk, sink, "--player", "aplay")
     aborted = start_goal(talk, LONG, key="battery", throttle=60)
     expired = send(talk, NEVER, key="home", throttle=60, ttl=0.1)
@@ -163,12 +163,12 @@ def test_row_40_a_preempting_goal_does_not_interrupt_a_higher_priority(talk: Tal
 
 
 def test_a_goal_uses_the_settings_at_its_start_except_its_own(talk: Talk, voice: Voice) -> None:
-    """A change holds for the goals that have not begun, except for the values that they were sent with."""
+    """A changed setting applies to all goals that have not started, unless a goal was sent with its own value."""
     sentences = [
         Sentence(HELP, rate=QUICK),
         Sentence(LOW, rate=300, volume=0.2),
         Sentence(HOME, rate=350, volume=0.5),
-        Sentence(HELP, rate=350, volume=0),  # takes its time, in silence
+        Sentence(HELP, rate=350, volume=0),  # silent, but as long
         Sentence(LOW, rate=350, volume=0.5),
     ]
     first = start_short_goal(talk)

@@ -1,4 +1,4 @@
-"""Speech that is held and goes on: row 43, compared with the sound at the sink, and the goals meanwhile."""
+"""Row 43: paused and resumed speech, compared with the recorded sound, and goals during a pause."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.conformance import stopped
+from tests.conformance.checks import assert_event_order, assert_recalled, submit
 from tests.conformance.hearing import (
     HELP,
     HOME,
@@ -21,7 +22,6 @@ from tests.conformance.hearing import (
     start_goal,
     start_goal_with_client,
 )
-from tests.conformance.told import assert_event_order, assert_recalled, submit
 from tests.conformance.voices import with_both
 from tests.support.compare import SAME, assert_heard, assert_resumed, assert_silent, compare, extent, find_part
 from tests.support.recording import LOUD
@@ -38,11 +38,11 @@ if TYPE_CHECKING:
 
 SPOKEN = ["PENDING", "ACTIVE", "SUCCEEDED"]
 STOPPED = ["PENDING", "ACTIVE", "PREEMPTING", "PREEMPTED"]
-#: Seconds for which a sentence is held, the shorter time for holding it in another place, and the limit for silence.
+#: Seconds of a pause, of a short pause, and of the limit for silence after `pause`.
 PAUSE_S, SHORT_PAUSE_S, SILENCE_LIMIT_S = 2.0, 0.7, 0.15
-#: Seconds that may be heard again if the player had to be started again.
+#: Seconds that may be heard twice if the player had to be restarted.
 REPEAT_LIMIT_S = 0.05
-#: Samples that the monitor may lose at the start of a stream.
+#: Number of samples that the monitor may drop at the start of a stream.
 SLACK = 256
 
 
@@ -52,21 +52,21 @@ def talk(make_talk: MakeTalk, sink: Sink, voice: Voice) -> Talk:
 
 
 def pause(talk: Talk) -> Message:
-    """Hold speech, and return the reply, after which it is silent."""
+    """Pause speech, and return the reply, after which it is silent."""
     reply = talk.request("pause")
     assert (reply["ok"], reply["paused"]) == (True, True), reply
     return reply
 
 
 def resume(talk: Talk) -> Message:
-    """Let speech go on, and return the reply."""
+    """Resume speech, and return the reply."""
     reply = talk.request("resume")
     assert (reply["ok"], reply["paused"]) == (True, False), reply
     return reply
 
 
 def assert_silent_for(talk: Talk, moment: float, seconds: float) -> None:
-    """Assert that nothing is heard from then on, for so long."""
+    """Assert that nothing is heard for this many seconds after a moment."""
     assert talk.recording.wait_until(moment + seconds, seconds + 1)
     assert_silent(talk.recording.between(moment + PRECISION, moment + seconds))
 
@@ -121,7 +121,7 @@ def test_row_43_a_sentence_paused_twice_is_heard_whole_and_reported(talk: Talk, 
         resume(talk)
         await_word(talk, goal, 8)
         pause(talk)
-        assert pause(talk)["goal"]["id"] == goal  # twice is success
+        assert pause(talk)["goal"]["id"] == goal  # a second pause succeeds
         assert_silent_for(talk, time.monotonic(), 0.5)
         resume(talk)
         assert resume(talk)["goal"]["id"] == goal
@@ -171,11 +171,11 @@ def test_row_43_a_cancelled_paused_goal_ends_at_once_and_stays_silent(talk: Talk
         resume(talk)
         assert talk.watcher.wait_for_terminal(after) == "SUCCEEDED"
         stopped.assert_heard_after_stop(heard(talk), LONG, [LOW], voice=voice)
-        assert_within(seconds, SILENCE_LIMIT_S, "the cancel of a held goal")
+        assert_within(seconds, SILENCE_LIMIT_S, "the cancel of a paused goal")
 
 
 def test_row_43_a_client_times_out_while_speech_is_paused(talk: Talk) -> None:
-    """The client owns the goal: that is cancelled, and the client ends at its time."""
+    """The client cancels its goal, and exits on time."""
 
     with limits():
         started_at = time.monotonic()
@@ -194,7 +194,7 @@ def test_row_43_a_preempting_goal_ends_the_paused_one_and_waits(talk: Talk, voic
     paused = start_goal(talk, LONG, priority=1)
     pause(talk)
     lower = submit(talk, HOME, preempt=True)["id"]
-    assert talk.goal(paused)["paused"] is True  # a lower priority leaves it
+    assert talk.goal(paused)["paused"] is True  # a lower priority does not preempt it
     newcomer = send(talk, LOW, preempt=True, priority=1)
     assert talk.watcher.wait_for_terminal(paused) == "PREEMPTED"
     assert talk.goal(paused)["by"] == {"goal": newcomer}
@@ -219,12 +219,12 @@ def test_row_43_a_long_pause_does_not_trigger_the_watchdog(talk: Talk, voice: Vo
 
 
 def _assert_paused_twice(samples: Samples, reference: Samples) -> None:
-    """Assert that three parts were heard, which together are the sentence, nothing of it missing or heard twice."""
+    """Assert that three parts were heard, which together are the sentence, without gaps or repeated parts."""
     loud = np.flatnonzero(np.abs(samples.astype(np.int32)) > LOUD)
     cuts = np.sort(np.argsort(np.diff(loud))[-2:])
-    assert np.diff(loud)[cuts].min() > SHORT_PAUSE_S / 2 * RATE, "it was not held twice"
+    assert np.diff(loud)[cuts].min() > SHORT_PAUSE_S / 2 * RATE, "it was not paused twice"
     if compare(samples, reference).same:
-        return  # with nothing but silence put in
+        return  # only silence was inserted
     starts, ends = [loud[0], *loud[cuts + 1]], [*loud[cuts], loud[-1]]
     begin, end = extent(reference) or (0, 0)
     wanted = reference[begin:end]

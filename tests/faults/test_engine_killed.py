@@ -169,7 +169,7 @@ def test_a_sound_server_started_by_a_player_keeps_running(make_talk: MakeTalk, t
         finally:
             os.kill(server, signal.SIGTERM)
             while command_line(server) != "ended":
-                time.sleep(0.005)  # it is no child of ours
+                time.sleep(0.005)  # it is not our child
 
 
 #: A library that prints an error with a terminal escape for each text.
