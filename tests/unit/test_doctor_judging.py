@@ -345,6 +345,8 @@ def test_the_result_of_the_sentence_is_shown_with_the_next_step() -> None:
     stalled = SentenceResult(State.ABORTED, "audio_stalled", "aplay accepted no sound for 3 s")
     finding = sentence.judge_sentence(replace(stalled, suspended=("usb",)), silent=False, device=None)
     assert (finding.next, "suspended: usb" in finding.message) == ("pactl suspend-sink usb 0", True)
+    finding = sentence.judge_sentence(replace(played, muted_device="usb"), silent=False, device="usb")
+    assert (finding.state, "pactl set-sink-mute usb 0" in str(finding.next)) == (FAILURE, True)
     late = SentenceResult(State.RECALLED, "late", "not spoken: it was still waiting behind 7 goals after 20 s")
     finding = sentence.judge_sentence(late, silent=False, device=None)
     assert finding.message.startswith("not spoken: it was still waiting behind 7 goals")
