@@ -38,7 +38,7 @@ def busy(scripted: Talk) -> Talk:
     return scripted
 
 
-def test_it_shows_the_settings_and_all_that_is_known_of_each_goal(busy: Talk) -> None:
+def test_status_shows_the_settings_and_the_details_of_each_goal(busy: Talk) -> None:
     done = busy.run("status")
     lines = done.out.splitlines()
     assert (done.code, done.err) == (0, "")
@@ -55,7 +55,7 @@ def test_it_shows_the_settings_and_all_that_is_known_of_each_goal(busy: Talk) ->
 
 
 @pytest.mark.parametrize("columns", [60, 120])
-def test_it_fits_the_terminal(busy: Talk, columns: int) -> None:
+def test_status_fits_the_terminal(busy: Talk, columns: int) -> None:
     with Terminal([*TALK, "status"], {"TERM": "xterm", **busy.env}, columns) as shown:
         assert shown.finish() == 0
         lines = shown.lines
@@ -70,7 +70,7 @@ def test_it_fits_the_terminal(busy: Talk, columns: int) -> None:
     assert b"\x1b[1;32mACTIVE" in shown.raw
 
 
-def test_one_goal_is_shown_with_all_that_is_known(busy: Talk) -> None:
+def test_status_of_one_goal_shows_all_its_details(busy: Talk) -> None:
     pending = json.loads(busy.run("--json", "status").out)["pending"][0]
     lines = dict(each.split(None, 1) for each in busy.run("status", pending["id"]).out.splitlines())
     assert lines["state"] == "PENDING"
@@ -85,7 +85,7 @@ def test_one_goal_is_shown_with_all_that_is_known(busy: Talk) -> None:
     assert f"id       {pending['id']}\n" in busy.run("status", number).out
 
 
-def test_a_foreign_key_is_escaped_and_a_long_text_is_cut_at_200_characters(busy: Talk) -> None:
+def test_keys_are_escaped_and_long_texts_are_cut_at_200_characters(busy: Talk) -> None:
     goal_id = busy.request("say", text="x" * 300, key="a\x1b[31m\n\u202eb")["goal"]["id"]
     for words in (["status"], ["status", goal_id]):
         shown = busy.run(*words).out
@@ -94,7 +94,7 @@ def test_a_foreign_key_is_escaped_and_a_long_text_is_cut_at_200_characters(busy:
     assert f'"{"x" * 200}…"' in busy.run("status").out
 
 
-def test_ids_as_long_as_they_may_be_leave_room_for_the_text(scripted: Talk) -> None:
+def test_ids_of_maximum_length_leave_room_for_the_text(scripted: Talk) -> None:
     scripted.run("say", "--id", "i" * 64, "--wait", "length=0")
     for command in ("status", "log"):
         with Terminal([*TALK, command], {"TERM": "xterm", **scripted.env}, 80) as shown:
@@ -106,7 +106,7 @@ def test_ids_as_long_as_they_may_be_leave_room_for_the_text(scripted: Talk) -> N
 
 
 @pytest.mark.parametrize("columns", [60, 120])
-def test_one_goal_fits_the_terminal_with_all_of_its_text(scripted: Talk, columns: int) -> None:
+def test_status_of_one_goal_wraps_its_whole_text_to_the_terminal(scripted: Talk, columns: int) -> None:
     text = f"length=0 {'ten words of which none may be broken by a line ' * 6}".strip()
     scripted.run("say", "--id", "long", "--wait", text)
     with Terminal([*TALK, "status", "long"], {"TERM": "xterm", **scripted.env}, columns) as shown:
@@ -146,7 +146,7 @@ def settings(talk: Talk) -> dict[str, str]:
     return dict(each.split() for each in done.out.splitlines())
 
 
-def test_alone_it_prints_the_settings(shared: Talk) -> None:
+def test_set_without_options_prints_the_settings(shared: Talk) -> None:
     assert settings(shared) == DEFAULTS
     done = shared.run("set", "--json")
     assert json.loads(done.out) == {
@@ -172,7 +172,9 @@ def test_alone_it_prints_the_settings(shared: Talk) -> None:
         (["--ttl", "0"], "ttl", None, "0"),
     ],
 )
-def test_one_setting_is_changed_alone(shared: Talk, words: list[str], name: str, value: object, shown: str) -> None:
+def test_set_changes_only_the_given_setting(
+    shared: Talk, words: list[str], name: str, value: object, shown: str
+) -> None:
     changed = json.loads(shared.run("--json", "set", *words).out)
     assert changed[name] == value
     assert settings(shared) == {**DEFAULTS, name: shown}
@@ -180,7 +182,7 @@ def test_one_setting_is_changed_alone(shared: Talk, words: list[str], name: str,
     assert {each: described[each] for each in changed} == changed
 
 
-def test_the_printed_settings_can_be_given_back(shared: Talk) -> None:
+def test_the_printed_settings_can_be_used_as_options(shared: Talk) -> None:
     shared.run("set", "--rate", "150", "--volume", str(0.1 + 0.2), "--ttl", "1.5", "--pitch", "60", "--voice", "en")
     assert "volume 0.3, " in shared.log
     before = settings(shared)
@@ -189,14 +191,14 @@ def test_the_printed_settings_can_be_given_back(shared: Talk) -> None:
     assert settings(shared) == before
 
 
-def test_a_wrong_value_changes_nothing(shared: Talk) -> None:
+def test_an_invalid_value_changes_no_setting(shared: Talk) -> None:
     for words in (["--rate", "79"], ["--volume", "nan"], ["--ttl", "inf"], ["--voice", ""], ["60"]):
         done = shared.run("set", "--pitch", "60", *words)
         assert (done.code, done.out, words[0] in done.err) == (2, "", True)
     assert settings(shared) == DEFAULTS
 
 
-def test_an_unknown_voice_is_told_with_one_that_comes_near(shared: Talk) -> None:
+def test_an_unknown_voice_is_refused_with_a_suggestion(shared: Talk) -> None:
     done = shared.run("set", "--rate", "150", "--voice", "scirpted")
     assert (done.code, done.out) == (2, "")
     assert "did you mean 'scripted'?" in done.err
@@ -206,13 +208,13 @@ def test_an_unknown_voice_is_told_with_one_that_comes_near(shared: Talk) -> None
     assert settings(shared) == DEFAULTS
 
 
-def test_the_variables_of_serve_change_nothing(shared: Talk) -> None:
+def test_set_ignores_the_environment_variables_of_serve(shared: Talk) -> None:
     env = {**shared.env, "TALK_RATE": "100", "TALK_VOLUME": "0.1", "TALK_VOICE": "none"}
     assert run([*TALK, "set", "--pitch", "50"], env).code == 0
     assert settings(shared) == DEFAULTS
 
 
-def test_serve_starts_with_its_options(make_talk: MakeTalk) -> None:
+def test_serve_starts_with_the_settings_from_its_options(make_talk: MakeTalk) -> None:
     talk = make_talk("--ttl", "0.5", "--rate", "100", "--pitch", "40", "--preempt", "--lead-in", "250", scripted=True)
     assert settings(talk) == {**DEFAULTS, "ttl": "0.5", "rate": "100", "pitch": "40", "preempt": "yes"}
     server = json.loads(talk.run("--json", "status").out)["server"]
@@ -225,7 +227,7 @@ def test_serve_starts_with_its_options(make_talk: MakeTalk) -> None:
 # talk cancel
 
 
-def test_cancel_stops_the_goals_that_any_selector_selects_and_no_other(scripted: Talk) -> None:
+def test_cancel_stops_exactly_the_goals_that_its_selectors_match(scripted: Talk) -> None:
     active = scripted.run("say", "--key", "battery", "never-ends").id
     scripted.watcher.wait_for_word(active)
     keys = ("door", "battery", "lift", "hall")

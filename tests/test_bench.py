@@ -35,7 +35,7 @@ def stage() -> Iterator[Stage]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("group", [*GROUPS, *NAMED])
-def test_the_rows_of_a_group_measure_something(stage: Stage, group: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_row_of_a_group_measures_something(stage: Stage, group: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if group == "neural":
         real_voice()
     if group == "fleet":
@@ -54,7 +54,7 @@ def test_the_rows_of_a_group_measure_something(stage: Stage, group: str, monkeyp
         assert {form(each.name, each.goal) for each in rows} <= known, f"a table in {BENCHMARK.name} is out of date"
 
 
-def test_readme_tells_what_the_table_has() -> None:
+def test_the_readme_quotes_numbers_from_the_table() -> None:
     told = re.findall(r"\d[\d.,]* (?:ms|MB|%)", README.section("Speed"))
     assert len(told) == 5
     assert set(told) <= {cell for row in TABLES[0] for cell in row}

@@ -96,7 +96,7 @@ def leave_stale(path: str) -> None:
     ],
     ids=["no directory", "no socket", "nobody at the socket"],
 )
-def test_a_server_that_starts_meanwhile_is_reached(
+def test_a_client_reaches_a_server_that_starts_while_it_tries(
     path: str, monkeypatch: pytest.MonkeyPatch, prepare: Callable[[str], None], greetings: list[bytes]
 ) -> None:
     prepare(path)
@@ -118,7 +118,7 @@ def test_a_server_that_starts_meanwhile_is_reached(
         (b"220 mail ready\n", ServerUnavailable),
     ],
 )
-def test_a_server_that_says_no_is_asked_once(
+def test_a_refused_client_does_not_try_again(
     path: str, monkeypatch: pytest.MonkeyPatch, greeting: bytes, error: type[TalkError]
 ) -> None:
     waits = Waits(monkeypatch)
@@ -127,7 +127,7 @@ def test_a_server_that_says_no_is_asked_once(
     assert waits.pauses == []
 
 
-def test_a_place_where_no_server_can_come_is_tried_once(path: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unusable_socket_path_is_tried_once(path: str, monkeypatch: pytest.MonkeyPatch) -> None:
     waits = Waits(monkeypatch)
     os.makedirs(path)
     with pytest.raises(ServerUnavailable, match="a directory, not a socket"):
@@ -139,9 +139,7 @@ def test_a_place_where_no_server_can_come_is_tried_once(path: str, monkeypatch: 
     assert waits.pauses == []
 
 
-def test_a_place_that_is_denied_does_not_end_the_waiting_for_another(
-    path: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_refusal_at_one_socket_does_not_end_the_wait_for_another(path: str, monkeypatch: pytest.MonkeyPatch) -> None:
     denied = f"{path}-denied"
     monkeypatch.setattr("talkcli.paths.client_sockets", lambda _: [path, denied])
     refusal = b'{"talk": 1, "error": "permission_denied", "message": "not you"}\n'
@@ -157,7 +155,7 @@ def test_a_place_that_is_denied_does_not_end_the_waiting_for_another(
 @pytest.mark.parametrize(
     ("keep_trying", "left", "least", "most"), [(0, None, 4, 5), (1, None, 4, 5), (60, None, 50, 60), (2, 2, 1, 2)]
 )
-def test_greeting_and_replies_get_the_remaining_time(
+def test_the_greeting_and_replies_may_take_the_remaining_time(
     path: str, monkeypatch: pytest.MonkeyPatch, keep_trying: float, left: float | None, least: float, most: float
 ) -> None:
     waits = Waits(monkeypatch)
@@ -189,7 +187,7 @@ def trying(path: str, *words: str) -> Iterator[Process]:
         client.wait()
 
 
-def test_a_sentence_is_spoken_once_the_server_is_there(path: str, make_talk: MakeTalk) -> None:
+def test_a_sentence_is_spoken_when_the_server_has_started(path: str, make_talk: MakeTalk) -> None:
     with trying(path, "say", "--wait", "--id", "first", "length=0.1") as client:
         talk = make_talk(scripted=True, env={"TALK_SOCKET": path})
         out, err = client.communicate(timeout=PATIENCE)
@@ -197,7 +195,7 @@ def test_a_sentence_is_spoken_once_the_server_is_there(path: str, make_talk: Mak
     assert talk.watcher.texts("SUCCEEDED") == ["length=0.1"]
 
 
-def test_ctrl_c_ends_the_waiting(path: str) -> None:
+def test_ctrl_c_ends_the_wait_for_a_server(path: str) -> None:
     with trying(path, "say", "--wait", "hello") as client:
         client.send_signal(signal.SIGINT)
         out, err = client.communicate(timeout=PATIENCE)
@@ -213,7 +211,7 @@ def test_ctrl_c_ends_the_waiting(path: str) -> None:
         ("--connect-timeout 60 wait --timeout 0.1", 124),
     ],
 )
-def test_the_shorter_time_ends_the_waiting(path: str, line: str, code: int) -> None:
+def test_the_shorter_of_two_timeouts_ends_the_wait(path: str, line: str, code: int) -> None:
     client = start_talk(line.split(), clean_environment(os.path.dirname(path), {"TALK_SOCKET": path}))
     out, err = client.communicate(timeout=PATIENCE)
     assert (client.wait(), out) == (code, ""), err

@@ -51,7 +51,7 @@ def client(scripted: Talk) -> Iterator[Client]:
 
 
 @pytest.mark.parametrize("event", EVENTS)
-def test_event_goes_to_json_and_back(event: Event) -> None:
+def test_an_event_survives_conversion_to_json_and_back(event: Event) -> None:
     message = json.loads(json.dumps(event.to_json()))
     assert next(iter(message)) == "event"
     assert events.from_json(message) == event
@@ -72,18 +72,18 @@ def test_event_goes_to_json_and_back(event: Event) -> None:
         {"event": "snapshot", "pending": [1]},
     ],
 )
-def test_malformed_event_is_an_error(message: JsonObject) -> None:
+def test_a_malformed_event_is_an_error(message: JsonObject) -> None:
     with pytest.raises(ValueError, match=r"goal|event"):
         events.from_json(message)
 
 
-def test_an_unknown_kind_of_event_is_none() -> None:
+def test_an_unknown_kind_of_event_is_parsed_as_none() -> None:
     for kind in ("alive", None, ["state"]):
         assert events.from_json({"event": kind}) is None
     assert events.from_json({"ok": True}) is None
 
 
-def test_library_is_imported_from_one_place() -> None:
+def test_the_package_exports_every_name_in_all() -> None:
     for name in talkcli.__all__:
         assert getattr(talkcli, name)
     with pytest.raises(AttributeError, match="Speaker"):
@@ -98,7 +98,7 @@ def told(found: list[Event]) -> list[object]:
     ]
 
 
-def test_events_of_a_goal_end_with_its_result(client: Client) -> None:
+def test_the_events_of_a_goal_end_with_its_result(client: Client) -> None:
     handle = client.say("length=0.2 one", feedback=True)
     found = list(handle.events(5))
     assert told(found) == [State.PENDING, State.ACTIVE, "length=0.2", "one", State.SUCCEEDED, Result]
@@ -112,7 +112,7 @@ def test_events_of_a_goal_end_with_its_result(client: Client) -> None:
     assert handle.wait(0) is handle.goal
 
 
-def test_feedback_of_a_goal_sent_without_it_begins_with_the_question(client: Client, scripted: Talk) -> None:
+def test_feedback_can_be_requested_after_a_goal_was_sent(client: Client, scripted: Talk) -> None:
     for follow in (True, False):
         first = client.say("never-ends", follow=follow)
         handle = client.say("length=0.1 one", follow=follow)
@@ -124,7 +124,7 @@ def test_feedback_of_a_goal_sent_without_it_begins_with_the_question(client: Cli
     assert told(list(client.say("length=0").events(5))) == [State.PENDING, State.ACTIVE, State.SUCCEEDED, Result]
 
 
-def test_goal_that_was_rejected_has_a_result_and_no_words(client: Client) -> None:
+def test_a_rejected_goal_has_a_result_and_no_words(client: Client) -> None:
     for handle in (client.say(""), client.say("a" * 100_000, feedback=True)):
         assert [handle.poll(), handle.poll()] == [Result(handle.goal), None]
         assert list(handle.events(1)) == [Result(handle.goal)]
@@ -134,7 +134,7 @@ def test_goal_that_was_rejected_has_a_result_and_no_words(client: Client) -> Non
     assert client.log()[-1].state is State.REJECTED
 
 
-def test_iterator_that_is_broken_off_is_taken_up_again(client: Client) -> None:
+def test_an_interrupted_feedback_loop_can_be_continued(client: Client) -> None:
     handle = client.say("length=0.3 one two three", feedback=True)
     seen: list[str] = []
     for word in handle.feedback(5):
@@ -148,7 +148,7 @@ def test_iterator_that_is_broken_off_is_taken_up_again(client: Client) -> None:
     assert handle.wait(5).state is State.SUCCEEDED
 
 
-def test_two_handles_of_a_goal_hear_the_same(client: Client, scripted: Talk) -> None:
+def test_two_handles_of_a_goal_get_the_same_events(client: Client, scripted: Talk) -> None:
     client.say("never-ends", key="first")
     handle = client.say("length=0.1 one", feedback=True)
     (other,) = client.follow([handle.id], feedback=True)
@@ -160,7 +160,7 @@ def test_two_handles_of_a_goal_hear_the_same(client: Client, scripted: Talk) -> 
     assert told(list(plain.events(5))) == [State.ACTIVE, State.SUCCEEDED, Result]
 
 
-def test_late_feedback_of_an_unknown_goal_is_an_error(client: Client) -> None:
+def test_feedback_of_an_unknown_goal_is_an_error(client: Client) -> None:
     with pytest.raises(UnknownGoal):
         GoalHandle(client._connection, Goal("none-1", State.ACTIVE)).feedback(1)
 
@@ -179,7 +179,7 @@ def polled(handle: GoalHandle) -> list[Event]:
     return found
 
 
-def test_poll_gives_each_event_once_then_the_result_then_nothing(client: Client) -> None:
+def test_poll_returns_each_event_once_then_the_result_then_none(client: Client) -> None:
     handle = client.say("length=0.2 one", feedback=True)
     found = polled(handle)
     assert told(found) == [State.PENDING, State.ACTIVE, "length=0.2", "one", State.SUCCEEDED, Result]
@@ -209,7 +209,7 @@ def test_poll_never_waits(client: Client, scripted: Talk) -> None:
     waiting.join(5)
 
 
-def test_poll_of_a_goal_that_nothing_is_heard_of_says_so(client: Client) -> None:
+def test_poll_of_a_goal_that_is_not_followed_is_an_error(client: Client) -> None:
     handle = client.say("length=0.1", follow=False)
     with pytest.raises(UsageError, match=rf"{handle.id}.*follow=False"):
         handle.poll()
@@ -218,7 +218,7 @@ def test_poll_of_a_goal_that_nothing_is_heard_of_says_so(client: Client) -> None
 
 
 @pytest.mark.parametrize("how", ["killed", "frozen"])
-def test_poll_tells_that_the_goal_is_lost(scripted: Talk, monkeypatch: pytest.MonkeyPatch, how: str) -> None:
+def test_poll_returns_the_result_of_a_lost_goal(scripted: Talk, monkeypatch: pytest.MonkeyPatch, how: str) -> None:
     began = time.monotonic()
     with Client(scripted.socket, timeout=0.5) as client:
         handle = client.say("never-ends words=1")
@@ -247,7 +247,7 @@ def until_all_ended(watch: Iterator[Event], count: int) -> list[Event]:
     return found
 
 
-def test_watch_begins_with_a_snapshot_and_tells_everything(client: Client, scripted: Talk) -> None:
+def test_a_watch_starts_with_a_snapshot_and_then_misses_no_event(client: Client, scripted: Talk) -> None:
     said = client.say("length=0").wait(5)
     active, pending = client.say("never-ends words=1"), client.say("length=0")
     scripted.watcher.wait_for_word(active.id)
@@ -299,7 +299,7 @@ def check_events(events: list[Event], handle: GoalHandle) -> None:
     assert {each.id for each in before if isinstance(each, StateChanged | WordHeard)} == {handle.id}
 
 
-def test_eight_threads_say_hear_wait_and_cancel(make_talk: MakeTalk) -> None:
+def test_eight_threads_can_say_follow_wait_and_cancel_at_once(make_talk: MakeTalk) -> None:
     talk = make_talk("--max-queue", "1000", scripted=True)
     turns, count = 12, 8
     handles: list[GoalHandle] = []
@@ -353,7 +353,7 @@ def test_threads_share_the_events_of_one_goal(scripted: Talk) -> None:
 
 
 @pytest.mark.parametrize("how", ["killed", "closed"])
-def test_end_of_the_connection_ends_every_thread(scripted: Talk, how: str) -> None:
+def test_all_waiting_threads_return_if_the_connection_ends(scripted: Talk, how: str) -> None:
     with Client(scripted.socket, timeout=0.5) as client:
         handles = [client.say("never-ends words=1", feedback=True) for _ in range(6)]
         scripted.watcher.wait_for_word(handles[0].id)

@@ -47,7 +47,7 @@ def client(scripted: Talk) -> Iterator[Client]:
         yield result
 
 
-def test_say_and_wait(scripted: Talk, client: Client) -> None:
+def test_wait_returns_the_ended_goal(scripted: Talk, client: Client) -> None:
     client.pause()  # the goal must still be pending below
     handle = client.say("length=0.1 battery low", data={"from": "the test"})
     assert handle.state is State.PENDING
@@ -66,7 +66,7 @@ def test_say_and_wait(scripted: Talk, client: Client) -> None:
     assert aborted.client == goal.client
 
 
-def test_wait_gives_up_and_the_goal_goes_on(scripted: Talk, client: Client) -> None:
+def test_a_goal_continues_after_a_wait_has_timed_out(scripted: Talk, client: Client) -> None:
     handle = client.say("never-ends")
     began = time.monotonic()
     with pytest.raises(TimeoutError, match=handle.id):
@@ -78,7 +78,7 @@ def test_wait_gives_up_and_the_goal_goes_on(scripted: Talk, client: Client) -> N
     assert handle.cancel() is handle.goal  # again: it has ended
 
 
-def test_cancel_selects(client: Client, scripted: Talk) -> None:
+def test_cancel_stops_only_the_selected_goals(client: Client, scripted: Talk) -> None:
     handles = [client.say(f"never-ends {number}") for number in range(5)]
     scripted.watcher.wait_for_word(handles[0].id)
     assert client.cancel([]).canceled == ()  # none is not all
@@ -101,7 +101,7 @@ def test_cancel_selects(client: Client, scripted: Talk) -> None:
     assert client.cancel().canceled == ()
 
 
-def test_status_goal_voices_and_follow(client: Client, scripted: Talk) -> None:
+def test_status_goal_voices_and_follow_show_the_servers_state(client: Client, scripted: Talk) -> None:
     said = client.say("length=0").wait(5)
     active, pending = client.say("never-ends", follow=False), client.say("never-ends too", follow=False)
     scripted.watcher.wait_for_word(active.id)
@@ -126,7 +126,7 @@ def test_status_goal_voices_and_follow(client: Client, scripted: Talk) -> None:
     assert followed[1].wait(1).state is State.PREEMPTED
 
 
-def test_text_that_cannot_be_spoken_is_a_goal_that_is_rejected(client: Client) -> None:
+def test_a_text_that_cannot_be_spoken_is_a_rejected_goal(client: Client) -> None:
     for text in ("", "\ud800", "a" * 100_000, "a\0b"):
         handle = client.say(text)
         assert (handle.state, handle.wait(1).state) == (State.REJECTED, State.REJECTED)
@@ -134,12 +134,12 @@ def test_text_that_cannot_be_spoken_is_a_goal_that_is_rejected(client: Client) -
         assert handle.goal.text == text
 
 
-def test_name_that_no_server_takes_is_an_error(scripted: Talk) -> None:
+def test_a_client_name_that_is_too_long_is_an_error(scripted: Talk) -> None:
     with pytest.raises(UsageError, match="64"), Client(scripted.socket, name="n" * 65):
         pass
 
 
-def test_say_that_is_not_answered_may_have_been_heard() -> None:
+def test_a_say_without_an_answer_is_an_error() -> None:
     with (
         short_directory() as home,
         FakeServer(f"{home}/s", [GREETING], closes=True),
@@ -151,7 +151,7 @@ def test_say_that_is_not_answered_may_have_been_heard() -> None:
         Client(f"{home}/s")
 
 
-def test_refusal_is_heard_though_the_server_hangs_up_at_once() -> None:
+def test_a_refusal_is_read_even_if_the_server_hangs_up_at_once() -> None:
     says = b'{"talk": 1, "error": "permission_denied", "message": "not you"}\n'
     with short_directory() as home, FakeServer(f"{home}/s", [says], closes=True, listens=False):
         for _ in range(100):  # the server may have hung up before the client says hello
@@ -159,7 +159,7 @@ def test_refusal_is_heard_though_the_server_hangs_up_at_once() -> None:
                 pass
 
 
-def test_closed_client_says_so(client: Client) -> None:
+def test_calls_of_a_closed_client_fail_and_its_goals_are_lost(client: Client) -> None:
     handle = client.say("length=0.2")
     client.close()
     client.close()  # a second time is no error
@@ -169,7 +169,7 @@ def test_closed_client_says_so(client: Client) -> None:
 
 
 @pytest.mark.parametrize("reads", [False, True], ids=["alone", "while a thread reads"])
-def test_a_forked_child_closes_its_copy_and_leaves_its_parents_connection(client: Client, reads: bool) -> None:
+def test_closing_a_client_in_a_forked_child_keeps_the_parents_connection(client: Client, reads: bool) -> None:
     goal = client.say("never-ends words=1", feedback=True)
     next(goal.feedback(5))
     waiting = threading.Thread(target=goal.wait)
@@ -192,7 +192,7 @@ def test_a_forked_child_closes_its_copy_and_leaves_its_parents_connection(client
         waiting.join(5)
 
 
-def test_full_server_turns_goals_away_but_answers_status_and_cancel(make_talk: MakeTalk) -> None:
+def test_a_full_server_answers_urgent_clients_and_refuses_others(make_talk: MakeTalk) -> None:
     talk = make_talk("--max-clients", "1", scripted=True, watched=False)
     with talk.connect() as only:
         goal_id = only.request("say", text="never-ends", wait=True)["goal"]["id"]
@@ -223,7 +223,7 @@ TAKEN = [each for each in OPTIONS if each.name not in {"wait", "format"}]
 
 
 @pytest.mark.parametrize("row", TAKEN, ids=lambda each: each.name)
-def test_value_of_the_wrong_type_is_an_error_and_nothing_is_sent(untouched: Client, row: Option) -> None:
+def test_a_value_of_the_wrong_type_is_refused_and_nothing_is_sent(untouched: Client, row: Option) -> None:
     with pytest.raises(UsageError, match=f"'{row.name}' must be"):
         untouched.say(**{"text": "hello", row.name: object()})  # type: ignore[arg-type]
     if row.setting:
@@ -233,7 +233,7 @@ def test_value_of_the_wrong_type_is_an_error_and_nothing_is_sent(untouched: Clie
 
 
 @pytest.mark.parametrize("options", [{"rate": 79}, {"ttl": math.nan}, {"id": "17"}, {"data": {"a": math.nan}}])
-def test_value_out_of_range_is_an_error_and_nothing_is_sent(untouched: Client, options: dict[str, Any]) -> None:
+def test_a_value_out_of_range_is_refused_and_nothing_is_sent(untouched: Client, options: dict[str, Any]) -> None:
     """`tests/unit/test_options.py` has all limits."""
     with pytest.raises(UsageError):
         untouched.say("hello", **options)
@@ -242,7 +242,7 @@ def test_value_out_of_range_is_an_error_and_nothing_is_sent(untouched: Client, o
     assert (untouched.log(), untouched.settings()) == ([], SETTINGS)
 
 
-def test_options_of_a_goal_arrive(client: Client) -> None:
+def test_the_options_of_a_goal_reach_the_server(client: Client) -> None:
     first = client.say("never-ends")
     told = client.say("hello", priority=-3, ttl=60, key="k", id="mine", data={"a": [1]}, voice="en", throttle=0.1)
     goal = client.goal("mine")
@@ -260,7 +260,7 @@ def test_options_of_a_goal_arrive(client: Client) -> None:
     assert (ended[0].started_at or 0) < (ended[1].started_at or 0)  # of a higher priority: not flushed, and first
 
 
-def test_same_id_again_attaches(client: Client, scripted: Talk) -> None:
+def test_the_same_id_and_text_attach_to_the_existing_goal(client: Client, scripted: Talk) -> None:
     scripted.request("pause")  # no word may come before the second handle is attached
     first = client.say("length=0.2 one", id="door.1", feedback=True)
     with Client(scripted.socket) as other:
@@ -279,7 +279,7 @@ def test_same_id_again_attaches(client: Client, scripted: Talk) -> None:
     assert len(scripted.watcher.words("door.1")) == 2  # it was spoken once
 
 
-def test_patient_goal_waits_for_room(make_talk: MakeTalk) -> None:
+def test_a_patient_goal_waits_for_room_in_the_queue(make_talk: MakeTalk) -> None:
     talk = make_talk("--max-queue", "1", scripted=True)
     with Client(talk.socket) as client, Client(talk.socket) as other:
         active, pending = client.say("never-ends"), client.say("never-ends")
@@ -294,7 +294,7 @@ def test_patient_goal_waits_for_room(make_talk: MakeTalk) -> None:
         assert states == [State.SUCCEEDED]
 
 
-def test_patient_goal_whose_sender_hangs_up_is_not_spoken(make_talk: MakeTalk, tmp_path: Path) -> None:
+def test_a_patient_goal_is_not_spoken_after_its_sender_hangs_up(make_talk: MakeTalk, tmp_path: Path) -> None:
     """The server notices that a waiting client has hung up when it shows that it is alive."""
     talk = make_talk("--max-queue", "1", program=patched_serve(tmp_path, subscribers__CLIENT_ALIVE_INTERVAL_S=0.5))
     with Client(talk.socket) as client:
@@ -312,7 +312,7 @@ def test_patient_goal_whose_sender_hangs_up_is_not_spoken(make_talk: MakeTalk, t
         assert "never heard" not in str(client.log())
 
 
-def test_cancel_by_key(client: Client) -> None:
+def test_cancel_by_key_stops_every_goal_with_that_key(client: Client) -> None:
     active, other = client.say("never-ends", key="k"), client.say("never-ends", key="j")
     pending = client.say("pending", key="k")
     assert {each.id for each in client.cancel(key="k").canceled} == {active.id, pending.id}
@@ -327,7 +327,7 @@ def test_cancel_by_key(client: Client) -> None:
     goal.cancel()
 
 
-def test_parts_of_a_list_of_ids_fit_into_a_line() -> None:
+def test_long_lists_of_ids_are_split_into_lines_of_legal_length() -> None:
     assert batches([]) == []
     assert batches(["a", "b", "a"]) == [("a", "b")]
     for each in ("a" * 64, '"' * 64, "\x01" * 64, "🤖" * 64, "\ud800" * 64, "7"):
@@ -338,7 +338,7 @@ def test_parts_of_a_list_of_ids_fit_into_a_line() -> None:
         assert longest < MAX_LINE_BYTES - 1_000
 
 
-def test_log_is_what_was_said_oldest_first(client: Client) -> None:
+def test_the_log_lists_ended_goals_oldest_first(client: Client) -> None:
     assert client.log() == []
     goals = [client.say(f"length=0 {number}").wait(5) for number in range(3)]
     rejected = client.say("").goal
@@ -349,7 +349,7 @@ def test_log_is_what_was_said_oldest_first(client: Client) -> None:
             client.log(count)
 
 
-def test_settings_are_changed_and_told(client: Client) -> None:
+def test_set_changes_settings_and_returns_them(client: Client) -> None:
     assert client.settings() == SETTINGS
     changed = client.set(rate=150, volume=0.5, voice="en", pitch=60, preempt=True, ttl=30)
     assert changed == {"rate": 150, "volume": 0.5, "voice": "en", "pitch": 60, "preempt": True, "ttl": 30}
@@ -363,7 +363,7 @@ def test_settings_are_changed_and_told(client: Client) -> None:
     assert client.set(rate=200, volume=1.0, pitch=50) == SETTINGS
 
 
-def test_voice_that_the_engine_has_not_cannot_be_set(untouched: Client) -> None:
+def test_an_unknown_voice_cannot_be_set(untouched: Client) -> None:
     with pytest.raises(BadOption, match="klingon") as refused:
         untouched.set(rate=300, voice="klingon")
     assert (refused.value.code, refused.value.exit_code) == ("unknown_voice", 2)
@@ -371,7 +371,7 @@ def test_voice_that_the_engine_has_not_cannot_be_set(untouched: Client) -> None:
     assert untouched.settings() == SETTINGS
 
 
-def test_speech_is_held_and_goes_on(client: Client, scripted: Talk) -> None:
+def test_pause_stops_speech_and_resume_continues_it(client: Client, scripted: Talk) -> None:
     assert client.resume() is None  # speech was not paused
     assert client.pause() is None  # nothing was being spoken
     assert client.status().server["paused"] is True

@@ -73,7 +73,7 @@ def state(name: str, number: int) -> JsonObject:
     return {"event": "state", "id": "g", "state": name, "n": number, "at": 0.0}
 
 
-def test_a_goal_is_sent_followed_and_ends(scripted: Scripted) -> None:
+def test_a_goal_is_sent_and_followed_to_its_result(scripted: Scripted) -> None:
     with Client.over(scripted) as client:
         handle = client.say("a b c")
         assert (client.path, client.server_pid, handle.state) == ("nowhere", None, State.PENDING)
@@ -84,7 +84,7 @@ def test_a_goal_is_sent_followed_and_ends(scripted: Scripted) -> None:
         client.status()
 
 
-def test_a_number_is_a_goal_of_the_server_that_was_reached(scripted: Scripted) -> None:
+def test_a_number_means_a_goal_of_the_connected_server(scripted: Scripted) -> None:
     client = Client.over(scripted)
     client.goal("12")
     client.cancel(["12", "mine"])
@@ -104,7 +104,7 @@ def test_a_handle_needs_no_client(scripted: Scripted) -> None:
     assert scripted.asked[2:] == [Wait(("g",))]
 
 
-def test_polling_an_ended_goal_receives_the_events_of_others(scripted: Scripted) -> None:
+def test_polling_an_ended_goal_receives_events_of_other_goals(scripted: Scripted) -> None:
     ended, other = GoalHandle(scripted, Goal("x", State.SUCCEEDED)), Client.over(scripted).say("a")
     assert [ended.poll(), ended.poll()] == [Result(ended.goal), None]
     scripted.coming = [result()]
@@ -117,7 +117,7 @@ def test_goals_are_followed_as_one_stream(scripted: Scripted) -> None:
     assert [(each, type(event)) for each, event in merged([handle])] == [(handle, StateChanged), (handle, Result)]
 
 
-def test_each_pause_is_in_the_stream_once_also_if_only_some_goals_were_followed_by_then(scripted: Scripted) -> None:
+def test_a_merged_stream_contains_each_pause_once(scripted: Scripted) -> None:
     late, early = (GoalHandle(scripted, Goal(each, State.PENDING)) for each in ("late", "early"))
     pauses = [PausedChanged(paused, None, None, 0.0, n) for n, paused in ((3, True), (5, False), (7, True))]
     early._listen_to(scripted.listeners, feedback=True, now=0.0)

@@ -83,7 +83,7 @@ def restart(talk: Talk) -> None:
 # Without waiting
 
 
-def test_goal_that_is_said_without_waiting_has_an_id_at_once(client: Client) -> None:
+def test_a_nonblocking_say_returns_an_id_at_once(client: Client) -> None:
     handle = client.say("length=0.1 one", feedback=True, block=False)
     assert (handle.state, handle.goal.text) == (State.PENDING, "length=0.1 one")
     assert handle.id.startswith("talk:")
@@ -98,7 +98,7 @@ def test_goal_that_is_said_without_waiting_has_an_id_at_once(client: Client) -> 
     assert client.goal(handle.id).text == "length=0.1 one"
 
 
-def test_goal_that_is_said_without_waiting_can_be_cancelled_at_once(client: Client, scripted: Talk) -> None:
+def test_a_goal_from_a_nonblocking_say_can_be_cancelled_at_once(client: Client, scripted: Talk) -> None:
     handle = client.say("never-ends", block=False)
     handle.request_cancel()
     poll_until(handle, ended)
@@ -107,7 +107,7 @@ def test_goal_that_is_said_without_waiting_can_be_cancelled_at_once(client: Clie
     assert scripted.watcher.terminal_counts()[handle.id] == 1
 
 
-def test_goal_without_waiting_may_be_rejected_or_followed_by_nobody(client: Client) -> None:
+def test_a_nonblocking_say_may_be_rejected_or_not_followed(client: Client) -> None:
     handle = client.say("", block=False)
     assert poll_until(handle, ended)[-1] == Result(handle.goal)
     assert (handle.state, handle.goal.reason) == (State.REJECTED, "invalid_text")
@@ -122,7 +122,7 @@ def test_goal_without_waiting_may_be_rejected_or_followed_by_nobody(client: Clie
         client.say("a", block=False)
 
 
-def test_frozen_server_makes_nobody_wait_and_takes_what_is_left_later(scripted: Talk) -> None:
+def test_calls_do_not_wait_for_a_frozen_server_and_send_the_rest_later(scripted: Talk) -> None:
     """More is said than the socket holds: what is left is sent by later calls, as long as it may still be sent."""
     text = "length=0 " + "a" * 8_000
     with limits(), Client(scripted.socket, timeout=60) as client:
@@ -146,7 +146,7 @@ def test_frozen_server_makes_nobody_wait_and_takes_what_is_left_later(scripted: 
         assert {each.wait(PATIENCE).state for each in handles} == {State.RECALLED}
 
 
-def test_frozen_server_loses_what_was_sent_in_time(scripted: Talk) -> None:
+def test_goals_sent_to_a_frozen_server_are_lost_after_the_timeout(scripted: Talk) -> None:
     with Client(scripted.socket, timeout=0.5) as client:
         scripted.freeze()
         began = time.monotonic()
@@ -160,7 +160,7 @@ def test_frozen_server_loses_what_was_sent_in_time(scripted: Talk) -> None:
         assert client.say("length=0").wait(PATIENCE).state is State.SUCCEEDED
 
 
-def test_partly_sent_goal_is_rejected_and_the_next_connection_is_a_new_one(scripted: Talk) -> None:
+def test_a_partly_sent_goal_is_rejected_and_the_client_reconnects(scripted: Talk) -> None:
     with Client(scripted.socket, timeout=0.5) as client:
         followed = client.say("never-ends")
         scripted.watcher.wait_for(followed.id, "ACTIVE")
@@ -184,7 +184,7 @@ def test_partly_sent_goal_is_rejected_and_the_next_connection_is_a_new_one(scrip
 # Across breaks
 
 
-def test_client_goes_on_with_the_next_server_and_its_goals_are_lost(client: Client, scripted: Talk) -> None:
+def test_a_restart_loses_all_goals_and_the_client_uses_the_new_server(client: Client, scripted: Talk) -> None:
     active, pending = client.say("never-ends"), client.say("never-ends", block=False)
     poll_until(pending, accepted)
     number = active.id.partition("-")[2]
@@ -205,7 +205,7 @@ def test_client_goes_on_with_the_next_server_and_its_goals_are_lost(client: Clie
     assert client.server_pid == scripted.pid
 
 
-def test_goals_of_the_same_server_are_followed_again(client: Client, scripted: Talk) -> None:
+def test_goals_are_followed_again_after_a_reconnect_to_the_same_server(client: Client, scripted: Talk) -> None:
     active = client.say("length=0.6 one two", feedback=True)
     pending, ending = client.say("length=0"), client.say("length=0", priority=1)
     with Client(scripted.socket) as other:
@@ -221,7 +221,7 @@ def test_goals_of_the_same_server_are_followed_again(client: Client, scripted: T
         assert (ending.wait(PATIENCE).state, pending.wait(PATIENCE).state) == (State.RECALLED, State.SUCCEEDED)
 
 
-def test_watching_goes_on_with_another_snapshot(client: Client, scripted: Talk) -> None:
+def test_a_watch_continues_after_a_reconnect_with_a_new_snapshot(client: Client, scripted: Talk) -> None:
     watch = client.events(reconnect=True)
     assert isinstance(next(watch), Snapshot)
     cut(client)
@@ -241,7 +241,7 @@ def test_watching_goes_on_with_another_snapshot(client: Client, scripted: Talk) 
     assert Snapshot in {type(each) for each in seen}
 
 
-def test_threads_that_watch_outlast_an_absence_of_the_server(client: Client, scripted: Talk) -> None:
+def test_watching_threads_survive_a_server_outage(client: Client, scripted: Talk) -> None:
     """One of the threads tries to connect, and the others wait for it without a limit."""
     watches = [client.events(reconnect=True) for _ in range(3)]
     for watch in watches:
@@ -259,7 +259,7 @@ def not_of(event: Event, word: str) -> bool:
     return not (isinstance(event, StateChanged) and event.goal and word in (event.goal.text or ""))
 
 
-def test_calls_fail_at_once_while_there_is_no_server(client: Client, scripted: Talk) -> None:
+def test_calls_fail_at_once_while_no_server_runs(client: Client, scripted: Talk) -> None:
     scripted.kill()
     with limits():
         for act in (client.status, client.cancel, lambda: client.say("a"), client.log):
@@ -277,7 +277,7 @@ def test_calls_fail_at_once_while_there_is_no_server(client: Client, scripted: T
     assert handle.state is State.SUCCEEDED
 
 
-def test_cancel_connects_at_once(client: Client, scripted: Talk) -> None:
+def test_cancel_reconnects_without_a_delay(client: Client, scripted: Talk) -> None:
     scripted.kill()
     for _ in range(20):
         with pytest.raises(ServerUnavailable):
@@ -286,7 +286,7 @@ def test_cancel_connects_at_once(client: Client, scripted: Talk) -> None:
     assert client.cancel().canceled == ()
 
 
-def test_goal_without_a_server_is_rejected_in_time(scripted: Talk) -> None:
+def test_a_goal_without_a_server_is_rejected_after_the_timeout(scripted: Talk) -> None:
     with Client(scripted.socket, timeout=0.5) as client:
         scripted.kill()
         began = time.monotonic()
@@ -299,7 +299,7 @@ def test_goal_without_a_server_is_rejected_in_time(scripted: Talk) -> None:
 
 
 @pytest.mark.parametrize("timeout", [0, -1, float("nan")])
-def test_timeout_must_be_positive(timeout: float) -> None:
+def test_the_timeout_must_be_positive(timeout: float) -> None:
     with pytest.raises(UsageError, match="timeout"):
         Client(timeout=timeout)
 
@@ -344,7 +344,7 @@ print(json.dumps(robot.lateness))
 """
 
 
-def test_loop_of_the_readme_is_never_late_and_speaks_again(scripted: Talk) -> None:
+def test_the_readmes_loop_is_never_late_and_speaks_after_outages(scripted: Talk) -> None:
     """The server is stopped for 7 s and killed once, beside the same loop without `talk`."""
     (example,) = [each for each in README.examples("python", "Use it from Python") if "robot.drives" in each]
     programs = [ROBOT.format(loop=example), ROBOT.format(loop="while robot.drives():\n    pass")]

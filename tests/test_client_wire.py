@@ -30,7 +30,7 @@ def unanswered(peer: Peer) -> None:
     peer.receive("say")
 
 
-def test_answer_to_a_patient_say_may_take_long_as_long_as_the_server_is_alive() -> None:
+def test_a_patient_say_waits_while_the_server_is_alive() -> None:
     def play(peer: Peer) -> None:
         seq = peer.receive("say")["seq"]
         for _ in range(6):
@@ -47,7 +47,7 @@ def test_answer_to_a_patient_say_may_take_long_as_long_as_the_server_is_alive() 
         assert handle.wait(5).state is State.SUCCEEDED
 
 
-def test_answer_to_pause_may_take_long() -> None:
+def test_a_reply_to_pause_may_take_longer_than_the_timeout() -> None:
     def play(peer: Peer) -> None:
         seq = peer.receive("pause")["seq"]
         time.sleep(0.5)
@@ -61,7 +61,7 @@ def test_answer_to_pause_may_take_long() -> None:
         assert client.resume() is None
 
 
-def test_server_that_says_nothing_at_all_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_silent_server_is_considered_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("talkcli.client.core.SILENCE_LIMIT_S", 0.3)
     with serving(unanswered) as path, Client.over(SocketConnection(path, patience=5)) as client:
         began = time.monotonic()
@@ -72,7 +72,7 @@ def test_server_that_says_nothing_at_all_is_given_up(monkeypatch: pytest.MonkeyP
             client.status()
 
 
-def test_watch_goes_on_as_long_as_the_server_is_alive(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_watch_lasts_while_the_server_is_alive(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("talkcli.client.core.SILENCE_LIMIT_S", 0.4)
 
     def play(peer: Peer) -> None:
@@ -89,7 +89,7 @@ def test_watch_goes_on_as_long_as_the_server_is_alive(monkeypatch: pytest.Monkey
             next(watch)
 
 
-def test_feedback_times_out_while_words_go_on() -> None:
+def test_feedback_times_out_even_while_words_arrive() -> None:
     def play(peer: Peer) -> None:
         peer.accept()
         with contextlib.suppress(OSError):
@@ -107,7 +107,7 @@ def test_feedback_times_out_while_words_go_on() -> None:
 
 
 @pytest.mark.parametrize("timeout", [0, 0.1])
-def test_what_has_arrived_by_the_deadline_counts(timeout: float) -> None:
+def test_events_received_by_the_deadline_are_returned(timeout: float) -> None:
     def play(peer: Peer) -> None:
         peer.accept()
         peer.send(peer.state("PENDING"), peer.state("ACTIVE"))
@@ -125,7 +125,7 @@ def test_what_has_arrived_by_the_deadline_counts(timeout: float) -> None:
             next(handle.events(timeout))  # each event is handed out once
 
 
-def test_result_that_came_before_the_server_went_away_counts() -> None:
+def test_a_result_received_before_the_server_disconnects_counts() -> None:
     gone = threading.Event()
 
     def play(peer: Peer) -> None:
@@ -145,7 +145,7 @@ def test_result_that_came_before_the_server_went_away_counts() -> None:
 
 
 @pytest.mark.parametrize("how", ["events", "feedback", "wait"])
-def test_goal_of_a_server_that_goes_away_is_lost(how: str) -> None:
+def test_a_goal_is_lost_if_the_server_disconnects(how: str) -> None:
     def play(peer: Peer) -> None:
         peer.accept()
         peer.send(peer.state("ACTIVE"), peer.word())
@@ -166,7 +166,7 @@ def test_goal_of_a_server_that_goes_away_is_lost(how: str) -> None:
         assert [each for each in handle.events() if isinstance(each, Result)] == [Result(handle.goal)]
 
 
-def test_malformed_message_breaks_the_connection_and_blocks_no_caller() -> None:
+def test_a_malformed_message_ends_the_connection_and_blocks_no_caller() -> None:
     def play(peer: Peer) -> None:
         peer.accept()
         peer.send({**peer.word(), "time": None})
@@ -189,7 +189,7 @@ def interrupt() -> Iterator[tuple[int, int]]:
 @pytest.mark.parametrize(
     "wait", [lambda handle: [*handle.events(5)], lambda handle: [*handle.feedback(5)], GoalHandle.wait]
 )
-def test_interrupt_ends_the_wait_for_a_goal_and_loses_nothing(
+def test_an_interrupt_ends_a_wait_and_loses_no_event(
     interrupt: tuple[int, int], wait: Callable[[GoalHandle], object]
 ) -> None:
     def play(peer: Peer) -> None:
@@ -216,9 +216,7 @@ def test_interrupt_ends_the_wait_for_a_goal_and_loses_nothing(
         ("pause", Client.pause),
     ],
 )
-def test_interrupt_ends_a_call_that_may_take_long(
-    interrupt: tuple[int, int], kind: str, do: Callable[[Client], object]
-) -> None:
+def test_an_interrupt_ends_a_long_call(interrupt: tuple[int, int], kind: str, do: Callable[[Client], object]) -> None:
     def play(peer: Peer) -> None:
         request = peer.receive(kind)
         if kind == "watch":
@@ -231,7 +229,7 @@ def test_interrupt_ends_a_call_that_may_take_long(
             do(client)
 
 
-def test_pause_of_all_speech_is_told_to_those_who_follow_with_feedback() -> None:
+def test_a_handle_with_feedback_gets_pause_events() -> None:
     by = {"client": {"pid": 7, "uid": 0, "command": "talk", "parent": None, "name": "me"}}
     paused = {"event": "paused", "paused": True, "id": "g", "by": by, "n": 50, "at": 3.5}
 
@@ -255,7 +253,7 @@ def test_pause_of_all_speech_is_told_to_those_who_follow_with_feedback() -> None
         assert (handle.speech_paused, handle.goal.paused) == (False, False)
 
 
-def test_watch_ends_with_its_iterator() -> None:
+def test_a_watch_ends_when_its_iterator_is_dropped() -> None:
     def play(peer: Peer) -> None:
         for _ in range(2):
             peer.reply("watch", **OVERVIEW)
@@ -272,7 +270,7 @@ def test_watch_ends_with_its_iterator() -> None:
         assert len(watches) == 0
 
 
-def test_thousands_of_ids_go_in_lines_that_are_not_too_long() -> None:
+def test_thousands_of_ids_are_sent_in_lines_of_legal_length() -> None:
     ids = [f"4k7f-{each}" for each in range(9_000)] + ["é" * 64, "🤖" * 64]
     asked: list[str] = []
 

@@ -47,7 +47,7 @@ def imported(env: dict[str, str], *command: str) -> set[str]:
 
 
 @pytest.mark.parametrize("words", OTHERS, ids=" ".join)
-def test_a_command_imports_nothing_that_it_does_not_use(scripted: Talk, words: tuple[str, ...]) -> None:
+def test_a_command_imports_no_unused_modules(scripted: Talk, words: tuple[str, ...]) -> None:
     found = imported(scripted.env, "-m", "talkcli", *words)
     assert "talkcli" in found
     useless = {*HEAVY, *(CLIENT if " ".join(words) in ALONE else [])}

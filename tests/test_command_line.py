@@ -76,7 +76,7 @@ def error_of(err: str) -> dict[str, Any]:
         (["serve", "--socket-mode", "777"], "--socket-mode: must be a mode such as "),
     ],
 )
-def test_a_mistyped_line_is_told_with_the_next_step(words: list[str], said: str) -> None:
+def test_a_usage_error_suggests_the_next_step(words: list[str], said: str) -> None:
     done = alone(*words)
     assert (done.code, done.out) == (2, "")
     first, *rest = done.err.splitlines()
@@ -85,7 +85,7 @@ def test_a_mistyped_line_is_told_with_the_next_step(words: list[str], said: str)
     assert rest == ([] if "--help" in first else [f"talk: see '{asked} --help'"])
 
 
-def test_json_after_the_command_holds_for_usage_errors_too() -> None:
+def test_json_after_the_command_applies_to_usage_errors() -> None:
     assert error_of(alone("wait", "-t", "soon", "--json").err)["exit"] == 2
     assert error_of(alone("say", "--loud", "hello", "--json").err)["exit"] == 2
 
@@ -100,7 +100,7 @@ def test_a_name_that_is_too_long_is_refused(scripted: Talk) -> None:
 # Output
 
 
-def test_json_shapes(scripted: Talk) -> None:
+def test_json_output_has_the_documented_fields(scripted: Talk) -> None:
     accepted = scripted.run("--json", "say", "never-ends")
     goal = json.loads(accepted.out)
     assert goal.keys() == GOAL
@@ -127,7 +127,7 @@ def test_json_shapes(scripted: Talk) -> None:
     assert unknown.out == ""
 
 
-def test_standard_output_carries_data_only(scripted: Talk) -> None:
+def test_standard_output_contains_only_data(scripted: Talk) -> None:
     failed = scripted.run("say", "--wait", "fail=audio_lost message=no_cable")
     assert re.fullmatch(r"\w{4}-\d+\n", failed.out)
     assert failed.err == f"talk: {failed.id}: speech failed: no cable; find out why with: talk doctor\n"
@@ -138,7 +138,7 @@ def test_standard_output_carries_data_only(scripted: Talk) -> None:
     assert error_of(alone("--json", "status").err)["code"] == "no_server"
 
 
-def test_options_before_and_after_the_command(scripted: Talk) -> None:
+def test_options_work_before_and_after_the_command(scripted: Talk) -> None:
     for words in (["--socket", scripted.socket, "status"], ["status", "--socket", scripted.socket]):
         done = run([*TALK, *words], {**scripted.env, "TALK_SOCKET": "/nowhere"})
         assert done.code == 0, done.err
@@ -154,7 +154,7 @@ def local(scripted: Talk, tmp_path: Path) -> dict[str, str]:
     return {**scripted.env, "TALK_SOCKET": "", "XDG_RUNTIME_DIR": str(tmp_path)}
 
 
-def test_an_empty_socket_option_does_not_mean_the_local_server(scripted: Talk, local: dict[str, str]) -> None:
+def test_an_empty_socket_option_is_refused(scripted: Talk, local: dict[str, str]) -> None:
     for words in (["--socket", "", "say", "hello"], ["--socket=", "cancel"], ["serve", "--socket", ""]):
         done = run([*TALK, *words], local)
         assert (done.code, done.out) == (2, "")
@@ -162,7 +162,7 @@ def test_an_empty_socket_option_does_not_mean_the_local_server(scripted: Talk, l
     assert scripted.watcher.goals() == []
 
 
-def test_empty_variables_count_as_not_set(scripted: Talk, local: dict[str, str]) -> None:
+def test_empty_variables_count_as_unset(scripted: Talk, local: dict[str, str]) -> None:
     for words in (["say", "length=0"], ["say", "--lines"], ["wait"], ["status"], ["voices"]):
         done = run([*TALK, *words], {**local, "TALK_NAME": ""})
         assert done.code == 0, done
@@ -175,7 +175,7 @@ def test_empty_variables_count_as_not_set(scripted: Talk, local: dict[str, str])
             assert client.server_pid == scripted.pid
 
 
-def test_a_name_that_is_not_utf8_speaks_nothing_but_cancels(scripted: Talk, local: dict[str, str]) -> None:
+def test_an_invalid_utf8_name_prevents_speech_but_not_cancel(scripted: Talk, local: dict[str, str]) -> None:
     env = {**local, "TALK_NAME": "n\udcff"}
     said = run([*TALK, "say", "x"], env)
     assert (said.code, said.out) == (2, "")
@@ -185,7 +185,7 @@ def test_a_name_that_is_not_utf8_speaks_nothing_but_cancels(scripted: Talk, loca
     assert scripted.goal(goal)["by"]["client"]["name"] == "n\ufffd"
 
 
-def test_arguments_and_output_are_utf8_whatever_the_locale_is(scripted: Talk) -> None:
+def test_arguments_and_output_are_utf8_in_every_locale(scripted: Talk) -> None:
     ascii_only = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0", "TALK_NAME": "é"}
     words = ["say", "-w", "--key", "日", "--", "length=0 a\udcff b é"]
     done = run([*TALK, *words], {**scripted.env, **ascii_only})
@@ -202,7 +202,7 @@ def test_arguments_and_output_are_utf8_whatever_the_locale_is(scripted: Talk) ->
         assert "日本" in run([*TALK, "status"], env).out
 
 
-def test_foreign_text_never_reaches_a_terminal_raw(scripted: Talk) -> None:
+def test_text_from_others_is_always_escaped(scripted: Talk) -> None:
     goal_id = scripted.run("say", "--as", HOSTILE[:60], "--", f"never-ends {HOSTILE}").id
     scripted.watcher.wait_for_word(goal_id)
     scripted.run("say", "--wait", "--as", "b\x1b]0;title\x07", "-t", "0.1", "--", f"{HOSTILE} pending")
@@ -219,7 +219,7 @@ def test_foreign_text_never_reaches_a_terminal_raw(scripted: Talk) -> None:
 
 
 @pytest.mark.parametrize("command", [["status"], ["watch"], ["say", "--id", "theirs", "-w"]])
-def test_json_on_a_terminal_is_escaped_and_means_the_same(scripted: Talk, command: list[str]) -> None:
+def test_json_on_a_terminal_is_escaped_without_changing_its_meaning(scripted: Talk, command: list[str]) -> None:
     text = f'length=0 {HOSTILE} \x9b31m \x7f \ue000 \U000e0001 "quoted" \\ Grüße 日本 👩'
     scripted.run("say", "--wait", "--id", "theirs", "--as", "\u202epatrol", "--", text)
     words = ["--json", *command, *(["--", text] if command[0] == "say" else [])]
@@ -238,7 +238,7 @@ def test_json_on_a_terminal_is_escaped_and_means_the_same(scripted: Talk, comman
         assert "\x9b31m \x7f" in scripted.run(*words).out
 
 
-def test_colour_is_for_terminals_alone(scripted: Talk) -> None:
+def test_colours_are_used_only_on_terminals(scripted: Talk) -> None:
     scripted.run("say", "--wait", "length=0")
     for extra in ({}, {"NO_COLOR": "1"}, {"TERM": "dumb"}):
         env = {"TERM": "xterm", **scripted.env, **extra}
@@ -255,7 +255,7 @@ def test_colour_is_for_terminals_alone(scripted: Talk) -> None:
 # Standard input
 
 
-def test_standard_input_is_read_only_if_it_is_asked_for(scripted: Talk) -> None:
+def test_standard_input_is_read_only_on_request(scripted: Talk) -> None:
     assert json.loads(scripted.run("--json", "say", "-", stdin="one\ntwo\n").out)["text"] == "one\ntwo"
     assert json.loads(scripted.run("--json", "say", "-", "and", stdin="unread").out)["text"] == "- and"
     for words in (["say", "hello"], ["status"], ["cancel"], ["wait"]):
@@ -263,7 +263,7 @@ def test_standard_input_is_read_only_if_it_is_asked_for(scripted: Talk) -> None:
         assert client.wait(10) == 0
 
 
-def test_a_timeout_may_be_as_long_as_one_likes(scripted: Talk) -> None:
+def test_a_timeout_has_no_upper_limit(scripted: Talk) -> None:
     for seconds in ("inf", "9999999"):
         done = scripted.run("say", "--wait", "--timeout", seconds, "length=0")
         assert done.code == 0, done.err
@@ -273,7 +273,7 @@ def test_a_timeout_may_be_as_long_as_one_likes(scripted: Talk) -> None:
 # The script, and the processes that may answer
 
 
-def test_the_installed_script_is_this_one_and_imports_only_main() -> None:
+def test_the_installed_script_imports_only_main() -> None:
     """What pip makes of an entry point imports `re` first; the wheel brings its own script."""
     script = Path(cli.__file__).with_name("talk")
     assert os.access(script, os.X_OK)
@@ -299,7 +299,7 @@ def test_the_installed_script_is_this_one_and_imports_only_main() -> None:
         (GREETING, 3, "no_server", "connection to the server was lost"),
     ],
 )
-def test_a_process_that_is_no_server_of_this_protocol_is_told(says: bytes, code: int, error: str, words: str) -> None:
+def test_an_incompatible_process_at_the_socket_is_reported(says: bytes, code: int, error: str, words: str) -> None:
     with short_directory() as home, FakeServer(f"{home}/s", [says], closes=True):
         env = clean_environment(home, {"TALK_SOCKET": f"{home}/s"})
         began = time.monotonic()
@@ -310,7 +310,7 @@ def test_a_process_that_is_no_server_of_this_protocol_is_told(says: bytes, code:
     assert words in told["message"]
 
 
-def test_a_place_that_is_no_socket_is_told_from_a_socket_that_a_server_left(tmp_path: Path) -> None:
+def test_a_path_that_is_not_a_socket_is_reported_with_the_next_step(tmp_path: Path) -> None:
     place, file, pipe = (tmp_path / each for each in ("talk", "file", "pipe"))
     place.mkdir()
     file.touch()

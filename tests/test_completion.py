@@ -95,7 +95,7 @@ def busy(make_talk: MakeTalk) -> tuple[Talk, list[str]]:
 
 
 @pytest.mark.parametrize(("shell", "name"), FILES.items())
-def test_the_command_prints_the_scripts_that_are_checked_in(tmp_path: pathlib.Path, shell: str, name: str) -> None:
+def test_the_command_prints_the_checked_in_script(tmp_path: pathlib.Path, shell: str, name: str) -> None:
     assert sorted(os.listdir(CHECKED_IN)) == sorted(FILES.values())
     done = run([*TALK, "completion", shell], environment(str(tmp_path)))
     assert (done.code, done.err) == (0, "")
@@ -106,7 +106,7 @@ def test_the_command_prints_the_scripts_that_are_checked_in(tmp_path: pathlib.Pa
 # Offers
 
 
-def test_much_is_offered_without_a_server(tmp_path: pathlib.Path) -> None:
+def test_commands_options_and_values_are_offered_without_a_server(tmp_path: pathlib.Path) -> None:
     env = environment(str(tmp_path), TALK_SOCKET=f"{tmp_path}/none")
     for line, expected in (
         ("talk sta", {"status"}),
@@ -134,7 +134,7 @@ def test_every_command_and_option_is_offered_with_its_help(tmp_path: pathlib.Pat
         assert not [each for each in options if each not in shown]
 
 
-def test_ids_of_goals_are_offered_with_their_texts(busy: tuple[Talk, list[str]]) -> None:
+def test_goal_ids_are_offered_with_their_texts(busy: tuple[Talk, list[str]]) -> None:
     talk, (ended, active, pending) = busy
     for line in ("talk cancel ", "talk wait ", "talk cancel --before ", f"talk wait {pending} "):
         assert values(line, talk) == [active, pending]
@@ -160,7 +160,7 @@ def test_keys_and_voices_are_offered(busy: tuple[Talk, list[str]]) -> None:
     assert values("talk set --voice=e", talk) == ["--voice=en"]
 
 
-def test_long_texts_are_shortened_and_keys_that_cannot_be_typed_are_left_out(scripted: Talk) -> None:
+def test_long_texts_are_shortened_and_untypable_keys_are_omitted(scripted: Talk) -> None:
     scripted.request("say", text=f"never-ends {'x' * 1000}", key="a\x1b[31mb")
     ((_, words),) = offered("talk cancel ", scripted.env)
     assert len(words) < 80
@@ -170,7 +170,7 @@ def test_long_texts_are_shortened_and_keys_that_cannot_be_typed_are_left_out(scr
     assert values("talk cancel --key ", scripted) == ["fine"]
 
 
-def test_the_server_on_the_line_is_asked(busy: tuple[Talk, list[str]]) -> None:
+def test_completion_asks_the_server_named_on_the_command_line(busy: tuple[Talk, list[str]]) -> None:
     talk, (_, active, pending) = busy
     env = {**talk.env, "TALK_SOCKET": "/nowhere"}
     assert offered("talk cancel ", env) == offered("talk --socket /nowhere cancel ", talk.env) == []
@@ -182,7 +182,7 @@ def test_the_server_on_the_line_is_asked(busy: tuple[Talk, list[str]]) -> None:
         assert [value for value, _ in offered(line, env)] == [active, pending]
 
 
-def test_no_error_is_printed_if_the_offers_cannot_be_written(tmp_path: pathlib.Path) -> None:
+def test_completion_prints_no_error_if_its_output_cannot_be_written(tmp_path: pathlib.Path) -> None:
     env = environment(str(tmp_path), _TALK_COMPLETE="bash_complete", COMP_WORDS="talk ", COMP_CWORD="")
     with open("/dev/full", "wb") as full:
         done = subprocess.run(TALK, env=env, stdout=full, stderr=subprocess.PIPE, check=False)
@@ -191,7 +191,7 @@ def test_no_error_is_printed_if_the_offers_cannot_be_written(tmp_path: pathlib.P
 
 @pytest.mark.parametrize("says", [b"", GREETING, b'{"talk": 9}\n', b"no server of ours\n", None])
 @limits()
-def test_it_is_silent_and_quick_whatever_answers(says: bytes | None) -> None:
+def test_completion_is_silent_and_quick_whatever_the_server_does(says: bytes | None) -> None:
     with short_directory() as home, contextlib.ExitStack() as stack:
         if says is not None:
             stack.enter_context(FakeServer(f"{home}/s", [says]))
@@ -282,7 +282,7 @@ def test_shells_complete_and_quote_ids_keys_and_options(busy: tuple[Talk, list[s
 
 
 @pytest.mark.parametrize("name", SHELLS)
-def test_start_files_of_the_readme_load_it(busy: tuple[Talk, list[str]], name: str) -> None:
+def test_the_readmes_start_files_load_the_completion(busy: tuple[Talk, list[str]], name: str) -> None:
     """The start file of bash loads bash-completion first, as on most machines."""
     talk, _ = busy
     if name == "bash" and not os.path.exists(BASH_COMPLETION):
@@ -298,7 +298,7 @@ def test_start_files_of_the_readme_load_it(busy: tuple[Talk, list[str]], name: s
 
 
 @pytest.mark.parametrize("name", ["zsh", "fish"])
-def test_shells_that_show_help_show_the_texts_of_goals(busy: tuple[Talk, list[str]], name: str) -> None:
+def test_zsh_and_fish_show_the_texts_of_goals(busy: tuple[Talk, list[str]], name: str) -> None:
     talk, _ = busy
     with contextlib.ExitStack() as stack:
         shell = Shell(name, talk, stack)

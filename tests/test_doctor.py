@@ -96,7 +96,7 @@ def logged(talk: Talk) -> list[Message]:
     return [json.loads(line) for line in talk.run("--json", "log").out.splitlines()]
 
 
-def test_if_all_is_well_its_sentence_is_heard_as_its_own_goal(robot: Talk, sink: Sink) -> None:
+def test_without_faults_the_doctors_sentence_is_heard(robot: Talk, sink: Sink) -> None:
     with sink.record() as recording:
         found = doctor(robot.env, code=0)
     assert list(found) == CHECKS
@@ -128,7 +128,7 @@ def test_silent_makes_no_sound_and_shows_one_finding_per_line(robot: Talk, sink:
     assert done.err == f"talk: a sentence is heard, unless the loudspeaker itself is off; {told}\n"
 
 
-def test_silent_waits_for_no_goal_and_leaves_none(robot: Talk) -> None:
+def test_silent_neither_waits_for_goals_nor_adds_any(robot: Talk) -> None:
     """As from cron, every five minutes, whatever is being spoken."""
     before = logged(robot)
     with Client(robot.socket) as client:
@@ -140,7 +140,7 @@ def test_silent_waits_for_no_goal_and_leaves_none(robot: Talk) -> None:
         assert logged(robot) == before
 
 
-def test_a_muted_sink_fails_though_the_sentence_was_played(robot: Talk, sink: Sink) -> None:
+def test_a_muted_sink_is_a_failure_although_the_sentence_was_played(robot: Talk, sink: Sink) -> None:
     sink.pactl("set-sink-mute", "null", "1")
     try:
         found = doctor(robot.env, "--silent")
@@ -150,7 +150,7 @@ def test_a_muted_sink_fails_though_the_sentence_was_played(robot: Talk, sink: Si
     assert (found["loudness"]["state"], found["loudness"]["message"]) == ("failed", "the default sink is muted")
 
 
-def test_the_sound_behind_a_forwarded_socket_is_not_looked_for_here(robot: Talk, sink: Sink) -> None:
+def test_sound_is_not_checked_here_if_the_socket_is_forwarded(robot: Talk, sink: Sink) -> None:
     """With ssh -L, the forwarder answers, and the server's player is on another machine."""
     needs("socat")
     forwarded = f"{robot.socket}.here"
@@ -172,7 +172,7 @@ def test_the_sound_behind_a_forwarded_socket_is_not_looked_for_here(robot: Talk,
     assert extent(recording.samples)
 
 
-def test_silent_plays_zeros_as_the_server_would_play(make_talk: MakeTalk, sink: Sink, tmp_path: Path) -> None:
+def test_silent_plays_zeros_with_the_servers_player_and_device(make_talk: MakeTalk, sink: Sink, tmp_path: Path) -> None:
     script = f"""#!/bin/sh
 printf '%s ' "$@" "$PULSE_SERVER" >> {tmp_path}/called
 tee -a {tmp_path}/played | aplay -q -t raw -f S16_LE -c 1 -r "$1"
@@ -188,7 +188,7 @@ tee -a {tmp_path}/played | aplay -q -t raw -f S16_LE -c 1 -r "$1"
     assert not any(played)
 
 
-def test_a_custom_player_that_fails_is_to_be_tried_by_hand(make_talk: MakeTalk) -> None:
+def test_a_failed_custom_player_is_reported_with_a_command_to_test_it(make_talk: MakeTalk) -> None:
     player = "sh -c 'echo no such card >&2; exit 1'"
     talk = make_talk("--player", player, forked=False)
     step = f"test the player with a second of silence: head -c 44100 /dev/zero | {player}"
@@ -204,7 +204,7 @@ def test_a_custom_player_that_fails_is_to_be_tried_by_hand(make_talk: MakeTalk) 
 
 
 @pytest.mark.slow
-def test_a_sound_server_that_hangs_is_named(make_talk: MakeTalk, private_sink: Callable[[], Sink]) -> None:
+def test_a_hanging_sound_server_is_reported(make_talk: MakeTalk, private_sink: Callable[[], Sink]) -> None:
     sink = private_sink()
     talk = make_talk(sink=sink, forked=False)
     sink.freeze()
@@ -219,7 +219,7 @@ def test_a_sound_server_that_hangs_is_named(make_talk: MakeTalk, private_sink: C
 # The sentence, sent to a server
 
 
-def test_a_paused_server_leaves_no_sentence_behind(scripted: Talk) -> None:
+def test_no_sentence_stays_in_the_queue_of_a_paused_server(scripted: Talk) -> None:
     assert scripted.run("pause").code == 0
     with Client(scripted.socket) as client:
         played = sentence.speak_by_server(client, SENTENCE_TEXT, 10)
@@ -227,7 +227,7 @@ def test_a_paused_server_leaves_no_sentence_behind(scripted: Talk) -> None:
         assert client.status().pending == ()
 
 
-def test_a_sentence_that_waits_too_long_is_taken_back(scripted: Talk) -> None:
+def test_a_sentence_that_waits_too_long_is_cancelled(scripted: Talk) -> None:
     with Client(scripted.socket) as client:
         goals = [client.say(f"{each} never-ends") for each in ("one", "two", "three", "four")]
         began = time.monotonic()
@@ -243,7 +243,7 @@ def test_a_sentence_that_waits_too_long_is_taken_back(scripted: Talk) -> None:
         assert client.status().active is None
 
 
-def test_a_sentence_preempts_no_goal(make_talk: MakeTalk) -> None:
+def test_the_sentence_preempts_no_goal(make_talk: MakeTalk) -> None:
     talk = make_talk("--preempt", scripted=True)
     with Client(talk.socket) as client:
         first = client.say("sentence length=0.5")
@@ -256,7 +256,7 @@ def await_waiting(client: Client) -> None:
         time.sleep(0.01)  # only a watch would tell a client of another's goal
 
 
-def test_a_sentence_that_another_client_cancels_says_so(scripted: Talk) -> None:
+def test_a_sentence_cancelled_by_another_client_is_reported(scripted: Talk) -> None:
     with Client(scripted.socket) as client, Client(scripted.socket) as other, ThreadPoolExecutor(1) as beside:
         other.say("sentence never-ends")
         playing = beside.submit(sentence.speak_by_server, client, SENTENCE_TEXT, LIMIT)
@@ -266,7 +266,7 @@ def test_a_sentence_that_another_client_cancels_says_so(scripted: Talk) -> None:
     assert (played.state, played.reason) == (State.RECALLED, "canceled")
 
 
-def test_a_signal_cancels_its_sentence(scripted: Talk) -> None:
+def test_a_signal_cancels_the_sentence(scripted: Talk) -> None:
     with Client(scripted.socket) as client:
         client.say("sentence never-ends")
         process = scripted.start("doctor")
@@ -283,7 +283,7 @@ def test_a_signal_cancels_its_sentence(scripted: Talk) -> None:
 
 
 @pytest.mark.usefixtures("nobody_serves")
-def test_its_own_engine_is_heard_and_the_server_is_missing(home: str, sink: Sink) -> None:
+def test_without_a_server_the_doctors_own_engine_is_heard(home: str, sink: Sink) -> None:
     with sink.record() as recording:
         found = doctor(environment(home, **sink.env, TALK_SOCKET=f"{home}/s"))
         recording.wait_until_quiet(0.2)
@@ -295,7 +295,7 @@ def test_its_own_engine_is_heard_and_the_server_is_missing(home: str, sink: Sink
 
 
 @pytest.mark.usefixtures("nobody_serves")
-def test_without_any_sound_the_player_s_own_words_are_told(home: str) -> None:
+def test_without_sound_the_players_error_message_is_shown(home: str) -> None:
     needs("aplay")
     found = doctor(environment(home, TALK_PLAYER="aplay", ALSA_CONFIG_PATH="/dev/null"))
     assert found["sentence"]["message"].startswith("ABORTED, audio_device: aplay: audio open error")
@@ -303,14 +303,14 @@ def test_without_any_sound_the_player_s_own_words_are_told(home: str) -> None:
     assert "PULSE_SERVER" in found["sound server"]["message"]
 
 
-def test_without_a_library_the_sentence_fails_as_the_engine_does(home: str, tmp_path: Path) -> None:
+def test_a_missing_library_fails_its_own_check_and_the_sentence(home: str, tmp_path: Path) -> None:
     write(tmp_path / "pyttsx3.py", "raise ModuleNotFoundError('No module named pyttsx3', name='pyttsx3')\n")
     found = doctor({**quick(home), **python_path(tmp_path)})
     assert (found["pyttsx3"]["state"], found["sentence"]["state"]) == ("failed", "failed")
     assert "pip install pyttsx3" in found["pyttsx3"]["next"]
 
 
-def test_a_server_that_goes_away_is_named(home: str) -> None:
+def test_a_server_that_disconnects_is_reported(home: str) -> None:
     greeting = b'{"talk": 1, "version": "0.1", "pid": 1, "boot": "abcd"}\n'
     with FakeServer(f"{home}/s", [greeting], closes=True):
         found = doctor(quick(home), "--silent")["server"]
@@ -319,7 +319,7 @@ def test_a_server_that_goes_away_is_named(home: str) -> None:
     assert "restart it" in found["next"]
 
 
-def test_programs_that_hang_delay_it_and_no_more(home: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hanging_programs_only_delay_the_doctor(home: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("pactl", "aplay", "pw-cli"):
         write(Path(home, "run", name), "#!/bin/sh\nexec sleep 98\n", 0o755)
     env = environment(home, TALK_SOCKET=f"{home}/s")
@@ -335,7 +335,7 @@ def test_programs_that_hang_delay_it_and_no_more(home: str, monkeypatch: pytest.
     assert "does not answer" in found["sound server"]
 
 
-def test_a_signal_ends_it_and_its_engine(home: str) -> None:
+def test_a_signal_ends_the_doctor(home: str) -> None:
     env = environment(home, TALK_SOCKET=f"{home}/s", TALK_PLAYER="sleep 97")
     with subprocess.Popen([*TALK, "doctor"], env=env, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout
@@ -346,7 +346,7 @@ def test_a_signal_ends_it_and_its_engine(home: str) -> None:
         assert process.wait(10) == 128 + 15
 
 
-def test_the_library_stays_out_of_its_own_process(home: str) -> None:
+def test_the_doctors_process_does_not_load_the_speech_libraries(home: str) -> None:
     code = (
         "import sys\nfrom talkcli.doctor.examine import LocalExamination\n"
         "found = [each.check for each in LocalExamination(None, silent=True).findings()]\n"

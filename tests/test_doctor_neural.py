@@ -75,7 +75,7 @@ def test_the_voice_in_use_is_loaded_and_timed(alone: dict[str, str]) -> None:
     assert list(checks)[3:8] == ["voices", "neural", "voice files", "neural voice", "session"]
 
 
-def test_wrong_files_are_named_one_after_the_other_with_the_next_step(alone: dict[str, str], home: str) -> None:
+def test_faulty_files_are_reported_one_by_one_with_the_next_step(alone: dict[str, str], home: str) -> None:
     place = Path(home) / "v"
     for name in ("a", "b", "c"):
         tiny_voice.put(place, name)
@@ -104,7 +104,7 @@ def test_wrong_files_are_named_one_after_the_other_with_the_next_step(alone: dic
     ],
     ids=["garbage", "another's json"],
 )
-def test_a_voice_that_cannot_speak_says_why(
+def test_the_fault_of_a_voice_that_cannot_speak_is_reported(
     alone: dict[str, str], home: str, model: bytes | None, speakers: int, words: str, step: str
 ) -> None:
     tiny_voice.put(Path(home) / "v", "bad", model or tiny_voice.model(speakers=speakers))
@@ -122,7 +122,7 @@ def test_a_voice_that_cannot_speak_says_why(
         ("raise ImportError('no libgomp.so.1')", "ImportError: no libgomp.so.1", "install it again", None),
     ],
 )
-def test_a_broken_package_is_a_finding(tmp_path: Path, code: str, words: str, step: str, used: str | None) -> None:
+def test_a_broken_package_is_reported(tmp_path: Path, code: str, words: str, step: str, used: str | None) -> None:
     needs_packages(*NEURAL_PACKAGES)
     package = f"import os\nassert os.environ['ORT_DISABLE_TELEMETRY'] == '1'\n{code}\n"
     (tmp_path / "onnxruntime.py").write_text(package)
@@ -133,7 +133,7 @@ def test_a_broken_package_is_a_finding(tmp_path: Path, code: str, words: str, st
     assert "neural voice" not in found
 
 
-def test_slow_packages_are_not_to_be_installed_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_slow_import_is_not_reported_as_a_broken_package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     needs_packages(*NEURAL_PACKAGES)
     monkeypatch.setattr(voice, "_IMPORT_LIMIT_S", 0.2)
     (tmp_path / "onnxruntime.py").write_text("import time\ntime.sleep(60)\n")
@@ -141,7 +141,7 @@ def test_slow_packages_are_not_to_be_installed_again(monkeypatch: pytest.MonkeyP
     assert (found.state, found.next) == (WARNING, "run talk doctor again when this machine is less busy")
 
 
-def test_the_server_s_voice_is_tried_in_its_environment(alone: dict[str, str]) -> None:
+def test_the_servers_voice_is_tried_in_the_servers_environment(alone: dict[str, str]) -> None:
     silent = {name: value for name, value in alone.items() if name != "TALK_PLAYER"}
     with serving(silent, "--voice", "piper/ti"), Client(alone["TALK_SOCKET"]) as client:
         limit = time.monotonic() + LIMIT
@@ -168,7 +168,7 @@ def started(voice: str | None = None, *voices: str, driver: str = "espeak") -> E
 ESPEAK = started()
 
 
-def test_only_a_voice_that_is_used_is_tried(home: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_the_voice_in_use_is_tried(home: str, monkeypatch: pytest.MonkeyPatch) -> None:
     tiny_voice.put(Path(home) / "v", "tiny")
     asked: list[str | None] = []
 
@@ -203,7 +203,7 @@ def test_only_a_voice_that_is_used_is_tried(home: str, monkeypatch: pytest.Monke
     assert tried(None, ESPEAK, SERVED, neural_voices=voices) == [None]
 
 
-def test_without_neural_voices_nothing_of_them_is_imported() -> None:
+def test_without_neural_voices_their_packages_are_not_imported() -> None:
     code = """
 import sys
 from talkcli.doctor import examine
@@ -219,12 +219,12 @@ assert not {"onnxruntime", "numpy"} & {*sys.modules}, sys.modules.keys()
 # How a voice is tried
 
 
-def test_a_voice_that_takes_too_long_is_given_up(alone: dict[str, str]) -> None:
+def test_the_trial_of_a_slow_voice_is_aborted(alone: dict[str, str]) -> None:
     found = _found("piper/tiny", alone, 0.01)["neural voice"]
     assert found.message == "piper/tiny is in use: loading and speaking took more than 0.01 s"
 
 
-def test_a_voice_that_kills_the_engine_process_is_a_fact(home: str, tmp_path: Path) -> None:
+def test_a_voice_that_crashes_the_engine_process_is_reported(home: str, tmp_path: Path) -> None:
     needs_packages(*NEURAL_PACKAGES)
     tiny_voice.put(Path(home) / "v", "tiny")
     dies = (
@@ -252,7 +252,7 @@ def test_a_signal_ends_the_trial(alone: dict[str, str]) -> None:
 FAILED_THEN = {"piper/a": {"state": "loaded", "why": None}, "piper/b": {"state": "failed", "why": "x is no model"}}
 
 
-def test_a_server_s_words_about_its_voices_are_told_if_they_cannot_be_examined() -> None:
+def test_the_servers_status_is_reported_if_voices_cannot_be_examined() -> None:
     (found,) = voice.judge_server_voices(FAILED_THEN)
     assert (found.state, found.message) == (WARNING, "the server cannot speak with the voice piper/b: x is no model")
     assert found.next == "check whether this is still true: talk set --voice piper/b"
@@ -261,7 +261,7 @@ def test_a_server_s_words_about_its_voices_are_told_if_they_cannot_be_examined()
     assert voice.judge_server_voices({}) == []
 
 
-def test_a_voice_that_speaks_here_and_that_the_server_has_given_up_is_a_warning() -> None:
+def test_a_voice_that_fails_only_on_the_server_is_a_warning() -> None:
     trial = VoiceTrial(load_s=0.5, speed=9.0)
     assert voice.judge_trial("piper/b", trial, FAILED_THEN).state == WARNING
     assert voice.judge_trial("piper/b", trial, {}).state == OK
@@ -272,7 +272,7 @@ def _judged(**tried: object) -> Finding:
     return voice.judge_trial("piper/a", trial, None)
 
 
-def test_on_a_slow_machine_another_voice_is_the_next_step() -> None:
+def test_on_a_slow_machine_a_faster_voice_is_suggested() -> None:
     slow = _judged(load_s=3.04, speed=1.29, memory_bytes=250_400_000)
     assert slow.state == WARNING
     assert slow.message.startswith(
@@ -283,7 +283,7 @@ def test_on_a_slow_machine_another_voice_is_the_next_step() -> None:
     assert "MB" not in _judged(speed=2.0).message
 
 
-def test_a_voice_that_fails_is_a_warning_if_a_server_speaks_with_espeak_instead(
+def test_a_failed_voice_is_a_warning_if_the_server_falls_back_to_espeak(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(voice, "_find_package_fault", lambda _: ("onnxruntime is missing", "install it"))
@@ -298,7 +298,7 @@ def test_a_voice_that_fails_is_a_warning_if_a_server_speaks_with_espeak_instead(
     assert packages(None, None) == WARNING
 
 
-def test_a_voice_that_needs_a_missing_package_is_cured_by_installing_it() -> None:
+def test_a_missing_package_is_reported_with_its_install_command() -> None:
     words = f"the voice piper/a cannot be loaded: numpy is missing; install it with: {install.neural()}"
     found = voice.judge_engine("2.99", EngineReport(reason="unknown_voice", message=words), server=None)[-1]
     assert (found.check, found.next) == ("voices", install.neural())

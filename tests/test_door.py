@@ -80,7 +80,7 @@ async def turns() -> None:
 
 
 @in_loop
-async def test_client_comes_in_when_another_leaves() -> None:
+async def test_a_waiting_client_is_admitted_when_another_leaves() -> None:
     with server_for(1) as connect:
         first, second, third = connect(b""), connect(b""), connect(b"")
         await turns()
@@ -99,7 +99,7 @@ async def test_client_comes_in_when_another_leaves() -> None:
 
 
 @in_loop
-async def test_silent_client_waits_and_urgent_client_is_let_in() -> None:
+async def test_a_full_server_admits_urgent_clients_and_lets_silent_ones_wait() -> None:
     with server_for(1) as connect:
         connect(HELLO)
         urgent, other = connect(URGENT), connect(HELLO)
@@ -113,7 +113,7 @@ async def test_silent_client_waits_and_urgent_client_is_let_in() -> None:
 
 
 @in_loop
-async def test_server_that_ends_answers_what_clients_have_sent_with_whole_lists() -> None:
+async def test_a_server_that_ends_first_answers_all_received_requests() -> None:
     served, count = Server(ServerSettings(), cast("Any", Unused())), 3 * LINES_PER_TURN
     client, idle = Client(SAY * count + STATUS), Client()
     for each in (client, idle):

@@ -48,7 +48,7 @@ def listening_at(path: str, backlog: int = 8) -> Iterator[socket.socket]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
-def test_a_signal_before_all_is_imported_cancels_the_goal_that_was_sent(number: signal.Signals) -> None:
+def test_a_signal_during_the_imports_cancels_the_sent_goal(number: signal.Signals) -> None:
     def play(peer: Peer) -> None:
         asked = peer.receive("say")
         # At this moment the client has sent its request, and has most of its modules still to import.
@@ -107,7 +107,7 @@ def test_a_request_is_sent_once_however_the_server_greets(greeting: list[bytes])
     assert_hello_is_sent_once(serve, said)
 
 
-def test_a_server_that_hangs_up_is_asked_once_more() -> None:
+def test_a_request_is_sent_again_if_the_server_hangs_up() -> None:
     """As if the server ended, and a socket unit started the next one."""
     said: list[dict[str, Any]] = []
 
@@ -123,7 +123,7 @@ def test_a_server_that_hangs_up_is_asked_once_more() -> None:
     assert_hello_is_sent_once(serve, said)
 
 
-def test_the_request_goes_before_the_client_is_imported(scripted: Talk) -> None:
+def test_the_request_is_sent_before_the_client_is_imported(scripted: Talk) -> None:
     """These imports would delay the first word."""
     code = (
         "import sys\n"
@@ -145,7 +145,7 @@ def test_the_request_goes_before_the_client_is_imported(scripted: Talk) -> None:
         assert [done.out.splitlines()[each] for each in (0, -1) if done.out] == ["[]", "False"], done
 
 
-def test_a_client_that_waits_imports_nothing_until_the_server_has_had_its_time(scripted: Talk) -> None:
+def test_a_waiting_client_delays_its_imports(scripted: Talk) -> None:
     """The imports would compete with the engine and the player until the first sound."""
     code = (
         "import sys\n"
@@ -168,7 +168,7 @@ def test_a_client_that_waits_imports_nothing_until_the_server_has_had_its_time(s
         assert ("stood back set()" in done.out.splitlines()) == stands_back, (words, done)
 
 
-def test_a_client_stands_back_for_as_long_as_it_has_worked_and_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_client_yields_the_processor_and_loses_no_reply(monkeypatch: pytest.MonkeyPatch) -> None:
     ours, theirs = socket.socketpair()
     attempt = ConnectionAttempt(ours, "s", hello_sent=True, request_sent=b"request\n")
     with ours, theirs:
@@ -196,7 +196,7 @@ def test_a_client_stands_back_for_as_long_as_it_has_worked_and_loses_nothing(mon
         assert (os.get_blocking(ours.fileno()), ours.recv(1)) == (False, b"")
 
 
-def test_plain_commands_import_neither_click_nor_anything_heavy(scripted: Talk) -> None:
+def test_simple_commands_import_neither_click_nor_slow_modules(scripted: Talk) -> None:
     heavy = ["click", "asyncio", "pyttsx3", "platformdirs", "ssl"]
     heavy += ["talkcli.server", "talkcli.goals.scheduler", "talkcli.engine"]
     code = (
@@ -209,7 +209,7 @@ def test_plain_commands_import_neither_click_nor_anything_heavy(scripted: Talk) 
     assert done.out.splitlines()[-1] == "[]", done
 
 
-def test_ctrl_c_before_the_server_has_greeted_is_no_traceback() -> None:
+def test_ctrl_c_before_the_greeting_prints_no_traceback() -> None:
     with short_directory() as directory, listening_at(f"{directory}/s") as listening:
         client = start(f"{directory}/s")
         connected, _ = listening.accept()
@@ -221,7 +221,7 @@ def test_ctrl_c_before_the_server_has_greeted_is_no_traceback() -> None:
             assert connected.recv(65536) == b""
 
 
-def test_a_server_whose_backlog_is_full_is_not_passed_over_for_the_next_place() -> None:
+def test_a_server_with_a_full_backlog_is_not_skipped() -> None:
     with short_directory() as directory, contextlib.ExitStack() as stack:
         first, second = f"{directory}/runtime/talk/talk.sock", f"{directory}/runtime-{os.getuid()}/talk/talk.sock"
         for each in (first, second):
@@ -245,7 +245,7 @@ def test_a_server_whose_backlog_is_full_is_not_passed_over_for_the_next_place() 
 
 
 @pytest.mark.parametrize("early", [False, True])
-def test_a_server_that_refuses_this_client_is_passed_over_for_the_next_place(early: bool) -> None:
+def test_a_server_that_refuses_the_client_is_skipped(early: bool) -> None:
     heard: list[bytes] = []
 
     def serve(listening: socket.socket, greeting: bytes) -> None:
@@ -291,7 +291,7 @@ def to_another_thread(number: signal.Signals) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_to_another_thread_ends_the_waiting(number: signal.Signals) -> None:
+def test_a_signal_to_another_thread_ends_the_wait(number: signal.Signals) -> None:
     began = time.monotonic()
     with Interrupts() as interrupts:
         sender = threading.Timer(0.1, to_another_thread, [number])
@@ -303,7 +303,7 @@ def test_a_signal_to_another_thread_ends_the_waiting(number: signal.Signals) -> 
     assert signal.set_wakeup_fd(-1) == -1  # nothing is left behind
 
 
-def test_after_a_reset_only_a_first_signal_ends_the_waiting() -> None:
+def test_during_cleanup_only_a_first_signal_ends_the_wait() -> None:
     with Interrupts() as interrupts:
         signal.raise_signal(signal.SIGHUP)
         interrupts.prepare_cleanup()

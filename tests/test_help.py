@@ -55,7 +55,7 @@ def as_it_was(name: str) -> str:
 # Help
 
 
-def test_talk_alone_fits_a_small_terminal_and_shows_every_command() -> None:
+def test_talk_without_arguments_shows_every_command_on_one_screen() -> None:
     done = alone(COLUMNS="80")
     out = done.out
     assert (done.code, done.err, too_wide(out)) == (0, "", [])
@@ -65,7 +65,7 @@ def test_talk_alone_fits_a_small_terminal_and_shows_every_command() -> None:
         assert words in out
 
 
-def test_help_of_talk_has_all_exit_codes() -> None:
+def test_the_help_of_talk_lists_all_exit_codes() -> None:
     out = as_it_was("talk")
     classes = [each for each in vars(errors).values() if isinstance(each, type) and issubclass(each, errors.TalkError)]
     used = {each.exit_code for each in classes} | set(states.EXIT_CODES.values())
@@ -77,7 +77,7 @@ def test_help_of_talk_has_all_exit_codes() -> None:
 
 
 @pytest.mark.parametrize("words", [["-h"], ["say", "-h"]])
-def test_help_has_a_short_option_and_uses_the_width_of_the_terminal(words: list[str]) -> None:
+def test_h_shows_the_help_in_the_width_of_the_terminal(words: list[str]) -> None:
     assert alone(*words, COLUMNS="80").out == as_it_was(words[0] if words[1:] else "talk")
     done = alone(*words, COLUMNS="120")
     assert (done.code, done.err, too_wide(done.out, 120)) == (0, "", [])
@@ -85,7 +85,7 @@ def test_help_has_a_short_option_and_uses_the_width_of_the_terminal(words: list[
 
 
 @pytest.mark.parametrize("name", commands.COMMANDS)
-def test_help_of_each_command_has_a_purpose_examples_and_its_own_options(name: str) -> None:
+def test_the_help_of_a_command_has_a_purpose_examples_and_options(name: str) -> None:
     out = as_it_was(name)
     assert too_wide(out) == []
     assert out.endswith("\n\nCommon options and exit codes: talk --help\n")
@@ -120,7 +120,7 @@ def test_every_option_is_explained(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", commands.COMMANDS)
-def test_the_examples_can_be_typed(name: str) -> None:
+def test_the_examples_are_valid_command_lines(name: str) -> None:
     """The words of each `talk` in them are read as the command line would be; nothing is carried out."""
     seen = []
     for line in command(name).row.examples.strip().splitlines():
@@ -136,7 +136,7 @@ def test_the_examples_can_be_typed(name: str) -> None:
 
 
 @pytest.mark.parametrize(("columns", "lines"), [(60, 4), (80, 3), (200, 2)])
-def test_on_a_terminal_a_message_breaks_between_words(columns: int, lines: int) -> None:
+def test_messages_wrap_between_words_on_a_terminal(columns: int, lines: int) -> None:
     words = ["say", "--wiat", "hello"]
     with short_directory() as home:
         with Terminal([*TALK, *words], environment(home), columns) as shown:
@@ -148,7 +148,7 @@ def test_on_a_terminal_a_message_breaks_between_words(columns: int, lines: int) 
     assert len(shown.lines) == lines
 
 
-def test_a_command_in_a_message_is_not_broken() -> None:
+def test_a_command_in_a_message_is_not_wrapped() -> None:
     command = "sudo python3 -m venv /opt/talk && sudo /opt/talk/bin/pip install ."
     for told in (f"one two {'three ' * 20}'{command}' four {'five ' * 20}", f"{'one ' * 30}start one with: {command}"):
         lines = show._wrap(told).splitlines()
@@ -157,18 +157,18 @@ def test_a_command_in_a_message_is_not_broken() -> None:
         assert " ".join(each.strip() for each in lines) == told.strip()
 
 
-def test_a_variable_with_a_wrong_value_is_named() -> None:
+def test_the_error_for_a_wrong_value_names_its_variable() -> None:
     assert alone("serve", TALK_RATE="fast").err.startswith(
         "talk: --rate (env var: 'TALK_RATE'): must be a whole number, got 'fast'"
     )
 
 
-def test_a_missing_player_is_told_at_the_start(make_talk: MakeTalk) -> None:
+def test_a_missing_player_is_reported_at_the_start(make_talk: MakeTalk) -> None:
     first = make_talk("--player", "aply").log.splitlines()[0]
     assert first == "talk: player \"aply\" not found; nothing can be heard; did you mean 'aplay'?"
 
 
-def test_a_missing_sound_device_is_told_at_the_start_and_found_when_it_comes(make_talk: MakeTalk, sink: Sink) -> None:
+def test_a_missing_sound_device_is_reported_and_used_once_it_appears(make_talk: MakeTalk, sink: Sink) -> None:
     talk = make_talk(*FAST, env={"PULSE_SERVER": ""}, forked=False)
     first = talk.log.splitlines()[0]
     assert first.startswith("talk: no sound device or sound server found, ") == players.has_no_output(talk.env)
@@ -186,12 +186,14 @@ def test_a_missing_sound_device_is_told_at_the_start_and_found_when_it_comes(mak
     ("options", "server"),
     [("--player null", ""), ("--player file:said.wav", ""), ("--player cat", ""), ("-q", ""), ("", "unix:/there")],
 )
-def test_a_missing_sound_device_is_not_told_if_none_is_needed(make_talk: MakeTalk, options: str, server: str) -> None:
+def test_a_missing_sound_device_is_not_reported_if_none_is_needed(
+    make_talk: MakeTalk, options: str, server: str
+) -> None:
     talk = make_talk(*options.split(), env={"PULSE_SERVER": server}, watched=False)
     assert "no sound device" not in talk.log
 
 
-def test_a_player_is_told_to_have_no_effect_with_a_driver_that_plays_by_itself(make_talk: MakeTalk) -> None:
+def test_unused_player_options_are_reported_if_the_driver_plays_sound(make_talk: MakeTalk) -> None:
     for options, told in (("--player aply --lead-in 100", "; --player and --lead-in have no effect"), ("", "")):
         talk = make_talk(*options.split(), env={"PULSE_SERVER": ""}, driver="dummy")
         assert talk.run("say", "--wait", "hello").code == 0
@@ -200,20 +202,20 @@ def test_a_player_is_told_to_have_no_effect_with_a_driver_that_plays_by_itself(m
         assert "no sound device" not in talk.log
 
 
-def test_without_any_player_the_packages_to_install_are_told(make_talk: MakeTalk, tmp_path: pathlib.Path) -> None:
+def test_without_a_player_the_log_names_packages_to_install(make_talk: MakeTalk, tmp_path: pathlib.Path) -> None:
     talk = make_talk(env={"PATH": str(tmp_path)}, watched=False)
     talk.run("voices")  # the engine is ready before it lists them
     said = "no player found; install alsa-utils (aplay), pulseaudio-utils (pacat) or pipewire-bin (pw-cat)\n"
     assert next(each for each in talk.log.splitlines(True) if "engine ready" in each).endswith(f", {said}")
 
 
-def test_a_file_of_another_format_is_refused_and_not_written(tmp_path: pathlib.Path) -> None:
+def test_an_output_file_of_another_format_is_refused(tmp_path: pathlib.Path) -> None:
     done = alone("say", "-o", str(tmp_path / "hello.MP3"), "hello")
     assert (done.code, "--output writes WAV, not .MP3; name the file .wav" in done.err) == (2, True)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_mistyped_key_is_told_on_a_terminal_alone(scripted: Talk) -> None:
+def test_a_mistyped_key_is_reported_only_on_a_terminal(scripted: Talk) -> None:
     scripted.run("say", "--key", "battery", "never-ends")
     told = "talk: no goal has the key 'batery'; did you mean 'battery'?\n"
     for words, said in (("batery", told), ("door", ""), ("batery -q", ""), ("battery", r"\w{4}-\d+\n")):

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 SECONDS = 3
 
 
-def test_an_idle_server_and_its_engine_switch_once_a_second_at_most(make_talk: MakeTalk) -> None:
+def test_an_idle_server_switches_context_at_most_once_a_second(make_talk: MakeTalk) -> None:
     talk = make_talk("--player", "null", watched=False)
     assert talk.run("say", "--wait", "--", "ready").code == 0
     processes = [talk.pid, *descendants(talk.pid)]

@@ -38,7 +38,7 @@ def refused(home: str, *words: str, code: int = 11, **extra: str) -> str:
 
 
 @pytest.mark.parametrize(("mode", "umask"), [("0600", 0o000), ("0660", 0o077)])
-def test_socket_has_the_mode_that_was_asked_for(home: str, mode: str, umask: int) -> None:
+def test_the_socket_has_the_requested_mode(home: str, mode: str, umask: int) -> None:
     path = f"{home}/talk/s"
     command = ["sh", "-c", f'umask {umask:04o}; exec "$@"', "sh", *SERVE]
     with serving(environment(home), "--socket", path, "--socket-mode", mode, command=command):
@@ -47,7 +47,7 @@ def test_socket_has_the_mode_that_was_asked_for(home: str, mode: str, umask: int
     assert not os.path.exists(path)
 
 
-def test_what_is_left_in_the_place_of_socket_and_lock_is_no_obstacle(home: str) -> None:
+def test_a_stale_socket_and_lock_file_are_replaced(home: str) -> None:
     path = f"{home}/s"
     with socket.socket(socket.AF_UNIX) as stale:
         stale.bind(path)
@@ -59,7 +59,7 @@ def test_what_is_left_in_the_place_of_socket_and_lock_is_no_obstacle(home: str) 
         assert not os.path.exists(path)
 
 
-def test_second_server_names_the_one_that_serves_and_never_the_one_before_it(home: str) -> None:
+def test_a_second_server_reports_the_current_lock_holder(home: str) -> None:
     """A server that has just acquired the lock may not have written its process id yet."""
     with subprocess.Popen(["true"]) as gone:
         gone.wait()
@@ -78,7 +78,7 @@ def test_second_server_names_the_one_that_serves_and_never_the_one_before_it(hom
     assert found == [os.getpid()]
 
 
-def test_file_in_the_place_of_the_socket_is_not_removed(home: str) -> None:
+def test_a_file_at_the_sockets_path_is_not_removed(home: str) -> None:
     path = f"{home}/s"
     with open(path, "w", encoding="utf-8") as file:
         file.write("precious")
@@ -90,7 +90,7 @@ def test_file_in_the_place_of_the_socket_is_not_removed(home: str) -> None:
     assert "is not a socket; choose another path" in refused(home, TALK_SOCKET=f"{home}/pipe")
 
 
-def test_server_that_is_refused_leaves_no_lock(home: str) -> None:
+def test_a_server_that_cannot_start_leaves_no_lock_file(home: str) -> None:
     os.mkdir(f"{home}/directory")
     os.mkfifo(f"{home}/pipe")
     for name in ("directory", "pipe"):
@@ -100,7 +100,7 @@ def test_server_that_is_refused_leaves_no_lock(home: str) -> None:
 
 
 @pytest.mark.parametrize("words", ["is not a regular file", "is a symbolic link", "is a hard link"])
-def test_file_that_is_no_lock_is_reported_and_left_unchanged(home: str, words: str) -> None:
+def test_an_unsafe_lock_file_is_reported_and_left_unchanged(home: str, words: str) -> None:
     with open(f"{home}/precious", "w", encoding="utf-8") as file:
         file.write("precious")
     if "regular" in words:
@@ -115,7 +115,7 @@ def test_file_that_is_no_lock_is_reported_and_left_unchanged(home: str, words: s
     assert sorted(os.listdir(home)) == ["precious", "s.lock"]
 
 
-def test_relative_socket_is_refused_if_the_working_directory_is_gone(home: str) -> None:
+def test_a_relative_socket_is_refused_if_the_directory_is_gone(home: str) -> None:
     command = ["sh", "-c", 'mkdir gone && cd gone && rmdir ../gone && exec "$@"', "sh", *SERVE, "--socket", "s"]
     done = run(command, environment(home), cwd=home)
     assert (done.code, done.out) == (11, "")
@@ -123,7 +123,7 @@ def test_relative_socket_is_refused_if_the_working_directory_is_gone(home: str) 
     assert "Traceback" not in done.err
 
 
-def test_directory_that_is_not_safe_is_refused(home: str) -> None:
+def test_an_unsafe_directory_is_refused(home: str) -> None:
     for name, mode in (("open", 0o777), ("group", 0o770)):
         os.mkdir(f"{home}/{name}")
         os.chmod(f"{home}/{name}", mode)
@@ -141,7 +141,7 @@ def test_directory_that_is_not_safe_is_refused(home: str) -> None:
 
 
 @pytest.mark.skipif(os.getuid() != 0 or not shutil.which("setpriv"), reason="only root can act as another user")
-def test_client_of_another_user_ends_with_10(home: str) -> None:
+def test_a_refused_client_of_another_user_exits_with_10(home: str) -> None:
     path = f"{home}/s"
     # The other user may be unable to read this checkout and its interpreter, so use a copy and the system's Python.
     needs("/usr/bin/python3")
@@ -166,7 +166,7 @@ def test_client_of_another_user_ends_with_10(home: str) -> None:
         assert run([*client, "--socket", path, "say", "--wait", "hi"], theirs).code == 0
 
 
-def test_socket_that_is_passed_is_served_and_left(home: str) -> None:
+def test_a_passed_socket_is_served_and_not_removed(home: str) -> None:
     path = f"{home}/passed"
     with socket.socket(socket.AF_UNIX) as listening:
         listening.bind(path)

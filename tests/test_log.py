@@ -44,7 +44,7 @@ def history(scripted: Talk) -> list[str]:
     return [succeeded, aborted, rejected, pending, active]
 
 
-def test_a_line_tells_when_how_what_who_and_why(scripted: Talk, history: list[str]) -> None:
+def test_a_line_shows_time_state_text_sender_and_reason(scripted: Talk, history: list[str]) -> None:
     done = scripted.run("log")
     assert (done.code, done.err) == (0, "")
     lines = done.out.splitlines()
@@ -69,7 +69,7 @@ def test_a_line_tells_when_how_what_who_and_why(scripted: Talk, history: list[st
     assert goals[-1] == scripted.goal(history[-1])
 
 
-def test_count_and_order(scripted: Talk) -> None:
+def test_log_shows_the_latest_goals_oldest_first(scripted: Talk) -> None:
     assert (scripted.run("log").out, scripted.run("log").code, scripted.run("--json", "log").out) == ("", 0, "")
     goals = [scripted.request("say", text=f"length=0 {number}", wait=True)["goal"] for number in range(22)]
     history = [each["id"] for each in goals]
@@ -81,7 +81,7 @@ def test_count_and_order(scripted: Talk) -> None:
     )
 
 
-def test_lines_fit_the_terminal_and_line_up(scripted: Talk, history: list[str]) -> None:
+def test_lines_are_aligned_and_fit_the_terminal(scripted: Talk, history: list[str]) -> None:
     """Other widths are tested in `tests/unit/test_transcript.py`."""
     columns = 80
     env = {"TERM": "xterm", **scripted.env}
@@ -101,7 +101,7 @@ def test_lines_fit_the_terminal_and_line_up(scripted: Talk, history: list[str]) 
 
 
 @pytest.mark.parametrize("starter", ["timeout 20", "nice timeout 20"])
-def test_the_script_is_shown_that_starts_talk_by_way_of_another_program(tmp_path: Path, starter: str) -> None:
+def test_a_script_that_starts_talk_through_another_program_is_shown(tmp_path: Path, starter: str) -> None:
     (tmp_path / "talk").write_text("#!/bin/sh\necho $$\nread -r _\n")
     (tmp_path / "talk").chmod(0o755)
     script = tmp_path / "patrol.sh"

@@ -141,7 +141,7 @@ def _robot(env: dict[str, str], *options: str) -> Iterator[Robot]:
 # -- a voice that is being loaded
 
 
-def test_a_goal_waits_for_its_voice_and_so_do_those_behind_it(env: dict[str, str], hold: Path) -> None:
+def test_a_goal_and_those_behind_it_wait_for_its_voice(env: dict[str, str], hold: Path) -> None:
     with _robot(env) as robot:
         first, second = robot.say(), robot.say("behind", None)
         robot.until(lambda: robot.neural() == {"state": "loading", "why": None})
@@ -154,9 +154,7 @@ def test_a_goal_waits_for_its_voice_and_so_do_those_behind_it(env: dict[str, str
     assert "voice piper/tiny loaded in " in robot.server.log
 
 
-def test_the_server_is_ready_before_its_voice_and_goals_stop_waiting_if_it_is_changed(
-    env: dict[str, str], hold: Path
-) -> None:
+def test_goals_stop_waiting_if_the_loading_voice_is_changed(env: dict[str, str], hold: Path) -> None:
     with _robot(env, "--voice", "piper/ti") as robot:
         assert "loaded" not in robot.server.log
         robot.until(lambda: robot.neural()["state"] == "loading")
@@ -171,7 +169,7 @@ def test_the_server_is_ready_before_its_voice_and_goals_stop_waiting_if_it_is_ch
         assert robot.heard(goal) == ("SUCCEEDED", TINY)
 
 
-def test_espeak_speaks_instead_if_a_goal_cannot_wait_and_does_not_insist(env: dict[str, str], hold: Path) -> None:
+def test_espeak_speaks_urgent_goals_while_their_voice_is_loading(env: dict[str, str], hold: Path) -> None:
     with _robot(env) as robot:
         for urgent in ({"preempt": True}, {"flush": True}, {"priority": 1}, {"ttl": 0.2}):
             goal = robot.say("hello", **urgent)
@@ -185,7 +183,7 @@ def test_espeak_speaks_instead_if_a_goal_cannot_wait_and_does_not_insist(env: di
         assert robot.heard(insists) == ("SUCCEEDED", TINY)
 
 
-def test_the_first_voice_is_loaded_in_silence_and_others_during_the_speech(env: dict[str, str], tmp_path: Path) -> None:
+def test_the_first_voice_is_loaded_in_silence_and_others_during_speech(env: dict[str, str], tmp_path: Path) -> None:
     """The libraries of the first one stop the whole process for a moment, which would be heard."""
     tiny_voice.put(tmp_path / "voices", "second")
     with _robot(env) as robot:
@@ -215,7 +213,7 @@ def test_the_first_voice_is_loaded_in_silence_and_others_during_the_speech(env: 
 # -- a voice that can't be loaded
 
 
-def test_espeak_speaks_instead_of_a_broken_voice_until_it_is_mended(env: dict[str, str], tmp_path: Path) -> None:
+def test_espeak_replaces_a_broken_voice_until_it_is_repaired(env: dict[str, str], tmp_path: Path) -> None:
     why = f"{tmp_path}/voices/broken.onnx is not an ONNX model; download the voice again, from a source that you trust"
     with _robot(env, "--voice", BROKEN) as robot:
         assert robot.heard(robot.say("hello", None)) == ("SUCCEEDED", INSTEAD)
@@ -231,7 +229,7 @@ def test_espeak_speaks_instead_of_a_broken_voice_until_it_is_mended(env: dict[st
         assert robot.heard(robot.say("hello", None)) == ("SUCCEEDED", BROKEN)
 
 
-def test_two_voices_that_do_not_fit_together_speak_in_turn(env: dict[str, str], tmp_path: Path) -> None:
+def test_two_voices_that_exceed_the_memory_limit_speak_in_turn(env: dict[str, str], tmp_path: Path) -> None:
     tiny_voice.put(tmp_path / "voices", "second")
     with _robot(env, "--voice-memory", "0") as robot:
         names = (TINY, "piper/second", TINY)
@@ -240,7 +238,7 @@ def test_two_voices_that_do_not_fit_together_speak_in_turn(env: dict[str, str], 
         assert "unloaded voice piper/tiny to make room" in robot.server.log
 
 
-def test_a_voice_that_is_dropped_while_it_speaks_is_not_counted_twice(env: dict[str, str], tmp_path: Path) -> None:
+def test_a_voice_unloaded_while_speaking_is_not_counted_twice(env: dict[str, str], tmp_path: Path) -> None:
     tiny_voice.put(tmp_path / "voices", "second")
     env["BALLAST_BYTES"] = "100000000"
     with _robot(env, "--voice-memory", "180") as robot:
@@ -255,7 +253,7 @@ def test_a_voice_that_is_dropped_while_it_speaks_is_not_counted_twice(env: dict[
         assert "it uses" not in robot.server.log
 
 
-def test_a_voice_that_alone_takes_too_much_memory_speaks_and_is_told(env: dict[str, str]) -> None:
+def test_a_voice_larger_than_the_memory_limit_speaks_and_is_reported(env: dict[str, str]) -> None:
     env["BALLAST_BYTES"] = "100000000"
     with _robot(env, "--voice-memory", "50") as robot:
         assert robot.heard(robot.say()) == ("SUCCEEDED", TINY)
@@ -263,7 +261,7 @@ def test_a_voice_that_alone_takes_too_much_memory_speaks_and_is_told(env: dict[s
         assert re.search(rf"{TINY} loaded: it uses 1\d\d MB, more than", run([*TALK, "status"], env).out)
 
 
-def test_a_pitch_is_refused_with_a_voice_that_has_none(env: dict[str, str]) -> None:
+def test_a_pitch_is_refused_with_a_voice_of_fixed_pitch(env: dict[str, str]) -> None:
     with _robot(env, "--voice", TINY, "--pitch", "60") as robot:
         refused = robot.say(pitch=70).goal
         assert (refused.reason, refused.state.name) == ("bad_option", "REJECTED")
@@ -275,7 +273,7 @@ def test_a_pitch_is_refused_with_a_voice_that_has_none(env: dict[str, str]) -> N
 # -- an engine that dies, hangs or cannot start
 
 
-def test_an_engine_that_dies_costs_one_goal_and_loads_its_voice_again(env: dict[str, str]) -> None:
+def test_an_engine_crash_costs_one_goal_and_the_voice_is_loaded_again(env: dict[str, str]) -> None:
     with _robot(env, "--voice", TINY) as robot:
         robot.loads()
         goal = robot.say(LONG, None)
@@ -286,7 +284,7 @@ def test_an_engine_that_dies_costs_one_goal_and_loads_its_voice_again(env: dict[
         assert robot.heard(robot.say("hello", None)) == ("SUCCEEDED", TINY)
 
 
-def test_a_voice_that_kills_the_engine_twice_is_left_alone(env: dict[str, str], hold: Path) -> None:
+def test_a_voice_that_crashes_the_engine_twice_is_not_used(env: dict[str, str], hold: Path) -> None:
     why = "the engine process died while loading the voice"
     with _robot(env, "--voice", TINY) as robot:
         for crashes in (1, 2):
@@ -305,7 +303,7 @@ def test_a_voice_that_kills_the_engine_twice_is_left_alone(env: dict[str, str], 
         assert robot.heard(robot.say("hello", None)) == ("SUCCEEDED", TINY)
 
 
-def test_espeak_speaks_if_the_files_of_a_voice_are_gone(env: dict[str, str], tmp_path: Path) -> None:
+def test_espeak_speaks_if_the_files_of_a_voice_are_missing(env: dict[str, str], tmp_path: Path) -> None:
     with _robot(env, "--voice", TINY) as robot:
         robot.loads()
         (tmp_path / "voices" / "tiny.onnx").unlink()
@@ -317,7 +315,7 @@ def test_espeak_speaks_if_the_files_of_a_voice_are_gone(env: dict[str, str], tmp
         assert f'{goal.id} is spoken by {voice} instead: unknown voice "piper/tiny"' in robot.server.log
 
 
-def test_goals_end_at_once_if_the_engine_cannot_start(env: dict[str, str], tmp_path: Path) -> None:
+def test_goals_fail_at_once_if_the_engine_cannot_start(env: dict[str, str], tmp_path: Path) -> None:
     (tmp_path / "site" / "pyttsx3.py").write_text("raise ModuleNotFoundError('no pyttsx3 here', name='pyttsx3')")
     with _robot(env, "--voice", TINY) as robot:
         robot.until(lambda: "pyttsx3 is missing" in robot.server.log)
@@ -325,7 +323,7 @@ def test_goals_end_at_once_if_the_engine_cannot_start(env: dict[str, str], tmp_p
         assert [each.wait(LIMIT).reason for each in goals] == ["engine_failed"] * 3
 
 
-def test_an_engine_that_hangs_while_it_loads_is_replaced(env: dict[str, str], hold: Path) -> None:
+def test_an_engine_that_hangs_while_loading_is_replaced(env: dict[str, str], hold: Path) -> None:
     with _robot(env) as robot:
         goal = robot.say(voice_only=True)
         robot.until(lambda: robot.neural()["state"] == "loading")
@@ -339,7 +337,7 @@ def test_an_engine_that_hangs_while_it_loads_is_replaced(env: dict[str, str], ho
 # -- lists, files, refusals
 
 
-def test_gaps_on_a_slow_machine_are_told(env: dict[str, str], tmp_path: Path) -> None:
+def test_gaps_on_a_slow_machine_are_reported(env: dict[str, str], tmp_path: Path) -> None:
     (tmp_path / "site" / "sitecustomize.py").write_text(SLOW_TO_SPEAK)
     with serving({**env, "PYTHONPATH": str(tmp_path / "site")}):
         done = run([*TALK, "--json", "say", "--wait", "--voice", "piper/tiny", "--voice-only", "one two three"], env)
@@ -354,7 +352,7 @@ def test_gaps_on_a_slow_machine_are_told(env: dict[str, str], tmp_path: Path) ->
     )
 
 
-def test_a_voice_that_is_installed_later_is_listed_and_spoken_with(env: dict[str, str], tmp_path: Path) -> None:
+def test_a_voice_installed_later_can_be_listed_and_used(env: dict[str, str], tmp_path: Path) -> None:
     with serving(env, "--rate", "450"):
         listed = run([*TALK, "voices"], env).out
         assert "piper/tiny" in listed
@@ -382,7 +380,7 @@ def test_a_file_is_rendered_with_a_neural_voice(env: dict[str, str], tmp_path: P
     assert "download the voice again" in done.err
 
 
-def test_voices_are_listed_with_quality_and_speakers_and_by_language(env: dict[str, str], tmp_path: Path) -> None:
+def test_voices_are_listed_with_quality_and_speakers(env: dict[str, str], tmp_path: Path) -> None:
     several = tiny_voice.description(speakers=2, language="de_DE")
     tiny_voice.put(tmp_path / "voices", "two", tiny_voice.model(speakers=2), several)
     with serving(env):
@@ -405,7 +403,7 @@ def test_voices_are_listed_with_quality_and_speakers_and_by_language(env: dict[s
         assert (done.code, "'de'" in done.err, "'en'" in done.err) == (1, False, False), done
 
 
-def test_the_text_of_a_voice_s_file_never_reaches_the_terminal_raw(env: dict[str, str], tmp_path: Path) -> None:
+def test_text_from_a_voices_files_is_always_escaped(env: dict[str, str], tmp_path: Path) -> None:
     evil = "\x1b]0;owned\x07\n\u202e"
     told = tiny_voice.description(voice=evil, language=evil, speakers=2, dataset=evil * 100, speaker_id_map={evil: 0})
     told["audio"] = {"sample_rate": 22050, "quality": evil}
@@ -428,7 +426,7 @@ def test_the_text_of_a_voice_s_file_never_reaches_the_terminal_raw(env: dict[str
         assert max(map(len, text.splitlines()), default=0) < 1000
 
 
-def test_the_voices_that_completion_offers_are_found(env: dict[str, str]) -> None:
+def test_every_voice_offered_by_completion_exists(env: dict[str, str]) -> None:
     with serving(env):
         told = [json.loads(each) for each in run([*TALK, "--json", "voices"], env).out.splitlines()]
         found = {
@@ -443,7 +441,7 @@ def test_the_voices_that_completion_offers_are_found(env: dict[str, str]) -> Non
     assert found["ti"] == []
 
 
-def test_with_another_driver_a_neural_voice_is_refused(env: dict[str, str]) -> None:
+def test_a_neural_voice_is_refused_with_another_driver(env: dict[str, str]) -> None:
     words = '"piper/tiny" is a neural voice, which the driver "dummy" does not support; leave out --driver'
     done = run([*TALK, "serve", "--driver", "dummy", "--voice", "piper/tiny"], env)
     assert (done.code, words in done.err) == (2, True), done
@@ -454,7 +452,7 @@ def test_with_another_driver_a_neural_voice_is_refused(env: dict[str, str]) -> N
         assert (done.code, words in done.err) == (2, True), done
 
 
-def test_without_the_extra_they_are_listed_and_refused(env: dict[str, str], tmp_path: Path) -> None:
+def test_without_the_extra_neural_voices_are_listed_but_refused(env: dict[str, str], tmp_path: Path) -> None:
     (tmp_path / "site" / "sitecustomize.py").write_text(WITHOUT.format(names=["onnxruntime"]))
     bare = {**env, "PYTHONPATH": str(tmp_path / "site")}
     words = f"onnxruntime is missing; install it with: {install.neural()}"
@@ -476,7 +474,7 @@ def heard(env: dict[str, str], *options: str) -> object:
     return json.loads(run([*TALK, "--json", "say", "--wait", *options, "hello"], env).out)["voice"]
 
 
-def test_the_server_s_voice_is_neural_only_if_the_driver_has_no_such_voice(env: dict[str, str], tmp_path: Path) -> None:
+def test_a_drivers_voice_precedes_a_neural_voice_of_the_same_name(env: dict[str, str], tmp_path: Path) -> None:
     tiny_voice.put(tmp_path / "voices", "en")
     with serving(env, "--rate", "450", "--voice", "en"):
         assert heard(env) == "gmw/en"
@@ -510,7 +508,7 @@ _REPORTS = re.compile(
 
 
 @pytest.mark.parametrize("seconds", [0, pytest.param(30, marks=pytest.mark.slow)])
-def test_a_neural_sentence_is_reported_to_nobody(env: dict[str, str], tmp_path: Path, seconds: int) -> None:
+def test_a_neural_voice_contacts_no_host_and_changes_no_file(env: dict[str, str], tmp_path: Path, seconds: int) -> None:
     """Even if the user has turned on onnxruntime's telemetry, which asks for its host 9 seconds after the import."""
     needs("strace")
     trace = tmp_path / "trace"

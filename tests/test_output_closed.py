@@ -62,7 +62,7 @@ def unread(talk: Talk, *words: str) -> tuple[int, str]:
 # A command that prints
 
 
-def test_reader_that_has_enough_ends_it_with_141(scripted: Talk) -> None:
+def test_a_command_whose_reader_has_gone_exits_with_141(scripted: Talk) -> None:
     scripted.run("say", "--wait", "length=0")
     for words in (["status"], ["--json", "status"], ["voices"], ["--json", "voices"], ["log"], ["set"], ["--help"]):
         assert unread(scripted, *words) == (CLOSED, ""), words
@@ -73,23 +73,23 @@ def test_reader_that_has_enough_ends_it_with_141(scripted: Talk) -> None:
 
 
 @pytest.mark.parametrize("closed", [">&-", "1</dev/null"])
-def test_an_output_that_was_closed_from_the_start_is_141(scripted: Talk, closed: str) -> None:
+def test_a_command_with_a_closed_output_exits_with_141(scripted: Talk, closed: str) -> None:
     done = bash(scripted, f"(talk status; echo $? >&2) {closed}")
     assert (done.stdout, done.stderr) == ("", f"{CLOSED}\n")
 
 
 @pytest.mark.parametrize("command", ["status", "--json status", "say -w length=0", "voices"])
-def test_full_disk_is_told_in_plain_words(scripted: Talk, command: str) -> None:
+def test_a_full_disk_is_reported_with_a_readable_message(scripted: Talk, command: str) -> None:
     assert to(scripted, "/dev/full", *command.split()) == (1, FULL)
 
 
-def test_a_broken_disk_is_not_a_reader_that_went_away(scripted: Talk) -> None:
+def test_an_io_error_is_not_mistaken_for_a_closed_reader(scripted: Talk) -> None:
     with open("/proc/self/mem", "r+b") as broken:  # nothing can be written at 0
         found = to(scripted, os.dup(broken.fileno()), "status")
     assert found == (1, "talk: can't write to standard output: Input/output error\n")
 
 
-def test_closed_standard_error_changes_no_exit_code(scripted: Talk) -> None:
+def test_a_closed_standard_error_changes_no_exit_code(scripted: Talk) -> None:
     done = bash(scripted, "talk status 4k7f-99 2>&-; echo $?; talk say -w fail=audio_lost 2>&-; echo $?")
     assert [each for each in done.stdout.splitlines() if "-" not in each] == ["8", "4"]
 
@@ -97,7 +97,7 @@ def test_closed_standard_error_changes_no_exit_code(scripted: Talk) -> None:
 # A goal whose output cannot be written from the start
 
 
-def test_a_goal_is_spoken_whatever_becomes_of_its_id(scripted: Talk) -> None:
+def test_a_goal_is_spoken_even_if_its_id_cannot_be_printed(scripted: Talk) -> None:
     bash(scripted, "talk say length=0 >&-")
     to(scripted, "/dev/full", "say", "length=0")
     unread(scripted, "say", "length=0")
@@ -105,7 +105,7 @@ def test_a_goal_is_spoken_whatever_becomes_of_its_id(scripted: Talk) -> None:
 
 
 @pytest.mark.parametrize("words", ["say", "say -w", "--json say -wf", "say -wq"])
-def test_a_goal_is_waited_for_though_its_output_was_closed_from_the_start(scripted: Talk, words: str) -> None:
+def test_say_waits_even_if_its_output_was_closed_from_the_start(scripted: Talk, words: str) -> None:
     for closed in [">&-", "1</dev/null"] if words in {"say -w", "--json say -wf"} else []:
         done = bash(scripted, f"(talk {words} length=0.2; echo $? >&2) {closed}")
         assert (done.stdout, done.stderr) == ("", "0\n")
@@ -118,7 +118,7 @@ def test_a_goal_is_waited_for_though_its_output_was_closed_from_the_start(script
     assert (code, "speech failed" in err) == ((0, False) if words == "say" else (4, words != "say -wq"))
 
 
-def test_a_wait_waits_though_its_output_was_closed_from_the_start(scripted: Talk) -> None:
+def test_wait_waits_even_if_its_output_was_closed_from_the_start(scripted: Talk) -> None:
     goal = scripted.run("say", "fail=audio_lost length=0.2").id
     assert bash(scripted, f"talk wait {goal} >&-; echo $?").stdout == "4\n"
     goal = scripted.run("say", "fail=audio_lost length=0.2").id
@@ -127,7 +127,7 @@ def test_a_wait_waits_though_its_output_was_closed_from_the_start(scripted: Talk
 
 
 @pytest.mark.parametrize("words", ["say -w", "--json say -wf", "wait", "wait -f", "--json wait"])
-def test_a_goal_is_waited_for_though_the_disk_is_full(scripted: Talk, words: str) -> None:
+def test_a_client_waits_for_its_goal_even_if_the_disk_is_full(scripted: Talk, words: str) -> None:
     for text, state, code in (("length=0.2", "SUCCEEDED", 1), ("fail=audio_lost length=0.2", "ABORTED", 4)):
         given = scripted.run("say", text).id if "wait" in words else text
         ended, err = to(scripted, "/dev/full", *words.split(), given)
@@ -144,7 +144,7 @@ def test_a_goal_is_waited_for_though_the_disk_is_full(scripted: Talk, words: str
 
 
 @pytest.mark.parametrize("words", ["", "--json", "-w", "--json -f"])
-def test_lines_are_spoken_though_the_disk_is_full(scripted: Talk, words: str) -> None:
+def test_lines_are_spoken_even_if_the_disk_is_full(scripted: Talk, words: str) -> None:
     for first, code in (("length=0 a", 1), ("fail=audio_lost", 4) if words[-2:] in {"-w", "-f"} else ("nul \0", 5)):
         lines = f"{first}\nlength=0 b\n"
         ended, err = to(scripted, "/dev/full", "say", "--lines", *words.split(), stdin=lines)
@@ -191,7 +191,7 @@ SLOW = f"{ENDLESS} slow-stop=0.2"
         (["-q", "say", "-w"], {"terminal": True, "errors": True}),
     ],
 )
-def test_a_reader_that_goes_away_cancels_the_goal(scripted: Talk, words: list[str], way: dict[str, bool]) -> None:
+def test_a_goal_is_cancelled_if_its_reader_goes_away(scripted: Talk, words: list[str], way: dict[str, bool]) -> None:
     reader = Reader(scripted, *words, ENDLESS, **way)
     goal = scripted.watcher.wait_until(lambda each: each.get("event") == "word")["id"]
     assert reader.leave() == CLOSED
@@ -199,7 +199,7 @@ def test_a_reader_that_goes_away_cancels_the_goal(scripted: Talk, words: list[st
     assert scripted.goal(goal)["by"]["client"]["pid"] == reader.client.pid
 
 
-def test_a_reader_that_goes_away_while_its_goal_is_in_the_queue_recalls_it(scripted: Talk) -> None:
+def test_a_pending_goal_is_recalled_if_its_reader_goes_away(scripted: Talk) -> None:
     first = scripted.run("say", ENDLESS).id
     reader = Reader(scripted, "say", "-w", "second")
     scripted.watcher.wait_until(lambda each: bool(each.get("goal")) and each["goal"]["text"] == "second")
@@ -213,7 +213,7 @@ def test_a_reader_that_goes_away_while_its_goal_is_in_the_queue_recalls_it(scrip
     ("words", "way"),
     [("say -wf", {}), ("--json say -wf", {"terminal": True}), ("--json say -w", {"errors": True})],
 )
-def test_a_signal_counts_more_than_a_reader_that_goes_away(
+def test_a_signal_decides_the_exit_code_even_if_the_reader_has_gone(
     scripted: Talk, words: str, way: dict[str, bool], first: str
 ) -> None:
     number = signal.SIGINT if first == "reader" else signal.SIGHUP
@@ -238,7 +238,7 @@ def test_a_signal_counts_more_than_a_reader_that_goes_away(
     ("words", "first"),
     [("say -w", signal.SIGINT), ("say -wf", signal.SIGHUP), ("say -w --lines", signal.SIGHUP)],
 )
-def test_a_closed_terminal_sends_sighup_more_than_once(scripted: Talk, words: str, first: signal.Signals) -> None:
+def test_a_second_signal_does_not_change_the_exit_code(scripted: Talk, words: str, first: signal.Signals) -> None:
     lines = "--lines" in words
     client = scripted.start(*words.split(), *([] if lines else [SLOW]), stdin=subprocess.PIPE)
     if lines:
@@ -254,7 +254,7 @@ def test_a_closed_terminal_sends_sighup_more_than_once(scripted: Talk, words: st
 
 
 @pytest.mark.parametrize("shared", [True, False], ids=["with its input", "alone"])
-def test_a_reader_that_goes_away_while_the_text_is_read_has_nothing_spoken(scripted: Talk, shared: bool) -> None:
+def test_nothing_is_spoken_if_the_reader_goes_away_while_text_is_read(scripted: Talk, shared: bool) -> None:
     ours, theirs = socket.socketpair()  # as sshd gives a command
     reader, output = (-1, theirs.fileno()) if shared else os.pipe()
     words = ["say", "-w", "-"]
@@ -274,7 +274,7 @@ def test_a_reader_that_goes_away_while_the_text_is_read_has_nothing_spoken(scrip
     assert scripted.watcher.goals() == []
 
 
-def test_a_text_is_spoken_if_its_sender_only_ends_its_input(scripted: Talk) -> None:
+def test_a_text_is_spoken_if_its_sender_closes_only_the_input(scripted: Talk) -> None:
     ours, theirs = socket.socketpair()
     with ours:
         client = Forked(["say", "-w", "-"], scripted.env, stdin=theirs.fileno(), stdout=theirs.fileno())
@@ -286,7 +286,7 @@ def test_a_text_is_spoken_if_its_sender_only_ends_its_input(scripted: Talk) -> N
 
 
 @pytest.mark.parametrize("words", [["say", "-w"], ["say", "-wf"]])
-def test_the_reader_of_an_attached_client_cancels_nothing(scripted: Talk, words: list[str]) -> None:
+def test_a_closed_reader_of_an_attached_client_cancels_nothing(scripted: Talk, words: list[str]) -> None:
     text = "never-ends length=60 " + "word " * 600  # one in a tenth of a second
     scripted.run("say", "--id", "mine", text)
     scripted.watcher.wait_for_word("mine")
@@ -300,7 +300,7 @@ def test_the_reader_of_an_attached_client_cancels_nothing(scripted: Talk, words:
     ("words", "terminal"),
     [(["wait"], True), (["wait", "-f"], False), (["wait", "-f"], True), (["--json", "wait"], False)],
 )
-def test_the_reader_of_a_wait_ends_it_and_cancels_nothing(scripted: Talk, words: list[str], terminal: bool) -> None:
+def test_a_closed_reader_ends_wait_and_cancels_nothing(scripted: Talk, words: list[str], terminal: bool) -> None:
     goal = scripted.run("say", ENDLESS).id
     reader = Reader(scripted, *words, goal, terminal=terminal)
     if terminal and words == ["wait", "-f"]:
@@ -309,7 +309,7 @@ def test_the_reader_of_a_wait_ends_it_and_cancels_nothing(scripted: Talk, words:
     assert scripted.goal(goal)["state"] in {"PENDING", "ACTIVE"}
 
 
-def test_sighup_cancels_the_goal_of_say_unless_nohup_keeps_it_away(scripted: Talk) -> None:
+def test_sighup_cancels_the_goal_of_say_unless_nohup_blocks_it(scripted: Talk) -> None:
     for words, code, state in ((["say", "-w"], 129, "PREEMPTED"), (["wait"], 129, "ACTIVE")):
         goal = scripted.run("say", ENDLESS).id if words == ["wait"] else None
         client = scripted.start(*words, goal or ENDLESS)

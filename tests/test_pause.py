@@ -25,7 +25,7 @@ def held(scripted: Talk) -> str:
     return goal_id
 
 
-def test_pause_tells_what_is_held_and_resume_what_goes_on(scripted: Talk, held: str) -> None:
+def test_pause_and_resume_report_the_affected_goal(scripted: Talk, held: str) -> None:
     done = scripted.run("pause")
     assert (done.code, done.out) == (0, "")
     assert done.err.startswith(f'talk: goal {held} is paused after "never-ends')
@@ -49,7 +49,7 @@ def test_pause_tells_what_is_held_and_resume_what_goes_on(scripted: Talk, held: 
     scripted.run("cancel")
 
 
-def test_status_shows_what_is_held(scripted: Talk, held: str) -> None:
+def test_status_shows_the_paused_goal(scripted: Talk, held: str) -> None:
     scripted.run("pause")
     status = scripted.run("status").out
     assert "paused   speech is paused; continue with: talk resume\n" in status
@@ -68,7 +68,7 @@ def begin(talk: Talk, text: str) -> str:
     return goal_id
 
 
-def test_a_pause_that_is_called_off_before_it_is_silent_is_answered_by_the_resume(scripted: Talk) -> None:
+def test_a_resume_answers_a_pause_that_is_not_silent_yet(scripted: Talk) -> None:
     goal = begin(scripted, "never-ends slow-pause=1")
     with scripted.connect() as wire:
         wire.send_raw(b'{"seq": 1, "request": "pause"}\n{"seq": 2, "request": "resume"}\n')
@@ -81,7 +81,7 @@ def test_a_pause_that_is_called_off_before_it_is_silent_is_answered_by_the_resum
     scripted.run("cancel")
 
 
-def test_silence_of_an_earlier_pause_answers_no_later_one(scripted: Talk) -> None:
+def test_a_late_confirmation_does_not_answer_the_next_pause(scripted: Talk) -> None:
     begin(scripted, "never-ends stale-pause slow-pause=0.4")
     with scripted.connect() as wire:
         wire.send_raw(b'{"seq": 1, "request": "pause"}\n{"seq": 2, "request": "resume"}\n')
@@ -92,7 +92,7 @@ def test_silence_of_an_earlier_pause_answers_no_later_one(scripted: Talk) -> Non
     scripted.run("cancel")
 
 
-def test_each_pause_that_is_not_confirmed_is_answered_in_its_own_time(make_talk: MakeTalk, tmp_path: Path) -> None:
+def test_each_unconfirmed_pause_fails_after_its_own_time_limit(make_talk: MakeTalk, tmp_path: Path) -> None:
     limit = 0.5
     talk = make_talk(program=patched_serve(tmp_path, requests__PAUSE_ANSWER_S=limit))
     begin(talk, "never-ends ignore-pause")
@@ -110,7 +110,7 @@ def test_each_pause_that_is_not_confirmed_is_answered_in_its_own_time(make_talk:
     talk.run("cancel")
 
 
-def test_pause_and_resume_succeed_if_nothing_is_spoken(make_talk: MakeTalk) -> None:
+def test_pause_and_resume_succeed_if_nothing_is_being_spoken(make_talk: MakeTalk) -> None:
     talk = make_talk(scripted=True, watched=False)
     done = talk.run("pause")
     assert (done.code, done.out, "talk: speech is paused; " in done.err) == (0, "", True)

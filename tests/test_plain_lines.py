@@ -115,7 +115,7 @@ def assert_sent_as_by_the_library(arguments: list[str]) -> None:
 
 @settings(max_examples=200, deadline=None)
 @given(LINES, ENVIRONMENTS)
-def test_lines_are_read_as_by_click_and_sent_as_by_the_library(
+def test_simple_lines_are_parsed_like_click_and_sent_like_the_library(
     arguments: list[str], environment: Mapping[str, str]
 ) -> None:
     with named(environment):
@@ -126,7 +126,9 @@ def test_lines_are_read_as_by_click_and_sent_as_by_the_library(
 @pytest.mark.slow
 @settings(max_examples=5000, deadline=None)
 @given(LINES, ENVIRONMENTS)
-def test_thousands_of_lines_are_read_and_sent_alike(arguments: list[str], environment: Mapping[str, str]) -> None:
+def test_thousands_of_simple_lines_are_parsed_and_sent_alike(
+    arguments: list[str], environment: Mapping[str, str]
+) -> None:
     with named(environment):
         assert_read_alike(arguments)
         assert_sent_as_by_the_library(arguments)
@@ -141,7 +143,7 @@ def test_thousands_of_lines_are_read_and_sent_alike(arguments: list[str], enviro
         *("cancel --current 12 13", "status -q", "--socket /run/x status 12 --json", "wait 12 -t 10 -f"),
     ],
 )
-def test_the_lines_of_scripts_are_plain(line: str) -> None:
+def test_typical_script_lines_are_parsed_without_click(line: str) -> None:
     assert plain.read(line.split(), {})
 
 
@@ -163,7 +165,7 @@ def test_the_lines_of_scripts_are_plain(line: str) -> None:
         *(["say", "x", "--key", "k" * 65], ["say", "x", "--priority", "1000001"], ["say", "-o", "x.wav", "x"]),
     ],
 )
-def test_any_other_line_is_left_to_click(line: list[str]) -> None:
+def test_other_lines_are_left_to_click(line: list[str]) -> None:
     assert plain.read(line, {}) is None
 
 
@@ -207,7 +209,7 @@ def test_any_text_is_sent_early_unchanged(text: str) -> None:
         *(["cancel", "4k7f-12"], ["cancel", "--before", "x"], ["cancel", "--key", "k"], ["status", "4k7f-12"]),
     ],
 )
-def test_a_request_that_only_the_server_judges_is_sent_early(line: list[str]) -> None:
+def test_a_request_that_only_the_server_checks_is_sent_early(line: list[str]) -> None:
     found = plain.read(line, {})
     assert found
     assert sent_early(found) == written(found)
@@ -228,11 +230,11 @@ def test_a_request_that_the_library_may_change_or_refuse_is_not_sent_early(line:
     assert sent_early(found) is None
 
 
-def test_the_expected_greeting_is_the_server_s() -> None:
+def test_the_expected_greeting_matches_the_servers() -> None:
     assert encode(events.greeting("0.1.0", 1, "4k7f")).startswith(GREETING_START)
     assert not encode(events.busy_greeting()).startswith(GREETING_START)
 
 
-def test_the_comparison_is_with_click() -> None:
+def test_the_reference_parser_reports_clicks_usage_errors() -> None:
     with pytest.raises(click.UsageError):
         by_click(["say", "--wiat", "x"])

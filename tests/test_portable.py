@@ -48,14 +48,14 @@ def on_macos(*command: str, **extra: str) -> str:
     return done.out
 
 
-def test_the_interfaces_of_linux_are_hidden() -> None:
+def test_the_linux_interfaces_are_hidden() -> None:
     names = {"pidfd_open", "waitid", "F_SETSIG", "F_SETPIPE_SZ", "epoll", "SO_PEERCRED", "prctl"}
     code = _PEEK.format(names, "{*dir(os), *dir(fcntl), *dir(select), *dir(socket)}")
     assert on_macos(sys.executable, "-c", code) == "darwin False\n"
     assert on_macos(sys.executable, "-c", code, PYTHONPATH="").startswith("linux True ")
 
 
-def test_every_module_can_be_imported_and_every_command_helps() -> None:
+def test_every_module_can_be_imported_and_every_command_has_help() -> None:
     modules = sum(1 for _ in Path(talkcli.__path__[0]).rglob("*.py"))
     found = on_macos(sys.executable, "-c", _IMPORT_ALL)
     assert found == f"{modules - 1} {len(COMMANDS)}\n"  # the package itself is there by then
@@ -63,7 +63,7 @@ def test_every_module_can_be_imported_and_every_command_helps() -> None:
 
 
 @pytest.mark.parametrize(("platform", "driver"), [("darwin", "dummy"), ("linux", "espeak")])
-def test_speech_is_awaited_held_cancelled_and_examined(make_talk: MakeTalk, platform: str, driver: str) -> None:
+def test_speech_can_be_awaited_paused_cancelled_and_examined(make_talk: MakeTalk, platform: str, driver: str) -> None:
     """The platform's name differs, or only its interfaces."""
     env = {"PYTHONPATH": PATH, "TALK_TEST_PLATFORM": platform}
     served = make_talk("--player", "null", "--rate", "450", driver=driver, env=env)
@@ -92,7 +92,7 @@ def test_speech_is_awaited_held_cancelled_and_examined(make_talk: MakeTalk, plat
     assert found["server"]["state"] == found["sentence"]["state"] == "ok"
 
 
-def test_a_player_is_awaited_killed_and_told_to_have_failed(make_talk: MakeTalk) -> None:
+def test_a_player_is_awaited_and_killed_and_its_failure_is_reported(make_talk: MakeTalk) -> None:
     """With talk's own driver: one program plays silence for longer than it is fed, and another one fails."""
     env = {"PYTHONPATH": PATH, "TALK_TEST_PLATFORM": "linux"}
     talk = make_talk("--player", "sh -c 'cat >/dev/null; sleep 0.4'", "--rate", "450", env=env)

@@ -26,7 +26,7 @@ def objects(out: str) -> list[dict[str, Any]]:
     return [json.loads(each) for each in out.splitlines()]
 
 
-def test_each_event_is_a_line_that_can_be_cut(scripted: Talk) -> None:
+def test_each_event_is_printed_as_one_line_of_fields(scripted: Talk) -> None:
     done = scripted.run("say", "-wf", "--", "length=0.4 battery d'été 日本\x1b[m")
     goal_id = scripted.watcher.goals()[0]
     assert done.code == 0
@@ -42,7 +42,7 @@ def test_each_event_is_a_line_that_can_be_cut(scripted: Talk) -> None:
     ]
 
 
-def test_objects_are_the_wires_own_and_the_last_is_the_result(scripted: Talk) -> None:
+def test_json_prints_the_protocols_events_and_then_the_result(scripted: Talk) -> None:
     done = scripted.run("--json", "say", "-wf", "--", "length=0.2 battery low")
     *events, result = objects(done.out)
     goal_id = events[0]["id"]
@@ -56,7 +56,7 @@ def test_objects_are_the_wires_own_and_the_last_is_the_result(scripted: Talk) ->
     assert result == {"event": "result", "goal": scripted.goal(goal_id)}
 
 
-def test_whatever_happens_the_last_object_is_the_result(scripted: Talk) -> None:
+def test_the_last_object_is_the_result_for_every_outcome(scripted: Talk) -> None:
     for text, code, state in (("", 5, "REJECTED"), ("fail=audio_lost", 4, "ABORTED"), ("never-ends", 124, "PREEMPTED")):
         done = scripted.run("--json", "say", "-f", "-t", "0.3", "--", text)
         last = objects(done.out)[-1]
@@ -109,7 +109,7 @@ def test_wait_follows_several_goals_in_the_servers_order(scripted: Talk) -> None
         assert own == ["ACTIVE", "word", "word", "SUCCEEDED"]
 
 
-def test_wait_without_ids_follows_all_that_is_there(scripted: Talk) -> None:
+def test_wait_without_ids_follows_all_current_goals(scripted: Talk) -> None:
     assert scripted.run("wait", "-f").out == ""
     first = scripted.run("say", TALKING).id
     scripted.watcher.wait_for_word(first)
@@ -132,7 +132,7 @@ def test_wait_without_ids_follows_all_that_is_there(scripted: Talk) -> None:
     assert client.returncode == 0  # only goals that are named can fail
 
 
-def test_wait_for_a_goal_that_has_ended_shows_its_end(scripted: Talk) -> None:
+def test_wait_for_an_ended_goal_shows_its_state(scripted: Talk) -> None:
     goal_id = scripted.run("say", "--wait", "fail=audio_lost").id
     done = scripted.run("wait", "--feedback", goal_id)
     assert (done.code, done.out) == (4, f"{goal_id} ABORTED\n")

@@ -72,7 +72,7 @@ def test_each_line_is_a_goal_and_its_id_is_printed(scripted: Talk) -> None:
         assert (done.code, done.out, done.err) == (0, "", ""), "nothing to say is success"
 
 
-def test_input_that_never_ends_is_spoken_line_by_line(scripted: Talk) -> None:
+def test_endless_input_is_spoken_line_by_line(scripted: Talk) -> None:
     typing = Typing(scripted, "say", "--lines")
     for text in ("length=0 one", "length=0 two"):
         typing.type(f"{text}\n")
@@ -86,7 +86,7 @@ def test_input_that_never_ends_is_spoken_line_by_line(scripted: Talk) -> None:
     assert scripted.goal(out[0])["text"] == "length=0 without a newline"
 
 
-def test_options_hold_for_each_line_and_the_time_that_is_left_is_sent(scripted: Talk) -> None:
+def test_options_apply_to_each_line_with_the_remaining_ttl(scripted: Talk) -> None:
     options = ("--as", "reader", "--priority", "3", "--ttl", "9", "--ahead", "1")
     text = "length=0.5 one\n\0\nlength=0 two\nlength=0 three\n"
     done = scripted.run("--json", "say", "--lines", *options, stdin=text)
@@ -103,7 +103,7 @@ def test_options_hold_for_each_line_and_the_time_that_is_left_is_sent(scripted: 
     assert (goals[-1]["state"], ended.code) == ("ABORTED", 4)
 
 
-def test_a_line_that_is_refused_is_reported_by_its_number_and_the_rest_goes_on(scripted: Talk) -> None:
+def test_a_refused_line_is_reported_by_number_and_the_rest_is_spoken(scripted: Talk) -> None:
     widest = "\N{GRINNING FACE}" * 10_000  # the most bytes that a text may have, beside the end of its line
     lines = ["length=0 one", "", "nul \0", "length=0 two", "x" * 10_001, "y" * 300_000, "length=0 three"]
     text = "\n".join([*lines, f"{widest}\r", f"{widest}a\r\n"])
@@ -117,7 +117,7 @@ def test_a_line_that_is_refused_is_reported_by_its_number_and_the_rest_goes_on(s
     assert (quiet.code, quiet.out, quiet.err) == (5, "", "")
 
 
-def test_bytes_that_are_no_utf8_are_left_out_and_their_line_is_spoken(scripted: Talk) -> None:
+def test_a_line_with_invalid_utf8_is_reported_and_spoken(scripted: Talk) -> None:
     data = b"length=0 one\n\nlength=0 t\xffw\xfeo\n\xff\nlength=0 three\xc3"
     done, quiet = (
         subprocess.run([*TALK, *words], env=scripted.env, input=data, capture_output=True, timeout=60, check=False)
@@ -134,7 +134,7 @@ def test_bytes_that_are_no_utf8_are_left_out_and_their_line_is_spoken(scripted: 
     assert quiet.stderr == b""
 
 
-def test_wait_tells_how_each_ended_and_the_first_failure(scripted: Talk) -> None:
+def test_wait_reports_failures_and_exits_with_the_first_one(scripted: Talk) -> None:
     text = "length=0 fine\nfail=audio_lost message=no_cable\n\0\nlength=0 too\n"
     done = scripted.run("say", "--lines", "--wait", stdin=text)
     assert done.code == 4
@@ -146,7 +146,7 @@ def test_wait_tells_how_each_ended_and_the_first_failure(scripted: Talk) -> None
     assert (throttled.code, len(throttled.out.split()), "line 2: " in throttled.err) == (0, 1, True)
 
 
-def test_feedback_of_all_lines(scripted: Talk) -> None:
+def test_feedback_shows_the_events_of_all_lines(scripted: Talk) -> None:
     done = scripted.run("say", "--lines", "-f", stdin="length=0.1 a\nlength=0.1 b\n")
     assert done.code == 0
     shown = [each.split(" ", 1) for each in done.out.splitlines()]
@@ -161,7 +161,7 @@ def test_feedback_of_all_lines(scripted: Talk) -> None:
 
 
 @pytest.mark.parametrize(("words", "ahead"), [([], 10), (["--ahead", "2", "--wait"], 2)])
-def test_few_goals_are_pending_so_that_others_have_room(scripted: Talk, words: list[str], ahead: int) -> None:
+def test_few_lines_are_pending_so_that_others_have_room(scripted: Talk, words: list[str], ahead: int) -> None:
     typing = Typing(scripted, "say", "--lines", *words)
     lines = [ENDLESS.rstrip(), *(f"length=0 {number}" for number in range(20))]
     typing.type("\n".join(lines))
@@ -175,7 +175,7 @@ def test_few_goals_are_pending_so_that_others_have_room(scripted: Talk, words: l
     assert scripted.watcher.texts("PENDING") == [*lines[: ahead + 1], "length=0 theirs", *lines[ahead + 1 :]]
 
 
-def test_a_line_replaces_the_pending_one_of_its_key_however_few_may_be_pending(scripted: Talk) -> None:
+def test_a_line_replaces_a_pending_line_with_its_key_despite_the_limit(scripted: Talk) -> None:
     typing = Typing(scripted, "say", "--lines", "--key", "k", "--ahead", "1")
     typing.type(ENDLESS + "length=0 old\nlength=0 older\nlength=0 new\n")
     ids = [typing.line() for _ in range(4)]
@@ -186,7 +186,7 @@ def test_a_line_replaces_the_pending_one_of_its_key_however_few_may_be_pending(s
 @pytest.mark.parametrize(
     ("words", "code"), [([], 0), (["-q", "--wait"], 6), (["--json", "--wait"], 6), (["--ttl=0"], 0)]
 )
-def test_lines_whose_ttl_is_over_while_they_wait_are_dropped(make_talk: MakeTalk, words: list[str], code: int) -> None:
+def test_lines_whose_ttl_expires_while_they_wait_are_dropped(make_talk: MakeTalk, words: list[str], code: int) -> None:
     talk = make_talk("--max-queue", "1", scripted=True)
     theirs = [talk.run("say", each).id for each in (ENDLESS, "never-ends")]
     talk.watcher.wait_for_word(theirs[0])
@@ -216,7 +216,7 @@ def test_lines_whose_ttl_is_over_while_they_wait_are_dropped(make_talk: MakeTalk
 
 
 @pytest.mark.slow
-def test_a_line_that_comes_long_after_the_last_goal_ended_is_spoken(scripted: Talk) -> None:
+def test_a_line_is_spoken_after_a_long_pause_in_the_input(scripted: Talk) -> None:
     typing = Typing(scripted, "say", "--lines")
     typing.type("length=0 one\n")
     scripted.watcher.wait_for(typing.line(), "SUCCEEDED")
@@ -227,7 +227,7 @@ def test_a_line_that_comes_long_after_the_last_goal_ended_is_spoken(scripted: Ta
 
 
 @limits()
-def test_fifty_lines_a_second_are_spoken_while_they_are_new_and_others_are_spoken_too(scripted: Talk) -> None:
+def test_fast_input_is_spoken_within_its_ttl_and_delays_no_other_client(scripted: Talk) -> None:
     ttl, seconds, typed = 1.0, 2, {}
     typing = Typing(scripted, "-q", "say", "--lines", "--ttl", f"{ttl}")
     began = time.monotonic()
@@ -249,7 +249,7 @@ def test_fifty_lines_a_second_are_spoken_while_they_are_new_and_others_are_spoke
 
 
 @pytest.mark.parametrize(("words", "most"), [(["--ttl", "60"], 1_000_000), ([], 0)])
-def test_no_more_is_read_than_is_kept(scripted: Talk, words: list[str], most: int) -> None:
+def test_only_as_much_input_is_read_as_can_be_kept(scripted: Talk, words: list[str], most: int) -> None:
     client = Forked(["say", "--lines", *words], scripted.env, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)
     assert client.stdin
     pipe = client.stdin.fileno()
@@ -275,7 +275,7 @@ def test_lines_wait_for_room_and_none_is_lost(make_talk: MakeTalk) -> None:
     assert talk.watcher.texts("SUCCEEDED") == lines
 
 
-def test_several_hundred_lines_a_second(make_talk: MakeTalk) -> None:
+def test_several_hundred_lines_are_spoken_per_second(make_talk: MakeTalk) -> None:
     talk = make_talk(scripted=True, watched=False)
     lines = [f"length=0 {number}" for number in range(600)]
     with limits():
@@ -284,7 +284,7 @@ def test_several_hundred_lines_a_second(make_talk: MakeTalk) -> None:
     assert (done.code, len(done.out.split())) == (0, len(lines))
 
 
-def test_a_line_without_an_end_is_read_in_bounded_memory(scripted: Talk) -> None:
+def test_an_endless_line_is_read_with_bounded_memory(scripted: Talk) -> None:
     limited = ["sh", "-c", 'ulimit -v 400000 && exec "$@"', "sh", *TALK, "say", "--lines"]
     client = subprocess.Popen(
         limited, env=scripted.env, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
@@ -299,7 +299,7 @@ def test_a_line_without_an_end_is_read_in_bounded_memory(scripted: Talk) -> None
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
-def test_signal_cancels_what_is_its_own_and_nothing_else(make_talk: MakeTalk, number: signal.Signals) -> None:
+def test_a_signal_cancels_only_the_clients_own_goals(make_talk: MakeTalk, number: signal.Signals) -> None:
     talk = make_talk("--max-queue", "4", scripted=True)
     theirs = talk.run("say", "--priority", "-1", "length=0 theirs").id
     talk.watcher.wait_for_terminal(theirs)
@@ -325,7 +325,7 @@ def test_signal_cancels_what_is_its_own_and_nothing_else(make_talk: MakeTalk, nu
 
 
 @pytest.mark.parametrize("words", [["--json", "--wait"], ["-f"]])
-def test_line_that_waits_for_room_is_never_spoken_after_the_signal(make_talk: MakeTalk, words: list[str]) -> None:
+def test_a_line_that_waits_for_room_is_not_spoken_after_a_signal(make_talk: MakeTalk, words: list[str]) -> None:
     talk = make_talk("--max-queue", "1", scripted=True)
     typing = Typing(talk, "say", "--lines", *words)
     typing.type(ENDLESS + "second\nthird\nfourth\n")
@@ -343,7 +343,7 @@ def test_line_that_waits_for_room_is_never_spoken_after_the_signal(make_talk: Ma
     assert talk.run("--json", "status").out.count('"PENDING"') == 0
 
 
-def test_timeout_is_for_all_lines(scripted: Talk) -> None:
+def test_the_timeout_applies_to_all_lines_together(scripted: Talk) -> None:
     typing = Typing(scripted, "say", "--lines", "-w", "-t", "0.5")
     typing.type(ENDLESS + "second\n")
     ids = [typing.line(), typing.line()]
@@ -360,7 +360,7 @@ def test_timeout_is_for_all_lines(scripted: Talk) -> None:
 
 
 @pytest.mark.parametrize("words", [[], ["-f"]])
-def test_server_that_goes_away(scripted: Talk, words: list[str]) -> None:
+def test_the_client_exits_if_the_server_goes_away(scripted: Talk, words: list[str]) -> None:
     typing = Typing(scripted, "say", "--lines", *words)
     typing.type(ENDLESS)
     first = typing.line().split()[0]
@@ -373,7 +373,7 @@ def test_server_that_goes_away(scripted: Talk, words: list[str]) -> None:
     assert [each for each in out if "LOST" in each] == ([f"{first} LOST"] if words == ["-f"] else [])
 
 
-def test_a_server_that_went_away_while_nothing_was_spoken_is_told_with_the_next_line(scripted: Talk) -> None:
+def test_a_lost_idle_server_is_reported_with_the_next_line(scripted: Talk) -> None:
     typing = Typing(scripted, "say", "--lines")
     typing.type("\0\n")
     assert "line 1" in typing.errors.readline()
@@ -384,7 +384,7 @@ def test_a_server_that_went_away_while_nothing_was_spoken_is_told_with_the_next_
     assert "line 2 may not have been accepted" in err
 
 
-def test_no_server_is_told_before_anything_is_read() -> None:
+def test_a_missing_server_is_reported_before_input_is_read() -> None:
     with short_directory() as home:
         client = subprocess.Popen(
             [*TALK, "say", "--lines"],
@@ -422,9 +422,7 @@ def test_lines_are_spoken_if_the_reader_of_their_ids_has_gone(scripted: Talk, wo
 
 
 @pytest.mark.parametrize(("words", "ended"), [(["--wait"], True), (["--wait", "--json"], False), (["-f"], False)])
-def test_reader_that_goes_away_while_it_waits_cancels_what_is_its_own(
-    scripted: Talk, words: list[str], ended: bool
-) -> None:
+def test_the_clients_goals_are_cancelled_if_its_reader_goes_away(scripted: Talk, words: list[str], ended: bool) -> None:
     client, reader = piped(scripted, *words)
     with client:
         assert client.stdin
@@ -440,7 +438,7 @@ def test_reader_that_goes_away_while_it_waits_cancels_what_is_its_own(
     assert [scripted.watcher.wait_for_terminal(each) for each in (first, second["id"])] == ["PREEMPTED", "RECALLED"]
 
 
-def test_standard_input_that_cannot_be_read_is_told(scripted: Talk) -> None:
+def test_an_unreadable_standard_input_is_reported(scripted: Talk) -> None:
     for words in (["--lines"], ["-"]):
         with open(os.devnull, "wb") as write_only:
             done = subprocess.run(

@@ -77,7 +77,7 @@ def test_preempt_queue_flush_and_priority_reach_the_server(make_talk: MakeTalk) 
     assert ends == ["PREEMPTED", "RECALLED", "SUCCEEDED"]
 
 
-def test_ttl_and_key_and_wait_tell_what_became_of_it(scripted: Talk) -> None:
+def test_expired_and_replaced_goals_exit_with_6(scripted: Talk) -> None:
     busy(scripted)
     expired = scripted.run("--json", "say", "--wait", "--ttl", "0.2", "too late")
     goal = json.loads(expired.out)
@@ -90,7 +90,7 @@ def test_ttl_and_key_and_wait_tell_what_became_of_it(scripted: Talk) -> None:
     assert (done.code, done.out, newer in done.err) == (6, "", True)
 
 
-def test_throttled_is_success_without_a_word_on_standard_output(scripted: Talk) -> None:
+def test_a_throttled_goal_exits_with_0_and_prints_no_id(scripted: Talk) -> None:
     throttled = ["say", "--key", "battery", "--throttle", "60"]
     assert scripted.run(*throttled, "--wait", "length=0").code == 0
     for words in ([], ["-f"]):
@@ -104,7 +104,7 @@ def test_throttled_is_success_without_a_word_on_standard_output(scripted: Talk) 
     assert (goal["state"], goal["reason"]) == ("REJECTED", "throttled")
 
 
-def test_settings_of_a_goal_are_sent_and_the_environment_is_not(make_talk: MakeTalk) -> None:
+def test_the_settings_of_a_goal_come_from_options_not_from_variables(make_talk: MakeTalk) -> None:
     env = {"TALK_RATE": "111", "TALK_VOLUME": "0.1", "TALK_VOICE": "nobody"}
     talk = make_talk(scripted=True)
     done = run([*TALK, "say", "--wait", "length=0"], {**talk.env, **env})
@@ -116,7 +116,7 @@ def test_settings_of_a_goal_are_sent_and_the_environment_is_not(make_talk: MakeT
     assert "nobody-speaks-it" in unknown.err
 
 
-def test_ctrl_c_while_the_text_is_read_ends_the_terminal_s_line(scripted: Talk) -> None:
+def test_ctrl_c_while_the_text_is_read_prints_a_newline(scripted: Talk) -> None:
     with subprocess.Popen(
         [*TALK, "say", "-"], env=scripted.env, stdin=subprocess.PIPE, stderr=subprocess.PIPE
     ) as client:
@@ -131,14 +131,14 @@ def test_ctrl_c_while_the_text_is_read_ends_the_terminal_s_line(scripted: Talk) 
     assert client.returncode == 130
 
 
-def test_a_lead_in_of_its_own_takes_its_time_and_is_no_part_of_the_goal(make_talk: MakeTalk) -> None:
+def test_the_lead_in_of_a_goal_is_not_part_of_its_duration(make_talk: MakeTalk) -> None:
     talk = make_talk("--player", "null")
     goal = json.loads(talk.run("--json", "say", "--wait", "--lead-in", "300", "hi").out.splitlines()[-1])
     assert goal["state"] == "SUCCEEDED"
     assert goal["ended_at"] - goal["started_at"] >= goal["duration"] + 0.3
 
 
-def test_speech_that_is_paused_is_noted(scripted: Talk) -> None:
+def test_say_reports_that_speech_is_paused(scripted: Talk) -> None:
     held = busy(scripted)
     assert scripted.run("pause").code == 0
     note = "talk: speech is paused; continue with: talk resume\n"
@@ -154,7 +154,7 @@ def test_speech_that_is_paused_is_noted(scripted: Talk) -> None:
     assert scripted.run("say", "length=0").err == ""
 
 
-def test_own_id_is_printed_and_spoken_once(scripted: Talk) -> None:
+def test_a_goal_with_a_chosen_id_is_spoken_once(scripted: Talk) -> None:
     text = "fail=audio_lost message=no_cable"
     assert scripted.run("say", "--id", "dock-17a", text).out == "dock-17a\n"
     scripted.watcher.wait_for_terminal("dock-17a")
@@ -170,7 +170,7 @@ def test_own_id_is_printed_and_spoken_once(scripted: Talk) -> None:
 
 
 @pytest.mark.parametrize("feedback", [[], ["-f"]])
-def test_client_that_attached_cancels_nothing(scripted: Talk, feedback: list[str]) -> None:
+def test_an_attached_client_cancels_nothing(scripted: Talk, feedback: list[str]) -> None:
     text = "never-ends length=60 " + "word " * 600  # one in a tenth of a second
     scripted.run("say", "--id", "mine", text)
     scripted.watcher.wait_for_word("mine")
@@ -206,7 +206,7 @@ def test_output_writes_a_file_without_a_server(tmp_path: Path) -> None:
     assert told["seconds"] == pytest.approx(seconds, abs=0.05)
 
 
-def test_output_leaves_out_bytes_that_are_no_utf8_and_names_them(tmp_path: Path) -> None:
+def test_output_omits_and_reports_invalid_utf8_bytes(tmp_path: Path) -> None:
     hidden = ".mp3"  # no ending
     for name, text in (("said.wav", "battery \udcfflow"), (hidden, "battery  low")):
         done = alone("say", "-o", str(tmp_path / name), "--", text, TALK_NAME="patrol")
@@ -223,7 +223,7 @@ def _seconds_of(tmp_path: Path, *words: str, **env: str) -> float:
     return float(json.loads(done.out)["seconds"])
 
 
-def test_output_goes_to_standard_output(tmp_path: Path) -> None:
+def test_output_can_be_standard_output(tmp_path: Path) -> None:
     with short_directory() as home:
         env = environment(home, TALK_SOCKET=f"{home}/s")
         script = 'printf "battery low" | "$@" say -o - - | cat > said.wav'
@@ -241,7 +241,7 @@ def test_output_goes_to_standard_output(tmp_path: Path) -> None:
     assert "standard output" in both.err
 
 
-def test_output_takes_a_text_of_any_length(tmp_path: Path) -> None:
+def test_output_accepts_a_text_of_any_length(tmp_path: Path) -> None:
     text = f"one {' ' * 45_000} two"  # more than a goal may have of characters, and of bytes
     words = ["--json", "say", "-o", str(tmp_path / "x.wav"), "--rate", "450"]
     with short_directory() as home:
@@ -254,7 +254,7 @@ def test_output_takes_a_text_of_any_length(tmp_path: Path) -> None:
         assert found.getnframes() / found.getframerate() == pytest.approx(told["seconds"], abs=0.01)
 
 
-def test_a_text_that_is_too_long_is_told_what_takes_any(scripted: Talk) -> None:
+def test_the_error_for_a_long_text_suggests_lines(scripted: Talk) -> None:
     for words, typed in ((["-"], "one two. " * 2000), (["-w", "-"], "x" * 50_000), (["-w", "x" * 10_001], None)):
         done = scripted.run("say", *words, stdin=typed)
         assert (done.code, done.out) == (5, "")
@@ -263,7 +263,7 @@ def test_a_text_that_is_too_long_is_told_what_takes_any(scripted: Talk) -> None:
     assert scripted.run("-q", "say", "-", stdin="x" * 50_000).err == ""
 
 
-def test_output_takes_settings_from_options_then_from_the_environment(tmp_path: Path) -> None:
+def test_output_prefers_options_to_environment_variables(tmp_path: Path) -> None:
     usual = _seconds_of(tmp_path, "--rate", "200", TALK_RATE="100")
     assert _seconds_of(tmp_path, TALK_RATE="") == pytest.approx(usual, abs=0.1)
     assert _seconds_of(tmp_path, TALK_RATE="100") > 1.5 * usual
@@ -277,7 +277,7 @@ def test_output_takes_settings_from_options_then_from_the_environment(tmp_path: 
     assert os.listdir(tmp_path) == ["x.wav"]
 
 
-def test_output_that_fails_says_why_and_leaves_nothing(tmp_path: Path) -> None:
+def test_a_failed_output_reports_an_error_and_leaves_no_file(tmp_path: Path) -> None:
     for words, code in (
         (["-o", f"{tmp_path}/no/x.wav", "hello"], 1),
         (["-o", str(tmp_path), "hello"], 2),
@@ -290,7 +290,7 @@ def test_output_that_fails_says_why_and_leaves_nothing(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == []
 
 
-def test_output_that_is_interrupted_leaves_nothing(tmp_path: Path) -> None:
+def test_an_interrupted_output_leaves_no_file(tmp_path: Path) -> None:
     with short_directory() as home:
         client = subprocess.Popen(
             [*TALK, "say", "-o", str(tmp_path / "x.wav"), "--rate", "80", "--", "one two three. " * 600],

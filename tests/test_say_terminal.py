@@ -48,7 +48,7 @@ def painted(terminal: Terminal, columns: int = 80) -> Iterator[Screen]:
         yield screen
 
 
-def test_each_word_is_lit_as_it_is_heard_and_the_line_is_left_whole(scripted: Talk, in_terminal: Run) -> None:
+def test_each_word_is_highlighted_while_it_is_heard(scripted: Talk, in_terminal: Run) -> None:
     text = "length=0.4 battery low now"
     terminal = in_terminal("say", "-wf", "--", text)
     terminal.wait_until(lambda screen: bool(screen.marked(LIT)))  # while the rest is still to come
@@ -68,7 +68,7 @@ def test_each_word_is_lit_as_it_is_heard_and_the_line_is_left_whole(scripted: Ta
     assert terminal.screen.attributes == ""
 
 
-def test_a_long_text_is_followed_within_the_width_and_whole_at_the_end(scripted: Talk, in_terminal: Run) -> None:
+def test_a_long_text_scrolls_and_is_shown_whole_at_the_end(scripted: Talk, in_terminal: Run) -> None:
     words = [f"word{number}" for number in range(60)]
     text = " ".join(["length=1", *words])
     terminal = in_terminal("say", "-wf", "--", text, columns=50)
@@ -87,7 +87,7 @@ def test_a_long_text_is_followed_within_the_width_and_whole_at_the_end(scripted:
 
 
 @pytest.mark.parametrize("columns", [5, 30])
-def test_neither_wide_nor_control_characters_break_the_line(in_terminal: Run, columns: int) -> None:
+def test_wide_and_control_characters_do_not_break_the_line(in_terminal: Run, columns: int) -> None:
     text = "length=0.3 日本語の文章です a\x1b[31mred \u202egnp 👩👩👩👩 é é é の終わり\x07"
     terminal = in_terminal("say", "-wf", "--", text, columns=columns)
     assert terminal.finish() == 0  # the screen fails at any control sequence but those of talk
@@ -100,7 +100,7 @@ def test_neither_wide_nor_control_characters_break_the_line(in_terminal: Run, co
     assert printable(text).replace(" ", "") in shown.replace(" ", "")
 
 
-def test_a_terminal_that_is_resized_is_painted_anew(scripted: Talk, in_terminal: Run) -> None:
+def test_the_line_is_redrawn_when_the_terminal_is_resized(scripted: Talk, in_terminal: Run) -> None:
     text = "never-ends words=1 " + " ".join(f"word{number}" for number in range(20))
     terminal = in_terminal("say", "-wf", "--", text, columns=100)
     terminal.wait_until(lambda screen: screen.marked(LIT) == "never-ends")
@@ -114,7 +114,7 @@ def test_a_terminal_that_is_resized_is_painted_anew(scripted: Talk, in_terminal:
     assert terminal.finish() == 7
 
 
-def test_ctrl_c_cancels_and_leaves_the_terminal_clean_and_a_pause_is_shown(scripted: Talk, in_terminal: Run) -> None:
+def test_a_pause_is_shown_and_ctrl_c_leaves_the_terminal_clean(scripted: Talk, in_terminal: Run) -> None:
     terminal = in_terminal("say", "-wf", "--", "never-ends words=2 and so on", columns=200)
     terminal.wait_until(lambda screen: screen.marked(LIT) == "words=2")
     scripted.run("pause")
@@ -132,7 +132,7 @@ def test_ctrl_c_cancels_and_leaves_the_terminal_clean_and_a_pause_is_shown(scrip
     assert (last, terminal.screen.attributes) == ("", "")
 
 
-def test_a_timeout_or_a_lost_server_leaves_the_line_whole(scripted: Talk, in_terminal: Run) -> None:
+def test_the_line_is_whole_after_a_timeout_or_a_lost_server(scripted: Talk, in_terminal: Run) -> None:
     terminal = in_terminal("say", "-f", "-t", "0.3", "--", "never-ends words=1 text")
     assert terminal.finish() == 124
     assert terminal.screen.lines[0] == f"{scripted.watcher.goals()[0]}  PREEMPTED  never-ends words=1 text"
@@ -144,7 +144,7 @@ def test_a_timeout_or_a_lost_server_leaves_the_line_whole(scripted: Talk, in_ter
     assert "may still be spoken" in "".join(terminal.screen.lines[1:3])
 
 
-def test_a_failure_leaves_the_words_that_were_heard_and_its_reason(in_terminal: Run) -> None:
+def test_a_failed_goal_shows_the_heard_words_and_the_reason(in_terminal: Run) -> None:
     terminal = in_terminal(
         "say", "-wf", "--", "length=0.4 fail=audio_lost message=no_cable words=2 never heard", columns=200
     )
@@ -165,7 +165,7 @@ def test_a_terminal_without_colour_gets_one_line_per_event(scripted: Talk, in_te
     assert b"\x1b" not in terminal.raw
 
 
-def test_wait_shows_the_goal_being_spoken_and_each_end(scripted: Talk, in_terminal: Run) -> None:
+def test_wait_shows_the_active_goal_and_all_results(scripted: Talk, in_terminal: Run) -> None:
     first = scripted.run("say", "never-ends words=1 first").id
     second = scripted.run("say", "length=0.3 second").id
     third = scripted.run("say", "length=0.3 third").id
@@ -182,7 +182,7 @@ def test_wait_shows_the_goal_being_spoken_and_each_end(scripted: Talk, in_termin
     assert [each[:5] for each in terminal.screen.lines[3:]] == ["talk:", "talk:", ""]
 
 
-def test_lines_that_are_typed_light_up_one_after_the_other(scripted: Talk, in_terminal: Run) -> None:
+def test_typed_lines_are_highlighted_one_after_the_other(scripted: Talk, in_terminal: Run) -> None:
     terminal = in_terminal("say", "--lines", "-f", columns=100)
     terminal.type(b"length=0.5 words=1 one\n")
     terminal.wait_until(lambda screen: screen.marked(LIT) == "length=0.5")
@@ -198,7 +198,7 @@ def test_lines_that_are_typed_light_up_one_after_the_other(scripted: Talk, in_te
     assert terminal.screen.attributes == ""
 
 
-def test_the_doctor_is_named_when_a_goal_was_aborted_unless_its_text_has_no_words(scripted: Talk) -> None:
+def test_aborted_goals_refer_to_the_doctor_unless_they_had_no_words(scripted: Talk) -> None:
     for text, told in (("fail=audio_lost", True), ("fail=nothing_to_say", False), ("length=0", False)):
         assert scripted.run("say", "--wait", "--", text).err.endswith("; find out why with: talk doctor\n") == told
 
@@ -216,7 +216,7 @@ def word(text: str, view: str) -> tuple[int, int]:
     return start, start + len(view)
 
 
-def test_a_sentence_is_cut_around_the_word() -> None:
+def test_a_sentence_is_cut_around_the_current_word() -> None:
     assert MeasuredText("battery low").view(8, 11, 11) == ("battery ", "low", "")
     assert MeasuredText("").view(0, 0, 80) == ("", "", "")
     sentence = MeasuredText(LONG)
@@ -238,13 +238,13 @@ def test_wide_characters_take_two_columns() -> None:
     assert lit == "日本語"
 
 
-def test_control_and_bidi_characters_are_shown_escaped_and_still_lit_in_place() -> None:
+def test_escaped_characters_do_not_shift_the_highlight() -> None:
     text = "a\x1b[31m \u202ered\nnext"
     assert MeasuredText(text).view(*word(text, "next"), 80)[:2] == ("a\\x1b[31m \\u202ered\\n", "next")
 
 
 @given(text=ODD, start=st.integers(-3, 90), length=st.integers(-3, 30), columns=st.integers(-2, 60))
-def test_never_wider_than_the_terminal_and_never_anything_raw(text: str, start: int, length: int, columns: int) -> None:
+def test_the_view_fits_the_terminal_and_is_always_printable(text: str, start: int, length: int, columns: int) -> None:
     sentence = MeasuredText(text)
     assert sentence.whole == printable(text)
     heard, lit, ahead = sentence.view(start, start + length, columns)

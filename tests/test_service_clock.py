@@ -52,7 +52,7 @@ async def _queued_behind_another(ttl: float) -> Speech:
 
 
 @in_loop
-async def test_a_goal_whose_time_ended_in_a_suspend_is_recalled_when_the_machine_wakes(slept: list[float]) -> None:
+async def test_a_goal_that_expired_during_a_suspend_is_recalled_afterwards(slept: list[float]) -> None:
     served = await _queued_behind_another(ttl=600)
     await asyncio.sleep(0)  # the loop has set its timer for the ten minutes
     slept.append(3_600)
@@ -64,7 +64,7 @@ async def test_a_goal_whose_time_ended_in_a_suspend_is_recalled_when_the_machine
 
 
 @in_loop
-async def test_no_request_after_a_suspend_finds_a_goal_whose_time_is_over(slept: list[float]) -> None:
+async def test_requests_after_a_suspend_find_no_expired_goals(slept: list[float]) -> None:
     served = await _queued_behind_another(ttl=600)
     slept.append(3_600)
     served.advance_time()  # every request begins with this
@@ -72,6 +72,6 @@ async def test_no_request_after_a_suspend_finds_a_goal_whose_time_is_over(slept:
 
 
 @pytest.mark.skipif(not hasattr(time, "CLOCK_BOOTTIME"), reason="this system has no clock that counts a suspend")
-def test_the_clock_is_the_one_that_counts_a_suspend() -> None:
+def test_the_servers_clock_includes_suspends() -> None:
     before = time.clock_gettime(time.CLOCK_BOOTTIME)
     assert before <= speech.elapsed() <= time.clock_gettime(time.CLOCK_BOOTTIME)

@@ -113,7 +113,7 @@ async def test_begin_reads_waiting_input_and_sends_waiting_output_at_once() -> N
 
 
 @in_loop
-async def test_output_of_one_turn_goes_out_in_one_piece() -> None:
+async def test_the_output_of_one_turn_is_sent_in_one_piece() -> None:
     async with paired() as pair:
         pair.stream.begin()
         for number in range(5):
@@ -134,7 +134,7 @@ async def test_large_output_is_sent_before_the_turn_ends() -> None:
 
 
 @in_loop
-async def test_congestion_is_told_once_and_all_output_arrives() -> None:
+async def test_congestion_is_reported_once_and_all_output_arrives() -> None:
     async with paired() as pair:
         pair.stream.begin()
         written = b""
@@ -153,7 +153,7 @@ async def test_congestion_is_told_once_and_all_output_arrives() -> None:
 
 
 @in_loop
-async def test_reading_stops_and_goes_on() -> None:
+async def test_reading_can_be_paused_and_resumed() -> None:
     async with paired() as pair:
         pair.stream.begin()
         pair.stream.pause_reading()
@@ -167,7 +167,7 @@ async def test_reading_stops_and_goes_on() -> None:
 
 
 @in_loop
-async def test_end_of_the_input_is_told_once_and_replies_still_go_out() -> None:
+async def test_the_end_of_input_is_reported_once_and_replies_are_still_sent() -> None:
     async with paired() as pair:
         pair.stream.begin()
         pair.client.shutdown(socket.SHUT_WR)
@@ -182,7 +182,7 @@ async def test_end_of_the_input_is_told_once_and_replies_still_go_out() -> None:
         assert (pair.receive(), pair.told.lost) == (b"answer\n", [None])
 
 
-def test_close_sends_the_rest_of_the_output_and_abort_does_not() -> None:
+def test_close_sends_the_remaining_output_and_abort_does_not() -> None:
     async def play(*, abort: bool) -> int:
         async with paired() as pair:
             pair.stream.begin()
@@ -206,7 +206,7 @@ def test_close_sends_the_rest_of_the_output_and_abort_does_not() -> None:
 
 
 @in_loop
-async def test_write_to_a_client_that_is_gone_ends_the_stream_and_its_input_can_still_be_read() -> None:
+async def test_input_can_be_read_after_a_write_to_a_closed_client_failed() -> None:
     async with paired() as pair:
         pair.stream.begin()
         pair.stream.pause_reading()
@@ -223,7 +223,7 @@ async def test_write_to_a_client_that_is_gone_ends_the_stream_and_its_input_can_
 
 
 @in_loop
-async def test_bug_in_the_receiver_ends_the_connection() -> None:
+async def test_a_bug_in_the_receiver_ends_the_connection() -> None:
     said = []
     asyncio.get_running_loop().set_exception_handler(lambda _, context: said.append(context["exception"]))
     async with paired() as pair:
@@ -255,7 +255,7 @@ async def test_one_callback_sends_the_output_of_all_streams() -> None:
 
 
 @in_loop
-async def test_past_the_limit_for_all_output_the_largest_backlog_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_the_client_with_the_largest_backlog_is_dropped_at_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     streams = ClientStreams()
     async with contextlib.AsyncExitStack() as stack:
         pairs = [await stack.enter_async_context(paired()) for _ in range(3)]

@@ -62,7 +62,7 @@ def low() -> Samples:
     return render([LOW])[0]
 
 
-def test_the_reference_is_espeak_ngs_own_sound_bit_for_bit(low: Samples, tmp_path: pathlib.Path) -> None:
+def test_the_reference_equals_the_output_of_espeak_ng_bit_for_bit(low: Samples, tmp_path: pathlib.Path) -> None:
     needs("espeak-ng")
     out = str(tmp_path / "out.wav")
     subprocess.run(["espeak-ng", "-s", "200", "-w", out, LOW], check=True, capture_output=True)
@@ -82,7 +82,7 @@ def test_a_played_sentence_is_recorded_sample_for_sample(sink: Sink) -> None:
     assert result.correlation > 0.999
 
 
-def test_the_right_sentence_is_recognised_whatever_a_busy_machine_does_to_it(low: Samples) -> None:
+def test_a_sentence_is_recognised_despite_gaps_and_lost_samples(low: Samples) -> None:
     """A player that runs dry puts silence between two samples, and the monitor loses some samples then."""
     (result,) = assert_heard(recorded(low), [low])
     assert result.correlation > 0.999
@@ -100,7 +100,7 @@ def test_the_right_sentence_is_recognised_whatever_a_busy_machine_does_to_it(low
     assert_heard(recorded(heard[-1], SILENCE, low), [low, low])
 
 
-def test_a_wrong_sentence_is_noticed(low: Samples) -> None:
+def test_a_wrong_sentence_is_detected(low: Samples) -> None:
     left, right, low_it = render([LEFT])[0], render([RIGHT])[0], render([LOW_IT])[0]
     ends = [without_end(low, each) for each in (0.03, 0.1, 0.3)]
     stutter = np.concatenate([low[:12000], low[11000:]])
@@ -120,7 +120,7 @@ def test_a_wrong_sentence_is_noticed(low: Samples) -> None:
             assert_heard(recorded(heard), [low])
 
 
-def test_silence_is_no_sentence_and_a_missing_recording_is_no_silence(low: Samples) -> None:
+def test_silence_is_not_a_sentence_and_an_empty_recording_is_not_silence(low: Samples) -> None:
     assert compare(SILENCE, low).correlation == 0
     with pytest.raises(AssertionError, match="was not heard"):
         assert_heard(SILENCE, [low])
@@ -129,7 +129,7 @@ def test_silence_is_no_sentence_and_a_missing_recording_is_no_silence(low: Sampl
         assert_silent(SILENCE[:0])
 
 
-def test_sentences_are_recognised_in_order_and_each_once(low: Samples) -> None:
+def test_sentences_must_be_heard_once_and_in_order(low: Samples) -> None:
     with pytest.raises(AssertionError, match="more was heard"):
         assert_heard(recorded(low, low), [low])
     with pytest.raises(AssertionError, match="not heard correctly"):
@@ -148,7 +148,7 @@ def test_sentences_are_recognised_in_order_and_each_once(low: Samples) -> None:
 
 
 @pytest.mark.parametrize("silence", [0, 63, 240])
-def test_a_sentence_is_found_behind_a_stopped_one_however_little_silence_is_between(silence: int) -> None:
+def test_a_sentence_is_found_directly_after_a_stopped_one(silence: int) -> None:
     (beginning,) = render([LONG], rate=QUICK)
     first, _ = extent(beginning) or (0, 0)
     (following,) = stopped._render_after_stop((LONG, BATTERY), QUICK)[11]
@@ -160,7 +160,7 @@ def test_a_sentence_is_found_behind_a_stopped_one_however_little_silence_is_betw
 
 
 @pytest.mark.parametrize("dry", [None, 5000, 12000])
-def test_a_stopped_or_held_sentence_is_recognised_though_it_ran_dry_before(low: Samples, dry: int | None) -> None:
+def test_a_stopped_or_paused_sentence_is_recognised_despite_a_gap(low: Samples, dry: int | None) -> None:
     (left,) = render([LEFT])
     gap, dry = zeros(900 if dry else 0), dry or 0
     begun = np.concatenate([low[:dry], gap, low[dry:20000]])
@@ -182,7 +182,7 @@ def test_a_stopped_or_held_sentence_is_recognised_though_it_ran_dry_before(low: 
             assert_resumed(recorded(begun[:16000], pause, rest), low, 1.9)
 
 
-def test_quiet_samples_beside_a_pause_belong_to_the_sentence() -> None:
+def test_quiet_samples_next_to_a_pause_belong_to_the_sentence() -> None:
     """A sentence is held at its own zeros, which stand between faint sounds, and it ran dry before."""
     (sentence,) = render([Sentence("two three four five six seven eight nine ten", rate=450)])
     sounds = np.flatnonzero(sentence)
@@ -198,7 +198,7 @@ def test_quiet_samples_beside_a_pause_belong_to_the_sentence() -> None:
                 assert_resumed(recorded(begun, PAUSE, wrong), sentence, 1.9, repeated=0.05)
 
 
-def test_a_sentence_that_is_not_repeated_to_the_sample_is_told_from_others() -> None:
+def test_similarity_distinguishes_sentences_whose_samples_vary() -> None:
     """It is spoken a fifth time by one process, with a gap at which the player ran dry."""
     low, left, right = (Sentence(each, rate=450) for each in (LOW, LEFT, RIGHT))
     first, *_, again = render([low, left, right, left, low])

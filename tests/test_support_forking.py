@@ -51,7 +51,7 @@ def serving(env: dict[str, str], *, session: bool = False) -> Forked:
     return process
 
 
-def test_it_ends_as_a_started_one_does(env: dict[str, str]) -> None:
+def test_a_forked_command_ends_like_a_started_one(env: dict[str, str]) -> None:
     for words, code, out, err in (
         (["--version"], 0, "talk ", ""),
         (["sya"], 2, "", "did you mean"),
@@ -64,7 +64,7 @@ def test_it_ends_as_a_started_one_does(env: dict[str, str]) -> None:
         assert found == (started.returncode, started.stdout, started.stderr)
 
 
-def test_a_signal_is_not_lost_however_early_it_comes(env: dict[str, str]) -> None:
+def test_an_early_signal_is_not_lost(env: dict[str, str]) -> None:
     for _ in range(10):
         reading = piped(["say", "-"], env)  # which would wait for ever
         reading.send_signal(signal.SIGINT)
@@ -72,7 +72,7 @@ def test_a_signal_is_not_lost_however_early_it_comes(env: dict[str, str]) -> Non
         reading.communicate(timeout=LIMIT)
 
 
-def test_a_signal_that_kills_it_is_a_negative_code(env: dict[str, str]) -> None:
+def test_a_fatal_signal_gives_a_negative_exit_code(env: dict[str, str]) -> None:
     number = signal.SIGSEGV
     with serving(env, session=True) as process:
         assert process.poll() is None
@@ -85,7 +85,7 @@ def test_a_signal_that_kills_it_is_a_negative_code(env: dict[str, str]) -> None:
         process.send_signal(number)  # the process is gone, and no other process gets the signal
 
 
-def test_sigint_and_sigterm_give_a_shell_s_exit_codes(env: dict[str, str]) -> None:
+def test_sigint_and_sigterm_give_the_exit_codes_of_a_shell(env: dict[str, str]) -> None:
     with serving(env) as server:
         for number in (signal.SIGINT, signal.SIGTERM):
             client = piped(["watch"], env)
@@ -98,7 +98,7 @@ def test_sigint_and_sigterm_give_a_shell_s_exit_codes(env: dict[str, str]) -> No
         assert server.wait(LIMIT) == 0
 
 
-def test_its_input_environment_and_directory_are_its_own(env: dict[str, str], tmp_path: pathlib.Path) -> None:
+def test_input_environment_and_directory_can_be_set(env: dict[str, str], tmp_path: pathlib.Path) -> None:
     assert env["TALK_SOCKET"] in ended(["status"], env)[2]
     assert env["TALK_SOCKET"] not in ended(["status"], {**env, "TALK_SOCKET": "/nowhere/else"})[2]
     for each in ("one", "two"):
@@ -109,7 +109,7 @@ def test_its_input_environment_and_directory_are_its_own(env: dict[str, str], tm
         assert (tmp_path / each / "here.wav").stat().st_size > 1000
 
 
-def test_it_is_killed_with_the_process_that_forks(env: dict[str, str]) -> None:
+def test_a_forked_server_dies_with_its_parent(env: dict[str, str]) -> None:
     code = (
         "import os, sys\nfrom tests.support.forking import Forked\n"
         "server = Forked(['serve', '--player', 'null'], dict(os.environ), stderr=-1)\n"
@@ -130,7 +130,7 @@ def test_it_is_killed_with_the_process_that_forks(env: dict[str, str]) -> None:
                 pass  # until it is gone
 
 
-def test_another_interpreter_library_or_locale_is_not_forked(env: dict[str, str]) -> None:
+def test_can_fork_rejects_another_interpreter_library_or_locale(env: dict[str, str]) -> None:
     assert can_fork(env)
     assert can_fork({**env, "TALK_PLAYER": "null", "HOME": "/elsewhere"})
     for name, value in (("PYTHONPATH", "/elsewhere"), ("PYTHONUTF8", "0"), ("LD_PRELOAD", "lib.so")):

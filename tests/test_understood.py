@@ -72,7 +72,7 @@ def test_ten_sentences_of_a_neural_voice_are_understood(make_talk: MakeTalk, tmp
 
 
 @pytest.mark.slow  # each sentence takes as long as it is, with either voice: a minute and a half
-def test_a_neural_voice_is_understood_no_worse_than_espeak(make_talk: MakeTalk, sink: Sink, tmp_path: Path) -> None:
+def test_a_neural_voice_is_understood_as_well_as_espeak(make_talk: MakeTalk, sink: Sink, tmp_path: Path) -> None:
     real_voice()
     needs_packages(PACKAGE)
     env = {"XDG_CACHE_HOME": str(tmp_path / "cache")}
@@ -88,6 +88,6 @@ def test_a_neural_voice_is_understood_no_worse_than_espeak(make_talk: MakeTalk, 
     assert len(wrong[REAL_VOICE]) <= min(1, len(wrong[ESPEAK])), wrong
 
 
-def test_noise_is_understood_as_nothing() -> None:
+def test_no_sentence_is_recognised_in_noise() -> None:
     noise = np.random.default_rng(3).normal(0, 3000, 2 * RATE).astype(np.int16)
     assert recognize(noise, SENTENCES) == ""

@@ -122,7 +122,7 @@ async def all_told(line: Notifications) -> None:
 
 
 @in_loop
-async def test_a_check_for_room_asks_once_for_goals_that_need_the_same_room() -> None:
+async def test_a_room_check_asks_once_per_priority() -> None:
     server, client = Server(), Client()
     server.fill()
     for number in range(1_000):
@@ -138,7 +138,7 @@ async def test_a_check_for_room_asks_once_for_goals_that_need_the_same_room() ->
 
 
 @in_loop
-async def test_waiting_requests_of_all_connections_have_a_limit_in_bytes() -> None:
+async def test_the_memory_for_all_waiting_requests_is_limited() -> None:
     server, one, other = Server(), Client(), Client()
     server.fill()
     count = 0
@@ -163,14 +163,14 @@ async def test_waiting_requests_of_all_connections_have_a_limit_in_bytes() -> No
     "request_", [Say("w", data={"a": [[] for _ in range(300)]}), Wait(ids=tuple(f"{each}" for each in range(400)))]
 )
 @in_loop
-async def test_small_values_count_with_the_memory_that_they_take(request_: Say | Wait) -> None:
+async def test_small_values_are_counted_with_their_real_memory_use(request_: Say | Wait) -> None:
     server = Server()
     assert server.requests._reserve_memory(PendingRequest(cast("Any", Client()), None, request_))
     assert server.requests._waiting_bytes > REQUEST_BYTES + 16_000
 
 
 @in_loop
-async def test_client_that_leaves_while_its_goals_are_cancelled_is_forgotten() -> None:
+async def test_a_client_that_leaves_during_a_cancel_is_forgotten() -> None:
     server, one, other, canceling = Server(), Client(), Client(), Client()
     server.fill()
     for number in range(100):
@@ -186,7 +186,7 @@ async def test_client_that_leaves_while_its_goals_are_cancelled_is_forgotten() -
 
 
 @in_loop
-async def test_server_ends_only_after_every_waiting_goal_was_answered() -> None:
+async def test_a_server_ends_only_after_answering_every_waiting_goal() -> None:
     server, one, count = Server(), Client(), 3 * subscribers._MAX_PER_TURN
     server.speech.scheduler.pause()
     server.fill(1)
@@ -200,7 +200,7 @@ async def test_server_ends_only_after_every_waiting_goal_was_answered() -> None:
 
 
 @in_loop
-async def test_server_ends_although_a_request_came_while_it_told_clients_about_the_end() -> None:
+async def test_a_request_during_shutdown_is_answered_before_the_server_ends() -> None:
     count = 3 * subscribers._MAX_PER_TURN
     server, late = Server(count), Client()
     server.speech.scheduler.pause()
@@ -215,7 +215,7 @@ async def test_server_ends_although_a_request_came_while_it_told_clients_about_t
 
 
 @in_loop
-async def test_bug_in_a_request_that_waited_harms_no_other_request(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_bug_in_a_waiting_request_does_not_affect_others(monkeypatch: pytest.MonkeyPatch) -> None:
     server, client = Server(), Client()
     server.fill()
     server.wait(client, "one")
@@ -251,7 +251,7 @@ class Readers:
 
 
 @in_loop
-async def test_a_cancel_of_thousands_of_pending_goals_leaves_the_others_their_turns() -> None:
+async def test_cancelling_thousands_of_goals_does_not_block_other_clients() -> None:
     count = 2_000
     server, watcher, canceling, asking = Server(count), Client(), Client(), Client()
     server.fill(1)
@@ -273,7 +273,7 @@ async def test_a_cancel_of_thousands_of_pending_goals_leaves_the_others_their_tu
 
 
 @in_loop
-async def test_new_watcher_gets_only_events_after_its_snapshot(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_new_watcher_gets_only_events_after_its_snapshot(monkeypatch: pytest.MonkeyPatch) -> None:
     count = 500
     server, watcher = Server(count), Client()
     server.fill(1 + count)
@@ -288,7 +288,7 @@ async def test_new_watcher_gets_only_events_after_its_snapshot(monkeypatch: pyte
 
 
 @in_loop
-async def test_news_is_told_as_fast_as_clients_read_it() -> None:
+async def test_notifications_are_sent_as_fast_as_clients_read() -> None:
     readers = Readers()
     line = Notifications(cast("Any", readers))
     line.add([partial(readers.tell, number) for number in range(100)])
@@ -302,7 +302,7 @@ async def test_news_is_told_as_fast_as_clients_read_it() -> None:
 
 
 @in_loop
-async def test_wait_for_clients_that_do_not_read_news_has_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_the_wait_for_clients_that_do_not_read_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(subscribers, "_READ_TIME_S", 0.02)
     monkeypatch.setattr(subscribers, "_READ_TIME_FACTOR", 0.1)
     loop, readers, waits = asyncio.get_running_loop(), Readers(), []
@@ -318,7 +318,7 @@ async def test_wait_for_clients_that_do_not_read_news_has_a_limit(monkeypatch: p
 
 
 @in_loop
-async def test_news_about_news_is_told_in_order_and_a_bug_harms_no_other() -> None:
+async def test_nested_notifications_are_sent_in_order_despite_a_bug() -> None:
     told: list[str] = []
     line = Notifications(cast("Any", Readers()))
 
@@ -348,7 +348,7 @@ class _Written:
 
 
 @in_loop
-async def test_many_words_at_once_leave_the_clients_their_turns() -> None:
+async def test_many_words_at_once_do_not_block_clients() -> None:
     loop, count = asyncio.get_running_loop(), 5 * REPORTS_PER_TURN + 1
     taken: list[object] = []
     wakes = []
@@ -377,7 +377,7 @@ async def test_many_words_at_once_leave_the_clients_their_turns() -> None:
 
 
 @in_loop
-async def test_bug_in_a_report_harms_no_other_report(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_bug_in_a_report_does_not_affect_other_reports(monkeypatch: pytest.MonkeyPatch) -> None:
     taken, failed = [], []
 
     def take(report: protocol.Event) -> None:
@@ -396,7 +396,7 @@ async def test_bug_in_a_report_harms_no_other_report(monkeypatch: pytest.MonkeyP
 
 
 @in_loop
-async def test_engine_gets_its_next_task_before_clients_get_events() -> None:
+async def test_the_engine_gets_its_next_task_before_clients_get_events() -> None:
     written: list[str] = []
     served = Speech(Scheduler("4k7f", max_queue=1))
     served.engine = _Written(written)  # type: ignore[assignment]

@@ -55,7 +55,7 @@ def at_terminal(talk: Talk, columns: int, *words: str, **env: str) -> Terminal:
     return Terminal([*TALK, *words], {"TERM": "xterm", **talk.env, **env}, columns)
 
 
-def test_in_a_pipe_every_event_is_a_full_line_at_once(scripted: Talk) -> None:
+def test_in_a_pipe_every_event_is_printed_at_once_as_a_full_line(scripted: Talk) -> None:
     watch = Lines(scripted, "-l")
     assert re.fullmatch(rf"\d\d:\d\d:\d\d  watching    silent; server {scripted.pid} on \S+", watch.lines[0])
     goal_id = scripted.run("say", "--as", "patrol", "--", LONG).id
@@ -70,7 +70,7 @@ def test_in_a_pipe_every_event_is_a_full_line_at_once(scripted: Talk) -> None:
     assert not any("\x1b" in each or "never-ends  " in each or " word " in each for each in watch.lines)
 
 
-def test_it_begins_with_what_is_now(scripted: Talk) -> None:
+def test_watch_starts_with_the_current_goals(scripted: Talk) -> None:
     active = scripted.run("say", "never-ends").id
     pending = scripted.run("say", "waits").id
     scripted.watcher.wait_for_word(active)
@@ -86,7 +86,7 @@ def test_it_begins_with_what_is_now(scripted: Talk) -> None:
     assert watch.end() == 130
 
 
-def test_words_are_shown_if_asked_for(scripted: Talk) -> None:
+def test_words_are_shown_with_feedback(scripted: Talk) -> None:
     watch = Lines(scripted, "-f")
     goal_id = scripted.run("say", "battery low\x1b[m").id
     watch.next("SUCCEEDED")
@@ -96,7 +96,7 @@ def test_words_are_shown_if_asked_for(scripted: Talk) -> None:
     assert watch.end() == 130
 
 
-def test_json_is_the_wires_own_events(scripted: Talk) -> None:
+def test_json_prints_the_protocols_events(scripted: Talk) -> None:
     watch = Lines(scripted, "--json")
     snapshot = json.loads(watch.lines[0])
     assert list(snapshot) == ["event", "server", "active", "pending", "recent"]
@@ -108,7 +108,7 @@ def test_json_is_the_wires_own_events(scripted: Talk) -> None:
     assert [json.loads(each) for each in watch.lines[1:]] == scripted.watcher.events()
 
 
-def test_who_paused_and_who_resumed_is_told(scripted: Talk) -> None:
+def test_the_clients_that_paused_and_resumed_are_shown(scripted: Talk) -> None:
     talk = scripted
     goal_id = talk.run("say", "never-ends").id
     talk.watcher.wait_for_word(goal_id)
@@ -128,7 +128,7 @@ def test_who_paused_and_who_resumed_is_told(scripted: Talk) -> None:
     talk.run("cancel")
 
 
-def test_lines_follow_a_window_that_is_resized(scripted: Talk) -> None:
+def test_lines_adapt_to_a_resized_window(scripted: Talk) -> None:
     with at_terminal(scripted, 80, "watch", COLUMNS="200") as watch:
         watch.wait_for("silent")
         first = scripted.run("say", "--", LONG).id
@@ -143,7 +143,7 @@ def test_lines_follow_a_window_that_is_resized(scripted: Talk) -> None:
         scripted.run("cancel")
 
 
-def test_colour_by_outcome_on_a_terminal_alone(scripted: Talk) -> None:
+def test_states_are_coloured_only_on_a_terminal(scripted: Talk) -> None:
     for extra in ({}, {"TERM": "dumb"}):
         with at_terminal(scripted, 80, "watch", **extra) as watch:
             watch.wait_for("silent")
@@ -155,7 +155,7 @@ def test_colour_by_outcome_on_a_terminal_alone(scripted: Talk) -> None:
         assert coloured == [not extra] * 3
 
 
-def test_a_server_that_goes_away_is_told(scripted: Talk) -> None:
+def test_a_server_that_goes_away_is_reported(scripted: Talk) -> None:
     watch = Lines(scripted)
     goal_id = scripted.run("say", "never-ends").id
     watch.next("ACTIVE")
@@ -166,7 +166,7 @@ def test_a_server_that_goes_away_is_told(scripted: Talk) -> None:
     assert (done.code, done.out, "connection to the server was lost" in done.err) == (12, "", True), done
 
 
-def test_it_ends_when_its_reader_has_gone_though_nothing_happens(scripted: Talk) -> None:
+def test_watch_ends_with_its_reader_even_without_events(scripted: Talk) -> None:
     reader, writer = os.pipe()
     with os.fdopen(writer, "wb") as stdout, os.fdopen(reader, "rb") as lines:
         watch = subprocess.Popen([*TALK, "watch"], env=scripted.env, stdout=stdout, stderr=subprocess.PIPE)
@@ -176,7 +176,7 @@ def test_it_ends_when_its_reader_has_gone_though_nothing_happens(scripted: Talk)
         assert (watch.wait(10), watch.stderr.read()) == (141, b"")
 
 
-def test_an_idle_watcher_costs_nothing(scripted: Talk) -> None:
+def test_an_idle_watcher_uses_no_processor_time(scripted: Talk) -> None:
     watch = Lines(scripted)
     before = _switches(watch.process.pid)
     scripted.run("voices")  # time passes, and no goal is sent

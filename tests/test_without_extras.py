@@ -31,7 +31,7 @@ COMMANDS = (["status"], ["say", "--wait", "hello"], ["--json", "log"], ["doctor"
 
 
 @pytest.mark.usefixtures("nobody_serves")
-def test_neither_server_nor_clients_import_anything_for_fleets(tmp_path: Path) -> None:
+def test_servers_and_clients_import_no_fleet_modules(tmp_path: Path) -> None:
     with short_directory() as home:
         os.mkdir(f"{home}/run", 0o700)
         env = record_imports(
@@ -52,7 +52,7 @@ def test_neither_server_nor_clients_import_anything_for_fleets(tmp_path: Path) -
     "words",
     [["--robot", "anna", "status"], ["say", "--robot", "anna", "hello"], ["--robot", "anna", "doctor"], ["watch"]],
 )
-def test_without_the_extra_a_fleet_tells_what_to_install(words: list[str], tmp_path: Path) -> None:
+def test_without_the_extra_fleet_commands_name_the_missing_package(words: list[str], tmp_path: Path) -> None:
     env = record_imports(
         tmp_path, environment(str(tmp_path), TALK_ROBOT="anna", TALK_BROKER="mqtt://127.0.0.1"), ["paho"]
     )
@@ -102,7 +102,7 @@ def measure(directory: Path, *options: str, without: Sequence[str] = ()) -> Cost
     return Cost(found[pid], found[engine], clients, counted, threads)
 
 
-def test_neither_server_nor_engine_nor_clients_import_start_or_keep_anything_for_them(tmp_path: Path) -> None:
+def test_unused_neural_packages_cost_no_imports_threads_or_memory(tmp_path: Path) -> None:
     needs_packages(*NEURAL_PACKAGES)
     installed, missing = measure(tmp_path / "with"), measure(tmp_path / "without", without=NEURAL_PACKAGES)
     assert all("talkcli" in each for each in (installed.server, installed.engine, installed.clients))
@@ -115,7 +115,7 @@ def test_neither_server_nor_engine_nor_clients_import_start_or_keep_anything_for
     assert installed.counted.memory == pytest.approx(missing.counted.memory, abs=SLACK)
 
 
-def test_for_a_neural_voice_the_engine_alone_imports_its_modules(tmp_path: Path) -> None:
+def test_only_the_engine_imports_modules_for_a_neural_voice(tmp_path: Path) -> None:
     needs_packages(*NEURAL_PACKAGES)
     found = measure(tmp_path, "--voice", "piper/tiny")
     assert {*NEURAL_PACKAGES} <= found.engine

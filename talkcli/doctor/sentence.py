@@ -85,6 +85,8 @@ class SentenceResult:
     beside_speech: bool = False
     #: the sinks that were suspended after the sentence
     suspended: tuple[str, ...] = ()
+    #: the device that played the sentence while it was muted, or None
+    muted_device: str | None = None
 
 
 def speak_by_server(client: Client, text: str, limit: float) -> SentenceResult:
@@ -125,7 +127,8 @@ def _cancel_late_goal(client: Client, goal: GoalHandle, limit: float) -> Sentenc
 
 def _goal_result(goal: Goal) -> SentenceResult:
     """Convert an ended goal to a SentenceResult."""
-    return SentenceResult(goal.state, goal.reason, goal.message, goal.duration, by_server=True)
+    muted = goal.output.device if goal.output and goal.output.muted else None
+    return SentenceResult(goal.state, goal.reason, goal.message, goal.duration, by_server=True, muted_device=muted)
 
 
 def speak_beside_server(client: Client, options: EngineOptions, limit: float) -> SentenceResult:
@@ -212,6 +215,9 @@ def judge_sentence(
         playback_step: the result of `find_playback_step`.
         hangs: whether the sound server hangs, which also blocks engines when they start.
     """
+    if result.state is State.SUCCEEDED and result.muted_device:
+        step = ADVICE[Reason.MUTED].replace("@DEFAULT_SINK@", result.muted_device)
+        return failure(_SENTENCE_CHECK, f"it was played, but the output {result.muted_device} was muted", step)
     if result.state is State.SUCCEEDED:
         how = "through the server" if result.by_server else "by talk doctor's own engine"
         seconds = "" if result.duration is None else f", {result.duration:.1f} s"

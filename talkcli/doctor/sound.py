@@ -521,6 +521,8 @@ def check_device(env: Mapping[str, str], player: str, configured: str | None) ->
         return ok("device", words) if configured is None else warning("device", words, step)
     output = run_program(program, *arguments, env=env)
     names = list(parse(output))
+    if output.error is not None and parse is _parse_pulse_sinks:
+        return ok("device", f"{used}; {command}: {output.error}")  # the check of the sound server gives advice
     if output.error is not None:
         return warning("device", f"{command}: {output.error}", f"run this command to see the whole error: {command}")
     if not names:

@@ -1,4 +1,4 @@
-"""`talk serve` for tests that name no socket, or in which it must not start."""
+"""Helpers to run `talk serve` without a named socket, or to check that it does not start."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 TALK = [sys.executable, "-m", "talkcli"]
 SERVE = [*TALK, "serve", "--player", "null"]
-#: Seconds in which a process starts or ends.
+#: Limit in seconds for the start or the end of a process.
 LIMIT = 20.0
 
 
@@ -34,14 +34,14 @@ class Ended:
 
 
 class BareServe:
-    """A server whose whole environment is given."""
+    """A server with only this environment."""
 
     def __init__(self, command: Sequence[str], env: Mapping[str, str], pass_fds: Sequence[int] = ()) -> None:
         self.process: subprocess.Popen[str] | Forked
-        words = None if pass_fds else _forked(command, env)
-        if words is not None:
+        arguments = None if pass_fds else _forked(command, env)
+        if arguments is not None:
             scripted = command[1] == SCRIPTED
-            self.process = Forked(words, env, scripted=scripted, stderr=subprocess.PIPE, start_new_session=True)
+            self.process = Forked(arguments, env, scripted=scripted, stderr=subprocess.PIPE, start_new_session=True)
         else:
             self.process = subprocess.Popen(
                 dying_with_parent(list(command)),
@@ -64,12 +64,12 @@ class BareServe:
         return "".join(self._lines)
 
     def serves(self) -> bool:
-        """Wait until it serves or has closed its standard error; return whether it serves."""
+        """Wait until the server is ready or has ended, and return whether it is ready."""
         assert self._settled.wait(LIMIT), f"neither ready nor ended: {self.log}"
         return "ready on " in self.log
 
     def end(self, *signals: signal.Signals) -> int:
-        """Send signals one after another, and return the exit code."""
+        """Send these signals, wait for the end, and return the exit code."""
         for number in signals:
             self.process.send_signal(number)
         code = self.process.wait(LIMIT)
@@ -77,7 +77,7 @@ class BareServe:
         return code
 
     def close(self) -> None:
-        """Kill it if it still runs."""
+        """Kill the server if it still runs."""
         if self.process.poll() is None:
             self.process.kill()
         self.process.wait()
@@ -98,7 +98,7 @@ class BareServe:
 def serving(
     env: Mapping[str, str], *options: str, command: Sequence[str] = SERVE, pass_fds: Sequence[int] = ()
 ) -> Iterator[BareServe]:
-    """Run a server that is ready. At the end SIGTERM must end it, unless it has already ended."""
+    """Start a server and wait until it is ready. At the end, stop it with SIGTERM if it still runs."""
     server = BareServe([*command, *options], env, pass_fds)
     try:
         assert server.serves(), server.log
@@ -111,10 +111,10 @@ def serving(
 
 
 def run(command: Sequence[str], env: Mapping[str, str], **options: object) -> Ended:
-    """Run a program to its end."""
-    words = None if options else _forked(command, env)
-    if words is not None:
-        return Ended(*run_talk(words, env, LIMIT))
+    """Run a program, and return its exit code and output."""
+    arguments = None if options else _forked(command, env)
+    if arguments is not None:
+        return Ended(*run_talk(arguments, env, LIMIT))
     done = subprocess.run(  # type: ignore[call-overload]
         list(command),
         env=dict(env),
@@ -127,14 +127,14 @@ def run(command: Sequence[str], env: Mapping[str, str], **options: object) -> En
     return Ended(done.returncode, os.fsdecode(done.stdout), os.fsdecode(done.stderr))
 
 
-def alone(*words: str, **extra: str) -> Ended:
+def alone(*arguments: str, **extra: str) -> Ended:
     """Run `talk` without a server."""
     with short_directory() as home:
-        return run([*TALK, *words], environment(home, **{"TALK_SOCKET": f"{home}/s", **extra}))
+        return run([*TALK, *arguments], environment(home, **{"TALK_SOCKET": f"{home}/s", **extra}))
 
 
 def _forked(command: Sequence[str], env: Mapping[str, str]) -> list[str] | None:
-    """Return the arguments of `talk` in a command that can be forked, else None."""
+    """Return the arguments of `talk` if the command can be forked, otherwise None."""
     if not can_fork(env):
         return None
     if list(command[:2]) == [sys.executable, SCRIPTED]:

@@ -1,4 +1,4 @@
-"""The voices of the tests of sound."""
+"""The voices for the tests of sound."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 @pytest.fixture(scope="session")
 def joe(tmp_path_factory: pytest.TempPathFactory) -> Joe:
-    """A real neural voice, without noise; the test is skipped if it is not installed.
+    """A real neural voice without noise. Tests are skipped if it is not installed.
 
-    Each sentence begins as behind a comma, in 36 ms or more of silence, so the monitor drops no sound at its start.
+    Each sentence starts with at least 36 ms of silence, as after a comma, so that the monitor drops no sound.
     """
     place = tmp_path_factory.mktemp("voices")
     place.chmod(0o755)
@@ -34,9 +34,9 @@ def joe(tmp_path_factory: pytest.TempPathFactory) -> Joe:
 
 @pytest.fixture(params=["espeak", pytest.param("joe", marks=pytest.mark.slow)])
 def voice(request: pytest.FixtureRequest) -> Voice:
-    """The voice of a test's servers: the neural one in slow runs alone, unless the test is marked `with_both`.
+    """The voice of a test's servers: the neural voice only in slow runs, unless the test is marked `with_both`.
 
-    Each of its servers loads the voice for a second. One test of each kind is marked: spoken, stopped, queued, held.
+    A server takes a second to load it. One test of each kind is marked: spoken, stopped, queued, paused.
     """
     if request.param == "espeak":
         return ESPEAK

@@ -1,4 +1,4 @@
-"""Shared by the tests of sound: sentences, goals that have begun, and the processes behind a server."""
+"""Helpers for tests of sound: sentences, started goals, and the processes of a server."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ if TYPE_CHECKING:
 
     Samples = npt.NDArray[np.int16]
 
-#: Short sentences, and a long one to interrupt. Each begins with a moment of silence before its "b" or "c", which takes
-#: the place of the sound that the monitor drops at the start of a stream, up to 10 ms.
+#: Short sentences, and a long one to interrupt. Each starts with a short silence, because the monitor drops up to
+#: 10 ms at the start of a stream.
 LOW = "battery low"
 HOME = "coming home"
 HELP = "please help, I am stuck"
 LONG = "two three four five six seven eight nine ten eleven twelve"
 
-#: Words per minute for tests of anything but the rate: the fastest there are. LONG takes 1.3 s, HELP 0.6 s.
+#: The maximum rate in words per minute, for all tests but those of the rate. LONG takes 1.3 s, HELP 0.6 s.
 QUICK = 450
 
-#: Seconds by which the time of a sample is known: blocks of the monitor, and of the sink before it.
+#: Precision of a sample's time in seconds: a block of the monitor, and one of the sink before it.
 PRECISION = 0.03
-#: Seconds in which a process that was started must be there.
+#: Limit in seconds until a started process is found.
 _PATIENCE = 5.0
 
 
 def render_quick(sentences: Sequence[str | Sentence]) -> list[Samples]:
-    """Return the samples of each sentence as a server at that rate speaks them."""
+    """Return the samples of each sentence at the rate QUICK."""
     return render(sentences, rate=QUICK)
 
 
@@ -53,19 +53,19 @@ def send(talk: Talk, text: str, **fields: Any) -> str:
 
 
 def await_word(talk: Talk, goal_id: str, number: int = 3) -> None:
-    """Wait until this word of a goal is heard; the third is in mid-sentence."""
+    """Wait until this word of a goal is heard. The third one is in mid-sentence."""
     wanted = {"event": "word", "id": goal_id, "number": number}
     talk.watcher.wait_until(lambda event: wanted.items() <= event.items(), what=f"word {number} of {goal_id}")
 
 
-def begin(talk: Talk, text: str, *, number: int = 3, **fields: Any) -> str:
+def start_goal(talk: Talk, text: str, *, number: int = 3, **fields: Any) -> str:
     """Send a goal, wait until this word of it is heard, and return its id."""
     goal_id = send(talk, text, **fields)
     await_word(talk, goal_id, number)
     return goal_id
 
 
-def begin_with_client(talk: Talk, text: str, *options: str) -> tuple[str, Process]:
+def start_goal_with_client(talk: Talk, text: str, *options: str) -> tuple[str, Process]:
     """Start a client that waits for its goal, wait until its third word is heard, and return the id and the client."""
     known = {None, *talk.watcher.goals()}
     client = talk.start("say", "--wait", *options, "--", text)
@@ -75,33 +75,33 @@ def begin_with_client(talk: Talk, text: str, *options: str) -> tuple[str, Proces
 
 
 def heard(talk: Talk, quiet: float = 0.2) -> Samples:
-    """Return everything that was heard, once it is quiet."""
+    """Wait until it is quiet, and return everything that was heard."""
     talk.recording.wait_until_quiet(quiet)
     return talk.recording.samples
 
 
 def assert_same(samples: Samples, reference: Samples) -> Comparison:
-    """Assert that one whole sentence was heard, and nothing else."""
+    """Assert that this whole sentence was heard, and nothing else."""
     compared = compare(samples, reference)
     assert compared.same, compared
     return compared
 
 
-def assert_aborted(goal: Message, reason: str, *words: str) -> None:
-    """Assert that a goal was ABORTED for that reason, with these words in its message."""
+def assert_aborted(goal: Message, reason: str, *texts: str) -> None:
+    """Assert that a goal was ABORTED for this reason, with these strings in its message."""
     assert (goal["state"], goal["reason"]) == ("ABORTED", reason), goal
     assert goal["message"].startswith("speech failed: "), goal
-    for word in words:
-        assert word in goal["message"], goal
+    for text in texts:
+        assert text in goal["message"], goal
 
 
 def engine_process(talk: Talk) -> int:
-    """Return the process id of the server's engine, once there is exactly one."""
+    """Wait until the server has exactly one engine process, and return its id."""
     return _only_child(lambda: talk.pid, "engine")
 
 
 def player_process(talk: Talk) -> int:
-    """Return the process id of the player of the goal that is being spoken."""
+    """Wait until the engine has exactly one player process, and return its id."""
     return _only_child(lambda: engine_process(talk), "player")
 
 
@@ -109,5 +109,5 @@ def _only_child(parent: Callable[[], int], name: str) -> int:
     end = time.monotonic() + _PATIENCE
     while len(processes := children(parent())) != 1:
         assert time.monotonic() < end, f"not one {name}: {processes}"
-        time.sleep(0.005)  # the child of a child sends no event
+        time.sleep(0.005)  # a process that is not our child sends no event
     return processes[0]

@@ -1,6 +1,6 @@
-"""Bytes on a Unix socket: what a broken or foreign client sends, and what a foreign server answers.
+"""Clients and servers that send any bytes, for malformed or incomplete messages.
 
-`tests.support.connection.Wire` sends objects and is greeted; this is for what isn't an object, or stops halfway.
+`tests.support.connection.Wire` is a client that sends whole messages and waits for the greeting.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from tests.support.connection import PATIENCE
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-#: What a server sends that is one, for a fake.
+#: A valid greeting of a server.
 GREETING = b'{"talk": 1, "version": "0", "pid": 1, "boot": "fake", "features": []}\n'
 
 
 class Raw(contextlib.AbstractContextManager["Raw"]):
-    """A connection that sends bytes and collects bytes; it waits for no greeting."""
+    """A connection that sends and collects bytes, and does not wait for the greeting."""
 
     def __init__(self, path: str) -> None:
         self.socket = socket.socket(socket.AF_UNIX)
@@ -34,17 +34,17 @@ class Raw(contextlib.AbstractContextManager["Raw"]):
         self.socket.close()
 
     def send(self, data: bytes) -> None:
-        """Send bytes; a server that has closed meanwhile is none of the sender's business."""
+        """Send bytes, and ignore it if the server has closed the connection."""
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             self.socket.sendall(data)
 
     def half_close(self) -> None:
-        """Say that nothing more will be sent."""
+        """Close the sending half of the connection."""
         with contextlib.suppress(OSError):
             self.socket.shutdown(socket.SHUT_WR)
 
     def receive(self, timeout: float = PATIENCE) -> bytes:
-        """Return what comes next; b"" once the server has closed."""
+        """Return the next bytes; b"" if the server has closed the connection."""
         self.socket.settimeout(timeout)
         try:
             data = self.socket.recv(1 << 20)
@@ -54,7 +54,7 @@ class Raw(contextlib.AbstractContextManager["Raw"]):
         return data
 
     def receive_lines(self, count: int) -> list[dict[str, Any]]:
-        """Wait for so many lines since the connection began, and return all that came whole."""
+        """Wait until `count` lines have arrived in total, and return all complete lines."""
         end = time.monotonic() + PATIENCE
         while self.received.count(b"\n") < count:
             if not self.receive(max(0.001, end - time.monotonic())):
@@ -62,7 +62,7 @@ class Raw(contextlib.AbstractContextManager["Raw"]):
         return self.lines
 
     def receive_all(self, timeout: float = PATIENCE) -> list[dict[str, Any]]:
-        """Wait until the server closes, and return every line since the connection began."""
+        """Wait until the server closes the connection, and return all lines."""
         end = time.monotonic() + timeout
         while self.receive(max(0.001, end - time.monotonic())):
             pass
@@ -75,13 +75,15 @@ class Raw(contextlib.AbstractContextManager["Raw"]):
 
 
 class FakeServer(contextlib.AbstractContextManager["FakeServer"]):
-    """Says the same bytes to every client, and nothing else.
+    """A server that sends the same bytes to every client, and nothing else.
 
-    `closes`: hangs up after that and the client's first words; `listens`: waits for these.
+    Args:
+        closes: Close the connection after the client's first request.
+        listens: Wait for the client's first request.
     """
 
-    def __init__(self, path: str, says: Iterable[bytes], *, closes: bool = False, listens: bool = True) -> None:
-        self._says = b"".join(says)
+    def __init__(self, path: str, messages: Iterable[bytes], *, closes: bool = False, listens: bool = True) -> None:
+        self._data = b"".join(messages)
         self._closes = closes
         self._listens = listens
         self._clients: list[socket.socket] = []
@@ -93,14 +95,14 @@ class FakeServer(contextlib.AbstractContextManager["FakeServer"]):
         self._thread.start()
 
     def __exit__(self, *_error: object) -> None:
-        self._socket.shutdown(socket.SHUT_RDWR)  # which ends `accept`
+        self._socket.shutdown(socket.SHUT_RDWR)  # so that `accept` returns
         self._thread.join()
         for connection in (self._socket, *self._clients):
             connection.close()
 
     def wait_for_client(self) -> None:
-        """Wait until one more client has sent something."""
-        assert self._served.acquire(timeout=PATIENCE), "no client came"
+        """Wait until one more client has sent a request."""
+        assert self._served.acquire(timeout=PATIENCE), "no client connected"
 
     def _serve(self) -> None:
         while True:
@@ -109,7 +111,7 @@ class FakeServer(contextlib.AbstractContextManager["FakeServer"]):
             except OSError:
                 return
             with contextlib.suppress(OSError):
-                client.sendall(self._says)
+                client.sendall(self._data)
                 client.settimeout(PATIENCE)
                 if self._listens:
                     client.recv(65536)

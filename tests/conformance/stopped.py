@@ -1,11 +1,11 @@
-"""Compares the sound of sentences after a stopped one; and the program that renders their references.
+"""Compare the sound of sentences after a stopped one with references, which this module renders as a program.
 
-A sentence that follows a stopped one differs from the same sentence elsewhere, but it depends only on the place where
-the synthesis was stopped, which is between two pieces of the library's sound. So there is a reference for each piece,
-and the heard sentence must be one of them, sample by sample.
+libespeak-ng renders a sentence differently after a stopped one. The result depends only on the place where the
+synthesis was stopped, which is between two chunks of its sound. So there is a reference for each chunk, and the heard
+sentence must equal one of them, sample by sample.
 
-The program reads a list on standard input, the words per minute and the texts. It stops the first text after each of
-its pieces in turn, and writes the other texts for each turn: a line with the number of samples, then these, 16 bit.
+The program reads a JSON list from standard input: the words per minute, and the texts. In each turn, it stops the first
+text after one more chunk, and writes the other texts: a line with the number of samples, and then the 16-bit samples.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ if TYPE_CHECKING:
 
     Samples = npt.NDArray[np.int16]
 
-#: Samples by which a sentence may begin before the place where it fits best, as the monitor may have dropped them. At
-#: least `_SILENCE` samples are left of the silence between two sentences.
+#: Maximum number of samples at the start of a sentence that the monitor may have dropped. At least `_SILENCE` samples
+#: remain of the silence between two sentences.
 DROPPED = 240
 _SILENCE = 64
-#: Samples in a row that are the same at the beginning of a sentence.
+#: Minimum number of equal samples in a row at the start of a sentence.
 _SAME = 32
 
 
@@ -49,58 +49,58 @@ def assert_heard_after_stop(
     stopped: str,
     following: Sequence[str],
     *,
-    begun: bool = True,
+    first_heard: bool = True,
     voice: Voice = ESPEAK,
 ) -> list[Comparison]:
-    """Assert that a beginning of a fresh engine's first sentence was heard, then the following ones whole.
+    """Assert that the beginning of a new engine's first sentence was heard, and then the following ones whole.
 
-    If it had not `begun`, nothing of it may have been heard. Returns how the following ones compare. One place of the
-    stop has to be right; the place after which the next sentence is the same for longest comes first.
+    The sound must match the references of one place of the stop. The most similar ones are tried first. Unless
+    `first_heard`, nothing of the first sentence may have been heard. Return the comparisons of the following ones.
     """
     samples = heard if isinstance(heard, np.ndarray) else heard.samples
     wrong: AssertionError | None = None
     turns = [voice.render(following, QUICK)] if voice.repeats else _render_after_stop((stopped, *following), QUICK)
     beginning = voice.render([stopped], QUICK)[0]
-    # The sound server may join the rest of the first sentence and the next one, with no silence between them.
-    for start, references in likeliest(samples, turns, [matching_length(samples, beginning)] if begun else []):
+    # The sound server may join the two sentences without any silence between them.
+    for start, references in likeliest(samples, turns, [matching_length(samples, beginning)] if first_heard else []):
         try:
-            if begun:
+            if first_heard:
                 assert_only_beginning(samples[:start], beginning)
             elif start:  # otherwise it is the first recorded sample
                 assert_silent(samples[:start])
             return assert_heard(samples[start:], references)
         except AssertionError as error:
             wrong = wrong or error
-    assert wrong, f"{following[0]!r} was not heard behind silence, wherever {stopped!r} was stopped"
+    assert wrong, f"{following[0]!r} was not heard after a silence, wherever {stopped!r} was stopped"
     raise wrong
 
 
 def likeliest(
     samples: Samples, turns: Sequence[list[Samples]], ends: Sequence[int] = ()
 ) -> Iterator[tuple[int, list[Samples]]]:
-    """Yield the places where the next sentence may begin, with the references of that turn.
+    """Yield the places where the next sentence may start, with the references of a turn, the best match first.
 
-    That is behind silence, or with the first sound behind one of the `ends` of the sentence before it.
+    A sentence may start after a silence, or with the first sound after one of the `ends` of the previous sentence.
     """
     loud = np.flatnonzero(np.abs(samples.astype(np.int32)) > LOUD)
     silence = np.diff(loud, prepend=-DROPPED)
-    may = silence >= _SILENCE
-    may[[place for place in np.searchsorted(loud, ends) if place < len(loud)]] = True
-    begins = loud[may]
-    before = np.minimum(silence[may] - 1, DROPPED)
+    possible = silence >= _SILENCE
+    possible[[place for place in np.searchsorted(loud, ends) if place < len(loud)]] = True
+    starts = loud[possible]
+    before = np.minimum(silence[possible] - 1, DROPPED)
     candidates = []
     for references in turns:
         first, last = extent(references[0]) or (0, 0)
         wanted = references[0][first:last]
-        for begin, quiet in zip(begins.tolist(), before.tolist(), strict=True):
-            same = _same(samples[begin : begin + len(wanted)], wanted)
-            candidates += [(same, max(0, begin - quiet), references)] if same else []
+        for start, quiet in zip(starts.tolist(), before.tolist(), strict=True):
+            same = _same(samples[start : start + len(wanted)], wanted)
+            candidates += [(same, max(0, start - quiet), references)] if same else []
     for _, start, references in sorted(candidates, key=lambda place: -place[0]):
         yield start, references
 
 
 def _same(samples: Samples, wanted: Samples) -> int:
-    """Return for how long samples are the same as those wanted, of which the first may have been dropped."""
+    """Return the number of equal samples, although the first of the wanted ones may have been dropped."""
     for dropped in np.flatnonzero(wanted[:DROPPED] == samples[0]):
         rest = wanted[dropped:]
         length = min(len(samples), len(rest))
@@ -113,7 +113,7 @@ def _same(samples: Samples, wanted: Samples) -> int:
 
 @functools.cache
 def _render_after_stop(texts: tuple[str, ...], rate: int) -> list[list[Samples]]:
-    """Return the sentences that follow the first text, for each place where it can be stopped."""
+    """Return the sentences after the first text, for each place where the first can be stopped."""
     sentences: list[Samples] = []
     rest = run(["-m", __name__], json.dumps([rate, *texts]), timeout=60)
     while rest:
@@ -126,10 +126,10 @@ def _render_after_stop(texts: tuple[str, ...], rate: int) -> list[list[Samples]]
 
 
 def main() -> None:
-    """Render the texts of standard input; each turn is a child, forked where it stops, so that it has that memory."""
+    """Render the texts of standard input. Each turn is a child process, forked at the place of the stop."""
     rate, first, *following = json.load(sys.stdin)
     pieces: list[bytes] = []
-    stopping: bool | None = False  # None once nothing is to be stopped any more
+    stopping: bool | None = False  # None while nothing should be stopped any more
 
     def take(sound: bytes, _: object) -> bool:
         nonlocal stopping
@@ -153,13 +153,13 @@ def main() -> None:
 
 
 def _turn() -> bool:
-    """Return True in a child, and False in the parent once the child has ended."""
+    """Fork; return True in the child, and False in the parent after the child has ended."""
     child = os.fork()
     if child:
         status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         if status:
-            print(f"a rendering ended with {status}", file=sys.stderr, flush=True)
-            os._exit(1)  # an exception within a call of the library would be ignored
+            print(f"a rendering exited with {status}", file=sys.stderr, flush=True)
+            os._exit(1)  # the library would ignore an exception in its callback
     return child == 0
 
 

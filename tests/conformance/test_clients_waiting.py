@@ -1,4 +1,4 @@
-"""Clients that wait, give up, are interrupted or lose their server end in time, with the right exit code."""
+"""Clients exit in time and with the right code if they time out, are interrupted or lose their server."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.conformance.bareserve import TALK, Ended, environment, run
+from tests.conformance.checks import states
 from tests.conformance.rawsocket import GREETING, FakeServer, Raw
-from tests.conformance.witness import states
 from tests.support.surroundings import short_directory
 from tests.support.timing import assert_within, limits
 
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     from tests.support.connection import Wire
     from tests.support.processes import Process, Talk
 
-#: Seconds that the start and the end of a client may take.
+#: Seconds for the start and the end of a client.
 START = 0.5
 
 
-def speaking(talk: Talk, *words: str) -> tuple[Process, str]:
-    """Start a client whose goal never ends, and return it with the goal's id once it is heard."""
+def start_speaking(talk: Talk, *words: str) -> tuple[Process, str]:
+    """Start a client whose goal never ends, wait for its first word, and return the client and the goal's id."""
     client = talk.start("say", *words, "--", "never-ends words=1")
     goal_id = str(talk.watcher.wait_for(None, "ACTIVE")["id"])
     talk.watcher.wait_for_word(goal_id)
@@ -37,7 +37,7 @@ def speaking(talk: Talk, *words: str) -> tuple[Process, str]:
 
 @limits()
 def test_row_07_clients_of_a_killed_server_report_their_goals_lost(scripted: Talk) -> None:
-    sayer, goal_id = speaking(scripted, "--wait")
+    sayer, goal_id = start_speaking(scripted, "--wait")
     behind = scripted.start("--json", "say", "--wait", "behind it")
     pending_id = scripted.watcher.wait_until(lambda event: bool(event["id"] != goal_id))["id"]
     scripted.kill()
@@ -52,7 +52,7 @@ def test_row_07_clients_of_a_killed_server_report_their_goals_lost(scripted: Tal
 
 
 def _until_connected(wire: Wire, clients: int) -> None:
-    """Wait until so many clients are connected, this connection and the watcher's included."""
+    """Wait until this many clients are connected, including `wire` and the watcher."""
     end = time.monotonic() + 5
     while wire.request("status")["server"]["clients"] != clients:
         assert time.monotonic() < end, "the clients have not connected"
@@ -72,7 +72,7 @@ def test_row_08_a_client_times_out_while_the_server_is_frozen(scripted: Talk) ->
         assert done.code == 124
         assert seconds >= 2
         assert "did not confirm" in done.err
-        assert scripted.watcher.wait_for_terminal(goal_id) == "PREEMPTED"  # the cancel was on its way
+        assert scripted.watcher.wait_for_terminal(goal_id) == "PREEMPTED"  # the client had sent its cancel
         assert scripted.goal(goal_id)["state"] == "PREEMPTED"
         assert_within(seconds, 2 + 1 + START, "a timeout of 2 s, and 1 s for silence")
 
@@ -107,14 +107,14 @@ def test_a_client_times_out_if_the_server_does_not_answer(says: bytes) -> None:
         started_at = time.monotonic()
         done = _talk(home, "say", "--wait", "--timeout", "0.5", "--", "hello")
         seconds = time.monotonic() - started_at
-    # Nothing was sent to a server that did not greet: that is no server.
+    # Without a greeting, the client sends no request, and reports that there is no server.
     assert done.code == (124 if says else 3), done
     assert ("timed out after 0.5 s: the say request was sent" in done.err) == bool(says)
     assert_within(seconds, 0.5 + 1 + START, "a timeout of 0.5 s")
 
 
 def _talk(home: str, *words: str) -> Ended:
-    """Run `talk` in a process of its own, without a fork."""
+    """Run `talk` in a new process, without a fork."""
     return run([*TALK, *words], environment(home, TALK_SOCKET=f"{home}/s"), cwd="/")
 
 
@@ -126,12 +126,12 @@ def test_row_15_a_goal_is_spoken_even_if_its_client_disconnects_at_once(scripted
                 raw.receive_lines(1)  # the greeting
             raw.send(b'{"request": "say", "text": "length=0", "wait": true}\n')
     last = scripted.run("say", "--wait", "length=0 the last").id
-    scripted.watcher.wait_for_terminal(last)  # then all the events before it have come
+    scripted.watcher.wait_for_terminal(last)  # after this event, all earlier ones have arrived
     goals = scripted.watcher.goals()
     assert len(goals) == count + 1
     assert {scripted.watcher.wait_for_terminal(goal_id) for goal_id in goals} == {"SUCCEEDED"}
     for line in scripted.log.splitlines():
-        assert " SUCCEEDED after " in line or " ready" in line, line  # nothing about clients that are gone
+        assert " SUCCEEDED after " in line or " ready" in line, line  # nothing about disconnected clients
 
 
 def test_row_15_a_goal_is_spoken_even_if_its_client_is_killed(scripted: Talk) -> None:
@@ -157,13 +157,13 @@ def test_row_31_any_process_can_get_the_result_of_an_ended_goal(scripted: Talk) 
     scripted.request("cancel", ids=["early"])
     scripted.request("say", text="recalled", id="early")
     for words, code in ((("early", ids[1]), 6), ((ids[1], "early"), 4)):
-        assert scripted.run("wait", ids[0], *words, ids[2]).code == code  # of the first that did not succeed
+        assert scripted.run("wait", ids[0], *words, ids[2]).code == code  # of the first goal that did not succeed
 
 
 @pytest.mark.parametrize("command", ["say", "wait"])
 @limits()
 def test_row_33_ctrl_c_cancels_only_the_clients_own_goal(scripted: Talk, command: str) -> None:
-    client, goal_id = speaking(scripted, "--wait") if command == "say" else speaking(scripted)
+    client, goal_id = start_speaking(scripted, "--wait") if command == "say" else start_speaking(scripted)
     with scripted.connect() as wire:
         if command == "wait":
             assert scripted.finish(client).id == goal_id
@@ -213,14 +213,14 @@ def test_row_34_sigterm_to_a_background_client_cancels_its_goal(scripted: Talk) 
     ) as shell:
         goal_id = scripted.watcher.wait_for(None, "ACTIVE")["id"]
         scripted.watcher.wait_for_word(goal_id)
-        out, err = shell.communicate("go on\n", timeout=20)
+        out, err = shell.communicate("continue\n", timeout=20)
     assert out == f"{goal_id}\ncode 143\n"
     assert "Talk preempted" in err
     assert scripted.goal(goal_id)["state"] == "PREEMPTED"
 
 
 def _version() -> float:
-    """Return the seconds of the shortest command, a control for a client that finds no server."""
+    """Return the duration of the shortest command, the control for a client without a server."""
     started_at = time.monotonic()
     assert _talk("/", "--version").code == 0
     return time.monotonic() - started_at
@@ -240,8 +240,8 @@ def test_row_35_a_missing_server_is_reported_at_once(words: Sequence[str]) -> No
 
 @pytest.mark.slow
 def test_row_46_clients_do_not_wait_forever_for_a_frozen_server(scripted: Talk) -> None:
-    """All clients wait together for the limit of silence, 16 s."""
-    waiter, goal_id = speaking(scripted, "--wait")
+    """All clients wait in parallel for the limit of 16 s without an event."""
+    waiter, goal_id = start_speaking(scripted, "--wait")
     scripted.freeze()
     started_at = time.monotonic()
     try:

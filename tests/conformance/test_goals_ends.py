@@ -1,4 +1,4 @@
-"""How goals end when the engine fails, crashes or ignores a stop, and when clients cancel: a scripted engine."""
+"""How goals end if the engine fails, crashes or ignores a stop, or if clients cancel. The engine is scripted."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.conformance.witness import ends, states
+from tests.conformance.checks import count_ends, states
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from tests.support.connection import Message, Wire
     from tests.support.processes import Talk
 
-#: Seconds within which `status` and `cancel` answer, whatever the engine does.
+#: Limit in seconds for the reply to `status` and `cancel`, whatever the engine does.
 ANSWER = 0.1
 
 
@@ -62,7 +62,7 @@ def test_row_05_a_sentence_that_completes_despite_a_stop_has_succeeded(scripted:
     goal_id = scripted.watcher.wait_for(None, "ACTIVE")["id"]
     scripted.watcher.wait_for_word(goal_id)
     canceled = scripted.run("cancel", goal_id)
-    assert (canceled.code, canceled.out) == (0, "")  # it ended, but not because of this
+    assert (canceled.code, canceled.out) == (0, "")  # it ended, but not because of the cancel
     assert states(scripted, goal_id) == ["PENDING", "ACTIVE", "PREEMPTING", "SUCCEEDED"]
     assert scripted.finish(waiter).code == 0
     goal = scripted.goal(goal_id)
@@ -87,7 +87,7 @@ def test_row_06_an_engine_that_ignores_a_stop_is_killed(scripted: Talk, how: str
                 reply = asker.request("status") if request == "status" else asker.request("cancel", ids=[ended])
                 assert reply["ok"]
                 times[request] = max(times[request], time.monotonic() - sent_at)
-            time.sleep(0.02)  # without a pause, the requests alone would keep a processor busy
+            time.sleep(0.02)  # otherwise, the requests would keep a CPU core busy
         silent = scripted.watcher.arrived(scripted.watcher.wait_for(goal_id, "PREEMPTED")) - started_at
         reply = canceler.receive()
         assert reply["canceled"]["id"] == goal_id
@@ -96,7 +96,7 @@ def test_row_06_an_engine_that_ignores_a_stop_is_killed(scripted: Talk, how: str
         result = speaker.receive_event("result", timeout=10)["goal"]
         assert (result["id"], result["state"]) == (following, "SUCCEEDED")
         assert states(scripted, goal_id) == ["PENDING", "ACTIVE", "PREEMPTING", "PREEMPTED"]
-        assert silent >= 0.14, "it was killed before the limit"
+        assert silent >= 0.14, "the engine was killed before the limit"
         for request, seconds in times.items():
             assert_within(seconds, ANSWER, request)
         assert_within(silent, 0.15 + 0.35, "the end of a process that ignores stop")
@@ -120,8 +120,8 @@ def test_row_11_a_cancel_without_an_id_ends_all_goals(scripted: Talk) -> None:
     assert (done.code, sorted(done.out.split()), done.err) == (0, sorted(ids), "")
     assert [scripted.goal(goal_id)["state"] for goal_id in ids] == ["PREEMPTED", "RECALLED", "RECALLED", "RECALLED"]
     assert {scripted.goal(goal_id)["reason"] for goal_id in ids} == {"canceled"}
-    assert ends(scripted, *ids) == [1, 1, 1, 1]
-    assert states(scripted, ids[1]) == ["PENDING", "RECALLED"]  # never ACTIVE in between
+    assert count_ends(scripted, *ids) == [1, 1, 1, 1]
+    assert states(scripted, ids[1]) == ["PENDING", "RECALLED"]  # never ACTIVE
 
 
 def test_row_12_feedback_names_its_goal_and_precedes_the_result(make_talk: MakeTalk) -> None:
@@ -160,14 +160,14 @@ def test_row_19_unknown_ids_are_errors_and_ended_goals_do_not_change(scripted: T
         assert "none-7" in done.err
     unknown_too = scripted.run("wait", active, "none-7")
     assert unknown_too.code == 8
-    assert unknown_too.seconds < 2, "an unknown id is an error at once"
+    assert unknown_too.seconds < 2, "an unknown id was not reported at once"
     note = scripted.run("cancel", ended)
     assert (note.code, note.out) == (0, "")
     assert ended in note.err
     assert "SUCCEEDED" in note.err
     assert scripted.goal(ended) == before
     both = scripted.run("cancel", pending, "none-7")
-    assert (both.code, both.id) == (8, pending)  # the known one is cancelled all the same
+    assert (both.code, both.id) == (8, pending)  # the known goal is cancelled nevertheless
     assert scripted.goal(active)["state"] == "ACTIVE"
     assert scripted.run("cancel", "--current").id == active
 
@@ -180,11 +180,11 @@ def test_row_20_cancel_before_ends_all_goals_accepted_up_to_that_goal(scripted: 
         ]
     scripted.watcher.wait_for_word(ids[0])
     number = ids[6].rpartition("-")[2]
-    done = scripted.run("cancel", "--before", number)  # a number alone means this server's
+    done = scripted.run("cancel", "--before", number)  # a number means a goal of this server
     assert (done.code, sorted(done.out.split())) == (0, sorted(ids[:7]))
     assert [states(scripted, goal_id)[-1] for goal_id in ids[:7]] == ["PREEMPTED", *["RECALLED"] * 6]
     assert [scripted.goal(goal_id)["state"] for goal_id in ids[7:]] == ["PENDING", "PENDING", "ACTIVE"]
-    more = scripted.run("cancel", ids[8].rpartition("-")[2], "--current")  # selectors add up
+    more = scripted.run("cancel", ids[8].rpartition("-")[2], "--current")  # the selectors are combined
     assert sorted(more.out.split()) == sorted(ids[8:])
     assert scripted.run("cancel").id == ids[7]
 

@@ -1,4 +1,4 @@
-"""Row 44: what an engine says of goals that it was not given, or out of order, is refused and changes nothing."""
+"""Row 44: messages of the engine about wrong goals, or out of order, are refused and change nothing."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.conformance.witness import ends, states
+from tests.conformance.checks import count_ends, states
 
 if TYPE_CHECKING:
     import pathlib
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 ROOT = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 
-#: An engine process that says what the text of a goal lists: "word=1", "ended=failed:2", "raw=…", each for the goal in
-#: hand or, after a colon, for the one with that number. "stop?" waits for a command.
+#: An engine process that sends the messages in the text of a goal, like "word=1", "ended=failed:2" or "raw=…". They are
+#: about the current goal, or about the goal with the number after a colon. "stop?" waits for a command.
 ENGINE = """
 import os, sys
 sys.path.insert(0, {root!r})
@@ -28,10 +28,10 @@ from talkcli.engine import protocol
 def send(event):
     os.write(0, protocol.encode(event))
 
-def does(word, said):
-    what, _, goal_id = word.partition(":")
-    name, _, value = what.partition("=")
-    goal_id = said.id.rpartition("-")[0] + "-" + goal_id if goal_id else said.id
+def run(word, goal):
+    event, _, goal_id = word.partition(":")
+    name, _, value = event.partition("=")
+    goal_id = goal.id.rpartition("-")[0] + "-" + goal_id if goal_id else goal.id
     if name == "started":
         send(protocol.Started(goal_id))
     elif name == "alive":
@@ -55,7 +55,7 @@ for command in arriving:
         send(protocol.VoiceList(()))
     elif isinstance(command, protocol.Speak):
         for word in command.text.split():
-            does(word, command)
+            run(word, command)
 """
 SERVE = """
 import sys
@@ -78,7 +78,7 @@ def talk(make_talk: MakeTalk, tmp_path: pathlib.Path) -> Talk:
 
 
 def test_row_44_engine_messages_for_inactive_goals_change_nothing(talk: Talk) -> None:
-    others = ("1", "3", "99")  # one that has ended, one that is pending, one that nobody knows
+    others = ("1", "3", "99")  # an ended, a pending and an unknown goal
     strange = " ".join(
         f"started:{other} alive:{other} word=7:{other} ended={outcome}:{other}"
         for other, outcome in itertools.product(others, ("completed", "failed", "stopped"))
@@ -107,7 +107,7 @@ def test_row_44_engine_messages_after_the_end_change_nothing(talk: Talk, outcome
     assert goal["state"] == "SUCCEEDED"
     assert talk.goal(goal_id) == goal
     assert len(talk.watcher.words(goal_id)) == 1
-    assert ends(talk, goal_id, following) == [1, 1]
+    assert count_ends(talk, goal_id, following) == [1, 1]
 
 
 def test_row_44_an_unrequested_stop_aborts_the_goal(talk: Talk) -> None:
@@ -126,4 +126,4 @@ def test_row_44_a_malformed_engine_message_affects_no_other_goal(talk: Talk) -> 
             assert wire.receive_event("result", timeout=10)["goal"]["state"] in {"SUCCEEDED", "ABORTED"}
             following = wire.request("say", text="started ended=completed", wait=True)["goal"]["id"]
             assert wire.receive_event("result", timeout=10)["goal"]["state"] == "SUCCEEDED"
-            assert ends(talk, goal_id, following) == [1, 1]
+            assert count_ends(talk, goal_id, following) == [1, 1]

@@ -1,11 +1,10 @@
-"""Rows 21 and 22: ids that a sender chooses, on the wire and on the command line."""
+"""Rows 21 and 22: ids chosen by a sender, on the wire and on the command line."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from tests.conformance.told import assert_told_in_order
-from tests.conformance.witness import states
+from tests.conformance.checks import assert_event_order, states
 
 if TYPE_CHECKING:
     from tests.support.processes import Talk
@@ -26,7 +25,7 @@ def test_row_21_a_cancel_that_arrives_before_its_goal_recalls_it(scripted: Talk)
     assert states(scripted, "front-door.1") == ["PENDING", "RECALLED"]
     again = scripted.request("say", text=TEXT, id="front-door.1")
     assert (again["attached"], again["goal"]["state"]) == (True, "RECALLED")
-    assert_told_in_order(scripted)
+    assert_event_order(scripted)
 
 
 def test_row_22_a_goal_sent_twice_is_spoken_once_for_both_senders(scripted: Talk) -> None:
@@ -56,7 +55,7 @@ def test_row_22_an_attached_sender_that_disconnects_ends_nothing(scripted: Talk)
 
 def test_row_22_the_commands_accept_ids_of_ros_goals(scripted: Talk) -> None:
     own = "/patrol/goal-1-1712.25"
-    assert scripted.run("say", "--id", own, "--", "").code == 5  # a rejected goal does not use up its id
+    assert scripted.run("say", "--id", own, "--", "").code == 5  # the id of a rejected goal can be used again
     done = scripted.run("say", "--wait", "--id", own, "--", SHORT)
     assert (done.code, done.id) == (0, own), done
     assert scripted.request("say", text=SHORT, id=own)["attached"]
@@ -66,4 +65,4 @@ def test_row_22_the_commands_accept_ids_of_ros_goals(scripted: Talk) -> None:
     assert scripted.run("cancel", own).code == 0
     assert scripted.run("cancel", f"{own}.later").code == 8
     assert scripted.run("say", "--wait", "--id", f"{own}.later", "--", SHORT).code == 6
-    assert_told_in_order(scripted)
+    assert_event_order(scripted)

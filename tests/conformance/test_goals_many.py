@@ -1,4 +1,4 @@
-"""Many goals at once, by many clients: no deadlock, one terminal state each, told in order; the last one is spoken."""
+"""Many goals of many clients: no deadlock, one terminal state per goal, events in order, and the last is spoken."""
 
 from __future__ import annotations
 
@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
+from tests.conformance.checks import assert_event_order, count_ends
 from tests.conformance.hearing import HELP, PRECISION
 from tests.conformance.stopped import DROPPED
-from tests.conformance.told import assert_told_in_order
-from tests.conformance.witness import ends
 from tests.support import usage
 from tests.support.compare import compare, similarity
 from tests.support.recording import LOUD
@@ -31,13 +30,13 @@ if TYPE_CHECKING:
     from tests.support.sink import Sink
 
 CLIENTS = 5
-#: Row 17 asks for 45 seconds; a shorter form runs unless the environment asks for all of it.
+#: Row 17 asks for 45 seconds. A shorter test runs unless TALK_TEST_SOAK is set.
 SECONDS = float(os.environ.get("TALK_TEST_SOAK", "15"))
 BURST = 1_000
-#: So many are on their way at once: the client is not what takes the second.
+#: Number of goals per batch, so that the client itself takes little time.
 BATCH = 50
 
-#: What an engine may do with a goal of row 17, the usual things more often.
+#: The goals of row 17. The usual ones are more frequent.
 TEXTS = [
     *["length=0.02 a short one", "length=0.2 a longer one", "never-ends and never ends"] * 4,
     "length=0.1 slow-stop=0.03 slow to stop",
@@ -69,7 +68,7 @@ def test_row_17_five_clients_that_send_and_cancel_goals_do_not_deadlock(make_tal
         try:
             with talk.connect() as wire:
                 _send_and_cancel(wire, random.Random(number), over, sent[number])
-        except BaseException as error:  # noqa: BLE001 - raised again below, in the test's own thread
+        except BaseException as error:  # noqa: BLE001 - raised below, in the main thread
             failures.append(error)
             over.set()
 
@@ -91,9 +90,9 @@ def test_row_17_five_clients_that_send_and_cancel_goals_do_not_deadlock(make_tal
     known = [goal_id for client in sent for goal_id in client]
     assert sorted([*known, goal]) == sorted(talk.watcher.goals())
     rejected = [goal_id for goal_id in known if talk.watcher.states(goal_id) == ["REJECTED"]]
-    assert set(ends(talk, *(goal_id for goal_id in known if goal_id not in rejected))) == {1}
+    assert set(count_ends(talk, *(goal_id for goal_id in known if goal_id not in rejected))) == {1}
     assert min(len(client) for client in sent) > seconds, "a client was starved"
-    assert_told_in_order(talk)
+    assert_event_order(talk)
 
 
 def test_row_26_the_last_of_a_thousand_preempting_goals_is_spoken_whole(make_talk: MakeTalk, sink: Sink) -> None:
@@ -117,11 +116,11 @@ def test_row_26_the_last_of_a_thousand_preempting_goals_is_spoken_whole(make_tal
         assert (words[0], words[-1]) == ("please", "stuck")
         *others, newest = talk.watcher.goals()
         assert (len(others), newest) == (BURST - 1, last)
-        assert set(ends(talk, *others)) == {1}
+        assert set(count_ends(talk, *others)) == {1}
         goals = {event["id"]: event["goal"] for event in talk.watcher.events() if event.get("goal")}
         assert {goals[goal_id]["state"] for goal_id in others} <= {"PREEMPTED", "RECALLED"}
         assert {goals[goal_id]["reason"] for goal_id in others} == {"preempted"}
-        assert_told_in_order(talk)
+        assert_event_order(talk)
         talk.stop()
         assert_within(seconds, 1.0, "taking a thousand goals")
 
@@ -136,7 +135,7 @@ def _send_batch(wire: Wire, numbers: range) -> None:
 
 
 def _send_and_cancel(wire: Wire, chance: random.Random, over: threading.Event, sent: list[str]) -> None:
-    """Loop: send a goal, wait for a while, cancel it, see its result."""
+    """Repeatedly send a goal, wait for a while, cancel it, and check its result."""
     while not over.is_set():
         reply = wire.request("say", text=chance.choice(TEXTS), wait=True, **chance.choice(OPTIONS))
         goal = reply["goal"]
@@ -155,18 +154,18 @@ def _send_and_cancel(wire: Wire, chance: random.Random, over: threading.Event, s
 
 
 def _assert_alike(heard: Samples, reference: Samples) -> None:
-    """Assert that a sentence was heard whole, though not sample by sample: the library remembers those before it.
+    """Assert that a sentence was heard whole, but not sample by sample, because the engine has spoken before.
 
-    It is as long, and each twentieth of a second is as loud, within a tenth of the loudest. Zeros count in neither: a
-    player that ran dry puts them in, and what the monitor drops there shifts what follows a little.
+    The length must match, and the loudness of each twentieth of a second, within a tenth of the loudest. Zeros are
+    ignored: a player underrun inserts them, and samples that the monitor drops there shift the rest a little.
     """
     sound, wanted = _sounding(heard), _sounding(reference)
     compared = compare(sound, wanted)
     assert abs(compared.heard - compared.expected) <= 0.02, compared
-    # Of another sentence they are about 0.1 and 0.2; the first is low as well where the monitor dropped something.
+    # Another sentence has about 0.1 and 0.2. The first value is also low if the monitor has dropped samples.
     assert max(compared.correlation, similarity(sound, wanted)) > 0.5, compared
     heard_from, begin = (int(np.flatnonzero(np.abs(samples.astype(np.int32)) > LOUD)[0]) for samples in (sound, wanted))
-    # What it is longer by stands before it: scraps of the sentences that it has preempted.
+    # Any excess is at the start: parts of the preempted sentences.
     heard_from += max(0, round((compared.heard - compared.expected) * RATE))
     frame = RATE // 20
     starts = np.arange(0, round(compared.expected * RATE) - frame + 1, frame)
@@ -178,7 +177,7 @@ def _assert_alike(heard: Samples, reference: Samples) -> None:
 
 
 def _sounding(samples: Samples) -> Samples:
-    """Return samples without their zeros."""
+    """Remove all zeros from samples."""
     return np.compress(samples != 0, samples)
 
 
@@ -187,7 +186,7 @@ def _loudness(samples: Samples) -> float:
 
 
 def test_an_engine_that_reads_nothing_for_a_while_still_speaks(scripted: Talk) -> None:
-    """The engine may miss updates about waiting goals if its socket is full."""
+    """If its socket is full, the engine may miss updates about waiting goals."""
     goal = scripted.run("say", "length=1").id
     scripted.watcher.wait_for_word(goal)
     (engine,) = usage.descendants(scripted.pid)

@@ -1,4 +1,4 @@
-"""Row 13: texts that cannot be spoken, by every way in; and texts that are spoken as they are."""
+"""Row 13: texts that cannot be spoken, on the wire and on the command line, and texts that are spoken unchanged."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ WHOLE = ["a" * 10_000, "😀" * 10_000, "😀 low", 'it\'s "$(touch hacked)"; `i
 
 
 class Bystanders:
-    """A goal that is spoken and one that would be preempted by the next: none may notice a goal that is REJECTED."""
+    """An active and a pending goal, which a REJECTED goal must not affect."""
 
     def __init__(self, talk: Talk) -> None:
         self._talk = talk
@@ -41,7 +41,7 @@ class Bystanders:
 
 
 def assert_rejected(done: Finished, reason: str) -> None:
-    """Assert what a client says whose goal was REJECTED."""
+    """Assert the output and the exit code of a client whose goal was REJECTED."""
     goal = json.loads(done.out)
     assert (done.code, goal["state"], goal["reason"]) == (5, "REJECTED", reason), done
     assert "not spoken: " in done.err
@@ -78,7 +78,7 @@ def test_row_13_a_text_that_cannot_be_spoken_is_rejected_by_say(scripted: Talk) 
         assert_rejected(scripted.run("--json", "say", "--preempt", "-", stdin=text), "text_too_long")
         assert_rejected(scripted.run("--json", "say", "--preempt", text), "text_too_long")
     plain = scripted.run("say", "--preempt", "--wait", "--", "")
-    assert (plain.code, plain.out) == (5, "")  # no id: there is nothing to wait for
+    assert (plain.code, plain.out) == (5, "")  # no id, because there is nothing to wait for
     assert plain.err.endswith("not spoken: the text is empty\n")
     bystanders.assert_untouched()
 
@@ -90,9 +90,8 @@ def test_the_error_for_an_oversized_input_is_accurate(scripted: Talk) -> None:
     for text in (f"{longest}\nand more", "a" * 300_000):
         done = scripted.run("say", "-", stdin=text)
         assert (done.code, done.out) == (5, "")
-        assert (
-            "not spoken: standard input is too long (more than 40,000 bytes; a text has at most 10,000 char" in done.err
-        )
+        error = "not spoken: standard input is too long (more than 40,000 bytes; a text has at most 10,000 characters"
+        assert error in done.err
     done = scripted.run("--json", "say", "-f", "-", stdin="a" * 300_000)
     (event,) = map(json.loads, done.out.splitlines())
     assert (event["event"], event["goal"]["reason"], done.code) == ("result", "text_too_long", 5)

@@ -1,4 +1,4 @@
-"""Goals that wait for, stop or replace each other, and the settings of each, compared with the sound at the sink."""
+"""Goals that wait for, stop or replace each other, and their settings, compared with the recorded sound."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from tests.conformance import stopped
+from tests.conformance.checks import assert_event_order, assert_recalled, assert_rejected, submit
 from tests.conformance.hearing import (
     HELP,
     HOME,
@@ -22,14 +23,13 @@ from tests.conformance.hearing import (
     assert_aborted,
     assert_same,
     await_word,
-    begin,
-    begin_with_client,
     heard,
     player_process,
     render_quick,
     send,
+    start_goal,
+    start_goal_with_client,
 )
-from tests.conformance.told import assert_recalled, assert_rejected, assert_told_in_order, submit
 from tests.conformance.voices import with_both
 from tests.support.compare import assert_heard, assert_only_beginning, assert_silent, compare, loudness
 from tests.support.reference import Sentence
@@ -52,13 +52,13 @@ def talk(make_talk: MakeTalk, sink: Sink, voice: Voice) -> Talk:
     return voice.serve(make_talk, sink)
 
 
-def busy(talk: Talk, **fields: Any) -> str:
-    """Send a goal and wait until it is spoken, which leaves half a second for others to come; return its id."""
-    return begin(talk, HELP, number=1, **fields)
+def start_short_goal(talk: Talk, **fields: Any) -> str:
+    """Send a goal of half a second, wait for its first word, and return its id."""
+    return start_goal(talk, HELP, number=1, **fields)
 
 
-def end(talk: Talk, *goals: str) -> None:
-    """Wait until these goals have ended; all must have been spoken."""
+def await_spoken(talk: Talk, *goals: str) -> None:
+    """Wait until these goals have ended, and assert that all have SUCCEEDED."""
     for goal_id in goals:
         assert talk.watcher.wait_for_terminal(goal_id, 20) == "SUCCEEDED"
         assert talk.watcher.states(goal_id) == SPOKEN
@@ -68,7 +68,7 @@ def test_row_28_half_the_volume_sounds_half_as_loud(make_talk: MakeTalk, sink: S
     volumes = []
     for volume in (0.5, 1.0):
         talk = voice.serve(make_talk, sink, "--volume", str(volume))
-        end(talk, send(talk, HELP))
+        await_spoken(talk, send(talk, HELP))
         samples = heard(talk)
         assert_same(samples, voice.render([Sentence(HELP, QUICK, volume)])[0])
         volumes.append(loudness(samples))
@@ -81,13 +81,13 @@ def test_row_29_half_the_rate_takes_twice_as_long(make_talk: MakeTalk, sink: Sin
     durations = []
     for rate in (100, 200):
         talk = voice.serve(make_talk, sink, rate=rate)
-        end(talk, send(talk, HOME))
+        await_spoken(talk, send(talk, HOME))
         durations.append(assert_same(heard(talk), voice.render([HOME], rate)[0]).heard)
     assert durations[0] / durations[1] == pytest.approx(2, abs=0.4)
 
 
 def test_row_36_an_expired_goal_is_never_heard(talk: Talk, voice: Voice) -> None:
-    """The goal ends the moment its time runs out, while the sentence of 3 s before it is still being spoken."""
+    """The goal expires on time, while the 3 s sentence before it is still being spoken."""
     long = send(talk, LONG, rate=200)
     goal = send(talk, NEVER, ttl=1)
     after = send(talk, LOW)
@@ -96,29 +96,29 @@ def test_row_36_an_expired_goal_is_never_heard(talk: Talk, voice: Voice) -> None
     expired = talk.goal(goal)
     assert expired["ended_at"] - expired["queued_at"] == pytest.approx(1, abs=0.1)
     assert (expired["ttl"], expired["message"].startswith("not spoken: ")) == (1, True)
-    end(talk, long, after)
+    await_spoken(talk, long, after)
     assert_heard(heard(talk), voice.render([Sentence(LONG, rate=200), LOW]))
-    assert_told_in_order(talk)
+    assert_event_order(talk)
 
 
 def test_row_37_a_newer_goal_with_the_same_key_takes_the_old_ones_place(talk: Talk, voice: Voice) -> None:
-    """The goal being spoken is not replaced, although it has the same key."""
-    long = busy(talk, key="battery")
+    """The active goal is not replaced, although it has the same key."""
+    long = start_short_goal(talk, key="battery")
     first = send(talk, "never the first", key="battery")
     other = send(talk, HOME)
     second = send(talk, "never the second", key="battery")
     newest = send(talk, LOW, key="battery")
     assert_recalled(talk, first, "replaced", by=second)
     assert_recalled(talk, second, "replaced", by=newest)
-    end(talk, long, newest, other)
+    await_spoken(talk, long, newest, other)
     assert_heard(heard(talk), voice.render([HELP, LOW, HOME]))
-    assert_told_in_order(talk)
+    assert_event_order(talk)
 
 
 def test_row_38_only_a_goal_that_was_heard_throttles_the_next(make_talk: MakeTalk, sink: Sink, voice: Voice) -> None:
-    """A throttled goal is silent and no failure for a script. One that expired or was aborted throttles nothing."""
+    """A throttled goal is silent, and its client exits with 0. An expired or aborted goal throttles nothing."""
     talk = voice.serve(make_talk, sink, "--player", "aplay")
-    aborted = begin(talk, LONG, key="battery", throttle=60)
+    aborted = start_goal(talk, LONG, key="battery", throttle=60)
     expired = send(talk, NEVER, key="home", throttle=60, ttl=0.1)
     assert_recalled(talk, expired, "expired")
     os.kill(player_process(talk), signal.SIGKILL)
@@ -127,7 +127,7 @@ def test_row_38_only_a_goal_that_was_heard_throttles_the_next(make_talk: MakeTal
     low, home = (send(talk, text, key=key, throttle=60) for text, key in ((LOW, "battery"), (HOME, "home")))
     talk.watcher.wait_for(low, "ACTIVE")
     while_spoken = submit(talk, NEVER, key="battery", throttle=60)
-    end(talk, low, home)
+    await_spoken(talk, low, home)
     after = submit(talk, NEVER, key="battery", throttle=60, flush=True)
     for goal in (while_spoken, after):
         assert_rejected(goal, "throttled")
@@ -138,18 +138,18 @@ def test_row_38_only_a_goal_that_was_heard_throttles_the_next(make_talk: MakeTal
 
 
 def test_row_39_goals_are_ordered_by_priority_and_then_by_arrival(talk: Talk, voice: Voice) -> None:
-    long = busy(talk)
+    long = start_short_goal(talk)
     texts = ["battery zero", "coming five", "battery one", "coming five again"]
     zero, five, one, five_again = [
         send(talk, text, priority=priority) for text, priority in zip(texts, (0, 5, 1, 5), strict=True)
     ]
-    end(talk, long, five, five_again, one, zero)
+    await_spoken(talk, long, five, five_again, one, zero)
     assert_heard(heard(talk), voice.render([HELP, texts[1], texts[3], texts[2], texts[0]]))
-    assert_told_in_order(talk)
+    assert_event_order(talk)
 
 
 def test_row_40_a_preempting_goal_does_not_interrupt_a_higher_priority(talk: Talk, voice: Voice) -> None:
-    long = busy(talk, priority=5)
+    long = start_short_goal(talk, priority=5)
     zero = send(talk, HOME)
     high = send(talk, "coming now", priority=3, preempt=True)
     lower, same = (send(talk, NEVER, priority=priority, preempt=True) for priority in (-1, 0))
@@ -157,24 +157,24 @@ def test_row_40_a_preempting_goal_does_not_interrupt_a_higher_priority(talk: Tal
     assert talk.watcher.states(long) == ["PENDING", "ACTIVE"]
     assert_recalled(talk, lower, "preempted", by=same)
     assert_recalled(talk, same, "preempted", by=low)
-    end(talk, long, high, low, zero)
+    await_spoken(talk, long, high, low, zero)
     assert_heard(heard(talk), voice.render([HELP, "coming now", LOW, HOME]))
-    assert_told_in_order(talk)
+    assert_event_order(talk)
 
 
 def test_a_goal_uses_the_settings_at_its_start_except_its_own(talk: Talk, voice: Voice) -> None:
-    """A change holds for the goals that have not begun, except for the values that they were sent with."""
+    """A changed setting applies to all goals that have not started, unless a goal was sent with its own value."""
     sentences = [
         Sentence(HELP, rate=QUICK),
         Sentence(LOW, rate=300, volume=0.2),
         Sentence(HOME, rate=350, volume=0.5),
-        Sentence(HELP, rate=350, volume=0),  # takes its time, in silence
+        Sentence(HELP, rate=350, volume=0),  # silent, but as long
         Sentence(LOW, rate=350, volume=0.5),
     ]
-    first = busy(talk)
+    first = start_short_goal(talk)
     goals = [send(talk, LOW, rate=300, volume=0.2), send(talk, HOME), send(talk, HELP, volume=0), send(talk, LOW)]
     assert talk.request("set", rate=350, volume=0.5)["settings"]["rate"] == 350
-    end(talk, first, *goals)
+    await_spoken(talk, first, *goals)
     references = voice.render(sentences)
     assert loudness(references[1]) < 0.6 * loudness(references[4])
     del references[3]
@@ -183,7 +183,7 @@ def test_a_goal_uses_the_settings_at_its_start_except_its_own(talk: Talk, voice:
 
 @pytest.mark.parametrize("voice", ["espeak"], indirect=True)
 def test_a_goals_own_pitch_and_voice_apply_only_to_it(talk: Talk) -> None:
-    end(talk, send(talk, LOW, pitch=80), send(talk, HOME, voice="de"), send(talk, LOW))
+    await_spoken(talk, send(talk, LOW, pitch=80), send(talk, HOME, voice="de"), send(talk, LOW))
     own = Sentence(LOW, QUICK, pitch=80)
     assert_heard(heard(talk), render_quick([own, Sentence(HOME, QUICK, voice="de"), LOW]))
     assert not compare(render_quick([LOW])[0], render_quick([own])[0]).same
@@ -191,7 +191,7 @@ def test_a_goals_own_pitch_and_voice_apply_only_to_it(talk: Talk) -> None:
 
 @with_both
 def test_row_03_the_cancel_command_returns_after_the_sound_has_stopped(talk: Talk, voice: Voice) -> None:
-    goal = begin(talk, LONG)
+    goal = start_goal(talk, LONG)
     canceled = talk.run("cancel", goal)
     returned = time.monotonic()
     assert (canceled.code, canceled.id, canceled.err) == (0, goal, "")
@@ -208,7 +208,7 @@ def test_row_03_the_cancel_command_returns_after_the_sound_has_stopped(talk: Tal
 def test_row_03_a_cancel_is_confirmed_within_150_ms_and_after_the_sound(talk: Talk) -> None:
     with limits():
         for number in (1, 4):
-            goal = begin(talk, LONG, number=number)
+            goal = start_goal(talk, LONG, number=number)
             sent_at = time.monotonic()
             reply = talk.request("cancel", ids=[goal])
             replied_at = time.monotonic()
@@ -245,7 +245,7 @@ def test_row_24_a_preempting_goal_is_heard_after_the_old_one_is_silent(
     make_talk: MakeTalk, sink: Sink, voice: Voice
 ) -> None:
     talk = voice.serve(make_talk, sink, "--preempt")
-    goal, first = begin_with_client(talk, LONG)
+    goal, first = start_goal_with_client(talk, LONG)
     second = talk.run("say", "--wait", "--", LOW)
     preempted = talk.finish(first)
     assert (preempted.code, preempted.id) == (7, goal)
@@ -272,7 +272,7 @@ def test_row_25_a_preempting_goal_goes_before_the_queued_ones(talk: Talk, voice:
 
 
 def test_row_27_cancel_current_stops_a_goal_and_the_next_is_spoken(talk: Talk, voice: Voice) -> None:
-    goal, waiter = begin_with_client(talk, LONG, "--queue")
+    goal, waiter = start_goal_with_client(talk, LONG, "--queue")
     waiting = send(talk, LOW)
     canceled = talk.run("cancel", "--current")
     assert (canceled.code, canceled.id) == (0, goal)

@@ -1,4 +1,4 @@
-"""Speech that is held and goes on: row 43, compared with the sound at the sink, and the goals meanwhile."""
+"""Row 43: paused and resumed speech, compared with the recorded sound, and goals during a pause."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.conformance import stopped
+from tests.conformance.checks import assert_event_order, assert_recalled, submit
 from tests.conformance.hearing import (
     HELP,
     HOME,
@@ -16,12 +17,11 @@ from tests.conformance.hearing import (
     LOW,
     PRECISION,
     await_word,
-    begin,
-    begin_with_client,
     heard,
     send,
+    start_goal,
+    start_goal_with_client,
 )
-from tests.conformance.told import assert_recalled, assert_told_in_order, submit
 from tests.conformance.voices import with_both
 from tests.support.compare import SAME, assert_heard, assert_resumed, assert_silent, compare, extent, find_part
 from tests.support.recording import LOUD
@@ -38,11 +38,11 @@ if TYPE_CHECKING:
 
 SPOKEN = ["PENDING", "ACTIVE", "SUCCEEDED"]
 STOPPED = ["PENDING", "ACTIVE", "PREEMPTING", "PREEMPTED"]
-#: Seconds for which a sentence is held, the shorter time for holding it in another place, and the limit for silence.
-HELD, BRIEFLY, SILENT = 2.0, 0.7, 0.15
-#: Seconds that may be heard again if the player had to be started again.
-TWICE = 0.05
-#: Samples that the monitor may lose at the start of a stream.
+#: Seconds of a pause, of a short pause, and of the limit for silence after `pause`.
+PAUSE_S, SHORT_PAUSE_S, SILENCE_LIMIT_S = 2.0, 0.7, 0.15
+#: Seconds that may be heard twice if the player had to be restarted.
+REPEAT_LIMIT_S = 0.05
+#: Number of samples that the monitor may drop at the start of a stream.
 SLACK = 256
 
 
@@ -52,21 +52,21 @@ def talk(make_talk: MakeTalk, sink: Sink, voice: Voice) -> Talk:
 
 
 def pause(talk: Talk) -> Message:
-    """Hold speech, and return the reply, after which it is silent."""
+    """Pause speech, and return the reply, after which it is silent."""
     reply = talk.request("pause")
     assert (reply["ok"], reply["paused"]) == (True, True), reply
     return reply
 
 
 def resume(talk: Talk) -> Message:
-    """Let speech go on, and return the reply."""
+    """Resume speech, and return the reply."""
     reply = talk.request("resume")
     assert (reply["ok"], reply["paused"]) == (True, False), reply
     return reply
 
 
-def assert_silent_since(talk: Talk, moment: float, seconds: float) -> None:
-    """Assert that nothing is heard from then on, for so long."""
+def assert_silent_for(talk: Talk, moment: float, seconds: float) -> None:
+    """Assert that nothing is heard for this many seconds after a moment."""
     assert talk.recording.wait_until(moment + seconds, seconds + 1)
     assert_silent(talk.recording.between(moment + PRECISION, moment + seconds))
 
@@ -74,10 +74,10 @@ def assert_silent_since(talk: Talk, moment: float, seconds: float) -> None:
 @pytest.mark.parametrize(
     ("player", "word", "seconds"),
     [
-        ("aplay", 3, HELD),
-        ("pacat", 8, BRIEFLY),
+        ("aplay", 3, PAUSE_S),
+        ("pacat", 8, SHORT_PAUSE_S),
         *(
-            pytest.param(player, word, HELD, marks=pytest.mark.slow)
+            pytest.param(player, word, PAUSE_S, marks=pytest.mark.slow)
             for player, word in (("aplay", 1), ("aplay", 8), ("pacat", 1), ("pacat", 3), ("pacat", 8))
         ),
     ],
@@ -95,20 +95,20 @@ def test_row_43_a_paused_sentence_resumes_where_it_stopped(
         paused = pause(talk)["goal"]
         paused_at = time.monotonic()
         assert (paused["id"], paused["state"], paused["paused"]) == (goal, "ACTIVE", True)
-        assert_silent_since(talk, paused_at, seconds)
+        assert_silent_for(talk, paused_at, seconds)
         status = talk.request("status")
         assert (status["server"]["paused"], status["active"]["id"], status["active"]["paused"]) == (True, goal, True)
         resumed = resume(talk)["goal"]
         assert (resumed["id"], resumed["state"], resumed["paused"]) == (goal, "ACTIVE", False)
         assert talk.watcher.wait_for_terminal(goal) == "SUCCEEDED"
-        assert_resumed(heard(talk), reference, pause=seconds - SILENT, repeated=TWICE)
+        assert_resumed(heard(talk), reference, pause=seconds - SILENCE_LIMIT_S, repeated=REPEAT_LIMIT_S)
         assert talk.watcher.states(goal) == SPOKEN
         numbers = [word["number"] for word in talk.watcher.words(goal)]
         assert numbers == list(range(1, len(numbers) + 1))
         assert talk.goal(goal)["spoken"] == LONG
-        assert_told_in_order(talk)
+        assert_event_order(talk)
         talk.stop()
-        assert_within(paused_at - sent_at, SILENT, f"the silence after a pause at word {word}")
+        assert_within(paused_at - sent_at, SILENCE_LIMIT_S, f"the silence after a pause at word {word}")
 
 
 @with_both
@@ -117,24 +117,24 @@ def test_row_43_a_sentence_paused_twice_is_heard_whole_and_reported(talk: Talk, 
         goal = follower.request("say", text=LONG, feedback=True)["goal"]["id"]
         await_word(talk, goal)
         pause(talk)
-        assert_silent_since(talk, time.monotonic(), 0.5)
+        assert_silent_for(talk, time.monotonic(), 0.5)
         resume(talk)
         await_word(talk, goal, 8)
         pause(talk)
-        assert pause(talk)["goal"]["id"] == goal  # twice is success
-        assert_silent_since(talk, time.monotonic(), 0.5)
+        assert pause(talk)["goal"]["id"] == goal  # a second pause succeeds
+        assert_silent_for(talk, time.monotonic(), 0.5)
         resume(talk)
         assert resume(talk)["goal"]["id"] == goal
         events = [follower.receive_event("paused") for _ in range(4)]
         assert follower.receive_event("result")["goal"]["state"] == "SUCCEEDED"
-    _assert_held_twice(heard(talk), voice.render([LONG])[0])
+    _assert_paused_twice(heard(talk), voice.render([LONG])[0])
     words = talk.watcher.words(goal)
     assert [word["number"] for word in words] == list(range(1, len(words) + 1))
     assert [word["word"] for word in words] == LONG.split()
     assert [(event["paused"], event["id"]) for event in events] == [(True, goal), (False, goal)] * 2
     assert all(event["by"]["client"]["pid"] for event in events)
     assert [event for event in talk.watcher.events() if event["event"] == "paused"] == events
-    assert_told_in_order(talk)
+    assert_event_order(talk)
 
 
 def test_row_43_nothing_starts_while_paused_but_pending_goals_can_end(talk: Talk, voice: Voice) -> None:
@@ -146,19 +146,19 @@ def test_row_43_nothing_starts_while_paused_but_pending_goals_can_end(talk: Talk
     assert talk.request("cancel", ids=[canceled])["count"] == 1
     assert_recalled(talk, canceled, "canceled")
     assert_recalled(talk, expiring, "expired")
-    assert_silent_since(talk, time.monotonic(), 0.2)
+    assert_silent_for(talk, time.monotonic(), 0.2)
     assert talk.request("status")["server"]["paused"] is True
     resume(talk)
     assert talk.watcher.wait_for_terminal(reply["goal"]["id"]) == "SUCCEEDED"
     assert_heard(heard(talk), voice.render([LOW, HOME]))
-    assert_told_in_order(talk)
+    assert_event_order(talk)
     assert "paused" not in talk.request("say", text=LOW)
     heard(talk)
 
 
 def test_row_43_a_cancelled_paused_goal_ends_at_once_and_stays_silent(talk: Talk, voice: Voice) -> None:
     with limits():
-        goal = begin(talk, LONG)
+        goal = start_goal(talk, LONG)
         pause(talk)
         started_at = time.monotonic()
         assert talk.request("cancel")["count"] == 1
@@ -167,19 +167,19 @@ def test_row_43_a_cancelled_paused_goal_ends_at_once_and_stays_silent(talk: Talk
         ended = talk.goal(goal)
         assert (ended["reason"], ended["paused"]) == ("canceled", False)
         after = send(talk, LOW)
-        assert_silent_since(talk, time.monotonic(), 0.3)
+        assert_silent_for(talk, time.monotonic(), 0.3)
         resume(talk)
         assert talk.watcher.wait_for_terminal(after) == "SUCCEEDED"
         stopped.assert_heard_after_stop(heard(talk), LONG, [LOW], voice=voice)
-        assert_within(seconds, SILENT, "the cancel of a held goal")
+        assert_within(seconds, SILENCE_LIMIT_S, "the cancel of a paused goal")
 
 
 def test_row_43_a_client_times_out_while_speech_is_paused(talk: Talk) -> None:
-    """The client owns the goal: that is cancelled, and the client ends at its time."""
+    """The client cancels its goal, and exits on time."""
 
     with limits():
         started_at = time.monotonic()
-        goal, client = begin_with_client(talk, LONG, "--timeout", "1")
+        goal, client = start_goal_with_client(talk, LONG, "--timeout", "1")
         pause(talk)
         done = talk.finish(client)
         took = time.monotonic() - started_at
@@ -191,52 +191,52 @@ def test_row_43_a_client_times_out_while_speech_is_paused(talk: Talk) -> None:
 
 
 def test_row_43_a_preempting_goal_ends_the_paused_one_and_waits(talk: Talk, voice: Voice) -> None:
-    paused = begin(talk, LONG, priority=1)
+    paused = start_goal(talk, LONG, priority=1)
     pause(talk)
     lower = submit(talk, HOME, preempt=True)["id"]
-    assert talk.goal(paused)["paused"] is True  # a lower priority leaves it
+    assert talk.goal(paused)["paused"] is True  # a lower priority does not preempt it
     newcomer = send(talk, LOW, preempt=True, priority=1)
     assert talk.watcher.wait_for_terminal(paused) == "PREEMPTED"
     assert talk.goal(paused)["by"] == {"goal": newcomer}
-    assert_silent_since(talk, time.monotonic(), 0.5)
+    assert_silent_for(talk, time.monotonic(), 0.5)
     assert talk.goal(newcomer)["state"] == "PENDING"
     resume(talk)
     assert talk.watcher.wait_for_terminal(newcomer) == "SUCCEEDED"
     assert talk.watcher.wait_for_terminal(lower) == "RECALLED"
     stopped.assert_heard_after_stop(heard(talk), LONG, [LOW], voice=voice)
-    assert_told_in_order(talk)
+    assert_event_order(talk)
 
 
 @pytest.mark.slow
 def test_row_43_a_long_pause_does_not_trigger_the_watchdog(talk: Talk, voice: Voice) -> None:
-    goal = begin(talk, LONG)
+    goal = start_goal(talk, LONG)
     pause(talk)
-    assert_silent_since(talk, time.monotonic(), 5)
+    assert_silent_for(talk, time.monotonic(), 5)
     assert talk.goal(goal)["paused"] is True
     resume(talk)
     assert talk.watcher.wait_for_terminal(goal) == "SUCCEEDED"
-    assert_resumed(heard(talk), voice.render([LONG])[0], pause=5, repeated=TWICE)
+    assert_resumed(heard(talk), voice.render([LONG])[0], pause=5, repeated=REPEAT_LIMIT_S)
 
 
-def _assert_held_twice(samples: Samples, reference: Samples) -> None:
-    """Assert that three parts were heard, which together are the sentence, nothing of it missing or heard twice."""
+def _assert_paused_twice(samples: Samples, reference: Samples) -> None:
+    """Assert that three parts were heard, which together are the sentence, without gaps or repeated parts."""
     loud = np.flatnonzero(np.abs(samples.astype(np.int32)) > LOUD)
     cuts = np.sort(np.argsort(np.diff(loud))[-2:])
-    assert np.diff(loud)[cuts].min() > BRIEFLY / 2 * RATE, "it was not held twice"
+    assert np.diff(loud)[cuts].min() > SHORT_PAUSE_S / 2 * RATE, "it was not paused twice"
     if compare(samples, reference).same:
-        return  # with nothing but silence put in
+        return  # only silence was inserted
     starts, ends = [loud[0], *loud[cuts + 1]], [*loud[cuts], loud[-1]]
     begin, end = extent(reference) or (0, 0)
     wanted = reference[begin:end]
     reached = 0
     for part in (samples[start : stop + 1] for start, stop in zip(starts, ends, strict=True)):
-        place = find_part(part, wanted, reached, round(TWICE * RATE) + SLACK)
+        place = find_part(part, wanted, reached, round(REPEAT_LIMIT_S * RATE) + SLACK)
         if place is None:
             compared = compare(wanted, part)
             assert compared.correlation > SAME, compared
             place = compared.offset, compared.offset + len(part)
         first, last = place
-        assert first >= reached - TWICE * RATE - SLACK, f"{(reached - first) / RATE:.3f} s heard twice"
+        assert first >= reached - REPEAT_LIMIT_S * RATE - SLACK, f"{(reached - first) / RATE:.3f} s heard twice"
         assert extent(wanted[reached + SLACK : max(0, first - SLACK)]) is None, f"missing before {first / RATE:.3f} s"
         reached = last
     assert reached >= len(wanted) - SLACK, f"{(len(wanted) - reached) / RATE:.3f} s missing at the end"

@@ -1,6 +1,6 @@
-"""Sentences that are spoken, with the sound of libespeak-ng; goals without a player or a device (row 41); and words.
+"""Spoken sentences, missing players and devices (row 41), and word events (row 42).
 
-Word feedback comes when the word is heard: measured at the sink, against the place where libespeak-ng puts it.
+A word event must arrive when the word is heard. This is measured in the recorded sound.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from tests.support.sink import Sink
 
 SPOKEN = ["PENDING", "ACTIVE", "SUCCEEDED"]
-#: Seconds that the monitor may lose at the start of a stream.
+#: Seconds that the monitor may drop at the start of a stream.
 LOST = 0.012
 
 
@@ -107,7 +107,7 @@ def test_row_30_a_text_is_spoken_and_never_executed(
     assert [(client.code, client.err) for client in clients] == [(0, "")] * len(texts)
     assert talk.run("wait", *(client.id for client in clients)).code == 0
     assert [talk.goal(client.id)["text"] for client in clients] == texts
-    assert talk.run("say", "--wait", *LOW.split()).code == 0  # words are joined
+    assert talk.run("say", "--wait", *LOW.split()).code == 0  # arguments are joined
     assert_heard(heard(talk), voice.render([*texts, LOW]))
     assert os.listdir(tmp_path) == []
 
@@ -126,7 +126,7 @@ def test_the_wheels_library_speaks_if_the_system_has_none(
 
 
 def test_only_a_limited_silence_is_cut_between_queued_sentences(talk: Talk) -> None:
-    """The time that a change of goals takes is a matter of speed; that enough of the pause stays is not."""
+    """Enough of the pause between two sentences must be left, however fast goals change."""
     texts = [LOW, HOME, LOW]
     goals = [send(talk, text) for text in texts]
     assert talk.watcher.wait_for_terminal(goals[-1], 20) == "SUCCEEDED"
@@ -144,7 +144,7 @@ def test_only_a_limited_silence_is_cut_between_queued_sentences(talk: Talk) -> N
     assert abs(talk.goal(goals[-1])["duration"] - len(references[-1]) / RATE) < 0.001
 
 
-#: Settings of ALSA for a card that there is not.
+#: ALSA settings for a card that does not exist.
 NO_CARD = "pcm.!default { type hw card 31 }\nctl.!default { type hw card 31 }\n"
 
 
@@ -158,7 +158,7 @@ def test_row_41_goals_are_aborted_until_a_player_is_installed(
     assert aplay
     (tmp_path / "aplay").symlink_to(aplay)
     assert talk.run("say", "--wait", "--", HOME).code == 0
-    stopped.assert_heard_after_stop(heard(talk), LOW, [HOME], begun=False, voice=voice)
+    stopped.assert_heard_after_stop(heard(talk), LOW, [HOME], first_heard=False, voice=voice)
 
 
 def test_row_41_a_missing_device_is_reported_within_a_second(
@@ -173,7 +173,7 @@ def test_row_41_a_missing_device_is_reported_within_a_second(
         done = _assert_aborted(talk, "audio_device", "aplay: audio open error: No such file or directory")
         shutil.copy(os.path.join(sink.directory, ".asoundrc"), configuration)
         assert talk.run("say", "--wait", "--", HOME).code == 0
-        stopped.assert_heard_after_stop(heard(talk), LOW, [HOME], begun=False, voice=voice)
+        stopped.assert_heard_after_stop(heard(talk), LOW, [HOME], first_heard=False, voice=voice)
         assert_within(done.seconds, 1, "`say --wait` without a device")
 
 
@@ -191,42 +191,43 @@ def test_row_41_an_unknown_device_name_is_reported(make_talk: MakeTalk, sink: Si
     assert_silent(heard(talk))
 
 
-def _assert_aborted(talk: Talk, reason: str, *words: str) -> Finished:
-    """Assert that a goal is ABORTED before anything is heard, and that its client says so."""
+def _assert_aborted(talk: Talk, reason: str, *texts: str) -> Finished:
+    """Assert that a goal is ABORTED before anything is heard, and that its client reports it."""
     done = talk.run("say", "--wait", "--", LOW)
     goal = talk.goal(done.id)
     assert (done.code, talk.watcher.states(done.id)) == (4, ["PENDING", "ACTIVE", "ABORTED"]), done
     assert goal["message"] in done.err, done
-    assert_aborted(goal, reason, *words)
+    assert_aborted(goal, reason, *texts)
     assert goal["spoken"] == ""
     return done
 
 
-#: Seconds between a word's feedback and the moment it is heard: the median, and the worst.
+#: Limits in seconds between a word's event and its sound: for the median, and for the worst word.
 MEDIAN, WORST = 0.03, 0.1
-#: The least likeness of a sentence that came through a tunnel: 0.985 were measured, 0.1 for another sentence.
+#: Minimum correlation of a sentence that came through a tunnel. Measured: 0.985, and 0.1 for another sentence.
 ALIKE = 0.95
-#: Thirty words, of which libespeak-ng says some neighbours as one. It begins with a moment of silence, see `hearing`.
+#: Thirty words. It starts with a short silence, see `hearing`.
 THIRTY = (
     "coming home to the charger in the kitchen, because the battery of this robot is low; "
     "please bring the small red box from the table to me and then wait"
 )
-#: The words of it that are told: "in the", "from the" are said as one.
-TOLD = re.sub(r"\b(in|from|of) the\b", r"\1", re.sub("[,;]", "", THIRTY)).split()
-#: Ten words with characters of one to four bytes; "from the" and "this one" are said as one, 東京 is told repeatedly.
+#: The words of THIRTY that are reported. libespeak-ng speaks "in the", "of the" and "from the" as one word.
+REPORTED_WORDS = re.sub(r"\b(in|from|of) the\b", r"\1", re.sub("[,;]", "", THIRTY)).split()
+#: Ten words with characters of one to four bytes. libespeak-ng speaks "from the" and "this one" as one word, and
+#: reports 東京 several times.
 TEN = "coming from the café 東京 is 😀 naïve, this one"
 
 
 @dataclass(frozen=True)
 class Measured:
-    """The word events of a sentence that was spoken, and by how many seconds each came after its word."""
+    """The word events of a spoken sentence, and their delays in seconds after the words."""
 
     words: list[Message]
-    received: list[float]  # by the watcher; empty if gaps made it impossible to tell
-    stamped: list[float]  # by `at`, the server's own clock
+    received: list[float]  # as received by the watcher; empty if gaps made a measurement impossible
+    stamped: list[float]  # from `at`, the server's clock
 
     def assert_in_time(self) -> None:
-        """Assert the limits: a word that is told before it is heard is as wrong as one that is told after."""
+        """Assert that no event came too early or too late."""
         for name, late in (("received", self.received), ("stamped", self.stamped)) if self.received else ():
             median, worst = statistics.median(map(abs, late)), max(map(abs, late))
             print(f"{name}: median {median * 1000:.1f} ms, {min(late) * 1000:.1f} to {max(late) * 1000:.1f} ms")
@@ -235,9 +236,10 @@ class Measured:
 
 
 def measure(talk: Talk, text: str, rate: int, *, exact: bool = True, voice: Voice = ESPEAK) -> Measured:
-    """Speak a server's first sentence to its end, stop the server, and return what was measured.
+    """Speak a server's first sentence, stop the server, and return the measurement.
 
-    `exact`: whether the sink plays every sample as it is; a tunnel doesn't.
+    Args:
+        exact: Whether the sink plays every sample unchanged, unlike a tunnel.
     """
     wall = time.time() - time.monotonic()
     done = talk.run("say", "--wait", "--", text, timeout=60)
@@ -248,11 +250,11 @@ def measure(talk: Talk, text: str, rate: int, *, exact: bool = True, voice: Voic
     words = talk.watcher.words(done.id)
     if compared.heard > compared.expected + EXTENT_TOLERANCE_S:
         assert_within(compared.heard - compared.expected, EXTENT_TOLERANCE_S, "the gaps in a sentence")
-        return Measured(words, [], [])  # behind a gap, no word is in its place
+        return Measured(words, [], [])  # after a gap, every word is late
     assert compared.same or (not exact and compared.correlation > ALIKE), compared
-    begins = (len(reference.samples) - len(without_leading_zeros(reference.samples))) / RATE
-    positions = [max(begins, position(reference, word["start"])) for word in words]
-    moments = [time_heard(talk.recording, compared, reference.samples, offset) for offset in positions]
+    silence_s = (len(reference.samples) - len(without_leading_zeros(reference.samples))) / RATE
+    offsets = [max(silence_s, position(reference, word["start"])) for word in words]
+    moments = [time_heard(talk.recording, compared, reference.samples, offset) for offset in offsets]
     talk.stop()
     received = [talk.watcher.arrived(word) - moment for word, moment in zip(words, moments, strict=True)]
     stamped = [word["at"] - wall - moment for word, moment in zip(words, moments, strict=True)]
@@ -260,7 +262,7 @@ def measure(talk: Talk, text: str, rate: int, *, exact: bool = True, voice: Voic
 
 
 def position(reference: Rendering, start: int) -> float:
-    """Return the seconds into the sound at which a word begins, the first time if libespeak-ng tells it repeatedly."""
+    """Return the seconds from the start of the sound to a word, the first time if it is reported several times."""
     return next(seconds for offset, _, seconds in reference.words if offset == start)
 
 
@@ -278,7 +280,7 @@ def test_word_events_arrive_as_the_words_are_heard(make_talk: MakeTalk, sink: Si
     with limits():
         talk = make_talk("--rate", str(rate), "--player", player, sink=sink)
         measured = measure(talk, THIRTY, rate)
-        assert [THIRTY[word["start"] : word["end"]] for word in measured.words] == TOLD
+        assert [THIRTY[word["start"] : word["end"]] for word in measured.words] == REPORTED_WORDS
         measured.assert_in_time()
 
 
@@ -289,8 +291,8 @@ def test_word_events_of_a_neural_voice_arrive_as_the_words_are_heard(
 ) -> None:
     with limits():
         measured = measure(joe.serve(make_talk, sink, rate=rate), THIRTY, rate, voice=joe)
-        assert [THIRTY[word["start"] : word["end"]] for word in measured.words] == TOLD
-        # How busy the machine is doesn't change where in the sound a word is said to be.
+        assert [THIRTY[word["start"] : word["end"]] for word in measured.words] == REPORTED_WORDS
+        # The reported place of a word in the sound doesn't depend on the load of the machine.
         reference = joe.render_with_words(Sentence(THIRTY, rate))
         beside = [abs(word["time"] - position(reference, word["start"])) for word in measured.words]
         assert statistics.median(beside) <= MEDIAN, beside
@@ -299,7 +301,7 @@ def test_word_events_of_a_neural_voice_arrive_as_the_words_are_heard(
 
 
 def test_word_events_wait_for_an_output_with_high_latency(make_talk: MakeTalk, sink: Sink) -> None:
-    """By a clock of the engine's own they would be told 200 ms before."""
+    """With the engine's own clock, the events would come 200 ms too early."""
     with limits(), DistantSink(sink) as distant:
         talk = make_talk("--rate", "350", sink=sink, env=distant.env)
         measure(talk, THIRTY, 350, exact=False).assert_in_time()
@@ -315,7 +317,7 @@ def test_row_42_words_of_any_script_are_reported_once_with_their_place(make_talk
 
 @pytest.mark.slow
 def test_row_42_a_neural_voice_reports_words_of_any_script_once(make_talk: MakeTalk, sink: Sink, joe: Joe) -> None:
-    """Nothing else knows when they are heard: the recognizer knows English words alone."""
+    """Their times can't be checked, because the recognizer knows only English words."""
     talk = joe.serve(make_talk, sink, rate=200)
     done = talk.run("say", "--wait", "--", TEN)
     assert (done.code, done.err) == (0, "")
@@ -333,8 +335,8 @@ def _assert_ten(words: list[Message]) -> None:
 
 def test_row_42_a_stopped_goal_reports_the_words_that_were_heard(make_talk: MakeTalk, sink: Sink, voice: Voice) -> None:
     reference = voice.render_with_words(Sentence(LONG))
-    begins = extent(reference.samples)
-    assert begins is not None
+    bounds = extent(reference.samples)
+    assert bounds is not None
 
     with limits():
         talk = voice.serve(make_talk, sink, rate=200)
@@ -348,8 +350,8 @@ def test_row_42_a_stopped_goal_reports_the_words_that_were_heard(make_talk: Make
         assert goal["spoken"] == LONG[: last["end"]]
         assert LONG[: goal["spoken_end"]] == LONG[: last["start"]].rstrip()
         heard(talk)
-        # When the sound ended, the last word that was told had begun, and the next one had not.
-        until = begins[0] / RATE + assert_only_beginning(talk.recording, reference.samples)
+        # When the sound ended, the last reported word had started, and the next one had not.
+        until = bounds[0] / RATE + assert_only_beginning(talk.recording, reference.samples)
         later = [seconds for start, _, seconds in reference.words if start > last["start"]]
         following = min(later, default=len(reference.samples) / RATE)
         talk.stop()
@@ -357,4 +359,4 @@ def test_row_42_a_stopped_goal_reports_the_words_that_were_heard(make_talk: Make
         assert_within(
             position(reference, last["start"]) - until, WORST, f"the word {last['word']!r}, before its sound,"
         )
-        assert_within(until - following, WORST, f"the word after {last['word']!r}, heard and not told,")
+        assert_within(until - following, WORST, f"the word after {last['word']!r}, heard but not reported,")

@@ -1,4 +1,4 @@
-"""Server and client meet in one place, whatever the environment of each has. A server speaks its greeting."""
+"""The socket's path, which client and server must agree on in any environment, and the start of a server."""
 
 from __future__ import annotations
 
@@ -25,12 +25,7 @@ def home(home: str) -> str:
 @pytest.mark.filterwarnings("ignore::platformdirs.RuntimeDirWarning")
 @pytest.mark.parametrize(
     "variables",
-    [
-        *({"XDG_RUNTIME_DIR": folder} for folder in ("run", "gone", "")),
-        {"TMPDIR": "run"},
-        {"TMP": "run"},
-        {"TMPDIR": ""},
-    ],
+    [*({"XDG_RUNTIME_DIR": name} for name in ("run", "gone", "")), {"TMPDIR": "run"}, {"TMP": "run"}, {"TMPDIR": ""}],
     ids=str,
 )
 def test_a_client_looks_where_platformdirs_puts_the_socket(
@@ -40,7 +35,7 @@ def test_a_client_looks_where_platformdirs_puts_the_socket(
         monkeypatch.delenv(name, raising=False)
     for name, value in variables.items():
         monkeypatch.setenv(name, value and f"{home}/{value}")
-    monkeypatch.setattr(tempfile, "tempdir", None)  # so that it is looked for again
+    monkeypatch.setattr(tempfile, "tempdir", None)  # so that it is determined again
     looked = paths.client_sockets(None)
     assert f"{platformdirs.PlatformDirs('talk', appauthor=False).user_runtime_dir}/talk.sock" in looked
     assert looked[-1] == "/run/talk/talk.sock"
@@ -53,7 +48,7 @@ def test_a_client_looks_where_platformdirs_puts_the_socket(
 def test_a_client_finds_the_server_without_naming_a_socket(home: str, runtime: str | None) -> None:
     env = environment(home) if runtime is None else environment(home, XDG_RUNTIME_DIR=runtime and f"{home}/{runtime}")
     if not runtime and os.path.isdir(f"/run/user/{os.getuid()}"):
-        pytest.skip("this user has a runtime directory, which is the place then")
+        pytest.skip("this user has a runtime directory, which would be used")
     with serving(env, "--rate", "450") as server:
         assert f"ready on {home}/" in server.log
         assert run([*TALK, "say", "--wait", "hi"], env).code == 0
@@ -61,7 +56,7 @@ def test_a_client_finds_the_server_without_naming_a_socket(home: str, runtime: s
         assert second.code == 11
         assert f"pid {server.process.pid}" in second.err
         if runtime:
-            # Cron and ssh start a client without that variable: it doesn't find the server.
+            # Without that variable, as under cron or ssh, the client doesn't find the server.
             assert run([*TALK, "status"], environment(home)).code == 3
     assert run([*TALK, "status"], env).code == 3
 

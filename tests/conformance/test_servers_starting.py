@@ -1,4 +1,4 @@
-"""Servers that are started twice or again: one serves a socket, and ids don't survive a restart."""
+"""Only one server serves a socket, and ids don't survive a restart."""
 
 from __future__ import annotations
 
@@ -54,11 +54,11 @@ def test_row_48_ids_from_before_a_restart_are_unknown(scripted: Talk) -> None:
     scripted.watcher.wait_for_word(active)
     assert {goal_id.rpartition("-")[0] for goal_id in before} != {active.rpartition("-")[0]}
     for goal_id in before:
-        for words in (["wait", goal_id], ["cancel", goal_id], ["cancel", "--before", goal_id], ["status", goal_id]):
-            done = scripted.run(*words)
+        for args in (["wait", goal_id], ["cancel", goal_id], ["cancel", "--before", goal_id], ["status", goal_id]):
+            done = scripted.run(*args)
             assert (done.code, done.out) == (8, ""), done
     assert [scripted.goal(goal_id)["state"] for goal_id in (active, pending)] == ["ACTIVE", "PENDING"]
-    assert scripted.run("say", "third").code == 0  # a later goal has no id from before either
+    assert scripted.run("say", "third").code == 0  # a later goal doesn't get an old id, either
     assert scripted.request("status")["server"]["pending"] == 2
     assert not set(before) & set(scripted.watcher.goals())
     assert len(scripted.run("cancel").out.split()) == 3

@@ -1,4 +1,4 @@
-"""Malformed lines are answered by an error with a code, or by a close. They change nothing, nor do refused clients."""
+"""Malformed lines get an error or close the connection. They change nothing, and neither do refused clients."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def say(rest: str) -> bytes:
     return b'{"request": "say", "text": "hello"' + rest.encode() + b"}"
 
 
-#: A line, and the code of the error that answers it. `tests/unit/test_lines.py` has many more.
+#: Lines, and the codes of their errors. `tests/unit/test_lines.py` has many more.
 REFUSED: dict[str, tuple[bytes, str]] = {
     "a blank line": (b"", "bad_json"),
     "an array": (b'[{"request": "say", "text": "hello"}]', "bad_json"),
@@ -41,12 +41,12 @@ REFUSED: dict[str, tuple[bytes, str]] = {
     "an integer of 5,000 digits": (say(', "seq": ' + "9" * 5_000), "bad_json"),
     "NaN": (say(', "data": {"a": NaN}'), "bad_json"),
     "a key twice": (say(', "text": "good bye"'), "bad_json"),
-    "bytes that are no UTF-8": (b'{"request": "say", "text": "hell\xf6"}', "bad_encoding"),
+    "invalid UTF-8": (b'{"request": "say", "text": "hell\xf6"}', "bad_encoding"),
     "a NUL": (b'{"request": "say",\0 "text": "hello"}', "bad_json"),
     "a greeting of another protocol": (b'{"talk": 2, "version": "9"}', "bad_request"),
     "an unknown request": (b'{"request": "sing", "text": "hello"}', "unknown_request"),
     "an unknown field": (say(', "loud": true'), "unknown_field"),
-    "a number that is no integer": (say(', "seq": 1.5'), "bad_field"),
+    "a number that is not an integer": (say(', "seq": 1.5'), "bad_field"),
     "a number that is a string": (say(', "seq": "7"'), "bad_field"),
     "a TLS hello": (b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(range(128, 255)), "bad_encoding"),
     "an HTTP request": (b"GET /say?text=hello HTTP/1.1\r", "bad_json"),
@@ -54,7 +54,7 @@ REFUSED: dict[str, tuple[bytes, str]] = {
 #: `tests/unit/test_requests.py` has all of them.
 WRONG_TYPES: list[tuple[str, str, object]] = [
     ("say", "text", None),
-    ("say", "data", {"a": "é" * 170}),  # its length is that in ASCII
+    ("say", "data", {"a": "é" * 170}),  # its length counts in ASCII
     ("hello", "name", ""),
     ("cancel", "ids", [7]),
     ("wait", "ids", ["i"] * 4_097),
@@ -64,7 +64,7 @@ WRONG_TYPES: list[tuple[str, str, object]] = [
 
 @pytest.fixture
 def talk(scripted: Talk) -> Iterator[Talk]:
-    """A server that must have spoken nothing, hold no more descriptors than before, and still speak at the end."""
+    """A server that must speak no goal of the test, leak no descriptor, and still work at the end."""
 
     def speak(wire: Wire) -> str:
         goal_id = wire.request("say", text="length=0", wait=True)["goal"]["id"]
@@ -83,13 +83,13 @@ def talk(scripted: Talk) -> Iterator[Talk]:
         assert scripted.watcher.goals() == [spoken, *rejected, last]
         end = time.monotonic() + 2
         while descriptors(scripted) > before and time.monotonic() < end:
-            wire.request("status")  # a connection's end reaches the server in its own time
+            wire.request("status")  # the server may notice the end of a connection a little later
         assert descriptors(scripted) <= before
     assert "a bug" not in scripted.log
 
 
 def descriptors(talk: Talk) -> int:
-    """Return the number of descriptors that the server has open, or 0 if the system doesn't tell."""
+    """Return the number of descriptors that the server has open, or 0 if it is unknown."""
     place = f"/proc/{talk.pid}/fd"
     return len(os.listdir(place)) if os.path.isdir(place) else 0
 
@@ -106,7 +106,7 @@ def test_bad_lines_are_answered_with_an_error_code(talk: Talk) -> None:
             raw.send(line + b"\n" + STATUS)
             _, error, *status = raw.receive_lines(4)
             assert_error(error, code)
-            assert "seq" not in error, "no number could be read"
+            assert "seq" not in error, "an unreadable line has no `seq`"
             assert [message.keys() - {"recent"} for message in status[:-1]] == [{"seq"}], f"{name}: {status}"
             assert (status[-1]["seq"], status[-1]["ok"]) == (7, True), name
 
@@ -119,7 +119,7 @@ def test_fields_of_the_wrong_type_are_refused(talk: Talk) -> None:
             reply = wire.receive()
             assert_error(reply, "bad_field")
             assert (field in reply["error"]["message"], reply["seq"]) == (True, 2**40), reply
-            assert wire.request("status")["ok"]  # a valid one in between: ten bad ones in a row end the connection
+            assert wire.request("status")["ok"]  # ten bad requests in a row would close the connection
 
 
 def test_row_49_an_unknown_field_is_an_error(talk: Talk) -> None:
@@ -140,7 +140,7 @@ def test_nested_data_of_any_depth_is_accepted_or_refused(talk: Talk) -> None:
             wire.send_raw(say(f', "format": "none", "data": {data}') + b"\n")
             reply = wire.receive()
             if reply["ok"]:
-                assert reply["goal"]["state"] == "REJECTED"  # for its unknown format, so nothing is spoken
+                assert reply["goal"]["state"] == "REJECTED"  # because of its unknown format, so nothing is spoken
             else:
                 assert reply["error"]["code"] in {"bad_field", "bad_json"}
             assert wire.request("status")["ok"]
@@ -178,7 +178,7 @@ def test_ten_bad_lines_in_a_row_close_the_connection(talk: Talk) -> None:
 
 
 def test_a_connection_that_closes_early_changes_nothing(talk: Talk) -> None:
-    talk.request("status")  # by its reply, all earlier events are in the log
+    talk.request("status")  # when the reply arrives, all earlier events are logged
     before = talk.log
     for data in (b"", b"{", say(""), b"\n", b'{"request": "say", "text": "hel'):
         Raw(talk.socket).__exit__()
@@ -187,12 +187,12 @@ def test_a_connection_that_closes_early_changes_nothing(talk: Talk) -> None:
                 raw.send(data)
                 if half:
                     raw.half_close()
-                    assert len(raw.receive_all()) == (2 if data == b"\n" else 1)  # the greeting, an error for a line
+                    assert len(raw.receive_all()) == (2 if data == b"\n" else 1)  # the greeting, and perhaps an error
     assert talk.request("status")["ok"]
     assert talk.log == before
 
 
-@pytest.mark.skipif(not hasattr(socket, "SCM_RIGHTS"), reason="descriptors cannot be passed here")
+@pytest.mark.skipif(not hasattr(socket, "SCM_RIGHTS"), reason="this system cannot pass descriptors")
 def test_passed_descriptors_are_not_kept(talk: Talk) -> None:
     with Raw(talk.socket) as raw, open(os.devnull, "rb") as file:
         for _ in range(20):
@@ -211,7 +211,7 @@ def test_requests_of_a_refused_client_are_ignored(make_talk: MakeTalk) -> None:
             stack.enter_context(Raw(talk.socket))
         asking.request("hello", urgent=True)
         send_and_go(talk, b'{"request":"set","volume":0.1,"preempt":true}\n', b'{"request":"pause"}\n')
-        with Raw(talk.socket) as last:  # once it is answered, the clients before it have been served
+        with Raw(talk.socket) as last:  # when it is answered, the earlier clients have been handled
             last.receive_all()
         after = asking.request("status")["server"]
     changed = {setting for setting in ("volume", "preempt", "paused") if before[setting] != after[setting]}

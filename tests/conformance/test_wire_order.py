@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from tests.conformance.checks import await_ends
 from tests.conformance.rawsocket import Raw
-from tests.conformance.witness import await_ends
 
 if TYPE_CHECKING:
     from tests.conftest import MakeTalk
@@ -41,7 +41,7 @@ def test_row_50_the_reply_comes_first_and_the_result_last(scripted: Talk, text: 
     state = "ABORTED" if "crash" in text else "SUCCEEDED"
     assert [shape(message) for message in (reply, *events)] == ["reply", "PENDING", "ACTIVE", state, "result"]
     assert reply["goal"].keys() == events[-1]["goal"].keys() == KEYS
-    assert reply["goal"]["state"] == "PENDING"  # as accepted: states that a client is told never go backwards
+    assert reply["goal"]["state"] == "PENDING"  # the state when it was accepted, so that states never go backwards
     numbers = [event["n"] for event in events[:-1]]
     assert numbers == sorted(set(numbers))
     moments = [event["at"] for event in events[:-1]]
@@ -130,9 +130,9 @@ def test_a_client_that_has_closed_its_sending_half_gets_its_replies(scripted: Ta
     assert sorted(replies) == [1, 2, 3]
 
 
-@pytest.mark.parametrize("behind", ["nothing", "cancel"])
-def test_requests_that_wait_for_the_voices_keep_their_order(make_talk: MakeTalk, behind: str) -> None:
-    """At the start, a goal with a voice and all requests after it wait until the voices are known."""
+@pytest.mark.parametrize("last_request", ["status", "cancel"])
+def test_requests_that_wait_for_the_voices_keep_their_order(make_talk: MakeTalk, last_request: str) -> None:
+    """After the server's start, a goal with a voice and all later requests wait until the voices are known."""
     count = 60
     talk = make_talk("--max-queue", str(2 * count), scripted=True, env={"SCRIPTED_START": "slow=0.5"})
     with talk.connect() as wire:
@@ -143,7 +143,7 @@ def test_requests_that_wait_for_the_voices_keep_their_order(make_talk: MakeTalk,
         wire.send({"seq": 6_000, "request": "say", "text": "length=0", "voice": "default", "id": "last"})
         wire.send({"seq": 6_001, "request": "wait", "ids": ["last"]})
         wire.send({"seq": 6_002, "request": "set", "rate": 100})
-        assert wire.request("cancel" if behind == "cancel" else "status")["ok"]
+        assert wire.request(last_request)["ok"]
         replies = [(reply["seq"], reply) for reply in wire.items if "ok" in reply]
     assert [seq for seq, _ in replies] == [*range(5_000, 5_000 + count), 6_000, 6_001, 6_002]
     assert all(reply["ok"] for _, reply in replies)
@@ -151,7 +151,7 @@ def test_requests_that_wait_for_the_voices_keep_their_order(make_talk: MakeTalk,
     await_ends(talk, talk.watcher.goals())
     spoken = [event["id"] for event in talk.watcher.events() if event.get("state") == "ACTIVE"]
     expected = [f"{boot}-{number + 1}" for number in range(count)]
-    assert spoken == ([*expected, "last"] if behind == "nothing" else expected[: len(spoken)])
+    assert spoken == ([*expected, "last"] if last_request == "status" else expected[: len(spoken)])
 
 
 def test_a_cancel_or_a_pause_does_not_answer_waiting_requests_early(make_talk: MakeTalk) -> None:
@@ -199,9 +199,9 @@ def test_no_request_is_handled_while_a_goal_is_ending(scripted: Talk) -> None:
     with scripted.connect() as wire:
         for _ in range(count):
             wire.send({"request": "say", "text": "length=0.005", "wait": True})
-        # Requests that wait to be taken are there when the goals end, one after the other.
+        # So requests are waiting whenever a goal ends.
         wire.send_raw(b"".join(line(request="cancel", current=True) for _ in range(4 * count)))
-        assert wire.request("hello", timeout=20)["ok"]  # then all of them have been taken
+        assert wire.request("hello", timeout=20)["ok"]  # when it is answered, all of them have been handled
         last = scripted.run("say", "--wait", "length=0 the last")
     assert last.code == 0
     goals = scripted.watcher.goals()

@@ -1,7 +1,7 @@
-"""The voices of the conformance tests: how a server speaks with each, and the sound of its sentences.
+"""The voices of the conformance tests: their servers, and the references for their sound.
 
-libespeak-ng makes other samples of a sentence that it has said before. A neural voice without noise makes the same ones
-each time, so its references are rendered by `say -o`, in an engine process of its own.
+libespeak-ng renders a sentence differently if it has spoken before. A neural voice without noise always renders the
+same samples, so `say -o` renders its references.
 """
 
 from __future__ import annotations
@@ -35,30 +35,30 @@ if TYPE_CHECKING:
     Samples = npt.NDArray[np.int16]
     Environment = Mapping[str, str] | None
 
-#: Runs a test with both voices in the default run, too.
+#: Marks a test that runs with both voices in the default run, too.
 with_both = pytest.mark.parametrize("voice", ["espeak", "joe"], indirect=True)
 
-#: Seconds of a block of samples, the number of blocks in a pause, and the limit of a silent sample.
+#: Seconds of a block of samples, number of blocks in a pause, and maximum value of a silent sample.
 _BLOCK, _PAUSE, _SILENT = 0.01, 8, 50
-#: Seconds in which a sentence must be rendered, the loading of its voice included.
+#: Limit in seconds for rendering a sentence, including the loading of its voice.
 _PATIENCE = 30.0
 
 
 class Espeak:
-    """The voice of libespeak-ng, which does not repeat a sentence to the sample."""
+    """The voice of libespeak-ng, which renders a repeated sentence differently."""
 
     repeats = False
 
     def serve(self, make_talk: MakeTalk, sink: Sink, *options: str, rate: int = QUICK, env: Environment = None) -> Talk:
-        """Start a server that speaks with this voice at a recorded sink."""
+        """Start a server that speaks with this voice to a recorded sink."""
         return make_talk("--rate", str(rate), *options, sink=sink, env=env)
 
     def render(self, sentences: Sequence[str | Sentence], rate: int = QUICK) -> list[Samples]:
-        """Return the samples of each sentence, as the first ones of a server."""
+        """Return the samples of each sentence, as a new server's first sentences."""
         return render(sentences, rate=rate)
 
     def render_with_words(self, sentence: Sentence) -> Rendering:
-        """Return the samples of a server's first sentence, with its English words."""
+        """Return the samples and the English words of a new server's first sentence."""
         return render_with_words([sentence])[0]
 
 
@@ -67,7 +67,7 @@ ESPEAK = Espeak()
 
 @dataclass(frozen=True)
 class Joe:
-    """A real neural voice, without noise; its files are in `voices`, its halves in `cache`."""
+    """A real neural voice without noise. `voices` contains its files, and `cache` its split model."""
 
     voices: str
     cache: str
@@ -78,30 +78,27 @@ class Joe:
         return serve_with_voice(make_talk, REAL_VOICE, "--rate", str(rate), *options, sink=sink, env=env)
 
     def render(self, sentences: Sequence[str | Sentence], rate: int = QUICK) -> list[Samples]:
-        return [
-            self._rendered(sentence if isinstance(sentence, Sentence) else Sentence(sentence, rate))
-            for sentence in sentences
-        ]
+        return [self._rendered(text if isinstance(text, Sentence) else Sentence(text, rate)) for text in sentences]
 
     def render_with_words(self, sentence: Sentence) -> Rendering:
-        """Return the samples with the words at the places that a speech recognizer hears, behind a pause."""
+        """Return the samples, with the words at the places where a speech recognizer finds them."""
         samples = self._rendered(sentence)
         words = WORD.finditer(sentence.text.lower())
         heard = align(samples, sentence.text)
         ends = [*(word.begin for word in heard[1:]), len(samples) / RATE]
-        begins = [_behind_a_pause(samples, word.begin, end) for word, end in zip(heard, ends, strict=True)]
-        return Rendering(samples, tuple((*at.span(), begin) for at, begin in zip(words, begins, strict=True)))
+        starts = [_skip_pause(samples, word.begin, end) for word, end in zip(heard, ends, strict=True)]
+        return Rendering(samples, tuple((*at.span(), start) for at, start in zip(words, starts, strict=True)))
 
     @property
     def places(self) -> dict[str, str]:
         return {"TALK_VOICES": self.voices, "XDG_CACHE_HOME": self.cache}
 
-    @functools.cache  # noqa: B019 - there is one of it
+    @functools.cache  # noqa: B019 - there is only one instance
     def _rendered(self, sentence: Sentence) -> Samples:
         path = f"{self.cache}/rendered.wav"
-        words = ["--rate", str(sentence.rate), "--volume", str(sentence.volume), "--voice", REAL_VOICE]
+        options = ["--rate", str(sentence.rate), "--volume", str(sentence.volume), "--voice", REAL_VOICE]
         env = clean_environment(self.cache, self.places)
-        code, _, error = run_talk(["say", "-o", path, *words, "--", sentence.text], env, _PATIENCE)
+        code, _, error = run_talk(["say", "-o", path, *options, "--", sentence.text], env, _PATIENCE)
         assert code == 0, error
         with wave.open(path) as file:
             samples = np.frombuffer(file.readframes(file.getnframes()), "<i2").astype(np.int16)
@@ -112,8 +109,8 @@ class Joe:
 Voice = Espeak | Joe
 
 
-def _behind_a_pause(samples: Samples, begin: float, end: float) -> float:
-    """Return where a word begins: a recognizer takes the pause before a word for a part of it."""
+def _skip_pause(samples: Samples, begin: float, end: float) -> float:
+    """Return where the sound of a word starts, because a recognizer includes the pause before it."""
     silent = [
         int(np.abs(samples[int(at * RATE) : int((at + _BLOCK) * RATE)]).max(initial=0)) < _SILENT
         for at in np.arange(begin, end, _BLOCK)

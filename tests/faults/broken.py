@@ -1,4 +1,4 @@
-"""Shared by the tests of faults: the server meanwhile, and the sound of the next goal."""
+"""Helpers for tests of faults: checks of the server during a fault, and of the next goal's sound."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ if TYPE_CHECKING:
     from tests.support.recording import Recording
     from tests.support.sink import Sink
 
-#: Seconds within which `status` is answered, whatever is broken.
+#: Limit in seconds for the reply to `status` during a fault.
 ANSWER = 0.1
-#: Seconds by which the goal that is heard again may be longer or shorter than a fresh engine's.
+#: Allowed difference in seconds between the next goal's sound and that of a new engine.
 ALIKE = 0.05
-#: kB by which a server may have grown after a fault; a goal and its log take a few.
+#: Allowed growth of a server's memory after a fault, in kB. A goal and its log take a few kB.
 GROWTH = 4096
 
 
 def assert_answers(talk: Talk) -> None:
-    """Assert that the server answers in time, whatever is broken."""
-    started_at = time.monotonic()  # before it connects: the greeting takes its time as well
+    """Assert that the server answers `status` in time."""
+    started_at = time.monotonic()  # before connecting, because the greeting takes time, too
     assert talk.request("status")["ok"]
     assert_within(time.monotonic() - started_at, ANSWER, "`status`")
 
 
 def await_end(talk: Talk, goal_id: str, within: float) -> str:
-    """Return the state in which a goal ended; the server must answer its status meanwhile."""
+    """Wait for a goal to end while the server keeps answering `status`; return the end state."""
     end = time.monotonic() + within
     while True:
         with contextlib.suppress(AssertionError):  # not yet
@@ -52,30 +52,30 @@ def await_end(talk: Talk, goal_id: str, within: float) -> str:
 
 
 @contextlib.contextmanager
-def nothing_left(talk: Talk) -> Iterator[None]:
-    """Assert that an idle server has no process, descriptor or thread more than before, once it is idle again."""
+def no_leaks(talk: Talk) -> Iterator[None]:
+    """Assert that the block leaves an idle server without additional processes, descriptors or threads."""
     assert talk.run("voices").code == 0  # so that the engine is ready
     before = usage.count(talk.pid)
     yield
     usage.assert_not_grown(talk.pid, before, GROWTH)
 
 
-def began(recording: Recording, whole: Samples) -> float:
-    """Assert that a sentence was heard whole, and last; return when its sound began."""
+def assert_heard_last(recording: Recording, whole: Samples) -> float:
+    """Assert that the last sentence was heard whole, and return when its sound started."""
     samples = recording.samples
     start, _ = next(likeliest(samples, [[whole]]), (0, [whole]))
-    (found,) = assert_heard(samples[start:], [whole])
-    return recording.time_of(start + found.offset)
+    (compared,) = assert_heard(samples[start:], [whole])
+    return recording.time_of(start + compared.offset)
 
 
-def heard_again(talk: Talk, sink: Sink) -> float:
-    """Assert that a goal that is sent now is heard whole, and return when its sound began.
+def assert_heard_again(talk: Talk, sink: Sink) -> float:
+    """Send a goal, assert that it is heard whole, and return when its sound started.
 
-    After a stopped sentence the library makes other samples of the next one, so only its length is compared, without
-    the zeros of a player that ran dry. LOW and LONG, which are lost at the faults, have other lengths.
+    After a stopped sentence, libespeak-ng renders the next one differently. So only the length is compared, without
+    the zeros of a player underrun. LOW and LONG, which the faults interrupt, have other lengths.
     """
     with sink.record() as recording:
-        recording.wait_until_quiet(0.2)  # a frozen sound server plays its buffer when it goes on
+        recording.wait_until_quiet(0.2)  # a frozen sound server plays its buffer when it resumes
         start = len(recording)
         assert talk.run("say", "--wait", "--rate", str(QUICK), "--", HELP).code == 0
         recording.wait_until_quiet(0.2)
@@ -88,7 +88,7 @@ def heard_again(talk: Talk, sink: Sink) -> float:
 
 
 def python_path(first: Path) -> dict[str, str]:
-    """Return an environment in which Python searches a directory before talk's own."""
+    """Return an environment in which Python searches this directory before that of talk."""
     return {"PYTHONPATH": os.pathsep.join([str(first), os.path.dirname(os.path.dirname(talkcli.__file__))])}
 
 

@@ -1,4 +1,4 @@
-"""Run `talk serve` without the guard before the library, with the arguments of `serve`."""
+"""Run `talk serve`, with its arguments, but without the guard for libespeak-ng."""
 
 from __future__ import annotations
 

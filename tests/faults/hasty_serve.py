@@ -1,4 +1,4 @@
-"""Run `talk serve` with the scripted engine, and have it check its socket's file every 0.05 s."""
+"""Run `talk serve` with the scripted engine, and check the socket file every 0.05 s."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A supervisor for tests: the other end of sd_notify(3), which receives the messages of a server."""
+"""A supervisor that receives the sd_notify(3) messages of a server."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ import os
 import socket
 import time
 
-#: Seconds in which a message must have come.
+#: Limit in seconds for the arrival of a message.
 PATIENCE = 10.0
 
 
 class Supervisor(contextlib.AbstractContextManager["Supervisor"]):
-    """Listens at `address`: a path, or an abstract name that begins with '@'."""
+    """A socket at `address`: a path, or an abstract name that starts with '@'."""
 
     def __init__(self, address: str) -> None:
         self.address = address
-        #: all messages so far: name, value, time
+        #: name, value and time of all received messages
         self.messages: list[tuple[str, str, float]] = []
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.bind(f"\0{address[1:]}" if address.startswith("@") else address)
@@ -27,16 +27,16 @@ class Supervisor(contextlib.AbstractContextManager["Supervisor"]):
             os.unlink(self.address)
 
     def wait_for(self, name: str, containing: str = "", since: float = 0.0) -> float:
-        """Return the time of a message of this name that came after a time."""
+        """Return the time of the first such message after `since`."""
         end = time.monotonic() + PATIENCE
         while True:
             for sent, value, at in self.messages:
                 if sent == name and containing in value and at > since:
                     return at
-            assert self.receive(end - time.monotonic()), f"{name} {containing!r} was never told: {self.messages}"
+            assert self.receive(end - time.monotonic()), f"{name} {containing!r} was never received: {self.messages}"
 
     def receive(self, timeout: float) -> bool:
-        """Take one datagram; False if none comes."""
+        """Receive one datagram; return False if none arrives in time."""
         self._socket.settimeout(max(0.001, timeout))
         try:
             data = self._socket.recv(65536)
@@ -49,7 +49,7 @@ class Supervisor(contextlib.AbstractContextManager["Supervisor"]):
         return True
 
     def fill(self) -> None:
-        """Fill the socket, so that a sender of one more message would wait."""
+        """Fill the socket so that the next sender would block."""
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as other:
             other.setblocking(False)
             with contextlib.suppress(BlockingIOError):
@@ -57,6 +57,6 @@ class Supervisor(contextlib.AbstractContextManager["Supervisor"]):
                     other.sendto(b"NOISE=1\n", self._socket.getsockname())
 
     def drain(self) -> None:
-        """Take the messages that have come already."""
+        """Receive the messages that have already arrived."""
         while self.receive(0):
             pass

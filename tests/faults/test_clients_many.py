@@ -1,4 +1,4 @@
-"""Clients by the hundred: turned away and taken later, frozen, killed; and descriptors that are used up."""
+"""Hundreds of clients that are refused, frozen or killed, and servers without free descriptors."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ if TYPE_CHECKING:
     from tests.conftest import MakeTalk
     from tests.support.processes import Talk
 
-#: As many words as the longest text has, less a few.
+#: Nearly as many words as the longest text can have.
 WORDS = "a " * 4_990
-#: kB that a frozen waiter may cost: a goal's text is never dropped and sent three times, 30 kB, and buffers grow by
-#: eighths.
-FROZEN = 8 * 1024 // 50
+#: Allowed memory of a frozen waiter, in kB. Its goal's text is never dropped and is sent three times, which takes
+#: 30 kB, and buffers grow in steps of an eighth.
+KB_PER_FROZEN_WAITER = 8 * 1024 // 50
 
-#: A process with many connections, each of which sends a line. It tells when all have been answered, and sleeps.
-_CROWD = """
+#: Opens many connections, sends a line on each, prints "ready" when all have been answered, and waits.
+CLIENT_PROGRAM = """
 import socket, sys
 path, count, line = sys.argv[1], int(sys.argv[2]), sys.argv[3].encode()
 crowd = [socket.socket(socket.AF_UNIX) for _ in range(count)]
@@ -56,10 +56,10 @@ sys.stdin.read()
 
 
 @contextlib.contextmanager
-def crowd(talk: Talk, count: int, line: str) -> Iterator[subprocess.Popen[str]]:
-    """Give a process with so many connections, each of which has sent this line and had its reply."""
+def client_process(talk: Talk, count: int, line: str) -> Iterator[subprocess.Popen[str]]:
+    """Run a process with `count` connections, each of which has sent `line` and received the reply."""
     process = subprocess.Popen(
-        [sys.executable, "-S", "-c", _CROWD, talk.socket, str(count), line],
+        [sys.executable, "-S", "-c", CLIENT_PROGRAM, talk.socket, str(count), line],
         env=talk.env,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -78,32 +78,32 @@ def crowd(talk: Talk, count: int, line: str) -> Iterator[subprocess.Popen[str]]:
 
 
 @pytest.mark.parametrize(
-    "patience", [("--timeout", "0.5"), pytest.param((), marks=pytest.mark.slow)], ids=["its own", "the usual 5 s"]
+    "options", [("--timeout", "0.5"), pytest.param((), marks=pytest.mark.slow)], ids=["--timeout", "the default 5 s"]
 )
-def test_clients_over_the_limit_get_busy_and_are_served_later(scripted: Talk, patience: tuple[str, ...]) -> None:
+def test_clients_over_the_limit_get_busy_and_are_served_later(scripted: Talk, options: tuple[str, ...]) -> None:
     with contextlib.ExitStack() as stack:
         clients = [stack.enter_context(Raw(scripted.socket)) for _ in range(300)]
         for client in clients:
             client.send(b'{"seq": 1, "request": "hello"}\n')
         lines = [client.receive_lines(1) for client in clients]
-        greeted = [client for client, messages in zip(clients, lines, strict=True) if "error" not in messages[0]]
+        admitted = [client for client, messages in zip(clients, lines, strict=True) if "error" not in messages[0]]
         busy = [messages[0] for messages in lines if "error" in messages[0]]
         # The watcher of this test is one client of 256.
-        assert (len(greeted), len(busy)) == (255, 45)
+        assert (len(admitted), len(busy)) == (255, 45)
         assert all((greeting["talk"], greeting["error"]) == (1, "busy") for greeting in busy)
-        assert all(client.receive_lines(2)[1] == {"seq": 1, "ok": True} for client in greeted)
-        full = scripted.run("--json", "say", "--wait", *patience, "length=0")
+        assert all(client.receive_lines(2)[1] == {"seq": 1, "ok": True} for client in admitted)
+        full = scripted.run("--json", "say", "--wait", *options, "length=0")
         assert (full.code, json.loads(full.err)["error"]["code"]) == (5, "busy")
-        assert scripted.run("status").code == 0  # places are kept for `status` and `cancel`
+        assert scripted.run("status").code == 0  # some places are reserved for `status` and `cancel`
         late = scripted.start("say", "--wait", "length=0")
-        greeted[0].socket.close()
-        assert scripted.finish(late).code == 0  # it tries again
+        admitted[0].socket.close()
+        assert scripted.finish(late).code == 0  # it has tried again
     assert scripted.run("say", "--wait", "length=0").code == 0
 
 
 @pytest.fixture
 def many_files() -> Iterator[None]:
-    """Let the tests open more files than a backlog has places: a user's limit is often lower."""
+    """Raise the limit of open files, because the default of many users is lower than the size of a backlog."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     yield
@@ -121,7 +121,7 @@ def many_files() -> Iterator[None]:
     ],
 )
 def test_500_say_processes_at_once_lose_no_accepted_goal(make_talk: MakeTalk, processes: int, max_queue: int) -> None:
-    """With room for all none is lost. Otherwise the accepted goals are spoken, and the other clients know."""
+    """If the queue is full, the other clients get an error."""
     talk = make_talk("--max-queue", str(max_queue), scripted=True)
     first = talk.run("say", "never-ends").id
     clients = [talk.start("say", "--", f"length=0 number {number}") for number in range(processes)]
@@ -147,19 +147,19 @@ def test_50_frozen_waiters_use_no_more_memory_during_10000_words(
 
     with limits():
         line = json.dumps({"seq": 1, "request": "watch"})
-        with crowd(talk, waiters, line) as frozen:
+        with client_process(talk, waiters, line) as frozen:
             frozen.send_signal(signal.SIGSTOP)
             idle = usage.count(talk.pid)
             speak_words(talk, seconds)
             before = usage.wait_until(talk.pid, lambda now: now.descriptors <= idle.descriptors)
             speak_words(talk, seconds)
-            # After 5,000 words the server owes clients as many as it ever does. The next 5,000 are 840 kB for each.
-            usage.assert_not_grown(talk.pid, before, memory=waiters * FROZEN)
+            # After 5,000 words, the output buffers are full. The next 5,000 words would take 840 kB per client.
+            usage.assert_not_grown(talk.pid, before, memory=waiters * KB_PER_FROZEN_WAITER)
             frozen.send_signal(signal.SIGCONT)
 
 
 def speak_words(talk: Talk, seconds: int) -> None:
-    """Speak a sentence of nearly 5,000 words, while another client gets the status in time."""
+    """Speak a sentence of nearly 5,000 words while another client gets the status in time."""
     with talk.connect() as wire:
         assert wire.request("say", text=f"length={seconds} {WORDS}", wait=True)["ok"]
         end = time.monotonic() + seconds
@@ -172,10 +172,10 @@ def speak_words(talk: Talk, seconds: int) -> None:
 @pytest.mark.parametrize(
     "text",
     ["never-ends length=60 " + "a " * 600, pytest.param("never-ends", marks=pytest.mark.slow)],
-    ids=["with a word now and then", "in silence"],
+    ids=["with words", "without words"],
 )
 def test_500_killed_waiters_leak_nothing_and_their_goal_continues(make_talk: MakeTalk, text: str) -> None:
-    """The server notices at the next message: a word, or every 5 s the sign that it is alive."""
+    """The server notices the killed clients at its next message: a word, or the `alive` event every 5 s."""
     talk = make_talk("--max-clients", "600", scripted=True)
     goal = talk.run("say", text).id
     talk.watcher.wait_for_word(goal)
@@ -183,9 +183,9 @@ def test_500_killed_waiters_leak_nothing_and_their_goal_continues(make_talk: Mak
     before = usage.count(talk.pid)
     for _ in range(2):
         with contextlib.ExitStack() as stack:
-            crowds = [stack.enter_context(crowd(talk, 50, line)) for _ in range(10)]
+            waiters = [stack.enter_context(client_process(talk, 50, line)) for _ in range(10)]
             assert usage.count(talk.pid).descriptors >= 500
-            for process in crowds:
+            for process in waiters:
                 os.kill(process.pid, signal.SIGKILL)
         usage.assert_not_grown(talk.pid, before, memory=8 * 1024)
     assert talk.goal(goal)["state"] == "ACTIVE"
@@ -202,10 +202,10 @@ def test_500_killed_waiters_leak_nothing_and_their_goal_continues(make_talk: Mak
         [["say", "--wait", "--timeout", "0.5", "hello"]],
         pytest.param([["status"], ["cancel"], ["say", "hello"], ["say", "--wait", "hello"]], marks=pytest.mark.slow),
     ],
-    ids=["its own patience", "the usual 5 s"],
+    ids=["--timeout", "the default 5 s"],
 )
 def test_a_server_with_a_full_backlog_does_not_block_clients(scripted: Talk, commands: list[list[str]]) -> None:
-    """Frozen, with its backlog full, so that `connect` itself would wait."""
+    """The server is frozen, and its backlog is full, so that even `connect` would block."""
     scripted.freeze()
     try:
         with contextlib.ExitStack() as stack:
@@ -225,16 +225,16 @@ def test_a_server_with_a_full_backlog_does_not_block_clients(scripted: Talk, com
 
 SCRIPTED = [SERVE[0], processes.SCRIPTED]
 CLIENTS = 60
-#: Seconds in which a server that was full is itself again.
-SOON = 5.0
+#: Limit in seconds for the recovery of a full server.
+RECOVERY_S = 5.0
 
 
-def limited(files: int, command: list[str]) -> list[str]:
+def limit_descriptors(files: int, command: list[str]) -> list[str]:
     return ["sh", "-c", f'ulimit -n {files}; exec "$@"', "sh", *command]
 
 
 def kill_engine(pid: int) -> int:
-    """Kill a server's engine, and return its former process id."""
+    """Kill a server's engine process, and return its id."""
     (engine,) = children(pid)
     os.kill(engine, signal.SIGKILL)
     return engine
@@ -247,22 +247,22 @@ def connected(path: str) -> Iterator[list[socket.SocketIO]]:
         clients: list[socket.SocketIO] = []
         for _ in range(CLIENTS):
             with socket.socket(socket.AF_UNIX) as client:
-                client.settimeout(SOON)
+                client.settimeout(RECOVERY_S)
                 client.connect(path)
                 clients.append(stack.enter_context(client.makefile("rwb", buffering=0)))
         yield clients
 
 
 def receive(client: socket.SocketIO) -> dict[str, Any]:
-    """Return the object of the next line."""
+    """Return the next message."""
     line = client.readline()
     assert line, "the server closed the connection"
     message: dict[str, Any] = json.loads(line)
     return message
 
 
-def greeted(clients: list[socket.SocketIO]) -> list[socket.SocketIO]:
-    """Return the clients that were let in; the others must have been told that descriptors are missing."""
+def admitted(clients: list[socket.SocketIO]) -> list[socket.SocketIO]:
+    """Return the admitted clients, and assert that the others got an error about missing descriptors."""
     inside = []
     for client in clients:
         greeting = receive(client)
@@ -276,7 +276,7 @@ def greeted(clients: list[socket.SocketIO]) -> list[socket.SocketIO]:
 
 
 def assert_status(client: socket.SocketIO) -> None:
-    """Assert that a client that was let in gets the status in time."""
+    """Assert that this client gets the status in time."""
     with limits():
         started_at = time.monotonic()
         client.write(b'{"seq": 7, "request": "status"}\n')
@@ -292,29 +292,29 @@ def wait_for_descriptors(pid: int, most: int) -> None:
 def test_60_clients_leave_the_engine_enough_of_40_descriptors(home: str) -> None:
     path = f"{home}/s"
     env = environment(home, TALK_SOCKET=path)
-    with serving(env, command=limited(40, [*SERVE, "--rate", "450"])) as server:
+    with serving(env, command=limit_descriptors(40, [*SERVE, "--rate", "450"])) as server:
         pid = server.process.pid
         assert run([*TALK, "say", "--wait", "hello"], env).code == 0
         wait_for_descriptors(pid, 20)
         before = len(usage.descriptors(pid))
         with connected(path) as clients:
-            inside = greeted(clients)
+            inside = admitted(clients)
             assert 5 <= len(inside) < CLIENTS
             assert_status(inside[0])
-            # A client that comes now tries again, and gets in when others leave.
+            # This client is refused at first, tries again, and is admitted when others disconnect.
             with processes.start_talk(["say", "--wait", "late"], env) as late:
                 time.sleep(0.5)
                 assert late.poll() is None
                 for client in inside[1:]:
                     client.close()
-                assert late.wait(SOON) == 0
+                assert late.wait(RECOVERY_S) == 0
         wait_for_descriptors(pid, before)
         with connected(path) as clients:
-            inside = greeted(clients)
-            engine = kill_engine(pid)  # so that a new one must find descriptors
-            end = time.monotonic() + SOON
+            inside = admitted(clients)
+            engine = kill_engine(pid)  # a new engine needs descriptors
+            end = time.monotonic() + RECOVERY_S
             while children(pid) in ([], [engine]):
-                assert time.monotonic() < end, "there is no new engine"
+                assert time.monotonic() < end, "no new engine was started"
                 time.sleep(0.01)
             inside[0].write(b'{"seq": 8, "request": "say", "text": "again", "wait": true}\n')
             while (line := receive(inside[0])).get("event") != "result":
@@ -324,7 +324,7 @@ def test_60_clients_leave_the_engine_enough_of_40_descriptors(home: str) -> None
         assert run([*TALK, "say", "--wait", "hello"], env).code == 0
         lines = server.log.splitlines()
         about = [line for line in lines if "files may be open" in line or "Traceback" in line or "bug" in line]
-        assert len(about) <= 2, server.log  # at the start, and once for all that were turned away
+        assert len(about) <= 2, server.log  # at the start, and once for all refused clients
         assert len(lines) < 12, server.log
 
 
@@ -332,16 +332,16 @@ def test_a_server_without_free_descriptors_recovers(home: str) -> None:
     path = f"{home}/s"
     env = environment(home, TALK_SOCKET=path)
     with serving(env, command=SCRIPTED) as server, Wire(path) as wire:
-        assert wire.request("hello")["ok"]  # else the connection is closed after a while
+        assert wire.request("hello")["ok"]  # otherwise the server closes the connection after a while
         pid = server.process.pid
         assert run([*TALK, "say", "--wait", "length=0"], env).code == 0
         before = len(usage.descriptors(pid))
         most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
-        resource.prlimit(pid, resource.RLIMIT_NOFILE, (3, most))  # it has more, and gets no new one
+        resource.prlimit(pid, resource.RLIMIT_NOFILE, (3, most))  # it keeps its open descriptors, but can't open more
         lines = server.log.count("\n")
         with connected(path) as clients:
             kill_engine(pid)
-            time.sleep(2)  # twice as long as it waits to look again; and four starts of the engine
+            time.sleep(2)  # twice the interval of its checks, and four starts of the engine
             with limits():
                 started_at = time.monotonic()
                 assert wire.request("status")["ok"]
@@ -351,8 +351,8 @@ def test_a_server_without_free_descriptors_recovers(home: str) -> None:
             assert "could not be started" in wire.request("status")["server"]["engine"]
             assert server.log.count("\n") - lines < 8, server.log
             resource.prlimit(pid, resource.RLIMIT_NOFILE, (most, most))
-            assert len(greeted(clients)) == CLIENTS  # those that waited are let in, all of them
-            ended = wire.receive_event("result", timeout=15)["goal"]  # the longest pause before a start is 10 s
+            assert len(admitted(clients)) == CLIENTS  # all waiting clients are admitted
+            ended = wire.receive_event("result", timeout=15)["goal"]  # the longest delay before a start is 10 s
             assert (ended["id"], ended["state"]) == (goal["id"], "SUCCEEDED")
         wait_for_descriptors(pid, before)
         assert "Traceback" not in server.log
@@ -376,7 +376,7 @@ def test_the_server_raises_its_descriptor_limit_for_max_clients(home: str) -> No
         assert "files may be open" not in server.log
 
 
-#: Goals on their way at once: fewer than the queue takes.
+#: Number of unanswered goals, fewer than the queue accepts.
 AHEAD = 50
 
 
@@ -398,8 +398,8 @@ def test_a_cancel_racing_with_the_end_gives_exactly_one_end_state(make_talk: Mak
         with talk.connect() as wire:
             for number in range(goals + AHEAD):
                 if number < goals:
-                    # Without a word the goal may be over before it is known to have begun. Every other one takes about
-                    # as long as a cancel, as that would nearly always be too late on busy cores.
+                    # A goal without words can end before its start is known. Every other goal takes about as long as a
+                    # cancel, which would otherwise nearly always be too late on busy cores.
                     text = f"length={0.001 * (number % 2)} words=0"
                     wire.send({"seq": number, "request": "say", "text": text, "wait": True})
                 if number >= AHEAD:
@@ -414,5 +414,5 @@ def test_a_cancel_racing_with_the_end_gives_exactly_one_end_state(make_talk: Mak
     assert sum(results.values()) == goals
     assert results.keys() <= {"SUCCEEDED", "PREEMPTED"}
     assert {state: count for (state, _), count in witness.ends.items()} == dict(results)
-    # Both must have come first often.
+    # Both outcomes must have been frequent.
     assert min(results["SUCCEEDED"], results["PREEMPTED"]) > goals / 100, results

@@ -1,4 +1,4 @@
-"""The engine or the server is killed, crashes, freezes or stands still: its goal ends, and the next is heard."""
+"""The engine or the server is killed, crashes or hangs. Its goal ends, and the next one is heard."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from tests.conformance.hearing import (
     PRECISION,
     assert_aborted,
     await_word,
-    begin,
     engine_process,
     player_process,
     send,
+    start_goal,
 )
 from tests.faults import trapped
-from tests.faults.broken import await_end, began, heard_again, nothing_left, python_path, write
+from tests.faults.broken import assert_heard_again, assert_heard_last, await_end, no_leaks, python_path, write
 from tests.support import usage
 from tests.support.compare import assert_only_beginning
 from tests.support.reference import render
@@ -44,23 +44,23 @@ if TYPE_CHECKING:
     from tests.support.sink import Sink
 
 KILL, SEGV, STOP = signal.SIGKILL, signal.SIGSEGV, signal.SIGSTOP
-#: Seconds from the signal to the first sample of the next goal.
+#: Limits in seconds from the signal to the first sample of the next goal.
 CRASH, HANG = 0.5, 6.0
 SIGNALS = {
     KILL: ("engine_crashed", "the engine crashed: it was killed by SIGKILL", CRASH),
     SEGV: ("engine_crashed", "the engine crashed: it was killed by SIGSEGV", CRASH),
     STOP: ("engine_hung", "the engine did not respond for 3 s", HANG),
 }
-#: A player that takes a sentence sooner than it plays it: the synthesis ends while the pipes hold the rest of the
-#: sound. If the engine process dies, only the server can end the processes that the shell has started.
+#: A player with a large buffer: the synthesis finishes while the rest of the sound is still in the pipes. If the
+#: engine process dies, only the server can kill the processes that the shell has started.
 DEEP = "sh -c 'cat | cat | cat | aplay -q -t raw -f S16_LE -c 1 -r {rate} --buffer-time=60000'"
-#: The player for each activity of the engine process.
+#: The player to use for each activity of the engine process.
 PLAYERS = {"idle": "pulse", "in synthesis": "aplay", "in playback": DEEP, "paused": "pulse"}
-#: The signals for each of them in the default run; the others are slow, as the engine dies in the same way.
+#: The cases of the default run. The others are slow, because the engine dies in the same way.
 ALWAYS = [("idle", KILL), ("in synthesis", SEGV), ("in synthesis", STOP), ("in playback", KILL), ("paused", SEGV)]
 ALL = [(activity, number) for activity in PLAYERS for number in SIGNALS]
 
-#: Words per minute of the next goal, the fastest there are.
+#: Words per minute of the next goal, the maximum.
 RATE = 450
 
 
@@ -74,13 +74,13 @@ def test_a_killed_or_frozen_engine_loses_at_most_one_goal(
 ) -> None:
     with limits():
         talk = make_talk("--player", PLAYERS[activity], sink=sink)
-        with nothing_left(talk), sink.record() as recording:
+        with no_leaks(talk), sink.record() as recording:
             goal = _bring_to(talk, activity, recording)
             following = send(talk, LOW, rate=RATE) if goal else None
             engine, since = engine_process(talk), time.monotonic()
             os.kill(engine, number)
             if activity == "idle" and number is STOP:
-                goal = send(talk, LONG)  # nothing shows that it is frozen before it is given a goal, which is lost
+                goal = send(talk, LONG)  # only a goal reveals that it is frozen, and that goal is lost
             elif activity == "idle":
                 usage.wait_until(talk.pid, lambda now: now.processes == 2 and engine_process(talk) != engine)
             following = following or send(talk, LOW, rate=RATE)
@@ -90,18 +90,18 @@ def test_a_killed_or_frozen_engine_loses_at_most_one_goal(
             if activity == "paused":
                 assert talk.request("status")["server"]["paused"]
                 assert talk.goal(following)["state"] == "PENDING"
-                # While speech is held nothing may be heard: after a crash the limit counts from the resume.
+                # Nothing may be heard while paused, so after a crash the limit counts from the resume.
                 since = since if number is STOP else time.monotonic()
                 talk.request("resume")
             assert talk.watcher.wait_for_terminal(following) == "SUCCEEDED"
         talk.stop()
-        next_one = _assert_next(recording, since, SIGNALS[number][2], f"{number.name}, {activity}")
+        heard_at = _assert_next(recording, since, SIGNALS[number][2], f"{number.name}, {activity}")
         if activity == "in synthesis":
-            assert_only_beginning(recording.between(0, next_one - PRECISION), render([LONG])[0])
+            assert_only_beginning(recording.between(0, heard_at - PRECISION), render([LONG])[0])
 
 
 def _bring_to(talk: Talk, activity: str, recording: Recording) -> str | None:
-    """Bring the engine process to an activity; return the goal of that, None if idle."""
+    """Bring the engine process to an activity, and return its goal; None if idle."""
     if activity == "idle":
         return None
     if activity == "in playback":
@@ -109,26 +109,26 @@ def _bring_to(talk: Talk, activity: str, recording: Recording) -> str | None:
         player = player_process(talk)
         end = time.monotonic() + 2
         while _feeding(talk, player):
-            assert time.monotonic() < end, "the player does not take the whole sentence"
+            assert time.monotonic() < end, "the player does not accept the whole sentence"
             time.sleep(0.005)  # the closing of a descriptor sends no event
         recording.wait_for_sound()
         return goal
-    goal = begin(talk, LONG)
+    goal = start_goal(talk, LONG)
     if activity == "paused":
         assert talk.request("pause")["goal"]["id"] == goal
     else:
-        assert _feeding(talk, player_process(talk)), "the synthesis goes on until the sentence is nearly over"
+        assert _feeding(talk, player_process(talk)), "the synthesis ended before the sentence was nearly over"
     return goal
 
 
-#: A player whose sound is made by a process in a session of its own.
-APART = "setsid -w aplay -q -t raw -f S16_LE -c 1 -r {rate} --buffer-time=60000"
-#: A player that starts the sound server which it plays to.
+#: A player that runs in another session.
+OTHER_SESSION = "setsid -w aplay -q -t raw -f S16_LE -c 1 -r {rate} --buffer-time=60000"
+#: A player that starts its own sound server.
 STARTS_A_SERVER = """
 unset {mark}
 export PULSE_RUNTIME_PATH={folder} PULSE_STATE_PATH={folder} PULSE_COOKIE={folder}/cookie HOME={folder}
 pulseaudio --check || pulseaudio -n --daemonize=yes --exit-idle-time=-1 -L module-null-sink \\
-    -L 'module-native-protocol-unix auth-anonymous=1 socket={folder}/pulse' 2>{folder}/said
+    -L 'module-native-protocol-unix auth-anonymous=1 socket={folder}/pulse' 2>{folder}/log
 exec pacat --server=unix:{folder}/pulse --raw --format=s16le --channels=1 --rate=$1
 """
 
@@ -138,9 +138,9 @@ def test_processes_that_a_player_started_in_another_session_are_killed(
     make_talk: MakeTalk, sink: Sink, ends: str
 ) -> None:
     needs("setsid")
-    talk = make_talk("--player", APART, sink=sink)
-    with nothing_left(talk):
-        goal = begin(talk, LONG, number=1)
+    talk = make_talk("--player", OTHER_SESSION, sink=sink)
+    with no_leaks(talk):
+        goal = start_goal(talk, LONG, number=1)
         playing = [pid for pid in usage.descendants(talk.pid) if command_line(pid).startswith("aplay")]
         assert playing
         following = send(talk, LOW, rate=RATE)
@@ -158,7 +158,7 @@ def test_a_sound_server_started_by_a_player_keeps_running(make_talk: MakeTalk, t
     with short_directory() as folder:
         player = write(tmp_path / "player", STARTS_A_SERVER.format(folder=folder, mark=MARK))
         talk = make_talk("--player", f"sh {player} {{rate}}")
-        goal = begin(talk, LONG, number=1)
+        goal = start_goal(talk, LONG, number=1)
         with open(f"{folder}/pid", encoding="ascii") as file:
             server = int(file.read())
         try:
@@ -169,11 +169,11 @@ def test_a_sound_server_started_by_a_player_keeps_running(make_talk: MakeTalk, t
         finally:
             os.kill(server, signal.SIGTERM)
             while command_line(server) != "ended":
-                time.sleep(0.005)  # it is no child of ours
+                time.sleep(0.005)  # it is not our child
 
 
-#: A library that complains of each text, with an escape that would colour a terminal.
-COMPLAINS = """
+#: A library that prints an error with a terminal escape for each text.
+PRINT_ERRORS = """
 import sys
 if "talkcli.engine.child.main" in "".join(sys.orig_argv):
     from pyttsx3.drivers import _espeak
@@ -187,20 +187,20 @@ if "talkcli.engine.child.main" in "".join(sys.orig_argv):
 
 
 def test_terminal_escapes_in_engine_errors_are_logged_escaped(make_talk: MakeTalk, tmp_path: Path) -> None:
-    write(tmp_path / "sitecustomize.py", COMPLAINS)
+    write(tmp_path / "sitecustomize.py", PRINT_ERRORS)
     talk = make_talk("--player", "null", env=python_path(tmp_path))
     assert talk.run("say", "--wait", "--", "yes").code == 0
     assert r"talk: engine: cannot say \x1b[31myes" in talk.log
 
 
 def _feeding(talk: Talk, player: int) -> bool:
-    """Return whether the engine still has samples for the player: it holds the other end of its standard input."""
+    """Return whether the engine still has the other end of the player's standard input open."""
     pipe = os.readlink(f"/proc/{player}/fd/0")
     return pipe in usage.descriptors(engine_process(talk)).values()
 
 
 def _assert_lost(talk: Talk, goal_id: str, number: signal.Signals) -> Message:
-    """Assert that a goal was ABORTED as its engine got this signal, and return the goal."""
+    """Assert that a goal was ABORTED because its engine got this signal, and return the goal."""
     reason, words, _ = SIGNALS[number]
     assert await_end(talk, goal_id, HANG) == "ABORTED"
     goal = talk.goal(goal_id)
@@ -209,22 +209,22 @@ def _assert_lost(talk: Talk, goal_id: str, number: signal.Signals) -> Message:
 
 
 def _assert_next(recording: Recording, signalled_at: float, limit: float, case: str) -> float:
-    """Assert that LOW was heard in time after the signal, and return when."""
-    heard_at = began(recording, render([LOW], rate=RATE)[0])
+    """Assert that LOW was heard in time after the signal, and return the time."""
+    heard_at = assert_heard_last(recording, render([LOW], rate=RATE)[0])
     assert_within(heard_at - signalled_at, limit, f"the next goal after {case}")
     return heard_at
 
 
-#: Seconds in which the thread acts and the watcher is told.
+#: Seconds for the watchdog thread to act and for the event to reach the watcher.
 SLACK = 0.5
-#: Seconds from a kill to the first sample of the next goal, the messages before included.
+#: Seconds from a kill to the first sample of the next goal, including messages.
 RESTART = 0.7
-#: Seconds in which `cancel` is answered, whatever happens.
+#: Limit in seconds for the reply to `cancel`, whatever happens.
 CANCEL = 2.0
-#: Seconds for which a killed player cannot be reaped here, longer than anything waits for it.
-HELD = 20.0
+#: Seconds for which a killed player cannot be reaped, longer than any wait for it.
+UNREAPABLE_S = 20.0
 
-#: A library that never comes back from a sentence with a certain word in it, and a shorter limit for that.
+#: A library that never returns from a text with the word "forever", and a shorter limit for it.
 STUCK_SYNTHESIS = """
 from talkcli.engine import protocol
 protocol.HANG_LIMIT_S = {limit}
@@ -239,7 +239,7 @@ if "talkcli.engine.child.main" in "".join(sys.orig_argv):
     _espeak.Synth = wait
 """
 
-#: What happens to a goal whose player cannot be reaped once it is killed, and the limit for its end in seconds.
+#: How a goal is ended whose killed player cannot be reaped, and the limit for its end in seconds.
 STUCK: dict[str, tuple[Callable[[Talk], object], float]] = {
     "its engine killed": (lambda talk: os.kill(engine_process(talk), signal.SIGKILL), KILL_LIMIT_S + SLACK),
     "stopped": (lambda talk: talk.request("cancel"), CANCEL),
@@ -256,7 +256,7 @@ def test_a_synthesis_without_progress_is_aborted(make_talk: MakeTalk, sink: Sink
 
     with limits():
         talk = make_talk(sink=sink, env=python_path(tmp_path))
-        with nothing_left(talk), sink.record() as recording:
+        with no_leaks(talk), sink.record() as recording:
             sent_at = time.monotonic()
             goal = send(talk, "this takes forever")
             following = send(talk, LOW, rate=RATE)
@@ -264,7 +264,7 @@ def test_a_synthesis_without_progress_is_aborted(make_talk: MakeTalk, sink: Sink
             assert_aborted(talk.goal(goal), "engine_hung", f"the engine did not respond for {limit:g} s")
             assert talk.watcher.wait_for_terminal(following) == "SUCCEEDED"
         talk.stop()
-        seconds = began(recording, render([LOW], rate=RATE)[0]) - sent_at
+        seconds = assert_heard_last(recording, render([LOW], rate=RATE)[0]) - sent_at
         assert seconds > limit
         assert_within(seconds, limit + RESTART, "the next goal after a synthesis without progress")
 
@@ -278,20 +278,20 @@ def test_a_player_that_cannot_be_reaped_does_not_block_the_next_goal(
     make_talk: MakeTalk, sink: Sink, tmp_path: Path, cases: list[str]
 ) -> None:
     play = "aplay -q -t raw -f S16_LE -r 22050 -c 1 --buffer-time=60000"
-    program = f"#!/bin/sh\nexec {sys.executable} -S {trapped.__file__} {HELD} {play}\n"
+    program = f"#!/bin/sh\nexec {sys.executable} -S {trapped.__file__} {UNREAPABLE_S} {play}\n"
     command = str(write(tmp_path / "player", program, 0o755))
 
     with limits(), contextlib.ExitStack() as idle:
         talks = {case: make_talk("--player", command, sink=sink) for case in cases}
         for talk in talks.values():
-            idle.enter_context(nothing_left(talk))
+            idle.enter_context(no_leaks(talk))
         goals = {case: send(talk, LONG) for case, talk in talks.items()}
         players, started_at = {}, {}
         for case, talk in talks.items():
             await_word(talk, goals[case])
             players[case] = player_process(talk)
             if "TracerPid:\t0\n" in Path(f"/proc/{players[case]}/status").read_text():
-                pytest.skip("this system does not let a killed process be held: ptrace is forbidden")
+                pytest.skip("ptrace is forbidden, so a killed process can always be reaped")
         for case, talk in talks.items():
             started_at[case] = time.monotonic()
             STUCK[case][0](talk)
@@ -304,19 +304,19 @@ def test_a_player_that_cannot_be_reaped_does_not_block_the_next_goal(
             assert_within(ended, limit, f"the end of a goal that was {case}")
         for case, talk in talks.items():
             player = players[case]
-            assert os.path.exists(f"/proc/{player}"), "it could be reaped, so nothing was tested"
-            heard_again(talk, sink)
-            assert os.path.exists(f"/proc/{player}"), "the next goal waited for it"
+            assert os.path.exists(f"/proc/{player}"), "the player was reaped, so nothing was tested"
+            assert_heard_again(talk, sink)
+            assert os.path.exists(f"/proc/{player}"), "the next goal waited for the player"
         for player in players.values():
             for tracer in usage.descendants(player):
-                os.kill(tracer, signal.SIGKILL)  # which lets go of it
+                os.kill(tracer, signal.SIGKILL)  # so that the player can be reaped
 
 
-#: By hand: `TALK_TEST_KILLS=1000 pytest -s -m slow -k server_killed tests/faults/test_engine_killed.py`.
+#: For a longer run: `TALK_TEST_KILLS=1000 pytest -s -m slow -k server_killed tests/faults/test_engine_killed.py`.
 FEW, KILLS = 3, int(os.environ.get("TALK_TEST_KILLS", "20"))
-#: Seconds from the kill to the last sound and to the end of the last process; from a start to its greeting.
+#: Limits in seconds: from the kill to the last sound and the last process's end, and from a start to the greeting.
 SILENT, SERVES = 0.3, 1.0
-#: Between which words of LONG it is killed: before the second, nothing loud may have been heard.
+#: First and last word of LONG at which the server is killed. Before the second word, there may be no sound yet.
 WORDS = (2, 5)
 
 
@@ -325,7 +325,7 @@ WORDS = (2, 5)
 def test_a_server_killed_in_mid_sentence_is_silent_and_starts_again(
     make_talk: MakeTalk, sink: Sink, kills: int
 ) -> None:
-    talk = make_talk(sink=sink, forked=False)  # its start is timed
+    talk = make_talk(sink=sink, forked=False)  # the start is timed
     chance = random.Random(kills)
     files = set(os.listdir(talk.directory))
     with limits():
@@ -341,5 +341,5 @@ def test_a_server_killed_in_mid_sentence_is_silent_and_starts_again(
             assert_within(time.monotonic() - started, SERVES, "the start after the server was killed")
             assert_within(gone, SILENT, "the end of all processes after the server was killed")
             assert_within(last - killed, SILENT, "the silence after the server was killed")
-    heard_again(talk, sink)
+    assert_heard_again(talk, sink)
     assert set(os.listdir(talk.directory)) == files

@@ -1,6 +1,6 @@
-"""The engine cannot start: goals end at once if it stays so, and wait if it may pass.
+"""The engine cannot start. Goals are aborted at once if the cause is permanent, and wait if it is temporary.
 
-A module or a library in the environment of a real server shadows the installed one.
+A module or library in the environment of a real server shadows the installed one.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import pytest
 
 from talkcli.engine.parent.supervisor import RESTART_DELAYS_S
 from tests.conformance.bareserve import SERVE, environment, run
-from tests.conformance.hearing import LONG, LOW, assert_aborted, begin, engine_process, send
-from tests.faults.broken import assert_answers, heard_again, python_path, write
+from tests.conformance.hearing import LONG, LOW, assert_aborted, engine_process, send, start_goal
+from tests.faults.broken import assert_answers, assert_heard_again, python_path, write
 from tests.support import usage
 from tests.support.connection import PATIENCE
 from tests.support.timing import assert_within, limits
@@ -33,21 +33,21 @@ if TYPE_CHECKING:
     from tests.support.processes import Talk
     from tests.support.sink import Sink
 
-#: Seconds in which a goal is ABORTED that waits for nothing.
+#: Limit in seconds for a goal that is ABORTED without waiting.
 AT_ONCE = 0.1
-#: Seconds in which the next goal is being spoken after an engine was killed.
+#: Limit in seconds from an engine's end to the next goal's first word.
 SPEAKING = 0.5
 
-#: The promised seconds between the starts of an engine that fails each time.
+#: The documented delays in seconds between failing starts of the engine.
 WAITS = (0.0, 0.1, 0.5, 2.0, 10.0)
-#: A module that cannot be imported, and writes the times of the attempts.
+#: A module that cannot be imported, and logs the time of each attempt.
 ABSENT = """
 import time
 with open({attempts!r}, "a") as file:
     file.write(str(time.monotonic()) + "\\n")
 raise ModuleNotFoundError("No module named " + repr(__name__), name=__name__)
 """
-#: The wheel without its data.
+#: The espeakng_loader package without its data.
 EMPTY = """
 def get_library_path():
     return {real!r} + "/libespeak-ng.so"
@@ -55,7 +55,7 @@ def get_data_path():
     return "{empty}"
 """
 WHEEL = os.path.dirname(espeakng_loader.__file__)
-#: The module that is replaced, by which one, and words that say what to install. The system's library is missing, too.
+#: The replaced module, its replacement, and the expected error. The system's library is missing, too.
 MISSING = {
     "pyttsx3": ("pyttsx3", ABSENT, "pyttsx3 is missing ("),
     "wheel": ("espeakng_loader", ABSENT, "libespeak-ng is missing ("),
@@ -78,14 +78,14 @@ def test_goals_are_aborted_at_once_while_a_dependency_is_missing(
         library = write(tmp_path / "libespeak-ng.so.1", "no library")
         talk = make_talk(sink=sink, env={**python_path(tmp_path), "LD_LIBRARY_PATH": str(tmp_path)})
         took = _assert_aborted_at_once(talk, error)
-        assert talk.log.count(error) == 3, f"once for the engine, once for each goal: {talk.log}"
+        assert talk.log.count(error) == 3, f"not once for the engine and once per goal: {talk.log}"
         assert_answers(talk)
         times = _await_attempts(attempts, 3 if missing == "pyttsx3" else 0)
         (shadow if missing == "pyttsx3" else library).unlink()
         with talk.connect() as wire:
             _await_engine(wire, "ready")
             times.append(time.monotonic())
-        heard_again(talk, sink)
+        assert_heard_again(talk, sink)
         talk.stop()
         for (former, following), wait in zip(itertools.pairwise(times), WAITS, strict=False):
             assert following - former >= wait
@@ -93,7 +93,7 @@ def test_goals_are_aborted_at_once_while_a_dependency_is_missing(
 
 
 def _await_attempts(path: Path, count: int) -> list[float]:
-    """Return the times of so many attempts to start the engine."""
+    """Return the times of the first `count` attempts to start the engine."""
     end = time.monotonic() + PATIENCE
     while len(times := path.read_text(encoding="utf-8").splitlines()) < count:
         assert time.monotonic() < end, times
@@ -102,7 +102,7 @@ def _await_attempts(path: Path, count: int) -> list[float]:
 
 
 def _assert_aborted_at_once(talk: Talk, error: str) -> float:
-    """Assert that goals are ABORTED, and say what to install; return after how many seconds one is."""
+    """Assert that goals are ABORTED with this error, and return the seconds until one is."""
     done = talk.run("say", "--wait", "--", LOW)
     assert done.code == 4
     assert error in done.err
@@ -116,12 +116,12 @@ def _assert_aborted_at_once(talk: Talk, error: str) -> float:
     return ended - sent_at
 
 
-#: Goals that wait behind the one that loses its engine.
+#: Number of goals that wait behind the one that loses its engine.
 WAITING = 20
-#: Too few descriptors for a server to start an engine.
+#: A limit of descriptors that is too low to start an engine.
 TOO_FEW = 12
-#: Shortens the waits of a server whose engine can't start: no second, but tenths.
-HASTY = """
+#: Shortens the delays between failing starts of the engine.
+SHORT_DELAYS = """
 from talkcli.engine.parent import supervisor
 supervisor.RESTART_DELAYS_S, supervisor.ENGINE_WAIT_LIMIT_S = (0.0, 0.05, 0.1), {patience}
 """
@@ -141,14 +141,13 @@ def _scripted_engine(talk: Talk) -> int:
 
 
 def _replaced(talk: Talk, engine: int, number: signal.Signals = signal.SIGKILL) -> int:
-    """Kill the engine process, and return the next one, once it is there."""
+    """Kill the engine process, wait for the next one, and return its id."""
     os.kill(engine, number)
     end = time.monotonic() + PATIENCE
     while not (replacement := set(usage.descendants(talk.pid)) - {engine}):
         assert time.monotonic() < end, talk.log
         time.sleep(0.002)  # the start of a process sends no event
-    (next_one,) = replacement
-    return next_one
+    return replacement.pop()
 
 
 def _ends(talk: Talk, goals: list[str]) -> list[tuple[str, str | None]]:
@@ -161,24 +160,22 @@ def _await_engine(wire: Wire, expected: str) -> None:
     end = time.monotonic() + 10
     while (state := wire.request("status")["server"]["engine"]) != expected:
         assert time.monotonic() < end, state
-        time.sleep(0.005)  # how the engine is, is published to nobody
+        time.sleep(0.005)  # no event reports the state of the engine
 
 
 def test_a_brief_lack_of_descriptors_aborts_only_the_current_goal(make_talk: MakeTalk) -> None:
     talk = make_talk("--player", "null")
     assert talk.run("voices").code == 0
-    first = begin(talk, LONG, number=1)
+    first = start_goal(talk, LONG, number=1)
     goals = [send(talk, "yes", rate=450, volume=0) for _ in range(3)]
     brief = send(talk, "too late", ttl=0.3)
-    with talk.connect() as wire:  # connected before: a new client would need a descriptor
+    with talk.connect() as wire:  # connected in advance, because a new client needs a descriptor
         with too_few_descriptors(talk):
             os.kill(engine_process(talk), signal.SIGKILL)
             assert talk.watcher.wait_for_terminal(first) == "ABORTED"
             _await_engine(wire, "the engine process could not be started: Too many open files")
-            assert talk.watcher.wait_for_terminal(brief) == "RECALLED"  # a goal that waits for an engine has its time
-            assert [wire.request("status", id=goal_id)["goal"]["state"] for goal_id in goals] == ["PENDING"] * len(
-                goals
-            )
+            assert talk.watcher.wait_for_terminal(brief) == "RECALLED"  # its time to live expires as usual
+            assert [wire.request("status", id=goal)["goal"]["state"] for goal in goals] == ["PENDING"] * len(goals)
         assert _ends(talk, goals) == [("SUCCEEDED", None)] * len(goals)
     assert (talk.goal(first)["reason"], talk.goal(brief)["reason"]) == ("engine_crashed", "expired")
     assert talk.log.count("could not be started") == 1, talk.log
@@ -187,9 +184,9 @@ def test_a_brief_lack_of_descriptors_aborts_only_the_current_goal(make_talk: Mak
 def test_an_engine_killed_again_during_its_restarts_costs_one_goal(scripted: Talk) -> None:
     talk = scripted
     with limits():
-        first = begin(talk, "never-ends", number=1)
+        first = start_goal(talk, "never-ends", number=1)
         goals = [send(talk, "length=0.01") for _ in range(WAITING)]
-        talk.script_start("hang")  # so that each start can be met in its middle
+        talk.script_start("hang")  # so that the engine can be killed during each start
         engine = _replaced(talk, _scripted_engine(talk))
         engine = _replaced(talk, engine, signal.SIGSEGV)
         talk.script_start("")
@@ -198,7 +195,7 @@ def test_an_engine_killed_again_during_its_restarts_costs_one_goal(scripted: Tal
         speaking = talk.watcher.arrived(talk.watcher.wait_for_word(goals[0])) - killed
         assert _ends(talk, [first]) == [("ABORTED", "engine_crashed")]
         assert _ends(talk, goals) == [("SUCCEEDED", None)] * WAITING
-        assert_within(speaking, SPEAKING, "the next goal after an engine was killed in its start")
+        assert_within(speaking, SPEAKING, "the next goal after an engine was killed during its start")
 
 
 def test_an_engine_killed_while_idle_costs_no_goal(make_talk: MakeTalk) -> None:
@@ -212,7 +209,7 @@ def test_an_engine_killed_while_idle_costs_no_goal(make_talk: MakeTalk) -> None:
 
 def test_engines_killed_after_a_goal_are_replaced_without_delay(scripted: Talk) -> None:
     assert RESTART_DELAYS_S == WAITS
-    assert RESTART_DELAYS_S[-1] > PATIENCE, "a goal that has to wait so long is not awaited"
+    assert RESTART_DELAYS_S[-1] > PATIENCE, "the test would not notice the longest delay"
     engine = _scripted_engine(scripted)
     for _ in range(2 * len(RESTART_DELAYS_S)):
         engine = _replaced(scripted, engine)
@@ -220,7 +217,7 @@ def test_engines_killed_after_a_goal_are_replaced_without_delay(scripted: Talk) 
 
 
 def test_after_a_wait_each_failed_engine_start_aborts_one_goal(make_talk: MakeTalk, tmp_path: Path) -> None:
-    write(tmp_path / "sitecustomize.py", HASTY.format(patience=0.5))
+    write(tmp_path / "sitecustomize.py", SHORT_DELAYS.format(patience=0.5))
     talk = make_talk(scripted=True, env=python_path(tmp_path))
     assert talk.run("voices").code == 0
     talk.script_start("crash")
@@ -230,17 +227,17 @@ def test_after_a_wait_each_failed_engine_start_aborts_one_goal(make_talk: MakeTa
     talk.watcher.wait_for_terminal(goals[1])
     waited = time.monotonic() - started_at
     talk.script_start("")
-    assert waited >= 0.4, "it is waited for first"
+    assert waited >= 0.4, "the goal did not wait for the engine"
     ends = _ends(talk, goals)
     assert (ends[:2], ends[-1]) == ([("ABORTED", "engine_failed")] * 2, ("SUCCEEDED", None))
     times = [talk.goal(goal_id)["ended_at"] for goal_id in goals[:2]]
-    assert times[1] - times[0] >= 0.09, "one goal for one start"
+    assert times[1] - times[0] >= 0.09, "one start aborted two goals"
     assert "the engine crashed: it was killed by SIGSEGV" in talk.goal(goals[0])["message"]
 
 
 def test_goals_end_if_a_temporary_failure_follows_a_permanent_one(make_talk: MakeTalk, tmp_path: Path) -> None:
-    """This happens if pyttsx3 is missing, and then half installed."""
-    write(tmp_path / "sitecustomize.py", HASTY.format(patience=0.3))
+    """This happens if pyttsx3 is missing at first, and only partly installed later."""
+    write(tmp_path / "sitecustomize.py", SHORT_DELAYS.format(patience=0.3))
     talk = make_talk(scripted=True, env=python_path(tmp_path))
     talk.script_start("fail")
     os.kill(_scripted_engine(talk), signal.SIGKILL)
@@ -261,9 +258,9 @@ def test_an_unknown_driver_or_voice_stops_the_server_at_start(tmp_path: Path, op
     place = str(tmp_path / "s")
     done = run([*SERVE, "--socket", place, *option], environment(str(tmp_path)))
     assert done.code == 2
-    (words,) = done.err.splitlines()
-    assert words.startswith("talk: "), words
-    assert f'"{option[1]}"' in words or f"'{option[1]}'" in words, words
+    (error,) = done.err.splitlines()
+    assert error.startswith("talk: "), error
+    assert f'"{option[1]}"' in error or f"'{option[1]}'" in error, error
     assert not os.path.exists(place)
 
 
@@ -272,5 +269,5 @@ def test_a_server_waiting_for_its_engine_can_be_stopped(make_talk: MakeTalk) -> 
     with limits():
         started_at = time.monotonic()
         talk.stop()
-        assert_within(time.monotonic() - started_at, 1, "the end of a server whose engine hangs in its start")
+        assert_within(time.monotonic() - started_at, 1, "the end of a server whose engine hangs while it starts")
     assert "ready on" not in talk.log

@@ -1,4 +1,4 @@
-"""Mutated requests from a fixed seed, and slow ones from a seed that is new each day."""
+"""Mutated requests: with a fixed seed, and in the slow run with a new seed every day."""
 
 from __future__ import annotations
 

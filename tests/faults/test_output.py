@@ -1,6 +1,6 @@
-"""Outputs that are muted, unplugged, moved, suspended or missing: the end of a sentence is told truly.
+"""Outputs that are muted, unplugged, moved, suspended or missing: the result of a goal must tell the truth.
 
-At a real PulseAudio and a real PipeWire, by the player "pulse". `test_sound_server` breaks the sound server itself.
+The player "pulse" plays to a real PulseAudio and a real PipeWire. `test_sound_server` breaks the sound server itself.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import pytest
 
 from talkcli.engine.child.players.pulse import SUSPENDED_LIMIT_S
 from talkcli.engine.players import DUMMY_SINK
-from tests.conformance.hearing import LONG, LOW, assert_aborted, begin, engine_process, send
+from tests.conformance.hearing import LONG, LOW, assert_aborted, engine_process, send, start_goal
 from tests.support.pipewire import PipeWire
 from tests.support.processes import Talk
 from tests.support.sink import Sink
@@ -31,13 +31,13 @@ if TYPE_CHECKING:
     from tests.conftest import MakeTalk
     from tests.support.connection import Message
 
-#: Seconds in which a sentence ends if the sound server tells the reason.
-TOLD = 0.5
-#: Clients that either server takes at once: MAX_CONNECTIONS of PulseAudio's, MAX_CLIENTS of PipeWire's.
+#: Limit in seconds for the end of a sentence if the sound server reports the reason.
+REPORT_S = 0.5
+#: Number of clients that PulseAudio (MAX_CONNECTIONS) and PipeWire (MAX_CLIENTS) accept.
 CLIENTS = 64
-#: A sink that counts as a device, beside the one of the test.
+#: Name of a second device.
 OTHER = "other"
-#: A session manager remembers the volume of a device by its name, so each test has a name of its own.
+#: A different device name for each test, because a session manager remembers volumes by name.
 _NAMES = (f"card{number}" for number in itertools.count())
 
 
@@ -52,7 +52,7 @@ def server(request: pytest.FixtureRequest) -> Iterator[Server]:
 
 @pytest.fixture(scope="module")
 def shared(server: Server) -> Iterator[Talk]:
-    """A server for all tests at this sound server."""
+    """A talk server that all tests with this sound server share."""
     talk = Talk(("--rate", "450"), env=server.env)
     try:
         yield talk
@@ -63,7 +63,7 @@ def shared(server: Server) -> Iterator[Talk]:
 
 @pytest.fixture
 def talk(shared: Talk) -> Iterator[Talk]:
-    """The shared server; each goal of a test has one end by the end of the test, and none goes on into the next one."""
+    """The shared server. At the end of a test, each of its goals must have one end, and no goal is left."""
     try:
         yield shared
         shared.watcher.check()
@@ -80,7 +80,7 @@ class Card(NamedTuple):
 
 @pytest.fixture
 def card(server: Server) -> Iterator[Card]:
-    """A device of its own, which is the default while the test runs."""
+    """A new device, which is the default device during the test."""
     name = next(_NAMES)
     with _loaded(server, name) as module:
         _make_default(server, name)
@@ -89,9 +89,9 @@ def card(server: Server) -> Iterator[Card]:
 
 @contextlib.contextmanager
 def _loaded(server: Server, name: str) -> Iterator[str]:
-    """Add a sink. PulseAudio's renders up to 2 s ahead, which its clients wait for, unless it does without rewinds."""
-    words = ["rate=22050", "channels=1", *(["norewinds=1"] if isinstance(server, Sink) else [])]
-    module = server.pactl("load-module", "module-null-sink", f"sink_name={name}", *words).strip()
+    """Add a sink. Without `norewinds`, one of PulseAudio renders up to 2 s ahead, and its clients wait for that."""
+    options = ["rate=22050", "channels=1", *(["norewinds=1"] if isinstance(server, Sink) else [])]
+    module = server.pactl("load-module", "module-null-sink", f"sink_name={name}", *options).strip()
     try:
         yield module
     finally:
@@ -104,11 +104,11 @@ def _make_default(server: Server, name: str) -> None:
     end = time.monotonic() + 10
     while f"Default Sink: {name}\n" not in server.pactl("info"):
         assert time.monotonic() < end, server.pactl("info")
-        time.sleep(0.01)  # a session manager decides it, and sends no event
+        time.sleep(0.01)  # the session manager sends no event
 
 
 def _move(server: Server, name: str) -> None:
-    """Move the only stream to this sink. A session manager takes its time, and a busy one may miss the request."""
+    """Move the only stream to this sink. Repeat the request, because a busy session manager may miss it."""
     sinks = [line.split("\t")[:2] for line in server.pactl("list", "short", "sinks").splitlines()]
     (wanted,) = [number for number, sink_name in sinks if sink_name == name]
     requested_at = 0.0
@@ -130,31 +130,31 @@ def _turn_down(server: Server, name: str) -> None:
     server.pactl("set-sink-volume", name, "0")
 
 
-def _ended(talk: Talk, goal_id: str) -> Message:
+def _wait_for_end(talk: Talk, goal_id: str) -> Message:
     talk.watcher.wait_for_terminal(goal_id)
     return talk.goal(goal_id)
 
 
 def test_a_goal_reports_its_device_and_volume(talk: Talk, server: Server, card: Card) -> None:
     server.pactl("set-sink-volume", card.name, "40%")
-    goal = begin(talk, LONG)
+    goal = start_goal(talk, LONG)
     wanted = {"player": "pulse", "device": card.name, "volume": 0.4, "muted": False}
-    assert talk.goal(goal)["output"] == wanted  # while it is being spoken, too
+    assert talk.goal(goal)["output"] == wanted  # also while it is being spoken
     (stream,) = server.pactl("list", "short", "sink-inputs").splitlines()
     server.pactl("set-sink-input-volume", stream.split("\t")[0], "50%")
-    ended = _ended(talk, goal)
+    ended = _wait_for_end(talk, goal)
     assert (ended["state"], ended["output"]) == ("SUCCEEDED", {**wanted, "volume": 0.2})
 
 
 def test_a_stream_moved_to_another_device_continues_there(talk: Talk, server: Server, card: Card) -> None:
-    """Another default device in mid-sentence ends nothing, either."""
+    """A change of the default device in mid-sentence does not end the goal, either."""
     with _loaded(server, OTHER):
-        goal = begin(talk, f"{LONG}, {LONG}")
+        goal = start_goal(talk, f"{LONG}, {LONG}")
         server.pactl("set-default-sink", OTHER)
         _move(server, OTHER)
         server.pactl("set-default-sink", card.name)
         _move(server, OTHER)
-        ended = _ended(talk, goal)
+        ended = _wait_for_end(talk, goal)
         assert (ended["state"], ended["output"]["device"]) == ("SUCCEEDED", OTHER)
 
 
@@ -174,16 +174,16 @@ def test_a_dummy_output_is_used_only_if_it_is_named(make_talk: MakeTalk, server:
 
 def test_speech_works_again_after_the_device_was_unplugged(talk: Talk, server: Server, card: Card) -> None:
     with limits():
-        goal = begin(talk, LONG)
+        goal = start_goal(talk, LONG)
         unplugged_at = time.monotonic()
         server.pactl("unload-module", card.module)
         if isinstance(server, PipeWire):
             ended = talk.watcher.wait_for(goal, "ABORTED")
-            assert_within(talk.watcher.arrived(ended) - unplugged_at, TOLD, "the end of a goal whose device is gone")
+            assert_within(talk.watcher.arrived(ended) - unplugged_at, REPORT_S, "the end of a goal after an unplug")
             assert_aborted(talk.goal(goal), "audio_lost", "the sound server has only a dummy output left")
-            assert_aborted(_ended(talk, send(talk, LOW)), "audio_device", "only a dummy output")
+            assert_aborted(_wait_for_end(talk, send(talk, LOW)), "audio_device", "only a dummy output")
         else:  # PulseAudio moves the stream to its other sink
-            assert _ended(talk, goal)["state"] == "SUCCEEDED"
+            assert _wait_for_end(talk, goal)["state"] == "SUCCEEDED"
         with _loaded(server, card.name):
             _make_default(server, card.name)
             assert talk.run("say", "--wait", "--", LOW).code == 0
@@ -192,14 +192,13 @@ def test_speech_works_again_after_the_device_was_unplugged(talk: Talk, server: S
 @pytest.mark.parametrize("server", [Sink], indirect=True, ids=["PulseAudio"])  # PipeWire suspends nothing that plays
 def test_a_suspended_device_aborts_the_sentence_in_time(talk: Talk, server: Server, card: Card) -> None:
     with limits():
-        goal = begin(talk, LONG)
+        goal = start_goal(talk, LONG)
         suspended_at = time.monotonic()
         server.pactl("suspend-sink", card.name, "1")
         ended = talk.watcher.wait_for(goal, "ABORTED")
         server.pactl("suspend-sink", card.name, "0")
-        assert_within(
-            talk.watcher.arrived(ended) - suspended_at, SUSPENDED_LIMIT_S + TOLD, "the end of a goal that stands still"
-        )
+        seconds = talk.watcher.arrived(ended) - suspended_at
+        assert_within(seconds, SUSPENDED_LIMIT_S + REPORT_S, "the end of a goal whose device is suspended")
         assert_aborted(talk.goal(goal), "audio_stalled", f"the sound server has suspended {card.name}")
         assert talk.run("say", "--wait", "--", LOW).code == 0
 
@@ -228,20 +227,20 @@ def test_muting_in_mid_sentence_is_reported_or_aborts_an_audible_goal(
 ) -> None:
     talk = make_talk("--rate", "450", "--audible", env=server.env)
     with limits():
-        goal = begin(talk, LONG)
+        goal = start_goal(talk, LONG)
         muted_at = time.monotonic()
         _mute(server, card.name)
         ended = talk.watcher.wait_for(goal, "ABORTED")
-        assert_within(talk.watcher.arrived(ended) - muted_at, TOLD, "the end of a goal that became muted")
+        assert_within(talk.watcher.arrived(ended) - muted_at, REPORT_S, "the end of a goal that became muted")
         assert_aborted(talk.goal(goal), "muted")
         _mute(server, card.name, "0")
-        second = begin(talk, LONG, audible=False)
+        second = start_goal(talk, LONG, audible=False)
         _mute(server, card.name)
         while not talk.goal(second)["output"]["muted"] and talk.goal(second)["state"] == "ACTIVE":
             pass
         _mute(server, card.name, "0")
-        result = _ended(talk, second)
-        assert (result["state"], result["output"]["muted"]) == ("SUCCEEDED", True)  # a moment of it is told as well
+        result = _wait_for_end(talk, second)
+        assert (result["state"], result["output"]["muted"]) == ("SUCCEEDED", True)  # even a short mute is reported
 
 
 @pytest.mark.usefixtures("card")
@@ -258,14 +257,14 @@ def test_a_full_sound_server_aborts_the_goal_with_a_clear_message(make_talk: Mak
 
 @pytest.mark.usefixtures("card")
 def test_no_stream_remains_after_a_cancel_or_a_killed_engine(talk: Talk, server: Server) -> None:
-    begin(talk, LONG)
-    assert descendants(engine_process(talk)) == []  # no player's process, which could be left
+    start_goal(talk, LONG)
+    assert descendants(engine_process(talk)) == []  # no player process that could remain
     talk.run("cancel")
     assert server.pactl("list", "short", "sink-inputs") == ""
-    begin(talk, LONG)
+    start_goal(talk, LONG)
     os.kill(engine_process(talk), signal.SIGKILL)
     end = time.monotonic() + 1
     while server.pactl("list", "short", "sink-inputs"):
-        assert time.monotonic() < end, "the stream goes on without its engine"
-        time.sleep(0.01)  # the server's end of a connection is no event here
+        assert time.monotonic() < end, "the stream continues without its engine"
+        time.sleep(0.01)  # the sound server sends no event
     assert talk.run("say", "--wait", "--", LOW).code == 0

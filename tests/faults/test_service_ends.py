@@ -1,4 +1,4 @@
-"""Signals and standard error: how fast a server ends, and the faults that don't end it."""
+"""Signals and standard error: how fast a server stops, and which faults it survives."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import pytest
 
 from talkcli.daemon import log
 from tests.conformance.bareserve import SERVE, TALK, environment, run, serving
-from tests.conformance.hearing import begin, engine_process, send
+from tests.conformance.hearing import engine_process, send, start_goal
 from tests.faults.broken import write
 from tests.support import processes
 from tests.support.connection import Wire
@@ -31,16 +31,16 @@ if TYPE_CHECKING:
     from tests.conftest import MakeTalk
 
 SCRIPTED = [SERVE[0], processes.SCRIPTED]
-#: A server at the fastest rate there is.
+#: A server that speaks at the maximum rate.
 FAST = [*SERVE, "--rate", "450"]
-#: Texts that make an answer long, and the number of requests for it: more than a connection's buffers hold.
+#: A long text, and a number of requests whose replies with such texts exceed a connection's buffers.
 LONG = "word " * 1900
-ASKED = 12
+REQUESTS = 12
 
 
 @contextlib.contextmanager
 def stalled(path: str, count: int = 100) -> Iterator[None]:
-    """Connect clients that ask for much, read nothing, and leave a line unfinished."""
+    """Connect clients that request long replies, read nothing, and leave a line unfinished."""
     with contextlib.ExitStack() as stack:
         wire = stack.enter_context(Wire(path))
         wire.request("pause")
@@ -51,10 +51,10 @@ def stalled(path: str, count: int = 100) -> Iterator[None]:
         for _ in range(count):
             client = stack.enter_context(socket.socket(socket.AF_UNIX))
             client.connect(path)
-            client.sendall(b'{"request": "watch"}\n' + b'{"request": "status"}\n' * ASKED + b'{"request": ')
+            client.sendall(b'{"request": "watch"}\n' + b'{"request": "status"}\n' * REQUESTS + b'{"request": ')
         end = time.monotonic() + 20
         while (clients := wire.request("status", timeout=20)["server"]["clients"]) < count:
-            assert time.monotonic() < end, f"{clients} clients of {count} were let in"
+            assert time.monotonic() < end, f"{clients} of {count} clients were admitted"
         yield
 
 
@@ -80,7 +80,7 @@ def test_a_second_sigterm_stops_a_server_with_stalled_clients_at_once(home: str)
     with limits():
         with serving(env, command=SCRIPTED) as server, Wire(path) as wire, stalled(path):
             wire.request("watch")
-            wire.request("say", text="never-ends ignore-stop words=1")  # takes a while to end
+            wire.request("say", text="never-ends ignore-stop words=1")  # takes a while to stop
             wire.receive_event("word")
             server.process.send_signal(signal.SIGTERM)
             wire.receive_event("state", state="PREEMPTING")
@@ -94,7 +94,7 @@ def test_a_second_sigterm_stops_a_server_with_stalled_clients_at_once(home: str)
 def test_a_server_survives_thousands_of_sighups_and_sigpipes(home: str) -> None:
     path = f"{home}/s"
     with serving(environment(home, TALK_SOCKET=path), command=FAST) as server, Wire(path) as wire:
-        goal = wire.request("say", text="spoken to its end, whatever comes", wait=True)["goal"]
+        goal = wire.request("say", text="this is spoken to its end", wait=True)["goal"]
         wire.receive_event("state", state="ACTIVE")
         with limits():
             for number in [signal.SIGHUP, signal.SIGPIPE] * 3:
@@ -102,13 +102,13 @@ def test_a_server_survives_thousands_of_sighups_and_sigpipes(home: str) -> None:
                     server.process.send_signal(number)
                 started_at = time.monotonic()
                 assert wire.request("status")["ok"]
-                assert_within(time.monotonic() - started_at, 0.1, "status in a storm of signals")
+                assert_within(time.monotonic() - started_at, 0.1, "status during thousands of signals")
         ended = wire.receive_event("result", timeout=10)["goal"]
         assert (ended["id"], ended["state"]) == (goal["id"], "SUCCEEDED")
 
 
 #: Starts a server with its signals blocked and ignored.
-STARTED_BADLY = """
+START_WITH_BLOCKED_SIGNALS = """
 import os, signal, sys
 signal.signal(signal.SIGCHLD, signal.SIG_IGN)
 signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -118,8 +118,8 @@ os.execv(sys.executable, [sys.executable, "-m", "talkcli", "serve", *sys.argv[1:
 
 
 def test_a_server_resets_inherited_signal_settings(make_talk: MakeTalk, tmp_path: Path) -> None:
-    talk = make_talk("--player", "null", program=str(write(tmp_path / "start.py", STARTED_BADLY)))
-    goal = begin(talk, "a sentence that is long enough to be in the middle of it", number=1)
+    talk = make_talk("--player", "null", program=str(write(tmp_path / "start.py", START_WITH_BLOCKED_SIGNALS)))
+    goal = start_goal(talk, "a sentence that is long enough to be in the middle of it", number=1)
     os.kill(engine_process(talk), signal.SIGKILL)
     assert talk.watcher.wait_for_terminal(goal) == "ABORTED"
     assert talk.goal(goal)["message"] == "speech failed: the engine crashed: it was killed by SIGKILL"
@@ -129,7 +129,7 @@ def test_a_server_resets_inherited_signal_settings(make_talk: MakeTalk, tmp_path
 
 
 def test_the_error_for_too_little_memory_names_the_limit(home: str) -> None:
-    """It is enough for the imports, but not for the stack of a thread, or just not enough for the server."""
+    """The limit allows the imports, but not the stack of a thread, or not quite the whole server."""
     kib = 22_000
     command = ["sh", "-c", f'ulimit -d {kib}; exec "$@"', "sh", *TALK, "serve", "--player", "null"]
     done = run(command, environment(home, TALK_SOCKET=f"{home}/s"))
@@ -139,13 +139,13 @@ def test_the_error_for_too_little_memory_names_the_limit(home: str) -> None:
 
 
 @contextlib.contextmanager
-def serving_with(home: str, redirection: str, stderr: int | None = None) -> Iterator[Wire]:
-    """Run a server whose log is not read, and assert that SIGTERM ends it well."""
+def serving_unread_log(home: str, redirection: str, stderr: int | None = None) -> Iterator[Wire]:
+    """Run a server whose log is not read, and assert that SIGTERM stops it normally."""
     path = f"{home}/s"
     command = dying_with_parent(["sh", "-c", f'exec "$@" {redirection}', "sh", *FAST])
     with subprocess.Popen(command, env=environment(home, TALK_SOCKET=path), stderr=stderr) as process:
         try:
-            with _greeted(path, process) as wire:
+            with _connect(path, process) as wire:
                 yield wire
             process.send_signal(signal.SIGTERM)
             assert process.wait(5) == 0
@@ -154,17 +154,17 @@ def serving_with(home: str, redirection: str, stderr: int | None = None) -> Iter
             process.kill()
 
 
-def _greeted(path: str, process: subprocess.Popen[bytes]) -> Wire:
+def _connect(path: str, process: subprocess.Popen[bytes]) -> Wire:
     end = time.monotonic() + 10
     while True:
         with contextlib.suppress(OSError):
             return Wire(path)
         assert process.poll() is None
         assert time.monotonic() < end
-        time.sleep(0.01)  # a socket's appearance is no event
+        time.sleep(0.01)  # the creation of a socket sends no event
 
 
-def speaks(wire: Wire, *texts: str) -> None:
+def assert_speaks(wire: Wire, *texts: str) -> None:
     for text in texts:
         wire.request("say", text=text, wait=True)
         assert wire.receive_event("result")["goal"]["state"] == "SUCCEEDED"
@@ -172,8 +172,8 @@ def speaks(wire: Wire, *texts: str) -> None:
 
 @pytest.mark.parametrize("redirection", ["2>&-", "<&- >&- 2>&-", "2>/dev/full"])
 def test_speech_continues_with_standard_error_closed_or_full(home: str, redirection: str) -> None:
-    with serving_with(home, redirection) as wire:
-        speaks(wire, "one", "two")
+    with serving_unread_log(home, redirection) as wire:
+        assert_speaks(wire, "one", "two")
         wire.request("cancel")
         wire.send_raw(b"nonsense\n")
 
@@ -190,18 +190,18 @@ def _fill(writing: int) -> None:
 def test_speech_continues_while_standard_error_is_a_full_or_broken_pipe(home: str) -> None:
     reading, writing = os.pipe()
     _fill(writing)
-    with serving_with(home, "", writing) as wire:
+    with serving_unread_log(home, "", writing) as wire:
         os.close(writing)
-        speaks(wire, "one", "two", "three")
-        os.read(reading, 1 << 20)  # all that the pipe holds
-        speaks(wire, "four")
+        assert_speaks(wire, "one", "two", "three")
+        os.read(reading, 1 << 20)  # the whole content of the pipe
+        assert_speaks(wire, "four")
         log_text = ""
         while '"four"' not in log_text:
             log_text += os.read(reading, 65536).decode()
-        # The loss is told as soon as there is room.
+        # Lost lines are reported as soon as there is room.
         assert "lines before this one could not be written)" in log_text.splitlines()[0]
         os.close(reading)
-        speaks(wire, "five", "six")
+        assert_speaks(wire, "five", "six")
 
 
 def test_a_log_message_is_one_line_of_limited_length(home: str) -> None:

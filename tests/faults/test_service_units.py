@@ -1,7 +1,4 @@
-"""The units that `talk serve --print-unit` prints, carried out as systemd does, and the messages to a supervisor.
-
-Only pid 1 is missing.
-"""
+"""The units of `talk serve --print-unit`, run as systemd runs them, and the notifications to a supervisor."""
 
 from __future__ import annotations
 
@@ -38,10 +35,10 @@ if TYPE_CHECKING:
 
 SCRIPTED = [SERVE[0], processes.SCRIPTED]
 UNITS = ["user", "system", "user-socket", "system-socket"]
-#: The installed command.
+#: An installed `talk` command.
 SCRIPT = f"#!{sys.executable}\nfrom talkcli.cli import main\nmain()\n"
-#: Starts a program as systemd does if it passes a socket.
-PASSING = """
+#: Starts a program with a passed socket, as systemd does.
+PASS_SOCKET = """
 import os, sys
 os.dup2(int(sys.argv[1]), 3, inheritable=True)
 os.environ["LISTEN_PID"] = str(os.getpid())
@@ -49,29 +46,29 @@ os.execv(sys.argv[2], sys.argv[2:])
 """
 
 
-def printed(home: str, name: str, *options: str) -> str:
+def print_unit(home: str, name: str, *options: str) -> str:
     done = run([*TALK, "serve", *options, "--print-unit", name], environment(home))
     assert done.code == 0, done
     return done.out
 
 
-def values(unit: str, name: str) -> list[str]:
+def unit_values(unit: str, name: str) -> list[str]:
     return re.findall(rf"^{name}=(.*)$", unit, re.MULTILINE)
 
 
 def command_of(unit: str) -> list[str]:
-    """Return the command that systemd would run: its quotes are a shell's, its other signs are doubled."""
-    (line,) = values(unit, "ExecStart")
+    """Return the command that systemd would run. It uses the shell's quotes, and doubles % and $."""
+    (line,) = unit_values(unit, "ExecStart")
     return [word.replace("%%", "%").replace("$$", "$") for word in shlex.split(line)]
 
 
-def passing(passed: socket.socket, *words: str) -> list[str]:
-    """Return a command that starts a scripted server with a passed socket."""
-    return [sys.executable, "-S", "-c", PASSING, str(passed.fileno()), *SCRIPTED, *words]
+def passing_command(passed: socket.socket, *words: str) -> list[str]:
+    """Return a command that starts a scripted server with this socket."""
+    return [sys.executable, "-S", "-c", PASS_SOCKET, str(passed.fileno()), *SCRIPTED, *words]
 
 
-def verify(home: str, name: str, **units: str) -> None:
-    """Assert that systemd finds nothing wrong with a unit of these files, named by their kind."""
+def assert_valid_unit(home: str, name: str, **units: str) -> None:
+    """Assert that systemd finds no error in a unit, given the texts of the files by their kind."""
     for kind, text in units.items():
         write(Path(home, f"talk.{kind}"), text)
     scope = ["--user"] if name.startswith("user") else []
@@ -84,7 +81,7 @@ def verify(home: str, name: str, **units: str) -> None:
 @pytest.mark.parametrize("name", UNITS)
 def test_a_unit_is_valid_and_explains_its_installation(home: str, name: str) -> None:
     needs("systemd-analyze")
-    unit = printed(home, name)
+    unit = print_unit(home, name)
     kind = "socket" if name.endswith("socket") else "service"
     folder = "/etc/systemd/system" if name.startswith("system") else "~/.config/systemd/user"
     head = unit.partition("\n[Unit]\n")[0].splitlines()
@@ -94,18 +91,18 @@ def test_a_unit_is_valid_and_explains_its_installation(home: str, name: str) -> 
     assert all(line.startswith("#") and len(line) <= 120 for line in head)
     assert "\n[Install]\nWantedBy=" in unit
     assert unit.endswith("\n")
-    service = printed(home, name.removesuffix("-socket"))
-    verify(home, name, **{"service": service, kind: unit})
+    service = print_unit(home, name.removesuffix("-socket"))
+    assert_valid_unit(home, name, **{"service": service, kind: unit})
 
 
 def test_services_are_supervised_and_the_system_one_admits_group_audio(home: str) -> None:
-    user, system = printed(home, "user"), printed(home, "system")
+    user, system = print_unit(home, "user"), print_unit(home, "system")
     both = {
         "Type": "notify",
         "NotifyAccess": "main",
         "WatchdogSec": "30",
         "Restart": "on-failure",
-        "KillMode": "mixed",  # else the engine dies of SIGTERM before the server can end its goal
+        "KillMode": "mixed",  # otherwise, SIGTERM kills the engine before the server can end its goal
         "NoNewPrivileges": "yes",
     }
     own = {
@@ -116,67 +113,62 @@ def test_services_are_supervised_and_the_system_one_admits_group_audio(home: str
         "CacheDirectoryMode": "0700",
         "DeviceAllow": "char-alsa rw",
     }
-    assert {name: values(user, name) for name in both} == {name: [value] for name, value in both.items()}
-    assert {name: values(system, name) for name in {**both, **own}} == {
+    assert {name: unit_values(user, name) for name in both} == {name: [value] for name, value in both.items()}
+    assert {name: unit_values(system, name) for name in {**both, **own}} == {
         name: [value] for name, value in {**both, **own}.items()
     }
-    assert "Directory=" not in user  # the user's own directories do
+    assert "Directory=" not in user  # the directories of the user are sufficient
     assert "PrivateDevices" not in re.sub("#.*", "", system)
     assert "--socket-mode=0660" in command_of(system)
-    assert "--socket-mode=0666" in command_of(printed(home, "system", "--socket-mode", "0666"))
+    assert "--socket-mode=0666" in command_of(print_unit(home, "system", "--socket-mode", "0666"))
 
 
 @pytest.mark.parametrize("name", ["user", "system"])
 def test_the_command_is_absolute_and_keeps_the_given_options(home: str, name: str) -> None:
     greeting = 'I\'m "here", at 100 % of $HOME \\ now; --really'
     options = ["--rate", "150", "--preempt", "--ttl=2.5", "--greeting", greeting, "--device", "plughw:1,0"]
-    command = command_of(printed(home, name, "--player", "aplay", *options))
+    command = command_of(print_unit(home, name, "--player", "aplay", *options))
     assert os.path.isabs(command[0])
     assert os.access(command[0], os.X_OK)
     wanted = ["--rate=150", "--preempt", "--ttl=2.5", "--player=aplay", "--device=plughw:1,0", f"--greeting={greeting}"]
     assert command[-6:] == wanted
-    assert command_of(printed(home, "user", "--rate", "200"))[-1] == "--rate=200"  # given, although the default
-    assert command_of(printed(home, "user"))[-1] == "serve"
+    assert command_of(print_unit(home, "user", "--rate", "200"))[-1] == "--rate=200"  # kept, although it is the default
+    assert command_of(print_unit(home, "user"))[-1] == "serve"
 
 
 @pytest.mark.parametrize("name", ["user", "system"])
 def test_control_characters_in_an_option_survive_systemds_quoting(home: str, name: str) -> None:
     needs("systemd-analyze")
     greeting = 'one\rtwo\nthree\tfour \x01\x7f\x85\u2028 "five" \\\n'
-    unit = printed(home, name, "--greeting", greeting, "--socket", f"{home}/a\nb")
-    (line,) = values(unit, "ExecStart")
+    unit = print_unit(home, name, "--greeting", greeting, "--socket", f"{home}/a\nb")
+    (line,) = unit_values(unit, "ExecStart")
     assert line.isprintable()
     quoted = line.partition('"--greeting=')[2].removesuffix('"')
     assert quoted.encode().decode("unicode_escape").encode("latin-1").decode() == greeting
     assert f"{home}/a\\nb" in unit.partition("[Unit]")[0] or name == "user"
-    verify(home, name, service=unit)
+    assert_valid_unit(home, name, service=unit)
 
 
 def test_a_socket_unit_listens_where_clients_look(home: str) -> None:
-    def socket_settings(name: str, *options: str) -> list[str]:
-        unit = printed(home, name, *options)
-        return values(unit, "ListenStream") + values(unit, "SocketMode") + values(unit, "SocketGroup")
+    def settings(name: str, *options: str) -> list[str]:
+        unit = print_unit(home, name, *options)
+        return unit_values(unit, "ListenStream") + unit_values(unit, "SocketMode") + unit_values(unit, "SocketGroup")
 
-    assert socket_settings("user-socket") == ["%t/talk/talk.sock", "0600"]
-    assert socket_settings("system-socket") == ["/run/talk/talk.sock", "0660", "audio"]
-    assert socket_settings("user-socket", "--socket", f"{home}/100%", "--socket-mode", "0666") == [
-        f"{home}/100%%",
-        "0666",
-    ]
-    assert socket_settings("user-socket", "--socket", f"{home}/a b")[0] == f"{home}/a b"
+    assert settings("user-socket") == ["%t/talk/talk.sock", "0600"]
+    assert settings("system-socket") == ["/run/talk/talk.sock", "0660", "audio"]
+    assert settings("user-socket", "--socket", f"{home}/100%", "--socket-mode", "0666") == [f"{home}/100%%", "0666"]
+    assert settings("user-socket", "--socket", f"{home}/a b")[0] == f"{home}/a b"
 
 
 def test_a_unit_that_cannot_be_printed_is_a_usage_error(home: str) -> None:
-    cases = [
-        (options, "--print-unit") for options in (["--print-unit"], ["--print-unit", "launchd"], ["--print-unit="])
-    ]
+    cases = [(args, "--print-unit") for args in (["--print-unit"], ["--print-unit", "launchd"], ["--print-unit="])]
     cases += [
         (["--print-unit", name, "--socket", f"{home}/{path}"], "a socket unit can't contain the path")
         for path in ("a\nb", "a\rb", "a ", "a\\")
         for name in ("user-socket", "system-socket")
     ]
-    for options, error in cases:
-        done = run([*TALK, "serve", *options], environment(home))
+    for args, error in cases:
+        done = run([*TALK, "serve", *args], environment(home))
         assert (done.code, done.out, error in done.err) == (2, "", True), done
 
 
@@ -194,22 +186,22 @@ def test_printing_the_system_unit_warns_if_its_user_cannot_run_talk(home: str) -
     os.mkdir(private, 0o700)
     script = str(write(Path(private, "talk"), SCRIPT, 0o755))
     os.mkdir(f"{home}/bin")
-    os.symlink(script, f"{home}/bin/talk")  # readable for all, unlike the program
+    os.symlink(script, f"{home}/bin/talk")  # readable for all users, unlike its target
     for command in (script, f"{home}/bin/talk"):
         done = run([command, "serve", "--print-unit", "system"], environment(home))
         assert done.code == 0
         warning = f"the service's user can't enter {private}, but this talk needs {script}; install talk for all users"
         assert warning in done.err
-        assert done.out.count("[Service]") == 1  # the unit alone is printed
+        assert done.out.count("[Service]") == 1  # only the unit is printed
     assert run([script, "serve", "--print-unit", "user"], environment(home)).err == ""
 
 
 def test_systemd_rates_the_system_service_as_well_protected(home: str) -> None:
     needs("systemd-analyze")
-    unit = write(Path(home, "talk.service"), printed(home, "system"))
+    unit = write(Path(home, "talk.service"), print_unit(home, "system"))
     done = run(["systemd-analyze", "security", "--offline=true", "--no-pager", str(unit)], environment(home))
     if "unrecognized option" in done.err:
-        pytest.skip("this systemd-analyze judges no unit that is not loaded: version 250 does")
+        pytest.skip("systemd-analyze before version 250 can only rate loaded units")
     match = re.search(r"Overall exposure level for talk.service: ([\d.]+)", done.out)
     assert match, done
     assert float(match[1]) <= 2.0
@@ -220,7 +212,7 @@ def test_the_command_serves_in_the_environment_that_systemd_sets(home: str) -> N
     needs("setpriv")
     os.mkdir(f"{home}/talk", 0o755)
     with Supervisor(f"{home}/n") as supervisor:
-        unit = printed(home, "system", "--player", "null", "--rate", "450")
+        unit = print_unit(home, "system", "--player", "null", "--rate", "450")
         env = {
             **{name: value for name, value in environment(home).items() if name in {"PYTHONPATH", "TMPDIR"}},
             "PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
@@ -242,10 +234,10 @@ def test_the_command_serves_in_the_environment_that_systemd_sets(home: str) -> N
 def test_the_system_service_caches_a_split_voice(home: str) -> None:
     needs_packages(*NEURAL_PACKAGES)
     tiny_voice.put(Path(home) / "voices", "tiny")
-    # As for each service with a user of its own: the variable names a link to a private directory.
+    # As for every service with DynamicUser: the variable names a link to a private directory.
     os.makedirs(f"{home}/private/talk", 0o700)
     os.symlink("private/talk", f"{home}/talk")
-    command = command_of(printed(home, "system", "--player", "null", "--rate", "450"))
+    command = command_of(print_unit(home, "system", "--player", "null", "--rate", "450"))
     env = environment(home, CACHE_DIRECTORY=f"{home}/talk", TALK_VOICES=f"{home}/voices", TALK_SOCKET=f"{home}/s")
     with serving(env, command=command):
         assert run([*TALK, "say", "--wait", "--voice", "piper/tiny", "hello"], env).code == 0
@@ -266,10 +258,10 @@ def test_a_passed_socket_is_served_and_its_file_is_kept(home: str) -> None:
     with Supervisor(f"{home}/n") as supervisor, listening_at(path) as passed:
         os.chmod(path, 0o666)
         early = socket.socket(socket.AF_UNIX)
-        early.connect(path)  # before the server is there: this is what starts it
+        early.connect(path)  # before the server runs: the connection starts it
         env = environment(home, LISTEN_FDS="1", LISTEN_FDNAMES="talk.socket", NOTIFY_SOCKET=supervisor.address)
-        for _ in range(2):  # and the next server, after a restart
-            with serving(env, command=passing(passed), pass_fds=[passed.fileno()]) as server:
+        for _ in range(2):  # the second server is the one after a restart
+            with serving(env, command=passing_command(passed), pass_fds=[passed.fileno()]) as server:
                 supervisor.wait_for("READY")
                 early.close()
                 with Wire(path):
@@ -285,13 +277,13 @@ def test_a_passed_socket_is_served_and_its_file_is_kept(home: str) -> None:
 
 def test_an_unusable_passed_socket_is_refused_with_a_reason(home: str) -> None:
     def refused(passed: socket.socket, count: str = "1", code: int = 2) -> str:
-        done = run(passing(passed), environment(home, LISTEN_FDS=count), pass_fds=[passed.fileno()])
+        done = run(passing_command(passed), environment(home, LISTEN_FDS=count), pass_fds=[passed.fileno()])
         assert (done.code, done.out, "Traceback" in done.err) == (code, "", False), done
         return done.err
 
     with listening_at(f"{home}/s") as passed:
         assert "systemd passed 2 sockets" in refused(passed, count="2")
-        os.unlink(f"{home}/s")  # its file is gone: the supervisor has to restart the socket's unit
+        os.unlink(f"{home}/s")  # without the file, the supervisor has to restart the socket's unit
         assert "systemctl restart talk.socket" in refused(passed, code=11)
     with listening_at(f"{home}/d", socket.SOCK_DGRAM) as passed:
         assert "doesn't listen" in refused(passed)
@@ -311,20 +303,20 @@ def test_a_passed_socket_is_ignored_if_it_is_not_meant_for_this_server(home: str
     with listening_at(f"{home}/passed") as passed:
         for place, pid in (("own", {}), ("passed", {}), ("third", {"LISTEN_PID": "1"})):
             env = environment(home, LISTEN_FDS="1", TALK_SOCKET=f"{home}/{place}", **pid)
-            command = SCRIPTED if pid else passing(passed)
+            command = SCRIPTED if pid else passing_command(passed)
             with serving(env, command=command, pass_fds=[passed.fileno()]), Wire(f"{home}/{place}") as wire:
                 assert wire.request("status")["server"]["socket"] == f"{home}/{place}"
                 assert os.path.exists(f"{home}/{place}.lock") == (place != "passed")
 
 
-def supervised(home: str, supervisor: Supervisor, **extra: str) -> dict[str, str]:
+def supervised_env(home: str, supervisor: Supervisor, **extra: str) -> dict[str, str]:
     return environment(home, TALK_SOCKET=f"{home}/s", NOTIFY_SOCKET=supervisor.address, **extra)
 
 
 def test_the_supervisor_is_notified_of_start_status_and_stop(home: str) -> None:
-    with Supervisor(f"{home}/n") as supervisor, serving(supervised(home, supervisor), command=SCRIPTED) as server:
+    with Supervisor(f"{home}/n") as supervisor, serving(supervised_env(home, supervisor), command=SCRIPTED) as server:
         ready = supervisor.wait_for("READY", "1")
-        with Wire(f"{home}/s") as wire:  # it was told no earlier than clients are served
+        with Wire(f"{home}/s") as wire:  # READY must not come before clients are served
             assert wire.greeting["pid"] == server.process.pid
             supervisor.wait_for("STATUS", "idle; ", since=ready)
             goal = wire.request("say", text="never-ends a secret")["goal"]
@@ -340,15 +332,15 @@ def test_the_supervisor_is_notified_of_start_status_and_stop(home: str) -> None:
         supervisor.drain()
     names = [name for name, _, _ in supervisor.messages]
     assert (names.count("READY"), names.count("STOPPING"), names.count("WATCHDOG")) == (1, 1, 0)
-    assert "secret" not in str(supervisor.messages)  # anybody may read a unit's status
+    assert "secret" not in str(supervisor.messages)  # every user can read a unit's status
 
 
 def test_the_unit_status_names_the_engines_problem(home: str) -> None:
     write(Path(home, "start"), "fail=engine_failed")
     with Supervisor(f"{home}/n") as supervisor:
-        env = supervised(home, supervisor, SCRIPTED_START_FILE=f"{home}/start")
+        env = supervised_env(home, supervisor, SCRIPTED_START_FILE=f"{home}/start")
         with serving(env, command=SCRIPTED):
-            supervisor.wait_for("READY")  # it serves, and says what is wrong, instead of being started in a loop
+            supervisor.wait_for("READY")  # it serves and reports the problem instead of failing in a restart loop
             supervisor.wait_for("STATUS", "engine: ")
             os.unlink(f"{home}/start")
             supervisor.wait_for("STATUS", "idle; ")
@@ -357,12 +349,12 @@ def test_the_unit_status_names_the_engines_problem(home: str) -> None:
 def test_the_watchdog_depends_on_the_event_loop_and_not_on_the_engine(home: str) -> None:
     limit = 0.6
     with Supervisor(f"{home}/n") as supervisor:
-        env = supervised(home, supervisor, WATCHDOG_USEC=str(int(limit * 1e6)))
+        env = supervised_env(home, supervisor, WATCHDOG_USEC=str(int(limit * 1e6)))
         with serving(env, command=SCRIPTED) as server, Wire(f"{home}/s") as wire:
             first = supervisor.wait_for("WATCHDOG")
             second = supervisor.wait_for("WATCHDOG", since=first)
             assert limit / 3 - 0.05 <= second - first <= limit
-            wire.request("say", text="hang")  # another watchdog looks after an engine that hangs
+            wire.request("say", text="hang")  # another watchdog detects a hanging engine
             started_at = time.monotonic()
             while (last := supervisor.wait_for("WATCHDOG", since=second)) < started_at + limit * 2:
                 assert last - second <= limit
@@ -371,7 +363,7 @@ def test_the_watchdog_depends_on_the_event_loop_and_not_on_the_engine(home: str)
             try:
                 time.sleep(0.01)
                 supervisor.drain()
-                assert not supervisor.receive(limit)  # an event loop that stands still feeds nothing
+                assert not supervisor.receive(limit)  # a stopped event loop does not feed the watchdog
             finally:
                 os.kill(server.process.pid, signal.SIGCONT)
             supervisor.wait_for("WATCHDOG", since=time.monotonic())
@@ -380,7 +372,7 @@ def test_the_watchdog_depends_on_the_event_loop_and_not_on_the_engine(home: str)
 @pytest.mark.parametrize("extra", [{"WATCHDOG_USEC": "0"}, {"WATCHDOG_USEC": "200000", "WATCHDOG_PID": "1"}])
 def test_a_disabled_or_foreign_watchdog_is_not_fed(home: str, extra: dict[str, str]) -> None:
     with Supervisor(f"{home}/n") as supervisor:
-        with serving(supervised(home, supervisor, **extra), command=SCRIPTED) as server:
+        with serving(supervised_env(home, supervisor, **extra), command=SCRIPTED) as server:
             supervisor.wait_for("STATUS", "idle; ")
             assert not supervisor.receive(0.3)
             assert server.end(signal.SIGTERM) == 0
@@ -391,9 +383,9 @@ def test_a_disabled_or_foreign_watchdog_is_not_fed(home: str, extra: dict[str, s
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux has abstract sockets")
 def test_the_watchdog_is_fed_at_an_abstract_address(home: str) -> None:
     with Supervisor(f"@talk-{uuid.uuid4().hex}") as supervisor:
-        # The shell's process is the server's, as systemd's child is.
+        # The shell's process becomes the server, like systemd's child.
         command = ["sh", "-c", 'WATCHDOG_PID=$$ exec "$@"', "sh", *SCRIPTED]
-        with serving(supervised(home, supervisor, WATCHDOG_USEC="500000"), command=command):
+        with serving(supervised_env(home, supervisor, WATCHDOG_USEC="500000"), command=command):
             supervisor.wait_for("WATCHDOG", since=supervisor.wait_for("WATCHDOG"))
 
 
@@ -404,19 +396,19 @@ def test_a_server_works_if_its_supervisor_cannot_be_reached(home: str, address: 
         wire.request("say", text="length=0", wait=True)
         assert wire.receive_event("result")["goal"]["state"] == "SUCCEEDED"
         if address.startswith("/"):
-            time.sleep(NOTIFY_RETRY_DELAY_S + 0.1)  # many signs of life, and another attempt
+            time.sleep(NOTIFY_RETRY_DELAY_S + 0.1)  # many watchdog messages, and another attempt to connect
     assert server.log.count("NOTIFY_SOCKET") == (1 if address.startswith("/") else 0)
 
 
 @limits()
 def test_a_slow_supervisor_delays_no_client_and_misses_no_status(home: str) -> None:
     with Supervisor(f"{home}/n") as supervisor:
-        env = supervised(home, supervisor, WATCHDOG_USEC="100000")
+        env = supervised_env(home, supervisor, WATCHDOG_USEC="100000")
         with serving(env, command=SCRIPTED) as server, Wire(f"{home}/s") as wire:
             supervisor.wait_for("STATUS", "idle; ")
             supervisor.fill()
             goal = wire.request("say", text="never-ends")["goal"]
-            time.sleep(STATUS_DELAY_S + 0.2)  # its signs of life, and the news, find no room
+            time.sleep(STATUS_DELAY_S + 0.2)  # there is no room for its watchdog and status messages
             started_at = time.monotonic()
             wire.request("status")
             assert_within(time.monotonic() - started_at, 0.5, "`status`")
@@ -440,7 +432,7 @@ def test_engine_and_player_do_not_inherit_the_supervisors_variables(make_talk: M
 
 def test_a_server_that_cannot_start_never_reports_ready(home: str) -> None:
     with Supervisor(f"{home}/n") as supervisor, serving(environment(home, TALK_SOCKET=f"{home}/s"), command=SCRIPTED):
-        second = BareServe(SCRIPTED, supervised(home, supervisor))
+        second = BareServe(SCRIPTED, supervised_env(home, supervisor))
         try:
             assert not second.serves()
             assert second.end() == 11
@@ -452,16 +444,16 @@ def test_a_server_that_cannot_start_never_reports_ready(home: str) -> None:
 @pytest.mark.slow
 def test_an_idle_supervised_server_wakes_less_than_once_a_second(home: str) -> None:
     with Supervisor(f"{home}/n") as supervisor:
-        env = supervised(home, supervisor, WATCHDOG_USEC="30000000")
+        env = supervised_env(home, supervisor, WATCHDOG_USEC="30000000")
         with serving(env, command=SCRIPTED) as server:
             supervisor.wait_for("STATUS", "idle; ")
-            before = switches(server.process.pid)
+            before = context_switches(server.process.pid)
             time.sleep(4)
-            assert switches(server.process.pid) - before < 4
+            assert context_switches(server.process.pid) - before < 4
 
 
-def switches(pid: int) -> int:
-    """Return how often the threads of a process were switched to and from."""
+def context_switches(pid: int) -> int:
+    """Return the number of context switches of a process's threads."""
     total = 0
     for task in os.listdir(f"/proc/{pid}/task"):
         with open(f"/proc/{pid}/task/{task}/status", encoding="utf-8") as file:

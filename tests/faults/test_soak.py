@@ -1,4 +1,4 @@
-"""Short soaks, or TALK_TEST_SOAK seconds if that is set."""
+"""Soak tests: short, or TALK_TEST_SOAK seconds if that is set."""
 
 from __future__ import annotations
 

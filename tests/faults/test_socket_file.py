@@ -1,4 +1,4 @@
-"""The socket's file, its lock or its directory is removed or replaced, or was made by another user beforehand."""
+"""The socket file, its lock file or its directory is removed, replaced, or already belongs to another user."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ if TYPE_CHECKING:
 
 HASTY = [sys.executable, os.path.join(os.path.dirname(os.path.abspath(__file__)), "hasty_serve.py")]
 SCRIPTED = [SERVE[0], processes.SCRIPTED]
-#: Seconds in which a server that looks every 0.05 s is found again.
-SOON = 5.0
+#: Limit in seconds until a server that checks every 0.05 s can be reached again.
+LIMIT_S = 5.0
 
 
 def await_true(condition: Callable[[], object]) -> None:
-    """Wait for something in the file system or in /proc, which sends no event."""
-    end = time.monotonic() + SOON
+    """Wait for a change in the file system or in /proc, which send no event."""
+    end = time.monotonic() + LIMIT_S
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.01)
 
 
-def found_again(path: str, pid: int) -> None:
-    """Wait until clients reach the server of this process."""
+def await_server(path: str, pid: int) -> None:
+    """Wait until clients can connect to the server with this process id."""
 
     def greeted() -> bool:
         with contextlib.suppress(OSError), Wire(path) as wire:
@@ -73,7 +73,7 @@ def move_directory(path: str) -> None:
 
 
 def test_the_socket_file_is_checked_at_least_every_15_seconds() -> None:
-    assert SOCKET_CHECK_S <= 15  # so that two checks, if the disk is full at the first, fit in the 30 s promised
+    assert SOCKET_CHECK_S <= 15  # two checks must fit in the documented 30 s, as the disk may be full at the first
 
 
 @pytest.mark.parametrize(
@@ -88,34 +88,34 @@ def test_a_removed_or_replaced_socket_is_bound_again(home: str, fault: Callable[
         goal = old.request("say", text="never-ends", wait=True)["goal"]
         old.receive_event("state", state="ACTIVE")
         fault(path)
-        found_again(path, server.process.pid)
+        await_server(path, server.process.pid)
         assert stat.S_IMODE(os.stat(path).st_mode) == 0o660
         assert stat.S_IMODE(os.stat(os.path.dirname(path)).st_mode) == 0o700
-        # Its connections live on, and new clients find it.
+        # Old connections still work, and new clients can connect.
         assert run([*TALK, "cancel"], env).out.split() == [goal["id"]]
         assert old.receive_event("result")["goal"]["state"] == "PREEMPTED"
         assert old.request("status")["server"]["socket"] == path
-        # There is still one server, which holds the lock of this name.
+        # There is still only one server, which holds the lock file.
         second = run([*SCRIPTED], env)
         assert second.code == 11, second
         assert f"pid {server.process.pid}" in second.err
         with open(f"{path}.lock", encoding="utf-8") as lock:
             assert lock.read() == f"{server.process.pid}\n"
         fault(path)  # and again
-        found_again(path, server.process.pid)
+        await_server(path, server.process.pid)
         assert server.end(signal.SIGTERM) == 0
     assert not os.path.exists(path)
     assert server.log.count("created the socket") == 2
 
 
 def test_a_relative_socket_path_is_bound_again_at_the_same_place(home: str) -> None:
-    """The directory from which its name was to be read is gone."""
+    """The server's working directory is gone."""
     path = f"{home}/here/s"
     os.mkdir(f"{home}/here", 0o700)
     command = ["sh", "-c", 'cd "$0" && exec "$@"', f"{home}/here", *HASTY]
     with serving(environment(home, TALK_SOCKET="s"), command=command) as server:
         remove_directory(path)
-        found_again(path, server.process.pid)
+        await_server(path, server.process.pid)
         with Wire(path) as wire:
             assert wire.request("status")["server"]["socket"] == path
     assert "a bug" not in server.log
@@ -124,24 +124,25 @@ def test_a_relative_socket_path_is_bound_again_at_the_same_place(home: str) -> N
 def test_a_removed_lock_file_is_created_again_without_leaking_descriptors(home: str) -> None:
     path = f"{home}/s"
     with serving(environment(home, TALK_SOCKET=path), command=HASTY) as server:
-        await_true(lambda: "engine ready" in server.log)  # the engine's pipes are opened once, after the socket
-        found_again(path, server.process.pid)
+        await_true(lambda: "engine ready" in server.log)  # the engine's pipes are opened after the socket, only once
+        await_server(path, server.process.pid)
         before = len(usage.descriptors(server.process.pid))
         socket_file = os.stat(path).st_ino
         os.unlink(f"{path}.lock")
         await_true(lambda: os.path.exists(f"{path}.lock"))
-        found_again(path, server.process.pid)
+        await_server(path, server.process.pid)
         assert os.stat(path).st_ino == socket_file
         for _ in range(5):
             unlink_both(path)
-            found_again(path, server.process.pid)
-        await_true(lambda: len(usage.descriptors(server.process.pid)) <= before)  # the last client takes its time
+            await_server(path, server.process.pid)
+        # The last client's connection takes a moment to close.
+        await_true(lambda: len(usage.descriptors(server.process.pid)) <= before)
 
 
-def ends_with_11(server: BareServe, words: str) -> None:
-    assert server.process.wait(SOON) == 11, server.log
+def assert_exits_with_11(server: BareServe, message: str) -> None:
+    assert server.process.wait(LIMIT_S) == 11, server.log
     server.end()
-    assert words in server.log
+    assert message in server.log
     assert "Traceback" not in server.log
 
 
@@ -151,17 +152,17 @@ def test_a_server_replaced_by_another_one_exits_with_code_11(home: str) -> None:
     with serving(env, command=HASTY) as first, Wire(path) as wire:
         wire.request("say", text="never-ends", wait=True)
         wire.receive_event("state", state="ACTIVE")
-        os.kill(first.process.pid, signal.SIGSTOP)  # so that the second is there before the first looks
+        os.kill(first.process.pid, signal.SIGSTOP)  # so that the second server starts before the first one checks
         unlink_both(path)
         with serving(env, command=SCRIPTED) as second:
             os.kill(first.process.pid, signal.SIGCONT)
             result = wire.receive_event("result")["goal"]
             assert (result["state"], result["reason"]) == ("PREEMPTED", "shutdown")
             pid = second.process.pid
-            ends_with_11(
+            assert_exits_with_11(
                 first, f"a server (pid {pid}) is already running at {path}; use it, or stop it with: kill {pid}"
             )
-            found_again(path, second.process.pid)  # which lost nothing
+            await_server(path, second.process.pid)
 
 
 def any_ended(*processes: Process) -> bool:
@@ -181,7 +182,7 @@ def test_of_two_servers_whose_files_were_removed_one_remains(home: str) -> None:
                 both = (first.process, second.process)
                 await_true(functools.partial(any_ended, *both))
                 assert sorted([server.poll() for server in both], key=str) == [11, None]
-                found_again(path, next(server.pid for server in both if server.poll() is None))
+                await_server(path, next(server.pid for server in both if server.poll() is None))
 
 
 def test_a_socket_that_another_program_puts_there_is_left_intact(home: str) -> None:
@@ -190,17 +191,17 @@ def test_a_socket_that_another_program_puts_there_is_left_intact(home: str) -> N
         other.bind(f"{path}new")
         other.listen()
         os.rename(f"{path}new", path)
-        ends_with_11(server, f"another program now listens at {path}")
+        assert_exits_with_11(server, f"another program now listens at {path}")
         with socket.socket(socket.AF_UNIX) as client:
             client.connect(path)
 
 
-def link_in_its_place(path: str) -> None:
+def replace_by_link(path: str) -> None:
     os.unlink(path)
     os.symlink("/etc/passwd", path)
 
 
-def directory_in_its_place(path: str) -> None:
+def replace_by_directory(path: str) -> None:
     os.unlink(path)
     os.mkdir(path)
 
@@ -211,20 +212,20 @@ def open_directory(path: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("fault", "words"),
+    ("fault", "message"),
     [
-        (link_in_its_place, "talk/s exists, but is not a socket"),
-        (directory_in_its_place, "talk/s is a directory, not a socket"),
+        (replace_by_link, "talk/s exists, but is not a socket"),
+        (replace_by_directory, "talk/s is a directory, not a socket"),
         (open_directory, "chmod go-w "),
     ],
 )
 def test_a_server_exits_if_its_socket_path_can_no_longer_be_used(
-    home: str, fault: Callable[[str], None], words: str
+    home: str, fault: Callable[[str], None], message: str
 ) -> None:
     path = f"{home}/talk/s"
     with serving(environment(home, TALK_SOCKET=path), command=HASTY) as server:
         fault(path)
-        ends_with_11(server, words)
+        assert_exits_with_11(server, message)
     assert os.path.lexists(path) == (fault is not open_directory)
 
 
@@ -243,7 +244,7 @@ def test_a_removed_file_of_a_passed_socket_is_only_reported(home: str) -> None:
                 time.sleep(0.2)
                 assert wire.request("status")["ok"]
             assert not os.path.exists(path)
-            assert server.log.count("systemctl restart") == 1  # said once, not at every look
+            assert server.log.count("systemctl restart") == 1  # reported once, not at every check
 
 
 NOBODY = 65534
@@ -251,9 +252,9 @@ NOBODY = 65534
 
 @pytest.fixture
 def _as_tmp(home: str) -> None:
-    """Share the home with all users, as /tmp is; skip the test if the usual place for a socket is elsewhere."""
+    """Share the home with all users, like /tmp. Skip the test if the default socket would be elsewhere."""
     if sys.platform == "darwin" or os.path.isdir(f"/run/user/{os.getuid()}"):
-        pytest.skip("this user has a runtime directory, or the place is in the user's home")
+        pytest.skip("this user has a runtime directory, or the default socket is in the home")
     os.chmod(home, 0o1777)
 
 
@@ -299,11 +300,11 @@ def test_an_unsafe_runtime_directory_is_refused_with_the_reason(home: str, fault
     assert (done.code, done.out) == (11, ""), done
     assert place(home) in done.err
     assert "Traceback" not in done.err
-    assert sorted(Path(home).rglob("*")) == before, "it has made or removed something"
+    assert sorted(Path(home).rglob("*")) == before, "files were created or removed"
 
 
 @pytest.mark.usefixtures("_as_tmp")
-@pytest.mark.skipif(os.getuid() != 0, reason="only root can make what is another user's")
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can create directories of another user")
 @pytest.mark.parametrize("names", [["talk"], [""], ["", "talk"]], ids=["inside", "whole", "both"])
 def test_a_runtime_directory_of_another_user_is_refused(home: str, names: list[str]) -> None:
     for name in names:

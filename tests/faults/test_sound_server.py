@@ -1,10 +1,10 @@
-"""The sound is lost: goals end in time, none SUCCEEDED unheard, and the next ones are heard when it is back.
+"""Lost sound and broken players: goals are aborted in time, and later goals are heard.
 
-The sink is suspended or unloaded, the sound server frozen or killed: these are also row 41 of the conformance. A goal
-is in mid-sentence at the fault, the next one comes while there is no sound, and the third is sent when there is sound
-again. Most of it is waiting, so all faults happen side by side, each at a sound server of its own.
+Row 41 of the conformance tests: the sink is suspended or unloaded, or the sound server is frozen or killed. The fault
+interrupts the first goal. The second goal is sent during the fault, and the third after it. Because most of the time
+is spent waiting, all faults happen in parallel, each with its own sound server.
 
-Or a player is broken: a shell script that misbehaves while a file exists, and plays with `aplay` after that.
+A broken player is a shell script that misbehaves while a file exists, and otherwise plays with `aplay`.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from tests.conformance.hearing import (
     LOW,
     assert_aborted,
     assert_same,
-    begin_with_client,
     heard,
     render_quick,
     send,
+    start_goal_with_client,
 )
-from tests.faults.broken import await_end, heard_again, nothing_left, write
+from tests.faults.broken import assert_heard_again, await_end, no_leaks, write
 from tests.support.compare import assert_heard, assert_only_beginning
 from tests.support.reference import render
 from tests.support.sink import Sink
@@ -44,11 +44,11 @@ if TYPE_CHECKING:
     from tests.conftest import MakeTalk
     from tests.support.processes import Talk
 
-#: Seconds from the return of the sink to the first sample of the next goal.
-AGAIN = 10.0
-#: Seconds from the fault, or the beginning of a goal, to its end: if the player is told that the sound is lost,
-#: and the waits for a player that takes none, with the looks and messages in between.
-TOLD = 1.0
+#: Limit in seconds from the return of the sink to the first sample of the next goal.
+RETURNED = 10.0
+#: Limits in seconds for a goal's end after the fault or the goal's start: if the sound server reports the loss, and
+#: if the player accepts no sound. They include the interval of checks, and the messages.
+REPORTED = 1.0
 STALLED = STALL_LIMIT_S + PROGRESS_CHECK_INTERVAL_S + 0.2
 NEVER_TAKEN = FIRST_SOUND_LIMIT_S + PROGRESS_CHECK_INTERVAL_S + 0.2
 SUSPENDED = SUSPENDED_LIMIT_S + 0.5
@@ -56,21 +56,21 @@ NO_ANSWER = READY_LIMIT_S + 0.2
 
 
 class End(NamedTuple):
-    """How a goal ends: its reason, its limit in seconds, and words of its message."""
+    """The expected end of a goal: its reason, the limit in seconds, and a part of its message."""
 
     reason: str
     within: float
-    words: str = ""
+    message: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """A fault of the sink, and the ends of a goal in mid-sentence and of one that comes meanwhile."""
+    """A fault of the sink, and the ends of the interrupted goal and of one sent during the fault."""
 
     breaks: Callable[[Sink], None]
     mends: Callable[[Sink], None]
     programs: tuple[End, End]
-    #: the same by the player "pulse", which the server tells more
+    #: the ends with the player "pulse", to which the sound server reports more
     pulse: tuple[End, End]
 
     def ends(self, player: str) -> tuple[End, End]:
@@ -88,8 +88,8 @@ FAULTS = {
     "sink unloaded": Fault(
         Sink.unload,
         lambda sink: sink.reload(warm=False),
-        (End("audio_lost", TOLD, "error: "), End("audio_device", TOLD)),
-        (End("audio_lost", TOLD, GONE), End("audio_device", TOLD)),
+        (End("audio_lost", REPORTED, "error: "), End("audio_device", REPORTED)),
+        (End("audio_lost", REPORTED, GONE), End("audio_device", REPORTED)),
     ),
     "sound server SIGSTOP": Fault(
         Sink.freeze,
@@ -100,11 +100,11 @@ FAULTS = {
     "sound server SIGKILL": Fault(
         Sink.kill_server,
         lambda sink: sink.start_server(warm=False),
-        (End("audio_lost", TOLD), End("audio_device", TOLD, "Connection refused")),
-        (End("audio_lost", TOLD, GONE), End("no_player", TOLD)),
+        (End("audio_lost", REPORTED), End("audio_device", REPORTED, "Connection refused")),
+        (End("audio_lost", REPORTED, GONE), End("no_player", REPORTED)),
     ),
 }
-#: The player of each fault: programs, or the engine's own connection.
+#: The player for each fault: a program, or the engine's own connection.
 PLAYERS = [
     pytest.param(("pacat", "aplay", "aplay", "pacat"), id="programs"),
     pytest.param(("aplay", "pacat", "pacat", "aplay"), id="the other programs", marks=pytest.mark.slow),
@@ -118,22 +118,22 @@ def test_row_41_goals_are_aborted_until_lost_sound_returns(make_talk: MakeTalk, 
         pool = stack.enter_context(ThreadPoolExecutor(len(FAULTS)))
         sinks = list(pool.map(lambda _: stack.enter_context(Sink()), FAULTS))
         talks = [make_talk("--player", player, sink=sink) for player, sink in zip(players, sinks, strict=True)]
-        with contextlib.ExitStack() as idle:  # counted together: they share memory
+        with contextlib.ExitStack() as idle:  # together, because the servers share memory
             for talk in talks:
-                idle.enter_context(nothing_left(talk))
+                idle.enter_context(no_leaks(talk))
             times = list(pool.map(_lose, FAULTS.values(), players, talks, sinks))
         for name, player, talk, (lost, meanwhile, again) in zip(FAULTS, players, talks, times, strict=True):
             talk.stop()
             ends, case = FAULTS[name].ends(player), f"{name}, {player}"
             assert_within(lost, ends[0].within, f"the end of a goal, {case}")
             assert_within(meanwhile, ends[1].within, f"the end of a goal meanwhile, {case}")
-            assert_within(again, AGAIN, f"the next goal, {case}")
+            assert_within(again, RETURNED, f"the next goal, {case}")
 
 
 def _lose(fault: Fault, player: str, talk: Talk, sink: Sink) -> tuple[float, float, float]:
-    """Have a fault and mend it; return the seconds in which two goals ended, and one was heard again."""
+    """Cause a fault and end it; return the seconds until two goals ended and one was heard again."""
     first, second = fault.ends(player)
-    goal, client = begin_with_client(talk, LONG)
+    goal, client = start_goal_with_client(talk, LONG)
     broken = time.monotonic()
     fault.breaks(sink)
     lost = _assert_ended(talk, goal, first, broken)
@@ -145,20 +145,20 @@ def _lose(fault: Fault, player: str, talk: Talk, sink: Sink) -> tuple[float, flo
     meanwhile = _assert_ended(talk, send(talk, LOW), second, time.monotonic())
     fault.mends(sink)
     returned = time.monotonic()
-    return lost, meanwhile, heard_again(talk, sink) - returned
+    return lost, meanwhile, assert_heard_again(talk, sink) - returned
 
 
 def _assert_ended(talk: Talk, goal_id: str, end: End, since: float) -> float:
-    """Assert that a goal is ABORTED in this way, and return after how many seconds."""
+    """Assert that a goal is ABORTED as expected, and return the seconds until its end."""
     assert await_end(talk, goal_id, NEVER_TAKEN + 2) == "ABORTED"
     goal = talk.goal(goal_id)
-    assert_aborted(goal, end.reason, end.words)
+    assert_aborted(goal, end.reason, end.message)
     assert goal["message"] != "speech failed: "
     return talk.watcher.arrived(talk.watcher.wait_for(goal_id, "ABORTED")) - since
 
 
 def test_a_hanging_sound_server_does_not_delay_the_engines_start(make_talk: MakeTalk, tmp_path: Path) -> None:
-    """libespeak-ng looks for PulseAudio when it is initialised, and would wait half a minute for a frozen one."""
+    """libespeak-ng connects to PulseAudio when it is initialised, and would wait 30 s for a frozen one."""
     with socket.socket(socket.AF_UNIX) as frozen:
         frozen.bind(str(tmp_path / "s"))
         frozen.listen()
@@ -171,7 +171,7 @@ def test_a_hanging_sound_server_does_not_delay_the_engines_start(make_talk: Make
 def test_another_player_is_used_if_the_sound_server_takes_no_stream(
     make_talk: MakeTalk, sink: Sink, tmp_path: Path, hangs: bool
 ) -> None:
-    """ALSA has its own way to the device here."""
+    """In this test, ALSA reaches the device without the sound server."""
     with limits(), socket.socket(socket.AF_UNIX) as frozen:
         if hangs:
             frozen.bind(str(tmp_path / "s"))
@@ -185,18 +185,18 @@ def test_another_player_is_used_if_the_sound_server_takes_no_stream(
         goal = talk.goal(done.id)
         assert (done.code, goal["output"]) == (0, None)
         assert_same(heard(talk), render_quick([LOW])[0])
-        assert_within(took - goal["duration"], READY_LIMIT_S * hangs + TOLD, "a sentence by the next player")
+        assert_within(took - goal["duration"], READY_LIMIT_S * hangs + REPORTED, "a sentence by the next player")
 
 
-#: Seconds above a limit of the engine in which a goal's end is told.
+#: Seconds between a limit of the engine and the event of a goal's end.
 SLACK = 0.5
-#: Seconds of LOW.
+#: Duration of LOW in seconds.
 LENGTH = 1.2
 
 PLAY = "aplay -q -t raw -f S16_LE -c 1 -r 22050 --buffer-time=60000"
 
 
-#: Broken players, and the ends of their goals.
+#: Broken players, and the expected ends of their goals.
 BROKEN = {
     "exits 1 at once": (
         "echo 'player: main:831: audio open error: No such device' >&2; exit 1",
@@ -220,32 +220,28 @@ BROKEN = {
         End("audio_stalled", LENGTH + DRAIN_LIMIT_S + SLACK, "player did not exit within 3 s after the sound"),
     ),
 }
-#: The slowest of the players. The others are tested side by side, as the engine waits for some until a limit.
+#: The slowest case. The others are tested in parallel, because some of them last until a limit of the engine.
 LONGEST = "never reads"
 OTHERS = [fault for fault in BROKEN if fault != LONGEST]
 
 
-@pytest.mark.parametrize("faults", [OTHERS, pytest.param([LONGEST], marks=pytest.mark.slow)], ids=" and ".join)
-def test_a_broken_player_aborts_its_goal_in_time(
-    make_talk: MakeTalk, sink: Sink, tmp_path: Path, faults: list[str]
-) -> None:
-    programs = {fault: _script(tmp_path / fault.replace(" ", "-"), BROKEN[fault][0]) for fault in faults}
+@pytest.mark.parametrize("cases", [OTHERS, pytest.param([LONGEST], marks=pytest.mark.slow)], ids=" and ".join)
+def test_a_broken_player_aborts_its_goal(make_talk: MakeTalk, sink: Sink, tmp_path: Path, cases: list[str]) -> None:
+    programs = {case: _script(tmp_path / case.replace(" ", "-"), BROKEN[case][0]) for case in cases}
 
     with limits(), contextlib.ExitStack() as idle:
         for path in programs.values():
             (path.parent / "broken").touch()
-        talks = {fault: make_talk("--player", str(programs[fault]), sink=sink) for fault in faults}
+        talks = {case: make_talk("--player", str(programs[case]), sink=sink) for case in cases}
         for talk in talks.values():
-            idle.enter_context(nothing_left(talk))
-        goals = {fault: (time.monotonic(), send(talk, LOW)) for fault, talk in talks.items()}
-        for fault, talk in talks.items():
-            (_, end), (sent_at, goal) = BROKEN[fault], goals[fault]
-            assert_within(
-                _assert_ended(talk, goal, end, sent_at), end.within, f"the end of a goal whose player {fault}"
-            )
-        for fault, talk in talks.items():
-            (programs[fault].parent / "broken").unlink()
-            heard_again(talk, sink)
+            idle.enter_context(no_leaks(talk))
+        goals = {case: (time.monotonic(), send(talk, LOW)) for case, talk in talks.items()}
+        for case, talk in talks.items():
+            (_, end), (sent_at, goal) = BROKEN[case], goals[case]
+            assert_within(_assert_ended(talk, goal, end, sent_at), end.within, f"the end of a goal whose player {case}")
+        for case, talk in talks.items():
+            (programs[case].parent / "broken").unlink()
+            assert_heard_again(talk, sink)
 
 
 def test_a_player_that_only_reports_underruns_is_not_an_error(make_talk: MakeTalk, sink: Sink, tmp_path: Path) -> None:
@@ -253,16 +249,16 @@ def test_a_player_that_only_reports_underruns_is_not_an_error(make_talk: MakeTal
     program = _script(tmp_path, f"({complains}) >&2 & sleep 100 & exec {PLAY}")
     (tmp_path / "broken").touch()
     talk = make_talk("--player", str(program), "--rate", "450", sink=sink)
-    with nothing_left(talk):
+    with no_leaks(talk):
         for text in (LOW, HOME):
             assert talk.run("say", "--wait", "--", text).code == 0
     talk.recording.wait_until_quiet(0.2)
     assert_heard(talk.recording, render([LOW, HOME], rate=450))
-    talk.stop(gone_within=0.1)  # what the player had started went with it
+    talk.stop(gone_within=0.1)  # the processes that the player started have ended, too
 
 
-def _script(folder: Path, does: str) -> Path:
-    """Write a player that does something while the file "broken" is there, and plays otherwise."""
+def _script(folder: Path, commands: str) -> Path:
+    """Write a player that runs these commands while the file "broken" exists, and plays otherwise."""
     folder.mkdir(exist_ok=True)
-    text = f"#!/bin/sh\nif [ -e {folder}/broken ]; then\n:\n{does}\nexit\nfi\nexec {PLAY}\n"
+    text = f"#!/bin/sh\nif [ -e {folder}/broken ]; then\n:\n{commands}\nexit\nfi\nexec {PLAY}\n"
     return write(folder / "player", text, 0o755)

@@ -1,4 +1,4 @@
-"""A machine without room in TMPDIR, a home, a path or a language, or with a wall clock that jumps."""
+"""A full TMPDIR, missing environment variables, and a wall clock that jumps."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from tests.conftest import MakeTalk
     from tests.support.sink import Sink
 
-#: Servers at the fastest rate there is.
+#: Servers that speak at the maximum rate.
 AUDIBLE = [*TALK, "serve", "--rate", "450"]
 QUIET = [*SERVE, "--rate", "450"]
 VARIABLES = ("HOME", "PATH", "LANG", "TMPDIR")
@@ -33,13 +33,13 @@ VARIABLES = ("HOME", "PATH", "LANG", "TMPDIR")
 
 @contextlib.contextmanager
 def mounted(directory: str, options: str) -> Iterator[None]:
-    """Mount a small file system of its own; skip where this user may not."""
+    """Mount a small file system; skip the test if this user may not."""
     needs("mount", "umount")
     os.mkdir(directory, 0o700)
     command = ["mount", "-t", "tmpfs", "-o", f"mode=700,{options}", "tmpfs", directory]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
-        pytest.skip(f"only root can mount a file system of its own: {done.stderr.splitlines()[0]}")
+        pytest.skip(f"only root can mount a file system: {done.stderr.splitlines()[0]}")
     try:
         yield
     finally:
@@ -47,7 +47,7 @@ def mounted(directory: str, options: str) -> Iterator[None]:
 
 
 def fill(directory: str) -> None:
-    """Write until there is no room for a single byte."""
+    """Fill a file system to the last byte."""
     with open(f"{directory}/full", "wb", buffering=0) as file, contextlib.suppress(OSError):
         while True:
             file.write(b"." * 4096)
@@ -66,7 +66,7 @@ def read_only(directory: str) -> AbstractContextManager[None]:
     return mounted(directory, "size=64k,ro")
 
 
-def speaks(env: dict[str, str]) -> None:
+def assert_speaks(env: dict[str, str]) -> None:
     done = run([*TALK, "say", "--wait", "--", "battery low"], env)
     assert (done.code, done.err) == (0, ""), done
 
@@ -78,21 +78,21 @@ def test_speech_works_with_a_full_or_read_only_temporary_directory(
     with fault(f"{home}/tmp"):
         env = environment(home, **{**sink.env, "TALK_SOCKET": f"{home}/s", "TMPDIR": f"{home}/tmp"})
         with serving(env, command=AUDIBLE) as server:
-            speaks(env)
-            os.kill(children(server.process.pid)[0], signal.SIGKILL)  # the next engine, too, needs no room
-            speaks(env)
+            assert_speaks(env)
+            os.kill(children(server.process.pid)[0], signal.SIGKILL)  # the next engine needs no room, either
+            assert_speaks(env)
 
 
 def test_a_socket_in_a_full_directory_is_served_and_locked(home: str) -> None:
     with full(f"{home}/tmp"):
         env = environment(home, TALK_SOCKET=f"{home}/tmp/s")
         with serving(env, command=QUIET):
-            speaks(env)
+            assert_speaks(env)
             second = run(SERVE, env)
             assert second.code == 11
             assert "is already running at" in second.err
-        with serving(env, command=QUIET):  # and again
-            speaks(env)
+        with serving(env, command=QUIET):  # after a restart
+            assert_speaks(env)
 
 
 def test_an_unusable_socket_directory_is_reported_clearly(home: str) -> None:
@@ -115,16 +115,16 @@ def test_speech_works_with_missing_variables_or_a_missing_home(
     home: str, sink: Sink, missing: tuple[str, ...] | str
 ) -> None:
     env = environment(home, **{**sink.env, "TALK_SOCKET": f"{home}/s"})
-    assert "XDG_RUNTIME_DIR" not in env  # `test_servers_places` tests that it is missing
+    assert "XDG_RUNTIME_DIR" not in env  # see `test_servers_places`
     if isinstance(missing, str):
         env["HOME"] = missing
     else:
         env = {name: value for name, value in env.items() if name not in missing}
     if "PATH" in missing and not any(os.access(f"/{place}/pacat", os.X_OK) for place in ("bin", "usr/bin")):
-        pytest.skip("the player is in no directory that is searched without PATH")
-    # Without a home, aplay's settings for this sink aren't found either.
+        pytest.skip("the player is not in a directory that is searched without PATH")
+    # Not aplay, which reads its settings for this sink from the home.
     with serving(env, "--player", "pacat", command=AUDIBLE) as server:
-        speaks(env)
+        assert_speaks(env)
         assert run([*TALK, "say", "--wait", "--", "größer 二"], env).code == 0
         assert "engine ready" in server.log
 
@@ -143,18 +143,18 @@ def test_a_path_without_players_is_a_clear_error(home: str) -> None:
 def test_clients_in_an_empty_environment_reach_the_server(home: str) -> None:
     env = environment(home, TALK_SOCKET=f"{home}/s")
     with serving(env, command=QUIET):
-        for words in (["status"], ["say", "--wait", "größer"], ["cancel"], ["log"]):
+        for arguments in (["status"], ["say", "--wait", "größer"], ["cancel"], ["log"]):
             kept = {name: env[name] for name in ("PYTHONPATH",) if name in env}
-            done = run([*TALK, "--socket", f"{home}/s", *words], kept)
+            done = run([*TALK, "--socket", f"{home}/s", *arguments], kept)
             assert (done.code, done.err) == (0, ""), done
 
 
-pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="mounts and /proc as Linux has them")
+pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs mounts and /proc of Linux")
 
 HOUR = 3600
-#: Seconds by which a timer may be late on a busy machine.
+#: Allowed delay of a timer in seconds, on a busy machine.
 LATE = 1.0
-#: Python runs this at its start.
+#: Python runs this when it starts.
 SITE_CUSTOMIZE = """
 import time
 _real = time.time
@@ -182,7 +182,7 @@ def test_a_jump_of_the_wall_clock_changes_no_timer_or_throttle(
         long = wire.request("say", text="two", ttl=20)["goal"]["id"]
     os.replace(write(tmp_path / "new", str(seconds)), offset)
     jumped = talk.request("say", text="")["goal"]
-    assert abs(jumped["queued_at"] - time.time() - seconds) < 60, "it did not jump, so nothing is tested"
+    assert abs(jumped["queued_at"] - time.time() - seconds) < 60, "the clock did not jump, so nothing was tested"
     refused = talk.request("say", text="length=0.05 battery low", throttle=60)["goal"]
     assert (refused["state"], refused["reason"]) == ("REJECTED", "throttled")
     assert talk.watcher.wait_for_terminal(short, 10) == "RECALLED"

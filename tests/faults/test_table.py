@@ -1,4 +1,4 @@
-"""The tables of faults name tests that exist, and the one of this folder names each of its modules."""
+"""The tables of faults name only existing tests, and the table of this folder names all of its modules."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent.parent
-#: A file, a function, or both: `test_a.py::test_b`; `::test_c` belongs to the file named before it.
+#: A file, a function, or both: `test_a.py::test_b`. `::test_c` is in the file named before it.
 _NAMED = re.compile(r"`((?:tests/)?[\w/]*\.py)?(?:::(\w+))?`")
 _HEAD = re.compile(r"\| (---|fault|it covers|line|text) \|")
 
@@ -31,14 +31,14 @@ def test_every_row_names_tests_that_exist(folder: str) -> None:
                 assert path.is_file(), f"{path} does not exist: {row}"
             if path and function:
                 assert function in functions(path), f"{path.name} has no {function}: {row}"
-                assert function.startswith("test_"), f"{function} is no test"
+                assert function.startswith("test_"), f"{function} is not a test"
         assert path, f"no test: {row}"
 
 
 def test_every_module_of_faults_is_named_in_a_row() -> None:
     rows = "\n".join(_rows("tests/faults"))
     modules = {path.name for path in Path(__file__).parent.glob("test_*.py")}
-    # Units for systemd and this table are no faults.
+    # Neither systemd units nor this table are faults.
     assert {module for module in modules if f"`{module}" not in rows} == {"test_service_units.py", "test_table.py"}
 
 

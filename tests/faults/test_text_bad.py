@@ -1,4 +1,4 @@
-"""Section "Bad text": whatever a goal's text is, it is spoken as text or refused, and the server lives."""
+"""Bad texts: every text is spoken or refused, and the server survives."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import pytest
 
 from talkcli.engine.parent.render import render
 from talkcli.goals.options import bad_text
-from tests.conformance.hearing import HOME, LOW, assert_aborted, assert_same, begin, send
+from tests.conformance.hearing import HOME, LOW, assert_aborted, assert_same, send, start_goal
 from tests.faults.broken import await_end
 from tests.support.compare import assert_heard
 from tests.support.connection import PATIENCE
@@ -33,18 +33,18 @@ if TYPE_CHECKING:
     from tests.support.processes import Talk
     from tests.support.sink import Sink
 
-#: Characters of one text with many of them.
-_MANY = 1000
-#: All of them in CI, and where TALK_TEST_FUZZ asks for much; elsewhere one of so many.
-_WHOLE = bool(os.environ.get("CI") or os.environ.get("TALK_TEST_FUZZ"))
-_FEW, _FEWER = (1, 1) if _WHOLE else (20, 200)
+#: Number of characters of a text in the test of every character.
+_TEXT_CHARS = 1000
+#: All characters are tested in CI, and if TALK_TEST_FUZZ is set. Otherwise, one in 20 or 200 is.
+_ALL = bool(os.environ.get("CI") or os.environ.get("TALK_TEST_FUZZ"))
+_COMMON_STEP, _LARGE_STEP = (1, 1) if _ALL else (20, 200)
 
 MARKUP = (
     "<speak>hello</speak> &lt; &#65; {{x}}",
     '<audio src="file:///etc/passwd"/><voice name="de"><prosody rate="x-slow">hello</prosody></voice>',
     "[[h@'loU]] [[_^_de]]",
 )
-#: The longest words of several languages, each with its voice.
+#: The longest words of several languages, by voice.
 LONGEST_WORDS = {
     "gmw/de": "Rindfleischetikettierungsüberwachungsaufgabenübertragungsgesetz",
     "trk/tr": "muvaffakiyetsizleştiricileştiriveremeyebileceklerimizdenmişsinizcesine",
@@ -56,7 +56,7 @@ RIGHT_TO_LEFT = {
     "sem/he": "הסוללה חלשה, אני חוזר לבסיס 12:30.",
     "gmw/en": "low \u202eyrettab\u202c \u2067שלום\u2069 now",
 }
-#: Texts with too much of something; less of it if it takes minutes to be spoken.
+#: Texts with thousands of similar characters, fewer if they would be spoken for minutes.
 ENDLESS = {
     "letters": "a" * 10_000,
     "capitals": "WXYZ" * 500,
@@ -77,13 +77,13 @@ ENDLESS = {
     "blanks": " " * 9_999 + "a",
     "lines": "\n" * 9_999 + "a",
 }
-#: Those that are rendered soon. The others tell little more: each is of another script.
-_SOON = ["letters", "signs", "points", "letters with points", "accents", "letters with accents", "syllables"]
-_SOON += ["pictures", "blanks", "lines"]
+#: The texts that are rendered quickly. The others add little: they are similar texts in other scripts.
+_FAST = ["letters", "signs", "points", "letters with points", "accents", "letters with accents", "syllables"]
+_FAST += ["pictures", "blanks", "lines"]
 
 
 def assert_rendered(path: Path, text: str, voice: str = "en") -> None:
-    """Assert that a text is spoken as libespeak-ng speaks it, to the sample."""
+    """Assert that a text has the same samples as with libespeak-ng itself."""
     render(text, str(path), voice=voice)
     with wave.open(str(path)) as file:
         assert file.readframes(file.getnframes()) == reference([Sentence(text, voice=voice)])[0].tobytes(), (
@@ -113,16 +113,16 @@ def test_the_guard_does_not_change_ordinary_sentences(tmp_path: Path) -> None:
 
 
 def _every_character(common: bool) -> Iterator[str]:
-    """Return texts of all assigned characters: of the 32,000 common ones, or of the large sets of East Asia."""
+    """Return texts with all assigned characters: the 32,000 common ones, or the large East Asian sets."""
     large = (range(0x3400, 0xA000), range(0xAC00, 0xD7A4), range(0x17000, 0x19000), range(0x20000, 0xE0000))
     characters = [
         chr(code)
         for code in range(1, sys.maxunicode + 1)
         if unicodedata.category(chr(code)) not in {"Cn", "Co", "Cs"} and common != any(code in block for block in large)
     ]
-    characters = characters[:: _FEW if common else _FEWER]
-    texts = ("".join(characters[at : at + _MANY]) for at in range(0, len(characters), _MANY))
-    return (text for text in texts if bad_text(text) is None)  # one of controls alone says nothing
+    characters = characters[:: _COMMON_STEP if common else _LARGE_STEP]
+    texts = ("".join(characters[at : at + _TEXT_CHARS]) for at in range(0, len(characters), _TEXT_CHARS))
+    return (text for text in texts if bad_text(text) is None)  # a text with only control characters is refused
 
 
 @pytest.mark.slow
@@ -138,7 +138,7 @@ def test_every_assigned_character_can_be_spoken(common: bool) -> None:
 
 @pytest.mark.parametrize("voice", ["tai/shn", pytest.param("sit/yue", marks=pytest.mark.slow)])
 def test_numbers_of_up_to_20_digits_are_spoken(voice: str) -> None:
-    """Without the guard these voices die of those with thirteen and fourteen digits."""
+    """Without the guard, these voices crash at numbers with 13 and 14 digits."""
     chance = random.Random(voice)
     numbers = ["".join(chance.choices("1234567890", k=digits)) for digits in range(1, 21)]
     numbers += ["1111111111111", "1,111,111,111,111"]
@@ -154,7 +154,7 @@ def test_very_long_words_and_right_to_left_scripts_are_spoken_whole(tmp_path: Pa
 
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize(
-    "names", [_SOON, *(pytest.param([name], marks=pytest.mark.slow) for name in ENDLESS if name not in _SOON)]
+    "names", [_FAST, *(pytest.param([name], marks=pytest.mark.slow) for name in ENDLESS if name not in _FAST)]
 )
 def test_thousands_of_characters_of_one_kind_do_not_hang(names: list[str]) -> None:
     texts = [ENDLESS[name] for name in names]
@@ -165,7 +165,7 @@ def test_thousands_of_characters_of_one_kind_do_not_hang(names: list[str]) -> No
 
 
 def test_a_server_survives_bad_texts_and_speaks_the_next_one(talk: Talk) -> None:
-    """Each text is begun and cancelled, as it would take minutes."""
+    """Each text is cancelled after its start, because it would take minutes."""
     for text in ENDLESS.values():
         goal = send(talk, text)
         talk.watcher.wait_for(goal, "ACTIVE")
@@ -174,18 +174,18 @@ def test_a_server_survives_bad_texts_and_speaks_the_next_one(talk: Talk) -> None
     assert talk.run("say", "--wait", "--rate", "450", "--", LOW).code == 0
 
 
-#: Starts the client from a program whose command line would do harm, too.
+#: Starts the client from a program whose command line also contains escapes.
 PARENT = "import subprocess, sys; sys.exit(subprocess.call(sys.argv[2:]))"
 HOSTILE = "a\x1b[31mred\x07\x9b2J\u202egnp.exe\r\nfake line"
-#: A client that needs nothing but a socket, so that its program can have any name.
+#: A client that needs only a socket, so that its executable can have any name.
 CLIENT = """
 import socket, sys
 with socket.socket(socket.AF_UNIX) as connection:
     connection.connect(sys.argv[1])
     connection.sendall(b'{"request": "say", "text": "length=0.1 named", "wait": true}\\n')
-    heard = b""
-    while b'"result"' not in heard:
-        heard += connection.recv(65536)
+    received = b""
+    while b'"result"' not in received:
+        received += connection.recv(65536)
 """
 
 
@@ -203,7 +203,7 @@ def test_terminal_escapes_in_texts_ids_keys_and_names_are_shown_escaped(scripted
     os.symlink(sys.executable, evil)
     command = [sys.executable, "-c", PARENT, HOSTILE, evil, "-c", CLIENT, scripted.socket]
     subprocess.run(command, env=scripted.env, timeout=20, check=True)
-    active = begin(scripted, f"never-ends {HOSTILE}", number=1, key=HOSTILE)
+    active = start_goal(scripted, f"never-ends {HOSTILE}", number=1, key=HOSTILE)
     send(scripted, f"waits {HOSTILE}")
     commands = (["status"], ["log"], ["status", goal], ["status", active], ["cancel", "\x1b[31m"], ["set"], ["cancel"])
     shown = [scripted.run(*words) for words in commands]
@@ -218,15 +218,15 @@ def test_terminal_escapes_in_texts_ids_keys_and_names_are_shown_escaped(scripted
     assert r"ev\x1b[31m" in out + scripted.log + shown[0].out + shown[1].out
 
 
-#: A text for which every known version of libespeak-ng writes past the end of a table.
+#: A text for which all known versions of libespeak-ng write past the end of a table.
 CRASHING = "a." * 200
 UNGUARDED = os.path.join(os.path.dirname(os.path.abspath(__file__)), "fuzz_texts_serve.py")
-#: Seconds for each of a hundred crashing texts, from the first to the sound of the goal behind them.
+#: Seconds per crashing text, from the first to the sound of the goal behind them.
 LOOP_LIMIT = 0.3
 
 
 def unguarded(make_talk: MakeTalk, sink: Sink, *options: str) -> Talk:
-    """Start a server with the real engine, and without the guard before the library."""
+    """Start a server with the real engine, but without the guard for libespeak-ng."""
     return make_talk(*options, program=UNGUARDED, sink=sink)
 
 
@@ -237,14 +237,14 @@ def test_a_crashing_text_among_ten_goals_aborts_only_itself(make_talk: MakeTalk,
     goals = [send(talk, text) for text in texts]
     states = []
     for goal in goals:
-        with limits():  # of each goal by itself, so that the machine's load at one explains nothing at another
+        with limits():  # one block per goal, so that a load during one goal excuses no other
             states.append(await_end(talk, goal, PATIENCE))
     assert states == ["SUCCEEDED"] * 5 + ["ABORTED"] + ["SUCCEEDED"] * 4
-    assert talk.watcher.states(goals[5]) == ["PENDING", "ACTIVE", "ABORTED"]  # never tried again
+    assert talk.watcher.states(goals[5]) == ["PENDING", "ACTIVE", "ABORTED"]  # not tried again
     assert [event["id"] for event in talk.watcher.events() if event.get("state") == "ACTIVE"] == goals
     assert_aborted(talk.goal(goals[5]), "engine_crashed", "SIG")
     talk.recording.wait_until_quiet(0.2)
-    # Spoken by two processes, of which the second begins anew: the goals before the crash, and those after it.
+    # Two processes speak: one the goals before the crash, and a new one those after it.
     assert_heard(talk.recording.samples, [*reference(texts[:5], rate=450), *reference(texts[6:], rate=450)])
 
 
@@ -269,7 +269,7 @@ def test_after_100_crashing_texts_the_next_goal_is_heard_in_time(make_talk: Make
         print(f"{texts} crashing texts and a good one: {heard_at - started_at:.1f} s")
         assert_within(heard_at - started_at, texts * LOOP_LIMIT, f"the goal behind {texts} crashing texts")
 
-    # Each had a process that was ready, so the next one needed no wait.
+    # An engine process was ready for each text, so no goal had to wait for one.
     assert talk.log.count("talk: the engine crashed: it was killed by ") == texts
     assert "engine_failed" not in talk.log
 
@@ -285,9 +285,9 @@ def test_known_crashing_texts_are_spoken_with_the_guard(voice: str) -> None:
     cases = [Case(voice, text) for text in texts]
     guarded = speak_all(cases, guarded=True)
     assert (guarded.texts, guarded.deaths, guarded.faults) == (len(texts), [], [])
-    without = speak_all(cases[:3], guarded=False)
-    assert (without.texts, without.faults) == (3, [])
-    assert without.deaths, "this library needs no guard: look for what still kills it"
+    bare = speak_all(cases[:3], guarded=False)
+    assert (bare.texts, bare.faults) == (3, [])
+    assert bare.deaths, "these texts do not crash this version: find others that do"
 
 
 def test_texts_that_crash_some_voices_are_spoken_by_all_of_them() -> None:

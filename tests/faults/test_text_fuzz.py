@@ -1,4 +1,4 @@
-"""Mutated texts in all voices, for TALK_TEST_FUZZ seconds if that is set."""
+"""Mutated texts in all voices: for some seconds, or TALK_TEST_FUZZ seconds if that is set."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import pytest
 from tests.tools.fuzz_texts import Case, cases, crashers, list_voices, speak_all, today
 
 SECONDS = float(os.environ.get("TALK_TEST_FUZZ") or (30 if os.environ.get("CI") else 10))
-#: Texts of each kind that crashes the library.
-OF_EACH_KIND = 12
+#: Number of texts of each kind that crashes libespeak-ng.
+TEXTS_PER_KIND = 12
 
 
 @pytest.mark.parametrize("count", [25, pytest.param(None, marks=pytest.mark.slow)])
@@ -34,11 +34,11 @@ def test_crashing_texts_with_todays_seed_are_spoken_with_the_guard() -> None:
     source = random.Random(today())
     texts = [
         Case(source.choice(voices) if voice is None else voice, text)
-        for voice, text in itertools.islice(crashers(source), 5 * OF_EACH_KIND)
+        for voice, text in itertools.islice(crashers(source), 5 * TEXTS_PER_KIND)
     ]
-    without = speak_all(texts, guarded=False)
-    assert not without.faults, without.faults
-    assert len(without.deaths) > len(texts) // 2, f"these texts need no guard: {without}"
+    unguarded = speak_all(texts, guarded=False)
+    assert not unguarded.faults, unguarded.faults
+    assert len(unguarded.deaths) > len(texts) // 2, f"these texts need no guard: {unguarded}"
     tally = speak_all(texts, guarded=True)
     assert not tally.faults, tally.faults
     assert not tally.deaths, tally.deaths

@@ -1,4 +1,4 @@
-"""Several users of one machine: which of them get in, and what they can do to each other."""
+"""Several users on one machine: which users are admitted, and what they can do."""
 
 from __future__ import annotations
 
@@ -26,10 +26,9 @@ if TYPE_CHECKING:
 
 SCRIPTED = [SERVE[0], processes.SCRIPTED]
 NOBODY = 65534
-#: The group of the server, and of some of the strangers.
+#: The group of the server and of some strangers.
 GROUP = 4242
-#: A client for users that may be able to read neither this checkout nor its interpreter. It sends lines and prints the
-#: answers.
+#: A client for users who may not be able to read this checkout or its interpreter. It sends lines and prints replies.
 STRANGER = r"""
 import socket, sys
 s = socket.socket(socket.AF_UNIX)
@@ -43,14 +42,14 @@ try:
         s.sendall(line.encode() + b"\n")
     s.shutdown(socket.SHUT_WR)
 except OSError:
-    pass  # closed before that, with the reason
+    pass  # already closed, with the reason
 try:
     while data := s.recv(65536):
         sys.stdout.buffer.write(data)
 except ConnectionResetError:
-    pass  # it closed without reading what was sent
+    pass  # closed without reading the request
 """
-#: A server of another user's, with the greeting of ours.
+#: A server of another user, with the greeting of a talk server.
 IMPOSTOR = r"""
 import os, socket, sys
 s = socket.socket(socket.AF_UNIX)
@@ -73,7 +72,7 @@ pytestmark = [
     pytest.mark.skipif(
         os.getuid() != 0 or shutil.which("setpriv") is None, reason="only root can act as other users (and setpriv)"
     ),
-    pytest.mark.skipif(not sys.platform.startswith("linux"), reason="users, groups and sockets as Linux has them"),
+    pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs users, groups and sockets of Linux"),
 ]
 
 
@@ -89,7 +88,7 @@ def stranger(path: str, *requests: dict[str, object], groups: Sequence[int] = ()
 
 @contextlib.contextmanager
 def impostor(path: str) -> Iterator[Callable[[], bytes]]:
-    """Run another user's server there; gives a function that waits for a client and returns its first bytes."""
+    """Run another user's server; yield a function that waits for a client and returns its first bytes."""
     command = [*as_user(NOBODY), PYTHON, "-u", "-c", IMPOSTOR, path]
     with subprocess.Popen(command, cwd="/", stdout=subprocess.PIPE) as process:
         try:
@@ -110,35 +109,28 @@ def group_server() -> list[str]:
 
 
 def test_the_socket_mode_admits_only_members_of_the_group(home: str) -> None:
-    """A member may silence everybody, and the log tells the user."""
+    """A member may cancel everyone's goals, and the log names the user."""
     path = f"{home}/s"
     with serving(environment(home, TALK_SOCKET=path), command=group_server()) as server, Wire(path) as wire:
         status = os.stat(path)
         assert (status.st_uid, status.st_gid, stat.S_IMODE(status.st_mode)) == (0, GROUP, 0o660)
         assert stranger(path).stderr.strip() == "PermissionError"
         assert stranger(path, groups=[4343]).stderr.strip() == "PermissionError"
-        messages = replies(
-            stranger(path, {"seq": 1, "request": "say", "text": "length=0", "wait": True}, groups=[GROUP])
-        )
-        assert messages[-1]["goal"]["state"] == "SUCCEEDED"
-        assert messages[-1]["goal"]["client"]["uid"] == NOBODY
+        say = {"seq": 1, "request": "say", "text": "length=0", "wait": True}
+        answers = replies(stranger(path, say, groups=[GROUP]))
+        assert answers[-1]["goal"]["state"] == "SUCCEEDED"
+        assert answers[-1]["goal"]["client"]["uid"] == NOBODY
         goal = wire.request("say", text="never-ends", wait=True)["goal"]
         wire.receive_event("state", state="ACTIVE")
         pending = wire.request("say", text="waits")["goal"]
-        messages = replies(stranger(path, {"seq": 1, "request": "cancel"}, groups=[GROUP]))
-        assert {message["canceled"]["id"] for message in messages if "canceled" in message} == {
-            goal["id"],
-            pending["id"],
-        }
+        answers = replies(stranger(path, {"seq": 1, "request": "cancel"}, groups=[GROUP]))
+        canceled = {answer["canceled"]["id"] for answer in answers if "canceled" in answer}
+        assert canceled == {goal["id"], pending["id"]}
         ended = wire.receive_event("result")["goal"]
         assert (ended["state"], ended["by"]["client"]["uid"]) == ("PREEMPTED", NOBODY)
-        requests: list[dict[str, object]] = [
-            {"request": "pause"},
-            {"request": "resume"},
-            {"request": "set", "rate": 150},
-        ]
-        messages = replies(stranger(path, *({"seq": 1, **request} for request in requests), groups=[GROUP]))
-        assert [message["ok"] for message in messages if "ok" in message] == [True] * 3
+        others: list[dict[str, object]] = [{"request": "pause"}, {"request": "resume"}, {"request": "set", "rate": 150}]
+        answers = replies(stranger(path, *({"seq": 1, **other} for other in others), groups=[GROUP]))
+        assert [answer["ok"] for answer in answers if "ok" in answer] == [True] * 3
         assert server.end(signal.SIGTERM) == 0
     line = next(line for line in server.log.splitlines() if f"{goal['id']} PREEMPTED" in line)
     assert f"(canceled by uid {NOBODY}, pid " in line
@@ -147,7 +139,7 @@ def test_the_socket_mode_admits_only_members_of_the_group(home: str) -> None:
 def test_another_user_is_refused_even_if_the_socket_file_is_writable(home: str) -> None:
     path = f"{home}/s"
     with serving(environment(home, TALK_SOCKET=path), command=SCRIPTED) as server, Wire(path) as wire:
-        os.chmod(path, 0o666)  # the server was not told to let others in
+        os.chmod(path, 0o666)  # the server has no --socket-mode that admits others
         (reply,) = replies(stranger(path, {"request": "say", "text": "somebody else"}))
         assert reply["error"] == "permission_denied"
         assert "--socket-mode" in reply["message"]
@@ -166,14 +158,14 @@ def test_a_client_trusts_another_users_server_only_if_it_was_named(home: str) ->
         done = run([*TALK, "say", "a secret"], env)
         assert done.code == 10, done
         assert f"belongs to uid {NOBODY}" in done.err
-        assert heard() == b"b''\n"  # it closed the connection without a word
+        assert heard() == b"b''\n"  # it closed the connection without sending anything
         run([*TALK, "--socket", path, "status"], env)
-        assert b'"hello"' in heard()  # the user named it, and trusts it
+        assert b'"hello"' in heard()  # the user named it, and thus trusts it
 
 
 @pytest.mark.usefixtures("nobody_serves")
 def test_a_server_at_run_talk_is_trusted_whoever_runs_it(home: str) -> None:
-    """The user of the system's service is neither root nor the client's."""
+    """The system service runs as neither root nor the client's user."""
     script = f"""
         set -e
         mount -t tmpfs tmpfs /run
@@ -190,20 +182,20 @@ def test_a_server_at_run_talk_is_trusted_whoever_runs_it(home: str) -> None:
         os.chown(f"{home}/heard", NOBODY, NOBODY)
     done = run(command, environment(home))
     if "unshare" in done.err or "mount" in done.err:
-        pytest.skip(f"this root may not mount: {done.err}")
+        pytest.skip(f"root is not allowed to mount here: {done.err}")
     with open(f"{home}/heard", encoding="utf-8") as file:
         assert '"hello"' in file.read(), done
 
 
 def test_a_users_server_admits_root_and_refuses_other_users(home: str) -> None:
-    needs("/usr/bin/python3")  # they may be able to read neither this checkout nor its interpreter
+    needs("/usr/bin/python3")  # other users may not be able to read this checkout or its interpreter
     for package in (talkcli, click):
         folder = os.path.dirname(str(package.__file__))
         shutil.copytree(folder, f"{home}/lib/{package.__name__}", ignore=shutil.ignore_patterns("__pycache__"))
     subprocess.run(["chmod", "-R", "a+rX", f"{home}/lib"], check=True)
-    os.mkdir(f"{home}/theirs")
-    os.chown(f"{home}/theirs", 4141, 4141)
-    path = f"{home}/theirs/s"
+    os.mkdir(f"{home}/other")
+    os.chown(f"{home}/other", 4141, 4141)
+    path = f"{home}/other/s"
     env = environment(home, TALK_SOCKET=path, PYTHONPATH=f"{home}/lib", PYTHONDONTWRITEBYTECODE="1")
     command = [*as_user(4141), "/usr/bin/python3", "-m", "talkcli", "serve", "--player", "null"]
     with serving(env, command=command):

@@ -1,7 +1,7 @@
-"""Runs a program that cannot be reaped for some seconds after it was killed, as if it hung in a device's driver.
+"""Runs a program that cannot be reaped for some seconds after it was killed, as if it hung in a device driver.
 
-`python trapped.py SECONDS PROGRAM ARGUMENT…`. The kernel waits for a tracer before it takes the resources of a killed
-process away. A program that ends by itself is not held.
+Usage: `python trapped.py SECONDS PROGRAM ARGUMENT…`. The kernel waits for a tracer before it frees a killed process.
+A program that exits normally is reaped at once.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _ALL_CHILDREN = 0x40000000
 
 
 def main() -> None:
-    """Have this process traced, and become the program."""
+    """Start a tracer for this process, and execute the program."""
     libc = ctypes.CDLL(None, use_errno=True)
     libc.ptrace.argtypes = [ctypes.c_ulong] * 4
     libc.ptrace.restype = ctypes.c_long
@@ -35,7 +35,7 @@ def main() -> None:
 
 
 def _trace(libc: ctypes.CDLL, player: int, tell: int, seconds: float) -> None:
-    """Hold the player in its end if it was killed, without any of the player's descriptors."""
+    """Delay the end of the player if it is killed, without keeping any of its descriptors open."""
     os.setsid()
     nothing = os.open(os.devnull, os.O_RDWR)
     for descriptor in (0, 1, 2):

@@ -17,8 +17,8 @@ ELSEWHERE = {
     "The wire": "tests/wire/test_examples.py::test_line_of_socat_says_a_sentence",
     "Two clients": "tests/wire/test_examples.py::test_client_in_shell",
     "Two clients #2": "tests/wire/test_examples.py::test_client_in_plain_python",
-    "Completion": "tests/test_completion.py::test_start_files_of_the_readme_load_it",
-    "Speed": "tests/test_bench.py::test_the_rows_of_a_group_measure_something",
+    "Completion": "tests/test_completion.py::test_the_readmes_start_files_load_the_completion",
+    "Speed": "tests/test_bench.py::test_every_row_of_a_group_measures_something",
 }
 for _path in Path(__file__).parent.glob("test_*.py"):
     if _path != Path(__file__):

@@ -11,7 +11,7 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 from tests.conformance.rawsocket import Raw
-from tests.faults.test_clients_many import crowd
+from tests.faults.test_clients_many import client_process
 from tests.support.surroundings import command_line
 from tests.support.usage import descendants
 
@@ -135,7 +135,7 @@ class Faults(FaultsInTurn):
         client.wait()
 
     def _freeze_clients(self) -> None:
-        with crowd(self._talk, 20, json.dumps({"seq": 1, "request": "watch"})) as clients:
+        with client_process(self._talk, 20, json.dumps({"seq": 1, "request": "watch"})) as clients:
             clients.send_signal(signal.SIGSTOP)
             time.sleep(self.chance.uniform(0.5, 3))
 

@@ -6,7 +6,7 @@ Every other step is a verb:
     a 5 preempt key=k ttl=1     send a goal of priority 5 that preempts; "queue" is preempt=False
     heard a; completed a; failed a; stopped a; deaf a   report this as the engine; * is the active goal
     cancel; cancel a b; cancel current before=c key=k
-    wait 1; pass 1              let a second pass, with or without a look at the clock
+    wait 1; pass 1              let a second pass, with or without a tick
     pause; resume; shutdown; lost; ready; unavailable; missing; room 2 (the places in the queue); set ttl=5 preempt=yes
     loaded joe; unloadable joe; unloaded joe; measured joe 2; chosen a joe      report this about the voice piper/joe
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 ARM = Sender(pid=7, uid=1000, command="talk", name="arm")
 DOOR = Sender(pid=8, uid=1000, command="talk", name="door")
-WORDS = {"yes": True, "no": False}
+FLAGS = {"yes": True, "no": False}
 
 
 @dataclass
@@ -59,61 +59,61 @@ class Robot:
     def now(self) -> Now:
         return Now(self.seconds, 1.7e9 + self.seconds)
 
-    def see(self, effects: list[Effect]) -> list[Effect]:
+    def collect(self, effects: list[Effect]) -> list[Effect]:
         for effect in effects:
             if isinstance(effect, StateChange):
                 self.seen.append(f"{self.name_of(effect.record)} {effect.state.name}")
             elif isinstance(effect, EngineOrder):
                 self.seen.append(f"{self.name_of(effect.record)} {effect.order.value}")
             elif isinstance(effect, VoiceLoadOrder):
-                self.seen += [*(f"drop {each}" for each in effect.dropped), f"load {effect.voice}"]
+                self.seen += [*(f"drop {voice}" for voice in effect.dropped), f"load {effect.voice}"]
             elif isinstance(effect, VoiceDropOrder):
                 self.seen.append(f"drop {effect.voice}")
         return effects
 
     def name_of(self, record: Record) -> str:
-        return next((name for name, each in self.goals.items() if each is record), str(record.number))
+        return next((name for name, other in self.goals.items() if other is record), str(record.number))
 
     # -- single steps
 
-    def asks(self, say: Say, name: str = "", **known: Any) -> Record:
+    def submit(self, say: Say, name: str = "", **known: Any) -> Record:
         record, effects = self.scheduler.submit(say, ARM, self.now, **known)
         if name and not effects:
             self.attached.append(f"{name} is {self.name_of(record)}")
         elif name:
             self.goals[name] = record
-        self.see(effects)
+        self.collect(effects)
         return record
 
-    def says(self, text: str = "door open", *, preempt: bool | None = None, priority: int = 0) -> Record:
-        return self.asks(Say(text, preempt=preempt, priority=priority))
+    def say(self, text: str = "door open", *, preempt: bool | None = None, priority: int = 0) -> Record:
+        return self.submit(Say(text, preempt=preempt, priority=priority))
 
-    def cancels(self, *ids: str, waiting: tuple[str, ...] = (), **selection: Any) -> Cancellation:
+    def cancel(self, *ids: str, waiting: tuple[str, ...] = (), **selection: Any) -> Cancellation:
         done = self.scheduler.cancel(Cancel(ids or None, **selection), DOOR, self.now, waiting)
-        self.see(done.effects)
+        self.collect(done.effects)
         return done
 
-    def waits(self, seconds: float) -> None:
+    def wait(self, seconds: float) -> None:
         self.seconds += seconds
-        self.see(self.scheduler.tick(self.now))
+        self.collect(self.scheduler.tick(self.now))
 
-    def loads(self, voice: str, error: str | None) -> None:
+    def end_loading(self, voice: str, error: str | None) -> None:
         """Report as the engine that a voice was loaded or could not be loaded."""
-        self.see(self.scheduler.voice_load_ended(f"piper/{voice}", error, self.now, has_libraries=True))
+        self.collect(self.scheduler.voice_load_ended(f"piper/{voice}", error, self.now, has_libraries=True))
 
-    def tells(self, event: str, goal_id: str) -> None:
+    def report(self, event: str, goal_id: str) -> None:
         """Report an event of a goal as the engine."""
         match event:
             case "heard":
                 self.scheduler.word_heard(goal_id, 0, 4, 0.25)
             case "completed":
-                self.see(self.scheduler.completed(goal_id, 1.5, self.now))
+                self.collect(self.scheduler.completed(goal_id, 1.5, self.now))
             case "failed":
-                self.see(self.scheduler.failed(goal_id, Reason.AUDIO_LOST, "device is gone", 1.5, self.now))
+                self.collect(self.scheduler.failed(goal_id, Reason.AUDIO_LOST, "device is gone", 1.5, self.now))
             case "deaf":
-                self.see(self.scheduler.failed(goal_id, Reason.NOT_SILENT, "it does not end", None, self.now))
+                self.collect(self.scheduler.failed(goal_id, Reason.NOT_SILENT, "it does not end", None, self.now))
             case "stopped":
-                self.see(self.scheduler.stopped(goal_id, self.now))
+                self.collect(self.scheduler.stopped(goal_id, self.now))
             case _:
                 raise ValueError(event)
 
@@ -124,18 +124,18 @@ class Robot:
             verb, *words = step.split()
             if len(verb) == 1:
                 given = options(words)
-                words_of = {"waited": "waited_s", "fault": "refusal", "canceled": "canceled"}
-                known = {name: given.pop(each) for each, name in words_of.items() if each in given}
+                parameters = {"waited": "waited_s", "fault": "refusal", "canceled": "canceled"}
+                known = {name: given.pop(option) for option, name in parameters.items() if option in given}
                 if "refusal" in known:
                     known["refusal"] = Reason(known["refusal"]), "it can't be had"
                 if "canceled" in known:
                     known["canceled"] = By(client=DOOR)
-                self.asks(Say(**{"text": verb, **given}), verb, **known)
+                self.submit(Say(**{"text": verb, **given}), verb, **known)
             elif verb == "cancel":
                 given = options(words)
-                ids = [self._id(each) for each in words if "=" not in each and each != "current"]
-                selection: dict[str, Any] = {each: self._id(given[each]) for each in ("before", "key") if each in given}
-                self.cancels(*ids, current="current" in given, **selection)
+                ids = [self._id(word) for word in words if "=" not in word and word != "current"]
+                selection: dict[str, Any] = {name: self._id(given[name]) for name in ("before", "key") if name in given}
+                self.cancel(*ids, current="current" in given, **selection)
             else:
                 self._do(verb, words)
         return self
@@ -143,23 +143,23 @@ class Robot:
     def _do(self, verb: str, words: list[str]) -> None:
         scheduler, word = self.scheduler, words[0] if words else ""
         step: Callable[[], object] = {
-            "pause": lambda: self.see(scheduler.pause()),
-            "resume": lambda: self.see(scheduler.resume(self.now)),
-            "shutdown": lambda: self.see(scheduler.shutdown(self.now)),
-            "lost": lambda: self.see(scheduler.engine_lost(self.now)),
-            "ready": lambda: self.see(scheduler.engine_ready(self.now)),
-            "missing": lambda: self.see(scheduler.fail_next("no memory", self.now)),
-            "unavailable": lambda: self.see(scheduler.engine_unavailable(self.now)),
-            "loaded": lambda: self.loads(word, None),
-            "unloadable": lambda: self.loads(word, "no json"),
-            "unloaded": lambda: self.see(scheduler.voice_unloaded(f"piper/{word}", self.now)),
-            "measured": lambda: self.see(scheduler.voices_measured(f"piper/{word}", int(words[1]), self.now)),
-            "chosen": lambda: self.see(scheduler.voice_chosen(self._id(word), f"piper/{words[1]}", self.now)),
-            "wait": lambda: self.waits(float(word)),
+            "pause": lambda: self.collect(scheduler.pause()),
+            "resume": lambda: self.collect(scheduler.resume(self.now)),
+            "shutdown": lambda: self.collect(scheduler.shutdown(self.now)),
+            "lost": lambda: self.collect(scheduler.engine_lost(self.now)),
+            "ready": lambda: self.collect(scheduler.engine_ready(self.now)),
+            "missing": lambda: self.collect(scheduler.fail_next("no memory", self.now)),
+            "unavailable": lambda: self.collect(scheduler.engine_unavailable(self.now)),
+            "loaded": lambda: self.end_loading(word, None),
+            "unloadable": lambda: self.end_loading(word, "no json"),
+            "unloaded": lambda: self.collect(scheduler.voice_unloaded(f"piper/{word}", self.now)),
+            "measured": lambda: self.collect(scheduler.voices_measured(f"piper/{word}", int(words[1]), self.now)),
+            "chosen": lambda: self.collect(scheduler.voice_chosen(self._id(word), f"piper/{words[1]}", self.now)),
+            "wait": lambda: self.wait(float(word)),
             "pass": lambda: setattr(self, "seconds", self.seconds + float(word)),
             "room": lambda: setattr(scheduler, "max_queue", int(word)),
-            "set": lambda: self.see(scheduler.change_settings(options(words), self.now)),
-        }.get(verb, lambda: self.tells(verb, self._id(word)))
+            "set": lambda: self.collect(scheduler.change_settings(options(words), self.now)),
+        }.get(verb, lambda: self.report(verb, self._id(word)))
         step()
 
     def _id(self, name: str) -> str:
@@ -168,27 +168,27 @@ class Robot:
         return self.goals[name].id if name in self.goals else name
 
     def outcome(self) -> str:
-        """Return the outcome of all goals. Check that each goal agrees with the published events."""
+        """Return the outcome of all goals, and check that each goal agrees with the published events."""
         unfinished = self.scheduler.unfinished()
         groups: dict[str, list[str]] = {}
-        for record in [*unfinished, *(each for each in self.goals.values() if each not in unfinished)]:
+        for record in [*unfinished, *(ended for ended in self.goals.values() if ended not in unfinished)]:
             groups.setdefault(self._ending(record), []).append(self.name_of(record))
         return "; ".join([*(f"{' '.join(names)} {ending}" for ending, names in groups.items()), *self.attached])
 
     def _ending(self, record: Record) -> str:
         goal = record.snapshot()
-        told = [each.split()[1] for each in self.seen if each.startswith(f"{self.name_of(record)} ")]
-        states = [each for each in told if each.isupper()]
-        assert states[-1] == goal.state.name, f"it is {goal.state.name}, and was told to be {states}"
+        effects = [effect.split()[1] for effect in self.seen if effect.startswith(f"{self.name_of(record)} ")]
+        states = [effect for effect in effects if effect.isupper()]
+        assert states[-1] == goal.state.name, f"the goal is {goal.state.name}, but {states} were published"
         assert (goal.started_at is not None) == ("ACTIVE" in states)
         assert (goal.ended_at is not None) == goal.state.terminal
         assert (goal.message is not None) == goal.state.terminal
-        words = [goal.state.name, *(["paused"] if goal.paused else []), *([goal.reason] if goal.reason else [])]
+        parts = [goal.state.name, *(["paused"] if goal.paused else []), *([goal.reason] if goal.reason else [])]
         if goal.by and goal.by.goal:
-            words += ["by", self.name_of(next(each for each in self.goals.values() if each.id == goal.by.goal))]
+            parts += ["by", self.name_of(next(other for other in self.goals.values() if other.id == goal.by.goal))]
         elif goal.by and goal.by.client:
-            words += ["by", str(goal.by.client.name)]
-        return " ".join(words)
+            parts += ["by", str(goal.by.client.name)]
+        return " ".join(parts)
 
 
 def play(script: str) -> Robot:
@@ -198,30 +198,30 @@ def play(script: str) -> Robot:
 def rules(table: str) -> list[Any]:
     """Return the rows of a table as test parameters. A row is a rule, followed by an indented "script -> outcome"."""
     blocks = re.findall(r"^(#|\w)(.*)\n((?:    .*\n)*)", table, re.MULTILINE)
-    title, found = "", []
+    title, params = "", []
     for first, rest, example in blocks:
         if first == "#":
             title = f"{rest.strip()}: "
         else:
             script, outcome = " ".join(example.split()).split(" -> ")
-            found.append(pytest.param(script, outcome, id=f"{title}{first}{rest}"))
-    return found
+            params.append(pytest.param(script, outcome, id=f"{title}{first}{rest}"))
+    return params
 
 
 def options(words: list[str]) -> dict[str, Any]:
     """Return the options of a goal in a step. A number is a priority, and a single word is a flag."""
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for word in words:
         name, is_value, value = word.partition("=")
         if is_value:
-            found[name] = WORDS.get(value, number(value))
+            values[name] = FLAGS.get(value, number(value))
         elif name == "queue":
-            found["preempt"] = False
+            values["preempt"] = False
         elif isinstance(number(name), int):
-            found["priority"] = number(name)
+            values["priority"] = number(name)
         else:
-            found[name] = True
-    return found
+            values[name] = True
+    return values
 
 
 def number(word: str) -> int | float | str:

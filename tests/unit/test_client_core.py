@@ -1,4 +1,4 @@
-"""The client core, without a socket: requests, answers, limits, breaks and new connections, and who hears events."""
+"""The client core without a socket: requests, answers, time limits, new connections, and the delivery of events."""
 
 from __future__ import annotations
 
@@ -39,19 +39,19 @@ if TYPE_CHECKING:
     from talkcli.protocol.events import Event
     from talkcli.protocol.requests import Request
 
-PATIENCE = 5.0
+TIMEOUT_S = 5.0
 HELLO = b'{"request": "hello"}\n'
 
 
 class Reconnecting(ClientCore):
-    """A core whose shell connects again."""
+    """A client core whose owner connects again after a disconnect."""
 
     def break_off(self, why: str, now: float) -> None:
         self.disconnected(why, now)
 
 
 def core_of(kind: type[ClientCore] = ClientCore) -> ClientCore:
-    core = kind(PATIENCE, 0.0)
+    core = kind(TIMEOUT_S, 0.0)
     core.path, core.boot = "/s", "4k7f"
     return core
 
@@ -66,21 +66,21 @@ def reconnecting() -> ClientCore:
     return core_of(Reconnecting)
 
 
-def begin(core: ClientCore, request: Request, now: float = 0.0, **options: Any) -> Exchange:
+def submit(core: ClientCore, request: Request, now: float = 0.0, **options: Any) -> Exchange:
     exchange = Exchange(request, **options)
     core.register(exchange, now)
     core.queue(core.line(exchange), exchange)
     return exchange
 
 
-def sent(core: ClientCore) -> list[JsonObject]:
-    """Send all that waits, and return it."""
+def send_all(core: ClientCore) -> list[JsonObject]:
+    """Send all queued lines, and return their messages."""
     data = core.outgoing()
     core.mark_sent(len(data))
-    return [decode(each) for each in data.splitlines()]
+    return [decode(line) for line in data.splitlines()]
 
 
-def hear(core: ClientCore, *messages: JsonObject, now: float = 1.0) -> None:
+def receive(core: ClientCore, *messages: JsonObject, now: float = 1.0) -> None:
     core.receive(b"".join(map(encode, messages)), now)
 
 
@@ -107,30 +107,30 @@ def say(core: ClientCore, now: float = 0.0, **options: Any) -> TrackedGoal:
         tracked._accept(reply)
         tracked._listen_to(core.listeners, feedback=request.feedback, now=now)
 
-    begin(core, request, now, on_reply=on_reply, on_failure=tracked._fail)
+    submit(core, request, now, on_reply=on_reply, on_failure=tracked._fail)
     return tracked
 
 
 def greet(core: ClientCore, boot: str = "4k7f", now: float = 2.0) -> None:
     core.connecting(HELLO)
     core.mark_sent(len(HELLO))
-    hear(core, {"talk": 1, "version": "1.0", "pid": 7, "boot": boot, "features": []}, now=now)
+    receive(core, {"talk": 1, "version": "1.0", "pid": 7, "boot": boot, "features": []}, now=now)
 
 
 # Requests and answers
 
 
-def test_requests_are_numbered_and_go_out_in_their_order(core: ClientCore) -> None:
-    begin(core, Status())
-    begin(core, Say("a", wait=True))
-    assert sent(core) == [
+def test_requests_are_numbered_and_sent_in_order(core: ClientCore) -> None:
+    submit(core, Status())
+    submit(core, Say("a", wait=True))
+    assert send_all(core) == [
         {"seq": 1, "request": "status"},
         {"seq": 2, "request": "say", "text": "a", "wait": True},
     ]
     assert core.outgoing() == b""
 
 
-def test_an_answer_is_a_list_and_a_reply_and_answers_may_overtake_each_other(core: ClientCore) -> None:
+def test_items_belong_to_their_reply_and_replies_may_come_out_of_order(core: ClientCore) -> None:
     tracked = TrackedGoal(Goal("g", State.PENDING))
     tracked._listen_to(core.listeners, feedback=False, now=0.0)
     heard: list[object] = []
@@ -138,36 +138,36 @@ def test_an_answer_is_a_list_and_a_reply_and_answers_may_overtake_each_other(cor
     def on_reply(reply: JsonObject, items: list[JsonObject]) -> None:
         heard.append((reply["count"], len(items), tracked._has_event()))
 
-    first = begin(core, Wait(("g",)), on_reply=on_reply)
-    second = begin(core, Status())
-    hear(core, {"seq": 1, "goal": goal()}, {"seq": 2, "ok": True})
+    first = submit(core, Wait(("g",)), on_reply=on_reply)
+    second = submit(core, Status())
+    receive(core, {"seq": 1, "goal": goal()}, {"seq": 2, "ok": True})
     assert (first.over, second.over) == (False, True)
-    hear(core, {"seq": 1, "ok": True, "count": 1}, state("ACTIVE"), {"seq": 1, "ok": True, "count": 2})
+    receive(core, {"seq": 1, "ok": True, "count": 1}, state("ACTIVE"), {"seq": 1, "ok": True, "count": 2})
     assert core.answer(first) == ({"seq": 1, "ok": True, "count": 1}, [{"seq": 1, "goal": goal()}])
     assert (heard, tracked._take()) == ([(1, 1, False)], StateChanged("g", State.ACTIVE, 0.0, 1))
 
 
-def test_a_refusal_is_an_error_with_the_lines_of_its_list(core: ClientCore) -> None:
-    exchange = begin(core, Cancel(("x",)))
-    hear(core, {"seq": 1, "ended": goal("SUCCEEDED")})
-    hear(core, {"seq": 1, "ok": False, "error": {"code": "unknown_goal", "message": "no x"}})
+def test_a_refusal_raises_an_error_with_the_items_received_before(core: ClientCore) -> None:
+    exchange = submit(core, Cancel(("x",)))
+    receive(core, {"seq": 1, "ended": goal("SUCCEEDED")})
+    receive(core, {"seq": 1, "ok": False, "error": {"code": "unknown_goal", "message": "no x"}})
     with pytest.raises(UnknownGoal, match="no x") as refused:
         core.answer(exchange)
     assert len(refused.value.items) == 1
 
 
 @pytest.mark.parametrize("error", [None, "no", {}, {"code": "bad_text", "message": None}, {"message": ""}])
-def test_a_refusal_without_a_reason_says_so(core: ClientCore, error: object) -> None:
-    exchange = begin(core, Pause())
-    hear(core, {"seq": 1, "ok": False, "error": error})
+def test_a_refusal_without_a_reason_gets_a_default_message(core: ClientCore, error: object) -> None:
+    exchange = submit(core, Pause())
+    receive(core, {"seq": 1, "ok": False, "error": error})
     with pytest.raises(RequestRefused, match=r"^the server refused the request without a reason$"):
         core.answer(exchange)
 
 
 @given(st.lists(st.integers(1, 40)))
-def test_bytes_may_be_taken_in_any_portions(counts: list[int]) -> None:
+def test_outgoing_bytes_may_be_sent_in_chunks_of_any_size(counts: list[int]) -> None:
     core = core_of()
-    exchanges = [begin(core, Say("a" * each)) for each in range(3)]
+    exchanges = [submit(core, Say("a" * size)) for size in range(3)]
     whole = core.outgoing()
     ends = [place + 1 for place, byte in enumerate(whole) if byte == ord("\n")]
     taken = b""
@@ -176,14 +176,14 @@ def test_bytes_may_be_taken_in_any_portions(counts: list[int]) -> None:
         core.mark_sent(len(portion))
         taken += portion
         assert core.unsent_bytes == len(whole) - len(taken)
-        assert [each.sent for each in exchanges] == [len(taken) >= end for end in ends]
+        assert [exchange.sent for exchange in exchanges] == [len(taken) >= end for end in ends]
     assert taken == whole
 
 
 @given(st.lists(st.integers(1, 80)))
-def test_bytes_may_come_in_any_portions(counts: list[int]) -> None:
+def test_incoming_bytes_may_arrive_in_chunks_of_any_size(counts: list[int]) -> None:
     core = core_of()
-    exchange = begin(core, Status())
+    exchange = submit(core, Status())
     data = encode({"seq": 1, "pending": goal()}) + encode({"event": "alive"}) + encode({"seq": 1, "ok": True})
     for count in [*counts, len(data)]:
         core.receive(data[:count], 0.0)
@@ -194,42 +194,42 @@ def test_bytes_may_come_in_any_portions(counts: list[int]) -> None:
 def test_a_request_that_was_sent_early_is_not_sent_again(core: ClientCore) -> None:
     line = encode({"seq": 1, "request": "status"})
     core._sent_early = line[:5]
-    exchange = begin(core, Status())
+    exchange = submit(core, Status())
     assert (core.outgoing(), exchange.sent) == (line[5:], False)
     core = core_of()
     core._sent_early = line
-    exchange = begin(core, Status())
+    exchange = submit(core, Status())
     assert (core.outgoing(), exchange.sent) == (b"", True)
     core = core_of()
     core._sent_early = line
     with pytest.raises(AssertionError, match="early"):
-        begin(core, Pause())
+        submit(core, Pause())
 
 
-def test_a_request_is_held_back_unless_a_part_of_it_is_sent(core: ClientCore) -> None:
-    first, second, third = (begin(core, Say(each)) for each in "abc")
+def test_a_request_can_be_withdrawn_until_a_part_of_it_is_sent(core: ClientCore) -> None:
+    first, second, third = (submit(core, Say(text)) for text in "abc")
     core.mark_sent(3)
     assert core.forget(second)
-    assert [decode(each)["text"] for each in (b'{"s' + core.outgoing()).splitlines()] == ["a", "c"]
+    assert [decode(line)["text"] for line in (b'{"s' + core.outgoing()).splitlines()] == ["a", "c"]
     assert not core.forget(first)
     assert core.forget(third)
     assert core.exchanges == {}
 
 
-def test_sending_ends_and_what_was_sent_is_still_answered(core: ClientCore) -> None:
-    first = begin(core, Status())
-    sent(core)
-    second = begin(core, Status())
+def test_requests_sent_before_sending_stopped_are_still_answered(core: ClientCore) -> None:
+    first = submit(core, Status())
+    send_all(core)
+    second = submit(core, Status())
     core.stop_sending("it is gone")
     with pytest.raises(ServerUnavailable, match="nothing was sent to the server at /s: it is gone"):
         core.answer(second)
     with pytest.raises(ServerUnavailable, match="nothing was sent to the server at /s: it is gone"):
-        begin(core, Status())
-    hear(core, {"seq": 1, "ok": True})
+        submit(core, Status())
+    receive(core, {"seq": 1, "ok": True})
     assert core.answer(first)
 
 
-# The end
+# The end of the connection
 
 
 @pytest.mark.parametrize(
@@ -241,12 +241,12 @@ def test_sending_ends_and_what_was_sent_is_still_answered(core: ClientCore) -> N
         (Status(), False, ServerUnavailable),
     ],
 )
-def test_the_end_loses_what_was_sent(
+def test_the_end_of_the_connection_fails_every_request(
     core: ClientCore, request_: Request, is_sent: bool, error: type[TalkError]
 ) -> None:
-    exchange = begin(core, request_)
+    exchange = submit(core, request_)
     if is_sent:
-        sent(core)
+        send_all(core)
     else:
         core.mark_sent(5)
     core.end("it is gone")
@@ -254,11 +254,11 @@ def test_the_end_loses_what_was_sent(
         core.answer(exchange)
     assert ("nothing was sent" in raised.value.message) != is_sent
     with pytest.raises(ServerUnavailable, match="nothing was sent"):
-        begin(core, Status())
+        submit(core, Status())
 
 
-def test_the_servers_last_words_are_the_reason_of_the_end(core: ClientCore) -> None:
-    hear(core, {"ok": False, "error": {"code": "too_slow", "message": "you are too slow"}})
+def test_the_servers_last_error_explains_why_the_connection_ended(core: ClientCore) -> None:
+    receive(core, {"ok": False, "error": {"code": "too_slow", "message": "you are too slow"}})
     core.end("the server went away")
     assert core.ended == "the server closed the connection: you are too slow"
 
@@ -266,52 +266,52 @@ def test_the_servers_last_words_are_the_reason_of_the_end(core: ClientCore) -> N
 MALFORMED = [
     *(b"{", b"[]", b'{"event": "state", "id": "g", "state": "BORED"}', b'{"event": "result"}'),
     *(
-        encode({**word(1), **each}).strip()
-        for each in ({"word": 1}, {"start": "0"}, {"number": True}, {"time": None}, {"id": None})
+        encode({**word(1), **wrong}).strip()
+        for wrong in ({"word": 1}, {"start": "0"}, {"number": True}, {"time": None}, {"id": None})
     ),
 ]
 
 
 @pytest.mark.parametrize("line", MALFORMED)
-def test_a_malformed_line_ends_the_connection_and_nothing_after_it_counts(core: ClientCore, line: bytes) -> None:
-    exchange = begin(core, Status())
+def test_a_malformed_line_ends_the_connection_and_later_lines_are_ignored(core: ClientCore, line: bytes) -> None:
+    exchange = submit(core, Status())
     core.receive(line + b"\n" + encode({"seq": 1, "ok": True}), 0.0)
     assert (core.ended or "").startswith("the server sent a malformed message")
     assert exchange.reply is None
 
 
-def test_a_reply_with_a_malformed_goal_is_none(core: ClientCore) -> None:
+def test_a_goal_is_lost_if_the_reply_contains_a_malformed_goal(core: ClientCore) -> None:
     tracked = say(core)
-    sent(core)
-    hear(core, {"seq": 1, "ok": True, "goal": {"id": "g", "state": "BORED"}})
+    send_all(core)
+    receive(core, {"seq": 1, "ok": True, "goal": {"id": "g", "state": "BORED"}})
     assert (tracked.goal.state, tracked.goal.reason, core.exchanges) == (State.LOST, "lost", {})
 
 
-# Limits
+# Time limits
 
 
-def test_an_answer_must_come_in_time_and_each_line_of_it_counts(core: ClientCore) -> None:
-    exchange = begin(core, Status(), now=1.0)
-    assert core.answer_deadline(exchange) == 1.0 + PATIENCE
-    sent(core)
-    hear(core, {"seq": 1, "recent": goal()}, now=3.0)
-    assert core.answer_deadline(exchange) == 3.0 + PATIENCE
-    slow = begin(core, Say("a", patient=True), now=1.0)
-    assert core.answer_deadline(slow) == 1.0 + PATIENCE  # it must be sent
-    sent(core)
+def test_each_line_of_an_answer_extends_its_deadline(core: ClientCore) -> None:
+    exchange = submit(core, Status(), now=1.0)
+    assert core.answer_deadline(exchange) == 1.0 + TIMEOUT_S
+    send_all(core)
+    receive(core, {"seq": 1, "recent": goal()}, now=3.0)
+    assert core.answer_deadline(exchange) == 3.0 + TIMEOUT_S
+    slow = submit(core, Say("a", patient=True), now=1.0)
+    assert core.answer_deadline(slow) == 1.0 + TIMEOUT_S  # the request must be sent first
+    send_all(core)
     assert core.answer_deadline(slow) == float("inf")
 
 
-def test_a_silent_server_counts_as_gone(core: ClientCore) -> None:
+def test_a_silent_server_is_considered_gone(core: ClientCore) -> None:
     assert core.silent_by(2.0) == (2.0 + SILENCE_LIMIT_S, "the server sent nothing for 15 s")
-    hear(core, {"event": "alive"}, now=7.0)
+    receive(core, {"event": "alive"}, now=7.0)
     assert core.silent_by(2.0)[0] == 7.0 + SILENCE_LIMIT_S
 
 
-def test_a_goal_without_an_answer_is_lost_if_it_was_sent_else_rejected(core: ClientCore) -> None:
+def test_an_unanswered_goal_is_lost_if_it_was_sent_and_rejected_otherwise(core: ClientCore) -> None:
     tracked = say(core, now=1.0)
-    assert core.next_expiry() == 1.0 + PATIENCE
-    sent(core)
+    assert core.next_expiry() == 1.0 + TIMEOUT_S
+    send_all(core)
     late = say(core, now=1.5)
     assert core.expire(5.9)
     assert (tracked.goal.state, tracked._has_event()) == (State.PENDING, False)
@@ -322,14 +322,14 @@ def test_a_goal_without_an_answer_is_lost_if_it_was_sent_else_rejected(core: Cli
     assert (core.next_expiry(), core.outgoing(), core.exchanges) == (float("inf"), b"", {})
 
 
-def test_a_goal_whose_line_is_sent_in_part_is_rejected_and_the_connection_is_useless(core: ClientCore) -> None:
+def test_a_partly_sent_goal_is_rejected_and_its_connection_is_unusable(core: ClientCore) -> None:
     tracked = say(core)
     core.mark_sent(5)
-    assert not core.expire(PATIENCE)
+    assert not core.expire(TIMEOUT_S)
     assert (tracked.goal.state, tracked.goal.reason) == (State.REJECTED, "not_sent")
 
 
-def test_a_goal_whose_ttl_ends_before_it_can_be_sent_is_rejected(core: ClientCore) -> None:
+def test_a_goal_that_expires_before_it_is_sent_is_rejected(core: ClientCore) -> None:
     tracked = say(core, ttl=2)
     assert core.next_expiry() == 2.0
     core.expire(2.0)
@@ -338,20 +338,20 @@ def test_a_goal_whose_ttl_ends_before_it_can_be_sent_is_rejected(core: ClientCor
 
 def test_a_refused_goal_is_rejected_with_the_servers_code(core: ClientCore) -> None:
     tracked = say(core)
-    sent(core)
-    hear(core, {"seq": 1, "ok": False, "error": {"code": "unknown_field", "message": "no melody"}})
+    send_all(core)
+    receive(core, {"seq": 1, "ok": False, "error": {"code": "unknown_field", "message": "no melody"}})
     assert (tracked.goal.state, tracked.goal.reason) == (State.REJECTED, "unknown_field")
     assert (tracked.goal.message, core.exchanges) == ("not spoken: no melody", {})
 
 
-# A break, and another connection
+# A lost connection, and a new one
 
 
-def test_a_break_loses_what_was_sent_and_rejects_what_was_not(reconnecting: ClientCore) -> None:
-    answered = begin(reconnecting, Status())
+def test_a_disconnect_loses_unanswered_goals_and_rejects_unsent_ones(reconnecting: ClientCore) -> None:
+    answered = submit(reconnecting, Status())
     unanswered, following = say(reconnecting), say(reconnecting)
-    sent(reconnecting)
-    hear(reconnecting, {"seq": 1, "ok": True}, {"seq": 3, "ok": True, "goal": goal()})
+    send_all(reconnecting)
+    receive(reconnecting, {"seq": 1, "ok": True}, {"seq": 3, "ok": True, "goal": goal()})
     partly = say(reconnecting)
     reconnecting.mark_sent(5)
     reconnecting.disconnected("it is gone", 1.0)
@@ -361,47 +361,47 @@ def test_a_break_loses_what_was_sent_and_rejects_what_was_not(reconnecting: Clie
     assert (reconnecting.outgoing(), reconnecting.ended) == (b"", None)
 
 
-def test_goals_of_the_same_server_are_followed_again(reconnecting: ClientCore) -> None:
+def test_goals_are_followed_again_after_reconnecting_to_the_same_server(reconnecting: ClientCore) -> None:
     tracked = say(reconnecting, feedback=True)
-    sent(reconnecting)
-    hear(reconnecting, {"seq": 1, "ok": True, "goal": goal()}, state("PENDING"))
+    send_all(reconnecting)
+    receive(reconnecting, {"seq": 1, "ok": True, "goal": goal()}, state("PENDING"))
     assert tracked._take() == StateChanged("g", State.PENDING, 0.0, 1)
     reconnecting.disconnected("it is gone", 1.0)
-    late = begin(reconnecting, Status(), now=1.5, on_failure=lambda _: None)
+    late = submit(reconnecting, Status(), now=1.5, on_failure=lambda _: None)
     greet(reconnecting)
-    assert sent(reconnecting) == [
+    assert send_all(reconnecting) == [
         {"seq": 3, "request": "wait", "ids": ["g"], "feedback": True},
         {"seq": 2, "request": "status"},
     ]
-    hear(reconnecting, {"seq": 3, "goal": goal("ACTIVE")}, {"seq": 3, "ok": True}, word(5), {"seq": 2, "ok": True})
-    found = [tracked._take(), tracked._take()]
-    assert [type(each) for each in found] == [StateChanged, WordHeard]
+    receive(reconnecting, {"seq": 3, "goal": goal("ACTIVE")}, {"seq": 3, "ok": True}, word(5), {"seq": 2, "ok": True})
+    events = [tracked._take(), tracked._take()]
+    assert [type(event) for event in events] == [StateChanged, WordHeard]
     assert (tracked.goal.state, late.over) == (State.ACTIVE, True)
-    hear(reconnecting, {"event": "result", "goal": goal("SUCCEEDED")})
+    receive(reconnecting, {"event": "result", "goal": goal("SUCCEEDED")})
     assert tracked.goal.state is State.SUCCEEDED
 
 
-def test_goals_of_a_server_that_was_restarted_are_lost(reconnecting: ClientCore) -> None:
+def test_goals_are_lost_if_the_server_was_restarted(reconnecting: ClientCore) -> None:
     tracked = say(reconnecting)
-    sent(reconnecting)
-    hear(reconnecting, {"seq": 1, "ok": True, "goal": goal()})
+    send_all(reconnecting)
+    receive(reconnecting, {"seq": 1, "ok": True, "goal": goal()})
     reconnecting.disconnected("it is gone", 1.0)
     greet(reconnecting, "5m8g")
-    assert (tracked.goal.state, sent(reconnecting), reconnecting.boot) == (State.LOST, [], "5m8g")
+    assert (tracked.goal.state, send_all(reconnecting), reconnecting.boot) == (State.LOST, [], "5m8g")
     assert tracked.goal.message == "result unknown: it is gone; the sentence may still be spoken"
 
 
-def test_a_goal_that_the_same_server_has_forgotten_is_lost(reconnecting: ClientCore) -> None:
+def test_a_goal_that_the_server_has_forgotten_is_lost(reconnecting: ClientCore) -> None:
     tracked = say(reconnecting)
-    sent(reconnecting)
-    hear(reconnecting, {"seq": 1, "ok": True, "goal": goal()})
+    send_all(reconnecting)
+    receive(reconnecting, {"seq": 1, "ok": True, "goal": goal()})
     reconnecting.disconnected("it is gone", 1.0)
     greet(reconnecting)
-    sent(reconnecting)
+    send_all(reconnecting)
     reconnecting.disconnected("gone again", 2.5)
     assert tracked.goal.state is State.PENDING
     greet(reconnecting)
-    hear(reconnecting, {"seq": 3, "ok": False, "error": {"code": "unknown_goal", "message": "no g"}})
+    receive(reconnecting, {"seq": 3, "ok": False, "error": {"code": "unknown_goal", "message": "no g"}})
     assert (tracked.goal.state, tracked.goal.message) == (
         State.LOST,
         "result unknown: no g; the sentence may have been spoken",
@@ -410,10 +410,10 @@ def test_a_goal_that_the_same_server_has_forgotten_is_lost(reconnecting: ClientC
 
 def test_goals_are_lost_if_no_connection_is_made_in_time(reconnecting: ClientCore) -> None:
     tracked = say(reconnecting)
-    sent(reconnecting)
-    hear(reconnecting, {"seq": 1, "ok": True, "goal": goal()})
+    send_all(reconnecting)
+    receive(reconnecting, {"seq": 1, "ok": True, "goal": goal()})
     reconnecting.disconnected("it is gone", 1.0)
-    assert reconnecting.next_expiry() == 1.0 + PATIENCE
+    assert reconnecting.next_expiry() == 1.0 + TIMEOUT_S
     reconnecting.not_connected(ServerUnavailable("no server"))
     reconnecting.expire(5.9)
     assert tracked.goal.state is State.PENDING
@@ -424,30 +424,30 @@ def test_goals_are_lost_if_no_connection_is_made_in_time(reconnecting: ClientCor
     )
 
 
-def test_a_goal_that_is_said_without_a_connection_waits_for_one(reconnecting: ClientCore) -> None:
+def test_a_goal_requested_while_disconnected_waits_for_a_connection(reconnecting: ClientCore) -> None:
     reconnecting.disconnected("it is gone", 1.0)
     tracked, other = say(reconnecting, now=2.0, ttl=4), say(reconnecting, now=2.0)
-    waits_for = begin(reconnecting, Status(), now=2.0)
+    status_request = submit(reconnecting, Status(), now=2.0)
     reconnecting.not_connected(ServerUnavailable("no server"))
     with pytest.raises(ServerUnavailable, match="no server"):
-        reconnecting.answer(waits_for)
+        reconnecting.answer(status_request)
     reconnecting.connecting(HELLO)
     assert reconnecting.outgoing() == HELLO
     reconnecting.mark_sent(len(HELLO))
     assert reconnecting.outgoing() == b""
     greet(reconnecting, "5m8g", now=3.0)
-    assert [each.get("ttl") for each in sent(reconnecting)] == [3.0, None]
+    assert [request.get("ttl") for request in send_all(reconnecting)] == [3.0, None]
     reconnecting.expire(7.9)
-    assert [tracked._has_event(), other._has_event()] == [False, False]  # the limit counts from the greeting on
+    assert [tracked._has_event(), other._has_event()] == [False, False]  # the limit starts at the greeting
     reconnecting.expire(8.0)
     assert other.goal.state is State.LOST
 
 
-def test_a_goal_that_is_said_without_a_connection_is_rejected_in_time(reconnecting: ClientCore) -> None:
+def test_a_goal_requested_while_disconnected_is_rejected_after_the_limit(reconnecting: ClientCore) -> None:
     reconnecting.disconnected("it is gone", 1.0)
     tracked = say(reconnecting, now=2.0)
     reconnecting.not_connected(ServerUnavailable("no server found; tried:\n  /s"))
-    assert reconnecting.next_expiry() == 2.0 + PATIENCE
+    assert reconnecting.next_expiry() == 2.0 + TIMEOUT_S
     assert reconnecting.expire(7.0)
     message = "not spoken: nothing was sent to the server at /s: no server found; tried: /s"
     assert (tracked.goal.reason, tracked.goal.message) == ("not_sent", message)
@@ -462,53 +462,53 @@ def test_a_goal_that_is_said_without_a_connection_is_rejected_in_time(reconnecti
         ({"ok": True}, ServerUnavailable),
     ],
 )
-def test_a_greeting_that_refuses_is_an_error(
+def test_a_greeting_that_refuses_the_client_raises_an_error(
     reconnecting: ClientCore, greeting: JsonObject, error: type[TalkError]
 ) -> None:
     reconnecting.disconnected("it is gone", 1.0)
     reconnecting.connecting(HELLO)
     with pytest.raises(error):
-        hear(reconnecting, greeting)
+        receive(reconnecting, greeting)
 
 
-# Who hears what
+# Events
 
 
-def test_watching_ends_with_a_break_or_goes_on_with_another_snapshot(reconnecting: ClientCore) -> None:
+def test_a_watch_ends_at_a_disconnect_or_resumes_with_a_new_snapshot(reconnecting: ClientCore) -> None:
     ending, lasting = EventBuffer(), EventBuffer(reconnects=True)
     reconnecting.listeners.watches.add(ending)
     reconnecting.listeners.watches.add(lasting)
-    hear(reconnecting, state("ACTIVE", 5))
+    receive(reconnecting, state("ACTIVE", 5))
     reconnecting.disconnected("it is gone", 1.0)
     greet(reconnecting, "5m8g")
-    assert sent(reconnecting) == [{"seq": 1, "request": "watch"}]
-    hear(reconnecting, {"seq": 1, "ok": True, "server": {"pid": 7}, "active": None}, state("ACTIVE", 5))
+    assert send_all(reconnecting) == [{"seq": 1, "request": "watch"}]
+    receive(reconnecting, {"seq": 1, "ok": True, "server": {"pid": 7}, "active": None}, state("ACTIVE", 5))
     assert ending.closed == "no more events from the server at /s: it is gone"
     assert taken(ending) == [StateChanged]
     assert (lasting.closed, taken(lasting)) == (None, [StateChanged, Snapshot, StateChanged])
     del lasting
     reconnecting.disconnected("it is gone", 3.0)
     greet(reconnecting, "5m8g")
-    assert sent(reconnecting) == []
+    assert send_all(reconnecting) == []
 
 
-def test_watching_that_is_refused_later_ends(reconnecting: ClientCore) -> None:
+def test_a_watch_ends_if_it_is_refused_after_reconnecting(reconnecting: ClientCore) -> None:
     buffer = EventBuffer(reconnects=True)
     reconnecting.listeners.watches.add(buffer)
     reconnecting.disconnected("it is gone", 1.0)
     greet(reconnecting)
-    hear(reconnecting, {"seq": 1, "ok": False, "error": {"code": "busy", "message": "no"}})
+    receive(reconnecting, {"seq": 1, "ok": False, "error": {"code": "busy", "message": "no"}})
     assert buffer.closed == "no"
 
 
 def taken(buffer: EventBuffer) -> list[type[Event]]:
-    found = []
+    kinds = []
     while event := buffer.take():
-        found.append(type(event))
-    return found
+        kinds.append(type(event))
+    return kinds
 
 
-def test_buffer_hands_out_in_order_and_drops_the_oldest_feedback() -> None:
+def test_a_buffer_keeps_the_order_and_drops_the_oldest_feedback() -> None:
     buffer = EventBuffer()
     changed, heard = StateChanged("g", State.ACTIVE), WordHeard("g", "a", 0, 1, 1, 0.0)
     for number in range(MAX_FEEDBACK_EVENTS + 2):
@@ -525,55 +525,56 @@ def test_buffer_hands_out_in_order_and_drops_the_oldest_feedback() -> None:
     buffer.add(changed)
     buffer.add(heard)
     assert "read too slowly" in (buffer.closed or "")
-    assert len(taken(buffer)) == MAX_STATE_EVENTS  # nothing that came after what is missing
+    assert len(taken(buffer)) == MAX_STATE_EVENTS  # no event after the one that did not fit
 
 
-def test_words_are_kept_only_for_a_goal_with_feedback_and_other_kinds_of_events_never(core: ClientCore) -> None:
+def test_word_events_are_kept_only_with_feedback_and_unknown_events_never(core: ClientCore) -> None:
     plain, fed = say(core), say(core, feedback=True)
     for number in (1, 2):
-        hear(core, {"seq": number, "ok": True, "goal": goal()})
+        receive(core, {"seq": number, "ok": True, "goal": goal()})
     paused: JsonObject = {"event": "paused", "paused": True, "id": "g", "by": None, "n": 3}
-    hear(core, {"event": "viseme", "id": "g"}, {"event": None}, {**word(1), "viseme": "o"}, paused)
-    hear(core, {"event": "result", "goal": goal("SUCCEEDED")})
+    receive(core, {"event": "viseme", "id": "g"}, {"event": None}, {**word(1), "viseme": "o"}, paused)
+    receive(core, {"event": "result", "goal": goal("SUCCEEDED")})
     for tracked, kinds in ((plain, [Result]), (fed, [WordHeard, PausedChanged, Result])):
         assert [type(tracked._take()) for _ in kinds] == kinds
         assert tracked.speech_paused
 
 
-def test_a_reader_of_all_goals_gets_each_state_once_and_with_the_whole_goal(core: ClientCore) -> None:
+def test_a_watch_gets_each_state_once_with_the_full_goal(core: ClientCore) -> None:
     """A connection that waits for a goal and watches all goals receives each state twice."""
     watching = EventBuffer()
     core.listeners.watches.add(watching)
     tracked = say(core)
-    hear(core, {"seq": 1, "ok": True, "goal": goal()})
+    receive(core, {"seq": 1, "ok": True, "goal": goal()})
     for number, name in enumerate(("PENDING", "ACTIVE", "SUCCEEDED"), 1):
         whole: JsonObject = {} if name == "ACTIVE" else {"goal": goal(name)}
-        hear(core, state(name, number), {**state(name, number), **whole})
-    hear(core, {"event": "result", "goal": goal("SUCCEEDED")})
+        receive(core, state(name, number), {**state(name, number), **whole})
+    receive(core, {"event": "result", "goal": goal("SUCCEEDED")})
     states = [State.PENDING, State.ACTIVE, State.SUCCEEDED]
     own = [tracked._take() for _ in range(4)]
-    assert [each.state for each in own if isinstance(each, StateChanged)] == states
+    assert [event.state for event in own if isinstance(event, StateChanged)] == states
     assert isinstance(own[-1], Result)
     seen = [event for event in iter(watching.take, None) if isinstance(event, StateChanged)]
-    assert [(each.state, each.goal is not None) for each in seen] == list(zip(states, (True, False, True), strict=True))
+    assert [event.state for event in seen] == states
+    assert [event.goal is not None for event in seen] == [True, False, True]
 
 
-def test_event_that_comes_twice_is_kept_once() -> None:
+def test_a_duplicate_event_is_kept_once() -> None:
     buffer = EventBuffer()
     for number in (1, 1, 2, None, None):
         buffer.add(StateChanged("g", State.ACTIVE, n=number))
     assert len(buffer) == 4
 
 
-def test_ended_goal_hears_nothing_more(core: ClientCore) -> None:
+def test_an_ended_goal_ignores_later_events(core: ClientCore) -> None:
     tracked = say(core)
-    sent(core)
-    hear(core, {"seq": 1, "ok": True, "goal": goal(), "attached": True, "paused": True})
+    send_all(core)
+    receive(core, {"seq": 1, "ok": True, "goal": goal(), "attached": True, "paused": True})
     assert (tracked.attached, tracked.speech_paused) == (True, True)
-    hear(core, state("ACTIVE"), word(1), {"event": "paused", "paused": True, "id": "g", "by": None, "n": 2})
+    receive(core, state("ACTIVE"), word(1), {"event": "paused", "paused": True, "id": "g", "by": None, "n": 2})
     assert (tracked.goal.paused, core.listeners.goals) == (True, {"g": False})
-    hear(core, {"event": "result", "goal": goal("SUCCEEDED")}, state("ACTIVE"))
-    assert [type(each) for each in (tracked._take(), tracked._take(), tracked._take())] == [
+    receive(core, {"event": "result", "goal": goal("SUCCEEDED")}, state("ACTIVE"))
+    assert [type(event) for event in (tracked._take(), tracked._take(), tracked._take())] == [
         StateChanged,
         Result,
         Result,

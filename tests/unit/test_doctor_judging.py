@@ -43,11 +43,11 @@ SERVER: dict[str, object] = {
 }  # fmt: skip
 
 
-def of(findings: list[Finding], check: str) -> Finding:
-    return next(each for each in findings if each.check == check)
+def find(findings: list[Finding], check: str) -> Finding:
+    return next(finding for finding in findings if finding.check == check)
 
 
-def test_the_next_step_is_that_of_the_first_failure() -> None:
+def test_the_next_step_is_taken_from_the_first_failure() -> None:
     played, group = ok("sentence", "played"), warning("group", "not in audio", "usermod")
     lost = failure("socket", "no server", "talk serve")
     stuck = failure("sentence", "ABORTED", "look at the loudspeaker")
@@ -56,54 +56,54 @@ def test_the_next_step_is_that_of_the_first_failure() -> None:
     assert next_step([group, played]) is None
 
 
-def cured(reason: str, words: str, player: str | None = None, behind: str | None = None) -> str:
-    """Return the next step after a sentence that ended so; `behind`: that of the checks before."""
-    played = SentenceResult(State.ABORTED, reason, words, player=player)
-    return str(sentence.judge_sentence(played, silent=False, playback_step=behind, device="usb").next)
+def step_after(reason: str, message: str, player: str | None = None, earlier: str | None = None) -> str:
+    """Return the next step after a sentence that failed like this. `earlier` is the next step of the earlier checks."""
+    played = SentenceResult(State.ABORTED, reason, message, player=player)
+    return str(sentence.judge_sentence(played, silent=False, playback_step=earlier, device="usb").next)
 
 
-def test_the_next_step_for_a_missing_device_is_that_of_its_check() -> None:
-    looked = [warning("cards", "none", "plug in"), warning("group", "not in audio", "usermod"), ok("python", "3")]
-    assert find_playback_step(looked) == "usermod"
-    assert find_playback_step(looked[2:]) is None
-    assert cured("audio_device", "aplay: Permission denied", behind="usermod") == "usermod"
-    assert cured("audio_lost", "unplugged", behind="usermod") == "usermod"
-    assert "another program" in cured("audio_device", "aplay: Device or resource busy", behind="usermod")
-    assert "talk set --voice" in cured("nothing_to_say", "nothing", behind="usermod")
-    assert cured("audio_device", "aplay: No such device") == sentence.ADVICE["audio_device"]
-    assert "usermod" in cured("audio_device", "aplay: Operation not permitted")
+def test_the_next_step_for_a_missing_device_comes_from_the_device_checks() -> None:
+    findings = [warning("cards", "none", "plug in"), warning("group", "not in audio", "usermod"), ok("python", "3")]
+    assert find_playback_step(findings) == "usermod"
+    assert find_playback_step(findings[2:]) is None
+    assert step_after("audio_device", "aplay: Permission denied", earlier="usermod") == "usermod"
+    assert step_after("audio_lost", "unplugged", earlier="usermod") == "usermod"
+    assert "another program" in step_after("audio_device", "aplay: Device or resource busy", earlier="usermod")
+    assert "talk set --voice" in step_after("nothing_to_say", "nothing", earlier="usermod")
+    assert step_after("audio_device", "aplay: No such device") == sentence.ADVICE["audio_device"]
+    assert "usermod" in step_after("audio_device", "aplay: Operation not permitted")
 
 
-def test_a_custom_player_is_to_be_tried_by_hand_unless_it_names_a_cause() -> None:
+def test_a_custom_player_is_to_be_tested_by_hand_unless_the_cause_is_known() -> None:
     cards = warning("cards", "none in this container", "start the container with --device /dev/snd")
     missing = warning("player", "it is not there", "name a program that is there")
     assert find_playback_step([cards], custom=True) is None
     assert find_playback_step([cards, missing], custom=True) == "name a program that is there"
     stalled = ("audio_stalled", "it accepted no sound for 5 s")
     by_hand = "test the player with a second of silence: head -c 44100 /dev/zero | sox -r 22050 -d usb"
-    assert cured(*stalled, "sox -r {rate} -d {device}") == by_hand
-    assert cured(*stalled, "aplay -r {rate}") == sentence.ADVICE["audio_stalled"]
-    assert "another program" in cured("audio_device", "Device or resource busy", "sox")
+    assert step_after(*stalled, "sox -r {rate} -d {device}") == by_hand
+    assert step_after(*stalled, "aplay -r {rate}") == sentence.ADVICE["audio_stalled"]
+    assert "another program" in step_after("audio_device", "Device or resource busy", "sox")
 
 
 BUSY = SentenceResult(State.ABORTED, "audio_device", "aplay: audio open error: Device or resource busy")
 
 
-def test_a_device_that_is_busy_with_the_server_s_speech_is_well() -> None:
-    found = sentence.judge_sentence(replace(BUSY, beside_speech=True), silent=True, device=None)
-    assert (found.state, "busy, because the server is speaking" in found.message) == (OK, True)
-    found = sentence.judge_sentence(BUSY, silent=True, device=None)
-    assert (found.state, "another program uses the device" in str(found.next)) == (FAILURE, True)
+def test_a_device_that_is_busy_with_the_servers_speech_is_ok() -> None:
+    finding = sentence.judge_sentence(replace(BUSY, beside_speech=True), silent=True, device=None)
+    assert (finding.state, "busy, because the server is speaking" in finding.message) == (OK, True)
+    finding = sentence.judge_sentence(BUSY, silent=True, device=None)
+    assert (finding.state, "another program uses the device" in str(finding.next)) == (FAILURE, True)
     gone = SentenceResult(State.ABORTED, "audio_device", "aplay: audio open error: No such device")
     assert sentence.judge_sentence(replace(gone, beside_speech=True), silent=True, device=None).state == FAILURE
 
 
-def test_whether_the_server_spoke_is_seen_from_its_goals_before_and_after(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_servers_goals_before_and_after_show_whether_it_spoke(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sentence, "speak_by_engine", lambda *_: BUSY)
 
     def spoke(before: tuple[Goal | None, Sequence[Goal]], after: tuple[Goal | None, Sequence[Goal]]) -> bool:
-        told = (SimpleNamespace(active=active, recent=recent) for active, recent in (before, after))
-        client = cast("Client", SimpleNamespace(status=told.__next__))
+        statuses = (SimpleNamespace(active=active, recent=recent) for active, recent in (before, after))
+        client = cast("Client", SimpleNamespace(status=statuses.__next__))
         played = sentence.speak_beside_server(client, EngineOptions(), 1.0)
         assert played == replace(BUSY, beside_speech=played.beside_speech)
         return played.beside_speech
@@ -122,10 +122,10 @@ CLIENT = cast("Client", object())
 WARNED = [warning("sound server", "it hangs", "restart it")]
 
 
-def examined(
+def examine(
     played: SentenceResult, client: Client | None = CLIENT, *, silent: bool = False, **facts: object
 ) -> Finding:
-    """Return the finding about a sentence that ended like this; `facts`: attributes of the examination."""
+    """Return the finding about a sentence with this result. `facts` are attributes of the examination."""
     examination = LocalExamination(None, silent=silent)
     engine = EngineReport(reason=played.reason, message=str(played.message)) if client is None else ENGINE
     session = UserSession(0, "root", server_pid=7)
@@ -142,39 +142,32 @@ def examined(
 HUNG = SentenceResult(State.ABORTED, "engine_hung", "silence")
 
 
-def test_the_next_step_after_a_sentence_depends_on_the_checks_before() -> None:
-    assert examined(STALLED).next == examined(STALLED, silent=True).next == "pactl suspend-sink usb 0"
-    assert examined(STALLED, hangs=True).next == "restart it"
-    custom = examined(replace(STALLED, player="mine"), server={"player": "mine"})
+def test_the_next_step_after_a_sentence_depends_on_the_earlier_checks() -> None:
+    assert examine(STALLED).next == examine(STALLED, silent=True).next == "pactl suspend-sink usb 0"
+    assert examine(STALLED, hangs=True).next == "restart it"
+    custom = examine(replace(STALLED, player="mine"), server={"player": "mine"})
     assert str(custom.next).startswith("test the player with")
-    assert examined(HUNG, None, hangs=True).next == "restart it"
-    assert str(examined(HUNG, None).next).startswith("run talk doctor again")
-    assert str(examined(STALLED, silent=True, server_pid=None).next).startswith("run talk doctor --silent there")
+    assert examine(HUNG, None, hangs=True).next == "restart it"
+    assert str(examine(HUNG, None).next).startswith("run talk doctor again")
+    assert str(examine(STALLED, silent=True, server_pid=None).next).startswith("run talk doctor --silent there")
 
 
-def test_another_user_s_server_is_to_be_examined_by_that_user(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_server_is_to_be_examined_by_the_user_who_runs_it(monkeypatch: pytest.MonkeyPatch) -> None:
     gone = SentenceResult(State.ABORTED, "audio_device", "aplay: audio open error: No such device")
     monkeypatch.setattr(sound, "file_owner", lambda path: 33 if path == "/proc/7" else None)
-    assert str(examined(gone, silent=True, session=UserSession(0, "root")).next).endswith(
-        ": sudo -u '#33' talk doctor --silent"
-    )
+    root = UserSession(0, "root")
+    assert str(examine(gone, silent=True, session=root).next).endswith(": sudo -u '#33' talk doctor --silent")
     monkeypatch.setattr(sound, "file_owner", lambda _: None)  # as if /proc were mounted with hidepid
-    assert (
-        examined(gone, silent=True, session=UserSession(0, "root")).next
-        == examined(gone, silent=True).next
-        == "restart it"
-    )
+    assert examine(gone, silent=True, session=root).next == examine(gone, silent=True).next == "restart it"
 
 
-def test_a_player_without_sound_plays_a_sentence_that_is_not_heard() -> None:
+def test_a_sentence_played_by_a_silent_player_is_reported_as_such() -> None:
     played = SentenceResult(State.SUCCEEDED, duration=1.0, player="null")
-    assert "a sentence was played without sound" in examined(played, server={"player": "null"}).message
-    assert "without sound" not in examined(played, server={"player": "aplay"}).message
+    assert "a sentence was played without sound" in examine(played, server={"player": "null"}).message
+    assert "without sound" not in examine(played, server={"player": "aplay"}).message
 
 
-def test_without_a_server_an_engine_process_plays_by_the_variables(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_server_the_sentence_uses_the_environment_variables(monkeypatch: pytest.MonkeyPatch) -> None:
     given: list[tuple[object, ...]] = []
 
     def by_engine(*arguments: object) -> SentenceResult:
@@ -187,14 +180,14 @@ def test_without_a_server_an_engine_process_plays_by_the_variables(monkeypatch: 
     for silent in (False, True):
         LocalExamination(None, silent=silent)._speak_sentence()
     setting = EngineOptions("pacat", None, "de")
-    assert [each[:3] for each in given] == [(SENTENCE_TEXT, setting, 1.0), (SENTENCE_TEXT, setting, 0.0)]
+    assert [call[:3] for call in given] == [(SENTENCE_TEXT, setting, 1.0), (SENTENCE_TEXT, setting, 0.0)]
 
 
-def test_silent_plays_with_the_server_s_settings_and_tries_the_same_players(monkeypatch: pytest.MonkeyPatch) -> None:
-    def setting(told: str | None, *, named: bool) -> EngineOptions:
+def test_silent_mode_uses_the_servers_settings_and_players(monkeypatch: pytest.MonkeyPatch) -> None:
+    def setting(configured: str | None, *, named: bool) -> EngineOptions:
         monkeypatch.setattr(sound, "names_a_player", lambda *_: named)
         examination = LocalExamination(None, silent=True)
-        examination._server = {"player": told, "device": "usb", "voice": "de", "driver": "espeak"}
+        examination._server = {"player": configured, "device": "usb", "voice": "de", "driver": "espeak"}
         examination._env = {}
         return examination._copy_server_options(7)
 
@@ -207,13 +200,13 @@ def test_silent_plays_with_the_server_s_settings_and_tries_the_same_players(monk
     assert setting(None, named=False) == EngineOptions(None, *rest, None, {})
 
 
-def test_foreign_text_is_escaped_in_every_finding() -> None:
-    found = failure("device", "aplay: \x1b[2Jred", "remove \u202e it\n")
-    assert (found.message, found.next) == ("aplay: \\x1b[2Jred", "remove \\u202e it\\n")
+def test_control_characters_are_escaped_in_every_finding() -> None:
+    finding = failure("device", "aplay: \x1b[2Jred", "remove \u202e it\n")
+    assert (finding.message, finding.next) == ("aplay: \\x1b[2Jred", "remove \\u202e it\\n")
 
 
 @pytest.mark.parametrize(
-    ("reason", "words", "check", "step"),
+    ("reason", "message", "check", "step"),
     [
         ("engine_failed", "pyttsx3 is missing (no module): install it", "pyttsx3", "pip"),
         ("engine_failed", "libespeak-ng is missing: install it", "libespeak-ng", "libesp"),
@@ -223,27 +216,28 @@ def test_foreign_text_is_escaped_in_every_finding() -> None:
         ("unknown_voice", 'unknown voice "x"', "voices", "talk voices"),
     ],
 )
-def test_a_voice_that_cannot_speak_is_named(reason: str, words: str, check: str, step: str) -> None:
-    engine = EngineReport(reason=reason, message=words)
-    found = of(voice.judge_engine("2.99", engine, server=None), check)
-    assert found.state == FAILURE
-    assert words in found.message
-    assert step in (found.next or "")
-    assert of(voice.judge_engine("2.99", engine, server="ready"), check).state == WARNING, "the server has its own"
+def test_an_engine_failure_is_reported_by_the_right_check(reason: str, message: str, check: str, step: str) -> None:
+    engine = EngineReport(reason=reason, message=message)
+    finding = find(voice.judge_engine("2.99", engine, server=None), check)
+    assert finding.state == FAILURE
+    assert message in finding.message
+    assert step in (finding.next or "")
+    beside_server = voice.judge_engine("2.99", engine, server="ready")
+    assert find(beside_server, check).state == WARNING, "the server has its own engine"
 
 
-def test_a_voice_that_can_speak_is_told_with_its_version_and_voices() -> None:
-    found = voice.judge_engine("2.99", ENGINE, server=None)
-    assert [each.check for each in found] == ["pyttsx3", "libespeak-ng", "voices"]
-    assert {each.state for each in found} == {OK}
-    assert "1.51 (system)" in found[1].message
-    assert "141" in found[2].message
+def test_a_working_engine_is_reported_with_its_version_and_voices() -> None:
+    findings = voice.judge_engine("2.99", ENGINE, server=None)
+    assert [finding.check for finding in findings] == ["pyttsx3", "libespeak-ng", "voices"]
+    assert {finding.state for finding in findings} == {OK}
+    assert "1.51 (system)" in findings[1].message
+    assert "141" in findings[2].message
     for voices in (None, ()):
         engine = EngineReport(READY, voices)
         assert voice.judge_engine("2.99", engine, server="starting")[-1].state == WARNING
 
 
-def test_a_library_that_the_server_lacks_comes_before_its_silent_player() -> None:
+def test_a_missing_library_is_fixed_before_a_silent_player() -> None:
     for engine in (ENGINE, EngineReport(reason="engine_failed", message=MISSING)):
         judged = voice.judge_engine("2.99", engine, server=MISSING)
         assert next_step([*judged, sound.judge_silent_player("null", by_server=True)]) == voice.INSTALL_LIBRARY
@@ -257,7 +251,7 @@ OTHER_SOCKET = "/run/user/7/talk/talk.sock"
 
 
 @pytest.mark.parametrize(
-    ("place", "named_by", "error", "others", "words", "step"),
+    ("place", "named_by", "error", "others", "message", "step"),
     [
         (SocketPlace(PATH, PLACE_FORBIDDEN, 7), None, NONE, [], "permission denied (uid 7)", "ask uid 7 for access"),
         (SocketPlace(PATH, PLACE_ABSENT), "--socket", NONE, [], "--socket names", "leave out --socket, or"),
@@ -266,30 +260,30 @@ OTHER_SOCKET = "/run/user/7/talk/talk.sock"
         (SocketPlace(PATH, PLACE_ABSENT), None, NONE, [OTHER_SOCKET], "not found", f"talk --socket {OTHER_SOCKET}"),
     ],
 )
-def test_without_a_server_each_place_is_described(
+def test_a_missing_server_is_explained_by_the_state_of_its_socket(
     monkeypatch: pytest.MonkeyPatch,
     place: SocketPlace,
     named_by: str | None,
     error: TalkError,
     others: list[str],
-    words: str,
+    message: str,
     step: str,
 ) -> None:
     monkeypatch.setattr(paths, "client_sockets", lambda _: [])
     monkeypatch.setattr("glob.glob", lambda _: others)
     judgement = server.explain_missing_server([place], named_by, error)
     assert judgement.state == FAILURE
-    assert words in judgement.message
+    assert message in judgement.message
     assert step in str(judgement.next)
 
 
-def test_an_obstacle_before_the_server_s_place_is_a_warning() -> None:
-    words = f"the server is on {PATH} (process 4711)"
-    found = server.judge_found_server(words, [SocketPlace("/a", PLACE_ABSENT)])
-    assert (found.state, found.message) == (OK, words)
-    found = server.judge_found_server(words, [SocketPlace("/a", server.PLACE_FOREIGN, 7)])
-    assert found.state == WARNING
-    assert "/a: another user's server (uid 7)" in found.message
+def test_another_users_socket_before_the_servers_one_is_a_warning() -> None:
+    message = f"the server is on {PATH} (process 4711)"
+    finding = server.judge_found_server(message, [SocketPlace("/a", PLACE_ABSENT)])
+    assert (finding.state, finding.message) == (OK, message)
+    finding = server.judge_found_server(message, [SocketPlace("/a", server.PLACE_FOREIGN, 7)])
+    assert finding.state == WARNING
+    assert "/a: another user's server (uid 7)" in finding.message
 
 
 @pytest.mark.parametrize(
@@ -305,54 +299,58 @@ def test_an_obstacle_before_the_server_s_place_is_a_warning() -> None:
         ({"volume": 0.1 + 0.2, "ttl": 1.23456789012}, "settings", OK, "None"),
     ],
 )
-def test_a_server_is_judged_by_its_words(change: dict[str, object], check: str, state: str, step: str) -> None:
-    found = of(server.judge_server({**SERVER, **change}, [], 0.0), check)
-    assert (found.state, step in str(found.next)) == (state, True)
-    assert not re.search(r"\.\d{5}", found.message)
+def test_a_server_is_judged_by_the_status_that_it_reports(
+    change: dict[str, object], check: str, state: str, step: str
+) -> None:
+    finding = find(server.judge_server({**SERVER, **change}, [], 0.0), check)
+    assert (finding.state, step in str(finding.next)) == (state, True)
+    assert not re.search(r"\.\d{5}", finding.message)
 
 
-def test_recent_failures_are_counted_and_the_last_one_is_told() -> None:
-    for beginning in ("speech failed", "Talk aborted"):  # the second is an older server's
+def test_recent_failures_are_counted_and_the_last_one_is_shown() -> None:
+    for beginning in ("speech failed", "Talk aborted"):  # older servers send the second one
         message = f"{beginning}: aplay: device is busy"
         aborted = Goal("4k7f-2", State.ABORTED, reason="audio_device", ended_at=0.0, message=message)
-        found = of(server.judge_server(SERVER, [SPOKEN, aborted], 600.0), "recent goals")
-        assert found.state == WARNING
-        assert "ABORTED: 1 of the last 2 goals, most recently 4k7f-2, 10 min ago" in found.message
-        assert "audio_device: aplay: device is busy" in found.message
-    assert "another program uses the device" in str(found.next)
-    found = of(server.judge_server(SERVER, [aborted, SPOKEN], 600.0), "recent goals")
-    assert (found.state, "1 succeeded since then" in found.message) == (OK, True)
-    assert of(server.judge_server(SERVER, [SPOKEN], 0.0), "recent goals").message == "the last goal did not fail"
+        finding = find(server.judge_server(SERVER, [SPOKEN, aborted], 600.0), "recent goals")
+        assert finding.state == WARNING
+        assert "ABORTED: 1 of the last 2 goals, most recently 4k7f-2, 10 min ago" in finding.message
+        assert "audio_device: aplay: device is busy" in finding.message
+    assert "another program uses the device" in str(finding.next)
+    finding = find(server.judge_server(SERVER, [aborted, SPOKEN], 600.0), "recent goals")
+    assert (finding.state, "1 succeeded since then" in finding.message) == (OK, True)
+    assert find(server.judge_server(SERVER, [SPOKEN], 0.0), "recent goals").message == "the last goal did not fail"
 
 
-def test_after_a_text_without_words_the_next_step_is_to_send_words() -> None:
+def test_the_next_step_after_a_text_without_words_depends_on_the_text() -> None:
     goal = Goal("4k7f-2", State.ABORTED, text="...", reason="nothing_to_say", message="speech failed: nothing")
-    assert of(server.judge_server(SERVER, [goal], 0.0), "recent goals").next == (
+    assert find(server.judge_server(SERVER, [goal], 0.0), "recent goals").next == (
         "send a text with words: this one has no letters or digits"
     )
     foreign = replace(goal, text="你好")
-    assert "choose a voice" in str(of(server.judge_server(SERVER, [foreign], 0.0), "recent goals").next)
+    assert "choose a voice" in str(find(server.judge_server(SERVER, [foreign], 0.0), "recent goals").next)
 
 
-def test_the_end_of_the_sentence_is_told_with_the_next_step() -> None:
+def test_the_result_of_the_sentence_is_shown_with_the_next_step() -> None:
     played = SentenceResult(State.SUCCEEDED, duration=1.7, player="aplay", by_server=True)
-    found = sentence.judge_sentence(played, silent=False, device=None)
-    assert found.state == OK
-    assert found.message.endswith("was played to its end through the server, aplay, 1.7 s")
+    finding = sentence.judge_sentence(played, silent=False, device=None)
+    assert finding.state == OK
+    assert finding.message.endswith("was played to its end through the server, aplay, 1.7 s")
     assert "a sentence was played without sound" in sentence.judge_sentence(played, silent=True, device=None).message
-    for beginning in ("speech failed: ", "Talk aborted: ", ""):  # the second is an older server's
+    for beginning in ("speech failed: ", "Talk aborted: ", ""):  # older servers send the second one
         message = f"{beginning}aplay: audio open error: Permission denied"
         denied = SentenceResult(State.ABORTED, "audio_device", message)
-        found = sentence.judge_sentence(denied, silent=False, device=None)
-        assert found.message == "ABORTED, audio_device: aplay: audio open error: Permission denied"
-    assert "usermod -aG audio" in str(found.next)
+        finding = sentence.judge_sentence(denied, silent=False, device=None)
+        assert finding.message == "ABORTED, audio_device: aplay: audio open error: Permission denied"
+    assert "usermod -aG audio" in str(finding.next)
     stalled = SentenceResult(State.ABORTED, "audio_stalled", "aplay accepted no sound for 3 s")
-    found = sentence.judge_sentence(replace(stalled, suspended=("usb",)), silent=False, device=None)
-    assert (found.next, "suspended: usb" in found.message) == ("pactl suspend-sink usb 0", True)
+    finding = sentence.judge_sentence(replace(stalled, suspended=("usb",)), silent=False, device=None)
+    assert (finding.next, "suspended: usb" in finding.message) == ("pactl suspend-sink usb 0", True)
+    finding = sentence.judge_sentence(replace(played, muted_device="usb"), silent=False, device="usb")
+    assert (finding.state, "pactl set-sink-mute usb 0" in str(finding.next)) == (FAILURE, True)
     late = SentenceResult(State.RECALLED, "late", "not spoken: it was still waiting behind 7 goals after 20 s")
-    found = sentence.judge_sentence(late, silent=False, device=None)
-    assert found.message.startswith("not spoken: it was still waiting behind 7 goals")
-    assert "talk status" in str(found.next)
+    finding = sentence.judge_sentence(late, silent=False, device=None)
+    assert finding.message.startswith("not spoken: it was still waiting behind 7 goals")
+    assert "talk status" in str(finding.next)
     assert "run talk doctor again" in str(
         sentence.judge_sentence(
             SentenceResult(State.PREEMPTED, "canceled", "Talk preempted"), silent=False, device=None
@@ -360,7 +358,7 @@ def test_the_end_of_the_sentence_is_told_with_the_next_step() -> None:
     )
 
 
-def test_every_reason_of_an_aborted_goal_has_a_remedy_of_its_own() -> None:
+def test_every_reason_for_an_aborted_goal_has_its_own_advice() -> None:
     reasons = {
         "no_player", "audio_device", "audio_lost", "audio_stalled", "engine_failed", "engine_crashed", "engine_hung",
         "nothing_to_say", "not_silent", "unknown_voice",
@@ -372,7 +370,7 @@ def test_every_reason_of_an_aborted_goal_has_a_remedy_of_its_own() -> None:
     assert sentence.advise("no_player", "no player found", "aplay") == sentence.ADVICE["no_player"]
 
 
-FOUND = [
+FINDINGS = [
     ok("python", "Python 3.11.2"),
     warning("sound server", "one " * 40, "do " * 40),
     failure("socket", "no server", "talk serve"),
@@ -382,26 +380,25 @@ FOUND = [
 @pytest.mark.parametrize("columns", [40, 80, 120])
 def test_no_line_is_wider_than_the_terminal(columns: int) -> None:
     screen = Screen(columns, colour=True)
-    for finding in FOUND:
+    for finding in FINDINGS:
         lines = report.format_finding(finding, screen)
         assert max(map(width, lines)) <= columns, lines
-        assert all("\x1b" not in each or each.endswith("\x1b[0m") or "\x1b[0m  " in each for each in lines)
+        assert all("\x1b" not in line or line.endswith("\x1b[0m") or "\x1b[0m  " in line for line in lines)
         if finding.next is not None:
-            assert any("-> " in each for each in lines)
-    assert (
-        max(map(len, report.format_conclusion(FOUND, screen).splitlines()), default=0) + len("talk: ") <= columns + 12
-    )
+            assert any("-> " in line for line in lines)
+    conclusion = report.format_conclusion(FINDINGS, screen).splitlines()
+    assert max(map(len, conclusion), default=0) + len("talk: ") <= columns + 12
 
 
 def test_in_a_pipe_a_finding_is_one_line_without_colour() -> None:
-    assert [report.format_finding(each, Screen()) for each in FOUND[::2]] == [
+    assert [report.format_finding(finding, Screen()) for finding in FINDINGS[::2]] == [
         ["ok       python        Python 3.11.2"],
         ["failed   socket        no server -> talk serve"],
     ]
-    assert report.format_conclusion(FOUND, Screen()) == "a sentence would not be heard; do this next:\n  talk serve"
+    assert report.format_conclusion(FINDINGS, Screen()) == "a sentence would not be heard; do this next:\n  talk serve"
     played = [ok("python", "3"), ok("sentence", "played")]
     assert report.format_conclusion(played, Screen()) == "a sentence is heard, unless the loudspeaker itself is off"
-    assert report.format_conclusion([FOUND[1], *played], Screen()).endswith("; 1 warning")
+    assert report.format_conclusion([FINDINGS[1], *played], Screen()).endswith("; 1 warning")
 
 
 # Sound
@@ -425,25 +422,25 @@ def player(configured: str | None, used: str | None, *installed: str, by_server:
         return sound.check_player({}, configured, used, by_server=by_server)
 
 
-def test_a_robot_with_a_card_and_nothing_else_is_well() -> None:
+def test_a_sound_card_without_a_sound_server_is_ok() -> None:
     assert {sound.check_cards(CARDS, SoundServer(), PI).state, judged_server(SoundServer()).state} == {OK}
     used = player(None, "aplay", "aplay", "pacat")
     assert (used.state, used.message) == (OK, "aplay is used; other players: pacat")
 
 
-def test_a_sound_server_that_answers_needs_no_program() -> None:
+def test_a_responding_sound_server_needs_no_player_program() -> None:
     assert (
         player(None, "pulse", "aplay", "pacat").message
         == "pulse is used to play through the sound server; other players: aplay, pacat"
     )
-    alone = player(None, "pulse")
-    assert (alone.state, alone.message) == (OK, "pulse is used to play through the sound server")
+    only_server = player(None, "pulse")
+    assert (only_server.state, only_server.message) == (OK, "pulse is used to play through the sound server")
     assert player("pulse", "pulse", by_server=True).message == "pulse (set by the server)"
-    both = player("pacat", "pacat", "aplay", "pacat", "pw-cat")
-    assert both.message == "pacat (set by TALK_PLAYER); other players: aplay, pw-cat"
+    configured = player("pacat", "pacat", "aplay", "pacat", "pw-cat")
+    assert configured.message == "pacat (set by TALK_PLAYER); other players: aplay, pw-cat"
 
 
-def test_the_player_is_chosen_by_the_engine_process_or_else_by_the_sound_server(
+def test_the_engine_process_or_else_the_sound_server_determines_the_player(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(sound, "on_path", lambda program, _: program in {"aplay", "pacat"})
@@ -455,42 +452,42 @@ def test_the_player_is_chosen_by_the_engine_process_or_else_by_the_sound_server(
         examination = LocalExamination(None, silent=True)
         examination._engine, examination._env = EngineReport(replace(READY, player=chosen)), {}
         examination._client = CLIENT if by_server else None
-        found = of(list(examination._check_sound()), "player").message
-        return found.partition(" is used")[0]
+        message = find(list(examination._check_sound()), "player").message
+        return message.partition(" is used")[0]
 
     monkeypatch.delenv("TALK_PLAYER", raising=False)
     assert first(PULSE) == first(WIRE, "pulse") == "pulse"
     assert first(PULSE, "aplay") == first(WIRE) == first(NO_SERVER) == "aplay"
-    assert first(PULSE, "aplay", by_server=True) == "pulse", "the server's engine is another one"
+    assert first(PULSE, "aplay", by_server=True) == "pulse", "the server has another engine"
 
 
-def test_a_sound_server_with_only_a_dummy_output_is_not_heard() -> None:
-    found = judged_server(replace(PULSE, sink=DUMMY_SINK))
-    assert (found.state, found.next) == (
+def test_a_sound_server_with_only_a_dummy_output_is_a_warning() -> None:
+    finding = judged_server(replace(PULSE, sink=DUMMY_SINK))
+    assert (finding.state, finding.next) == (
         WARNING, "connect a loudspeaker, and check that it is listed: pactl list short sinks"
     )  # fmt: skip
-    assert "has only the dummy output auto_null, which nobody can hear" in found.message
+    assert "has only the dummy output auto_null, which nobody can hear" in finding.message
 
 
-def test_a_missing_player_is_named_with_its_package() -> None:
-    found = player(None, None)
-    assert (found.state, found.next) == (FAILURE, "sudo apt-get install -y alsa-utils")
+def test_a_missing_player_is_reported_with_its_package() -> None:
+    finding = player(None, None)
+    assert (finding.state, finding.next) == (FAILURE, "sudo apt-get install -y alsa-utils")
     assert player(None, None, by_server=True).state == WARNING
-    found = player("pw-cat", "pw-cat", "aplay")
-    assert (found.state, found.next) == (FAILURE, "sudo apt-get install -y pipewire-bin")
-    for each in ("/opt/play -x", "'"):
-        found = player(each, each, "aplay")
-        assert (found.state, f"{each} (set by TALK_PLAYER) is not installed" in found.message) == (FAILURE, True)
+    finding = player("pw-cat", "pw-cat", "aplay")
+    assert (finding.state, finding.next) == (FAILURE, "sudo apt-get install -y pipewire-bin")
+    for command in ("/opt/play -x", "'"):
+        finding = player(command, command, "aplay")
+        assert (finding.state, f"{command} (set by TALK_PLAYER) is not installed" in finding.message) == (FAILURE, True)
     assert player("/opt/play -x", "/opt/play -x", "/opt/play", "aplay").state == OK
 
 
-def test_a_player_without_sound_is_not_heard(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_silent_player_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     for player in ("null", "file:/tmp/x.wav"):
         monkeypatch.setenv("TALK_PLAYER", player)
         examination = LocalExamination(None, silent=True)
         examination._env = {"PATH": "/nowhere"}
-        (found,) = examination._check_sound()
-        assert (found.check, found.state, found.next) == ("player", FAILURE, "unset TALK_PLAYER")
+        (finding,) = examination._check_sound()
+        assert (finding.check, finding.state, finding.next) == ("player", FAILURE, "unset TALK_PLAYER")
         assert "without --player" in str(sound.judge_silent_player(player, by_server=True).next)
 
 
@@ -505,11 +502,11 @@ def test_a_step_that_needs_pactl_names_its_package(tmp_path: Path) -> None:
     assert sound.add_pactl_hint(muted, without) == muted
 
 
-def test_a_missing_device_is_to_be_plugged_in_or_given_to_the_container() -> None:
-    found = sound.check_cards((), NO_SERVER, PI)
-    assert (found.state, "connect a loudspeaker" in str(found.next)) == (WARNING, True)
-    found = sound.check_cards((), NO_SERVER, replace(PI, origins=("a container",)))
-    assert "--device /dev/snd" in str(found.next)
+def test_a_missing_device_is_to_be_connected_or_passed_to_the_container() -> None:
+    finding = sound.check_cards((), NO_SERVER, PI)
+    assert (finding.state, "connect a loudspeaker" in str(finding.next)) == (WARNING, True)
+    finding = sound.check_cards((), NO_SERVER, replace(PI, origins=("a container",)))
+    assert "--device /dev/snd" in str(finding.next)
     assert sound.check_cards((), PULSE, PI).state == OK
 
 
@@ -523,27 +520,27 @@ def test_a_missing_device_is_to_be_plugged_in_or_given_to_the_container() -> Non
         ({}, "systemctl --user restart"),
     ],
 )
-def test_the_step_to_a_sound_server_depends_on_the_session(change: dict[str, object], step: str) -> None:
+def test_the_next_step_to_reach_a_sound_server_depends_on_the_session(change: dict[str, object], step: str) -> None:
     server = replace(NO_SERVER, sockets=("/run/user/1000/pulse/native",))
-    found = judged_server(server, session=replace(PI, **change))
-    assert found.state == WARNING
-    assert "/run/user/1000/pulse/native cannot be reached from here: Connection refused" in found.message
-    assert step in str(found.next)
+    finding = judged_server(server, session=replace(PI, **change))
+    assert finding.state == WARNING
+    assert "/run/user/1000/pulse/native cannot be reached from here: Connection refused" in finding.message
+    assert step in str(finding.next)
 
 
-def test_a_sound_server_that_hangs_or_is_named_wrongly_or_cannot_be_asked() -> None:
+def test_an_unusable_sound_server_is_reported_with_its_cause() -> None:
     assert "does not answer" in judged_server(SoundServer(hangs=True)).message
     assert "unset PULSE_SERVER" in str(judged_server(SoundServer(pulse_server="unix:/x", error="refused")).next)
-    found = judged_server(SoundServer(sockets=("/run/user/1000/pipewire-0",)))
-    assert found.next == "sudo apt-get install -y pulseaudio-utils"
+    finding = judged_server(SoundServer(sockets=("/run/user/1000/pipewire-0",)))
+    assert finding.next == "sudo apt-get install -y pulseaudio-utils"
     service = judged_server(SoundServer(), (), replace(PI, origins=("a cron job",)))
     assert service.state == WARNING
 
 
-def test_a_missing_runtime_directory_is_told_with_the_variable_to_set() -> None:
-    found = sound.judge_session(replace(PI, runtime_dir=None, runtime_owner=None, usual_runtime_dir="/run/user/1000"))
-    assert (found.state, found.next) == (WARNING, "export XDG_RUNTIME_DIR=/run/user/1000")
-    assert "cron, sudo" in found.message
+def test_a_missing_runtime_directory_is_reported_with_the_variable_to_set() -> None:
+    finding = sound.judge_session(replace(PI, runtime_dir=None, runtime_owner=None, usual_runtime_dir="/run/user/1000"))
+    assert (finding.state, finding.next) == (WARNING, "export XDG_RUNTIME_DIR=/run/user/1000")
+    assert "cron, sudo" in finding.message
     served = sound.judge_session(replace(PI, runtime_dir=None, usual_runtime_dir="/run/user/1000", server_pid=7))
     assert " for the server, and restart it" in str(served.next)
     assert sound.judge_session(replace(PI, runtime_dir=None)).state == OK
@@ -563,23 +560,23 @@ SOUND_OUTPUTS = [
 
 
 @pytest.mark.parametrize(("text", "state", "message"), SOUND_OUTPUTS)
-def test_a_muted_output_is_not_heard(text: str, state: str, message: str) -> None:
-    found = sound.judge_level("out", text, "unmute", "louder", is_used=True)
-    assert (found.check, found.state, found.message) == ("loudness", state, message)
-    assert found.next == (None if state == OK else "unmute" if message == "out is muted" else "louder")
-    found = sound.judge_level("out", text, "unmute", "louder", is_used=False)
-    assert found.state == (OK if state == OK else WARNING), "another device is played to"
+def test_a_muted_or_quiet_output_is_reported(text: str, state: str, message: str) -> None:
+    finding = sound.judge_level("out", text, "unmute", "louder", is_used=True)
+    assert (finding.check, finding.state, finding.message) == ("loudness", state, message)
+    assert finding.next == (None if state == OK else "unmute" if message == "out is muted" else "louder")
+    finding = sound.judge_level("out", text, "unmute", "louder", is_used=False)
+    assert finding.state == (OK if state == OK else WARNING), "another device is in use"
 
 
 def test_the_worst_of_several_outputs_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     def levels(*texts: str) -> list[Finding]:
-        found = [(f"out{number}", text, "unmute", "louder") for number, text in enumerate(texts)]
-        monkeypatch.setattr(sound, "_read_levels", lambda *_: found)
+        outputs = [(f"out{number}", text, "unmute", "louder") for number, text in enumerate(texts)]
+        monkeypatch.setattr(sound, "_read_levels", lambda *_: outputs)
         return sound.check_levels({}, NO_SERVER, CARDS, is_used=True)
 
     assert levels() == []
-    assert [each.message for each in levels("[40%] [on]", "[on]")] == ["out0 is at 40%, out1 is not muted"]
-    assert [each.message for each in levels("[40%] [on]", "[5%] [on]", "[off]")] == ["out2 is muted"]
+    assert [finding.message for finding in levels("[40%] [on]", "[on]")] == ["out0 is at 40%, out1 is not muted"]
+    assert [finding.message for finding in levels("[40%] [on]", "[5%] [on]", "[off]")] == ["out2 is muted"]
 
 
 def test_a_player_with_an_unknown_program_is_custom() -> None:

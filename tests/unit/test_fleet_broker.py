@@ -22,13 +22,13 @@ if TYPE_CHECKING:
         ("mqtt://[::1]:18", Broker("::1", 18, tls=False), "mqtt://[::1]:18"),
     ],
 )
-def test_a_url_names_a_broker(url: str, broker: Broker, shown: str) -> None:
-    found = from_environment({"TALK_BROKER": url})
-    assert (found, found.url) == (broker, shown)
+def test_the_broker_is_read_from_its_url(url: str, broker: Broker, shown: str) -> None:
+    actual = from_environment({"TALK_BROKER": url})
+    assert (actual, actual.url) == (broker, shown)
 
 
 @pytest.mark.parametrize(
-    ("url", "words"),
+    ("url", "message"),
     [
         ("", "export TALK_BROKER=mqtts://broker.example"),
         ("broker", "mqtts://HOST or mqtt://HOST"),
@@ -41,36 +41,36 @@ def test_a_url_names_a_broker(url: str, broker: Broker, shown: str) -> None:
         ("mqtt://broker?x=1", "must only have a host and a port"),
     ],
 )
-def test_a_wrong_url_is_refused_with_the_next_step(url: str, words: str) -> None:
+def test_an_invalid_url_is_refused_with_the_next_step(url: str, message: str) -> None:
     with pytest.raises(UsageError, match="TALK_BROKER") as caught:
         from_environment({"TALK_BROKER": url})
-    assert words in str(caught.value)
+    assert message in str(caught.value)
 
 
 @pytest.mark.parametrize(
     "url",
     ["mqtts://olga:hunter2@broker", "mqtts://olga@broker", "mqtts://:hunter2@broker:x", "mqtt://olga:hunter2\u2100@b"],
 )
-def test_a_url_that_holds_a_secret_is_refused_without_showing_it(url: str) -> None:
+def test_a_url_with_a_login_is_refused_without_showing_the_password(url: str) -> None:
     with pytest.raises(UsageError, match=r"TALK_MQTT_PASSWORD_FILE|is not a valid URL") as caught:
         from_environment({"TALK_BROKER": url})
     assert "hunter2" not in str(caught.value)
 
 
-def test_a_password_is_sent_in_clear_text_to_this_machine_alone(tmp_path: Path) -> None:
+def test_a_password_is_sent_in_clear_text_only_to_this_machine(tmp_path: Path) -> None:
     (tmp_path / "password").write_text("correct horse\n", encoding="utf-8")
     login = {"TALK_MQTT_USER": "olga", "TALK_MQTT_PASSWORD_FILE": str(tmp_path / "password")}
-    for here in ("mqtt://localhost", "mqtt://127.0.0.1", "mqtt://127.8.0.1", "mqtt://[::1]", "mqtts://broker"):
-        found = from_environment({"TALK_BROKER": here, **login})
-        assert (found.user, found.password) == ("olga", "correct horse")
-    for elsewhere in ("broker", "192.168.1.2", "[fe80::1]", "localhost.example"):
+    for local_url in ("mqtt://localhost", "mqtt://127.0.0.1", "mqtt://127.8.0.1", "mqtt://[::1]", "mqtts://broker"):
+        broker = from_environment({"TALK_BROKER": local_url, **login})
+        assert (broker.user, broker.password) == ("olga", "correct horse")
+    for host in ("broker", "192.168.1.2", "[fe80::1]", "localhost.example"):
         with pytest.raises(UsageError, match=r"clear text.*mqtts:.*--insecure"):
-            from_environment({"TALK_BROKER": f"mqtt://{elsewhere}", **login})
-        assert from_environment({"TALK_BROKER": f"mqtt://{elsewhere}", **login}, insecure=True).password
+            from_environment({"TALK_BROKER": f"mqtt://{host}", **login})
+        assert from_environment({"TALK_BROKER": f"mqtt://{host}", **login}, insecure=True).password
 
 
 @pytest.mark.parametrize(
-    ("variables", "words"),
+    ("variables", "message"),
     [
         ({"TALK_MQTT_PASSWORD_FILE": "{file}"}, "TALK_MQTT_USER is not; set TALK_MQTT_USER"),
         ({"TALK_MQTT_USER": "olga", "TALK_MQTT_PASSWORD_FILE": "{nothing}"}, "No such file"),
@@ -83,15 +83,13 @@ def test_a_password_is_sent_in_clear_text_to_this_machine_alone(tmp_path: Path) 
         ({"TALK_MQTT_CERT": "{file}", "TALK_MQTT_KEY": "{file}"}, "TALK_MQTT_CERT and TALK_MQTT_KEY: "),
     ],
 )
-def test_a_login_that_is_incomplete_or_unreadable_is_refused(
-    variables: dict[str, str], words: str, tmp_path: Path
-) -> None:
+def test_an_incomplete_or_unreadable_login_is_refused(variables: dict[str, str], message: str, tmp_path: Path) -> None:
     files = {"file": b"x", "empty": b"\n", "bytes": b"\xff", "long": b"x" * 70_000}
     for name, data in files.items():
         (tmp_path / name).write_bytes(data)
-    named = {each: str(tmp_path / each) for each in [*files, "nothing"]}
+    named = {name: str(tmp_path / name) for name in [*files, "nothing"]}
     given = {name: value.format(**named) for name, value in variables.items()}
-    with pytest.raises(UsageError, match=words):
+    with pytest.raises(UsageError, match=message):
         from_environment({"TALK_BROKER": "mqtts://broker", **given}).ssl_context()
 
 
@@ -101,7 +99,7 @@ def test_a_certificate_without_tls_is_refused(name: str) -> None:
         from_environment({"TALK_BROKER": "mqtt://broker", name: "/file"})
 
 
-def test_the_user_is_the_login_s_or_else_the_machine_s() -> None:
+def test_the_user_name_comes_from_the_login_or_else_from_the_machine() -> None:
     assert client_user(Broker("broker", 1, tls=True, user="olga")) == "olga"
     assert client_user(Broker("broker", 1, tls=True))
     with pytest.raises(UsageError, match="TALK_MQTT_USER"):

@@ -16,34 +16,34 @@ from tests.fleet.homeassistant import TOPIC, faults, rendered
 
 STATUS: dict[str, Any] = {"active": None, "text": None, "pending": 0, "paused": False, "last": None}
 ENDED = {"id": "door-17", "state": "ABORTED", "reason": "no_engine", "text": "it's <open>", "at": 1767225601.5}
-UNTOLD = {name: each for name, each in ENDED.items() if name != "text"}
+ENDED_WITHOUT_TEXT = {name: value for name, value in ENDED.items() if name != "text"}
 
 
-def announced(name: str = "anna", allow: tuple[str, ...] = ALLOWABLE_REQUESTS) -> dict[str, Any]:
+def announcement(name: str = "anna", allow: tuple[str, ...] = ALLOWABLE_REQUESTS) -> dict[str, Any]:
     message = homeassistant_device(name, allow, "0.1.0")
     assert message.retained
     assert faults(message.topic, message.payload) == []
-    found: dict[str, Any] = json.loads(message.payload)
-    return found
+    payload: dict[str, Any] = json.loads(message.payload)
+    return payload
 
 
 @pytest.mark.parametrize("name", ["anna", "wh-07", "A_1", "0", "r2.d2", "a.b_c..", "x" * 59])
-def test_an_announcement_keeps_home_assistants_rules(name: str) -> None:
-    found = announced(name)
-    assert found["device"] == {
+def test_an_announcement_follows_home_assistants_rules(name: str) -> None:
+    payload = announcement(name)
+    assert payload["device"] == {
         "identifiers": [f"talk-{name}"], "name": name, "model": "talk", "sw_version": "0.1.0",
     }  # fmt: skip
     for key in ("say", "cancel"):
-        topic = found["components"][key]["command_topic"]
+        topic = payload["components"][key]["command_topic"]
         assert topics.parse_request(topic) == (key, "homeassistant")
         assert topic.startswith(f"talk/robot/{name}/")
-        assert not found["components"][key].get("retain")  # retained requests are never spoken
-    assert {*found["components"]["last"]["options"]} == {each.name for each in State if each.terminal}
+        assert not payload["components"][key].get("retain")  # retained requests are never spoken
+    assert {*payload["components"]["last"]["options"]} == {state.name for state in State if state.terminal}
 
 
 @pytest.mark.parametrize("allow", [("say", "status"), ("cancel",), ()])
-def test_an_entity_that_the_robot_would_not_obey_is_removed(allow: tuple[str, ...]) -> None:
-    components = announced(allow=allow)["components"]
+def test_an_entity_for_a_forbidden_request_is_removed(allow: tuple[str, ...]) -> None:
+    components = announcement(allow=allow)["components"]
     for key, platform in (("say", "notify"), ("cancel", "button")):
         assert (components[key] == {"platform": platform}) == (key not in allow)
 
@@ -56,10 +56,10 @@ def test_an_entity_that_the_robot_would_not_obey_is_removed(allow: tuple[str, ..
         ({"talk": 1, "online": False, "session": "9b51"}, "offline"),
     ],
 )
-def test_a_device_is_available_if_the_robot_would_speak(presence: dict[str, Any], wanted: str) -> None:
-    (each,) = announced()["availability"]
-    assert each["topic"] == "talk/robot/anna/presence"
-    assert rendered(each["value_template"], json.dumps(presence).encode()) == wanted
+def test_a_device_is_available_if_its_robot_can_speak(presence: dict[str, Any], wanted: str) -> None:
+    (availability,) = announcement()["availability"]
+    assert availability["topic"] == "talk/robot/anna/presence"
+    assert rendered(availability["value_template"], json.dumps(presence).encode()) == wanted
 
 
 @pytest.mark.parametrize(
@@ -70,22 +70,22 @@ def test_a_device_is_available_if_the_robot_would_speak(presence: dict[str, Any]
         ({"active": "door-17", "paused": True}, ["paused", "OFF", "0", "None"]),
         ({"paused": True}, ["paused", "OFF", "0", "None"]),
         ({"last": ENDED}, ["idle", "OFF", "0", "ABORTED"]),
-        ({"last": UNTOLD}, ["idle", "OFF", "0", "ABORTED"]),
+        ({"last": ENDED_WITHOUT_TEXT}, ["idle", "OFF", "0", "ABORTED"]),
     ],
 )
 def test_the_entities_show_the_status(status: dict[str, Any], states: list[str]) -> None:
-    payload, components = json.dumps(STATUS | status).encode(), announced()["components"]
+    payload, components = json.dumps(STATUS | status).encode(), announcement()["components"]
     entities = [components[key] for key in ("state", "speaking", "pending", "last")]
-    assert [rendered(each["value_template"], payload) for each in entities] == states
-    assert {each["state_topic"] for each in entities} == {"talk/robot/anna/status"}
+    assert [rendered(entity["value_template"], payload) for entity in entities] == states
+    assert {entity["state_topic"] for entity in entities} == {"talk/robot/anna/status"}
     assert components["last"]["json_attributes_topic"] == "talk/robot/anna/status"
     attributes = json.loads(rendered(components["last"]["json_attributes_template"], payload))
     assert attributes == status.get("last", {})
 
 
-def test_each_name_has_a_topic_of_its_own() -> None:
-    names = ["a" + "".join(each) for length in range(5) for each in product("._d", repeat=length)]
-    assert len({topics.homeassistant_device(each) for each in names}) == len(names)
-    assert all(TOPIC.fullmatch(topics.homeassistant_device(each)) for each in names)
-    for name in ("anna", "A_1", "wh-07"):  # one pattern of an ACL matches it
+def test_each_name_has_its_own_topic() -> None:
+    names = ["a" + "".join(characters) for length in range(5) for characters in product("._d", repeat=length)]
+    assert len({topics.homeassistant_device(name) for name in names}) == len(names)
+    assert all(TOPIC.fullmatch(topics.homeassistant_device(name)) for name in names)
+    for name in ("anna", "A_1", "wh-07"):  # their topics match the pattern in the access rules
         assert topics.homeassistant_device(name) == topics.homeassistant_device("%u").replace("%u", name)

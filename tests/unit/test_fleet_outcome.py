@@ -1,4 +1,4 @@
-"""The outcome of a request at a robot, as programs see it."""
+"""The outcomes of a request to a robot, as programs see them."""
 
 from __future__ import annotations
 
@@ -54,15 +54,15 @@ GOAL = Goal("a", State.PREEMPTED, "hello", reason="canceled")
         (TalkError("anything"), "REFUSED", 1, "error"),
     ],
 )
-def test_an_error_is_a_state_and_an_exit_code(error: TalkError, state: str, exit_code: int, code: str) -> None:
+def test_an_error_has_a_state_and_an_exit_code(error: TalkError, state: str, exit_code: int, code: str) -> None:
     outcome = failure_outcome("anna", error)
     assert (outcome.error, outcome.goal, outcome.said, outcome.last) == (error, None, None, True)
-    told = {"code": code, "message": str(error)}
-    assert outcome.to_json() == {"robot": "anna", "state": state, "exit_code": exit_code, "error": told}
+    error_json = {"code": code, "message": str(error)}
+    assert outcome.to_json() == {"robot": "anna", "state": state, "exit_code": exit_code, "error": error_json}
 
 
 @pytest.mark.parametrize(
-    ("outcome", "told"),
+    ("outcome", "expected"),
     [
         (Outcome("anna", "PREEMPTED", 7, GOAL), {"state": "PREEMPTED", "exit_code": 7, "goal": GOAL.to_json()}),
         (Outcome("anna", "SET", said={"settings": {"rate": 150}}), {"state": "SET", "settings": {"rate": 150}}),
@@ -73,8 +73,8 @@ def test_an_error_is_a_state_and_an_exit_code(error: TalkError, state: str, exit
         (Outcome("anna", "IDLE"), {"state": "IDLE"}),
     ],
 )
-def test_an_outcome_has_its_goal_and_the_answer_of_the_robot(outcome: Outcome, told: dict[str, Any]) -> None:
-    assert outcome.to_json() == {"robot": "anna", "exit_code": 0, **told}
+def test_an_outcome_includes_its_goal_and_the_robots_reply(outcome: Outcome, expected: dict[str, Any]) -> None:
+    assert outcome.to_json() == {"robot": "anna", "exit_code": 0, **expected}
 
 
 ENDED, SPOKEN = GOAL.to_json(), Goal("b", State.ACTIVE, "hello").to_json()
@@ -98,19 +98,19 @@ SERVER: dict[str, Any] = {"server": {"paused": False}, "active": None}
         (Set(), {"settings": {"rate": 150}}, [], [("SET", 0, None)]),
     ],
 )
-def test_a_reply_is_an_outcome_for_each_goal_or_one(
+def test_a_reply_gives_one_outcome_per_goal_or_a_single_one(
     request_: Request, reply: dict[str, Any], items: list[dict[str, Any]], outcomes: list[tuple[str, int, str | None]]
 ) -> None:
-    found = reply_outcomes("anna", request_, {"ok": True, **reply}, items)
-    assert [(each.state, each.exit_code, each.goal and each.goal.id) for each in found] == outcomes
-    assert [each.last for each in found] == [False] * (len(found) - 1) + [True]
-    assert {each.robot for each in found} == {"anna"}
+    actual = reply_outcomes("anna", request_, {"ok": True, **reply}, items)
+    assert [(outcome.state, outcome.exit_code, outcome.goal and outcome.goal.id) for outcome in actual] == outcomes
+    assert [outcome.last for outcome in actual] == [False] * (len(actual) - 1) + [True]
+    assert {outcome.robot for outcome in actual} == {"anna"}
 
 
-def test_the_answer_to_a_status_of_a_goal_has_the_goal() -> None:
+def test_the_reply_to_a_status_request_for_a_goal_must_contain_it() -> None:
     with pytest.raises(ValueError, match="goal"):
         reply_outcomes("anna", Status("a"), {"ok": True}, [])
 
 
-def test_the_goals_of_a_refused_cancel_are_not_the_last_outcomes() -> None:
-    assert [each.last for each in outcomes_of_cancel("anna", [{"canceled": ENDED}], last=False)] == [False]
+def test_goals_of_a_refused_cancel_are_not_the_last_outcomes() -> None:
+    assert [outcome.last for outcome in outcomes_of_cancel("anna", [{"canceled": ENDED}], last=False)] == [False]

@@ -1,4 +1,4 @@
-"""The rules for messages from the broker: each rule, the order of the rules, and the limits of stored data."""
+"""A robot's rules for messages from the broker, the order of the rules, and the limits of stored data."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ REPLY = "talk/reply/bob/s1"
 SAY = {"request": "say", "text": "hello"}
 LONGEST = b"c" * policy.MAX_CORRELATION_BYTES
 
-Judged = RemoteRequest | Refusal | Goodbye | Ignored
+Decision = RemoteRequest | Refusal | Goodbye | Ignored
 
 
-def judge(message: Message, *, stale: bool = False, allow: tuple[str, ...] = policy.ALLOWABLE_REQUESTS) -> Judged:
-    asked = topics.parse_request(message.topic)
-    assert asked
+def decide(message: Message, *, stale: bool = False, allow: tuple[str, ...] = policy.ALLOWABLE_REQUESTS) -> Decision:
+    parsed = topics.parse_request(message.topic)
+    assert parsed
     rules = Policy("anna", allow)
     rules.newest_echo_at = NOW - (6.01 if stale else 6)
-    return rules.decide(message, *asked, NOW)
+    return rules.decide(message, *parsed, NOW)
 
 
 def request(fields: object = SAY, topic: str = OWN, response: str | None = REPLY, **more: object) -> Message:
@@ -47,14 +47,14 @@ def request(fields: object = SAY, topic: str = OWN, response: str | None = REPLY
     return replace(Message(topic, payload, response=response), **more)
 
 
-def refused(judged: Judged) -> str:
-    assert isinstance(judged, Refusal), judged
-    return judged.error.code
+def refusal_code(decision: Decision) -> str:
+    assert isinstance(decision, Refusal), decision
+    return decision.error.code
 
 
-def asked(judged: Judged) -> RemoteRequest:
-    assert isinstance(judged, RemoteRequest), judged
-    return judged
+def accepted(decision: Decision) -> RemoteRequest:
+    assert isinstance(decision, RemoteRequest), decision
+    return decision
 
 
 # Accepted requests
@@ -62,31 +62,31 @@ def asked(judged: Judged) -> RemoteRequest:
 
 @pytest.mark.parametrize("topic", [OWN, "talk/group/all/request/bob", "talk/group/g/request/bob"])
 @pytest.mark.parametrize("response", [REPLY, f"{REPLY}/anna"])
-def test_a_request_is_answered_under_the_robots_name(topic: str, response: str) -> None:
-    found = asked(judge(request({"seq": 5, **SAY}, topic, response, correlation=b"c")))
-    assert (found.user, found.reply_topic, found.seq, found.correlation) == ("bob", f"{REPLY}/anna", 5, b"c")
-    assert (found.request, found.start_by) == (Say("hello"), None)
+def test_a_reply_is_sent_to_a_topic_with_the_robots_name(topic: str, response: str) -> None:
+    remote = accepted(decide(request({"seq": 5, **SAY}, topic, response, correlation=b"c")))
+    assert (remote.user, remote.reply_topic, remote.seq, remote.correlation) == ("bob", f"{REPLY}/anna", 5, b"c")
+    assert (remote.request, remote.start_by) == (Say("hello"), None)
 
 
 @pytest.mark.parametrize(
-    ("topic", "payload", "wanted"),
+    ("topic", "payload", "expected"),
     [
         (OWN, json.dumps(SAY).encode() + b"\n", Say("hello")),
         *((PLAIN, text.encode(), Say(text)) for text in ("hello", '{"request": "cancel"}', "-w", "two\nlines\n", " ")),
         *((CANCEL, payload, Cancel()) for payload in (b"", b"anything", b"\xff", b"x" * 100_000)),
     ],
 )
-def test_a_plain_text_is_literal_and_anything_cancels_everything(topic: str, payload: bytes, wanted: object) -> None:
-    found = asked(judge(request(payload, topic, None)))
-    assert (found.request, found.reply_topic) == (wanted, None)
-    assert found.size_bytes == (0 if topic == CANCEL else len(payload))
-    assert not isinstance(found.request, Cancel) or found.request.selects_all
+def test_plain_text_is_literal_and_any_cancel_payload_cancels_all(topic: str, payload: bytes, expected: object) -> None:
+    remote = accepted(decide(request(payload, topic, None)))
+    assert (remote.request, remote.reply_topic) == (expected, None)
+    assert remote.size_bytes == (0 if topic == CANCEL else len(payload))
+    assert not isinstance(remote.request, Cancel) or remote.request.selects_all
 
 
-def test_an_empty_request_is_the_goodbye_of_the_session_that_it_names() -> None:
-    assert judge(request(b"")) == Goodbye("bob", f"{REPLY}/anna")
+def test_an_empty_request_ends_the_session_that_it_names() -> None:
+    assert decide(request(b"")) == Goodbye("bob", f"{REPLY}/anna")
     for topic, response in ((OWN, None), (PLAIN, None), (PLAIN, REPLY)):
-        assert isinstance(judge(request(b"", topic, response)), Ignored)
+        assert isinstance(decide(request(b"", topic, response)), Ignored)
 
 
 # Refusals, and their order
@@ -94,24 +94,24 @@ def test_an_empty_request_is_the_goodbye_of_the_session_that_it_names() -> None:
 
 @pytest.mark.parametrize("payload", [b"", json.dumps(SAY).encode(), b"{", b"x" * 100_000])
 @pytest.mark.parametrize("topic", [OWN, PLAIN, CANCEL])
-def test_a_retained_message_is_dropped_before_anything_else(topic: str, payload: bytes) -> None:
-    found = judge(request(payload, topic, retained=True), stale=True, allow=())
-    assert isinstance(found, Ignored)
-    assert found.kind == "retained"
+def test_a_retained_message_is_ignored_before_any_other_check(topic: str, payload: bytes) -> None:
+    decision = decide(request(payload, topic, retained=True), stale=True, allow=())
+    assert isinstance(decision, Ignored)
+    assert decision.kind == "retained"
 
 
 @pytest.mark.parametrize("response", ["talk/reply/eve/s1", "talk/robot/berta/say/bob", "elsewhere", ""])
-def test_a_message_with_the_response_topic_of_another_is_dropped(response: str) -> None:
-    found = judge(request(response=response))
-    assert isinstance(found, Ignored)
-    assert found.kind == "response"
+def test_a_message_with_another_users_response_topic_is_ignored(response: str) -> None:
+    decision = decide(request(response=response))
+    assert isinstance(decision, Ignored)
+    assert decision.kind == "response"
 
 
 @pytest.mark.parametrize(
     ("payload", "topic", "code"),
     [
         (b"x" * MAX_LINE_BYTES, OWN, "line_too_long"),
-        (b" " * (MAX_LINE_BYTES - 1) + b"\n", OWN, "bad_json"),  # as long as a line may be
+        (b" " * (MAX_LINE_BYTES - 1) + b"\n", OWN, "bad_json"),  # the longest valid line
         (b"\xff", OWN, "bad_encoding"),
         (b"{", OWN, "bad_json"),
         (b"[1]", OWN, "bad_json"),
@@ -127,89 +127,87 @@ def test_a_message_with_the_response_topic_of_another_is_dropped(response: str) 
         (b"a\xff", PLAIN, "bad_encoding"),
     ],
 )
-def test_a_malformed_request_has_the_error_of_the_wire_also_if_it_is_stale_and_not_allowed(
-    payload: bytes, topic: str, code: str
-) -> None:
-    assert refused(judge(request(payload, topic), stale=True, allow=())) == code
+def test_a_malformed_request_gets_its_error_even_if_stale_and_forbidden(payload: bytes, topic: str, code: str) -> None:
+    assert refusal_code(decide(request(payload, topic), stale=True, allow=())) == code
 
 
 @pytest.mark.parametrize("response", [REPLY, None])
-def test_an_error_has_the_number_and_the_correlation_of_its_request(response: str | None) -> None:
-    found = judge(request({"seq": 7, "request": "say"}, response=response, correlation=b"c"))
-    assert isinstance(found, Refusal)
-    assert found.error.code == "bad_field"
+def test_an_error_repeats_the_number_and_correlation_of_its_request(response: str | None) -> None:
+    refusal = decide(request({"seq": 7, "request": "say"}, response=response, correlation=b"c"))
+    assert isinstance(refusal, Refusal)
+    assert refusal.error.code == "bad_field"
     if response is None:
-        assert found.reply is None
+        assert refusal.reply is None
     else:
-        error = {"code": "bad_field", "message": found.error.message}
-        assert found.reply
-        assert (found.reply.topic, found.reply.correlation) == (f"{REPLY}/anna", b"c")
-        assert json.loads(found.reply.payload) == {"seq": 7, "ok": False, "error": error}
+        error = {"code": "bad_field", "message": refusal.error.message}
+        assert refusal.reply
+        assert (refusal.reply.topic, refusal.reply.correlation) == (f"{REPLY}/anna", b"c")
+        assert json.loads(refusal.reply.payload) == {"seq": 7, "ok": False, "error": error}
 
 
 @pytest.mark.parametrize(
     ("fields", "code", "seq"), [(b"{", "bad_json", None), (SAY, "bad_field", None), ({"seq": 7, **SAY}, "bad_field", 7)]
 )
-def test_correlation_data_that_are_too_long_are_on_no_answer(fields: object, code: str, seq: int | None) -> None:
-    assert asked(judge(request(correlation=LONGEST))).correlation == LONGEST
-    found = judge(request(fields, correlation=LONGEST + b"c"), stale=True, allow=())
-    assert isinstance(found, Refusal)
-    assert found.reply
-    assert (refused(found), found.reply.correlation) == (code, None)
-    assert json.loads(found.reply.payload).get("seq") == seq
+def test_correlation_data_that_is_too_long_is_not_returned(fields: object, code: str, seq: int | None) -> None:
+    assert accepted(decide(request(correlation=LONGEST))).correlation == LONGEST
+    refusal = decide(request(fields, correlation=LONGEST + b"c"), stale=True, allow=())
+    assert isinstance(refusal, Refusal)
+    assert refusal.reply
+    assert (refusal_code(refusal), refusal.reply.correlation) == (code, None)
+    assert json.loads(refusal.reply.payload).get("seq") == seq
 
 
-def test_each_kind_of_request_can_be_forbidden_but_hello_and_watch() -> None:
+def test_every_kind_of_request_except_hello_and_watch_can_be_forbidden() -> None:
     assert {*policy.ALLOWABLE_REQUESTS, *policy.ALWAYS_ALLOWED} == {*REQUEST_TYPES}
     for kind in policy.ALWAYS_ALLOWED:
-        assert asked(judge(request({"request": kind}), allow=())).request.kind == kind
+        assert accepted(decide(request({"request": kind}), allow=())).request.kind == kind
     for kind in policy.ALLOWABLE_REQUESTS:
         fields = {"request": kind, **({"text": "a"} if kind == "say" else {})}
-        assert refused(judge(request(fields), allow=())) == "not_allowed"
-        assert asked(judge(request(fields), allow=(kind,))).request.kind == kind
-    assert refused(judge(request(b"hi", PLAIN), stale=True, allow=("cancel",))) == "not_allowed"
+        assert refusal_code(decide(request(fields), allow=())) == "not_allowed"
+        assert accepted(decide(request(fields), allow=(kind,))).request.kind == kind
+    assert refusal_code(decide(request(b"hi", PLAIN), stale=True, allow=("cancel",))) == "not_allowed"
 
 
-def test_a_stale_sentence_is_refused_and_a_stale_cancel_is_not() -> None:
-    assert refused(judge(request(), stale=True)) == "stale"
-    assert refused(judge(request(b"hi", PLAIN), stale=True)) == "stale"
-    assert asked(judge(request({"request": "cancel"}), stale=True)).request == Cancel()
+def test_a_stale_sentence_is_refused_but_a_stale_cancel_is_accepted() -> None:
+    assert refusal_code(decide(request(), stale=True)) == "stale"
+    assert refusal_code(decide(request(b"hi", PLAIN), stale=True)) == "stale"
+    assert accepted(decide(request({"request": "cancel"}), stale=True)).request == Cancel()
 
 
 # Maximum age
 
 
 @pytest.mark.parametrize(
-    ("ttl", "expiry", "waited", "left"),
+    ("ttl", "expiry", "waited", "remaining"),
     [
         (None, None, 3, None),
         (5, None, 3, 5),
         (None, 10, 0, 10),
-        (0, 10, 0, 10),  # no limit of its own
+        (0, 10, 0, 10),  # the sentence itself has no limit
         (5, 10, 0, 5),
         (20, 10, 0, 10),
         (20, 10, 4, 6),
         (5, 10, 8, 2),
-        (None, 10, 10, 0.001),  # 0 would be no limit
+        (None, 10, 10, 0.001),  # 0 would mean no limit
         (None, 10, 11, 0.001),
     ],
 )
-def test_a_sentence_must_begin_before_its_message_expires(
-    ttl: float | None, expiry: int | None, waited: float, left: float | None
+def test_a_sentence_expires_no_later_than_its_message(
+    ttl: float | None, expiry: int | None, waited: float, remaining: float | None
 ) -> None:
-    found = asked(judge(request({**SAY, **({} if ttl is None else {"ttl": ttl})}, expiry=expiry)))
-    say = found.build_say("x", NOW + waited)
-    assert (say.ttl, say.id) == (left, "x")
+    remote = accepted(decide(request({**SAY, **({} if ttl is None else {"ttl": ttl})}, expiry=expiry)))
+    say = remote.build_say("x", NOW + waited)
+    assert (say.ttl, say.id) == (remaining, "x")
 
 
 def is_stale(rules: Policy, now: float) -> bool:
     """Return whether a sentence that arrives now is refused."""
-    found = rules.decide(request(), topics.REQUEST, "bob", now)
-    return isinstance(found, Refusal) and found.error.code == "stale"
+    decision = rules.decide(request(), topics.REQUEST, "bob", now)
+    return isinstance(decision, Refusal) and decision.error.code == "stale"
 
 
-def returned(rules: Policy, sent_at: float, now: float) -> bool:
-    """Return an echo to the robot, and tell whether it is the newest one."""
+def return_echo(rules: Policy, sent_at: float, now: float) -> bool:
+    """Let an echo come back, and return whether it is the newest one so far."""
     before = rules.newest_echo_at
     rules.record_echo(f"{sent_at}".encode(), now)
     return rules.newest_echo_at > before
@@ -222,48 +220,48 @@ def connected(now: float) -> Policy:
     return rules
 
 
-def test_what_comes_within_six_seconds_of_the_newest_echo_that_came_back_is_taken() -> None:
+def test_messages_are_accepted_up_to_six_seconds_after_the_newest_echo() -> None:
     rules = connected(100.0)
     assert not is_stale(rules, 106.0)
     assert is_stale(rules, 106.01)
-    assert returned(rules, 104.0, 105.0)
+    assert return_echo(rules, 104.0, 105.0)
     assert not is_stale(rules, 110.0)
     assert is_stale(rules, 110.01)
-    assert returned(rules, 105.0, 105.1)
+    assert return_echo(rules, 105.0, 105.1)
     assert not is_stale(rules, 111.0)
 
 
 @pytest.mark.parametrize(
     "unknown", [b"20.1", b"0", b"-1", b"", b"one", b"7" * 5000, b"inf", b"nan", b"15.0 15.0", b"\xb2", b"\xff"]
 )
-def test_an_unknown_echo_tells_nothing(unknown: bytes) -> None:
+def test_an_unknown_echo_is_ignored(unknown: bytes) -> None:
     rules = connected(0.0)
     rules.record_echo(unknown, 20.0)
     assert is_stale(rules, 10.0)
-    assert returned(rules, 10.0, 20.0)
-    assert not returned(rules, 10.0, 20.0)  # twice
+    assert return_echo(rules, 10.0, 20.0)
+    assert not return_echo(rules, 10.0, 20.0)  # a duplicate
     assert not is_stale(rules, 10.0)
 
 
-@given(st.lists(st.tuples(st.sampled_from(["send", "come", "wait"]), st.integers(0, 12)), max_size=60))
+@given(st.lists(st.tuples(st.sampled_from(["send", "return", "wait"]), st.integers(0, 12)), max_size=60))
 def test_messages_older_than_the_newest_echo_allows_are_refused(steps: list[tuple[str, int]]) -> None:
-    """The broker forwards a message that arrives after an echo no earlier than the echo was sent."""
+    """If a message arrives after an echo, the broker forwarded it after the echo was sent."""
     now, proved, rules = 0.0, 0.0, connected(0.0)
     sent: list[float] = []
-    for what, number in steps:
-        if what == "wait":
+    for action, number in steps:
+        if action == "wait":
             now += number
-        elif what == "send":
+        elif action == "send":
             sent.append(now)
         elif number < len(sent):
-            assert returned(rules, sent[number], now) == (sent[number] > proved)
+            assert return_echo(rules, sent[number], now) == (sent[number] > proved)
             proved = max(proved, sent[number])
         assert is_stale(rules, now) == (now - proved > policy.STALE_AFTER_S)
 
 
-def test_an_echo_that_comes_after_a_newer_one_tells_nothing() -> None:
+def test_an_echo_older_than_the_newest_one_is_ignored() -> None:
     rules = connected(0.0)
-    assert sum(returned(rules, float(each), 1000.0) for each in reversed(range(1000))) == 1
+    assert sum(return_echo(rules, float(sent_at), 1000.0) for sent_at in reversed(range(1000))) == 1
     assert not is_stale(rules, 1005.0)
     assert is_stale(rules, 1005.01)
 
@@ -271,80 +269,81 @@ def test_an_echo_that_comes_after_a_newer_one_tells_nothing() -> None:
 # Goals that were sent before
 
 
-def test_the_last_thousand_ids_are_remembered_with_the_servers_start() -> None:
+def test_the_last_thousand_ids_are_stored_with_the_servers_boot_id() -> None:
     ids = SentIds()
-    for each in range(1200):
-        ids.add(f"goal-{each}", "1a1a")
+    for number in range(1200):
+        ids.add(f"goal-{number}", "1a1a")
     ids.add("goal-200", "2b2b")  # added again, it becomes the newest
     ids.add("more", "2b2b")
-    known = {each: ids.boot_of(each) for each in ("goal-200", "goal-201", "goal-202", "more")}
+    known = {goal_id: ids.boot_of(goal_id) for goal_id in ("goal-200", "goal-201", "goal-202", "more")}
     assert known == {"goal-200": "2b2b", "goal-201": None, "goal-202": "1a1a", "more": "2b2b"}
     ids.discard("more")
     assert ids.boot_of("more") is None
     ids.discard("never known")
 
 
-def test_twenty_goals_may_be_pending_whichever_of_reply_and_event_comes_first() -> None:
-    share = RemoteGoals()
-    for each in range(20):
-        assert share.has_room(Say("a"))
-        share.add(f"g{each}", "battery" if each == 7 else None)
-        if each % 2:
-            share.record_pending(f"g{each}", "battery" if each == 7 else None)
-            share.record_reply(f"g{each}", pending=True)
-        elif each:  # the first goal is still on its way
-            share.record_reply(f"g{each}", pending=True)
-            share.record_pending(f"g{each}", None)
-    assert (len(share), share.pending_count) == (20, 19)
+def test_twenty_goals_may_be_pending_whether_reply_or_event_arrives_first() -> None:
+    goals = RemoteGoals()
+    for number in range(20):
+        assert goals.has_room(Say("a"))
+        goals.add(f"g{number}", "battery" if number == 7 else None)
+        if number % 2:
+            goals.record_pending(f"g{number}", "battery" if number == 7 else None)
+            goals.record_reply(f"g{number}", pending=True)
+        elif number:  # the first goal stays unanswered
+            goals.record_reply(f"g{number}", pending=True)
+            goals.record_pending(f"g{number}", None)
+    assert (len(goals), goals.pending_count) == (20, 19)
     sentences = [Say("a"), Say("a", key="door"), Say("a", key="battery"), Say("a", flush=True), Say("a", preempt=True)]
-    assert [share.has_room(each) for each in sentences] == [False, False, True, True, True]
-    share.remove("g3")
-    assert share.has_room(Say("a"))
+    assert [goals.has_room(say) for say in sentences] == [False, False, True, True, True]
+    goals.remove("g3")
+    assert goals.has_room(Say("a"))
 
 
-def test_goals_on_their_way_still_count_if_the_server_is_watched_anew() -> None:
-    share = RemoteGoals()
-    share.add("on its way", None)
-    share.record_pending("over", None)
-    share.replace_pending([("there", "k")])
-    assert (len(share), share.pending_count) == (2, 1)
-    share.replace_pending([])
-    assert (len(share), share.pending_count) == (1, 0)
+def test_unanswered_goals_still_count_after_a_new_watch() -> None:
+    goals = RemoteGoals()
+    goals.add("unanswered", None)
+    goals.record_pending("ended", None)
+    goals.replace_pending([("there", "k")])
+    assert (len(goals), goals.pending_count) == (2, 1)
+    goals.replace_pending([])
+    assert (len(goals), goals.pending_count) == (1, 0)
 
 
 @given(
     st.lists(
-        st.tuples(st.sampled_from(["sent", "accepted", "refused", "came", "left"]), st.integers(0, 6)), max_size=80
+        st.tuples(st.sampled_from(["sent", "accepted", "refused", "queued", "dequeued"]), st.integers(0, 6)),
+        max_size=80,
     )
 )
-def test_the_share_counts_like_a_slow_model(steps: list[tuple[str, int]]) -> None:
-    share = RemoteGoals()
-    on_way: set[int] = set()
+def test_remote_goals_are_counted_as_in_a_simple_model(steps: list[tuple[str, int]]) -> None:
+    goals = RemoteGoals()
+    unanswered: set[int] = set()
     pending: set[int] = set()
-    for what, number in steps:
+    for action, number in steps:
         name = str(number)
-        if what == "sent":
-            share.add(name, None)
-            on_way |= {number}
-        elif what in ("accepted", "refused"):
-            share.record_reply(name, pending=what == "accepted")
-            if number in on_way and what == "accepted":
+        if action == "sent":
+            goals.add(name, None)
+            unanswered |= {number}
+        elif action in ("accepted", "refused"):
+            goals.record_reply(name, pending=action == "accepted")
+            if number in unanswered and action == "accepted":
                 pending |= {number}
-            on_way -= {number}
-        elif what == "came":
-            share.record_pending(name, None)
+            unanswered -= {number}
+        elif action == "queued":
+            goals.record_pending(name, None)
             pending |= {number}
         else:
-            assert share.remove(name) is (number in on_way | pending)
-            on_way -= {number}
+            assert goals.remove(name) is (number in unanswered | pending)
+            unanswered -= {number}
             pending -= {number}
-        assert (len(share), share.pending_count) == (len(on_way | pending), len(pending))
+        assert (len(goals), goals.pending_count) == (len(unanswered | pending), len(pending))
 
 
 # Names
 
 
-def test_the_name_of_a_user_from_afar_fits_and_says_so() -> None:
+def test_the_sender_name_of_a_remote_user_has_a_prefix_and_fits() -> None:
     longest = "u" * topics.MAX_NAME_CHARS
     assert policy.sender_name("bob") == "mqtt:bob"
     assert policy.sender_name("bob", "patrol") == "mqtt:bob patrol"

@@ -23,44 +23,44 @@ STATUS = {"active": "a-1", "text": "hello", "pending": 3, "paused": True, "last"
 OTHER_VALUES: tuple[object, ...] = (None, True, [], {})
 
 
-def presence(said: object) -> Presence | None:
-    return Presence.read("anna", json.dumps(said).encode() + b"\n")
+def presence(fields: object) -> Presence | None:
+    return Presence.read("anna", json.dumps(fields).encode() + b"\n")
 
 
-def status(said: object) -> RobotStatus | None:
-    return RobotStatus.read(json.dumps(said).encode() + b"\n")
+def status(fields: object) -> RobotStatus | None:
+    return RobotStatus.read(json.dumps(fields).encode() + b"\n")
 
 
-def test_a_presence_is_read_and_told_again() -> None:
-    found = presence(HERE)
-    assert found == Presence(
+def test_a_presence_is_read_and_written_back() -> None:
+    parsed = presence(HERE)
+    assert parsed == Presence(
         "anna", True, "9b51", 1767225600.25, ("all", "warehouse"), ("say", "cancel"), SERVER, "0.2.0"
     )
-    assert found.to_json() == {name: value for name, value in HERE.items() if name not in ("talk", "later")}
+    assert parsed.to_json() == {name: value for name, value in HERE.items() if name not in ("talk", "later")}
     will = {"talk": 1, "online": False, "session": "9b51", "groups": ["all", "night"]}
     assert presence(will) == Presence("anna", online=False, session="9b51", groups=("all", "night"))
 
 
-def test_a_status_is_read_and_told_again() -> None:
-    found = status({**STATUS, "later": "a field that is not known yet"})
+def test_a_status_is_read_and_written_back() -> None:
+    parsed = status({**STATUS, "later": "a field that is not known yet"})
     last = LastGoal("door-17", State.ABORTED, "player", "the door", 1767225601.5)
-    assert found == RobotStatus("a-1", "hello", 3, paused=True, last=last)
-    assert found.to_json() == STATUS
+    assert parsed == RobotStatus("a-1", "hello", 3, paused=True, last=last)
+    assert parsed.to_json() == STATUS
 
 
 @pytest.mark.parametrize(
     "payload",
     [
         *(b"", b"\n", b"[]", b"anna", b"3", b'"online"', b"{", b"\xff", b'{"a": 1, "a": 2}'),
-        *(b'{"online": true, "since": ' + each + b"}" for each in (b"NaN", b"-Infinity", b"1e999", b"7" * 5000)),
+        *(b'{"online": true, "since": ' + number + b"}" for number in (b"NaN", b"-Infinity", b"1e999", b"7" * 5000)),
     ],
 )
-def test_a_payload_that_is_no_object_is_ignored(payload: bytes) -> None:
+def test_a_payload_that_is_not_a_json_object_is_ignored(payload: bytes) -> None:
     assert (Presence.read("anna", payload), RobotStatus.read(payload)) == (None, None)
 
 
 @pytest.mark.parametrize("name", ["", "_", "+", "a b", "a" * 60, "\x1b[2J"])
-def test_a_name_that_no_robot_can_have_is_ignored(name: str) -> None:
+def test_an_invalid_robot_name_is_ignored(name: str) -> None:
     assert Presence.read(name, json.dumps(HERE).encode()) is None
 
 
@@ -83,15 +83,15 @@ def test_a_malformed_field_counts_as_missing(wrong: dict[str, object]) -> None:
     assert (presence(wrong), status(wrong)) == (Presence("anna", online=False), RobotStatus())
 
 
-def test_of_a_field_those_values_are_taken_that_can_be_read() -> None:
+def test_the_valid_parts_of_a_field_are_used() -> None:
     assert presence({"groups": ["all", 7, "night"]}) == Presence("anna", online=False, groups=("all", "night"))
-    untold = {name: value for name, value in LAST.items() if name not in ("text", "reason", "at")}
-    assert status({"active": "a", "last": untold}) == RobotStatus("a", last=LastGoal("door-17", State.ABORTED))
-    assert status({"last": {**untold, "at": True}}) == RobotStatus(last=LastGoal("door-17", State.ABORTED))
+    minimal = {name: value for name, value in LAST.items() if name not in ("text", "reason", "at")}
+    assert status({"active": "a", "last": minimal}) == RobotStatus("a", last=LastGoal("door-17", State.ABORTED))
+    assert status({"last": {**minimal, "at": True}}) == RobotStatus(last=LastGoal("door-17", State.ABORTED))
 
 
 @pytest.mark.parametrize(
-    ("changed", "found"),
+    ("changed", "rank"),
     [
         ({}, (1767225600.25, "9b51")),
         ({"since": 0}, (0.0, "9b51")),
@@ -100,10 +100,10 @@ def test_of_a_field_those_values_are_taken_that_can_be_read() -> None:
         *(({"session": wrong}, None) for wrong in (*OTHER_VALUES, "", 7)),
     ],
 )
-def test_only_a_presence_with_a_time_and_a_session_is_compared_with_other_bridges(
-    changed: dict[str, object], found: tuple[float, str] | None
+def test_only_an_online_presence_with_time_and_session_has_a_rank(
+    changed: dict[str, object], rank: tuple[float, str] | None
 ) -> None:
-    assert bridge_rank(presence(HERE | changed)) == found
+    assert bridge_rank(presence(HERE | changed)) == rank
 
 
 # Selection by `--robot`
@@ -113,13 +113,13 @@ def robot(name: str, *groups: str, online: bool = True) -> Presence:
     return Presence(name, online, groups=(topics.ALL_ROBOTS, *groups))
 
 
-CARL = Presence("carl", online=False)  # which says nothing of its groups
+CARL = Presence("carl", online=False)  # without groups
 FLEET = [robot("anna", "warehouse"), robot("bert", "night", online=False), CARL, robot("wh-01", "warehouse")]
 FLEET.append(robot("wh-12"))
 
 
 @pytest.mark.parametrize(
-    ("text", "picked"),
+    ("text", "selected"),
     [
         ("anna", "anna"),
         ("wh-*", "wh-01 wh-12"),
@@ -138,26 +138,26 @@ FLEET.append(robot("wh-12"))
         ("@ware", ""),
     ],
 )
-def test_a_selection_picks_by_name_by_glob_and_by_group(text: str, picked: str) -> None:
+def test_a_selection_matches_by_name_glob_or_group(text: str, selected: str) -> None:
     selection = Selection(text)
     assert (selection.fault, selection.name) == (None, None if selects_several(text) else text)
-    assert [each.name for each in FLEET if selection.includes(each)] == picked.split()
+    assert [robot.name for robot in FLEET if selection.includes(robot)] == selected.split()
     assert selection.group == (text[1:] if text[0] == "@" else None)
 
 
 @pytest.mark.parametrize(
-    ("text", "found"),
+    ("text", "several"),
     [
         *((text, True) for text in ("*", "wh-*", "a?", "[ab]c", "@all", "@", "a[")),
         *((text, False) for text in ("anna", "wh-01", "r2.d2", "", "a@b", "a]b", "!a")),
     ],
 )
-def test_a_glob_or_a_group_may_mean_several(text: str, found: bool) -> None:
-    assert selects_several(text) == found
+def test_a_glob_or_a_group_may_select_several_robots(text: str, several: bool) -> None:
+    assert selects_several(text) == several
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "message"),
     [
         ("@", "invalid group name ''"),
         ("@a b", "invalid group name 'a b'"),
@@ -171,5 +171,5 @@ def test_a_glob_or_a_group_may_mean_several(text: str, found: bool) -> None:
         ("wh-[]", "the pattern 'wh-[]' can't match any robot"),
     ],
 )
-def test_a_selection_that_can_pick_no_robot_has_a_fault(text: str, words: str) -> None:
-    assert words in str(Selection(text).fault)
+def test_a_selection_that_can_match_no_robot_is_invalid(text: str, message: str) -> None:
+    assert message in str(Selection(text).fault)

@@ -1,4 +1,4 @@
-"""The table of a fleet's robots, at any width: no line is wider than its terminal, and the text gives way first."""
+"""The table of a fleet's robots at any terminal width."""
 
 from __future__ import annotations
 
@@ -51,19 +51,19 @@ def anna(**changes: Any) -> RobotInfo:
 
 
 def cells(robot: RobotInfo) -> list[str]:
-    """Return a robot's line, cut at the heads; it has all the room that it needs."""
-    head, line = format_robots([robot], Screen(long=True), NOW)
-    places = [*(head.index(each) for each in COLUMN_NAMES), None]
+    """Return the cells of a robot's line in a table of unlimited width."""
+    header, line = format_robots([robot], Screen(long=True), NOW)
+    places = [*(header.index(name) for name in COLUMN_NAMES), None]
     return [line[start:end].strip() for start, end in pairwise(places)]
 
 
 @given(st.lists(ROBOTS, max_size=3), st.integers(1, 200), st.booleans())
-def test_no_line_is_wider_than_its_terminal(robots: list[RobotInfo], columns: int, colour: bool) -> None:
+def test_no_line_is_wider_than_the_terminal(robots: list[RobotInfo], columns: int, colour: bool) -> None:
     lines = format_robots(robots, Screen(columns, colour), NOW)
     assert len(lines) == len(robots) + 1
     assert max(map(width, lines)) <= max(columns, MIN_COLUMNS)
-    head, *lines = format_robots(robots, Screen(), NOW)  # in a pipe nothing is cut
-    assert head.split() == list(SHORT_NAMES)
+    header, *lines = format_robots(robots, Screen(), NOW)  # in a pipe nothing is cut
+    assert header.split() == list(SHORT_NAMES)
     for robot, line in zip(robots, lines, strict=True):
         presence, status = robot.presence, robot.status or RobotStatus()
         assert line.startswith(f"{presence.name} ")
@@ -83,7 +83,7 @@ def test_no_line_is_wider_than_its_terminal(robots: list[RobotInfo], columns: in
         (RobotInfo(ANNA.presence, None), ["anna", "yes", "0.1.0", "-", "0", "-", "15 min"]),
     ],
 )
-def test_a_robot_is_shown_with_all_that_is_known_of_it(robot: RobotInfo, shown: list[str]) -> None:
+def test_a_robot_is_shown_with_all_known_facts(robot: RobotInfo, shown: list[str]) -> None:
     assert cells(robot) == shown
 
 
@@ -97,7 +97,7 @@ def test_a_robot_is_shown_with_all_that_is_known_of_it(robot: RobotInfo, shown: 
         (anna(text="\x1b[2J\n\u202e"), r'"\x1b[2J\n\u202e"'),
     ],
 )
-def test_the_speaking_column_has_the_text_or_the_id_and_pauses(robot: RobotInfo, shown: str) -> None:
+def test_the_speaking_column_shows_text_or_id_and_a_pause(robot: RobotInfo, shown: str) -> None:
     assert cells(robot)[3] == shown
 
 
@@ -105,14 +105,14 @@ def test_the_speaking_column_has_the_text_or_the_id_and_pauses(robot: RobotInfo,
     ("seconds", "shown"),
     [(-5, "0 s"), (0.9, "0 s"), (59.9, "59 s"), (60, "1 min"), (3599, "59 min"), (7200, "2 h"), (1e6, "11 d")],
 )
-def test_a_time_is_shown_by_its_age(seconds: float, shown: str) -> None:
+def test_a_time_is_shown_as_its_age(seconds: float, shown: str) -> None:
     """A robot's clock may be ahead of the desk's."""
     robot = RobotInfo(replace(ANNA.presence, since=NOW - seconds), replace(ANNA.status, text=""))
     assert cells(robot)[-1] == shown
 
 
 @pytest.mark.parametrize(
-    ("columns", "long", "heads"),
+    ("columns", "long", "headers"),
     [
         (120, True, COLUMN_NAMES),
         (80, True, COLUMN_NAMES),
@@ -124,29 +124,29 @@ def test_a_time_is_shown_by_its_age(seconds: float, shown: str) -> None:
         (40, False, ("ROBOT", "ONLINE", "SPEAKING", "QUEUE")),
     ],
 )
-def test_the_text_gives_way_first_and_then_whole_columns(columns: int, long: bool, heads: tuple[str, ...]) -> None:
-    head, first, bert = format_robots([ANNA, GONE], Screen(columns, long=long), NOW)
-    assert tuple(head.split()) == heads
+def test_the_text_is_cut_first_and_then_columns_are_dropped(columns: int, long: bool, headers: tuple[str, ...]) -> None:
+    header, first, bert = format_robots([ANNA, GONE], Screen(columns, long=long), NOW)
+    assert tuple(header.split()) == headers
     assert '"please ste' in first
     assert ("doors are" in first) == (columns > 100 or (columns == 80 and not long))
     assert "OFFLINE" in bert
 
 
-def test_wide_characters_line_up() -> None:
+def test_columns_line_up_despite_wide_characters() -> None:
     lines = format_robots([ANNA, anna(text="请往后退，门即将关闭，请注意安全")], Screen(80), NOW)
-    ends = {width(each[: each.index("2  ")]) for each in lines[1:]}
+    ends = {width(line[: line.index("2  ")]) for line in lines[1:]}
     assert len(ends) == 1
 
 
-def test_colours_are_those_of_the_states() -> None:
-    head, first, bert = format_robots([ANNA, GONE], Screen(120, colour=True), NOW)
-    assert head.startswith("\x1b[1mROBOT")
+def test_states_have_their_colours() -> None:
+    header, first, bert = format_robots([ANNA, GONE], Screen(120, colour=True), NOW)
+    assert header.startswith("\x1b[1mROBOT")
     assert '\x1b[1;32m"please' in first
     assert "\x1b[31mOFFLINE\x1b[0m" in bert
 
 
 @pytest.mark.parametrize("moment", [1e300, -1e300, 1e15, -1e15])
-def test_a_robot_with_an_impossible_time_is_shown_all_the_same(moment: float) -> None:
+def test_a_robot_with_an_impossible_time_is_still_shown(moment: float) -> None:
     goal = {"id": "odd", "state": "SUCCEEDED", "text": "hello", "created_at": moment, "ended_at": moment, "at": moment}
     event = from_json({"event": "state", "id": "odd", "state": "SUCCEEDED", "at": moment, "n": 1, "goal": goal})
     presence = Presence.read("anna", json.dumps({"online": True, "since": moment}).encode())

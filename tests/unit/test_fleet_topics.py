@@ -11,7 +11,7 @@ from talkcli.goals.options import MAX_SENDER_NAME_CHARS
 
 
 @pytest.mark.parametrize("name", ["a", "anna", "wh-07", "r2.d2", "A_1", "0", "a" * 59])
-def test_a_name_is_one_level_of_a_topic(name: str) -> None:
+def test_a_valid_name_is_accepted_and_fits_into_a_sender_name(name: str) -> None:
     assert topics.name_fault(name) is None
     assert len(f"mqtt:{name}") <= MAX_SENDER_NAME_CHARS
 
@@ -19,12 +19,12 @@ def test_a_name_is_one_level_of_a_topic(name: str) -> None:
 @pytest.mark.parametrize(
     "name", ["", "_", "-a", ".a", "a/b", "+", "#", "a+", "$SYS", "a b", "ä", "a\n", "a\0", "a" * 60, "%u"]
 )
-def test_a_name_that_would_be_another_topic_is_refused(name: str) -> None:
+def test_a_name_that_is_not_a_plain_topic_level_is_refused(name: str) -> None:
     assert topics.name_fault(name)
 
 
 @pytest.mark.parametrize(
-    ("topic", "asked"),
+    ("topic", "parsed"),
     [
         ("talk/robot/anna/request/olga", ("request", "olga")),
         ("talk/robot/anna/say/olga", ("say", "olga")),
@@ -41,8 +41,8 @@ def test_a_name_that_would_be_another_topic_is_refused(name: str) -> None:
         ("", None),
     ],
 )
-def test_a_topic_says_what_is_asked_and_by_whom(topic: str, asked: tuple[str, str] | None) -> None:
-    assert topics.parse_request(topic) == asked
+def test_a_topic_contains_the_request_and_the_user(topic: str, parsed: tuple[str, str] | None) -> None:
+    assert topics.parse_request(topic) == parsed
 
 
 @pytest.mark.parametrize(
@@ -63,7 +63,7 @@ def test_a_topic_says_what_is_asked_and_by_whom(topic: str, asked: tuple[str, st
         ("homeassistant/light", None),
     ],
 )
-def test_a_robot_answers_nobody_but_the_remote_client(response: str, answer: str | None) -> None:
+def test_a_robot_replies_only_to_the_remote_clients_own_topic(response: str, answer: str | None) -> None:
     assert topics.checked_reply(response, "olga", "anna") == answer
 
 
@@ -84,46 +84,46 @@ HOME = {
 
 
 def may(way: str, login: str | None, rules: str) -> set[str]:
-    """Return the topics that a login may read or write by its own rules, or by the patterns if it is None."""
-    found, user = set(), None
-    for kind, *words in (each.split() for each in rules.splitlines() if each):
+    """Return the topics that a login may read or write. If the login is None, return the patterns."""
+    allowed, user = set(), None
+    for kind, *words in (line.split() for line in rules.splitlines() if line):
         if kind == "user":
             (user,) = words
         elif kind in ("pattern", "topic"):
             assert (kind == "topic") == (user is not None)  # mosquitto would apply a later pattern to that user only
-            found |= {words[1]} if user == login and words[0] in (way, "readwrite") else set()
-    return found
+            allowed |= {words[1]} if user == login and words[0] in (way, "readwrite") else set()
+    return allowed
 
 
-def talk(topics_of: str) -> set[str]:
-    return {f"talk/{each}" for each in topics_of.split()}
+def full_topics(names: str) -> set[str]:
+    return {f"talk/{topic}" for topic in names.split()}
 
 
 @pytest.mark.parametrize("way", ["read", "write"])
-def test_each_login_may_use_its_own_topics_and_no_others(way: str) -> None:
+def test_each_login_may_use_only_its_own_topics(way: str) -> None:
     """If a pattern had %u in the place of the user, each robot could command the others."""
     rules = topics.access_rules(("olga",), name="r2.d2")
-    assert may(way, None, rules) == talk(ROBOT[way])
-    assert may(way, "olga", rules) == talk(OPERATOR[way])
+    assert may(way, None, rules) == full_topics(ROBOT[way])
+    assert may(way, "olga", rules) == full_topics(OPERATOR[way])
     assert may(way, "homeassistant", rules) == may(way, "r2.d2", rules) == set()
     rules = topics.access_rules(("olga",), homeassistant=True, name="r2.d2")
     own = {"read": topics.HOMEASSISTANT_STATUS, "write": "homeassistant/device/talk/%u/config"}
-    assert may(way, None, rules) == talk(ROBOT[way]) | {own[way]}
-    assert may(way, "olga", rules) == talk(OPERATOR[way])
-    assert may(way, "homeassistant", rules) == talk(HOME[way]) | {"homeassistant/#"}
+    assert may(way, None, rules) == full_topics(ROBOT[way]) | {own[way]}
+    assert may(way, "olga", rules) == full_topics(OPERATOR[way])
+    assert may(way, "homeassistant", rules) == full_topics(HOME[way]) | {"homeassistant/#"}
     dotted = {"homeassistant/device/talk-dots/r2_dd2/config"} if way == "write" else set()
     assert may(way, "r2.d2", rules) == dotted
 
 
-def test_each_operator_has_the_same_lines() -> None:
+def test_all_operators_have_the_same_rules() -> None:
     robots, olga, ha = topics.access_rules(("olga", "ha")).split("\n\n")
     assert f"{robots}\n\n{olga}" == topics.access_rules(("olga",))
     assert ha == olga.replace("olga", "ha")
 
 
-def test_only_a_name_with_a_dot_has_a_line_of_its_own() -> None:
+def test_only_a_name_with_a_dot_has_its_own_rule() -> None:
     rules = topics.access_rules(("olga",), homeassistant=True, name="anna")
     assert rules == topics.access_rules(("olga",), homeassistant=True)
     assert {*topics.access_rules(("olga",), name="r2.d2").splitlines()} < {*rules.splitlines()}
     # mosquitto's manual: %u must be the only text of its level.
-    assert {each for line in rules.splitlines()[1:] for each in re.findall(r"[^/ ]*%u[^/ ]*", line)} == {"%u"}
+    assert {level for line in rules.splitlines()[1:] for level in re.findall(r"[^/ ]*%u[^/ ]*", line)} == {"%u"}

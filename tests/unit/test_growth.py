@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 
 FEW, MANY = 100, 10_000
 #: Limit for the ratio of instructions. A binary search takes seven more steps in a queue of a hundred times the length.
-AT_MOST = 1.5
+MAX_STEPS_RATIO = 1.5
 #: Limit for the ratio of times. It allows for caches and for other programs on the machine.
-AT_MOST_TIME = 5
+MAX_TIME_RATIO = 5
 #: Memory of a pending goal with a short text, in bytes.
-MEMORY = 1024
+MAX_GOAL_BYTES = 1024
 
 
-def steps(action: Callable[[], object]) -> int:
+def instructions(action: Callable[[], object]) -> int:
     """Return the number of bytecode instructions that an action takes."""
     taken = 0
 
@@ -53,26 +53,26 @@ def steps(action: Callable[[], object]) -> int:
     return taken
 
 
-def crowd(size: int) -> Robot:
-    """Return a robot with an active goal and many pending goals. These have many priorities, and half of them a ttl."""
+def busy_robot(size: int) -> Robot:
+    """Return a robot with an active goal, and pending goals of many priorities. Half of these have a ttl."""
     robot = Robot(max_queue=size)
-    robot.says("active", priority=9)
+    robot.say("active", priority=9)
     for number in range(size):
         ttl = 1_000.0 + number if number % 2 else None
-        robot.asks(Say("waiting", priority=-(number % 1_000), ttl=ttl, key=f"key {number}", id=f"goal:{number}"))
+        robot.submit(Say("waiting", priority=-(number % 1_000), ttl=ttl, key=f"key {number}", id=f"goal:{number}"))
     assert len(robot.scheduler.pending) == size
     robot.seen.clear()
     return robot
 
 
 @pytest.fixture(scope="module")
-def crowds() -> Iterator[tuple[Robot, Robot]]:
+def busy_robots() -> Iterator[tuple[Robot, Robot]]:
     gc.disable()  # otherwise, a garbage collection of all goals could distort the measurement
-    yield crowd(FEW), crowd(MANY)
+    yield busy_robot(FEW), busy_robot(MANY)
     gc.enable()
 
 
-def ask_for_room(robot: Robot) -> None:
+def check_for_room(robot: Robot) -> None:
     assert robot.scheduler.has_room(Say("patient", preempt=True, priority=8))
     assert not robot.scheduler.has_room(Say("patient", preempt=True, priority=-1_000))
 
@@ -83,22 +83,22 @@ def write_a_status_line(robot: Robot) -> None:
 
 #: The steps to measure: a function, or a script with an effect that it must have.
 STEPS: dict[str, tuple[str, str] | Callable[[Robot], None]] = {
-    "speak the next": ("completed *; z", "z PENDING"),
+    "start the next goal": ("completed *; z", "z PENDING"),
     "reject": ("z -1000", "z REJECTED"),
     "replace": ("z 8 key=battery ttl=50", "z PENDING"),
     "attach": ("z text=waiting id=goal:99", ""),
     "throttle": ("z 8 key=face throttle=60", "z PENDING"),
     "displace": ("z 8", "z PENDING"),
     "preempt": ("z 8 preempt", "z PENDING"),
-    "cancel among others": ("z -20; cancel z; z -999", "z RECALLED"),
+    "cancel one of many": ("z -20; cancel z; z -999", "z RECALLED"),
     "cancel a key": ("z 8 key=door; cancel key=door; z -999", "z RECALLED"),
-    "look at the clock": ("wait 0", ""),
-    "ask for room": ask_for_room,
+    "tick": ("wait 0", ""),
+    "check for room": check_for_room,
     "write a status line": write_a_status_line,
 }
 
 
-def take(robot: Robot, name: str) -> None:
+def run_step(robot: Robot, name: str) -> None:
     step = STEPS[name]
     if isinstance(step, tuple):
         script, news = step
@@ -110,23 +110,23 @@ def take(robot: Robot, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", STEPS)
-def test_a_step_costs_no_more_because_many_wait(crowds: tuple[Robot, Robot], name: str) -> None:
+def test_the_cost_of_a_step_does_not_depend_on_the_queue_length(busy_robots: tuple[Robot, Robot], name: str) -> None:
     def count(robot: Robot) -> int:
         # The median is used because some goals cause more work than others.
-        return sorted(steps(lambda: take(robot, name)) for _ in range(9))[4]
+        return sorted(instructions(lambda: run_step(robot, name)) for _ in range(9))[4]
 
     def seconds(robot: Robot) -> float:
-        return min(timeit.repeat(lambda: take(robot, name), repeat=7, number=8))
+        return min(timeit.repeat(lambda: run_step(robot, name), repeat=7, number=8))
 
-    few, many = map(count, crowds)
-    assert 0 < many <= AT_MOST * few, f"{many} steps of the interpreter, {few} with {FEW:,} goals"
-    few_s, many_s = map(seconds, crowds)
-    assert many_s < AT_MOST_TIME * few_s, f"{many_s / few_s:.0f} times as long with {MANY // FEW} times as many goals"
+    few, many = map(count, busy_robots)
+    assert 0 < many <= MAX_STEPS_RATIO * few, f"{many} instructions, {few} with {FEW:,} goals"
+    few_s, many_s = map(seconds, busy_robots)
+    assert many_s < MAX_TIME_RATIO * few_s, f"{many_s / few_s:.0f} times as long with {MANY // FEW} times as many goals"
 
 
-def test_a_pending_goal_takes_less_than_a_kilobyte() -> None:
+def test_a_pending_goal_uses_less_than_a_kilobyte() -> None:
     robot = Robot(max_queue=5_000)
-    robot.says("active")
+    robot.say("active")
     tracemalloc.start()
     try:
         before = tracemalloc.get_traced_memory()[0]
@@ -135,4 +135,4 @@ def test_a_pending_goal_takes_less_than_a_kilobyte() -> None:
         taken = (tracemalloc.get_traced_memory()[0] - before) / len(robot.scheduler.pending)
     finally:
         tracemalloc.stop()
-    assert taken < MEMORY, f"{taken:.0f} bytes a goal"
+    assert taken < MAX_GOAL_BYTES, f"{taken:.0f} bytes per goal"

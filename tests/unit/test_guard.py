@@ -1,4 +1,4 @@
-"""What the guard replaces in a text, and that it replaces nothing else."""
+"""Characters that the guard replaces for libespeak-ng, and texts that it leaves unchanged."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from talkcli.engine.child.synthesizers.guard import guarded
 
-#: As people write; each has something that looks like what a rule is about.
+#: Ordinary texts. Each contains something that resembles a case of a rule.
 ORDINARY = (
     "It's 10:30 on 2024-05-01; the U.S.A. and e.g. Mr. Smith's well-known e-mail: a.b@example.org.",
     "A. B. C. D. E. F. G. H. I. J. K. L. M. N. O. P. Q. R. S. T. U. V. W. X. Y. Z. 1. 2. 3. 4. 5. 6. 7. 8. 9. 10.",
@@ -28,16 +28,16 @@ ORDINARY = (
 
 
 @pytest.mark.parametrize("text", ORDINARY)
-def test_ordinary_text_stays_what_it_is(text: str) -> None:
+def test_ordinary_text_is_unchanged(text: str) -> None:
     assert guarded(text) == text
 
 
 @pytest.mark.parametrize("code", [*range(1, 9), 0x0B, 0x0C, *range(0x0E, 0x20), 0x7F, 0x80, 0x85, 0x9F, 0xFFFD])
-def test_a_control_character_or_one_that_could_not_be_read_becomes_a_blank(code: int) -> None:
+def test_a_control_or_replacement_character_becomes_a_blank(code: int) -> None:
     assert guarded(f"a{chr(code)}5Sb") == "a 5Sb"
 
 
-def test_letters_with_dots_are_parted_before_they_are_too_many() -> None:
+def test_long_runs_of_dotted_letters_are_split() -> None:
     assert guarded("a." * 85) == "a." * 38 + "a " + "a." * 38 + "a " + "a." * 7
     assert guarded("e.g. " * 60).count("e.g. ") < 60
     assert guarded("http://" + "x." * 100).startswith("http://" + "x." * 38 + "x x.")
@@ -48,14 +48,14 @@ def test_letters_with_dots_are_parted_before_they_are_too_many() -> None:
         assert changed.replace(" ", "").replace(".", "") == text.replace(" ", "").replace(".", "")
 
 
-def test_a_long_word_behind_letters_with_dots_is_parted_from_them() -> None:
+def test_a_long_word_after_dotted_letters_is_separated_from_them() -> None:
     assert guarded("a.b." + "1" * 170) == "a.b " + "1" * 170
     assert guarded("I." + "'s" * 90).startswith("I 's's")
-    assert guarded("a." + "한" * 20) == "a " + "한" * 20  # is taken apart into letters
+    assert guarded("a." + "한" * 20) == "a " + "한" * 20  # the library splits these into letters
     assert guarded("a." + "b" * 70) == "a." + "b" * 70
 
 
-def test_letters_with_dots_behind_very_many_words_of_a_clause_are_parted() -> None:
+def test_dotted_letters_after_very_many_words_of_a_clause_are_split() -> None:
     assert guarded("a " * 225 + "U.S.A.") == "a " * 225 + "U S A."
     assert guarded("a " * 225 + "b. u.s.a.") == "a " * 225 + "b  u s a."
     assert guarded("a " * 225 + "b. U.S.A.") == "a " * 225 + "b. U.S.A."
@@ -63,7 +63,7 @@ def test_letters_with_dots_behind_very_many_words_of_a_clause_are_parted() -> No
 
 
 @pytest.mark.parametrize("sign", ["'", "(", ".", "…", "€", "№", "_", "--", "' '"])
-def test_a_hyphen_that_joins_a_word_to_the_sign_at_the_start_of_a_clause_becomes_a_blank(sign: str) -> None:
+def test_a_hyphen_after_a_sign_at_the_start_of_a_clause_becomes_a_blank(sign: str) -> None:
     assert guarded(f"{sign}-o") == f"{sign} o"
     assert guarded(f"yes, {sign}-o") == f"yes, {sign} o"
     assert guarded(f"yes! {sign}-ს") == f"yes! {sign} ს"
@@ -71,37 +71,37 @@ def test_a_hyphen_that_joins_a_word_to_the_sign_at_the_start_of_a_clause_becomes
     assert guarded(f"yes {sign} -o") == f"yes {sign} -o"
 
 
-def test_an_endless_word_ends_earlier_and_loses_no_letter() -> None:
+def test_a_very_long_word_is_split_without_losing_letters() -> None:
     for text in ("a" * 163 + "ing", "A" * 400, "é" * 200, "я" * 300):
         changed = guarded(text)
         assert changed != text
         assert changed.lower() == text.lower()
-        parts = [each for each in _words(changed) if each]
-        assert max(len(each.encode()) for each in parts) <= 160, parts
-    # no capitals, or no word: nothing can be done, and nothing was seen
+        parts = [word for word in _words(changed) if word]
+        assert max(len(part.encode()) for part in parts) <= 160, parts
+    # without capitals or words, no split is possible, and no crash was observed
     for text in ("अ" * 100, "中" * 100, "1" * 400):
         assert guarded(text) == text
     assert guarded("x" + "'s" * 70) == "x" + "'s" * 30 + " s" + "'s" * 30 + " s" + "'s" * 8
 
 
 @given(st.text(st.characters() | st.sampled_from("a.- 'é\n\ud800"), max_size=300))
-def test_any_text_keeps_its_length_and_what_is_changed_once_is_not_changed_again(text: str) -> None:
+def test_any_text_keeps_its_length_and_a_second_pass_changes_nothing(text: str) -> None:
     changed = guarded(text)
     assert len(changed) == len(text)
     assert guarded(changed) == changed
 
 
 @pytest.mark.parametrize("motif", ["a.", "a. ", "-'", "'-o", "... ", "a", "é", ".-", "한.", "\u0301", "\n"])
-def test_the_longest_text_takes_no_time(motif: str) -> None:
+def test_the_longest_text_takes_less_than_half_a_second(motif: str) -> None:
     text = (motif * 10_000)[:10_000]
     guarded(text)
-    began = time.thread_time()
+    started_at = time.thread_time()
     guarded(text)
-    assert time.thread_time() - began < 0.5
+    assert time.thread_time() - started_at < 0.5
 
 
 def _words(text: str) -> list[str]:
-    """Return the words into which the library parts one: before a capital behind a small letter."""
+    """Split a text as the library does: before a capital that follows a small letter."""
     words = [""]
     for before, here in zip(" " + text, text, strict=False):
         if before.islower() and here.isupper():
@@ -110,8 +110,8 @@ def _words(text: str) -> list[str]:
     return words
 
 
-#: Voices, what they must not be given, and what they say as it stands.
-UNKNOWN = (
+#: A voice, the characters that would crash it, and characters of its own and other languages that it can speak.
+CRASHING = (
     ("gmw/en", "৩ ೬ ॰ ൟ ಌ ᇃ ᆀ ჻ ֏ \u0387", "ক ಕ क ക ᄀ 가 გ հ α", "٣ १ ๓ ՞ · 3"),
     ("inc/bn", "൧ ॰", "৩ ৳ ক", "१"),
     ("inc/pa", "৩", "੩ ૩", "१"),
@@ -122,12 +122,12 @@ UNKNOWN = (
 )
 
 
-@pytest.mark.parametrize(("voice", "blanked", "own", "others"), UNKNOWN)
-def test_what_the_language_of_its_script_has_no_word_for_is_given_to_voices_of_it_alone(
+@pytest.mark.parametrize(("voice", "blanked", "own", "others"), CRASHING)
+def test_a_crashing_character_is_kept_only_for_voices_of_its_language(
     voice: str, blanked: str, own: str, others: str
 ) -> None:
-    for each in blanked.split():
-        assert guarded(f"one{each}two {each}", voice) == "one two  ", each
+    for character in blanked.split():
+        assert guarded(f"one{character}two {character}", voice) == "one two  ", character
     assert guarded(f"{own} {others} low", voice) == f"{own} {others} low"
 
 
@@ -140,8 +140,6 @@ def test_what_the_language_of_its_script_has_no_word_for_is_given_to_voices_of_i
         ("sit/cmn", "1234567890123", "1234567890123"),
     ],
 )
-def test_a_number_that_the_library_cannot_say_is_parted_in_these_voices_alone(
-    voice: str, text: str, expected: str
-) -> None:
+def test_a_number_of_a_crashing_length_is_split_only_for_some_voices(voice: str, text: str, expected: str) -> None:
     assert guarded(text, voice) == expected
     assert guarded(expected, voice) == expected

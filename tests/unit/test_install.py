@@ -23,7 +23,7 @@ OPT = Environment("/opt/talk/bin/python3", needs_sudo=True)
 
 #: In the commands, PY stands for the environment's own Python.
 @pytest.mark.parametrize(
-    ("environment", "again", "command"),
+    ("environment", "reinstall", "command"),
     [
         (VENV, False, "PY -m pip install numpy"),
         (replace(VENV, python="/home/pi/my robot/bin/python"), False, "PY -m pip install numpy"),
@@ -51,16 +51,16 @@ OPT = Environment("/opt/talk/bin/python3", needs_sudo=True)
         (replace(VENV, has_pip=False, made_by_uv=True), True, "uv pip install --reinstall --python PY numpy"),
     ],
 )
-def test_the_command_fits_the_environment(environment: Environment, again: bool, command: str) -> None:
-    wanted = command.replace("PY ", f"{shlex.quote(environment.python)} ")
-    assert command_for(environment, ["numpy"], reinstall=again) == wanted
+def test_the_command_fits_the_environment(environment: Environment, reinstall: bool, command: str) -> None:
+    expected = command.replace("PY ", f"{shlex.quote(environment.python)} ")
+    assert command_for(environment, ["numpy"], reinstall=reinstall) == expected
 
 
-def test_the_command_names_the_python_that_runs() -> None:
+def test_the_command_names_the_running_python() -> None:
     assert sys.executable in shlex.split(install.command("numpy"))
 
 
-def test_on_a_32_bit_system_no_package_is_named_that_has_no_build_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_32_bit_system_is_not_offered_packages_without_a_build(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(install, "IS_64_BIT", False)
     assert install.espeak_library() == "sudo apt-get install -y libespeak-ng1"
     step = "neural voices need a 64-bit system; use an espeak voice, such as en"

@@ -53,16 +53,16 @@ BAD_LINES = {
     "objects 10,000 deep": (b'{"a":' * 10_000 + b"1" + b"}" * 10_000, "bad_json"),
     "an integer of 5,000 digits": (b'{"seq": ' + b"9" * 5_000 + b"}", "bad_json"),
     "a negative integer of 5,000 digits": (b'{"seq": -' + b"9" * 5_000 + b"}", "bad_json"),
-    "a number past every float": (b'{"ttl": 1e999}', "bad_json"),
-    "a negative number past every float": (b'{"ttl": -1e999}', "bad_json"),
+    "a number too large for a float": (b'{"ttl": 1e999}', "bad_json"),
+    "a negative number too large for a float": (b'{"ttl": -1e999}', "bad_json"),
     "a float of 5,000 digits": (b'{"ttl": ' + b"9" * 5_000 + b".0}", "bad_json"),
     "NaN": (b'{"ttl": NaN}', "bad_json"),
     "Infinity": (b'{"ttl": Infinity}', "bad_json"),
     "-Infinity": (b'{"ttl": -Infinity}', "bad_json"),
     "the same key twice": (b'{"request": "say", "text": "a", "text": "b"}', "bad_json"),
-    "the same key twice, within": (b'{"data": {"a": 1, "a": 1}}', "bad_json"),
+    "the same key twice in a nested object": (b'{"data": {"a": 1, "a": 1}}', "bad_json"),
     "invalid UTF-8": (b'{"request": "say", "text": "\xff"}', "bad_encoding"),
-    "UTF-8 cut short": (b'{"request": "say", "text": "\xe6\x97"}', "bad_encoding"),
+    "truncated UTF-8": (b'{"request": "say", "text": "\xe6\x97"}', "bad_encoding"),
     "a surrogate in UTF-8": (b'{"request": "say", "text": "\xed\xa0\x80"}', "bad_encoding"),
     "UTF-16": ('{"request": "status"}'.encode("utf-16"), "bad_encoding"),
     "NUL": (b"\0", "bad_json"),
@@ -76,7 +76,7 @@ BAD_LINES = {
 
 
 @pytest.mark.parametrize(("line", "code"), BAD_LINES.values(), ids=BAD_LINES.keys())
-def test_bad_line_is_refused_with_a_code(line: bytes, code: str) -> None:
+def test_an_invalid_line_is_refused_with_an_error_code(line: bytes, code: str) -> None:
     with pytest.raises(BadRequest) as refused:
         decode(line)
     assert refused.value.code == code
@@ -96,7 +96,7 @@ json_pieces = st.sampled_from(
 
 @given(st.binary(max_size=40) | st.lists(json_pieces | st.binary(max_size=2), max_size=20).map(b"".join))
 @example(b'{"a": 1e999}')
-def test_any_bytes_are_an_object_that_can_be_written_again_or_a_bad_request(line: bytes) -> None:
+def test_any_bytes_are_read_as_an_object_or_refused(line: bytes) -> None:
     assert decode(encode(read(line))) == read(line)
 
 
@@ -109,7 +109,7 @@ def read(line: bytes) -> JsonObject:
 
 
 @given(objects)
-def test_what_is_written_is_one_line_and_is_read_back(message: JsonObject) -> None:
+def test_an_object_is_written_as_one_line_and_read_back(message: JsonObject) -> None:
     line = encode(message)
     assert (line.endswith(b"\n"), line.count(b"\n")) == (True, 1)
     line.decode()
@@ -118,14 +118,14 @@ def test_what_is_written_is_one_line_and_is_read_back(message: JsonObject) -> No
 
 
 @pytest.mark.parametrize("number", [float("nan"), float("inf"), float("-inf")])
-def test_a_number_that_is_no_json_is_never_written(number: float) -> None:
+def test_a_number_that_json_cannot_express_is_never_written(number: float) -> None:
     with pytest.raises(ValueError, match="float"):
         encode({"ttl": number})
 
 
 # Splitting a stream into lines
 
-MOST = 8
+LIMIT = 8
 
 streams = st.lists(st.sampled_from([b"\n", b"a", b"\r", b"\xff", b"1234567", b"x" * 20]), max_size=30).map(b"".join)
 
@@ -138,54 +138,50 @@ def segments(stream: bytes, places: list[int]) -> list[bytes]:
 @given(streams, st.lists(st.integers(0), max_size=20))
 @example(b"12345678\n123456789\n" * 2, [3, 8, 9, 17, 20])
 def test_any_segmentation_gives_the_same_lines(stream: bytes, places: list[int]) -> None:
-    everything, beginnings = LineSplitter(), LineSplitter(MOST)
+    unlimited, limited = LineSplitter(), LineSplitter(LIMIT)
     lines, kept = [], []
     for segment in segments(stream, places):
-        lines += everything.feed(segment)
-        kept += beginnings.feed(segment)
-        assert everything.size == beginnings.size
+        lines += unlimited.feed(segment)
+        kept += limited.feed(segment)
+        assert unlimited.size == limited.size
     *whole, rest = stream.split(b"\n")
     assert lines == whole
-    assert everything.size == len(rest)
-    assert everything.take_rest() == rest
-    kept.append(beginnings.take_rest())
-    assert kept == [line[:MOST] for line in (*whole, rest)]
-    assert [each.size if isinstance(each, TruncatedLine) else len(each) for each in kept] == [
-        *map(len, whole),
-        len(rest),
-    ]
-    assert all(
-        isinstance(each, TruncatedLine) == (len(line) > MOST) for each, line in zip(kept, (*whole, rest), strict=True)
-    )
+    assert unlimited.size == len(rest)
+    assert unlimited.take_rest() == rest
+    kept.append(limited.take_rest())
+    assert kept == [line[:LIMIT] for line in (*whole, rest)]
+    sizes = [*map(len, whole), len(rest)]
+    assert [line.size if isinstance(line, TruncatedLine) else len(line) for line in kept] == sizes
+    assert [isinstance(line, TruncatedLine) for line in kept] == [size > LIMIT for size in sizes]
 
 
-@pytest.mark.parametrize("most", [MOST, 100])
-def test_a_stream_goes_on_after_its_end(most: int) -> None:
-    splitter = LineSplitter(most)
+@pytest.mark.parametrize("limit", [LIMIT, 100])
+def test_a_splitter_can_be_used_again_after_its_rest_is_taken(limit: int) -> None:
+    splitter = LineSplitter(limit)
     assert splitter.take_rest() == b""
     assert splitter.feed(b"123456789") == []
-    assert splitter.take_rest() == b"123456789"[:most]
+    assert splitter.take_rest() == b"123456789"[:limit]
     assert (splitter.size, splitter.take_rest()) == (0, b"")
     assert splitter.feed(b"a\nb") == [b"a"]
 
 
-def test_a_line_that_never_ends_is_not_kept() -> None:
-    splitter = LineSplitter(MOST)
+def test_only_the_start_of_an_endless_line_is_kept() -> None:
+    splitter = LineSplitter(LIMIT)
     for _ in range(100):
         assert splitter.feed(b"x" * 65536) == []
-    assert len(splitter._rest) == MOST
+    assert len(splitter._rest) == LIMIT
     assert splitter.size == 100 * 65536
 
 
 def feed(stream: bytes, segment: int) -> list[bytes]:
-    """Return the lines of a stream that arrives in these segments, including the incomplete last line."""
+    """Return the lines of a stream that arrives in segments of this size, including the incomplete last line."""
     splitter = LineSplitter(MAX_LINE_BYTES - 1)
-    lines = [each for at in range(0, len(stream), segment) for each in splitter.feed(stream[at : at + segment])]
+    lines = [line for at in range(0, len(stream), segment) for line in splitter.feed(stream[at : at + segment])]
     return [*lines, splitter.take_rest()]
 
 
 @pytest.mark.parametrize("segment", [7, 64 * KIB, 10 * KIB * KIB])
-def test_a_line_of_64_kib_with_its_newline_is_the_longest(segment: int) -> None:
+def test_the_longest_line_has_64_kib_including_its_newline(segment: int) -> None:
     assert MAX_LINE_BYTES == 64 * KIB
     line = b"a" * (64 * KIB - 1)
     assert feed(line + b"\n", segment) == [line, b""]
@@ -196,18 +192,18 @@ def test_a_line_of_64_kib_with_its_newline_is_the_longest(segment: int) -> None:
 
 
 @pytest.mark.parametrize("end", [b"", b"\n", b'\n{"request": "status"}\n'])
-def test_lines_before_one_that_is_too_long_are_not_lost(end: bytes) -> None:
+def test_lines_before_an_oversize_line_are_not_lost(end: bytes) -> None:
     first, blank, too_long, *_ = feed(b'{"request": "cancel"}\n\n' + b"[" * MAX_LINE_BYTES + end, 11)
     assert (first, blank) == (b'{"request": "cancel"}', b"")
     assert isinstance(too_long, TruncatedLine)
 
 
-def test_a_longest_text_fits_in_a_line() -> None:
+def test_the_longest_text_fits_into_a_line() -> None:
     for text in ("🤖" * 10_000, "日" * 10_000, "\x01" * 10_000, '"' * 10_000):
         assert len(encode({"seq": 1, "request": "say", "text": text, "wait": True})) <= MAX_LINE_BYTES
 
 
-def test_a_line_is_what_any_json_writer_makes() -> None:
+def test_json_from_other_writers_is_read() -> None:
     assert encode({"text": "é日🤖"}) == '{"text": "é日🤖"}\n'.encode()
     assert decode(b'{"seq": 18446744073709551615}') == {"seq": 2**64 - 1}
     for compact in (json.dumps({"text": "é"}), json.dumps({"text": "é"}, separators=(",", ":"), ensure_ascii=False)):

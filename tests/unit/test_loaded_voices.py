@@ -28,13 +28,13 @@ if TYPE_CHECKING:
 #: voices are dropped if a speaks and goals need b and c. "memory 2" sets the limit in bytes. A voice takes one byte
 #: until it is measured. The outcome consists of the last answer, the dropped voices, and all states.
 RULES = """
-# what is next
+# the next voice
 
 one voice is loaded at a time, in the order of the goals
     want b a; next a b  ->  a; b waiting, a loading
 the next voice waits for the one that is loading
     want b a; next a b; next a b  ->  nothing; b waiting, a loading
-the next voice is loaded after it
+the next voice is loaded after the first one
     want b a; next a b; loaded a; next a b  ->  b; b loading, a loaded
 no voice is next once all are loaded
     want b a; next a b; loaded a; next a b; loaded b; next a b  ->  nothing; b loaded, a loaded
@@ -42,11 +42,11 @@ a voice that no goal needs any more is forgotten
     want a; next  ->  nothing; none
 a forgotten voice is not loaded later
     want a; next; next a  ->  nothing; none
-a forgotten voice is loaded if a goal asks for it again
+a forgotten voice is loaded if a goal requests it again
     want a; next; want a; next a  ->  a; a loading
-the voice asked for least makes room
+the least recently requested voice is dropped for a new one
     load a b; want a c; next c  ->  c, b dropped; a loaded, c loading
-no voice is dropped that is needed before
+a voice that is needed earlier is not dropped
     load a b; want c; next a b c  ->  nothing; a loaded, b loaded, c waiting
 a voice that is not needed is dropped
     load a b; want c; next b c  ->  c, a dropped; b loaded, c loading
@@ -56,45 +56,45 @@ a dropped voice is not loaded before it is needed
     memory 1; load a; want b; next b a; loaded b; next b a  ->  nothing; b loaded, a waiting
 a dropped voice is loaded once it is needed
     memory 1; load a; want b; next b a; loaded b; next a  ->  a, b dropped; a loading
-a voice larger than the limit is loaded alone
+a voice larger than the limit is loaded as the only one
     memory 0; want a; next a  ->  a; a loading
-nothing is dropped for the server's own while no goal needs it
+no voice is dropped for the server's own voice before a goal needs that
     memory 1; load a; want b; next : b  ->  nothing; a loaded, b waiting
-a voice is dropped for the server's own once a goal needs that
+a voice is dropped for the server's own voice once a goal needs that
     memory 1; load a; want b; next b : b  ->  b, a dropped; b loading
-the server's own is loaded if nothing is in its way
+the server's own voice is loaded if no other voice is loaded
     memory 0; want a; next : a  ->  a; a loading
-a voice that the engine loads of itself stops no other
+a voice that the engine loads by itself does not delay others
     want a; next a; loaded d  ->  a; a loading, d loaded
 
-# what voices take
+# memory
 
-what is larger than allowed is dropped, the voice that is not needed first
+above the limit, a voice that is not needed is dropped first
     memory 100; load a b c; grown a 40; grown b 80; grown c 125; excess c : c  ->  a dropped; b loaded, c loaded
-nothing is dropped while all fit
+no voice is dropped below the limit
     memory 100; load a b c; grown a 40; grown b 80; excess b : b  ->  nothing; a loaded, b loaded, c loaded
-what a voice takes may grow
+the memory of a voice may grow
     memory 100; load a b c; grown a 40; grown a 60; grown b 100; grown c 130; excess c : c
         ->  a dropped; b loaded, c loaded
-what is measured while a voice is loaded replaces the size of its file
+memory measured while a voice is loading replaces the size of its file
     memory 100; want a; next a; grown a 50; loaded a; want b; next b; grown b 100; loaded b; excess b : b
         ->  nothing; a loaded, b loaded
-what was dropped no longer counts, before the engine has told what it got back
+a dropped voice no longer counts, even before the engine reports its memory again
     memory 100; load a b c; grown a 40; grown b 80; grown c 125; excess c : c; excess c : c
         ->  nothing; b loaded, c loaded
-nothing more is dropped after the engine has told what it got back
+no other voice is dropped after the engine reports less memory
     memory 100; load a b; grown a 60; grown b 120; excess b : b; grown - 60; excess b : b  ->  nothing; b loaded
-what a voice took is remembered
+the memory of a dropped voice is remembered
     memory 100; load a b; grown a 60; grown b 110; excess b : b; grown - 50; want a; next a
         ->  a, b dropped; a loading
-what the engine did not get back counts, too
+memory that the engine did not free counts, too
     memory 100; load a b; grown a 30; grown b 60; unloaded a; grown - 99; want c; next b c  ->  c; b loaded, c loading
-what the engine did not get back leaves no room for a voice
+memory that the engine did not free may leave no room for a voice
     memory 100; load a b; grown a 30; grown b 60; unloaded a; grown - 100; want c; next b c
         ->  nothing; b loaded, c waiting
-a lost engine has grown by nothing
+the memory of a lost engine no longer counts
     memory 100; load a b; grown a 99; lost; want d c; next d c; loaded d; next d c  ->  c; d loaded, c loading
-the voice that speaks is kept
+the voice that is speaking is kept
     memory 50; load a b c; grown a 60; grown b 120; grown c 180; excess a :  ->  b c dropped; a loaded
 without a speaking voice, the last one is kept
     memory 50; load a b c; grown a 60; grown b 120; grown c 180; excess - :  ->  a b dropped; c loaded
@@ -104,13 +104,13 @@ the voice that is needed last is dropped first
 a voice that is not needed is dropped before one that is
     memory 50; load a b c; grown a 60; grown b 120; grown c 180; excess c : c a  ->  b a dropped; c loaded, a waiting
 
-# an engine that is lost
+# a lost engine
 
-nothing is loaded any more
+all voices of a lost engine are forgotten
     load a b; lost  ->  b; none
-a voice that was being loaded is to be loaded again
+a voice that was loading is waiting again
     want b; next b; lost  ->  b; b waiting
-a voice has failed at the second death of the engine
+a voice has failed after the engine died twice
     want b; next b; lost; want b; next b; lost  ->  b; b failed
 a voice that has failed is not blamed for a third death
     want b; next b; lost; want b; next b; lost; lost; want b; next b  ->  nothing; b failed
@@ -119,8 +119,8 @@ a death is forgotten once the voice is loaded
 """
 
 
-class Asked(VoiceScheduler):
-    """A scheduler of voices whose files have a size of one byte."""
+class ScriptedVoices(VoiceScheduler):
+    """A voice scheduler that plays scripts. Every voice file has a size of one byte."""
 
     answer = "nothing"
     warnings: tuple[str, ...] | list[str] = ()
@@ -128,7 +128,7 @@ class Asked(VoiceScheduler):
     def __init__(self, memory: int = 2) -> None:
         super().__init__(memory, lambda _: 1)
 
-    def play(self, script: str, now: float = 0.0) -> Asked:
+    def play(self, script: str, now: float = 0.0) -> ScriptedVoices:
         for step in script.split("; "):
             verb, *words = step.split()
             self._do(verb, words, now)
@@ -136,12 +136,12 @@ class Asked(VoiceScheduler):
 
     def _do(self, verb: str, words: list[str], now: float) -> None:
         place = words.index(":") if ":" in words else len(words)
-        before, after = (["" if each == "-" else each for each in part] for part in (words[:place], words[place + 1 :]))
+        before, after = (["" if word == "-" else word for word in part] for part in (words[:place], words[place + 1 :]))
         steps: dict[str, Callable[[], object]] = {
             "memory": lambda: setattr(self, "_limit_bytes", int(words[0])),
             "want": lambda: list(map(partial(self.request, now=now), words)),
             "next": lambda: self._load_next(before, after, now),
-            "load": lambda: [self.play(f"want {each}; next {each}; loaded {each}") for each in words],
+            "load": lambda: [self.play(f"want {voice}; next {voice}; loaded {voice}") for voice in words],
             "loaded": lambda: self.load_ended(words[0], None, now),
             "failed": lambda: self.load_ended(words[0], "no json", now),
             "unloaded": lambda: self.unloaded(words[0], []),
@@ -153,73 +153,73 @@ class Asked(VoiceScheduler):
 
     def _load_next(self, needed: list[str], default: list[str], now: float) -> None:
         order = self.load_next(needed, "".join(default), now) if self.can_load else None
-        self._tell(order.voice if order else "", order.dropped if order else ())
+        self._set_answer(order.voice if order else "", order.dropped if order else ())
 
     def _drop_excess(self, first: str, needed: list[str]) -> None:
         orders = self.drop_excess(first, needed)
-        self._tell("", tuple(each.voice for each in orders if isinstance(each, VoiceDropOrder)))
-        self.warnings = [each.message for each in orders if isinstance(each, VoiceWarning)]
+        self._set_answer("", tuple(order.voice for order in orders if isinstance(order, VoiceDropOrder)))
+        self.warnings = [order.message for order in orders if isinstance(order, VoiceWarning)]
 
-    def _tell(self, voice: str, dropped: tuple[str, ...]) -> None:
-        told = [voice, f"{' '.join(dropped)} dropped" if dropped else ""]
-        self.answer = ", ".join(filter(None, told)) or "nothing"
+    def _set_answer(self, voice: str, dropped: tuple[str, ...]) -> None:
+        parts = [voice, f"{' '.join(dropped)} dropped" if dropped else ""]
+        self.answer = ", ".join(filter(None, parts)) or "nothing"
 
     def outcome(self) -> str:
-        states = ", ".join(f"{voice} {each.state.value}" for voice, each in self._voices.items())
+        states = ", ".join(f"{voice} {neural_voice.state.value}" for voice, neural_voice in self._voices.items())
         return f"{self.answer}; {states or 'none'}"
 
 
 @pytest.mark.parametrize(("script", "outcome"), rules(RULES))
 def test_a_rule_holds(script: str, outcome: str) -> None:
-    assert Asked().play(script).outcome() == outcome
+    assert ScriptedVoices().play(script).outcome() == outcome
 
 
-def test_a_voice_that_is_too_large_alone_stays_and_that_is_told_once() -> None:
-    voices = Asked(100_000_000).play("load a; grown a 99000000; excess a : a")
+def test_a_single_voice_that_is_too_large_stays_with_one_warning() -> None:
+    voices = ScriptedVoices(100_000_000).play("load a; grown a 99000000; excess a : a")
     assert voices.warnings == []
     voices.play("grown a 120000000; excess a : a")
     why = "it uses 120 MB, more than --voice-memory 100 allows"
     assert (voices.answer, voices.warnings) == ("nothing", [f"voice a: {why}"])
     assert voices.play("excess a : a").warnings == []
     assert voices.to_json() == {"a": {"state": "loaded", "why": why}}
-    assert Asked(0).play("load a; excess a : a").warnings == [], "a limit of 0 means one voice at a time"
+    assert ScriptedVoices(0).play("load a; excess a : a").warnings == [], "a limit of 0 means one voice at a time"
 
 
-def test_a_voice_that_fails_is_tried_again_later_and_later() -> None:
-    voices = Asked()
-    now, waited = 100.0, []
+def test_a_failed_voice_is_retried_at_growing_intervals() -> None:
+    voices = ScriptedVoices()
+    now, delays = 100.0, []
     for _ in range(14):
         voices.play("want a; next a; failed a", now)
         assert (voices.answer, voices.failure("a")) == ("a", "no json")
-        again = voices._voices["a"].retry_at
-        assert voices.play("want a; next a", again - 0.001).outcome() == "nothing; a failed"
-        waited.append(again - now)
-        now = again
-    assert waited[:3] == pytest.approx([FIRST_VOICE_RETRY_S, 2 * FIRST_VOICE_RETRY_S, 4 * FIRST_VOICE_RETRY_S])
-    assert waited[-1] == pytest.approx(LAST_VOICE_RETRY_S)
+        retry_at = voices._voices["a"].retry_at
+        assert voices.play("want a; next a", retry_at - 0.001).outcome() == "nothing; a failed"
+        delays.append(retry_at - now)
+        now = retry_at
+    assert delays[:3] == pytest.approx([FIRST_VOICE_RETRY_S, 2 * FIRST_VOICE_RETRY_S, 4 * FIRST_VOICE_RETRY_S])
+    assert delays[-1] == pytest.approx(LAST_VOICE_RETRY_S)
     voices.forget_failure("a")
     assert voices.play("want a", now).outcome() == "nothing; a waiting"
 
 
-def test_a_voice_has_failed_while_it_is_tried_again() -> None:
-    voices = Asked().play("want a; next a; failed a")
+def test_a_voice_still_counts_as_failed_while_it_is_retried() -> None:
+    voices = ScriptedVoices().play("want a; next a; failed a")
     assert voices.play("want a; next a", FIRST_VOICE_RETRY_S).outcome() == "a; a failed"
     assert voices.play("want a", 1000.0)._voices["a"].state is VoiceState.FAILED
     assert not voices.can_load
     assert voices.play("loaded a").to_json() == {"a": {"state": "loaded", "why": None}}
 
 
-def test_a_voice_that_no_goal_needs_any_more_keeps_nobody_looking() -> None:
-    voices = Asked().play("want a; next : b")
+def test_no_load_is_pending_once_no_goal_needs_the_voice() -> None:
+    voices = ScriptedVoices().play("want a; next : b")
     assert (voices.can_load, voices.outcome()) == (False, "nothing; none")
     voices.play("want a; next a; failed a").play("want a", FIRST_VOICE_RETRY_S)
     assert voices.can_load
     assert (voices.play("next").outcome(), voices.can_load) == ("nothing; a failed", False)
 
 
-def test_an_engine_that_dies_twice_has_its_cause() -> None:
+def test_a_voice_fails_with_a_reason_after_the_engine_died_twice() -> None:
     assert MAX_ENGINE_DEATHS == 2
-    voices = Asked().play("want a; next a; lost; want a; next a")
+    voices = ScriptedVoices().play("want a; next a; lost; want a; next a")
     why = "the engine process died while loading the voice"
     assert voices.engine_lost(0.0) == [VoiceWarning(f"voice a is not used: {why}")]
     assert voices.engine_lost(0.0) == []

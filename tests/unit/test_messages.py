@@ -1,4 +1,4 @@
-"""The JSON form of goals and senders: all keys, the way back, and messages from newer or broken servers."""
+"""The JSON form of goals and senders, and messages from newer or faulty servers."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ goals = st.builds(
 
 
 @given(goals, st.dictionaries(st.text().filter(lambda key: key not in KEYS), values, max_size=3))
-def test_a_goal_has_all_its_keys_and_is_read_back_whatever_else_comes(goal: Goal, extra: dict[str, object]) -> None:
+def test_a_goal_has_all_its_keys_and_is_read_back_despite_unknown_ones(goal: Goal, extra: dict[str, object]) -> None:
     message = goal.to_json()
     assert list(message) == KEYS
     assert (message["state"], message["status"], type(message["status"])) == (goal.state.name, goal.state.value, int)
@@ -65,20 +65,20 @@ def test_a_goal_has_all_its_keys_and_is_read_back_whatever_else_comes(goal: Goal
     assert Goal.from_json(read) == goal
 
 
-def test_what_is_not_known_of_a_goal_is_null() -> None:
+def test_unknown_values_of_a_goal_are_null() -> None:
     message = Goal("4k7f-1", State.PENDING).to_json()
     assert message == dict.fromkeys(KEYS) | {
         "id": "4k7f-1", "state": "PENDING", "status": 0, "format": "text", "priority": 0, "paused": False
     }  # fmt: skip
 
 
-def test_a_time_that_no_calendar_can_show_is_unknown() -> None:
+def test_a_time_beyond_the_calendar_is_unknown() -> None:
     shown: list[object] = [0, -1e15, 1e15]
-    assert [seconds_of(each) for each in shown] == shown
-    assert {seconds_of(each) for each in (1e15 + 1, -1e15 - 1, float("nan"), True, "1", None)} == {None}
+    assert [seconds_of(value) for value in shown] == shown
+    assert {seconds_of(value) for value in (1e15 + 1, -1e15 - 1, float("nan"), True, "1", None)} == {None}
 
 
-def test_an_output_that_lacks_something_is_none() -> None:
+def test_an_incomplete_output_is_ignored() -> None:
     message = Goal("4k7f-1", State.ACTIVE, output=Output("pulse", "card", 0.5, True)).to_json()
     assert Goal.from_json(message).output == Output("pulse", "card", 0.5, True)
     for name in ("player", "device", "volume", "muted"):
@@ -88,7 +88,7 @@ def test_an_output_that_lacks_something_is_none() -> None:
 
 
 @given(goals, st.sampled_from(KEYS), values)
-def test_a_goal_with_one_wrong_field_is_a_goal_or_a_value_error(goal: Goal, name: str, value: object) -> None:
+def test_a_goal_with_one_wrong_field_is_read_or_raises_value_error(goal: Goal, name: str, value: object) -> None:
     try:
         read = Goal.from_json({**goal.to_json(), name: value})
     except ValueError:
@@ -101,22 +101,22 @@ def test_a_goal_with_one_wrong_field_is_a_goal_or_a_value_error(goal: Goal, name
     "value",
     [
         *(None, [], "4k7f-1", 7, {}, {"id": "4k7f-1"}, {"state": "ACTIVE"}),
-        *({"id": each, "state": "ACTIVE"} for each in (1, "4k7f\x1b[31m")),
-        *({"id": "4k7f-1", "state": each} for each in (1, "DANCING", "active", None)),
+        *({"id": goal_id, "state": "ACTIVE"} for goal_id in (1, "4k7f\x1b[31m")),
+        *({"id": "4k7f-1", "state": state} for state in (1, "DANCING", "active", None)),
         {"id": "4k7f-1", "state": []},
     ],
 )
-def test_what_has_no_id_and_no_state_that_is_known_is_no_goal(value: object) -> None:
+def test_a_value_without_a_valid_id_and_state_is_not_a_goal(value: object) -> None:
     with pytest.raises(ValueError, match="goal"):
         Goal.from_json(value)
 
 
 @given(values)
-def test_any_json_value_for_a_sender_is_a_sender(value: object) -> None:
+def test_any_json_value_is_read_as_a_sender(value: object) -> None:
     assert isinstance(Sender.from_json(value), Sender)
 
 
-def test_by_names_a_goal_or_a_client_never_both() -> None:
+def test_by_names_a_goal_or_a_client_but_never_both() -> None:
     sender = Sender(pid=7, uid=1000, command="talk", parent="bash patrol.sh", name="patrol")
     assert By(goal="4k7f-2").to_json() == {"goal": "4k7f-2"}
     assert By(client=sender).to_json() == {

@@ -1,4 +1,4 @@
-"""The options of a goal: their limits, the form of ids, and all other places that repeat them."""
+"""The options of a goal: their limits, the form of ids, and the other places that must agree with them."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ from talkcli.server import run
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-ROWS = {each.name: each for each in OPTIONS}
-NO_SECONDS: list[object] = [-1, -0.001, math.nan, math.inf, -math.inf, 10**400, -(10**400)]
+ROWS = {option.name: option for option in OPTIONS}
+INVALID_SECONDS: list[object] = [-1, -0.001, math.nan, math.inf, -math.inf, 10**400, -(10**400)]
 GOOD: list[tuple[str, list[object]]] = [
     ("rate", [80, 200, 450]),
     ("volume", [0, 0.0, 0.5, 1, 1.0]),
@@ -71,8 +71,8 @@ BAD: list[tuple[str, list[object]]] = [
     ("pitch", [-1, 101, 10**400]),
     ("lead_in", [-1, 5_001, 10**400]),
     ("voice", [""]),
-    ("ttl", NO_SECONDS),
-    ("throttle", NO_SECONDS),
+    ("ttl", INVALID_SECONDS),
+    ("throttle", INVALID_SECONDS),
     ("priority", [MAX_PRIORITY + 1, -MAX_PRIORITY - 1, 10**400]),
     ("key", ["", "a" * (MAX_KEY_CHARS + 1)]),
     ("format", ["ssml", "", "TEXT", "a" * 5_000]),
@@ -96,25 +96,25 @@ def options(table: list[tuple[str, list[object]]]) -> list[tuple[str, object]]:
     return [(name, value) for name, values in table for value in values]
 
 
-@pytest.mark.parametrize(("name", "value"), [*options(GOOD), *[("id", each) for each in OWN_IDS]], ids=short)
-def test_an_option_within_its_limits_is_taken(name: str, value: object) -> None:
+@pytest.mark.parametrize(("name", "value"), [*options(GOOD), *[("id", goal_id) for goal_id in OWN_IDS]], ids=short)
+def test_an_option_within_its_limits_is_accepted(name: str, value: object) -> None:
     assert bad_option(Say("hi", **{name: value})) is None  # type: ignore[arg-type]
     if name in annotated(Set):
         assert bad_option(Set(**{name: value})) is None  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("name", "value"), [*options(BAD), *[("id", each) for each in OTHER_IDS]], ids=short)
-def test_an_option_out_of_its_limits_is_refused_and_named(name: str, value: object) -> None:
+@pytest.mark.parametrize(("name", "value"), [*options(BAD), *[("id", goal_id) for goal_id in OTHER_IDS]], ids=short)
+def test_an_option_outside_its_limits_is_refused_by_name(name: str, value: object) -> None:
     for preempt in (None, True):
-        words = bad_option(Say("hi", preempt=preempt, **{name: value}))  # type: ignore[arg-type]
-        assert words is not None
-        assert name in words
-        assert len(words) < 600
+        message = bad_option(Say("hi", preempt=preempt, **{name: value}))  # type: ignore[arg-type]
+        assert message is not None
+        assert name in message
+        assert len(message) < 600
     if name in annotated(Set):
         assert name in str(bad_option(Set(**{name: value})))  # type: ignore[arg-type]
 
 
-def test_flush_without_preempt_is_a_contradiction() -> None:
+def test_flush_with_preempt_turned_off_is_refused() -> None:
     assert bad_option(Say("hi")) is bad_option(Set()) is bad_option(Say("hi", flush=True)) is None
     assert bad_option(Say("hi", flush=True, preempt=True)) is None
     assert "flush" in str(bad_option(Say("hi", flush=True, preempt=False)))
@@ -124,13 +124,13 @@ def test_flush_without_preempt_is_a_contradiction() -> None:
     st.text(alphabet=st.sampled_from("aZ09._:/-") | st.characters(), max_size=70)
     | st.from_regex(r"[0-9a-z]{4}-[0-9]{1,3}", fullmatch=True)
 )
-def test_an_id_is_the_servers_or_a_clients_and_never_both(goal_id: str) -> None:
+def test_an_id_is_the_servers_or_a_clients_but_never_both(goal_id: str) -> None:
     plain = re.fullmatch(r"[A-Za-z0-9._:/-]{1,64}", goal_id) is not None and not goal_id.startswith("-")
     servers = re.fullmatch(r"[0-9][a-z][0-9][a-z]-[0-9]+|[0-9]+", goal_id) is not None
     assert is_clients_id(goal_id) == (plain and not servers)
 
 
-def test_an_id_of_a_server_is_no_client_s() -> None:
+def test_a_servers_id_is_not_a_clients_id() -> None:
     assert not [boot for boot in (run._random_boot_id() for _ in range(1_000)) if is_clients_id(f"{boot}-1")]
 
 
@@ -140,7 +140,7 @@ def test_an_id_of_a_server_is_no_client_s() -> None:
 def declared(function: Callable[..., object]) -> dict[str, tuple[str, object]]:
     """Return the annotations and defaults of a function's parameters, except the first."""
     parameters = list(inspect.signature(function).parameters.values())[1:]
-    return {each.name: (str(each.annotation), each.default) for each in parameters}
+    return {parameter.name: (str(parameter.annotation), parameter.default) for parameter in parameters}
 
 
 def annotated(message: type[object]) -> dict[str, str]:
@@ -160,54 +160,54 @@ TYPES = {
 
 
 @pytest.mark.parametrize("kind", REQUEST_TYPES)
-def test_the_fields_of_a_request_are_its_rows(kind: str) -> None:
+def test_the_fields_of_a_request_agree_with_its_rows(kind: str) -> None:
     request = REQUEST_TYPES[kind]
     empty = Say("") if issubclass(request, Say) else Append("") if issubclass(request, Append) else request()
     own = annotated(request)
-    assert list(own) == [each.name for each in request.options]
-    for each in request.options:
-        nothing = " | None" if each.default is None else ""
-        assert own[each.name] == TYPES[each.kind.name] + nothing, each.name
-        assert getattr(empty, each.name) == each.default, each.name
-        assert each.type_error(each.default) is None, each.name
-        assert each.meaning, each.name
+    assert list(own) == [option.name for option in request.options]
+    for option in request.options:
+        nothing = " | None" if option.default is None else ""
+        assert own[option.name] == TYPES[option.kind.name] + nothing, option.name
+        assert getattr(empty, option.name) == option.default, option.name
+        assert option.type_error(option.default) is None, option.name
+        assert option.meaning, option.name
 
 
-def test_what_the_library_takes_is_what_the_rows_say() -> None:
-    asked = declared(Client.say)
+def test_the_librarys_parameters_agree_with_the_rows() -> None:
+    parameters = declared(Client.say)
     # `wait` is called `follow` in the library and has another default. The library only offers the format text.
-    assert asked.pop("follow") == ("bool", True)
-    assert asked.pop("block") == ("bool", True)
-    assert asked.pop("text") == ("str", inspect.Parameter.empty)
+    assert parameters.pop("follow") == ("bool", True)
+    assert parameters.pop("block") == ("bool", True)
+    assert parameters.pop("text") == ("str", inspect.Parameter.empty)
     own = annotated(Say)
-    rows = [each for each in OPTIONS if each.name not in {"text", "wait", "format"}]
-    assert asked == {each.name: (own[each.name], each.default) for each in rows}
-    typed = [each.name for each in rows if each.flags and each.name != "feedback"]
-    assert [each for each in asked if each in typed] == typed
-    assert list(declared(Client.set).items()) == [(each.name, (annotated(Set)[each.name], None)) for each in SETTINGS]
+    rows = [option for option in OPTIONS if option.name not in {"text", "wait", "format"}]
+    assert parameters == {option.name: (own[option.name], option.default) for option in rows}
+    typed = [option.name for option in rows if option.flags and option.name != "feedback"]
+    assert [name for name in parameters if name in typed] == typed
+    assert list(declared(Client.set).items()) == [(row.name, (annotated(Set)[row.name], None)) for row in SETTINGS]
 
 
-def test_what_a_goal_shows_and_what_the_engine_is_told_are_what_the_rows_say() -> None:
+def test_the_fields_of_a_goal_and_of_speak_agree_with_the_rows() -> None:
     goal, say, engine = annotated(Goal), annotated(Say), annotated(protocol.Speak)
     assert {name: goal[name] for name in SHOWN_OPTIONS} == {name: say[name] for name in SHOWN_OPTIONS}
-    told = {name: kind for name, kind in engine.items() if name not in {"id", "text", "next_waits", "next_is_neural"}}
-    assert set(told) == set(ENGINE_OPTIONS)
-    assert {name: kind.removesuffix(" | None") for name, kind in told.items()} == {
+    sent = {name: kind for name, kind in engine.items() if name not in {"id", "text", "next_waits", "next_is_neural"}}
+    assert set(sent) == set(ENGINE_OPTIONS)
+    assert {name: kind.removesuffix(" | None") for name, kind in sent.items()} == {
         name: say[name].removesuffix(" | None") for name in ENGINE_OPTIONS
     }
 
 
-#: Options that are only stored with the goal, so no code has to obey them.
+#: Options that are only stored with the goal, so no code reads them.
 CARRIED = {"data", "format"}
 
 
-@pytest.mark.parametrize("option", [each for each in OPTIONS if each.name not in CARRIED], ids=lambda each: each.name)
-def test_every_option_is_obeyed(option: Option) -> None:
+@pytest.mark.parametrize("option", [row for row in OPTIONS if row.name not in CARRIED], ids=lambda row: row.name)
+def test_every_option_is_used_by_the_code(option: Option) -> None:
     """The scheduler and the server read options from a `Say`, and the engine process reads them from a command."""
     places, owners = ["goals", "server"], {"say", "request"}
     if option.for_engine:
         places, owners = ["engine/child"], {"command", "say", "settings"}
-    sources = [each for place in places for each in (Path(talkcli.__file__).parent / place).rglob("*.py")]
+    sources = [path for place in places for path in (Path(talkcli.__file__).parent / place).rglob("*.py")]
     read = {
         node.attr
         for path in sources
@@ -215,34 +215,28 @@ def test_every_option_is_obeyed(option: Option) -> None:
         for node in ast.walk(ast.parse(path.read_text("utf-8")))
         if isinstance(node, ast.Attribute) and ast.unparse(node.value).rpartition(".")[2] in owners
     }
-    assert option.name in read, f"nothing obeys the option {option.name!r}: {' and '.join(places)} never read it"
+    assert option.name in read, f"the option {option.name!r} is never read in {' and '.join(places)}"
 
 
-def test_a_row_without_its_field_is_named() -> None:
+def test_a_missing_field_for_a_row_is_reported() -> None:
     with pytest.raises(TypeError, match="Say has no field for the option 'loudness'"):
         require_fields(Say, ["text", "loudness"])
 
 
-def test_settings_are_given_whole_at_the_start_and_shown_with_null_for_what_there_is_not() -> None:
-    assert list(annotated(Set)) == [each.name for each in SETTINGS]
-    assert [each.name for each in SOUND_OPTIONS] == ["rate", "volume", "voice", "pitch"]
+def test_settings_are_shown_with_null_for_unset_values() -> None:
+    assert list(annotated(Set)) == [option.name for option in SETTINGS]
+    assert [option.name for option in SOUND_OPTIONS] == ["rate", "volume", "voice", "pitch"]
     shown = shown_settings(INITIAL)
     assert shown == {"rate": 200, "volume": 1.0, "voice": None, "pitch": 50, "preempt": False, "ttl": None}
     assert shown_settings(replace(INITIAL, voice=DEFAULT_VOICE, ttl=0.0)) == shown
     assert describe_settings({**shown, "volume": 0.1 + 0.2, "ttl": 1e6})[1::4] == ["volume 0.3", "ttl 1000000 s"]
-    assert describe_settings(shown) == [
-        "rate 200",
-        "volume 1",
-        "default voice",
-        "pitch 50",
-        "new goals wait",
-        "no ttl",
-    ]
+    defaults = ["rate 200", "volume 1", "default voice", "pitch 50", "new goals wait", "no ttl"]
+    assert describe_settings(shown) == defaults
     changed = shown_settings(replace(INITIAL, voice="de", ttl=2.5, preempt=True))
     assert describe_settings(changed)[2:] == ["voice de", "pitch 50", "new goals interrupt", "ttl 2.5 s"]
 
 
-def test_a_setting_is_typed_and_helped_as_its_command_wants_it() -> None:
+def test_a_setting_has_its_own_flags_and_help_in_serve_and_set() -> None:
     preempt, rate = ROWS["preempt"], ROWS["rate"]
     assert preempt.setting
     at_start, to_set = preempt.for_serve(), preempt.for_set()
@@ -253,18 +247,18 @@ def test_a_setting_is_typed_and_helped_as_its_command_wants_it() -> None:
     assert (to_set.flags, to_set.help, to_set.default, to_set.env) == ("--rate", rate.help, None, "")
 
 
-def test_the_engine_is_told_the_goal_s_own_value_else_the_server_s() -> None:
+def test_the_engine_gets_the_goals_value_or_else_the_servers() -> None:
     settings = replace(INITIAL, voice="de", rate=150)
     general = {"rate": 150, "volume": 1.0, "voice": "de", "pitch": 50, "lead_in": None, "audible": None}
     general["voice_only"] = False
     assert engine_options(Say("hi"), settings) == general
     own = Say("hi", rate=80, volume=0.0, voice=DEFAULT_VOICE, pitch=0, lead_in=0, audible=False)
-    asked = {"rate": 80, "volume": 0.0, "voice": None, "pitch": 0, "lead_in": 0, "audible": False, "voice_only": False}
-    assert engine_options(own, settings) == asked
+    expected = {"rate": 80, "volume": 0.0, "voice": None, "pitch": 0, "lead_in": 0, "audible": False}
+    assert engine_options(own, settings) == {**expected, "voice_only": False}
 
 
-def test_a_server_that_is_told_nothing_is_what_its_command_says() -> None:
-    rows = {each.name: each for each in COMMANDS["serve"].options}
+def test_the_servers_defaults_agree_with_its_command() -> None:
+    rows = {option.name: option for option in COMMANDS["serve"].options}
     server = fields(run.ServerSettings())
     assert server.pop("goals") == Set(**{name: row.default for name, row in rows.items() if row.setting})
     assert server.pop("socket") is None
@@ -276,7 +270,7 @@ def test_a_server_that_is_told_nothing_is_what_its_command_says() -> None:
 
 
 @pytest.mark.parametrize(
-    ("option", "value", "words"),
+    ("option", "value", "message"),
     [
         (Option("x", NUMBER, limits=(0, 1), unit=" m"), 2, "the x must be 0 to 1 m, got 2"),
         (Option("x", INTEGER, limits=(1, None)), 0, "the x must be 1 or more, got 0"),
@@ -289,23 +283,23 @@ def test_a_server_that_is_told_nothing_is_what_its_command_says() -> None:
         (ROWS["voice"], "", "the voice must not be empty"),
         (ROWS["format"], "x" * 99, f"the format must be 'text', got '{'x' * 64}'"),
     ],
-    ids=lambda each: getattr(each, "name", None) or str(each)[:24],
+    ids=lambda value: getattr(value, "name", None) or str(value)[:24],
 )
-def test_a_refusal_says_what_a_value_may_be(option: Option, value: object, words: str | None) -> None:
-    assert option.value_error(value) == words
+def test_a_refusal_names_the_valid_values(option: Option, value: object, message: str | None) -> None:
+    assert option.value_error(value) == message
     assert option.value_error(None) is None
     assert ROWS["key"].range == ""
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_what_carries_a_command_out_takes_what_its_row_gives(command: str) -> None:
+def test_the_function_of_a_command_accepts_the_options_of_its_row(command: str) -> None:
     row = COMMANDS[command]
     module, _, name = (row.function or f"ask:{command}").partition(":")
     function = getattr(importlib.import_module(f"talkcli.cli.{module}"), name)
-    names = [each.name for each in row.options] + ([row.argument.name] if row.argument else [])
+    names = [option.name for option in row.options] + ([row.argument.name] if row.argument else [])
     bound = inspect.signature(function).bind(None, **dict.fromkeys(names))
-    for each in bound.signature.parameters.values():
-        assert each.default is inspect.Parameter.empty, f"{each.name} is always given"
+    for parameter in bound.signature.parameters.values():
+        assert parameter.default is inspect.Parameter.empty, f"{parameter.name} must not have a default"
 
 
 LIMITED = (
@@ -315,10 +309,10 @@ LIMITED = (
 )
 
 
-def test_limits_hold_on_the_wire_and_on_the_command_line_alike() -> None:
-    taken: list[list[float]] = [[0.5, 1], [1, 10**400], [-5]]
+def test_limits_are_the_same_on_the_wire_and_on_the_command_line() -> None:
+    accepted: list[list[float]] = [[0.5, 1], [1, 10**400], [-5]]
     refused: list[list[float]] = [[0, -1, 1.5], [0, -5], []]
-    for option, good, bad in zip(LIMITED, taken, refused, strict=True):
+    for option, good, bad in zip(LIMITED, accepted, refused, strict=True):
         for value in good:
             assert (option.value_error(value), read_value(option, str(value))) == (None, value)
         for value in bad:
@@ -326,12 +320,12 @@ def test_limits_hold_on_the_wire_and_on_the_command_line_alike() -> None:
             with pytest.raises(ValueError, match=f"got '?{value}'?$"):
                 read_value(option, str(value))
     wanted = ["a number", "a whole number", "a whole number"]
-    for option, words in zip(LIMITED, wanted, strict=True):
-        with pytest.raises(ValueError, match=f"must be {words}, got 'abc'$"):
+    for option, message in zip(LIMITED, wanted, strict=True):
+        with pytest.raises(ValueError, match=f"must be {message}, got 'abc'$"):
             read_value(option, "abc")
 
 
-def test_a_plain_line_is_read_before_an_option_is_worth_compiling() -> None:
+def test_a_plain_command_line_is_parsed_without_compiling_options() -> None:
     """A client creates about a hundred rows when it starts. Compiling their constructor would take longer than that."""
     code = "import talkcli.cli.plain; from talkcli import frozen; from talkcli.goals.options import Option; "
     code += "print(Option.__init__ is frozen._METHODS['__init__'])"

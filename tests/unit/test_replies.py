@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
 
 
-def test_greeting_says_protocol_version_process_and_boot() -> None:
+def test_a_greeting_has_protocol_version_process_and_boot_id() -> None:
     message = greeting("1.2.3", 4711, "4k7f")
     assert message == {"talk": 1, "version": "1.2.3", "pid": 4711, "boot": "4k7f", "features": []}
     assert PROTOCOL == 1
@@ -24,25 +24,25 @@ def test_greeting_says_protocol_version_process_and_boot() -> None:
 
 
 @pytest.mark.parametrize(
-    ("theirs", "side"),
+    ("protocol", "side"),
     [(2, "upgrade this command"), (99, "upgrade this command"), (0, "restart the server"), (-1, "restart the server")],
 )
-def test_another_protocol_is_a_mismatch_that_says_which_side_to_upgrade(theirs: int, side: str) -> None:
+def test_a_protocol_mismatch_names_the_side_to_upgrade(protocol: int, side: str) -> None:
     with pytest.raises(ProtocolMismatch, match=side) as mismatch:
-        check_greeting({**greeting("3.0", 1, "4k7f"), "talk": theirs})
+        check_greeting({**greeting("3.0", 1, "4k7f"), "talk": protocol})
     assert mismatch.value.exit_code == 9
     assert __version__ in mismatch.value.message
     assert "3.0" in mismatch.value.message
 
 
 @pytest.mark.parametrize("message", [{}, {"talk": None}, {"talk": "1"}, {"talk": True}, {"talk": [1]}, {"ok": True}])
-def test_what_is_no_greeting_is_a_mismatch(message: JsonObject) -> None:
+def test_an_invalid_greeting_is_a_protocol_mismatch(message: JsonObject) -> None:
     with pytest.raises(ProtocolMismatch):
         check_greeting(message)
 
 
 @pytest.mark.parametrize(
-    ("greeting", "words"),
+    ("greeting", "message"),
     [
         (busy_greeting(), "too many clients; .*--max-clients"),
         (busy_greeting("too few descriptors"), "^too few descriptors$"),
@@ -51,13 +51,13 @@ def test_what_is_no_greeting_is_a_mismatch(message: JsonObject) -> None:
         ({"talk": 1, "error": "busy", "message": "\x1b[31m"}, "--max-clients"),
     ],
 )
-def test_a_server_that_is_full_is_busy_and_may_say_why(greeting: JsonObject, words: str) -> None:
-    with pytest.raises(Busy, match=words) as busy:
+def test_a_full_server_is_busy_and_may_give_a_reason(greeting: JsonObject, message: str) -> None:
+    with pytest.raises(Busy, match=message) as busy:
         check_greeting(greeting)
     assert (busy.value.code, busy.value.exit_code) == ("busy", 5)
 
 
-def test_replies_carry_the_number_of_their_request() -> None:
+def test_replies_have_the_number_of_their_request() -> None:
     assert ok(3, goal={}) == {"seq": 3, "ok": True, "goal": {}}
     assert ok(None) == {"ok": True}
     assert item(3, voice={}) == {"seq": 3, "voice": {}}
@@ -67,7 +67,7 @@ def test_replies_carry_the_number_of_their_request() -> None:
     assert failure(0, "busy", "no")["seq"] == 0
 
 
-def test_number_of_a_request_is_taken_out_of_it() -> None:
+def test_the_number_is_removed_from_a_request() -> None:
     message: JsonObject = {"seq": 7, "request": "status"}
     assert take_seq(message) == 7
     assert message == {"request": "status"}
@@ -76,7 +76,7 @@ def test_number_of_a_request_is_taken_out_of_it() -> None:
 
 
 @pytest.mark.parametrize("seq", ["1", 1.0, True, [], {}])
-def test_number_of_a_request_that_is_no_integer_is_refused(seq: object) -> None:
+def test_a_request_number_that_is_not_an_integer_is_refused(seq: object) -> None:
     with pytest.raises(BadRequest) as refused:
         take_seq({"seq": seq})
     assert refused.value.code == "bad_field"

@@ -1,4 +1,4 @@
-"""Requests are written and read back. An unknown field or a wrong type is refused with a code."""
+"""Writing and reading requests, and refusing unknown fields and wrong types."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 integers = st.integers(-(10**18), 10**18)
 goal_ids = st.text(min_size=1, max_size=MAX_ID_CHARS)
 #: Values of each kind of option.
-OF_KIND: dict[str, st.SearchStrategy[object]] = {
+BY_KIND: dict[str, st.SearchStrategy[object]] = {
     "boolean": st.booleans(),
     "string": st.text(max_size=8),
     "integer": integers,
@@ -42,8 +42,8 @@ OF_KIND: dict[str, st.SearchStrategy[object]] = {
 
 
 def requests_of(kind: type[Request]) -> st.SearchStrategy[Request]:
-    fields = {each.name: OF_KIND[each.kind.name] for each in kind.options}
-    optional = {each.name: st.none() | fields[each.name] for each in kind.options if each.default is None}
+    fields = {option.name: BY_KIND[option.kind.name] for option in kind.options}
+    optional = {option.name: st.none() | fields[option.name] for option in kind.options if option.default is None}
     limited = {
         "name": st.none() | st.text(min_size=1, max_size=MAX_SENDER_NAME_CHARS),
         "count": st.integers(1, MAX_LOG_GOALS),
@@ -56,7 +56,7 @@ SETTINGS = {"rate", "volume", "voice", "pitch", "preempt", "ttl"}
 ALL_FIELDS = sorted({option.name for kind in REQUEST_TYPES.values() for option in kind.options})
 
 
-def least(kind: str, **fields: object) -> JsonObject:
+def minimal(kind: str, **fields: object) -> JsonObject:
     """Return a request of a kind with these fields, and with a text if the kind requires one."""
     return {"request": kind, **({"text": "hi"} if kind == "say" else {}), **fields}
 
@@ -69,7 +69,7 @@ def refusal(message: JsonObject) -> BadRequest:
 
 
 @given(requests, st.none() | integers)
-def test_a_request_goes_over_the_wire_and_is_the_same(request: Request, number: int | None) -> None:
+def test_a_written_request_is_read_back_unchanged(request: Request, number: int | None) -> None:
     message: JsonObject = {"seq": number, **write_request(request)}
     line = request_line(message)
     assert line == encode(message)
@@ -78,48 +78,48 @@ def test_a_request_goes_over_the_wire_and_is_the_same(request: Request, number: 
 
 
 @pytest.mark.parametrize("text", ["\ud800", "Grüße \udc80", '"\\\b\n\x00\x7f\u2028🤖'])
-def test_any_text_has_a_line(text: str) -> None:
+def test_any_text_is_written_as_one_line(text: str) -> None:
     for request in (Say(text, key=text, data={text: [text, None, 1e300, True]}), Cancel((text, text), before=text)):
         assert request_line(write_request(request)) == encode(write_request(request))
 
 
 @pytest.mark.parametrize("data", [{"x": float("nan")}, {"x": [-float("inf")]}, {"x": object()}])
-def test_what_is_no_json_has_no_line(data: JsonObject) -> None:
+def test_data_that_is_not_json_is_not_written(data: JsonObject) -> None:
     with pytest.raises((ValueError, TypeError)):
         request_line({"data": data})
 
 
 @pytest.mark.parametrize("kind", REQUEST_TYPES)
 def test_fields_at_their_defaults_are_not_written(kind: str) -> None:
-    assert write_request(read_request(least(kind))) == least(kind)
+    assert write_request(read_request(minimal(kind))) == minimal(kind)
 
 
-def test_a_cancel_that_selects_is_not_of_everything() -> None:
+def test_a_cancel_with_a_selector_does_not_select_all_goals() -> None:
     assert Cancel().selects_all
     for selection in ({"ids": ("4k7f-1",)}, {"ids": ()}, {"current": True}, {"before": "4k7f-1"}, {"key": ""}):
         assert not Cancel(**selection).selects_all
 
 
 @pytest.mark.parametrize("kind", REQUEST_TYPES)
-def test_a_field_that_is_not_known_is_refused_and_named(kind: str) -> None:
+def test_an_unknown_field_is_refused_by_name(kind: str) -> None:
     for name in ("", "loudness", "Text", "seq", "request2", "a" * 5_000, "\x1b[31m", "\ud800"):
-        refused = refusal(least(kind, **{name: None}))
+        refused = refusal(minimal(kind, **{name: None}))
         assert refused.code == "unknown_field"
         assert repr(name[:60])[1:-1] in refused.message
         assert len(refused.message) < 500
 
 
 @pytest.mark.parametrize("kind", REQUEST_TYPES)
-def test_a_request_knows_its_own_fields_and_no_others(kind: str) -> None:
+def test_a_request_accepts_only_its_own_fields(kind: str) -> None:
     for name in set(ALL_FIELDS) - {option.name for option in REQUEST_TYPES[kind].options}:
-        assert refusal(least(kind, **{name: None})).code == "unknown_field"
+        assert refusal(minimal(kind, **{name: None})).code == "unknown_field"
 
 
 @pytest.mark.parametrize("kind", ["", "SAY", "sing", "say ", "a" * 60_000, "\x1b]0;", "\ud800"])
-def test_a_request_that_is_not_known_is_refused_with_those_that_are(kind: str) -> None:
+def test_an_unknown_request_is_refused_with_a_list_of_known_ones(kind: str) -> None:
     refused = refusal({"request": kind})
     assert refused.code == "unknown_request"
-    assert all(each in refused.message for each in REQUEST_TYPES)
+    assert all(name in refused.message for name in REQUEST_TYPES)
     assert len(refused.message) < 500
 
 
@@ -144,13 +144,13 @@ OUTSIDE: dict[str, list[object]] = {"hello name": ["", "a" * 65], "log count": [
 
 @pytest.mark.parametrize(
     ("kind", "option"),
-    [(kind, each) for kind in REQUEST_TYPES for each in REQUEST_TYPES[kind].options],
-    ids=lambda each: getattr(each, "name", each),
+    [(kind, option) for kind in REQUEST_TYPES for option in REQUEST_TYPES[kind].options],
+    ids=lambda value: getattr(value, "name", value),
 )
-def test_a_value_of_the_wrong_type_or_length_is_refused_and_its_field_named(kind: str, option: Option) -> None:
-    nothing = [] if option.default is None else [None]
-    for value in [*WRONG[option.kind.name], *OUTSIDE.get(f"{kind} {option.name}", []), *nothing]:
-        refused = refusal(least(kind, **{option.name: value}))
+def test_a_value_of_wrong_type_or_length_is_refused_with_its_field(kind: str, option: Option) -> None:
+    null_fields = [] if option.default is None else [None]
+    for value in [*WRONG[option.kind.name], *OUTSIDE.get(f"{kind} {option.name}", []), *null_fields]:
+        refused = refusal(minimal(kind, **{option.name: value}))
         assert refused.code == "bad_field", value
         assert repr(option.name) in refused.message
         assert len(refused.message) < 500
@@ -160,7 +160,7 @@ def test_say_without_a_text_is_refused() -> None:
     assert refusal({"request": "say"}).code == "bad_field"
 
 
-def test_values_at_their_limits_are_taken() -> None:
+def test_values_at_their_limits_are_accepted() -> None:
     exact: JsonObject = {"a": "b" * (MAX_DATA_BYTES - len('{"a": ""}'))}
     assert MAX_DATA_BYTES == 1024
     assert read_request({"request": "say", "text": "", "data": exact}) == Say("", data=exact)
@@ -171,7 +171,7 @@ def test_values_at_their_limits_are_taken() -> None:
     assert read_request({"request": "log", "count": MAX_LOG_GOALS}) == Log(MAX_LOG_GOALS)
 
 
-def test_values_out_of_range_are_read_so_that_the_goal_itself_can_be_rejected() -> None:
+def test_values_out_of_range_are_read_because_they_reject_only_the_goal() -> None:
     wild: JsonObject = {"rate": 10**6, "volume": -1, "pitch": 101, "ttl": -0.5, "throttle": -1, "key": "", "id": "-"}
     read = read_request({"request": "say", "text": "hi", "priority": 10**12, **wild})
     assert isinstance(read, Say)
@@ -180,12 +180,12 @@ def test_values_out_of_range_are_read_so_that_the_goal_itself_can_be_rejected() 
 
 
 @pytest.mark.parametrize("kind", REQUEST_TYPES)
-def test_null_is_the_default_where_there_may_be_nothing(kind: str) -> None:
-    nothing = {each.name: None for each in REQUEST_TYPES[kind].options if each.default is None}
-    assert read_request(least(kind, **nothing)) == read_request(least(kind))
+def test_null_means_the_default_for_optional_fields(kind: str) -> None:
+    null_fields = {option.name: None for option in REQUEST_TYPES[kind].options if option.default is None}
+    assert read_request(minimal(kind, **null_fields)) == read_request(minimal(kind))
 
 
-def test_data_at_any_depth_of_nesting_is_taken_or_refused() -> None:
+def test_deeply_nested_data_is_refused() -> None:
     for depth in range(900, 1_050):
         line = b'{"request": "say", "text": "hi", "data": {"a": ' + b"[" * depth + b"]" * depth + b"}}"
         with pytest.raises(BadRequest):
@@ -197,7 +197,7 @@ def test_data_at_any_depth_of_nesting_is_taken_or_refused() -> None:
     | st.dictionaries(st.sampled_from(["request", *ALL_FIELDS]) | st.text(max_size=3), values),
     st.dictionaries(st.sampled_from(ALL_FIELDS), values, max_size=3),
 )
-def test_any_object_is_a_request_or_a_bad_request(head: dict[str, object], fields: dict[str, object]) -> None:
+def test_any_object_is_read_as_a_request_or_refused(head: dict[str, object], fields: dict[str, object]) -> None:
     message = {**head, **fields}
     before = dict(message)
     assert outcome(message) in {"request", "bad_request", "unknown_request", "unknown_field", "bad_field"}

@@ -40,7 +40,7 @@ MESSAGES = {
 }
 
 #: The effects of each script in their order. Only the first row lists all of them.
-NEWS = {
+EFFECTS = {
     "a; b; completed a": "a PENDING, a ACTIVE, a Start, b PENDING, a SUCCEEDED, b ACTIVE, b Start",
     "a; b preempt; c preempt": "b PENDING, a PREEMPTING, a Stop, c PENDING, b RECALLED",
     "a; b; c key=k; d flush key=k": "d PENDING, c RECALLED, b RECALLED, a PREEMPTING, a Stop",
@@ -77,28 +77,28 @@ DEADLINES = {
 
 
 @pytest.mark.parametrize("script", MESSAGES)
-def test_each_end_has_its_words(script: str) -> None:
+def test_each_ended_goal_has_a_message(script: str) -> None:
     assert [*play(script).goals.values()][-1].message == MESSAGES[script]
 
 
-@pytest.mark.parametrize("script", NEWS)
-def test_what_happens_is_told_in_its_order(script: str) -> None:
-    news = NEWS[script].split(", ")
-    assert play(script).seen[-len(news) :] == news
+@pytest.mark.parametrize("script", EFFECTS)
+def test_effects_are_in_order(script: str) -> None:
+    expected = EFFECTS[script].split(", ")
+    assert play(script).seen[-len(expected) :] == expected
 
 
 @pytest.mark.parametrize("script", DEADLINES)
-def test_the_deadline_is_the_first_that_is_due(script: str) -> None:
+def test_the_deadline_is_the_earliest_due_time(script: str) -> None:
     assert play(script).scheduler.deadline() == DEADLINES[script]
 
 
-def test_silence_is_given_up_within_the_two_seconds_in_which_a_cancel_is_answered() -> None:
+def test_the_wait_for_silence_ends_before_a_cancel_must_be_answered() -> None:
     assert 1.5 < CONFIRM_SILENCE_S < 2
 
 
-def test_a_goal_that_succeeded_shows_how_it_was_spoken() -> None:
+def test_a_succeeded_goal_shows_when_and_how_it_was_spoken() -> None:
     robot = Robot()
-    record = robot.asks(Say("door", data={"page": 3}, priority=-7), "a")
+    record = robot.submit(Say("door", data={"page": 3}, priority=-7), "a")
     goal = robot.play("pass 3; completed a").goals["a"].snapshot()
     assert (goal, play("a format=x").goals["a"].snapshot().format) == (record.snapshot(), "x")
     assert (goal.id, goal.state, goal.client, goal.priority) == ("4k7f-1", State.SUCCEEDED, ARM, -7)
@@ -107,7 +107,7 @@ def test_a_goal_that_succeeded_shows_how_it_was_spoken() -> None:
     assert (goal.queued_at, goal.started_at, goal.ended_at) == (1.7e9 + 100, 1.7e9 + 100, 1.7e9 + 103)
 
 
-def test_what_was_heard_only_moves_forward_and_stays_after_a_failure() -> None:
+def test_the_spoken_text_only_grows_and_is_kept_after_a_failure() -> None:
     robot = play("a text=door_open; b")
     assert robot.goals["a"].snapshot().spoken == ""
     assert robot.goals["b"].snapshot().spoken is None
@@ -147,7 +147,7 @@ def test_a_word_is_heard_to_its_end_when_the_next_word_starts(text: str, words: 
 
 
 @pytest.mark.parametrize(
-    ("gaps", "muted", "words"),
+    ("gaps", "muted", "suffix"),
     [
         (0, False, ""),
         (1, False, ", but with 1 gap (2.0 s in total): this machine is too slow for the voice"),
@@ -155,16 +155,16 @@ def test_a_word_is_heard_to_its_end_when_the_next_word_starts(text: str, words: 
         (0, True, ", but the output was muted: card"),
     ],
 )
-def test_a_goal_that_was_not_heard_well_says_so(gaps: int, muted: bool, words: str) -> None:
+def test_the_message_of_a_goal_mentions_gaps_and_a_muted_output(gaps: int, muted: bool, suffix: str) -> None:
     robot = play("a")
     output = Output("pulse", "card", 0.5, muted)
     robot.scheduler.output_changed("4k7f-1", output)
-    robot.see(robot.scheduler.completed("4k7f-1", 1.5, robot.now, gaps, 2.04))
+    robot.collect(robot.scheduler.completed("4k7f-1", 1.5, robot.now, gaps, 2.04))
     goal = robot.goals["a"].snapshot()
-    assert (goal.state, goal.output, goal.message) == (State.SUCCEEDED, output, f"Talk completed successfully{words}")
+    assert (goal.state, goal.output, goal.message) == (State.SUCCEEDED, output, f"Talk completed successfully{suffix}")
 
 
-def test_a_goal_as_it_was_accepted_shows_nothing_that_came_later() -> None:
+def test_the_snapshot_of_a_pending_goal_has_no_later_values() -> None:
     robot = play("pause; a; resume; pause")
     robot.scheduler.voice_chosen("4k7f-1", "gmw/en-US", robot.now)
     robot.scheduler.output_changed("4k7f-1", Output("pulse", "card", 0.5, False))
@@ -182,48 +182,48 @@ def test_a_goal_as_it_was_accepted_shows_nothing_that_came_later() -> None:
     ("script", "ttl"),
     [("a", None), ("a ttl=0", None), ("a ttl=2.5", 2.5), ("set ttl=5; a", 5), ("set ttl=5; a ttl=0", None)],
 )
-def test_a_goal_shows_the_time_to_live_that_holds(script: str, ttl: float | None) -> None:
+def test_a_goal_shows_its_effective_ttl(script: str, ttl: float | None) -> None:
     assert play(script).goals["a"].snapshot().ttl == ttl
 
 
-def test_each_goal_has_an_id_of_its_own_and_attaching_uses_none_up() -> None:
+def test_each_goal_has_its_own_id_and_attaching_uses_no_new_one() -> None:
     robot = play("room 1; a; b text=; c; d; e id=mine; f text=a; g id=other text=; h")
     ids = ["4k7f-1", "4k7f-2", "4k7f-3", "4k7f-4", "4k7f-5", "4k7f-6", "4k7f-7", "4k7f-8"]
-    assert [each.id for each in robot.goals.values()] == ids
+    assert [record.id for record in robot.goals.values()] == ids
     assert play("a id=mine; b id=mine text=a; c").goals["c"].id == "4k7f-2"
 
 
-def test_a_result_is_found_after_the_end() -> None:
+def test_a_goal_is_found_after_its_end() -> None:
     robot = play("a; b; c; cancel; stopped a")
-    assert [robot.scheduler.find(each.id) for each in robot.goals.values()] == [*robot.goals.values()]
+    assert [robot.scheduler.find(record.id) for record in robot.goals.values()] == [*robot.goals.values()]
     assert robot.scheduler.find("4k7f-4") is None
     robot = play("a id=mine; completed a")
     robot.goals["a"].drop_text()
     assert robot.play("b text=a id=mine; c id=mine").outcome() == "a SUCCEEDED; c REJECTED id_conflict; b is a"
 
 
-def test_time_on_the_wall_does_not_matter() -> None:
+def test_the_wall_clock_does_not_matter() -> None:
     robot = play("a; b ttl=1; completed a; c; d ttl=1")
     assert robot.scheduler.tick(Now(robot.seconds + 0.5, 9e9)) == []
     assert robot.scheduler.submit(Say("a", throttle=60), ARM, Now(159, 9e9))[0].reason == "throttled"
 
 
-def test_a_cancel_tells_what_it_ended_and_what_it_did_not_find() -> None:
+def test_a_cancel_returns_ended_and_unknown_goals() -> None:
     robot = play("a; completed a; b; c; d")
     a, b, c, _ = robot.goals.values()
-    done = robot.cancels(a.id, "4k7f-99", c.id, c.id, current=True, before="mine")
+    done = robot.cancel(a.id, "4k7f-99", c.id, c.id, current=True, before="mine")
     assert (done.ended, done.unknown, done.recalled, done.stopping) == ([a], ["4k7f-99", "mine"], [c], b)
     assert len(done.effects) == 3
     assert (c.by, b.by) == (By(client=DOOR), By(client=DOOR))
-    again = robot.cancels(b.id)
+    again = robot.cancel(b.id)
     assert (again.stopping, again.effects) == (b, [])
-    assert Robot().cancels() == Robot().cancels(current=True) == Robot().cancels(key="k") == Cancellation()
+    assert Robot().cancel() == Robot().cancel(current=True) == Robot().cancel(key="k") == Cancellation()
 
 
-def test_an_id_that_waits_for_room_is_known_to_a_cancel() -> None:
+def test_a_cancel_knows_the_ids_of_goals_that_wait_for_room() -> None:
     robot = play("a; b")
-    assert robot.cancels("mine", waiting=("mine",)) == Cancellation()
-    done = robot.cancels(before="mine", waiting=("mine",))
+    assert robot.cancel("mine", waiting=("mine",)) == Cancellation()
+    done = robot.cancel(before="mine", waiting=("mine",))
     assert (done.unknown, done.recalled, done.stopping) == ([], [robot.goals["b"]], robot.goals["a"])
     assert robot.play("c id=mine").goals["c"].state is State.PENDING
 
@@ -247,7 +247,7 @@ def test_a_cancel_selects_among_goals_that_wait_for_room(selection: Cancel, chos
     assert selection.select_waiting(waiting) == chosen
 
 
-def test_a_goal_lacks_room_if_nothing_else_is_wrong_with_it() -> None:
+def test_a_goal_lacks_room_only_if_nothing_else_is_wrong_with_it() -> None:
     robot = play("room 1; a")
     assert not robot.scheduler.lacks_room(Say("x"), robot.now)
     robot.play("b id=mine key=face")
@@ -268,7 +268,7 @@ def test_a_goal_lacks_room_if_nothing_else_is_wrong_with_it() -> None:
     assert not robot.scheduler.lacks_room(Say("x"), robot.now)
 
 
-def test_a_goal_that_waits_for_room_goes_on_if_it_has_it_or_never_will() -> None:
+def test_a_goal_stops_waiting_for_room_if_it_has_room_or_never_will() -> None:
     robot = play("room 1; a; b id=mine")
     assert not robot.scheduler.has_room(Say("x"))
     assert robot.scheduler.has_room(Say("x", priority=1))
@@ -276,20 +276,20 @@ def test_a_goal_that_waits_for_room_goes_on_if_it_has_it_or_never_will() -> None
     assert robot.play("shutdown").scheduler.has_room(Say("x"))
 
 
-def test_as_many_keys_and_texts_are_remembered_as_may_be_and_the_oldest_goes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stored_keys_and_texts_are_limited_and_the_oldest_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     assert MAX_SPEECH_TIMES == 20_000
     monkeypatch.setattr(history, "MAX_SPEECH_TIMES", 6)
     robot = Robot()
     for name in ("a", "b", "c", "a", "d"):
-        robot.tells("completed", robot.asks(Say(f"text {name}", key=f"key {name}")).id)
+        robot.report("completed", robot.submit(Say(f"text {name}", key=f"key {name}")).id)
     for name in ("a", "c", "d"):
-        assert robot.asks(Say("x", key=f"key {name}", throttle=60)).reason == "throttled"
-        assert robot.asks(Say(f"text {name}", throttle=60)).reason == "throttled"
-    assert robot.asks(Say("x", key="key b", throttle=60)).state is State.ACTIVE
-    assert robot.asks(Say("text b", throttle=60)).state is State.PENDING
+        assert robot.submit(Say("x", key=f"key {name}", throttle=60)).reason == "throttled"
+        assert robot.submit(Say(f"text {name}", throttle=60)).reason == "throttled"
+    assert robot.submit(Say("x", key="key b", throttle=60)).state is State.ACTIVE
+    assert robot.submit(Say("text b", throttle=60)).state is State.PENDING
 
 
-def test_a_thousand_early_cancels_are_remembered_and_the_oldest_goes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_thousand_early_cancels_are_stored_and_the_oldest_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (EARLY_CANCEL_S, MAX_EARLY_CANCELS) == (60, 1_000)
     monkeypatch.setattr(history, "MAX_EARLY_CANCELS", 3)
     robot = play("cancel one two three; cancel one four; cancel 4k7f-8 9z9z-7 17 -x")

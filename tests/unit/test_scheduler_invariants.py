@@ -1,7 +1,7 @@
 """Invariants of the scheduler, which hold for all requests from clients and all reports from the engine.
 
-Random scripts in the language of `tests.unit.robot`, whose effects are checked one by one. The tables in
-`test_scheduler_*.py` say which goal goes first, and which reason it ends with.
+The tests play random scripts for `tests.unit.robot`, and check each effect. The tables in `test_scheduler_*.py` define
+the order of goals, and the reasons with which goals end.
 """
 
 from __future__ import annotations
@@ -92,60 +92,60 @@ class Checked(Robot):
         """The current time. The wall clock jumps, because nothing may depend on it."""
         return Now(self.seconds, 1.7e9 + self.seconds * 7_919 % 7_200)
 
-    def asks(self, say: Say, name: str = "", **known: Any) -> Record:
+    def submit(self, say: Say, name: str = "", **known: Any) -> Record:
         before = self.scheduler.unfinished()
         full = self.scheduler.lacks_room(say, self.now)
-        record = super().asks(say, name, **known)
+        record = super().submit(say, name, **known)
         if self.records.get(record.id) is record:
             return record  # the goal was sent before
-        assert record.id not in self.records, "an id was given twice"
+        assert record.id not in self.records, "an id was used twice"
         self.records[record.id] = record
         if record.state.terminal:
-            assert self.scheduler.unfinished() == before, "a goal that was not queued has done something"
-        assert full or record.reason != "queue_full", "refused for want of room that there was"
+            assert self.scheduler.unfinished() == before, "a goal that was not queued has changed other goals"
+        assert full or record.reason != "queue_full", "a goal was rejected although there was room"
         return record
 
-    def cancels(self, *ids: str, waiting: tuple[str, ...] = (), **selection: Any) -> Cancellation:
-        done = super().cancels(*ids, waiting=waiting, **selection)
-        assert all(each.state is State.RECALLED for each in done.recalled)
+    def cancel(self, *ids: str, waiting: tuple[str, ...] = (), **selection: Any) -> Cancellation:
+        done = super().cancel(*ids, waiting=waiting, **selection)
+        assert all(record.state is State.RECALLED for record in done.recalled)
         assert done.stopping is None or done.stopping.state is State.PREEMPTING
         if not ids and selection in ({}, {"current": False}):
             assert len(self.scheduler.pending) == 0
         return done
 
-    def waits(self, seconds: float) -> None:
-        super().waits(seconds)
+    def wait(self, seconds: float) -> None:
+        super().wait(seconds)
         deadline = self.scheduler.deadline()
-        assert deadline > self.seconds, "what was due has not been done"
+        assert deadline > self.seconds, "a deadline has passed"
 
-    def tells(self, event: str, goal_id: str) -> None:
+    def report(self, event: str, goal_id: str) -> None:
         if goal_id == "*":
             return  # no goal is active
         if self.engine and goal_id == self.engine.id:
             stopping = self.engine.state is State.PREEMPTING
-            super().tells(event if stopping or event not in {"deaf", "stopped"} else "heard", goal_id)
+            super().report(event if stopping or event not in {"deaf", "stopped"} else "heard", goal_id)
         else:
             before = self.scheduler.unfinished()
             with pytest.raises(IllegalTransition):
-                super().tells(event, goal_id)
+                super().report(event, goal_id)
             assert self.scheduler.unfinished() == before
 
     # -- the invariants
 
-    def see(self, effects: list[Effect]) -> list[Effect]:
+    def collect(self, effects: list[Effect]) -> list[Effect]:
         for effect in effects:
             if isinstance(effect, StateChange):
-                self._see_state(effect.record, effect.state)
+                self._check_state(effect.record, effect.state)
             elif isinstance(effect, EngineOrder):
-                self._see_order(effect.record, effect.order)
+                self._check_order(effect.record, effect.order)
             elif isinstance(effect, VoiceLoadOrder):
                 assert self.scheduler.has_engine
-                assert effect.voice not in effect.dropped, "a voice was dropped to load it"
+                assert effect.voice not in effect.dropped, "the voice to load was dropped"
                 loading = str(self.scheduler.voices.to_json()).count("'loading'")
                 assert loading <= 1, "two voices are loaded at once"
         return effects
 
-    def _see_state(self, record: Record, state: State) -> None:
+    def _check_state(self, record: Record, state: State) -> None:
         path = self.states[record.id]
         # RECALLING is not published.
         before = State.RECALLING if state is State.RECALLED else path[-1] if path else None
@@ -162,7 +162,7 @@ class Checked(Robot):
             if self.engine is record:
                 self.engine = None
 
-    def _see_order(self, record: Record, order: Order) -> None:
+    def _check_order(self, record: Record, order: Order) -> None:
         if order is Order.START:
             assert self.engine is None, "a goal started before the last one had ended"
             assert record.id not in self.started, "a goal was spoken twice"
@@ -178,7 +178,7 @@ class Checked(Robot):
             assert self.seconds >= record.stop_requested_at + CONFIRM_SILENCE_S
         else:
             assert self.engine is record, "an order for a goal that the engine does not have"
-            assert Order.STOP not in self.orders, "an order for a goal that was told to stop"
+            assert Order.STOP not in self.orders, "an order for a goal that is being stopped"
             assert (order is Order.RESUME) == (order is not Order.STOP and self.orders[-1:] == [Order.HOLD])
             self.orders.append(order)
 
@@ -186,12 +186,13 @@ class Checked(Robot):
         scheduler = self.scheduler
         waiting = list(scheduler.pending)
         assert len(scheduler.pending) == len(waiting) <= scheduler.max_queue
-        assert [each.say.priority for each in waiting] == sorted((each.say.priority for each in waiting), reverse=True)
-        plain = [(-each.say.priority, each.number) for each in waiting if each.say.key is None and not each.preempt]
-        assert plain == sorted(plain), "equals are not first in, first out"
-        keys = [each.say.key for each in waiting if each.say.key is not None]
-        assert len(keys) == len(set(keys)), "two goals with one key wait"
-        assert all(scheduler.find(each.id) is each for each in scheduler.unfinished())
+        priorities = [goal.say.priority for goal in waiting]
+        assert priorities == sorted(priorities, reverse=True)
+        plain = [(-goal.say.priority, goal.number) for goal in waiting if goal.say.key is None and not goal.preempt]
+        assert plain == sorted(plain), "goals of the same priority are not first in, first out"
+        keys = [record.say.key for record in waiting if record.say.key is not None]
+        assert len(keys) == len(set(keys)), "two pending goals have the same key"
+        assert all(scheduler.find(record.id) is record for record in scheduler.unfinished())
         if waiting and not (scheduler.active or scheduler.paused) and scheduler.has_engine:
             waits_for_voice = scheduler._start_time(waiting[0]) > self.seconds
             deadline = scheduler.deadline()
@@ -207,7 +208,7 @@ class Checked(Robot):
         assert {goal_id: record.snapshot() for goal_id, record in self.records.items()} == self.ended
 
 
-def fault(steps: list[str]) -> BaseException | None:
+def first_error(steps: list[str]) -> BaseException | None:
     """Play these steps, and return the first error."""
     robot = Checked()
     try:
@@ -226,11 +227,11 @@ def fault(steps: list[str]) -> BaseException | None:
     suppress_health_check=[HealthCheck.too_slow],  # a busy machine must not fail the test
 )
 @given(st.integers(0, 2**32))
-def test_the_rules_hold_whatever_is_asked_and_told(seed: int) -> None:
+def test_the_invariants_hold_for_random_scripts(seed: int) -> None:
     steps = script(seed)
-    if fault(steps) is None:
+    if first_error(steps) is None:
         return
     for place in reversed(range(len(steps))):
         shorter = steps[:place] + steps[place + 1 :]
-        steps = shorter if fault(shorter) else steps
-    raise AssertionError("; ".join(steps)) from fault(steps)
+        steps = shorter if first_error(shorter) else steps
+    raise AssertionError("; ".join(steps)) from first_error(steps)

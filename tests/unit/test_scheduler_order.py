@@ -36,11 +36,11 @@ preempt stops a goal of its own priority
     a 5; b 5 preempt  ->  a PREEMPTING preempted by b; b PENDING
 preempt stops a goal of a lower priority
     a 5; b 6 preempt  ->  a PREEMPTING preempted by b; b PENDING
-a goal that preempts goes first among its own priority alone
+a goal that preempts goes first only among goals of its own priority
     a 5; b 1; c 3; d 3 preempt; e 1 preempt  ->  a ACTIVE; d c e b PENDING
 a pending goal of a higher priority goes before one that preempts
     a; b 2; c preempt; stopped a  ->  b ACTIVE; c PENDING; a PREEMPTED preempted by c
-the server's setting holds for a goal that says nothing of preempt
+the server's setting applies to a goal without a preempt option
     set preempt=yes; a queue; b queue; c; d queue  ->  a PREEMPTING preempted by c; c b d PENDING
 a goal keeps the setting with which it was accepted
     set preempt=yes; a; b; set preempt=no; c; d preempt
@@ -61,13 +61,13 @@ flush preempts whatever the server's setting is
 
 a goal takes the place of the pending one with its key
     a; b key=k; c; d key=k; e key=k  ->  a ACTIVE; e c PENDING; b RECALLED replaced by d; d RECALLED replaced by e
-a key does not replace the goal that is spoken
+a key does not replace the active goal
     a key=k; b key=k  ->  a ACTIVE; b PENDING
 a key does not replace a goal with another key or none
     a; b key=k; c key=d; d; e key=k  ->  a ACTIVE; e c d PENDING; b RECALLED replaced by e
-a goal of a lower priority does not take the place
+a goal of a lower priority does not take the same place
     a; b key=k; c; d -1 key=k  ->  a ACTIVE; c d PENDING; b RECALLED replaced by d
-a goal of a higher priority does not take the place
+a goal of a higher priority does not take the same place
     a; b key=k; c; d 1 key=k  ->  a ACTIVE; d c PENDING; b RECALLED replaced by d
 a goal replaces one of a higher priority, too
     a; b 9 key=k; c; d key=k  ->  a ACTIVE; c d PENDING; b RECALLED replaced by d
@@ -84,7 +84,7 @@ a goal in the place of a preempting one does not count as preempting
 
 a key is throttled while it is spoken
     a key=k; pass 99; b key=k throttle=60  ->  a ACTIVE; b REJECTED throttled by a
-a key is throttled for the time since the first goal began
+a key is throttled for the time since the first goal started
     a key=k; pass 9; completed a; pass 50.9; b key=k throttle=60  ->  a SUCCEEDED; b REJECTED throttled by a
 a key is not throttled after that time
     a key=k; completed a; pass 60; b key=k throttle=60  ->  b ACTIVE; a SUCCEEDED
@@ -106,7 +106,7 @@ the active goal's text does not throttle a goal with a key
     a key=k; b text=a key=d throttle=60  ->  a ACTIVE; b PENDING
 a pending goal's text does not throttle a goal with a key
     a; b; c text=b key=k throttle=60  ->  a ACTIVE; b c PENDING
-a text said before does not throttle a goal with a key
+a text spoken before does not throttle a goal with a key
     a key=k; completed a; b text=a key=d throttle=60  ->  b ACTIVE; a SUCCEEDED
 a goal without a key is throttled by its text, whatever the first goal's key is
     a key=k; completed a; b text=a throttle=60  ->  a SUCCEEDED; b REJECTED throttled by a
@@ -114,25 +114,25 @@ a goal that expired throttles nothing
     a; b key=k ttl=1; wait 1; c key=k throttle=60  ->  a ACTIVE; c PENDING; b RECALLED expired
 a goal that was aborted throttles nothing
     a key=k; heard a; failed a; b key=k throttle=60  ->  b ACTIVE; a ABORTED audio_lost
-a goal of which nothing was heard throttles nothing
+a goal that was not heard throttles nothing
     a key=k; cancel a; stopped a; b key=k throttle=60  ->  b ACTIVE; a PREEMPTED canceled by door
 a goal that was heard in part throttles
     a; heard a; cancel a; stopped a; b text=a throttle=60  ->  a PREEMPTED canceled by door; b REJECTED throttled by a
 after an aborted goal the earlier one still throttles
     a; completed a; pass 5; b text=a; failed b; c text=a throttle=60
         ->  a SUCCEEDED; b ABORTED audio_lost; c REJECTED throttled by a
-a throttled goal does nothing to others
+a throttled goal does not affect others
     a key=k; b key=k; c key=k throttle=1 flush  ->  a ACTIVE; b PENDING; c REJECTED throttled by a
 
 # ttl
 
-a goal waits for less than its time
+a goal waits while its ttl lasts
     a; b ttl=1; wait 0.9  ->  a ACTIVE; b PENDING
-a goal whose time is over is recalled
+a goal whose ttl is over is recalled
     a; b ttl=1; wait 1  ->  a ACTIVE; b RECALLED expired
-a goal that has begun may take its time
+a goal that has started does not expire
     a ttl=1; wait 100  ->  a ACTIVE
-an expired goal is not started, even if the clock was not looked at
+an expired goal is not started, even without a tick
     a; b ttl=1; c ttl=2; pass 1; completed a  ->  c ACTIVE; a SUCCEEDED; b RECALLED expired
 a goal that expired while it waited for room interrupts nothing
     room 1; a; b; c ttl=1 preempt waited=1  ->  a ACTIVE; b PENDING; c RECALLED expired
@@ -140,57 +140,57 @@ a goal that expired while it waited for room flushes nothing
     room 1; a; b; c ttl=1 flush waited=1  ->  a ACTIVE; b PENDING; c RECALLED expired
 a goal that expired while it waited for room replaces nothing
     set ttl=1; a; b key=k; c key=k waited=1  ->  a ACTIVE; b PENDING; c RECALLED expired
-a goal that waited for room for less than its time is queued
+a goal that waited for room for less than its ttl is queued
     a; b ttl=1 waited=0.5; wait 0.4  ->  a ACTIVE; b PENDING
-the time of waiting for room counts
+the time spent waiting for room counts
     a; b ttl=1 waited=0.5; wait 0.5  ->  a ACTIVE; b RECALLED expired
-the server's time holds for goals that bring none
+the server's ttl applies to goals without one
     set ttl=5; a; b; c ttl=0; d ttl=9; wait 5  ->  a ACTIVE; c d PENDING; b RECALLED expired
-a goal keeps the time with which it was accepted
+a goal keeps the ttl with which it was accepted
     set ttl=5; a; b; set ttl=1; c; wait 1  ->  a ACTIVE; b PENDING; c RECALLED expired
-an expired goal does not start when silence is given up
+an expired goal does not start after the wait for silence
     a; b ttl=1; cancel a; wait 2  ->  a ABORTED not_silent by door; b RECALLED expired
 
 # pause
 
-the goal that is spoken is held
+the active goal is paused
     a; b; pause; pause  ->  a ACTIVE paused; b PENDING
-the held goal goes on at resume
+the paused goal continues at resume
     a; b; pause; resume; resume  ->  a ACTIVE; b PENDING
 resume without a pause does nothing
     a voice=piper/joe ttl=1; pass 1; resume  ->  a PENDING
 goals are accepted and none starts while speech is paused
     pause; a; b  ->  a b PENDING
-the first of them starts at resume
+the first goal starts at resume
     pause; a; b; resume  ->  a ACTIVE; b PENDING
 a full queue rejects while speech is paused
     room 1; pause; a; b  ->  a PENDING; b REJECTED queue_full
-the next goal does not start when the held one ends
+the next goal does not start when the paused one ends
     a; b; pause; completed a  ->  b PENDING; a SUCCEEDED
 the next goal starts at resume
     a; b; pause; completed a; resume  ->  b ACTIVE; a SUCCEEDED
-preempt stops the held goal
+preempt stops the paused goal
     a; pause; b preempt  ->  a PREEMPTING preempted by b; b PENDING
-a goal that has preempted the held one waits
+a goal that has preempted the paused one waits
     a; pause; b preempt; stopped a  ->  b PENDING; a PREEMPTED preempted by b
-a goal that has preempted the held one starts at resume
+a goal that has preempted the paused one starts at resume
     a; pause; b preempt; stopped a; resume  ->  b ACTIVE; a PREEMPTED preempted by b
-flush ends the held goal and waits
+flush ends the paused goal and waits
     a; b; pause; c flush; stopped a  ->  c PENDING; a PREEMPTED preempted by c; b RECALLED preempted by c
-the held goal is the current one for a cancel
+the paused goal is the current one for a cancel
     a; b; pause; cancel current; stopped a  ->  b PENDING; a PREEMPTED canceled by door
-a cancel of all goals up to one includes the held goal
+a cancel of all goals up to one includes the paused goal
     a; b; c; pause; cancel before=b; stopped a  ->  c PENDING; a PREEMPTED canceled by door; b RECALLED canceled by door
-a goal that is being stopped is not held
+a goal that is being stopped is not paused
     a; b; cancel a; pause  ->  a PREEMPTING canceled by door; b PENDING
-resume starts no goal beside one that is being stopped
+resume starts no goal while another is being stopped
     a; b; cancel a; pause; resume  ->  a PREEMPTING canceled by door; b PENDING
-cancel, ttl and the limit of silence hold while speech is paused
+cancel, ttl and the silence limit work while speech is paused
     a; b ttl=1; c; pause; wait 1; cancel c; cancel a; wait 2
         ->  a ABORTED not_silent by door; b RECALLED expired; c RECALLED canceled by door
 resume starts no expired goal
     pause; a ttl=1; b; pass 1; resume  ->  b ACTIVE; a RECALLED expired
-shutdown ends a held goal, too
+shutdown ends a paused goal, too
     a; b; pause; shutdown; stopped a; resume  ->  a PREEMPTED shutdown; b RECALLED shutdown
 
 # full queue
@@ -199,22 +199,22 @@ a queue without places rejects every goal
     room 0; a preempt; b  ->  a b REJECTED queue_full
 a full queue rejects the newcomer
     room 2; a; b; c; d  ->  a ACTIVE; b c PENDING; d REJECTED queue_full
-the newest of the lowest priority gives way to a higher one
+the newest goal of the lowest priority is displaced by a higher one
     room 4; a; b; c 1; d; e 2; f 5  ->  a ACTIVE; f e c b PENDING; d RECALLED displaced by f
-nothing gives way to its own priority
+no goal is displaced by its own priority
     room 2; a; b; c 1; d  ->  a ACTIVE; c b PENDING; d REJECTED queue_full
-nothing gives way to a lower priority
+no goal is displaced by a lower priority
     room 2; a; b; c 1; d -1 preempt  ->  a ACTIVE; c b PENDING; d REJECTED queue_full
-a goal that brings preempt displaces its own priority
+a goal with the preempt option displaces its own priority
     room 2; a 2; b; c; d preempt  ->  a ACTIVE; d b PENDING; c RECALLED displaced by d
-a goal with a key that brings preempt displaces its own priority, too
+a goal with a key and the preempt option displaces its own priority, too
     room 2; a 2; b; c; d preempt key=k  ->  a ACTIVE; d b PENDING; c RECALLED displaced by d
-a goal that brings preempt displaces its own priority while speech is paused
+a goal with the preempt option displaces its own priority while speech is paused
     room 2; a 2; b; c; pause; d preempt  ->  a ACTIVE paused; d b PENDING; c RECALLED displaced by d
-a goal that brings preempt displaces the newest of the lowest priority
+a goal with the preempt option displaces the newest of the lowest priority
     room 4; a 2; b 2; c 1; d 1; e 2; f 2 preempt
         ->  a PREEMPTING preempted by f; f b e c PENDING; d RECALLED displaced by f
-a goal that brings preempt displaces no higher priority
+a goal with the preempt option displaces no higher priority
     room 2; a 2; b 1; c 1; d preempt  ->  a ACTIVE; b c PENDING; d REJECTED queue_full
 a goal that flushes displaces no higher priority
     room 2; a; b 1; c 1; d flush  ->  a ACTIVE; b c PENDING; d REJECTED queue_full
@@ -227,9 +227,9 @@ a goal in the place of another counts as new
         ->  a ACTIVE; f c d PENDING; b RECALLED replaced by e; e RECALLED displaced by f
 room is counted after flush
     room 2; a; b -1; c key=k preempt; d flush  ->  a PREEMPTING preempted by c; d PENDING; b c RECALLED preempted by d
-room is counted after key, and no more gives way
+room is counted after key, and no other goal is displaced
     room 2; a; b -1; c key=k preempt; d key=k  ->  a PREEMPTING preempted by c; d b PENDING; c RECALLED replaced by d
-room is counted after preempt, and no more gives way
+room is counted after preempt, and no other goal is displaced
     room 2; a; b -1; c preempt; d preempt  ->  a PREEMPTING preempted by c; d b PENDING; c RECALLED preempted by d
 the active goal makes no room
     room 1; a; b 1; c preempt  ->  a ACTIVE; b PENDING; c REJECTED queue_full
@@ -248,11 +248,11 @@ cancel before a goal ends it and all accepted before it
 the selectors of a cancel add up
     a; b; c; d; e; cancel e current before=b
         ->  a PREEMPTING canceled by door; c d PENDING; b e RECALLED canceled by door
-cancel of a key ends the spoken and the pending goal
+cancel of a key ends the active and the pending goal
     a key=k; b key=d; c key=k; cancel key=k  ->  a PREEMPTING canceled by door; b PENDING; c RECALLED canceled by door
 cancel of a key that no goal has ends nothing
     a key=d; b; cancel b key=k  ->  a ACTIVE; b RECALLED canceled by door
-shutdown ends everything and takes no goal
+shutdown ends everything and accepts no goal
     a; b; c; shutdown; shutdown; d; stopped a  ->  a PREEMPTED shutdown; b c RECALLED shutdown; d REJECTED shutdown
 a goal that was cancelled while it waited for room stops nothing
     room 1; a; b; c flush canceled  ->  a ACTIVE; b PENDING; c RECALLED canceled by door
@@ -265,9 +265,9 @@ a goal with a known id attaches to the first
     a id=mine; b text=a id=mine  ->  a ACTIVE; b is a
 a goal attaches to one that has ended
     a id=mine; completed a; b text=a id=mine  ->  a SUCCEEDED; b is a
-attaching needs no room and does nothing
+attaching needs no room and changes nothing
     room 1; a; b id=mine; c text=b id=mine throttle=60 flush key=x  ->  a ACTIVE; b PENDING; c is b
-attaching goes on after shutdown
+attaching still works after shutdown
     a id=mine; shutdown; b text=a id=mine  ->  a PREEMPTING shutdown; b is a
 another text with the same id is a conflict
     a id=mine; b id=mine flush  ->  a ACTIVE; b REJECTED id_conflict
@@ -275,9 +275,9 @@ another text is a conflict after the end of the first
     a id=mine; completed a; b id=mine  ->  a SUCCEEDED; b REJECTED id_conflict
 an id of the server's form attaches to nothing
     a; b text=a id=4k7f-1  ->  a ACTIVE; b REJECTED bad_option
-a rejected goal does not use its id up
+a rejected goal does not use up its id
     a id=mine text=; b id=mine  ->  b ACTIVE; a REJECTED invalid_text
-a throttled goal does not use its id up
+a throttled goal does not use up its id
     a; b id=mine text=a throttle=60; c id=mine  ->  a ACTIVE; c PENDING; b REJECTED throttled by a
 cancel before an id ends that goal and all accepted before it
     a; b id=mine; c; cancel before=mine  ->  a PREEMPTING canceled by door; c PENDING; b RECALLED canceled by door
@@ -285,7 +285,7 @@ a goal that was cancelled before it arrived is recalled
     cancel mine; a id=mine; b text=a id=mine  ->  a RECALLED canceled by door; b is a
 a goal that was cancelled early by before is recalled
     cancel before=mine; a id=mine  ->  a RECALLED canceled by door
-a goal that was cancelled before it arrived needs no room and does nothing
+a goal that was cancelled before it arrived needs no room and changes nothing
     room 1; a; b key=k; cancel mine; c id=mine key=k flush  ->  a ACTIVE; b PENDING; c RECALLED canceled by door
 a rejected goal leaves its id cancelled
     cancel mine; a id=mine text=; b id=mine  ->  a REJECTED invalid_text; b RECALLED canceled by door
@@ -313,7 +313,7 @@ the first stop gives the reason
         ->  a PREEMPTED canceled by door; b RECALLED shutdown
 the next goal waits for silence
     a; b; cancel a; wait 1.89  ->  a PREEMPTING canceled by door; b PENDING
-silence is given up at the limit, and the next goal starts
+the wait for silence ends at the limit, and the next goal starts
     a; b; cancel a; wait 1.9  ->  b ACTIVE; a ABORTED not_silent by door
 the limit counts from the first stop
     a; cancel a; pass 1.5; cancel a; wait 0.5  ->  a ABORTED not_silent by door
@@ -333,30 +333,30 @@ a goal that lost its engine after it was heard does not expire
     a ttl=1; heard a; lost; wait 20  ->  a ACTIVE
 a goal may end while there is no engine
     a; b; lost; failed a  ->  b PENDING; a ABORTED audio_lost
-an engine that does not come aborts one goal
+a missing engine aborts one goal
     lost; a; b; missing  ->  b PENDING; a ABORTED engine_failed
-an engine that does not come aborts one goal each time
+each report of a missing engine aborts one goal
     lost; a; b; missing; missing  ->  a b ABORTED engine_failed
-an engine that does not come aborts a goal that waits for its voice
+a missing engine aborts a goal that waits for its voice
     lost; a voice=piper/joe; missing  ->  a ABORTED engine_failed
-an engine that does not come aborts no goal while speech is paused
+a missing engine aborts no goal while speech is paused
     lost; a; pause; missing  ->  a PENDING
-an engine that has come aborts no goal that waits for its voice
+a present engine aborts no goal that waits for its voice
     a voice=piper/joe; missing  ->  a PENDING
-an engine that has come aborts no goal
+a present engine aborts no goal
     a; b; missing  ->  a ACTIVE; b PENDING
 """
 
 REJECTED = {
     "an empty text": ("text=", "invalid_text"),
-    "a text that is silent": ("text=\u200b", "invalid_text"),
+    "an invisible text": ("text=\u200b", "invalid_text"),
     "NUL": ("text=a\0", "invalid_text"),
     "half of a surrogate pair": ("text=\ud800", "invalid_text"),
     "100,000 characters": (f"text={'a' * 100_000}", "text_too_long"),
     "another format": ("format=ssml", "bad_option"),
     "a value out of its range": ("rate=1", "bad_option"),
-    "a fault of which the server knows": ("fault=unknown_voice", "unknown_voice"),
-    "a fault of the text is told before that": ("text= fault=unknown_voice", "invalid_text"),
+    "a reason given by the server": ("fault=unknown_voice", "unknown_voice"),
+    "a faulty text and a reason given by the server": ("text= fault=unknown_voice", "invalid_text"),
 }
 
 
@@ -366,7 +366,7 @@ def test_a_rule_holds(script: str, outcome: str) -> None:
 
 
 @pytest.mark.parametrize(("options", "reason"), REJECTED.values(), ids=REJECTED.keys())
-def test_a_rejected_goal_does_nothing_to_others(options: str, reason: str) -> None:
+def test_a_rejected_goal_does_not_affect_others(options: str, reason: str) -> None:
     robot = play(f"a; b queue key=k; c flush key=k {options}")
     assert robot.outcome() == f"a ACTIVE; b PENDING; c REJECTED {reason}"
     assert robot.seen[-1] == "c REJECTED"
@@ -374,12 +374,12 @@ def test_a_rejected_goal_does_nothing_to_others(options: str, reason: str) -> No
     assert (record.id, robot.scheduler.find("4k7f-3")) == ("4k7f-3", record)
 
 
-def test_of_a_thousand_preempting_goals_the_last_is_spoken_whole() -> None:
+def test_the_last_of_a_thousand_preempting_goals_is_spoken_completely() -> None:
     robot = Robot()
-    goals = [robot.says(f"goal {number}", preempt=True) for number in range(1_000)]
-    robot.tells("stopped", goals[0].id)
-    robot.tells("completed", goals[-1].id)
-    assert [each.state.name for each in goals] == ["PREEMPTED", *["RECALLED"] * 998, "SUCCEEDED"]
-    ends = [each for each in robot.seen if each.split()[1] in {"PREEMPTED", "RECALLED", "SUCCEEDED"}]
+    goals = [robot.say(f"goal {number}", preempt=True) for number in range(1_000)]
+    robot.report("stopped", goals[0].id)
+    robot.report("completed", goals[-1].id)
+    assert [record.state.name for record in goals] == ["PREEMPTED", *["RECALLED"] * 998, "SUCCEEDED"]
+    ends = [effect for effect in robot.seen if effect.split()[1] in {"PREEMPTED", "RECALLED", "SUCCEEDED"}]
     assert len(ends) == len(set(ends)) == 1_000
     assert robot.scheduler.unfinished() == []

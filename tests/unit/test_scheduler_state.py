@@ -17,8 +17,8 @@ from talkcli.goals.voices import NeuralVoice, VoiceScheduler
 PACKAGE = Path(talkcli.__file__).parent
 #: Attributes of the scheduler, of its records and of its other objects.
 STATE = {
-    *(name for each in (Record, NeuralVoice) for name in each.__slots__),
-    *(name for each in (Scheduler("4k7f", max_queue=1), History(), Queue(), VoiceScheduler()) for name in vars(each)),
+    *(name for cls in (Record, NeuralVoice) for name in cls.__slots__),
+    *(name for part in (Scheduler("4k7f", max_queue=1), History(), Queue(), VoiceScheduler()) for name in vars(part)),
 }
 #: Objects of the scheduler that other packages may read, with the methods that they may call.
 READ = {"history": {"find", "latest", "log"}, "pending": {"first"}, "voices": {"failure", "to_json"}}
@@ -26,21 +26,21 @@ READ = {"history": {"find", "latest", "log"}, "pending": {"first"}, "voices": {"
 
 def writes(source: str) -> list[str]:
     """Return the places in a module's source that write to the scheduler's state."""
-    found = []
+    written = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store | ast.Del):
             base = ast.unparse(node.value)
             own = base in {"self", "cls"}
             if "scheduler" in base or (not own and node.attr in STATE):
-                found.append(ast.unparse(node))
+                written.append(ast.unparse(node))
         elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
             part = node.func.value
             inner = isinstance(part, ast.Attribute) and "scheduler" in ast.unparse(part.value)
             if inner and isinstance(part, ast.Attribute) and node.func.attr not in READ.get(part.attr, set()):
-                found.append(ast.unparse(node.func))
+                written.append(ast.unparse(node.func))
         elif isinstance(node, ast.Call) and ast.unparse(node.func) in {"setattr", "object.__setattr__"}:
-            found.append(ast.unparse(node))
-    return found
+            written.append(ast.unparse(node))
+    return written
 
 
 def users() -> list[Path]:
@@ -48,17 +48,17 @@ def users() -> list[Path]:
     return sorted((PACKAGE / "server").glob("*.py"))
 
 
-def test_only_the_server_knows_the_scheduler() -> None:
+def test_only_the_server_imports_the_scheduler() -> None:
     """This ensures that the test below checks all modules that could change the state."""
     names = ("goals.scheduler", "goals.record", "goals.queue", "goals.history", "goals.voices")
     for path in PACKAGE.rglob("*.py"):
         if path.parent.name not in {"goals", "server"}:
             source = path.read_text("utf-8")
-            assert not any(f"talkcli.{each} import" in source for each in names), path
+            assert not any(f"talkcli.{name} import" in source for name in names), path
 
 
-@pytest.mark.parametrize("path", users(), ids=lambda each: each.name)
-def test_nothing_outside_goals_writes_to_the_scheduler_s_state(path: Path) -> None:
+@pytest.mark.parametrize("path", users(), ids=lambda path: path.name)
+def test_no_module_outside_goals_writes_to_the_schedulers_state(path: Path) -> None:
     assert writes(path.read_text("utf-8")) == []
 
 
@@ -76,5 +76,5 @@ def test_nothing_outside_goals_writes_to_the_scheduler_s_state(path: Path) -> No
         "setattr(record, 'state', state)",
     ],
 )
-def test_a_write_is_found(line: str) -> None:
+def test_a_write_is_detected(line: str) -> None:
     assert writes(line)

@@ -9,29 +9,29 @@ import pytest
 from tests.unit.robot import play, rules
 
 RULES = """
-a goal waits for its voice, and so do those behind it
+a goal waits for its voice, and later goals wait, too
     a voice=piper/joe; b  ->  a b PENDING
 a goal with a speaker waits for the speaker's voice
     a voice=piper/joe#3; b; wait 9.9; loaded amy  ->  a b PENDING
-a goal begins once its voice is loaded
+a goal starts once its voice is loaded
     a voice=piper/joe#3; b; loaded joe  ->  a ACTIVE; b PENDING
-a goal begins if its voice can't be loaded
+a goal starts if its voice can't be loaded
     a voice=piper/joe; b; unloadable joe  ->  a ACTIVE; b PENDING
 a goal does not wait for a voice that has failed before
     a voice=piper/joe; unloadable joe; completed a; b voice=piper/joe  ->  b ACTIVE; a SUCCEEDED
 a goal does not wait for a voice that is loaded
     a voice=piper/joe; loaded joe; completed a; b voice=piper/joe  ->  b ACTIVE; a SUCCEEDED
-a goal does not wait for the voice of another
+a goal does not wait for the voice of another goal
     a voice=piper/joe; loaded joe; b voice=piper/amy; completed a; loaded amy  ->  b ACTIVE; a SUCCEEDED
-a goal without a voice waits for the server's
+a goal without a voice waits for the server's voice
     set voice=piper/joe; a; b voice=en  ->  a b PENDING
-a goal with a voice does not wait for the server's
+a goal with a voice does not wait for the server's voice
     set voice=piper/joe; a voice=en; b  ->  a ACTIVE; b PENDING
-a goal without a voice begins if the server's voice changes
+a goal without a voice starts if the server's voice changes
     set voice=piper/joe; a; set voice=en  ->  a ACTIVE
-a goal waits ten seconds from when loading began
+a goal waits until loading has taken ten seconds
     set voice=piper/joe; wait 4; a voice=piper/joe; wait 5.9  ->  a PENDING
-a goal begins ten seconds after loading began
+a goal starts once loading has taken ten seconds
     set voice=piper/joe; wait 4; a voice=piper/joe; wait 6  ->  a ACTIVE
 a goal that preempts does not wait
     a voice=piper/joe; b voice=piper/joe preempt  ->  b ACTIVE; a PENDING
@@ -41,29 +41,29 @@ a goal of a higher priority does not wait
     a voice=piper/joe; b voice=piper/joe 1  ->  b ACTIVE; a PENDING
 a goal of a lower priority waits
     a voice=piper/joe -1  ->  a PENDING
-a goal of which half a second is left begins at once
+a goal that expires in half a second starts at once
     a voice=piper/joe ttl=0.5  ->  a ACTIVE
-a goal that insists waits until the voice is loaded
+a goal with voice_only waits until the voice is loaded
     a voice=piper/joe voice_only; wait 60  ->  a PENDING
-a goal that insists waits even if it preempts
+a goal with voice_only waits even if it preempts
     a voice=piper/joe voice_only preempt; wait 60  ->  a PENDING
-a goal that insists waits even if its priority is high
+a goal with voice_only waits even if its priority is high
     a voice=piper/joe voice_only 5; wait 60; loaded joe  ->  a ACTIVE
-a goal that insists expires like any other
+a goal with voice_only expires like any other goal
     a voice=piper/joe voice_only ttl=3; b; wait 3  ->  b ACTIVE; a RECALLED expired
-a goal behind one that was cancelled begins
+a goal starts if the goal before it is cancelled
     a voice=piper/joe; b; cancel a; wait 0  ->  b ACTIVE; a RECALLED canceled by door
-a loaded voice starts none beside the active goal
+a loaded voice starts no goal beside the active one
     a; b voice=piper/joe; loaded joe  ->  a ACTIVE; b PENDING
 a loaded voice starts no goal while speech is paused
     a voice=piper/joe; pause; loaded joe  ->  a PENDING
-a goal waits for its voice again if another engine has to load it
+a goal waits for its voice again if a new engine has to load it
     a voice=piper/joe; lost; wait 3; ready  ->  a PENDING
 a goal that has waited ten seconds for an engine does not wait for its voice
     a voice=piper/joe; lost; wait 20; ready  ->  a ACTIVE
 goals wait for no voice if there is no engine to load it
     a voice=piper/joe; lost; unavailable  ->  a ACTIVE
-an engine that stays away fails a goal that waited for its voice
+a missing engine aborts a goal that waited for its voice
     a voice=piper/joe; lost; missing  ->  a ABORTED engine_failed
 """
 
@@ -125,5 +125,5 @@ def test_the_deadline_is_the_end_of_the_wait(script: str) -> None:
 
 @pytest.mark.parametrize("script", ORDERS)
 def test_voices_are_loaded_and_dropped_in_the_order_of_the_goals(script: str) -> None:
-    orders = [each for each in play(script).seen if each.startswith(("load", "drop"))]
+    orders = [effect for effect in play(script).seen if effect.startswith(("load", "drop"))]
     assert ", ".join(orders) == ORDERS[script]

@@ -28,7 +28,7 @@ ALLOWED = {
 
 
 def test_names_and_numbers_are_actionlibs() -> None:
-    assert {each.name: each.value for each in State} == NUMBERS
+    assert {state.name: state.value for state in State} == NUMBERS
 
 
 @pytest.mark.parametrize(("name", "number"), NUMBERS.items())
@@ -39,7 +39,7 @@ def test_a_state_prints_as_its_name_and_is_a_number_in_json(name: str, number: i
 
 
 @pytest.mark.parametrize(("state", "target"), [*itertools.product(NUMBERS, repeat=2)])
-def test_a_transition_of_the_table_is_made_and_any_other_is_refused(state: str, target: str) -> None:
+def test_only_the_transitions_in_the_table_are_allowed(state: str, target: str) -> None:
     record = Record("4k7f-1", 1, Say("door open"), Sender(), 1.0)
     record.state = State[state]
     before = record.snapshot()
@@ -53,15 +53,15 @@ def test_a_transition_of_the_table_is_made_and_any_other_is_refused(state: str, 
         assert record.snapshot() == before
 
 
-def test_a_goal_has_ended_where_nothing_may_follow() -> None:
+def test_a_state_without_transitions_is_terminal() -> None:
     ended = {"PREEMPTED", "SUCCEEDED", "ABORTED", "REJECTED", "RECALLED", "LOST"}
-    assert {each.name for each in State if each.terminal} == ended == set(NAMES) - ALLOWED.keys()
-    assert {each.name for each, following in TRANSITIONS.items() if not following} == ended
+    assert {state.name for state in State if state.terminal} == ended == set(NAMES) - ALLOWED.keys()
+    assert {state.name for state, following in TRANSITIONS.items() if not following} == ended
 
 
-def test_each_end_has_its_exit_code() -> None:
+def test_each_terminal_state_has_its_exit_code() -> None:
     codes = {"SUCCEEDED": 0, "ABORTED": 4, "REJECTED": 5, "RECALLED": 6, "PREEMPTED": 7, "LOST": 12}
-    assert {each.name: code for each, code in EXIT_CODES.items()} == codes
+    assert {state.name: code for state, code in EXIT_CODES.items()} == codes
     for state in State:
         assert Goal("4k7f-1", state).exit_code == codes.get(state.name)
     assert Goal("4k7f-1", State.REJECTED, reason="throttled").exit_code == 0

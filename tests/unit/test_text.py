@@ -22,7 +22,7 @@ INVALID = {
     "NUL": "\0",
     "NUL within words": "door\0open",
     "half of a surrogate pair": "\ud83d",
-    "other half": "door \udc00 open",
+    "the other half": "door \udc00 open",
     "private use": "\ue000",
 }
 SPOKEN = [
@@ -32,21 +32,21 @@ SPOKEN = [
 
 
 @pytest.mark.parametrize("text", INVALID.values(), ids=INVALID.keys())
-def test_a_text_without_anything_to_say_is_invalid_whatever_its_length(text: str) -> None:
-    for most in (10_000, None):
-        found = bad_text(text, most)
-        assert found is not None
-        assert found[0] == "invalid_text"
-        assert found[1]
+def test_a_text_without_anything_to_say_is_invalid(text: str) -> None:
+    for limit in (10_000, None):
+        refusal = bad_text(text, limit)
+        assert refusal is not None
+        assert refusal[0] == "invalid_text"
+        assert refusal[1]
 
 
 @pytest.mark.parametrize("text", SPOKEN)
-def test_a_text_of_any_kind_is_taken(text: str) -> None:
+def test_a_text_of_any_kind_is_accepted(text: str) -> None:
     assert bad_text(text) is None
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "message"),
     [
         ("", "the text is empty"),
         (" \t", "the text is empty"),
@@ -57,27 +57,27 @@ def test_a_text_of_any_kind_is_taken(text: str) -> None:
         ("door \0", "the text contains a NUL character (character 6)"),
     ],
 )
-def test_the_words_say_what_is_wrong_and_count_from_1(text: str, words: str) -> None:
-    assert bad_text(text) == ("invalid_text", words)
+def test_the_message_names_the_fault_and_counts_from_1(text: str, message: str) -> None:
+    assert bad_text(text) == ("invalid_text", message)
 
 
 @pytest.mark.parametrize(
-    ("longest", "most", "words"),
+    ("longest", "limit", "message"),
     [
-        *((each * 10_000, 10_000, "the text is too long: 10,001 characters (at most 10,000)") for each in "aé日🤖"),
+        *((sign * 10_000, 10_000, "the text is too long: 10,001 characters (at most 10,000)") for sign in "aé日🤖"),
         ("a" * 5, 5, "the text is too long: 6 characters (at most 5)"),
         ("🤖" * 10_000, 50_000, "the text is too long: 40,001 bytes (at most 40,000)"),
         ("a" * 40_000, 50_000, "the text is too long: 40,001 bytes (at most 40,000)"),
     ],
-    ids=lambda each: f"{each[:1]}{len(each)}" if isinstance(each, str) else str(each),
+    ids=lambda value: f"{value[:1]}{len(value)}" if isinstance(value, str) else str(value),
 )
-def test_a_text_has_a_longest_number_of_characters_and_of_bytes(longest: str, most: int, words: str) -> None:
-    assert bad_text(longest, most) is None
-    assert bad_text(f"{longest}{longest[0] if most == 10_000 else 'a'}", most) == ("text_too_long", words)
-    assert bad_text(f"{longest}a", None) is None, "a text that is no goal may have any length"
+def test_a_text_is_limited_in_characters_and_in_bytes(longest: str, limit: int, message: str) -> None:
+    assert bad_text(longest, limit) is None
+    assert bad_text(f"{longest}{longest[0] if limit == 10_000 else 'a'}", limit) == ("text_too_long", message)
+    assert bad_text(f"{longest}a", None) is None, "without a limit, a text may have any length"
 
 
-def test_ten_thousand_characters_are_the_longest_text() -> None:
+def test_a_text_has_at_most_ten_thousand_characters() -> None:
     assert bad_text("a" * 10_000) is None
     assert bad_text("a" * 10_001) == ("text_too_long", "the text is too long: 10,001 characters (at most 10,000)")
 
@@ -85,15 +85,15 @@ def test_ten_thousand_characters_are_the_longest_text() -> None:
 @given(
     st.text(st.characters(exclude_categories=[])) | st.text(st.characters(categories=["Zs", "Cc", "Cf", "Cn", "Cs"]))
 )
-def test_any_text_is_taken_or_refused_with_reason_and_words(text: str) -> None:
-    found = bad_text(text, 50)
-    if found is None:
+def test_any_text_is_accepted_or_refused_with_reason_and_message(text: str) -> None:
+    refusal = bad_text(text, 50)
+    if refusal is None:
         assert 0 < len(text) <= 50
         assert "\0" not in text
         assert text.strip()
         text.encode()
     else:
-        reason, words = found
+        reason, message = refusal
         assert reason in {"invalid_text", "text_too_long"}
-        assert words
-        words.encode()
+        assert message
+        message.encode()

@@ -1,4 +1,4 @@
-"""Lines for people, at any width: nothing is wider than its terminal, the columns line up, and what counts is there."""
+"""Lines for people, at any terminal width."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ NOON = time.mktime((2024, 5, 17, 12, 0, 0, 0, 0, -1))
 GOAL = Goal("4k7f-7", State.PENDING, "battery low", client=PATROL, queued_at=NOON)
 SERVER = {"pid": 1, "socket": "/run/talk/talk.sock", "boot": "4k7f"}
 
-#: Programs, with their options, that start another one.
+#: Programs with options, which start another program.
 STARTERS = [
     *("timeout -s KILL -k 5 1m", "timeout --signal KILL --kill-after=5 0.5", "nice -n 5", "nice -n5", "ionice -c 3"),
     *("env -u X", "sudo -u robot -E A=1", "/usr/bin/time -f %e", "stdbuf -oL", "chrt -f 5"),
@@ -37,13 +37,13 @@ SENDERS = st.none() | st.builds(
     st.just(1000),
     st.just("talk"),
     NAMES,
-    NAMES.map(lambda each: each or None),
+    NAMES.map(lambda name: name or None),
 )
 BYS = st.none() | st.builds(By, goal=st.sampled_from(["4k7f-1", "x" * 64])) | st.builds(By, client=SENDERS)
 GOALS = st.builds(
     Goal,
     id=st.sampled_from(["4k7f-1", "4k7f-123456", "i" * 64, "door:open"]),
-    state=st.sampled_from([each for each in State if each.terminal]),
+    state=st.sampled_from([state for state in State if state.terminal]),
     text=NAMES,
     reason=st.sampled_from([None, "canceled", "audio_device"]),
     by=BYS,
@@ -56,35 +56,35 @@ WIDTHS = st.integers(60, 200)
 
 
 def plain(line: str) -> bool:
-    """Return whether a line has nothing that a terminal would act on."""
-    return not any(unicodedata.category(each) in {"Cc", "Cf", "Zl", "Zp"} for each in line)
+    """Return whether a line contains no control characters."""
+    return not any(unicodedata.category(character) in {"Cc", "Cf", "Zl", "Zp"} for character in line)
 
 
 def test_width_counts_columns() -> None:
-    assert [width(each) for each in ("", "abc", "日本", "é", "e\u0301", "\x1b[1;32mok\x1b[0m")] == [0, 3, 4, 1, 1, 2]
+    assert [width(text) for text in ("", "abc", "日本", "é", "e\u0301", "\x1b[1;32mok\x1b[0m")] == [0, 3, 4, 1, 1, 2]
 
 
 @given(TEXTS, st.integers(1, 100))
-def test_cut_fits_and_is_no_shorter_than_it_must_be(text: str, room: int) -> None:
+def test_a_cut_text_fits_and_is_as_long_as_possible(text: str, room: int) -> None:
     shown = cut(text, room)
     assert width(shown) <= room
     assert shown == text or shown.endswith("…")
     if shown != text:
         assert text.startswith(shown[:-1])
-        assert width(shown) >= room - 1  # the one that did not fit may have taken two columns
+        assert width(shown) >= room - 1  # the next character may be two columns wide
 
 
 @given(
     st.text("ab日", max_size=90), st.lists(st.text("ab日", min_size=1, max_size=90), min_size=1), WIDTHS, st.booleans()
 )
-def test_a_row_fits_and_leaves_half_of_it_to_the_text(text: str, details: list[str], room: int, long: bool) -> None:
+def test_a_row_fits_and_gives_half_its_width_to_the_text(text: str, details: list[str], room: int, long: bool) -> None:
     text, details = f'"{text}"', sorted(details, key=width, reverse=True)
     row = fit_row("", text, details, 0, Screen(room, long=long))
     assert width(row) <= room
     shown = row[: row.index('"', 1) + 1]
     assert shown == text or "…" in shown
     if shown != text:
-        assert width(shown) >= (16 if long else room // 2) - 2  # a character of two columns may not have fitted
+        assert width(shown) >= (16 if long else room // 2) - 2  # the next character may be two columns wide
         assert width(row) >= room - 2
     if width(text) + 2 + width(details[0]) <= room and width(details[0]) <= room // 2 - 2:
         assert row == f"{text}  {details[0]}"
@@ -92,19 +92,19 @@ def test_a_row_fits_and_leaves_half_of_it_to_the_text(text: str, details: list[s
 
 
 @given(st.lists(GOALS, max_size=5), WIDTHS)
-def test_a_log_fits_and_lines_up(goals: list[Goal], room: int) -> None:
+def test_a_log_fits_and_its_columns_line_up(goals: list[Goal], room: int) -> None:
     lines = log_lines(goals, Screen(room), NOON)
     assert len(lines) == len(goals)
-    assert all(width(each) <= room for each in lines)
+    assert all(width(line) <= room for line in lines)
     assert all(map(plain, lines))
     for line, goal in zip(lines, goals, strict=True):
         assert goal.state.name in line
-    starts = {width(each[: each.index('"')]) for each, goal in zip(lines, goals, strict=True) if goal.text is not None}
+    starts = {width(line[: line.index('"')]) for line, goal in zip(lines, goals, strict=True) if goal.text is not None}
     assert len(starts) <= 1
 
 
 @given(st.lists(GOALS, max_size=5))
-def test_a_log_without_a_terminal_is_whole(goals: list[Goal]) -> None:
+def test_a_log_without_a_terminal_is_not_cut(goals: list[Goal]) -> None:
     for line, goal in zip(log_lines(goals, Screen(), NOON), goals, strict=True):
         assert goal.id in line
         assert sender_forms(goal.client, Screen())[0].rstrip() in line
@@ -122,18 +122,18 @@ def test_goals_of_the_running_server_are_shown_by_their_numbers() -> None:
         replace(GOAL, id="9a9a-3", state=State.RECALLED, reason="replaced", by=By("4k7f-7"), ended_at=NOON),
         replace(GOAL, id="4k7f-b", state=State.RECALLED, reason="replaced", by=By("9a9a-4"), ended_at=NOON),
     ]
-    assert [each.split()[2] for each in log_lines(goals, Screen(boot="4k7f"), NOON)] == ["7", "9a9a-3", "4k7f-b"]
-    assert [each.split("replaced by ")[-1] for each in log_lines(goals, Screen(boot="4k7f"), NOON)[1:]] == [
+    assert [line.split()[2] for line in log_lines(goals, Screen(boot="4k7f"), NOON)] == ["7", "9a9a-3", "4k7f-b"]
+    assert [line.split("replaced by ")[-1] for line in log_lines(goals, Screen(boot="4k7f"), NOON)[1:]] == [
         "7",
         "9a9a-4",
     ]
     for screen in (Screen(long=True, boot="4k7f"), Screen()):
-        assert [each.split()[2] for each in log_lines(goals, screen, NOON)] == [each.id for each in goals]
+        assert [line.split()[2] for line in log_lines(goals, screen, NOON)] == [goal.id for goal in goals]
     lines = status_lines(ServerStatus(SERVER, None, (), tuple(goals)), Screen(), NOON)
-    assert [each[9:].split()[1] for each in lines[-3:]] == ["7", "9a9a-3", "4k7f-b"]
+    assert [line[9:].split()[1] for line in lines[-3:]] == ["7", "9a9a-3", "4k7f-b"]
 
 
-def test_most_of_a_line_belongs_to_the_text() -> None:
+def test_the_text_gets_most_of_a_line() -> None:
     ended = replace(GOAL, text="please step back " * 9, state=State.SUCCEEDED, client=replace(PATROL, name=None))
     preempted = replace(ended, state=State.PREEMPTED, reason="canceled", by=By(client=PATROL))
     first, second = log_lines([ended, preempted], Screen(80, boot="4k7f"), NOON)
@@ -146,7 +146,7 @@ def test_most_of_a_line_belongs_to_the_text() -> None:
 @given(st.lists(GOALS, max_size=4), GOALS, WIDTHS, st.booleans())
 def test_a_transcript_and_a_status_fit(goals: list[Goal], goal: Goal, room: int, full: bool) -> None:
     now = replace(goal, state=State.ACTIVE, started_at=NOON, paused=True, key="k" * 64, priority=10**6)
-    waiting = tuple(replace(each, state=State.PENDING, ttl=5.0, queued_at=NOON) for each in goals)
+    waiting = tuple(replace(other, state=State.PENDING, ttl=5.0, queued_at=NOON) for other in goals)
     status = ServerStatus(SERVER, now, waiting, tuple(goals))
     events: list[Event] = [
         Snapshot(status),
@@ -156,13 +156,13 @@ def test_a_transcript_and_a_status_fit(goals: list[Goal], goal: Goal, room: int,
         StateChanged(goal.id, goal.state, NOON, goal=goal),
     ]
     transcript = Transcript(full=full, words=True)
-    told = [transcript.lines(each, Screen(room), NOON) for each in events]
-    for lines in (status_lines(status, Screen(room), NOON), *told):
-        assert all(width(each) <= room and plain(each) for each in lines), lines
-    assert told[-1]
+    shown = [transcript.lines(event, Screen(room), NOON) for event in events]
+    for lines in (status_lines(status, Screen(room), NOON), *shown):
+        assert all(width(line) <= room and plain(line) for line in lines), lines
+    assert shown[-1]
 
 
-def test_dates_are_shown_of_another_day_alone() -> None:
+def test_a_date_is_shown_only_for_another_day() -> None:
     ended = replace(GOAL, state=State.SUCCEEDED, ended_at=NOON)
     yesterday = replace(ended, ended_at=NOON - 86400)
     assert log_lines([ended], Screen(), NOON)[0].startswith("12:00:00  SUCCEEDED")
@@ -172,25 +172,25 @@ def test_dates_are_shown_of_another_day_alone() -> None:
     assert log_lines([replace(ended, ended_at=None)], Screen(), NOON)[0].startswith("--:--:--  ")
 
 
-def test_what_is_over_at_once_is_left_out_on_a_terminal() -> None:
-    def told(*states: State, full: bool, paused: bool = False) -> list[str]:
+def test_brief_states_are_left_out_on_a_terminal() -> None:
+    def shown_states(*states: State, full: bool, paused: bool = False) -> list[str]:
         transcript = Transcript(full=full, words=False)
         transcript.lines(Snapshot(ServerStatus({**SERVER, "paused": paused}, None, (), ())), Screen(), NOON)
         lines = []
         for state in states:
             goal = replace(GOAL, state=state) if state is State.PENDING or state.terminal else None
             lines += transcript.lines(StateChanged(GOAL.id, state, NOON, goal=goal), Screen(), NOON)
-        return [each.split()[1] for each in lines]
+        return [line.split()[1] for line in lines]
 
     course = State.PENDING, State.ACTIVE, State.PREEMPTING, State.PREEMPTED
-    assert told(*course, full=True) == [each.name for each in course]
-    assert told(State.ACTIVE, full=True) == ["ACTIVE"], "an event of a goal that is not known is shown, too"
-    assert told(*course, full=False) == ["ACTIVE", "PREEMPTED"]
-    assert told(*course, full=False, paused=True) == ["PENDING", "ACTIVE", "PREEMPTED"]
-    assert told(State.PENDING, State.RECALLED, full=False) == ["RECALLED"]
+    assert shown_states(*course, full=True) == [state.name for state in course]
+    assert shown_states(State.ACTIVE, full=True) == ["ACTIVE"], "events of unknown goals are shown, too"
+    assert shown_states(*course, full=False) == ["ACTIVE", "PREEMPTED"]
+    assert shown_states(*course, full=False, paused=True) == ["PENDING", "ACTIVE", "PREEMPTED"]
+    assert shown_states(State.PENDING, State.RECALLED, full=False) == ["RECALLED"]
 
 
-def test_what_waits_behind_another_is_shown() -> None:
+def test_a_goal_that_waits_for_another_is_shown() -> None:
     transcript = Transcript(full=False, words=False)
     transcript.lines(Snapshot(ServerStatus(SERVER, replace(GOAL, id="a", state=State.ACTIVE), (), ())), Screen(), NOON)
     waits = StateChanged(GOAL.id, State.PENDING, NOON, goal=GOAL)
@@ -201,7 +201,7 @@ def test_what_waits_behind_another_is_shown() -> None:
 
 
 @pytest.mark.parametrize(("words", "count"), [(True, 1), (False, 0)])
-def test_words_are_lines_where_they_are_wanted(words: bool, count: int) -> None:
+def test_words_are_shown_only_if_requested(words: bool, count: int) -> None:
     event = WordHeard("4k7f-7", "low", 8, 11, 2, 0.51, NOON)
     lines = Transcript(full=False, words=words).lines(event, Screen(80), NOON)
     assert lines == ["12:00:00  word        4k7f-7  low  0.51 s"] * count
@@ -242,7 +242,7 @@ def test_forms_of_a_sender_get_shorter_and_keep_the_script() -> None:
         ("perl -ne print a", "perl"),
         ("node --require x.js a.js", "a.js"),
         # programs that start another one
-        *((f"{each} ./a", "a") for each in STARTERS),
+        *((f"{starter} ./a", "a") for starter in STARTERS),
         ("timeout 60 python3 a.py", "a.py"),
         ("env -i A=1 B=2 ./a C=3", "a"),
         ("sudo -Eu robot -- ./a -x", "a"),
@@ -256,11 +256,11 @@ def test_forms_of_a_sender_get_shorter_and_keep_the_script() -> None:
         (None, "a program"),
     ],
 )
-def test_a_sender_is_shown_by_the_script_that_it_runs(parent: str | None, script: str) -> None:
+def test_a_sender_is_shown_as_the_script_that_it_runs(parent: str | None, script: str) -> None:
     assert sender_forms(Sender(parent=parent), Screen()) == [script]
 
 
-def test_why_a_goal_ended() -> None:
+def test_the_reason_for_the_end_of_a_goal_is_shown() -> None:
     def why(state: State, reason: str | None = None, by: By | None = None, message: str | None = None) -> list[str]:
         goal = replace(GOAL, state=state, reason=reason, by=by, message=message, duration=2.04)
         return reason_forms(goal, Screen())
@@ -272,12 +272,13 @@ def test_why_a_goal_ended() -> None:
     expired = why(State.RECALLED, "expired", None, "not spoken: its time was over")
     assert expired == ["expired: its time was over", "expired"]
     assert why(State.ABORTED, "audio_device", None, "speech failed: no: device") == ["audio_device: no: device"]
-    assert why(State.ABORTED, "audio_device", None, "Talk aborted: no: device") == ["audio_device: no: device"]  # older
+    older_server = why(State.ABORTED, "audio_device", None, "Talk aborted: no: device")
+    assert older_server == ["audio_device: no: device"]
     throttled = why(State.REJECTED, "throttled", By("4k7f-1"), "not spoken: the same text")
     assert throttled == ["throttled by 4k7f-1: the same text"]
     assert why(State.PREEMPTED, None) == ["preempted", "preempted"]
 
 
-def test_settings_are_shown_as_their_options_take_them() -> None:
+def test_settings_are_shown_as_their_options_accept_them() -> None:
     lines = setting_lines({"rate": 200, "volume": 0.5, "voice": None, "preempt": True, "ttl": None, "new": None})
     assert lines == ["rate     200", "volume   0.5", "voice    default", "preempt  yes", "ttl      0", "new      -"]

@@ -1,4 +1,4 @@
-"""A model is cut in two, and what is none of Piper's, or no file that may be run, is refused in words."""
+"""Splitting a Piper model in two, and refusing other models and unsafe ones."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 MODEL = tiny_voice.model()
-#: An attribute of a node: a graph, and one with a tensor.
+#: Field numbers of a graph and of a tensor in an attribute of a node.
 _GRAPH, _TENSOR = 6, 5
 CONSTANT = field(1, "value") + field(_TENSOR, tensor("t", [1], 1, more=field(14, 1))) + field(20, 4)
 
 
 def _halves(model: bytes) -> tuple[bytes, bytes]:
-    """Return both, the encoder first, whole."""
+    """Return the encoder and the decoder of a model."""
     encoder, decoder = split_model(model)
     return b"".join(encoder), b"".join(decoder)
 
 
 def _inside(graph: bytes, deep: int) -> bytes:
-    """Return a node with a graph inside of a graph, so many deep."""
+    """Return a node that contains this many nested graphs."""
     for _ in range(deep):
         graph = node("If", ["input"], "unused", field(1, "then_branch") + field(_GRAPH, graph) + field(20, 5))
     return graph
 
 
-def test_the_first_half_has_the_inputs_and_the_second_the_output() -> None:
+def test_the_encoder_has_the_inputs_and_the_decoder_the_output() -> None:
     encoder, decoder = _halves(MODEL)
     for name in ("input_lengths", "scales", "frames_of", "Ceil"):
         assert name.encode() in encoder
@@ -47,8 +47,8 @@ def test_the_first_half_has_the_inputs_and_the_second_the_output() -> None:
     assert len(encoder) + len(decoder) < 1.2 * len(MODEL)
 
 
-def test_what_belongs_to_neither_half_is_left_out() -> None:
-    """Only what was looked at reaches the library that reads it."""
+def test_parts_that_belong_to_neither_half_are_left_out() -> None:
+    """The library that reads the model must only get parts that were checked."""
     encoder, decoder = _halves(
         tiny_voice.model(fields=field(14, field(1, "note") + field(2, "metadata")) + field(20, b"training"))
     )
@@ -57,8 +57,8 @@ def test_what_belongs_to_neither_half_is_left_out() -> None:
         assert b"training" not in half
 
 
-def test_a_graph_inside_of_another_keeps_what_it_needs() -> None:
-    """A condition takes a weight that nothing else does."""
+def test_a_nested_graph_keeps_its_weights() -> None:
+    """Only the nested graph uses this weight."""
     inner = node("Identity", ["only_inside"], "then_out")
     condition = node("If", ["frames"], "more", field(1, "then_branch") + field(_GRAPH, inner) + field(20, 5))
     after = node("Add", ["output", "more"], "last")
@@ -91,7 +91,7 @@ def test_a_graph_inside_of_another_keeps_what_it_needs() -> None:
         (tiny_voice.model(nodes=node("Constant", [], "x", CONSTANT)), "in another file"),
     ],
 )
-def test_what_is_not_to_be_run_is_refused_in_words(model: bytes, why: str) -> None:
+def test_an_unsafe_or_invalid_model_is_refused_with_a_reason(model: bytes, why: str) -> None:
     with pytest.raises(NotSplit, match=why.replace("(", r"\(").replace(")", r"\)").replace(".", r"\.")):
         _halves(model)
 
@@ -109,10 +109,10 @@ def test_what_is_not_to_be_run_is_refused_in_words(model: bytes, why: str) -> No
     ],
     ids=["model", "graph", "attribute", "tensor", "weight", "operators", "nodes"],
 )
-def test_a_model_of_too_many_parts_is_refused_wherever_they_are(
+def test_a_model_with_too_many_parts_is_refused_wherever_they_are(
     monkeypatch: pytest.MonkeyPatch, where: Callable[[bytes], bytes]
 ) -> None:
-    """A file of as many bytes as a model may have could hold 100 million: minutes, and 30 GB."""
+    """The largest file could have 100 million parts, which would take minutes and 30 GB of memory."""
     assert vits._MAX_FIELDS == 300_000
     monkeypatch.setattr(vits, "_MAX_FIELDS", 3_000)
     _halves(where(field(3, 1) * 100))
@@ -121,7 +121,7 @@ def test_a_model_of_too_many_parts_is_refused_wherever_they_are(
 
 
 @given(st.integers(0, len(MODEL) - 1), st.binary(min_size=1, max_size=8))
-def test_whatever_is_wrong_with_a_model_it_is_cut_or_refused(place: int, written: bytes) -> None:
+def test_a_corrupt_model_is_split_or_refused(place: int, written: bytes) -> None:
     broken = MODEL[:place] + written + MODEL[place + len(written) :]
     with contextlib.suppress(NotSplit):
         encoder, decoder = _halves(broken)

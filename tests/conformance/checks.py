@@ -1,13 +1,12 @@
-"""What must hold of all that a watcher was told since before the first goal, whatever the goals were.
+"""Checks of goals, and of the order of all events that a watcher has received.
 
-It reads events alone and knows nothing of what was asked for: it is the same for every mix of requests.
+The watcher reads in a thread, so these helpers first wait until the goals have ended.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from tests.conformance.witness import await_ends
 from tests.support.watcher import TERMINAL
 
 if TYPE_CHECKING:
@@ -16,8 +15,8 @@ if TYPE_CHECKING:
     from tests.support.connection import Message
     from tests.support.processes import Talk
 
-#: All the ways that a goal may take.
-WAYS = (
+#: All valid sequences of a goal's states.
+STATE_SEQUENCES = (
     ["REJECTED"],
     ["PENDING", "RECALLED"],
     ["PENDING", "ACTIVE", "SUCCEEDED"],
@@ -27,24 +26,48 @@ WAYS = (
 )
 
 
+def states(talk: Talk, goal_id: str) -> list[str]:
+    """Wait for a goal to end, and return all its states."""
+    talk.watcher.wait_for_terminal(goal_id)
+    return talk.watcher.states(goal_id)
+
+
+def count_ends(talk: Talk, *goal_ids: str) -> list[int]:
+    """Wait for these goals to end, and return the number of terminal states of each."""
+    await_ends(talk, goal_ids)
+    counts = talk.watcher.terminal_counts()
+    return [counts[goal_id] for goal_id in goal_ids]
+
+
+def await_ends(talk: Talk, goal_ids: Iterable[str]) -> None:
+    """Wait until these goals have ended or were rejected."""
+    seen = {(event.get("id"), event.get("state")) for event in talk.watcher.events()}
+    ended = {goal_id for goal_id, state in seen if state in TERMINAL - {"REJECTED"}}
+    rejected = {goal_id for goal_id, state in seen if state == "REJECTED" and (goal_id, "PENDING") not in seen}
+    done = ended | rejected
+    for goal_id in goal_ids:
+        if goal_id not in done:
+            talk.watcher.wait_for_terminal(goal_id)
+
+
 def submit(talk: Talk, text: str, **fields: Any) -> Message:
-    """Send a goal and return it as the reply has it, REJECTED too."""
+    """Send a goal, and return the goal of the reply, which may be REJECTED."""
     reply = talk.request("say", text=text, **fields)
     assert reply["ok"], reply
     goal: Message = reply["goal"]
     return goal
 
 
-def assert_rejected(goal: Message, reason: str, *words: str) -> None:
-    """Assert that a goal was REJECTED for that reason, with these words in its message."""
+def assert_rejected(goal: Message, reason: str, *texts: str) -> None:
+    """Assert that a goal was REJECTED for this reason, with these strings in its message."""
     assert (goal["state"], goal["reason"]) == ("REJECTED", reason), goal
     assert goal["message"].startswith("not spoken: "), goal
-    for word in words:
-        assert word in goal["message"], goal
+    for text in texts:
+        assert text in goal["message"], goal
 
 
 def assert_recalled(talk: Talk, goal_id: str, reason: str, by: str | None = None) -> None:
-    """Assert that a goal was taken out of the queue for that reason, by that goal."""
+    """Assert that a pending goal was RECALLED for this reason, by this goal."""
     assert talk.watcher.wait_for_terminal(goal_id, 10) == "RECALLED"
     assert talk.watcher.states(goal_id) == ["PENDING", "RECALLED"]
     goal = talk.goal(goal_id)
@@ -53,8 +76,8 @@ def assert_recalled(talk: Talk, goal_id: str, reason: str, by: str | None = None
     assert by is None or goal["by"] == {"goal": by}, goal
 
 
-def assert_told_in_order(talk: Talk) -> None:
-    """Assert the order of section 9 of all goals that there were; all of them must have ended."""
+def assert_event_order(talk: Talk) -> None:
+    """Wait until all goals have ended, and assert that their events have the documented order."""
     await_ends(talk, talk.watcher.goals())
     events = talk.watcher.events()
     numbers = [event["n"] for event in events]
@@ -66,14 +89,14 @@ def assert_told_in_order(talk: Talk) -> None:
     for own in goals.values():
         _check_goal([event for event in own if event["event"] != "paused"])
     _check_one_at_a_time(events)
-    _check_newcomers(events)
+    _check_new_goals(events)
 
 
 def _check_goal(events: list[Message]) -> None:
-    """One goal: its states are one of the ways, its words are between ACTIVE and its end."""
+    """Assert that a goal's states are a valid sequence, and that its words come between ACTIVE and its end."""
     steps = [event.get("state", "word") for event in events]
     states = [state for state in steps if state != "word"]
-    assert states in WAYS, events
+    assert states in STATE_SEQUENCES, events
     assert steps[0] != "word" != steps[-1], steps
     assert "word" not in steps or steps.index("word") > steps.index("ACTIVE"), steps
     for event in (event for event in events if event["event"] == "state"):
@@ -85,7 +108,7 @@ def _check_goal(events: list[Message]) -> None:
 
 
 def _check_one_at_a_time(events: Iterable[Message]) -> None:
-    """No goal becomes ACTIVE before the one before it has ended."""
+    """Assert that no goal becomes ACTIVE before the previous one has ended."""
     active = None
     for event in events:
         if event.get("state") == "ACTIVE":
@@ -95,8 +118,8 @@ def _check_one_at_a_time(events: Iterable[Message]) -> None:
             active = None
 
 
-def _check_newcomers(events: Iterable[Message]) -> None:
-    """A goal that another one replaced, preempted or displaced: told between that one's PENDING and its ACTIVE."""
+def _check_new_goals(events: Iterable[Message]) -> None:
+    """Assert that a replaced, preempted or displaced goal ends between PENDING and ACTIVE of the new goal."""
     seen: dict[str, str] = {}
     for event in events:
         if event["event"] != "state":
@@ -105,6 +128,6 @@ def _check_newcomers(events: Iterable[Message]) -> None:
         newcomer = (event.get("goal", {}).get("by") or {}).get("goal")
         if newcomer is not None and event["state"] in {"RECALLED", "PREEMPTED"}:
             error = f"{event['id']} ended by {newcomer}, which was {seen.get(newcomer)}"
-            # One that was stopped may end long after the newcomer was recalled in its turn.
+            # A stopped goal may end long after the new goal was recalled itself.
             allowed = {"PENDING"} if event["state"] == "RECALLED" else {"PENDING", "RECALLED"}
             assert seen.get(newcomer) in allowed, error
