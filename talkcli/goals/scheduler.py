@@ -206,7 +206,7 @@ class Scheduler:
         expires_at = inf if ttl is None else now.monotonic + ttl - waited_s
         number, asked = self._count, say if ttl == say.ttl else replace(say, ttl=ttl)
         record = Record(f"{self.boot}-{number}", number, asked, sender, now.wall, self._preempts(say), expires_at)
-        record.first_chars, record.more = len(say.text), say.more
+        record.first_chars = len(say.text)
         by = canceled or self._early_cancels.find(say.id, now.monotonic)
         refused = self._find_refusal(say, refusal, first) or (None if canceled else self._throttle(say, record, now))
         expired = expires_at <= now.monotonic
@@ -218,7 +218,7 @@ class Scheduler:
             record.state, record.message, record.ended_at = State.REJECTED, f"not spoken: {words}", now.wall
             self.history.add(record)
             return record, [StateChange(record, State.REJECTED)]
-        record.id = say.id or record.id
+        record.id, record.more = say.id or record.id, say.more
         self._by_id[record.id] = record
         effects: list[Effect] = [StateChange(record, State.PENDING)]
         if by:
@@ -304,9 +304,9 @@ class Scheduler:
 
     def break_off(self, record: Record, now: Now, *, at_once: bool = False) -> list[Effect]:
         """End a goal whose text will never be complete. Sentences that are complete are spoken, unless `at_once`."""
+        self._adopt(record)
         if not (record.more and record.state in {State.PENDING, State.ACTIVE}):
             return []
-        self._adopt(record)
         if record.state is State.PENDING:
             return self._recall(record, Reason.BROKEN_OFF, _BROKEN_OFF, None, now) + self._order_next_voice(now)
         record.more, record.broken = False, True

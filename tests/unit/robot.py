@@ -4,6 +4,8 @@ The steps of a script are separated by semicolons. A single letter sends a goal 
 Every other step is a verb:
 
     a 5 preempt key=k ttl=1     send a goal of priority 5 that preempts; "queue" is preempt=False
+    a more stall=2; append a text=door at=4 end broken; left a         send a text that grows, add to it, and leave it
+    starved a; fed a            report as the engine that its text is missing, or isn't missing any more
     heard a; completed a; failed a; stopped a; deaf a   report this as the engine; * is the active goal
     cancel; cancel a b; cancel current before=c key=k
     wait 1; pass 1              let a second pass, with or without a tick
@@ -23,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from talkcli.goals.goal import By, Sender
-from talkcli.goals.options import INITIAL, Cancel, Say
+from talkcli.goals.options import INITIAL, Append, Cancel, Say
 from talkcli.goals.reasons import Reason
 from talkcli.goals.scheduler import Cancellation, Effect, EngineOrder, Now, Scheduler, StateChange
 from talkcli.goals.voices import VoiceDropOrder, VoiceLoadOrder, VoiceScheduler
@@ -93,6 +95,18 @@ class Robot:
         self.collect(done.effects)
         return done
 
+    def append(self, goal_id: str, **addition: Any) -> None:
+        """Add text to a goal, or end its text."""
+        record = self.scheduler.find(goal_id)
+        assert record
+        self.collect(self.scheduler.append(record, Append(goal_id, **addition), self.now))
+
+    def leave(self, goal_id: str) -> None:
+        """Report that the sender of a goal has left."""
+        record = self.scheduler.find(goal_id)
+        assert record
+        self.collect(self.scheduler.producer_left(record, self.now))
+
     def wait(self, seconds: float) -> None:
         self.seconds += seconds
         self.collect(self.scheduler.tick(self.now))
@@ -114,6 +128,8 @@ class Robot:
                 self.collect(self.scheduler.failed(goal_id, Reason.NOT_SILENT, "it does not end", None, self.now))
             case "stopped":
                 self.collect(self.scheduler.stopped(goal_id, self.now))
+            case "starved" | "fed":
+                self.scheduler.text_missing(goal_id, self.now, missing=event == "starved")
             case _:
                 raise ValueError(event)
 
@@ -131,6 +147,10 @@ class Robot:
                 if "canceled" in known:
                     known["canceled"] = By(client=DOOR)
                 self.submit(Say(**{"text": verb, **given}), verb, **known)
+            elif verb == "append":
+                self.append(self._id(words[0]), **options(words[1:]))
+            elif verb == "left":
+                self.leave(self._id(words[0]))
             elif verb == "cancel":
                 given = options(words)
                 ids = [self._id(word) for word in words if "=" not in word and word != "current"]

@@ -15,6 +15,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
+from talkcli.errors import RequestRefused
 from talkcli.goals.scheduler import CONFIRM_SILENCE_S, EngineOrder, Now, Order, StateChange
 from talkcli.goals.states import TRANSITIONS, IllegalTransition, State
 from talkcli.goals.voices import VoiceLoadOrder
@@ -38,9 +39,10 @@ OPTIONS = [
     ["", "", "", "voice=piper/joe", "voice=piper/amy#2"],
     ["", "", "", "voice_only"],
     ["", "", "", "waited=2.0"],
+    ["", "", "more", "more stall=2"],
 ]
 IDS = ["mine", "arm.1", "4k7f-900", *(f"4k7f-{number}" for number in range(1, 9))]
-ENGINE = ["heard", "completed", "completed", "failed", "deaf", "stopped"]
+ENGINE = ["heard", "completed", "completed", "failed", "deaf", "stopped", "starved", "starved", "fed"]
 STEPS_S = ["0", "0.5", "1", "2", "10"]
 BUSY = {State.ACTIVE, State.PREEMPTING}
 
@@ -63,6 +65,8 @@ def script(seed: int, length: int = 40) -> list[str]:
         *[lambda: f"{pick(['wait', 'wait', 'pass'])} {pick(STEPS_S)}"] * 2,
         *[lambda: pick(["pause", "resume", "resume", "lost", "ready", "ready", "missing"])] * 2,
         lambda: f"{pick(['heard', 'completed', 'failed', 'stopped'])} {pick(IDS)}",
+        lambda: f"append {pick(IDS)} text={pick('ab')} {pick(['', '', 'end', 'broken'])}",
+        lambda: f"left {pick(IDS)}",
         lambda: f"set preempt={pick(['yes', 'no'])} ttl={pick(['0.0', '1.0'])} voice={pick(['en', 'piper/joe'])}",
         lambda: (
             f"{pick(['loaded', 'loaded', 'unloadable', 'unloaded', 'measured'])} {pick(['joe', 'amy'])} {pick('29')}"
@@ -112,6 +116,20 @@ class Checked(Robot):
         if not ids and selection in ({}, {"current": False}):
             assert len(self.scheduler.pending) == 0
         return done
+
+    def append(self, goal_id: str, **addition: Any) -> None:
+        record = self.scheduler.find(goal_id)
+        before = record.snapshot() if record else None
+        try:
+            if record:
+                super().append(goal_id, **addition)
+        except RequestRefused:
+            assert record
+            assert record.snapshot() == before, "an addition that was refused has changed the goal"
+
+    def leave(self, goal_id: str) -> None:
+        if self.scheduler.find(goal_id):
+            super().leave(goal_id)
 
     def wait(self, seconds: float) -> None:
         super().wait(seconds)
@@ -171,6 +189,9 @@ class Checked(Robot):
             assert self.seconds < record.expires_at, "a goal started too late"
             self.engine, self.orders = record, []
             self.started.add(record.id)
+        elif order is Order.APPEND:
+            assert self.engine is record, "text for a goal that the engine does not have"
+            assert Order.STOP not in self.orders, "text for a goal that is being stopped"
         elif order is Order.GIVE_UP:
             assert self.engine is record
             assert self.orders[-1] is Order.STOP
@@ -179,7 +200,7 @@ class Checked(Robot):
         else:
             assert self.engine is record, "an order for a goal that the engine does not have"
             assert Order.STOP not in self.orders, "an order for a goal that is being stopped"
-            assert (order is Order.RESUME) == (order is not Order.STOP and self.orders[-1:] == [Order.HOLD])
+            assert order is Order.STOP or (order is Order.RESUME) == (self.orders[-1:] == [Order.HOLD])
             self.orders.append(order)
 
     def check(self) -> None:
