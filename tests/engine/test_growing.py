@@ -1,0 +1,149 @@
+"""Texts that grow while an engine process speaks them: they sound and report their words as if they came at once."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+import wave
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from talkcli.engine import protocol
+from talkcli.goals.reasons import Reason
+from tests.engine.spawned import Shared, Spawned
+from tests.support.compare import assert_heard
+from tests.support.reference import Sentence, render
+from tests.support.timing import assert_within, limits
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from tests.support.sink import Sink
+
+TEXT = "I found the charger. It is near the door, behind the table. Shall I go there now?"
+RATE = 450
+
+
+def grow(engine: Spawned, text: str, goal: str = "g1", *, interval_s: float = 0.0, end: bool = True) -> None:
+    """Send a text in tokens of four characters."""
+    tokens = [text[at : at + 4] for at in range(0, len(text), 4)]
+    engine.send(protocol.Speak(goal, tokens[0], RATE, 1.0, None, 50, more=True))
+    for token in tokens[1:]:
+        time.sleep(interval_s)
+        engine.send(protocol.Append(goal, token, end=False))
+    if end:
+        engine.send(protocol.Append(goal, "", end=True))
+
+
+@pytest.fixture(scope="module")
+def shared() -> Iterator[Shared]:
+    with contextlib.closing(Shared(Spawned)) as shared:
+        yield shared
+
+
+@pytest.fixture
+def engine(shared: Shared, request: pytest.FixtureRequest) -> Spawned:
+    return shared.take(request.session.testsfailed)
+
+
+def test_a_growing_text_is_heard_like_a_whole_one(sink: Sink) -> None:
+    with Spawned("pulse", environment=sink.env) as engine, sink.record() as recording:
+        grow(engine, TEXT, interval_s=0.02)
+        ended = engine.until(protocol.Ended)
+        recording.wait_until_quiet(0.3)
+    assert (ended.outcome, ended.gaps) == (protocol.OUTCOME_COMPLETED, 0)
+    assert_heard(recording, render([Sentence(TEXT, rate=RATE)]))
+
+
+def test_a_file_gets_the_same_samples(tmp_path: Path) -> None:
+    lengths = []
+    for name, send in (("whole", Spawned.say), ("grown", grow)):
+        with Spawned(f"file:{tmp_path / name}") as engine:
+            send(engine, TEXT)
+            assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
+        with wave.open(str(tmp_path / name)) as file:
+            samples = np.frombuffer(file.readframes(file.getnframes()), np.int16)
+        lengths.append(len(samples))
+    assert lengths[0] == pytest.approx(lengths[1], abs=22050 * 0.03)
+
+
+def test_words_have_their_places_in_the_whole_text(engine: Spawned) -> None:
+    whole = engine.spoken(TEXT)
+    words = [(word.start, word.end, word.number) for word in engine.words()]
+    grow(engine, TEXT, "g2")
+    ended = engine.until(protocol.Ended)
+    assert [(word.start, word.end, word.number) for word in engine.words("g2")] == words
+    assert [word.time for word in engine.words("g2")] == pytest.approx(
+        [word.time for word in engine.words()], abs=0.03
+    )
+    assert ended.duration == pytest.approx(whole.duration, abs=0.03)
+
+
+def test_missing_text_is_reported_once_and_so_is_its_end(engine: Spawned) -> None:
+    grow(engine, "One. ", end=False)
+    missing = [engine.until(protocol.TextMissing).missing]  # nothing can be spoken yet
+    missing += [engine.until(protocol.TextMissing).missing for _ in range(2)]
+    engine.send(protocol.Append("g1", "Two.", end=True))
+    missing.append(engine.until(protocol.TextMissing).missing)
+    ended = engine.until(protocol.Ended)
+    assert missing == [True, False, True, False]
+    assert (ended.outcome, ended.gaps, len(engine.words())) == (protocol.OUTCOME_COMPLETED, 0, 2)
+
+
+def test_the_end_of_a_text_may_come_after_all_of_it_was_heard(engine: Spawned) -> None:
+    grow(engine, "One.", end=False)
+    assert [engine.until(protocol.TextMissing).missing for _ in range(3)] == [True, False, True]
+    engine.send(protocol.Append("g1", " ", end=True))
+    assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
+
+
+def test_a_goal_that_waits_for_text_can_be_stopped_and_paused(engine: Spawned) -> None:
+    with limits():
+        for goal in ("g1", "g2"):
+            grow(engine, "One.", goal, end=False)
+            assert [engine.until(protocol.TextMissing).missing for _ in range(3)] == [True, False, True]
+            if goal == "g1":
+                assert_within(engine.stop(goal), 0.05, "a stop while text is missing")
+        assert_within(engine.pause("g2"), 0.2, "a pause while text is missing")
+        engine.send(protocol.Append("g2", " Two.", end=True))
+        engine.resume("g2")
+        assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
+        assert [word.number for word in engine.words("g2")] == [1, 2]
+
+
+@pytest.mark.parametrize("whole", [False, True], ids=["appended", "sent again"])
+def test_an_incomplete_sentence_at_the_end_of_a_broken_text_is_not_spoken(engine: Spawned, whole: bool) -> None:
+    text = "One two. Three fo"
+    if whole:
+        engine.send(protocol.Speak("g1", text, RATE, 1.0, None, 50, broken=True))
+    else:
+        grow(engine, text, end=False)
+        engine.send(protocol.Append("g1", "", end=True, broken=True))
+    assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
+    assert [text[word.start : word.end] for word in engine.words()] == ["One", "two"]
+
+
+def test_text_for_a_goal_that_has_ended_is_ignored(engine: Spawned) -> None:
+    grow(engine, "One.")
+    engine.until(protocol.Ended)
+    engine.send(protocol.Append("g1", " Two.", end=True))
+    assert engine.spoken("Three.", "g2").outcome == protocol.OUTCOME_COMPLETED
+    assert len(engine.words("g1")) == len(engine.words("g2")) == 1
+
+
+def test_a_text_without_speech_can_not_be_spoken(engine: Spawned) -> None:
+    grow(engine, "... ... ...")
+    ended = engine.until(protocol.Ended)
+    assert (ended.outcome, ended.reason) == (protocol.OUTCOME_FAILED, Reason.NOTHING_TO_SAY)
+
+
+def test_another_driver_refuses_a_growing_text() -> None:
+    with Spawned(driver="dummy") as engine:
+        grow(engine, "One. Two.")
+        ended = engine.until(protocol.Ended)
+        assert (ended.outcome, ended.reason) == (protocol.OUTCOME_FAILED, Reason.BAD_OPTION)
+        assert ended.message == "this driver can't speak a text that grows; send it when it is complete"
+        assert engine.spoken("Three.", "g2").outcome == protocol.OUTCOME_COMPLETED
