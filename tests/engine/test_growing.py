@@ -76,9 +76,7 @@ def test_words_have_their_places_in_the_whole_text(engine: Spawned) -> None:
     grow(engine, TEXT, "g2")
     ended = engine.until(protocol.Ended)
     assert [(word.start, word.end, word.number) for word in engine.words("g2")] == words
-    assert [word.time for word in engine.words("g2")] == pytest.approx(
-        [word.time for word in engine.words()], abs=0.03
-    )
+    assert [word.time for word in engine.words("g2")] == pytest.approx([word.time for word in engine.words()], abs=0.03)
     assert ended.duration == pytest.approx(whole.duration, abs=0.03)
 
 

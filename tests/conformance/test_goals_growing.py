@@ -1,0 +1,151 @@
+"""Goals whose text grows, over the wire: who may add text, when replies come, and what happens if a client leaves."""
+
+from __future__ import annotations
+
+import socket
+import time
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from talkcli.server.speech import MAX_UNHEARD_CHARS
+from tests.support.connection import Wire
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from tests.conftest import MakeTalk
+    from tests.support.connection import Message
+    from tests.support.processes import Talk
+
+
+@pytest.fixture
+def talk(make_talk: MakeTalk) -> Talk:
+    """A server without sound, whose engine is ready."""
+    talk = make_talk("--player", "null", "--rate", "450")
+    assert talk.run("voices").code == 0
+    return talk
+
+
+def begin(client: Wire, text: str = "One. ", **fields: Any) -> str:
+    """Send a goal that waits for more text, and return its id."""
+    reply = client.request("say", text=text, more=True, wait=True, **fields)
+    assert reply["ok"], reply
+    return str(reply["goal"]["id"])
+
+
+def result(client: Wire) -> Message:
+    goal = client.receive_event("result", timeout=20)["goal"]
+    assert isinstance(goal, dict)
+    return goal
+
+
+def test_a_text_grows_and_watching_clients_see_how(talk: Talk) -> None:
+    with talk.connect() as client:
+        goal_id = begin(client)
+        assert client.request("append", id=goal_id, text="Two", at=5) == {
+            "seq": 2, "ok": True, "length": 8, "state": "ACTIVE",
+        }  # fmt: skip
+        assert client.request("append", id=goal_id, text="Two. ", at=5)["length"] == 10  # a part was sent before
+        assert client.request("append", id=goal_id, end=True)["length"] == 10
+        assert client.request("append", id=goal_id, text="Two. ", at=5, end=True)["ok"]  # all of it was sent before
+        goal = result(client)
+    assert (goal["state"], goal["text"], goal["spoken_end"]) == ("SUCCEEDED", "One. Two. ", 10)
+    assert goal["heard"] == pytest.approx(goal["duration"])
+    events = talk.watcher.events(goal_id)
+    assert [(event["start"], event["text"]) for event in events if event["event"] == "text"] == [(5, "Two"), (8, ". ")]
+    waits = [event["waits"] for event in events if event["event"] == "waits"]
+    assert waits[-1:] != [True]
+    assert [event["word"] for event in events if event["event"] == "word"] == ["One", "Two"]
+
+
+def test_missing_text_is_feedback_and_ends_the_goal_after_the_limit(talk: Talk) -> None:
+    with talk.connect() as client:
+        goal_id = begin(client, stall=1, feedback=True)
+        client.receive_event("word")
+        client.receive_event("waits", waits=True)
+        assert client.request("status", id=goal_id)["goal"]["waits"]
+        goal = result(client)
+    assert (goal["state"], goal["reason"], goal["spoken"]) == ("ABORTED", "text_stalled", "One")
+    assert goal["message"] == "speech failed: no more text arrived for 1 s"
+
+
+def test_only_its_own_connection_may_add_text(talk: Talk) -> None:
+    with talk.connect() as client, talk.connect() as other:
+        for goal_id in (begin(client), begin(client, id="mine/1")):
+            reply = other.request("append", id=goal_id, text="Two.")
+            assert (reply["error"]["code"], reply["state"] in ("ACTIVE", "PENDING")) == ("not_sender", True)
+            assert reply["error"]["message"] == f"the text of goal {goal_id} comes from another connection"
+        assert other.request("append", id="4k7f-99", text="Two.")["error"]["code"] == "unknown_goal"
+        assert other.request("cancel")["ok"]
+
+
+def test_an_addition_to_a_goal_that_has_ended_names_its_state(talk: Talk) -> None:
+    with talk.connect() as client:
+        goal_id = begin(client)
+        client.request("cancel", ids=[goal_id])
+        reply = client.request("append", id=goal_id, text="Two.")
+    assert (reply["error"]["code"], reply["state"]) == ("goal_ended", "PREEMPTED")
+
+
+def test_a_new_connection_continues_a_text_whose_sender_chose_the_id(talk: Talk) -> None:
+    with talk.connect() as client:
+        begin(client, id="mine/1")
+    with talk.connect() as client:
+        assert client.request("say", id="mine/1", text="One. ", more=True, wait=True)["attached"]
+        assert client.request("append", id="mine/1", text="Two.", at=5, end=True)["ok"]
+        assert result(client)["state"] == "SUCCEEDED"
+
+
+def half_close(client: Wire) -> None:
+    client._socket.shutdown(socket.SHUT_WR)
+
+
+@pytest.mark.parametrize("leave", [Wire.close, half_close])
+def test_a_client_that_leaves_breaks_off_its_texts(talk: Talk, leave: Callable[[Wire], None]) -> None:
+    with talk.connect() as client:
+        active, waiting = begin(client, "One two. Three fo"), begin(client)
+        talk.watcher.wait_for(active, "ACTIVE")
+        leave(client)
+        talk.watcher.wait_for(active, "ABORTED")
+        if leave is half_close:  # the results still arrive
+            assert {result(client)["id"], result(client)["id"]} == {active, waiting}
+    goal = talk.goal(active)
+    assert (goal["reason"], goal["spoken"]) == ("broken_off", "One two")
+    goal = talk.goal(waiting)
+    assert (goal["state"], goal["reason"]) == ("RECALLED", "broken_off")
+
+
+def test_a_sender_that_gives_up_stops_the_goal_at_once(talk: Talk) -> None:
+    with talk.connect() as client:
+        goal_id = begin(client, "one two three four five six seven eight nine ten eleven twelve. " * 3)
+        talk.watcher.wait_for_word(goal_id)
+        began = time.monotonic()
+        assert client.request("append", id=goal_id, broken=True)["ok"]
+        goal = result(client)
+    assert time.monotonic() - began < 2
+    assert (goal["state"], goal["reason"]) == ("ABORTED", "broken_off")
+
+
+def test_the_reply_comes_when_enough_of_the_text_was_heard(talk: Talk) -> None:
+    with talk.connect() as client:
+        goal_id = begin(client, "Word. ")
+        assert client.request("append", id=goal_id, text="word " * (MAX_UNHEARD_CHARS // 5 - 2))["ok"]
+        client.send({"seq": 99, "request": "append", "id": goal_id, "text": "word " * 3})
+        assert client.request("status", id=goal_id)["goal"]["more"]  # other requests are answered meanwhile
+        messages = client.events + client.items
+        assert not any(message.get("seq") == 99 for message in messages)
+        while (message := client.receive(20)).get("seq") != 99:
+            pass
+    assert message["length"] == 6 + MAX_UNHEARD_CHARS - 10 + 15
+
+
+def test_a_held_back_reply_comes_at_the_end_of_the_goal(talk: Talk) -> None:
+    with talk.connect() as client, talk.connect() as other:
+        goal_id = begin(client, "Word. ")
+        for number in range(2):
+            client.send({"seq": number, "request": "append", "id": goal_id, "text": "word " * 1_800})
+        other.request("cancel", ids=[goal_id])
+        while (reply := client.receive()).get("seq") != 1:
+            pass
+    assert reply["state"] in {"PREEMPTING", "PREEMPTED"}
