@@ -20,17 +20,17 @@ _LONG_QUIET_S = 1.0
 _LOW_BUFFER_S = 0.15
 #: Shortest clause, and longest part of a text that still grows.
 _CLAUSE_CHARS, _PART_CHARS = 12, 300
-#: How far to look for the letter after a stop, and for the abbreviation before it.
-_LEAD_CHARS, _ABBREVIATION_CHARS = 32, 24
+#: Length in which the longest abbreviation is found.
+_ABBREVIATION_CHARS = 24
 #: What has to pass before a stop may be taken for the end of a sentence.
 _NOTHING, _QUIET, _LONG_QUIET, _NEVER = range(4)
 
 _CLOSERS = r"[\"'”’“‘»«›‹)\]}*_~`」』）】》]*"
-_WIDE_CLOSERS = "[\"'”’」』）】》]*"
+_WIDE_CLOSERS = r"[\"'”’」』）】》]*"
 _LIST_MARK = r"(?:[-*+•–>]|\d{1,3}[.)]|\#{1,6})"
 _SENTENCE_END = re.compile(
     rf"(?P<stop>(?<![.!?…])[.!?…]+{_CLOSERS}(?:[ \u00a0\u202f][»›](?=\s|\Z))?)(?=\s|\Z)"
-    rf"|(?P<wide_stop>[。！？]+{_WIDE_CLOSERS}|[!?]+(?=[\u3400-\u9fff]))"
+    rf"|(?P<wide_stop>[。！？]+{_WIDE_CLOSERS}|(?<![!?])[!?]+(?=[\u3400-\u9fff]))"
     rf"|(?P<line>\n)(?=[ \t]*(?:\n|{_LIST_MARK}[ \t]|\d{{1,3}}、))"
     rf"|(?P<last_line>\n)(?=[ \t]*(?:{_LIST_MARK}|\d{{1,3}})?\Z)"
 )
@@ -39,81 +39,56 @@ _CLAUSE_END = re.compile(
     r"|(?<!\d)[，；：、](?=[\s\w“「『《（]|\Z)|[，；：、](?=[\s“「『《（]|[^\W\d])"
 )
 #: A gap between words. In Chinese, it is the place between two characters. Numbers such as "1 000" have no gap.
-_GAP = re.compile(
-    r"(?<=[^\s\d])\s|(?<=\d)\s(?=\s*[^\s\d])|(?<=[\u3000-\u303f\u3400-\u9fff\uff00-\uff60])(?=[\u3400-\u9fff])"
-)
-_LEAD = re.compile(r"[\s\"“„‘‚«»‹›(\[{*_~—–¿¡-]*")
-_NEXT_WORD = re.compile(r"[^\W\d_]*['’]?")
-_BLANKS = re.compile(r"\s*")
-_SPOKEN = re.compile(r"\w")
-_QUOTES = (("“", "”"), ("「", "」"), ("『", "』"), ("（", "）"))
+_GAP = re.compile(r"(?<=[^\s\d])\s|(?<=\d)\s(?=\s*[^\s\d])|(?<=[\u3000-\u9fff\uff00-\uff60])(?=[\u3400-\u9fff])")
+#: Two characters of one number or flag.
+_PAIR = re.compile("\\d[\\d.,:]|[.,:]\\d|[\U0001f1e6-\U0001f1ff]{2}")
+_LAST_WORD = re.compile(r"[^\W\d_]*['’]?\Z")
+#: Characters between a stop and the first letter of the next sentence.
+_LEAD = ' \t\r\n\u00a0\u202f\u3000"“„‘‚«»‹›([{*_~—–¿¡-'
 
-
-def _any_of(words: str) -> str:
-    return "|".join(words.split())
-
-
-#: Abbreviations that are followed by the rest of the sentence.
-_TITLES = """
-    Mrs? Ms Messrs Dr Prof Rev Hon Gen Col Maj Capt Cmdr Lt Sgt Cpl Sen Rep Gov Pres Mt Hrn? Frl? Dipl Ing Mag
-    MM? Mmes? Mlles? Mgr Pr Ste Sra Srta Sres Sras Dra Dña Profa Lic Arq EE Excmo Gral Cnel Avda
-"""
-_WITHIN = r"""
-    e\.\s?g i\.\s?e z\.\s?B d\.\s?h p\.\s?ex p\.\s?ej c\.-à-d vs cf viz approx aprox bzw vgl ggf evtl inkl exkl zzgl
-    incl sog bspw ca env av bd boul apr ap med phil jur rer nat habil nr
-"""
-#: Abbreviations that need a number.
-_NUMBERED = """
-    No Nos núm págs? pp? vol figs? ch sec eq arts? cap abb abs kap bd tab anm tel ext max min mind
-    jan feb mar apr jun jul aug sept? oct okt nov dec dez ene abr ago dic janv févr juil déc
-"""
-#: Abbreviations that may end a sentence, but only before a word that begins one.
-_MAYBE_LAST = r"""
-    (?:[^\W\d_]\.[\s-]?)*(?!(?<=\d\s)[hmgltVW])[^\W\d_] [vn]\.\s?Chr EE\.\s?UU J\.-C Ph\.D
-    Inc Ltd Corp Co Bros Jr Sr St Ave Blvd Rd Dept Str [^\W\d_]+str Mio Mrd Tsd Std Min Sek Cía Uds? Vds?
-"""
-#: Abbreviations that end a sentence before any capitalized word, except one that belongs to a time.
-_OFTEN_LAST = r"etc usw usf [ap]\.\s?m"
-_ORDINAL = (
-    r"(?:(?<!\bI\s)\bam|\b(?:im|zum|zur|vom|beim|bis|ab|und|d(?:er|ie|as|em|en|es)|(?:[mds]?ein|ihr|unser|jed)e?[mnrs]?))"
-    r"\s\d{1,2}"
-)
+#: What a dot belongs to. The groups say whether the sentence can end there: never, not before a number, often (except
+#: before a part of a time), maybe (only before a word that begins sentences), or, for a number, not before a month.
 _ABBREVIATION = re.compile(
-    rf"(?:(?P<never>(?:\A|\n)[\s>*_#-]*\(?\d{{1,3}}|:\s1|(?<![\w.])(?:{_any_of(_TITLES)}|(?i:{_any_of(_WITHIN)}))|\bM)"
-    rf"|(?P<numbered>(?<![\w.])(?i:{_any_of(_NUMBERED)}))|(?P<often>(?<![\w.])(?:{_any_of(_OFTEN_LAST)}))"
-    rf"|(?P<maybe>(?<![\w.])(?:{_any_of(_MAYBE_LAST)})|{_ORDINAL})|(?P<day>(?<![\w.,])\d{{1,2}}))\.\Z"
+    r"""(?:
+    (?P<never>(?:\A|\n)[\s>*_\#-]*\(?\d{1,3}|:\s1|(?<![\w.])(?:
+        Mrs?|Ms|Messrs|Dr|Prof|Rev|Hon|Gen|Col|Maj|Capt|Cmdr|Lt|Sgt|Cpl|Sen|Rep|Gov|Pres|Mt|[Ee]\.\s?g|[Ii]\.\s?e|vs
+        |[Cc]f|viz|approx|Hrn?|Frl?|Dipl|Fa|Ing|Mag|[Zz]\.\s?B|[Dd]\.\s?h|bzw|[Vv]gl|[Gg]gf|[Ee]vtl|[Ii]n[ck]l|exkl
+        |zzgl|sog|bspw|[Cc]a|med|phil|jur|rer|nat|habil|Nr|MM?|Mmes?|Mlles?|Mgr|Pr|Ste|[Pp]\.\s?ex|[Cc]\.-à-d|env|[Aa]v
+        |[Bb]d|boul|apr?|Sra|Srta|Sres|Sras|Dra|Dña|Profa|Lic|Arq|Excmo|Gral|Cnel|Avda|[Pp]\.\s?ej|aprox|EE))
+    |(?P<numbered>\b\d\d?\.\s\d\d?|(?<![\w.])(?i:
+        Nos?|núm|págs?|pp?|vol|figs?|ch|sec|eq|arts?|cap|abb|abs|kap|bd|tab|anm|tel|ext|max|min|jan|feb|mar|apr|jun
+        |jul|aug|sept?|oct|okt|nov|dec|dez|ene|abr|ago|dic|janv|févr|juil|déc))
+    |(?P<often>(?<![\w.])(?:etc|us[wf]|[ap]\.\s?m))
+    |(?P<maybe>(?<![\w./])(?:(?:[^\W\d_]\.[\s-]?)*(?!(?<=\d\s)[hmgltVW])[^\W\d_]|[vn]\.\s?Chr|EE\.\s?UU|Ph\.D|Inc|Ltd
+        |Co|Corp|Bros|[JS]r|St|Ave|Blvd|Rd|Dept|\w*[Ss]tr|Mio|Mrd|Tsd|Std|Min|Sek|Cía|[UV]ds?)
+        |(?i:(?<!\bI\s)\bam|\b(?:zum?|im|zur|vom|beim|bis|ab|und|d(?:er|ie|as|e[mns])
+        |(?:[mds]?ein|ihr|unser|jed)e?[mnrs]?))\s\d{1,2})
+    |(?P<number>\d))\.[^.!?…]?\Z""",
+    re.VERBOSE,
 )
-_MONTHS = """
-    Januar Jänner Februar März April Mai Juni Juli August September Oktober November Dezember Jahrhundert Weltkrieg
-""".split()
-_TIME_WORDS = frozenset(
-    """
-    Monday Tuesday Wednesday Thursday Friday Saturday Sunday Eastern Central Pacific Mountain Greenwich
-    EST EDT ET CST CT MST PST PDT PT GMT UTC BST CET CEST
-    """.split()
-)
-#: Words that begin sentences, and that don't follow an abbreviation within a sentence if they are capitalized.
-_STARTERS = frozenset(
-    """
-    The A An I You He She It We They This That These Those There Here My Your His Her Its Our Their And But Or So Then
-    Now If When While After Before Because As At In On For From To With By Is Are Was Were Do Does Did Can Could Will
-    Would Should Must Have Has Had Let Please Yes No Not What Who Where Why How Which All Some Many Most Each Both
-    Also However Still Just Only Once Since Although Next Later Today Tomorrow Yesterday Meanwhile Finally
-    Der Die Das Den Dem Des Ein Eine Einen Einem Einer Ich Du Er Sie Es Wir Ihr Man Mein Meine Dein Deine Sein Seine
-    Unser Unsere Ihre Diese Dieser Dieses Und Aber Oder Doch Denn Dann Danach Da Dort Hier Heute Morgen Gestern Jetzt
-    Nun Auch Nur Noch Schon Wenn Als Weil Ob Wie Was Wer Wo Wann Warum Bitte Ja Nein Nicht Kein Keine Im Am An Auf Aus
-    Bei Mit Nach Von Vor Zu Zum Zur Für Über Unter Durch Gegen Um Bis Seit Ist Sind War Hat Haben Kann Können Soll
-    Sollen Muss Alle Viele Trotzdem Deshalb Allerdings Außerdem Später
-    Le La Les L' Un Une Du De J' Je Tu Il Elle On Nous Vous Ils Elles Ce C' Cet Cette Ces Cela Ça Mon Ma Mes Son Sa
-    Ses Notre Votre Leur Et Mais Ou Donc Or Car Puis Alors Ensuite Après Avant Si Quand Comme Pour Par Dans En Sur
-    Sous Avec Sans Chez Oui Non Ne N' Qui Que Qu' Quoi Où Comment Pourquoi Est Au Aux Tout Tous Aussi Ici Là Voici
-    Voilà Aujourd' Demain Hier Enfin Merci
-    El Los Las Lo Una Unos Unas Yo Tú Él Ella Usted Ud Nosotros Ellos Ellas Este Esta Estos Estas Esto Ese Esa Eso Mi
-    Su Sus Y Pero O Sí Ni Qué Cuando Cuándo Como Cómo Donde Dónde Por Para Con Sin Del Al Desde Hasta Entre Sobre Es
-    Son Está Hay Ha Fue Era Se Luego Después Entonces Ahora Hoy Mañana Ayer Aquí Ahí También Además Todo Todos Cada Muy
-    Más Ya
-    """.split()
-)
+#: Words that begin a sentence if they are capitalized after an abbreviation.
+_STARTER = r"""(?:
+    A|Aber|After|Ahora|Al|All|Alle|Allerdings|Alors|Als|Also|Although|Am|An|And|Après|Aquí|As|At|Au|Auch|Auf|Aus
+    |Außerdem|Avec|Because|Before|Bei|Bis|Bitte|But|By|Can|Car|Ce|Cela|Ces|Cette|Comment|Como|Con|Could|Cómo|Cuando
+    |Da|Danach|Dann|Dans|Das|De|Del|Dem|Den|Der|Des|Desde|Deshalb|Después|Did|Die|Diese[rs]?|Do|Doch|Does|Donc|Dort
+    |Du|Eine?[mnrs]?|El|Ella|Elles?|En|Ensuite|Entonces|Er|Es|Est|Est[aeo]s?|Está|Et|Él|For|From|Für|Had|Has|Hasta
+    |Hat|Have|Hay|He|Her|Here|Heute|Hier|His|How|However|Hoy|I|Ich|If|Ihre?|Ils?|Im|In|Is|Ist|It|Its|Ja|Je|Jetzt|Kann
+    |Kein|La|Las|Later|Le|Les|Let|Leur|Lo|Los|Luego|Mais|Man|Many|Mañana|Maybe|Meine?|Mi|Mit|Mon|Morgen|Most|Muy|My
+    |Nach|Nein|Next|Nicht|No|Non|Not|Notre|Nous|Now|Nun|Nur|O|Ob|Oder|On|Only|Or|Oui|Our|Où|Para|Pero|Please|Por|Pour
+    |Puis|Quand|Qué|Qui|Se|Seine?|Seit|Ses|She|Si|Sie|Sin|Sind|Sí|So|Some|Son|Still|Su|También|That|The|Their|Then
+    |There|These|They|This|Those|To|Today|Tomorrow|Tous|Tout|Trotzdem|Tu|Tú|Um|Una?|Und|Une|Unsere?|Unter|Usted|Über
+    |Voici|Von|Vor|Votre|Vous|War|Warum|Was|We|Wenn|Were|What|When|Where|Which|While|Who|Why|Wie|Will|Wir|With|Wo
+    |Would|Y|Yes|Yo|You|Your|Zu|Zum)(?![\w.])|(?:L|J|C|N|Qu|Aujourd)['’]"""
+#: What follows if the sentence goes on after an abbreviation.
+_REST = {
+    "numbered": re.compile(r"\d"),
+    "often": re.compile(r"(?:Mon|Tues|Wednes|Thurs|Fri|Satur|Sun)day|(?:East|West)ern|Pacific|[ECMP][SD]?T\b|GMT|UTC"),
+    "maybe": re.compile(rf"(?!{_STARTER})", re.VERBOSE),
+    "number": re.compile(
+        r"(?:J[aä]n(?:uar|ner)|Februar|März|April|Mai|Ju[nl]i|August|(?:Septem|Okto|Novem|Dezem)ber|Jahrhundert)\b"
+        r"|(?:Jan|Feb|Apr|Aug|Sept?|Okt|Nov|Dez)\."
+    ),
+}
 
 
 class GrowingText:
@@ -133,7 +108,7 @@ class GrowingText:
     @property
     def finished(self) -> bool:
         """Whether the text has ended and all of it was passed on."""
-        return self.ended and self._skip_blanks() == len(self.text)
+        return self.ended and not self.text[self._position :].strip()
 
     def append(self, text: str, now: float) -> None:
         """Add text at the end."""
@@ -183,17 +158,14 @@ class GrowingText:
                 return time
         return float("inf")
 
-    def _skip_blanks(self) -> int:
-        """Return the offset of the first character that isn't blank after the position."""
-        found = _BLANKS.match(self.text, self._position)
-        return found.end() if found else self._position
-
     def _find_end(self, now: float, silent_at: float) -> int | None:
         """Return the end of the next part at a time, given the time at which the player becomes silent."""
-        text, start = self.text, self._skip_blanks()
+        text = self.text
+        start = len(text) - len(text[self._position :].lstrip())
+        if self._position or not self.ended:
+            self._position = start
         if self.ended:
             return len(text) if start < len(text) else None
-        self._position = start
         if self._changed_at is None:
             self._changed_at = now
         passed = _QUIET if now >= self._changed_at + _QUIET_S else _NOTHING
@@ -225,47 +197,33 @@ class GrowingText:
 
 
 def _judge(text: str, start: int, found: re.Match[str]) -> int:
-    """Return what has to pass before a sentence that began at `start` may end here."""
+    """Return what has to pass before the sentence that begins at `start` may end here."""
     kind, end = found.lastgroup, found.end()
-    if not _SPOKEN.search(text, start, end):
+    sentence = text[start:end]
+    if not re.search(r"\w", sentence[:_PART_CHARS]):
         return _NEVER
-    if kind == "line":
-        return _NOTHING
-    if kind == "last_line":
-        return _LONG_QUIET
+    if "\n" in found.group():
+        return _NOTHING if kind == "line" else _LONG_QUIET
     if kind == "wide_stop":
-        is_quoted = any(text.count(left, start, end) > text.count(right, start, end) for left, right in _QUOTES)
+        is_quoted = len(re.findall("[“「『（]", sentence)) > len(re.findall("[”」』）]", sentence))
         return _QUIET if is_quoted and end == len(text) else _NOTHING
-    lead = _LEAD.match(text, end, end + _LEAD_CHARS)
-    following = lead.end() if lead else end
+    following = len(text) - len(text[end:].lstrip(_LEAD))
     if text[following : following + 1].islower():
         return _NEVER
-    abbreviation = None
-    if found.group().startswith(".") and not found.group().startswith(".."):
-        abbreviation = _ABBREVIATION.search(text[max(start, found.start() - _ABBREVIATION_CHARS) : found.start() + 1])
+    dot = found.start()
+    abbreviation = _ABBREVIATION.search(text[max(start, dot - _ABBREVIATION_CHARS) : dot + 2])
     if abbreviation:
-        return _judge_abbreviation(text, following, abbreviation.lastgroup)
+        return _judge_abbreviation(text, following, str(abbreviation.lastgroup))
     return _NOTHING if following < len(text) else _QUIET
 
 
-def _judge_abbreviation(text: str, following: int, kind: str | None) -> int:
+def _judge_abbreviation(text: str, following: int, kind: str) -> int:
     """Return what has to pass before a sentence may end after an abbreviation or a number, given what follows."""
     if kind == "never":
         return _NEVER
-    if kind == "numbered" and following < len(text):
-        return _NEVER if text[following].isdecimal() else _NOTHING
-    found = _NEXT_WORD.match(text, following)
-    word, end = (found.group().replace("’", "'"), found.end()) if found else ("", following)
-    is_complete = end < len(text)
-    if kind == "day":
-        is_ordinal = word in _MONTHS if is_complete else any(each.startswith(word) for each in _MONTHS)
-        return (_NEVER if is_complete else _LONG_QUIET) if is_ordinal else _NOTHING
-    if not is_complete:
+    if _LAST_WORD.match(text, following):
         return _LONG_QUIET
-    if kind == "often":
-        return _NEVER if word in _TIME_WORDS else _NOTHING
-    is_starter = text[end] != "." and (word in _STARTERS or word.rstrip("'") in _STARTERS)
-    return _NOTHING if is_starter else _NEVER
+    return _NEVER if _REST[kind].match(text, following) else _NOTHING
 
 
 def _find_gap(text: str, start: int, longest: int) -> int | None:
@@ -285,14 +243,9 @@ def _find_break(text: str, start: int, longest: int) -> int:
 
 
 def _may_separate(before: str, after: str) -> bool:
-    """Return whether two neighbouring characters may go to different parts."""
-    joined = (
-        unicodedata.category(after)[0] == "M" or "\u200d" in (before, after) or "\U0001f3fb" <= after <= "\U0001f3ff"
-    )
-    tags_or_flags = "\U000e0020" <= after <= "\U000e007f" or (
-        before >= "\U0001f1e6" and "\U0001f1e6" <= after <= "\U0001f1ff"
-    )
-    number = (before.isdecimal() or after.isdecimal()) and all(
-        each.isdecimal() or each in ".,:" for each in before + after
-    )
-    return not (joined or tags_or_flags or number)
+    """Return whether two neighbouring characters may be in different parts.
+
+    Accents, joiners, variation selectors, skin tones and tags belong to the character before them.
+    """
+    is_joined = before == "\u200d" or unicodedata.category(after) in ("Mn", "Mc", "Me", "Cf", "Sk")
+    return not is_joined and not _PAIR.match(before + after)
