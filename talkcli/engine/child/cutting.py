@@ -59,7 +59,7 @@ _ABBREVIATION = re.compile(
         Nos?|núm|págs?|pp?|vol|figs?|ch|sec|eq|arts?|cap|abb|abs|kap|bd|tab|anm|tel|ext|max|min|jan|feb|mar|apr|jun
         |jul|aug|sept?|oct|okt|nov|dec|dez|ene|abr|ago|dic|janv|févr|juil|déc))
     |(?P<often>(?<![\w.])(?:etc|us[wf]|[ap]\.\s?m))
-    |(?P<maybe>(?<![\w./])(?:(?:[^\W\d_]\.[\s-]?)*(?!(?<=\d\s)[hmgltVW])[^\W\d_]|[vn]\.\s?Chr|EE\.\s?UU|Ph\.D|Inc|Ltd
+    |(?P<maybe>(?<![\w./°])(?:(?:[^\W\d_]\.[\s-]?)*(?!(?<=\d\s)[hmgltVW])[^\W\d_]|[vn]\.\s?Chr|EE\.\s?UU|Ph\.D|Inc|Ltd
         |Co|Corp|Bros|[JS]r|St|Ave|Blvd|Rd|Dept|\w*[Ss]tr|Mio|Mrd|Tsd|Std|Min|Sek|Cía|[UV]ds?)
         |(?i:(?<!\bI\s)\bam|\b(?:zum?|im|zur|vom|beim|bis|ab|und|d(?:er|ie|as|e[mns])
         |(?:[mds]?ein|ihr|unser|jed)e?[mnrs]?))\s\d{1,2})
