@@ -13,7 +13,6 @@ from importlib import import_module
 
 from talkcli import install
 from talkcli.engine import protocol, voices
-from talkcli.engine.child.cutting import GrowingText
 from talkcli.engine.child.playback import Playback
 from talkcli.engine.child.players.base import CannotSpeak, Stopped
 from talkcli.engine.child.synthesizers.base import NotInstalled, SpeechSettings
@@ -347,7 +346,10 @@ class Driver:
 
         A text that doesn't grow is a single part. While text is missing, the playback continues.
         """
-        growing = self._runner.growing_text or GrowingText(text, ended=True)
+        growing = self._runner.growing_text
+        if growing is None:
+            yield text, True
+            return
         while True:
             now, buffered = time.monotonic(), playback.buffered()
             part = growing.next_part(now, buffered)

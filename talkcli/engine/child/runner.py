@@ -17,7 +17,6 @@ import time
 import traceback
 
 from talkcli.engine import protocol
-from talkcli.engine.child.cutting import GrowingText
 from talkcli.engine.child.players.base import CannotSpeak
 from talkcli.engine.child.words import WordFinder
 from talkcli.engine.voices import list_voices
@@ -30,6 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
     from typing import Any
 
+    from talkcli.engine.child.cutting import GrowingText
     from talkcli.engine.child.players.base import Interest
     from talkcli.engine.child.players.chooser import PlayerChooser
     from talkcli.engine.child.synthesizers.combined import CombinedSynthesizer
@@ -89,9 +89,7 @@ class ActiveGoal:
         self.id = command.id
         self.command = command
         #: the text, if it may still grow
-        self.growing_text = GrowingText(command.text, ended=False) if command.more or command.broken else None
-        if self.growing_text and command.broken:
-            self.growing_text.drop_incomplete()
+        self.growing_text = _growing_text(command) if command.more or command.broken else None
         self.text_missing = False
         self.words = WordFinder(command.text)
         #: time at which the driver last received text
@@ -445,6 +443,16 @@ class GoalRunner:
             goal.overdue_logged = True
             sys.stderr.write(f"the driver did not finish a text that takes less than {limit:.0f} s\n")
         return overdue
+
+
+def _growing_text(command: protocol.Speak) -> GrowingText:
+    """Return the text of a goal that grows, or that has grown and broke off before this process got it."""
+    from talkcli.engine.child.cutting import GrowingText  # rarely needed, and slow to import
+
+    text = GrowingText(command.text, ended=False)
+    if command.broken:
+        text.drop_incomplete()
+    return text
 
 
 def _with_traceback(callback: Callable[..., None]) -> Callable[..., None]:
