@@ -1,0 +1,249 @@
+r"""Markdown, reduced to the text that listeners should hear.
+
+The marks become blanks, so the result has the same length as the text, and offsets in it are offsets in the text.
+
+- The text of links, the description of images and inline code are kept. Addresses, footnote marks, HTML tags,
+  definitions of references and emoji become blanks. A keycap such as 1️⃣ keeps its digit.
+- Code blocks become blanks, because nobody understands code that is read aloud.
+- Headings, list items and table rows end with a pause: their newline becomes "。", unless they end with punctuation or
+  an empty line follows. A cell of a table ends with "，", and "1." at the beginning of an item becomes "1，". The
+  synthesizers pause at these characters even if no blank follows, as in "one\n2. two".
+- In an address that stands alone, only "https://" and "www." become blanks.
+- Everything else is kept: `2 * 3`, `snake_case`, `#1`, `5 > 3`, a single `*` after a word.
+"""
+
+from __future__ import annotations
+
+import re
+
+#: Maximum distance between the beginning and the end of a link, a tag, emphasis or inline code. Until the end arrives,
+#: the text can't be spoken. At a greater distance, the mark is treated as ordinary text.
+_MAX_SPAN_CHARS = 500
+#: Marks that make a pause at the end of a sentence or a cell, even if no blank follows.
+_SENTENCE_PAUSE, _CELL_PAUSE = "。", "，"
+#: Characters after which no further pause is needed.
+_PUNCTUATION = ".,;:!?…。，；：！？"
+#: Letters from here on belong to scripts without blanks between words.
+_FIRST_UNSPACED = "\u2e80"
+
+_TAG_NAMES = (
+    "a|abbr|audio|b|big|blockquote|br|center|cite|code|dd|del|details|div|dl|dt|em|figcaption|figure|font|footer|h[1-6]"
+    "|header|hr|i|iframe|img|input|ins|kbd|label|li|main|mark|nav|ol|p|picture|pre|q|s|samp|section|small|source|span"
+    "|strike|strong|style|sub|summary|sup|svg|table|tbody|td|tfoot|th|thead|think|tr|tt|u|ul|var|video"
+)
+_EMOJI = (
+    "\u231a\u231b\u23cf\u23e9-\u23fa\u25b6\u25c0\u25fb-\u25fe\u2600-\u2604\u260e\u2611-\u2623\u2626-\u262f\u2638-\u2642"
+    "\u2648-\u2653\u265f-\u2668\u267b-\u267f\u2692-\u26ff\u2702-\u2712\u2714\u2716\u271d-\u274e\u2753-\u2757\u2763"
+    "\u2764\u2795-\u2797\u27a1\u27b0\u27bf\u2934\u2935\u2b05-\u2b07\u2b1b\u2b1c\u2b50\u2b55\u3030\u303d\u3297\u3299"
+    "\U0001f000-\U0001faff\U000e0020-\U000e007f\ufe0e\ufe0f\u20e3"
+)
+_TOKEN = re.compile(
+    rf"""(?P<newline>\n) | (?P<escape>\\(?:[!-/:-@\[-`{{-~]|\Z)) | (?P<code>`+) | (?P<strong>\*\*+|__+|~~+)
+    | (?P<emphasis>[*_]) | (?P<pipe>\|[ \t]*) | (?P<closing>[\]>]|(?<=[ \t])\#+[ \t]*(?=\n|\Z))
+    | (?P<address>(?<!\w)(?P<scheme>https?://(?:www\.)?|www\.)[^\s<>|*`"\]]{{0,999}})
+    | (?P<autolink><(?:mailto:)?(?=https?://[^\s<>]+>|[\w.+-]+@[\w.-]+>))
+    | (?P<blank>(?:[{_EMOJI}]|(?<=[{_EMOJI}])\u200d)+ | \[\^[^\]\s]{{1,50}}\] | <!--.{{0,{_MAX_SPAN_CHARS}}}?-->
+      | </?(?:{_TAG_NAMES})(?:\s+[\w:-]+\s*=\s*(?:"[^"]*"|'[^']*'|[^\s"'<>]+)|\s+(?:open|controls))*\s*/?>)
+    | (?P<link>(?:(?<![^\s\[])!)?\[)""",
+    re.VERBOSE | re.DOTALL | re.IGNORECASE,
+)
+#: Matches the end of a text that may become a token.
+_PARTIAL_TOKEN = re.compile(
+    r"(?:(?<!~)~+|(?<![^\s\[])!|(?<!\w)(?:ht?t?|https?:?/?|w{1,3})|(?<!\\)<(?:!(?:-(?:-.*)?)?|(?:https?:|mailto:)[^\s<>]*"
+    rf"|[\w.+-]+@?[\w.-]*|/[a-z]*[1-6]?|/?(?:{_TAG_NAMES})[\s/][^<>]*)?)\Z",
+    re.DOTALL | re.IGNORECASE,
+)
+_LINE = re.compile(
+    r"[ \t]*(?:>[ \t]?)*[ \t]*(?:(?P<empty>(?=\n|\Z))|(?P<rule>[|:+ \t]*(?:[-=*_][|:+ \t]*){2,}(?=\n|\Z)"
+    r"|\[[^\]\n^][^\]\n]*\]:[ \t]*(?:https?:|mailto:|\.{0,2}/|#|<)[^\n]*)|(?P<heading>#{1,6}(?=[ \t\n]|\Z)[ \t]*)"
+    r"|(?P<block>(?P<fence>`{3,}(?=[^`\n]*(?:\n|\Z))|~{3,})[^\n]*)|(?P<row>\|[ \t]*)|(?P<item>(?:\[\^[^\]\s]{1,50}\]:"
+    r"|(?:[-*+•]|(?P<number>\d{1,3})[.)])(?=[ \t\n]|\Z)(?:[ \t]+\[[ xX]\](?=[ \t\n]))?)[ \t]*)|(?P<paragraph>))"
+)
+#: Matches an incomplete line if more text decides which marks it begins with.
+_PARTIAL_LINE = re.compile(
+    r"(?:[ \t>]*(?:[-*+•=_#|:`~ \t]{0,500}|\d{0,3}[.)]?)(?:[ \t]+\[?[ xX]?\]?)?|[ \t>]*(?:`{3}|~{3})[^`\n]{0,500}"
+    r"|[ \t>]*\[[^\]\n]{0,200}(?:\](?::[^\n]{0,500})?)?)\Z"
+)
+#: The end of a paragraph, after which no mark in it can be closed.
+_PARAGRAPH_END = re.compile(r"\n[ \t]*(?:\n|[-*+•#][ \t]|\||```|\d{1,3}[.)][ \t])")
+_LINK = re.compile(
+    r"""!?\[(?P<label>(?:[^\[\]\\]|\\.|\[(?:[^\[\]\\]|\\.)*\])*)(?P<end>\](?:\[[^\[\]\n]*\]|\([ \t\n]{0,9}"""
+    r"""(?:<[^<>\n]*>|[^\s()<>]*(?:\([^\s()]*\)[^\s()]*)*)"""
+    r"""(?:[ \t\n]{1,9}(?:"[^"]*"|'[^']*'|\([^()]*\)))?[ \t\n]{0,9}\)))""",
+    re.DOTALL,
+)
+_PARTIAL_LINK = re.compile(
+    r"""!?\[(?:[^\[\]\\]|\\.?|\[(?:[^\[\]\\]|\\.)*\]?)*(?:\](?:\[[^\[\]\n]*|\([ \t\n]{0,9}(?:<[^<>\n]*>?"""
+    r"""|[^\s()<>]*(?:\([^\s()]*\)[^\s()]*)*(?:\([^\s()]*)?)(?:[ \t\n]{1,9}(?:"[^"]*"?|'[^']*'?|\([^()]*\)?)?)?"""
+    r"""[ \t\n]{0,9})?)?\Z""",
+    re.DOTALL,
+)
+#: For each mark of emphasis, its end.
+_EMPHASIS = {
+    "*": re.compile(r"(?<![\s*\\])(?P<end>\*)(?![*a-zA-Z0-9\u00c0-\u024f])"),
+    "_": re.compile(r"(?<![\s_\\])(?P<end>_)(?!\w)"),
+}
+
+
+class MarkdownReader:
+    """Replaces the marks in a Markdown text with blanks, while the text arrives in pieces of any size.
+
+    The results joined have the length of the text so far, except for an end that can't be read yet, such as a link
+    without its address. They don't depend on how the text was divided, so a caller may cut them anywhere.
+    """
+
+    def __init__(self) -> None:
+        self._text = ""
+        #: offset up to which the text has been returned, and the offset of an incomplete token at its end
+        self._at = self._known = 0
+        self._ended = False
+        #: name of the group in `_LINE` that matches the current line, or an empty string before the first line
+        self._kind = ""
+        #: marks that began the current code block, or an empty string
+        self._fence = ""
+        #: whether the lines are rows of a table even if they don't begin with "|"
+        self._in_table = False
+        #: whether the current paragraph began as an item of a list
+        self._in_list = False
+        #: whether "**" or the like is open, so that it may be closed within a word
+        self._is_strong = False
+        #: the offsets of marks whose beginning was found earlier, with their lengths
+        self._closing: dict[int, int] = {}
+        #: the last character of the paragraph that was returned and isn't blank
+        self._last = ""
+
+    def read(self, text: str, *, ended: bool = False) -> str:
+        """Add text, and return what can be spoken of it and of earlier text. With `ended`, return all of the rest."""
+        self._text += text
+        self._ended = ended
+        partial = _PARTIAL_TOKEN.search(self._text, max(self._at, len(self._text) - _MAX_SPAN_CHARS))
+        self._known = partial.start() if partial and not ended else len(self._text)
+        found: list[str] = []
+        while self._at < len(self._text):
+            step = self._read_block() if self._fence else self._step() if self._kind else self._begin_line("")
+            if step is None:
+                break
+            self._at += len(step)
+            found.append(step)
+            self._last = step.rstrip()[-1:] or self._last
+        return "".join(found)
+
+    def _step(self) -> str | None:
+        """Return the next token without its marks, or the text before it, or None if more text is needed."""
+        text, at = self._text, self._at
+        token = _TOKEN.search(text, at, self._known)
+        start = token.start() if token else self._known
+        if start > at:
+            return text[at:start]
+        if token is None:
+            return None
+        kind, mark = str(token.lastgroup), token.group()
+        if kind == "newline":
+            return self._begin_line("\n")
+        if at in self._closing:
+            return " " * self._closing.pop(at)
+        is_complete = kind == "blank" or mark in "]>" or (kind == "escape" and len(mark) == 2)
+        if token.end() == len(text) and not self._ended and not is_complete:
+            return None
+        if kind in ("code", "emphasis", "link"):
+            return self._read_span(kind, token)
+        return self._read_mark(kind, token)
+
+    def _begin_line(self, newline: str) -> str | None:
+        """Return a newline or a pause, and what is left of the marks at the beginning of the next line."""
+        text, at, before = self._text, self._at + len(newline), self._kind
+        if not self._ended and (at == len(text) or _PARTIAL_LINE.match(text, at)):
+            return None
+        match = _LINE.match(text, at)
+        assert match
+        kind, number, marks = str(match.lastgroup), match["number"], " " * len(match.group())
+        if number and number != "1" and before == "paragraph" and not self._in_list:
+            kind, marks = "paragraph", ""  # the number belongs to a sentence that began on an earlier line
+        elif number:
+            place = match.start("number") - at
+            marks = marks[:place] + number + _CELL_PAUSE + marks[place + len(number) + 1 :]
+        if kind == "rule":
+            self._in_table = "|" in match.group()
+        elif kind == "paragraph" and self._in_table:
+            kind = "row"
+        elif kind != "row":
+            self._in_table = False
+        self._kind, self._fence = kind, match["fence"] or ""
+        self._in_list = kind == "item" or (self._in_list and kind == "paragraph" and before != "empty")
+        self._is_strong = self._is_strong and kind == "paragraph"
+        if kind == "empty":
+            self._last = ""
+        elif newline and (kind != "paragraph" or before in ("heading", "row")) and self._last not in _PUNCTUATION:
+            newline = _SENTENCE_PAUSE
+        return newline + marks
+
+    def _read_block(self) -> str | None:
+        """Return blanks for a line in a code block, and leave the code block at its end."""
+        text, at = self._text, self._at
+        end = text.find("\n", at)
+        line = text[at : end if end >= 0 else len(text)]
+        marks = line.strip(" \t>")
+        if text[at - 1] == "\n" and not marks.strip(self._fence[0]):
+            if end < 0 and not self._ended:
+                return None  # more text decides whether the code block ends
+            if len(marks) >= len(self._fence):
+                self._fence = ""
+                return " " * len(line)
+        return " " * (len(line) + (end >= 0))
+
+    def _read_span(self, kind: str, token: re.Match[str]) -> str | None:
+        """Return what is left of the beginning of a span, and remember its end. Return the whole span if it is code."""
+        text, (start, end), mark = self._text, token.span(), token.group()
+        if kind == "emphasis" and (_is_letter(text[start - 1 : start]) or text[end : end + 1] in " \t\n).,;:!?]}"):
+            return mark
+        paragraph_end = _PARAGRAPH_END.search(text, end, end + _MAX_SPAN_CHARS)
+        limit = paragraph_end.start() if paragraph_end else end + _MAX_SPAN_CHARS
+        known = self._ended or paragraph_end is not None or limit < len(text)
+        if kind == "link":
+            match = _LINK.match(text, start, limit)
+            known = known or not _PARTIAL_LINK.match(text, start)
+        else:
+            ticks = rf"(?<!`)(?P<end>`{{{min(len(mark), 99)}}})(?!`)"
+            match = (_EMPHASIS.get(mark) or re.compile(ticks)).search(text, end, limit)
+        if not known and (match is None or match.end() == len(text)):
+            return None
+        if match is None:
+            return " " * len(mark) if kind == "code" else mark
+        if kind == "code":
+            return text[end : match.start()].join((" " * len(mark), " " * len(mark)))
+        self._closing[match.start("end")] = len(match["end"])
+        return " " * len(mark)
+
+    def _read_mark(self, kind: str, token: re.Match[str]) -> str:
+        """Return what is left of any other token."""
+        text, (start, end), mark = self._text, token.span(), token.group()
+        before, after = text[start - 1 : start] or "\n", text[end : end + 1] or "\n"
+        kept = 0  # number of characters at the end of the token that aren't marks
+        if kind == "escape":
+            kept = 1
+        elif kind == "address":
+            kept = len(mark) - len(token["scheme"])
+        elif kind == "autolink":
+            self._closing[text.index(">", end)] = 1
+        elif kind == "closing":
+            kept = 0 if mark[0] == "#" and self._kind == "heading" else len(mark)
+        elif kind == "pipe" and self._kind != "row":
+            kept = len(mark)
+        elif kind == "pipe" and after != "\n" and self._last not in _PUNCTUATION:
+            return _CELL_PAUSE.ljust(len(mark))
+        elif kind == "strong":
+            within_word = _is_letter(before) and _is_letter(after)
+            if (within_word and (not self._is_strong or mark[0] == "_")) or (before + after).isspace():
+                return mark
+            self._is_strong = not (_is_letter(before) or after.isspace())
+        return mark[len(mark) - kept :].rjust(len(mark))
+
+
+def _is_letter(character: str) -> bool:
+    """Return whether a character is a letter or a digit of a script with blanks between words."""
+    return character.isalnum() and character < _FIRST_UNSPACED
+
+
+def blank_markdown(text: str) -> str:
+    """Return a text of the same length in which the marks of Markdown are blanks or pauses."""
+    return MarkdownReader().read(text, ended=True)
