@@ -10,6 +10,7 @@ import pytest
 
 from talkcli import Client, State
 from talkcli.client.connection import Connection
+from talkcli.client.core import ServerInfo
 from talkcli.client.goal import GoalHandle, merged
 from talkcli.errors import Lost, ServerUnavailable
 from talkcli.goals.goal import Goal
@@ -31,7 +32,7 @@ class Scripted(Connection):
 
     def __init__(self) -> None:
         super().__init__(PATIENCE)
-        self.path, self.boot = "nowhere", "fake"
+        self.path, self.server = "nowhere", ServerInfo("fake")
         self.asked: list[Request] = []
         #: events that the next wait receives
         self.coming: list[JsonObject] = []

@@ -20,7 +20,7 @@ from talkcli.cli.command import ALL_EXIT_CODES, COMMON_OPTIONS, OUTPUT_FILE, lon
 from talkcli.cli.commands import COMMANDS
 from talkcli.cli.show import CommonOptions, note, run_command, show_error, write_error_line
 from talkcli.errors import UsageError
-from talkcli.goals.options import FLAG, INTEGER, NUMBER, SECONDS
+from talkcli.goals.options import INTEGER, NUMBER, SECONDS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -80,11 +80,12 @@ class _OptionType(click.FloatRange):
 
 def _make_click_option(option: Option, *, common: bool = False) -> click.Option:
     """Create the click version of an option. The value of a common option is stored in CommonOptions."""
-    flag = option.kind is FLAG
+    flag = not option.takes_argument
     return click.Option(
         [*option.flags.split(", "), option.name],
         type=None if flag else _click_type(option),
         is_flag=flag or None,
+        **({"flag_value": option.flag_value} if option.flag_value else {}),
         default=option.default,
         show_default=not flag and option.default is not None,
         metavar=None if flag else option.metavar or option.kind.metavar or option.name.upper(),

@@ -51,7 +51,7 @@ def _say_options() -> Iterator[Option]:
 
 _SAY_OPTIONS = tuple(_say_options())
 #: Options of `say` that can be combined with --output.
-_SERVERLESS_OPTIONS = {"timeout", "output", *(each.name for each in goal_options.SOUND_OPTIONS)}
+_SERVERLESS_OPTIONS = {"timeout", "output", "format", *(each.name for each in goal_options.SOUND_OPTIONS)}
 #: File extensions of audio formats other than WAV.
 _OTHER_EXTENSIONS = (".aac", ".aiff", ".au", ".flac", ".m4a", ".mp3", ".mp4", ".oga", ".ogg", ".opus", ".webm", ".wma")
 

@@ -17,7 +17,7 @@ from talkcli.cli.command import COMMON_OPTIONS, OUTPUT_FILE, read_value
 from talkcli.cli.commands import COMMANDS
 from talkcli.client.connect import hello, reach, send_early, sender_name, yield_processor
 from talkcli.frozen import TYPE_CHECKING, frozen
-from talkcli.goals.options import FLAG, MAX_ID_CHARS, MAX_SENDER_NAME_CHARS, MAX_TEXT_CHARS, Cancel, Say, check_key
+from talkcli.goals.options import MAX_ID_CHARS, MAX_SENDER_NAME_CHARS, MAX_TEXT_CHARS, Cancel, Say, check_key
 from talkcli.paths import named_robot, named_socket
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from talkcli.goals.options import Option
 
     #: Maps each flag to its option, and to the option's value if the flag takes no argument.
-    Flags = dict[str, tuple[Option, bool]]
+    Flags = dict[str, tuple[Option, Any]]
 
 _COMMON_NAMES = {each.name for each in COMMON_OPTIONS}
 #: Commands that may send their request before the rest of the program is imported.
@@ -82,7 +82,7 @@ def _flag_table(options: Iterable[Option]) -> Flags:
     found: Flags = {}
     for option in options:
         yes, _, no = option.flags.partition("/")
-        found |= dict.fromkeys(yes.split(", "), (option, True))
+        found |= dict.fromkeys(yes.split(", "), (option, option.flag_value or True))
         if no:
             found[no] = option, False
     return found
@@ -96,9 +96,10 @@ def _read_option(flags: Flags, word: str, rest: Iterator[str], given: dict[str, 
     """
     name, equals, text = word.partition("=")
     option, value = flags[name]
-    if option.kind is OUTPUT_FILE or (equals and (option.kind is FLAG or name[:2] != "--")):
+    if option.kind is OUTPUT_FILE or (equals and not (option.takes_argument and name[:2] == "--")):
         raise ValueError(f"{word} isn't a plain option")
-    given[option.name] = value if option.kind is FLAG else read_value(option, text if equals else next(rest))
+    takes_argument = option.takes_argument
+    given[option.name] = read_value(option, text if equals else next(rest)) if takes_argument else value
 
 
 def _build_command(

@@ -14,7 +14,7 @@ from talkcli.cli.show import note, retry_without_output, show_error, show_if_pos
 from talkcli.cli.wait import GoalReporter, seconds_left, timeout_error
 from talkcli.errors import EXIT_OK, Lost, UsageError
 from talkcli.frozen import TYPE_CHECKING
-from talkcli.goals.options import SOUND_OPTIONS
+from talkcli.goals.options import MARKDOWN, SOUND_OPTIONS
 from talkcli.goals.states import State
 from talkcli.polling import Interrupted
 
@@ -153,13 +153,16 @@ def _write_file(
     from talkcli.engine.parent.render import STANDARD_OUTPUT, render
 
     settings, seconds_at_most = _sound_settings(goal_options), seconds_left(options.deadline(timeout))
+    markdown = goal_options["format"] == MARKDOWN
     if path in STANDARD_OUTPUT:
         if options.json:
             raise UsageError("--json and -o - both write to standard output; leave out one of them")
         standard_output()
     with Interrupts() as interrupts:
         try:
-            seconds = render(text, path, timeout=seconds_at_most, interrupt=interrupts.watched, **settings)
+            seconds = render(
+                text, path, timeout=seconds_at_most, interrupt=interrupts.watched, markdown=markdown, **settings
+            )
         except Interrupted:
             return interrupts.exit_code
     if options.json:

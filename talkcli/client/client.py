@@ -126,6 +126,7 @@ class Client:
         lead_in: int | None = None,
         audible: bool | None = None,
         data: JsonObject | None = None,
+        format: str = "text",  # noqa: A002 - the option has this name everywhere
         follow: bool = True,
         feedback: bool = False,
         patient: bool = False,
@@ -155,6 +156,7 @@ class Client:
                 setting, which is only played if the output was idle.
             audible: abort the goal with the reason `muted` if its output is muted. None means the server's setting.
             data: a JSON object of at most 1 KiB, which is stored with the goal.
+            format: "text", or "markdown" for a text whose marks, code blocks, link addresses and emoji are not spoken.
             follow: receive the goal's states and its Result.
             feedback: also receive each word as it is heard, for `GoalHandle.feedback` and `events`.
             patient: if the queue is full, wait until there is room, without a time limit.
@@ -165,6 +167,7 @@ class Client:
 
         Raises:
             UsageError: a value is out of its range. Nothing was sent.
+            ProtocolMismatch: the server is too old for Markdown. Nothing was sent.
             ServerUnavailable: the server can't be reached. Nothing was sent. With `block=False`, this is raised only
                 if the client is closed.
             Lost: the goal was sent, but the server didn't answer. The goal may be spoken.
@@ -191,6 +194,7 @@ class Client:
             lead_in=lead_in,
             audible=audible,
             data=data,
+            format=format,
         )
         if not block and id is None:
             request = replace(request, id=f"talk:{os.urandom(8).hex()}")

@@ -23,6 +23,7 @@ from talkcli.polling import wait_ready
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from talkcli.client.core import ServerInfo
     from talkcli.goals.goal import JsonObject
 
 #: The beginning of the greeting of a server with the same protocol. A test compares it with a real greeting.
@@ -60,10 +61,8 @@ class ConnectionAttempt:
     received: bytes = b""
     #: the part of the first request that has been sent
     request_sent: bytes = b""
-    #: the server's boot id, with which its goal ids begin, or "" if the greeting has not been read yet
-    boot: str = ""
-    #: the server's process id, or None if the greeting has not been read yet
-    pid: int | None = None
+    #: the server's greeting, or None if it has not been read yet
+    server: ServerInfo | None = None
 
     @property
     def backlog_full(self) -> bool:
@@ -111,7 +110,7 @@ def send_early(
 ) -> ConnectionAttempt | None:
     """Send hello, and the first request if the greeting arrives soon. Return the new state, or None if disconnected.
 
-    The request is not sent if the greeting is late or unexpected.
+    The request is not sent if the greeting is late or unexpected, or if the server may lack a feature.
 
     Args:
         attempt: an open connection.
@@ -122,6 +121,7 @@ def send_early(
     Returns:
         The connection with its progress, or None if the connection broke before a request was sent.
     """
+    from talkcli.protocol.features import missing_features
     from talkcli.protocol.lines import FIRST_NUMBER, request_line
 
     connected, line = attempt.socket, request_line({"seq": FIRST_NUMBER, **request})
@@ -131,7 +131,8 @@ def send_early(
     try:
         connected.sendall(request_line(hello))
         received = connected.recv(65536)
-        if received.startswith(GREETING_START) and b"\n" in received:
+        known = received.startswith(GREETING_START) and b"\n" in received
+        if known and all(f'"{each}"'.encode() in received for each in missing_features(request, ())):
             before()
             sent = line[: connected.send(line)]
     except TimeoutError:
@@ -285,11 +286,11 @@ def _greet(
                 raise ConnectionResetError
             received += data
         line, _, received = received.partition(b"\n")
-        boot, pid = read_greeting(line, attempt.path)
+        server = read_greeting(line, attempt.path)
     except BaseException:
         connected.close()
         raise
-    return replace(attempt, received=received, boot=boot, pid=pid)
+    return replace(attempt, received=received, server=server)
 
 
 def unreachable(attempt: ConnectionAttempt, named: str | None) -> TalkError:

@@ -15,7 +15,7 @@ from _socket import SHUT_RDWR  # importing `socket` takes longer (see `peers`)
 from talkcli import paths, peers
 from talkcli.client.connect import ANSWER_LIMIT_S, connect, hello, reach, sender_name, unreachable
 from talkcli.client.core import MAX_UNSENT_BYTES, ClientCore, Exchange
-from talkcli.errors import ServerUnavailable, TalkError, UsageError
+from talkcli.errors import ProtocolMismatch, ServerUnavailable, TalkError, UsageError
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import MAX_SENDER_NAME_CHARS, Cancel, Say
 from talkcli.polling import wait_ready
@@ -162,8 +162,10 @@ class Connection(ClientCore):
         with self.changed:
             self.register(exchange, time.monotonic())
             try:
+                if self.greeted and (error := self.unsupported(request)):
+                    raise error
                 self._send(exchange)
-            except ServerUnavailable as error:
+            except (ServerUnavailable, ProtocolMismatch) as error:
                 self.fail(exchange, error)
         return exchange
 
@@ -322,7 +324,8 @@ class SocketConnection(Connection):
         self._patience = max(patience, round(give_up - time.monotonic(), 1))
         #: None while disconnected
         self._socket: _socket.socket | None = attempt.socket
-        self.path, self.boot, self.pid = attempt.path, attempt.boot, attempt.pid
+        assert attempt.server
+        self.path, self.server = attempt.path, attempt.server
         self._sent_early = attempt.request_sent
         #: bytes received after the greeting. They are processed after the early request is registered.
         self._received_early = attempt.received

@@ -19,13 +19,23 @@ from _weakrefset import WeakSet  # importing `weakref` takes longer
 from collections import deque
 from collections.abc import Callable
 
-from talkcli.errors import AccessDenied, BadRequest, Lost, ServerUnavailable, TalkError, Unreadable, refusal
-from talkcli.frozen import TYPE_CHECKING, replace
-from talkcli.goals.goal import Goal
+from talkcli.errors import (
+    AccessDenied,
+    BadRequest,
+    Lost,
+    ProtocolMismatch,
+    ServerUnavailable,
+    TalkError,
+    Unreadable,
+    refusal,
+)
+from talkcli.frozen import TYPE_CHECKING, frozen, replace
+from talkcli.goals.goal import Goal, read_fields
 from talkcli.goals.options import Say
 from talkcli.goals.states import State
 from talkcli.protocol import events
 from talkcli.protocol.events import PausedChanged, Result, ServerStatus, Snapshot, StateChanged, WordHeard, goals
+from talkcli.protocol.features import FEATURES, missing_features
 from talkcli.protocol.lines import FIRST_NUMBER, LineSplitter, decode, request_line, write_request
 from talkcli.protocol.requests import Pause, Wait, Watch
 
@@ -245,8 +255,26 @@ class TrackedGoal:
         return self._buffer.take() or (Result(self.goal) if self.goal.state.terminal else None)
 
 
-def read_greeting(line: bytes, path: str) -> tuple[str, int | None]:
-    """Return the boot id and process id in a server's first line. Raises an error if the server can't be used.
+@frozen
+class ServerInfo:
+    """A server's description of itself in its greeting, or in the presence of a robot."""
+
+    boot: str = ""
+    pid: int | None = None
+    version: str = "unknown"
+    #: the names of the features that the server has; None if unknown
+    features: tuple[str, ...] | None = None
+
+    @classmethod
+    def read(cls, server: JsonObject) -> ServerInfo:
+        """Read a description. An invalid field is treated as missing."""
+        features = server.get("features")
+        names = tuple(map(str, features)) if isinstance(features, list) else None
+        return cls(**{**read_fields(cls, {**server, "features": None}), "features": names})
+
+
+def read_greeting(line: bytes, path: str) -> ServerInfo:
+    """Read a server's first line. Raises an error if the server can't be used.
 
     Raises:
         ServerUnavailable: the line is not a greeting.
@@ -264,13 +292,7 @@ def read_greeting(line: bytes, path: str) -> tuple[str, int | None]:
 
         reason = printable(str(greeting.get("message") or greeting["error"]))
         raise AccessDenied(f"the server refused the connection: {reason}")
-    return identity(greeting)
-
-
-def identity(server: JsonObject) -> tuple[str, int | None]:
-    """Return a server's boot id and process id, from its greeting or its status."""
-    boot, pid = server.get("boot"), server.get("pid")
-    return boot if isinstance(boot, str) else "", pid if isinstance(pid, int) else None
+    return ServerInfo.read(greeting)
 
 
 class Exchange:
@@ -325,10 +347,7 @@ class ClientCore:
         """
         #: the server's socket or address, for error messages
         self.path = ""
-        #: the server's boot id, with which its goal ids begin
-        self.boot = ""
-        #: the server's process id
-        self.pid: int | None = None
+        self.server = ServerInfo()
         self.listeners = EventListeners()
         #: why the connection has ended for good, or None if it hasn't
         self.ended: str | None = None
@@ -359,6 +378,16 @@ class ClientCore:
         self._sending_ended: str | None = None
         #: the last error message that did not belong to a request. It explains why the server closes the connection.
         self._last_error: str | None = None
+
+    @property
+    def boot(self) -> str:
+        """The server's boot id, with which its goal ids begin."""
+        return self.server.boot
+
+    @property
+    def pid(self) -> int | None:
+        """The server's process id."""
+        return self.server.pid
 
     # -- requests
 
@@ -461,6 +490,17 @@ class ClientCore:
             return Lost(f"{words}; the sentence may still be spoken")
         return Lost(words) if isinstance(request, self.lasting) else ServerUnavailable(words)
 
+    def unsupported(self, request: Request) -> TalkError | None:
+        """Return an error if the server is known to lack a feature that a request needs, otherwise None."""
+        features = self.server.features
+        missing = missing_features(write_request(request), features) if features is not None else []
+        if not missing:
+            return None
+        from talkcli.terminal.text import printable  # rarely needed, and slow to import
+
+        version, ability = printable(self.server.version), FEATURES[missing[0]].ability
+        return ProtocolMismatch(f"the server is {version} and can't {ability}: restart it")
+
     def refusal(self, reply: JsonObject, items: list[JsonObject]) -> TalkError:
         """Return the error that a refusing reply reports. `items` are the list items that came before the reply."""
         from talkcli.terminal.text import printable  # rarely needed, and slow to import
@@ -538,7 +578,7 @@ class ClientCore:
             if self.ended is not None or self._splitter is not splitter:
                 return  # processing the previous line has ended the connection
             if not self.greeted:
-                self.connected(*read_greeting(line, self.path), now)
+                self.connected(read_greeting(line, self.path), now)
                 continue
             try:
                 self.dispatch(decode(line), now)
@@ -626,18 +666,17 @@ class ClientCore:
             self.forget(exchange)
             self.fail(exchange, error)
 
-    def connected(self, boot: str, pid: int | None, now: float) -> None:
+    def connected(self, server: ServerInfo, now: float) -> None:
         """Record the greeting on a new connection, and follow goals again, or mark them LOST after a restart.
 
         Goals are followed again if this is still the same run of the server. Otherwise they are LOST.
 
         Args:
-            boot: the boot id in the greeting. Each start of the server has another one.
-            pid: the process id in the greeting.
+            server: the server's greeting. Each start of the server has another boot id.
             now: the monotonic time.
         """
-        restarted = boot != self.boot
-        self.boot, self.pid, self.greeted, self.connect_error = boot, pid, True, None
+        restarted = server.boot != self.boot
+        self.server, self.greeted, self.connect_error = server, True, None
         self._heard, self.absent_since = now, None
         if restarted:
             self._lose_goals()
@@ -647,7 +686,10 @@ class ClientCore:
         if self.listeners.watches:
             self._watch_again(now)
         for _, exchange in waiting:
-            self.queue(self._renew_line(exchange, now), exchange)
+            if error := self.unsupported(exchange.request):
+                self.fail(exchange, error)
+            else:
+                self.queue(self._renew_line(exchange, now), exchange)
 
     def _renew_line(self, exchange: Exchange, now: float) -> bytes:
         """Reduce a waiting request's TTL by the time waited, restart its time limit, and return its line."""

@@ -49,7 +49,7 @@ _TOKEN = re.compile(
 )
 #: Matches the end of a text that may become a token.
 _PARTIAL_TOKEN = re.compile(
-    r"(?:(?<!~)~+|(?<![^\s\[])!|(?<!\w)(?:ht?t?|https?:?/?|w{1,3})|(?<!\\)<(?:!(?:-(?:-.*)?)?|(?:https?:|mailto:)[^\s<>]*"
+    r"(?:(?<!~)~+|(?<![^\s\[])!|(?<!\w)(?:ht?t?|https?:?/?|w{1,3})|<(?:!(?:-(?:-.*)?)?|(?:https?:|mailto:)[^\s<>]*"
     rf"|[\w.+-]+@?[\w.-]*|/[a-z]*[1-6]?|/?(?:{_TAG_NAMES})[\s/][^<>]*)?)\Z",
     re.DOTALL | re.IGNORECASE,
 )
@@ -61,7 +61,7 @@ _LINE = re.compile(
 )
 #: Matches an incomplete line if more text decides which marks it begins with.
 _PARTIAL_LINE = re.compile(
-    r"(?:[ \t>]*(?:[-*+•=_#|:`~ \t]{0,500}|\d{0,3}[.)]?)(?:[ \t]+\[?[ xX]?\]?)?|[ \t>]*(?:`{3}|~{3})[^`\n]{0,500}"
+    r"(?:[ \t>]*(?:[-*+•=_#|:`~ \t]{0,500}|\d{0,3}[.)]?)(?:[ \t]+\[?[ xX]?\]?)?|[ \t>]*(?:`{3,}|~{3,})[^`\n]{0,500}"
     r"|[ \t>]*\[[^\]\n]{0,200}(?:\](?::[^\n]{0,500})?)?)\Z"
 )
 #: The end of a paragraph, after which no mark in it can be closed.
@@ -143,7 +143,7 @@ class MarkdownReader:
         if at in self._closing:
             return " " * self._closing.pop(at)
         is_complete = kind == "blank" or mark in "]>" or (kind == "escape" and len(mark) == 2)
-        if token.end() == len(text) and not self._ended and not is_complete:
+        if token.end() == self._known and not self._ended and not is_complete:
             return None
         if kind in ("code", "emphasis", "link"):
             return self._read_span(kind, token)

@@ -106,6 +106,7 @@ class Speak:
     lead_in: int | None = None  # milliseconds of silence to play before the text; None to use `Configure.lead_in`
     audible: bool | None = None  # whether to fail if the output is muted; None to use `Configure.audible`
     voice_only: bool = False  # whether to wait for the neural voice to load, and fail if it can't be loaded
+    format: str = "text"  # "text" or "markdown"
     more: bool = False  # whether text will be added with `Append`
     broken: bool = False  # whether the text broke off, so that an incomplete sentence at its end isn't spoken
 

@@ -53,7 +53,7 @@ class Presence:
     groups: tuple[str, ...] = ()
     #: requests that remote clients may send to the robot, such as `say`
     allow: tuple[str, ...] = ()
-    #: boot id, pid and version of the robot's server; None if the server isn't running
+    #: boot id, pid, version and features of the robot's server; None if the server isn't running
     server: JsonObject | None = None
     #: version of the bridge; "" if the robot is offline
     version: str = ""

@@ -48,6 +48,8 @@ MAX_KEY_CHARS = 64
 MAX_LEAD_IN_MS = 5000
 #: Name that selects the speech driver's default voice.
 DEFAULT_VOICE = "default"
+#: Value of the option `format` for texts in Markdown.
+MARKDOWN = "markdown"
 #: Prefix of neural voice ids, as in "piper/NAME".
 NEURAL_PREFIX = "piper/"
 #: Separator between a neural voice and its speaker, as in "piper/NAME#3".
@@ -193,6 +195,8 @@ class Option:
     help: str = ""
     #: environment variable that is used if the option isn't given
     env: str = ""
+    #: value that the flag sets, if the option isn't boolean but its flag takes no argument
+    flag_value: Any = None
     #: name of the function in `cli.completion` that completes values
     completion: str = ""
     #: the server setting that provides the default, if there is one
@@ -206,6 +210,11 @@ class Option:
     def flags(self) -> str:
         """Command-line flags, or an empty string if the option isn't available on the command line."""
         return self.special_flags or (f"--{self.name.replace('_', '-')}" if self.help else "")
+
+    @property
+    def takes_argument(self) -> bool:
+        """Whether a value follows the option's flag on the command line."""
+        return self.kind is not FLAG and self.flag_value is None
 
     def type_error(self, value: Any) -> str | None:
         """Return an error message if a value has the wrong type or format, or None."""
@@ -283,7 +292,11 @@ def _check_own_id(value: str) -> str | None:
 
 def _check_format(value: str) -> str | None:
     """Return an error message if the value of the option `format` is not supported, or None."""
-    return None if value == "text" else f"the format must be 'text', got {value[:MAX_ID_CHARS]!r}"
+    return (
+        None
+        if value in {"text", MARKDOWN}
+        else f"the format must be 'text' or 'markdown', got {value[:MAX_ID_CHARS]!r}"
+    )
 
 
 def _check_voice(value: str) -> str | None:
@@ -498,7 +511,19 @@ OPTIONS = (
         default=STALL_S,
         limits=(MIN_STALL_S, MAX_STALL_S),
     ),
-    Option("format", TEXT, "only `text` is supported", "text", check=_check_format, in_goal=True),
+    Option(
+        "format",
+        TEXT,
+        "how the text is written. The marks of Markdown are not spoken, see [Markdown](../cli/README.md#markdown)",
+        default="text",
+        check=_check_format,
+        form=f"`text` or `{MARKDOWN}`",
+        special_flags="--markdown",
+        flag_value=MARKDOWN,
+        help="Don't speak the marks of Markdown, code blocks, the addresses of links, and emoji.",
+        for_engine=True,
+        in_goal=True,
+    ),
 )
 
 #: Names of the options that are sent to the engine.

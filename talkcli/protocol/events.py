@@ -12,6 +12,7 @@ from talkcli import __version__
 from talkcli.errors import BadRequest, Busy, ProtocolMismatch, Unreadable
 from talkcli.frozen import TYPE_CHECKING, fields, frozen
 from talkcli.goals.goal import By, Goal, read_fields
+from talkcli.protocol.features import FEATURES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -248,7 +249,7 @@ def goal_in(reply: JsonObject, name: str = "goal") -> Goal | None:
 
 def greeting(version: str, pid: int, boot: str) -> JsonObject:
     """Return the greeting, which is the first message that a server sends."""
-    return {"talk": PROTOCOL, "version": version, "pid": pid, "boot": boot, "features": []}
+    return {"talk": PROTOCOL, "version": version, "pid": pid, "boot": boot, "features": list(FEATURES)}
 
 
 def busy_greeting(message: str | None = None) -> JsonObject:

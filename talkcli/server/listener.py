@@ -212,7 +212,8 @@ def _refuse_second_server(path: str | None) -> None:
     assert found.socket
     here, _ = peers.credentials(found.socket)  # this is the process id of ssh if ssh forwards the socket
     found.socket.close()
-    raise _already_served(found.pid, found.path, here=here == found.pid)
+    pid = found.server.pid if found.server else None
+    raise _already_served(pid, found.path, here=here == pid)
 
 
 def _refuse_live_socket(path: str) -> None:

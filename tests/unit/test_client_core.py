@@ -15,6 +15,7 @@ from talkcli.client.core import (
     ClientCore,
     EventBuffer,
     Exchange,
+    ServerInfo,
     TrackedGoal,
 )
 from talkcli.errors import (
@@ -52,7 +53,7 @@ class Reconnecting(ClientCore):
 
 def core_of(kind: type[ClientCore] = ClientCore) -> ClientCore:
     core = kind(TIMEOUT_S, 0.0)
-    core.path, core.boot = "/s", "4k7f"
+    core.path, core.server = "/s", ServerInfo("4k7f")
     return core
 
 

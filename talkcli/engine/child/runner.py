@@ -21,6 +21,7 @@ from talkcli.engine.child.players.base import CannotSpeak
 from talkcli.engine.child.words import WordFinder
 from talkcli.engine.voices import list_voices
 from talkcli.frozen import TYPE_CHECKING
+from talkcli.goals.options import MARKDOWN
 from talkcli.goals.reasons import Reason
 from talkcli.polling import NEVER, wait_ready
 from talkcli.protocol.lines import LineSplitter
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from talkcli.engine.child.players.base import Interest
     from talkcli.engine.child.players.chooser import PlayerChooser
     from talkcli.engine.child.synthesizers.combined import CombinedSynthesizer
+    from talkcli.engine.markdown import MarkdownReader
     from talkcli.goals.goal import Output
 
 #: Time between two steps of a third-party driver while it speaks. The driver is polled because it can't wake this
@@ -88,10 +90,13 @@ class ActiveGoal:
     def __init__(self, command: protocol.Speak, now: float) -> None:
         self.id = command.id
         self.command = command
+        self._markdown = _markdown_reader() if command.format == MARKDOWN else None
+        #: the text without the marks of Markdown. All offsets are the same as in the sender's text.
+        self.text = self._read(command.text, ended=not command.more)
         #: the text, if it may still grow
-        self.growing_text = _growing_text(command) if command.more or command.broken else None
+        self.growing_text = _growing_text(self.text, command) if command.more or command.broken else None
         self.text_missing = False
-        self.words = WordFinder(command.text)
+        self.words = WordFinder(self.text)
         #: time at which the driver last received text
         self.resumed_at = now
         #: seconds of speech before that, if a third-party driver was paused
@@ -122,12 +127,17 @@ class ActiveGoal:
     def append(self, command: protocol.Append, now: float) -> None:
         """Add text to a text that grows, or end it."""
         assert self.growing_text
-        self.growing_text.append(command.text, now)
-        self.words.append(command.text)
+        text = self._read(command.text, ended=command.end)
+        self.growing_text.append(text, now)
+        self.words.append(text)
         if command.broken:
             self.growing_text.drop_incomplete()
         elif command.end:
             self.growing_text.end()
+
+    def _read(self, text: str, *, ended: bool) -> str:
+        """Return what can be spoken of text in Markdown and of earlier text. Return any other text unchanged."""
+        return self._markdown.read(text, ended=ended) if self._markdown else text
 
     def speech_seconds(self, now: float) -> float:
         """Return how many seconds a third-party driver has spoken the goal, without pauses."""
@@ -344,7 +354,9 @@ class GoalRunner:
         goal.progress_at = goal.resumed_at = time.monotonic()
         goal.offset = goal.last_word
         goal.with_driver, goal.interrupted = True, False
-        if self._engine.say(goal.command.text[goal.offset :], goal.id) is not None:
+        # The first piece of a growing text may contain only marks, but pyttsx3 refuses blanks. The driver ignores it.
+        text = goal.command.text if goal.growing_text else goal.text[goal.offset :]
+        if self._engine.say(text, goal.id) is not None:
             self._fail_goal(Reason.NOTHING_TO_SAY, "nothing in the text can be spoken")
 
     def _step_driver(self, goal: ActiveGoal) -> None:
@@ -445,11 +457,18 @@ class GoalRunner:
         return overdue
 
 
-def _growing_text(command: protocol.Speak) -> GrowingText:
+def _markdown_reader() -> MarkdownReader:
+    """Return an object that reads a text in Markdown."""
+    from talkcli.engine.markdown import MarkdownReader  # rarely needed, and slow to import
+
+    return MarkdownReader()
+
+
+def _growing_text(beginning: str, command: protocol.Speak) -> GrowingText:
     """Return the text of a goal that grows, or that has grown and broke off before this process got it."""
     from talkcli.engine.child.cutting import GrowingText  # rarely needed, and slow to import
 
-    text = GrowingText(command.text, ended=False)
+    text = GrowingText(beginning, ended=False)
     if command.broken:
         text.drop_incomplete()
     return text

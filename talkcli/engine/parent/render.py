@@ -70,6 +70,7 @@ def render(
     path: str,
     *,
     driver: str | None = None,
+    markdown: bool = False,
     timeout: float | None = None,
     interrupt: Mapping[int, int] | None = None,
     **sound: Any,
@@ -80,6 +81,7 @@ def render(
         text: the text, of any length.
         path: the file to write, or "-" for standard output.
         driver: name of a pyttsx3 driver, or None for the default.
+        markdown: whether the text is written in Markdown, whose marks are not spoken.
         timeout: time limit in seconds, or None for no limit.
         interrupt: descriptors that interrupt the rendering, as in `polling.wait_ready`.
         sound: rate, volume, voice and pitch, if they differ from the defaults.
@@ -96,6 +98,10 @@ def render(
     if fault is not None:
         raise RenderFailed(*fault)
     sound = {each.name: getattr(INITIAL, each.name) for each in SOUND_OPTIONS} | sound
+    if markdown:
+        from talkcli.engine.markdown import blank_markdown  # rarely needed, and slow to import
+
+        text = blank_markdown(text)  # before the text is cut into pieces
     # A rendering can wait for its voice to load. A file with a different voice would be useless.
     numbered = enumerate(split_into_pieces(text), 1)
     commands = (protocol.Speak(f"{number}", piece, **sound, voice_only=True) for number, piece in numbered)

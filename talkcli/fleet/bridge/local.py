@@ -57,13 +57,13 @@ class LocalConnection(ClientCore):
                 raise ServerUnavailable(f"the server at {self.path} did not answer; {hint}")
             if not first:
                 raise ServerUnavailable(f"the server at {self.path} closed the connection without an answer")
-            boot, pid = read_greeting(first, self.path)
+            server = read_greeting(first, self.path)
         except BaseException:
             self.close()
             raise
         finally:
             limit.cancel()
-        self.connected(boot, pid, self._loop.time())
+        self.connected(server, self._loop.time())
 
     async def read(self) -> list[bytes]:
         """Wait for lines, and return them without their newlines.

@@ -21,6 +21,7 @@ from talkcli.frozen import replace
 from talkcli.goals.options import MAX_LOG_GOALS
 from talkcli.goals.states import State
 from talkcli.protocol.events import PausedChanged, ServerStatus, StateChanged, from_json, goals, unfinished
+from talkcli.protocol.features import FEATURES
 from talkcli.protocol.lines import decode, encode
 from talkcli.protocol.requests import Log, Watch
 
@@ -64,7 +65,7 @@ class Publisher:
         self._publish = publish
         self._on_server_change = on_server_change
         self._with_text = with_text
-        #: boot id, pid and version of the server; None if the bridge isn't connected to it
+        #: boot id, pid, version and features of the server; None if the bridge isn't connected to it
         self.server: JsonObject | None = None
         self._connection: LocalConnection | None = None
         #: texts of unfinished goals, by goal id
@@ -150,7 +151,9 @@ class Publisher:
         for each in unfinished(status):
             self._sessions.remember(each, server.boot)
         log.write(f"connected to the server at {log.sanitize(server.path)} (pid {server.pid})")
-        about = {"boot": server.boot, "pid": server.pid, "version": status.server.get("version")}
+        about: JsonObject = {"boot": server.boot, "pid": server.pid, "version": status.server.get("version")}
+        # Leave out features that this bridge doesn't know, because it may not pass on their requests.
+        about["features"] = [each for each in FEATURES if each in (server.server.features or ())]
         self._set_server(about, status, server.boot)
 
     def _set_server(self, about: JsonObject | None, status: ServerStatus, boot: str) -> None:

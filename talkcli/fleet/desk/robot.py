@@ -15,8 +15,17 @@ from typing import TYPE_CHECKING, Any
 
 from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.client.connection import Connection, checked_sender_name
-from talkcli.client.core import Exchange, identity
-from talkcli.errors import AccessDenied, BadRequest, Lost, ServerUnavailable, TalkError, UnknownGoal, UsageError
+from talkcli.client.core import Exchange, ServerInfo
+from talkcli.errors import (
+    AccessDenied,
+    BadRequest,
+    Lost,
+    ProtocolMismatch,
+    ServerUnavailable,
+    TalkError,
+    UnknownGoal,
+    UsageError,
+)
 from talkcli.fleet import topics
 from talkcli.fleet.desk.link import ABSENCE_LIMIT_S, DeskLink
 from talkcli.fleet.desk.request import NoServer, RobotOffline
@@ -183,6 +192,11 @@ class RobotConnection(Connection):
             return super().silent_by(began)
         return self.absent_since + ABSENCE_LIMIT_S, f"{self.absence} (for {ABSENCE_LIMIT_S:g} s)"
 
+    def unsupported(self, request: Request) -> TalkError | None:
+        """Return an error if the robot's server is known to lack a feature that a request needs, otherwise None."""
+        error = super().unsupported(request)
+        return ProtocolMismatch(f"{self.robot}: {error.message}") if error else None
+
     def refusal(self, reply: JsonObject, items: list[JsonObject]) -> TalkError:
         """Return the error that a refusing reply reports. Errors of the bridge have classes of their own."""
         error = super().refusal(reply, items)
@@ -244,7 +258,7 @@ class RobotConnection(Connection):
         elif not isinstance(server, dict):
             self._mark_absent(f"{self.robot} has no running talk server", NoServer)
         elif self._bridge_session != presence.get("session") or self.absent_since is not None:
-            self.boot, self.pid = identity(server)
+            self.server = ServerInfo.read(server)
             self._bridge_session = presence.get("session")
             self.absent_since, self._heard = None, time.monotonic()
             self._resume_requests()
@@ -302,6 +316,9 @@ class RobotConnection(Connection):
         if exchange.number not in self.exchanges:
             return  # The caller has stopped waiting for the answer.
         request = exchange.request
+        if error := self.unsupported(request):
+            self.fail(exchange, error)
+            return
         left = 0.0 if exchange.latest is None else exchange.latest - boottime()
         exchange.resends += 1
         why = "its ttl was over before an answer came" if left < 0 else f"{self.absence} ({_MAX_RESENDS} times)"

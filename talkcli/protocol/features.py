@@ -1,0 +1,35 @@
+"""Features of the protocol that not every server has.
+
+The server's greeting contains their names. A client that needs a feature checks for its name, and fails at once if the
+name is missing. Otherwise, an older server would refuse the request with a message about an unknown field or value.
+"""
+
+from __future__ import annotations
+
+from talkcli.frozen import TYPE_CHECKING, frozen
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection
+
+    from talkcli.goals.goal import JsonObject
+
+
+@frozen
+class Feature:
+    """A feature of the protocol."""
+
+    #: what a server without the feature can't do, for error messages
+    ability: str
+    #: function that returns whether a request needs the feature
+    is_needed: Callable[[JsonObject], bool]
+
+
+#: All features, by name. Never remove one.
+FEATURES = {
+    "markdown": Feature("take Markdown", lambda request: request.get("format") == "markdown"),
+}
+
+
+def missing_features(request: JsonObject, available: Collection[str]) -> list[str]:
+    """Return the names of the features that a request needs and that the server doesn't have."""
+    return [name for name, each in FEATURES.items() if name not in available and each.is_needed(request)]
