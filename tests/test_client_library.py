@@ -219,7 +219,7 @@ def untouched() -> Iterator[Client]:
         talk.stop()
 
 
-TAKEN = [each for each in OPTIONS if each.name not in {"wait", "format"}]
+TAKEN = [each for each in OPTIONS if each.name not in {"wait", "more", "stall"}]
 
 
 @pytest.mark.parametrize("row", TAKEN, ids=lambda each: each.name)

@@ -107,6 +107,14 @@ def test_a_request_is_sent_once_however_the_server_greets(greeting: list[bytes])
     assert_hello_is_sent_once(serve, said)
 
 
+def test_nothing_is_sent_to_a_server_that_lacks_a_feature() -> None:
+    with serving(lambda _: None) as path:
+        env = clean_environment(os.path.dirname(path), {"TALK_SOCKET": path})
+        done = run([*TALK, "say", "--markdown", "**hello**"], env)
+    assert (done.code, done.out) == (9, ""), done
+    assert done.err == "talk: the server is 0 and can't take Markdown: restart it\n"
+
+
 def test_a_request_is_sent_again_if_the_server_hangs_up() -> None:
     """As if the server ended, and a socket unit started the next one."""
     said: list[dict[str, Any]] = []

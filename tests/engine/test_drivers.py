@@ -130,6 +130,13 @@ def test_a_driver_is_stepped_to_the_end_of_each_sentence_and_reports_words(drive
             assert [(word.start, word.end) for word in engine.words(goal)] == [(0, 7), (8, 11)]
 
 
+def test_a_driver_gets_a_text_in_markdown_without_its_marks() -> None:
+    with Spawned(driver="slow", before=SLOW_DRIVER) as engine:
+        engine.send(protocol.Speak("g1", "**battery** `low`", 200, 1.0, None, 50, format="markdown"))
+        assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
+        assert [(word.start, word.end) for word in engine.words()] == [(2, 9), (13, 16)]
+
+
 @pytest.mark.parametrize(
     ("more", "reason", "message"),
     [

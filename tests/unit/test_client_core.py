@@ -121,6 +121,40 @@ def greet(core: ClientCore, boot: str = "4k7f", now: float = 2.0) -> None:
 # Requests and answers
 
 
+@pytest.mark.parametrize(
+    ("form", "features", "message"),
+    [
+        ("markdown", (), "the server is 0.1.0 and can't take Markdown: restart it"),
+        ("markdown", ("other",), "the server is 0.1.0 and can't take Markdown: restart it"),
+        ("markdown", ("markdown", "other"), None),
+        ("markdown", None, None),  # the bridge of a robot didn't tell, so the server may refuse the request
+        ("text", (), None),
+    ],
+)
+def test_a_request_is_unsupported_if_the_server_lacks_a_feature(
+    core: ClientCore, form: str, features: tuple[str, ...] | None, message: str | None
+) -> None:
+    core.server = ServerInfo("4k7f", 7, "0.1.0", features)
+    error = core.unsupported(Say("a", format=form))
+    assert (None if error is None else error.message) == message
+    assert error is None or isinstance(error, ProtocolMismatch)
+
+
+def test_a_waiting_request_fails_if_the_server_is_replaced_by_an_older_one(reconnecting: ClientCore) -> None:
+    reconnecting.break_off("gone", 1.0)
+    exchange = submit(reconnecting, Say("a", format="markdown"), on_failure=lambda _: None)
+    other = submit(reconnecting, Status(), on_failure=lambda _: None)
+    greet(reconnecting)
+    assert str(exchange.error) == "the server is 1.0 and can't take Markdown: restart it"
+    assert [each["seq"] for each in send_all(reconnecting)] == [other.number]
+
+
+def test_a_server_describes_itself_and_malformed_fields_count_as_missing() -> None:
+    told: JsonObject = {"boot": "4k7f", "pid": 7, "version": "1.0", "features": ["markdown"], "new": 1}
+    assert ServerInfo.read(told) == ServerInfo("4k7f", 7, "1.0", ("markdown",))
+    assert ServerInfo.read({"boot": 1, "pid": "x", "version": None, "features": "all"}) == ServerInfo()
+
+
 def test_requests_are_numbered_and_sent_in_order(core: ClientCore) -> None:
     submit(core, Status())
     submit(core, Say("a", wait=True))

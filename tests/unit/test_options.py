@@ -59,6 +59,7 @@ GOOD: list[tuple[str, list[object]]] = [
     ("volume", [0, 0.0, 0.5, 1, 1.0]),
     ("pitch", [0, 50, 100]),
     ("lead_in", [0, 1, 5_000]),
+    ("format", ["text", "markdown"]),
     ("voice", ["en", "default", "French (France)"]),
     ("ttl", [0, 0.0, 0.001, 5, 86_400.0]),
     ("throttle", [0, 0.0, 0.5, 60]),
@@ -175,12 +176,12 @@ def test_the_fields_of_a_request_agree_with_its_rows(kind: str) -> None:
 
 def test_the_librarys_parameters_agree_with_the_rows() -> None:
     parameters = declared(Client.say)
-    # `wait` is called `follow` in the library and has another default. The library only offers the format text.
+    # `wait` is called `follow` in the library and has another default.
     assert parameters.pop("follow") == ("bool", True)
     assert parameters.pop("block") == ("bool", True)
     assert parameters.pop("text") == ("str", inspect.Parameter.empty)
     own = annotated(Say)
-    rows = [option for option in OPTIONS if option.name not in {"text", "wait", "format"}]
+    rows = [option for option in OPTIONS if option.name not in {"text", "wait"}]
     assert parameters == {option.name: (own[option.name], option.default) for option in rows}
     typed = [option.name for option in rows if option.flags and option.name != "feedback"]
     assert [name for name in parameters if name in typed] == typed
@@ -198,7 +199,7 @@ def test_the_fields_of_a_goal_and_of_speak_agree_with_the_rows() -> None:
 
 
 #: Options that are only stored with the goal, so no code reads them.
-CARRIED = {"data", "format"}
+CARRIED = {"data"}
 
 
 @pytest.mark.parametrize("option", [row for row in OPTIONS if row.name not in CARRIED], ids=lambda row: row.name)
@@ -250,11 +251,11 @@ def test_a_setting_has_its_own_flags_and_help_in_serve_and_set() -> None:
 def test_the_engine_gets_the_goals_value_or_else_the_servers() -> None:
     settings = replace(INITIAL, voice="de", rate=150)
     general = {"rate": 150, "volume": 1.0, "voice": "de", "pitch": 50, "lead_in": None, "audible": None}
-    general["voice_only"] = False
+    general |= {"voice_only": False, "format": "text"}
     assert engine_options(Say("hi"), settings) == general
     own = Say("hi", rate=80, volume=0.0, voice=DEFAULT_VOICE, pitch=0, lead_in=0, audible=False)
     expected = {"rate": 80, "volume": 0.0, "voice": None, "pitch": 0, "lead_in": 0, "audible": False}
-    assert engine_options(own, settings) == {**expected, "voice_only": False}
+    assert engine_options(own, settings) == {**expected, "voice_only": False, "format": "text"}
 
 
 def test_the_servers_defaults_agree_with_its_command() -> None:
@@ -281,7 +282,7 @@ def test_the_servers_defaults_agree_with_its_command() -> None:
         (ROWS["priority"], 1_000_001, "the priority must be -1,000,000 to 1,000,000, got 1000001"),
         (ROWS["key"], "", "the key must have 1 to 64 characters, got 0"),
         (ROWS["voice"], "", "the voice must not be empty"),
-        (ROWS["format"], "x" * 99, f"the format must be 'text', got '{'x' * 64}'"),
+        (ROWS["format"], "x" * 99, f"the format must be 'text' or 'markdown', got '{'x' * 64}'"),
     ],
     ids=lambda value: getattr(value, "name", None) or str(value)[:24],
 )
