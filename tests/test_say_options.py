@@ -33,6 +33,24 @@ def busy(talk: Talk) -> str:
     return goal_id
 
 
+def test_markdown_is_spoken_without_its_marks(make_talk: MakeTalk, tmp_path: Path) -> None:
+    talk, text = make_talk("--player", "null"), "**Battery** [low](http://a.b/c)"
+    plain = talk.goal(talk.run("say", "--wait", "Battery low").id)
+    done = talk.run("say", "--feedback", "--markdown", text)
+    goal = talk.goal(done.out.split()[0])
+    assert (done.code, goal["format"], goal["text"]) == (0, "markdown", text)
+    assert goal["duration"] == pytest.approx(plain["duration"], abs=0.01)
+    assert [line.split()[3::2] for line in done.out.splitlines() if " word " in line] == [
+        ["2-9", "Battery"],
+        ["13-16", "low"],
+    ]
+    line = talk.run("say", "--lines", "--wait", "--markdown", stdin=text)
+    assert talk.goal(line.id)["duration"] == pytest.approx(plain["duration"], abs=0.01)
+    for name, words in (("plain", ["Battery low"]), ("markdown", ["--markdown", text])):
+        assert alone("say", "-o", f"{tmp_path}/{name}", *words).code == 0
+    assert (tmp_path / "plain").read_bytes() == (tmp_path / "markdown").read_bytes()
+
+
 @pytest.mark.parametrize(
     ("words", "hints"),
     [

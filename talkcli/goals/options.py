@@ -520,7 +520,7 @@ OPTIONS = (
         form=f"`text` or `{MARKDOWN}`",
         special_flags="--markdown",
         flag_value=MARKDOWN,
-        help="Don't speak the marks of Markdown, code blocks, the addresses of links, and emoji.",
+        help="Read TEXT as Markdown. Marks, code blocks, link addresses and emoji are not spoken.",
         for_engine=True,
         in_goal=True,
     ),
