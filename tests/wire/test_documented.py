@@ -15,6 +15,7 @@ from talkcli.goals.goal import Goal
 from talkcli.goals.history import MAX_RECALLED_GOALS, MAX_REJECTED_GOALS, MAX_SPOKEN_GOALS
 from talkcli.goals.states import State
 from talkcli.protocol import events
+from talkcli.protocol.features import FEATURES
 from talkcli.protocol.lines import MAX_LINE_BYTES
 from talkcli.protocol.requests import REQUEST_TYPES
 from talkcli.server import connection, stream
@@ -37,6 +38,11 @@ def test_states_and_replies_are_in_the_tables() -> None:
     assert documented == {each.name: (int(each), each.terminal) for each in State}
     answered = {each for row in tables(WIRE.section("Requests"))[1][1:] for each in code_spans(row[0])[:1]}
     assert answered == set(REQUEST_TYPES)
+
+
+def test_features_are_in_the_table() -> None:
+    (table,) = [each for each in tables(WIRE.text) if each[0][0] == "feature"]
+    assert [code_spans(row[0]) for row in table[1:]] == [[each] for each in FEATURES]
 
 
 def test_keys_and_error_codes_of_the_tables_are_those_of_the_code() -> None:

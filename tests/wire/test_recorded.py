@@ -34,6 +34,7 @@ NEVER_EDITED = {
     "protocol-1": "5a39d2af4e6c797d4d449d37623fd96d9f78ea4f33952ef545dc1e4e552212fd",
     "protocol-1-audible": "d027e998482272e961e2bebded96fb3d2d3dc4e2410b2d2fd6c0ea2076ce131a",
     "protocol-1-lead-in": "3f3263930adb3116d5329efa626e6eaefc47f16290d539d36e352152bc22067e",
+    "protocol-1-markdown": "2f65ff7f254ecbd5789e58ac5fb504248d0b3ba2d6cd9b4b746a238dedbab871",
     "protocol-1-voice": "4053df5d6bb376af2403e923cb48468fdeb25a46323a63e47e472ab823ef457f",
 }
 #: Fields that vary with the server, the client or the run: of these the type is compared.
@@ -88,6 +89,8 @@ def _alike(key: str, recorded: object, now: object, varies: Collection[str]) -> 
         return recorded is now or key in MAY_BE_NULL & set(varies)
     if key == "spoken" and varies:
         return isinstance(now, str)  # how far a goal came that was stopped
+    if key == "features":
+        return isinstance(recorded, list) and isinstance(now, list) and set(recorded) <= set(now)
     kinds = [int if isinstance(each, float) else type(each) for each in (recorded, now)]
     return kinds[0] is kinds[1] and (key in varies or recorded == now)
 
