@@ -106,6 +106,11 @@ def _id_error(value: str) -> str | None:
     return None if 0 < len(value) <= MAX_ID_CHARS else f"must have 1 to {MAX_ID_CHARS} characters"
 
 
+def _offset_error(value: int) -> str | None:
+    """Return an error message if an offset in a text is negative, or None."""
+    return None if value >= 0 else "must be 0 or more"
+
+
 def _ids_error(value: list[object]) -> str | None:
     """Return an error message if a list of ids is too long or contains an invalid id, or None."""
     if len(value) > MAX_IDS:
@@ -136,6 +141,7 @@ WORD = Kind("string", (str,), "must be a string")
 #: A file or socket path. On the command line, it may contain any bytes but must not be empty.
 PATH = Kind("string", (str,), "must be a string", "PATH")
 INTEGER = Kind("integer", (int,), "must be an integer", "N")
+_OFFSET = Kind("integer", (int,), "must be an integer", check=_offset_error)
 NUMBER = Kind("number", (int, float), "must be a number", "X")
 #: A duration in seconds, which can't be negative.
 SECONDS = Kind("number", (int, float), "must be a number", "SEC")
@@ -579,7 +585,7 @@ class Append:
     options: ClassVar[tuple[Option, ...]] = (
         Option("id", ID, "the goal", default="", default_words="required"),
         Option("text", TEXT, "the text to add", default=""),
-        Option("at", INTEGER, "the length of the text so far. An addition that was sent before is then harmless"),
+        Option("at", _OFFSET, "the length of the text so far. An addition that was sent before is then harmless"),
         Option("end", FLAG, "whether the text is complete", default=False),
         Option("broken", FLAG, "whether the sender gives up, so that the goal is stopped at once", default=False),
     )

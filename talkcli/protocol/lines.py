@@ -81,7 +81,7 @@ def write_request(request: Request) -> JsonObject:
     message: JsonObject = {"request": request.kind}
     for option in request.options:
         value = getattr(request, option.name)
-        if value != option.default or option.name == "text":
+        if value != option.default or option.default_words == "required":
             message[option.name] = list(value) if isinstance(value, tuple) else value
     return message
 

@@ -239,7 +239,7 @@ class Requests:
                 pending.canceled_goal = record
         goal = record.snapshot(state).to_json()
         ended = attached and state.terminal
-        if record.more and (effects or self._lacks_producer(record)):
+        if say.more and record.more and (effects or self._lacks_producer(record)):
             self._producers = {each: producer for each, producer in self._producers.items() if each.more}
             self._producers[record] = connection
         if (say.wait or say.feedback) and not ended:
@@ -264,6 +264,8 @@ class Requests:
             speech.notifications.add([partial(speech.subscribers.text_added, record.id, length, added, time.time())])
         speech.apply(effects)
         while unheard_chars(record) > MAX_UNHEARD_CHARS and not record.state.terminal:
+            if not self._reserve_memory(pending):
+                break  # too many requests are waiting
             speech.subscribers.schedule_keep_alive()
             await pending.wait(speech.waiting_for_hearing(record))
         pending.answer(length=len(record.say.text), state=record.state.name)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from talkcli.server.requests import MAX_CLIENT_REQUESTS
 from talkcli.server.speech import MAX_UNHEARD_CHARS
 from tests.support.connection import Wire
 
@@ -149,3 +150,16 @@ def test_a_held_back_reply_comes_at_the_end_of_the_goal(talk: Talk) -> None:
         while (reply := client.receive()).get("seq") != 1:
             pass
     assert reply["state"] in {"PREEMPTING", "PREEMPTED"}
+
+
+def test_replies_beyond_the_limit_for_waiting_requests_come_at_once(talk: Talk) -> None:
+    with talk.connect() as client:
+        goal_id = begin(client, "Word. ")
+        for text in ("word " * 2_100, *[""] * MAX_CLIENT_REQUESTS):
+            client.send({"request": "append", "id": goal_id, "text": text})
+        while (reply := client.receive()).get("length") is None:
+            pass
+        assert (reply["ok"], reply["length"]) == (True, 10_506)
+        assert client.request("status", id=goal_id)["goal"]["more"]
+        assert client.items == []
+        client.request("cancel")

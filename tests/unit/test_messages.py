@@ -44,6 +44,8 @@ goals = st.builds(
     data=st.none() | st.dictionaries(st.text(), values, max_size=3),
     client=st.none() | senders,
     paused=st.booleans(),
+    more=st.booleans(),
+    waits=st.booleans(),
     queued_at=seconds,
     started_at=seconds,
     ended_at=seconds,
@@ -68,7 +70,8 @@ def test_a_goal_has_all_its_keys_and_is_read_back_despite_unknown_ones(goal: Goa
 def test_unknown_values_of_a_goal_are_null() -> None:
     message = Goal("4k7f-1", State.PENDING).to_json()
     assert message == dict.fromkeys(KEYS) | {
-        "id": "4k7f-1", "state": "PENDING", "status": 0, "format": "text", "priority": 0, "paused": False
+        "id": "4k7f-1", "state": "PENDING", "status": 0, "format": "text", "priority": 0,
+        "paused": False, "more": False, "waits": False,
     }  # fmt: skip
 
 

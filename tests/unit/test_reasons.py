@@ -18,8 +18,8 @@ from tests.support.documents import WIRE, code_spans, tables
 
 #: Additional reasons that the doctor reports for its own sentence.
 DOCTOR_REASONS = {"late", "paused"}
-#: Reasons that the doctor's sentence can't have, because it has no option that a driver could refuse.
-WITHOUT_ADVICE = {Reason.BAD_OPTION}
+#: Reasons that the doctor's sentence can't have, because it doesn't grow and has no option that a driver could refuse.
+WITHOUT_ADVICE = {Reason.BAD_OPTION, Reason.TEXT_STALLED, Reason.BROKEN_OFF}
 
 
 @pytest.mark.parametrize("reason", Reason)

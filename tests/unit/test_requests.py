@@ -47,6 +47,7 @@ def requests_of(kind: type[Request]) -> st.SearchStrategy[Request]:
     limited = {
         "name": st.none() | st.text(min_size=1, max_size=MAX_SENDER_NAME_CHARS),
         "count": st.integers(1, MAX_LOG_GOALS),
+        "at": st.none() | st.integers(0),
     }
     return st.builds(kind, **{**fields, **optional, **{name: limited[name] for name in fields if name in limited}})
 
@@ -56,9 +57,13 @@ SETTINGS = {"rate", "volume", "voice", "pitch", "preempt", "ttl"}
 ALL_FIELDS = sorted({option.name for kind in REQUEST_TYPES.values() for option in kind.options})
 
 
+#: Required fields.
+REQUIRED: dict[str, JsonObject] = {"say": {"text": "hi"}, "append": {"id": "4k7f-1"}}
+
+
 def minimal(kind: str, **fields: object) -> JsonObject:
-    """Return a request of a kind with these fields, and with a text if the kind requires one."""
-    return {"request": kind, **({"text": "hi"} if kind == "say" else {}), **fields}
+    """Return a request of a kind with these fields, and with those that the kind requires."""
+    return {"request": kind, **REQUIRED.get(kind, {}), **fields}
 
 
 def refusal(message: JsonObject) -> BadRequest:
@@ -139,7 +144,7 @@ WRONG: dict[str, list[object]] = {
     "list": ["4k7f-1", 7, {"4k7f-1": 1}, [1], [None], [True], [""], ["a" * 65], [["4k7f-1"]], ["a"] * 4_097],
 }
 #: Invalid values of single fields.
-OUTSIDE: dict[str, list[object]] = {"hello name": ["", "a" * 65], "log count": [0, -1, 2_201]}
+OUTSIDE: dict[str, list[object]] = {"hello name": ["", "a" * 65], "append at": [-1], "log count": [0, -1, 2_201]}
 
 
 @pytest.mark.parametrize(
@@ -156,8 +161,9 @@ def test_a_value_of_wrong_type_or_length_is_refused_with_its_field(kind: str, op
         assert len(refused.message) < 500
 
 
-def test_say_without_a_text_is_refused() -> None:
-    assert refusal({"request": "say"}).code == "bad_field"
+@pytest.mark.parametrize("kind", REQUIRED)
+def test_a_request_without_a_required_field_is_refused(kind: str) -> None:
+    assert refusal({"request": kind}).code == "bad_field"
 
 
 def test_values_at_their_limits_are_accepted() -> None:
