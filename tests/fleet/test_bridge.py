@@ -339,6 +339,18 @@ def test_the_status_after_a_cancel_tells_the_end_of_the_goal(robot: Robot) -> No
         assert (told["active"], told["last"]["state"]) == (None, "PREEMPTED")
 
 
+def test_the_status_has_the_beginning_of_a_text_as_far_as_it_has_grown(
+    lasting_robot: Robot, client: RemoteClient
+) -> None:
+    goal = client.say("never-ends battery", more=True)
+    status = f"{ANNA}/status"
+    kept(lasting_robot.broker, status, lambda each: each["active"] == goal["id"])
+    for text in (" is", " low", " now" * 400):
+        assert client.ask("append", id=goal["id"], text=text)["ok"]
+    told = kept(lasting_robot.broker, status, lambda each: len(each["text"] or "") == 1_000)
+    assert told["text"] == ("never-ends battery is low" + " now" * 400)[:1_000]
+
+
 def of(messages: list[Published], kind: str) -> list[Message]:
     return [each.json for each in messages if each.topic == f"{ANNA}/{kind}"]
 

@@ -277,7 +277,14 @@ def test_a_robot_publishes_nothing_on_the_response_topic_of_another(lasting_robo
 
 def test_with_no_text_only_the_remote_client_reads_a_sentence(broker: Broker, make_robot: MakeRobot) -> None:
     robot = make_robot("anna", "--no-text")
-    with Listener(broker, "talk/robot/anna/+", "talk/robot/anna/event/+") as everybody:
+    with (
+        Listener(broker, "talk/robot/anna/+", "talk/robot/anna/event/+") as everybody,
+        RemoteClient(broker, "olga") as olga,
+    ):
+        goal = olga.say("never-ends se", more=True)
+        assert olga.ask("append", id=goal["id"], text="cret word")["ok"]
+        everybody.await_message(lambda each: each.topic.endswith("/status") and each.json["active"] == goal["id"])
+        assert olga.ask("cancel")["count"] == 1
         done = robot.desk("say", "--wait", "--feedback", "--key", "door", "the secret word")
         assert (done.code, "secret" in done.out) == (0, True), done
         assert robot.talk.run("say", "--wait", "--key", "door", "another secret").code == 0

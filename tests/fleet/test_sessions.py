@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli import __version__
+from talkcli.goals.goal import Goal
 from talkcli.protocol.events import greeting
 from talkcli.protocol.lines import encode
 from tests.fleet.conftest import in_loop
@@ -256,9 +257,9 @@ async def test_a_goal_that_never_reached_the_server_is_told_as_the_server_would(
     for each in range(20):
         await anna.ask(say(each), "full")
     more = {"wait": wait, "feedback": feedback, "key": "k", "priority": -2}
-    anna.post(say(1, id="waits", patient=True, **more))
+    anna.post(say(1, id="patient", patient=True, **more))
     await anna.ask(say(2, id="mine", **more))
-    await anna.ask({"seq": 3, "request": "cancel", "ids": ["waits"]}, "another")
+    await anna.ask({"seq": 3, "request": "cancel", "ids": ["patient"]}, "another")
     await anna.line(lambda each: each.get("seq") == 1)
     for number, state, reason in ((1, "RECALLED", "canceled"), (2, "REJECTED", "queue_full")):
         (reply,) = [each for each in anna.lines() if each.get("seq") == number]
@@ -267,7 +268,7 @@ async def test_a_goal_that_never_reached_the_server_is_told_as_the_server_would(
         assert (goal["text"], goal["key"], goal["priority"]) == (f"sentence {number}", "k", -2)
         assert goal["client"] == {"name": "mqtt:bob", **dict.fromkeys(goal["client"].keys() - {"name"})}
         assert bool(goal["by"]) == (number == 1)
-        assert (goal["id"] == "waits") == (number == 1)  # a rejected goal never has the id that its client chose
+        assert (goal["id"] == "patient") == (number == 1)  # a rejected goal never has the id that its client chose
         assert goal["id"] != "mine"
         told = [each for each in anna.lines() if "event" in each and goal["id"] in json.dumps(each)]
         assert [each["event"] for each in told] == (["state", "result"] if wait or feedback else [])
@@ -290,4 +291,63 @@ async def test_an_answer_that_is_too_long_for_the_broker_has_no_words_or_is_an_e
     reply = await anna.ask({"seq": 1, "request": "status"})
     assert (reply["ok"], reply["error"]["code"]) == (False, "too_long")
     assert (await anna.ask({"seq": 2, "request": "cancel"}))["count"] == 0
+    anna.sessions.end_all()
+
+
+async def begin(anna: SessionsWithoutBroker, goal_id: str, session: str = "s1", **fields: object) -> None:
+    reply = await anna.ask(say(1, id=goal_id, text="One. ", more=True, **fields), session)
+    assert reply["goal"]["more"], reply
+
+
+def append(number: int, goal_id: str, **fields: object) -> dict[str, object]:
+    return {"seq": number, "request": "append", "id": goal_id, **fields}
+
+
+@in_loop
+async def test_only_its_own_user_and_session_add_to_a_text(talk: Talk) -> None:
+    """The robot's own goals, and those of other users, can't be continued even after their senders have left."""
+    anna = SessionsWithoutBroker(talk.socket)
+    await begin(anna, "text")
+    assert (await anna.ask(append(2, "text", text="Two.", at=5)))["length"] == 9
+    anna.sessions.end_all()
+    with talk.connect() as local:
+        assert local.request("say", text="One. ", more=True, id="local")["ok"]
+        refused = await anna.ask(append(3, "local", text="Two."))
+        assert refused["error"]["code"] == "unknown_goal"
+    refused = await anna.ask(append(4, "local", text="Two."))
+    assert refused["error"]["code"] == "unknown_goal"
+    for fields in (append(5, "text", text="Three."), say(5, id="text", text="One. ", more=True)):
+        refused = await anna.ask(fields, "olga/s1")
+        assert refused["error"] == {"code": "not_sender", "message": "the goal text was not sent by olga"}
+    assert (await anna.ask(append(6, "text", text="Three.", at=9, end=True)))["length"] == 15
+    anna.sessions.end_all()
+
+
+@in_loop
+async def test_a_text_breaks_off_after_its_session_has_ended_but_may_be_continued_before(talk: Talk) -> None:
+    anna = SessionsWithoutBroker(talk.socket)
+    before = talk.request("status")["server"]["clients"]
+    for goal_id in ("kept", "left"):
+        await begin(anna, goal_id, stall=1)
+        anna.post(append(2, goal_id, text="Two.", at=5))
+    anna.post(b"")  # a goodbye; both additions still arrive
+    await await_clients(talk, before)
+    await anna.ask(append(3, "kept", text=" Three.", at=9, end=True), "s2")
+    talk.watcher.wait_for("left", "RECALLED")
+    assert (talk.goal("left")["reason"], talk.goal("left")["text"]) == ("broken_off", "One. Two.")
+    assert (talk.goal("kept")["state"], talk.goal("kept")["text"]) == ("PENDING", "One. Two. Three.")
+    anna.sessions.end_all()
+
+
+@in_loop
+async def test_the_senders_of_texts_are_known_to_a_new_bridge(talk: Talk) -> None:
+    anna = SessionsWithoutBroker(talk.socket)
+    await begin(anna, "text")
+    anna.sessions.end_all()
+    anna = SessionsWithoutBroker(talk.socket)
+    goal = Goal.from_json(talk.goal("text"))
+    anna.sessions.remember(goal, goal.id)
+    anna.sessions.remember(goal, talk.request("status")["server"]["boot"])
+    assert (await anna.ask(append(2, "text"), "olga/s1"))["error"]["code"] == "not_sender"
+    assert (await anna.ask(append(3, "text", at=5)))["ok"]
     anna.sessions.end_all()

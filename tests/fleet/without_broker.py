@@ -35,12 +35,16 @@ class SessionsWithoutBroker:
         self.sessions: RemoteSessions = RemoteSessions("anna", socket, self._publish, lambda: room, lambda: None)
 
     def post(self, fields: object, session: str = "s1", *, correlation: bytes | None = None) -> None:
-        """Send a request as bob, from an object or bytes. An empty payload is a goodbye."""
+        """Send a request, from an object or bytes. An empty payload is a goodbye.
+
+        The user is bob, unless the session is called USER/SESSION.
+        """
         payload = fields if isinstance(fields, bytes) else json.dumps(fields).encode()
-        topic, response = "talk/robot/anna/request/bob", f"talk/reply/bob/{session}"
+        full_name = _full_name(session)
+        topic = f"talk/robot/anna/request/{full_name.partition('/')[0]}"
         asked = topics.parse_request(topic)
         assert asked
-        message = Message(topic, payload, response=response, correlation=correlation)
+        message = Message(topic, payload, response=f"talk/reply/{full_name}", correlation=correlation)
         now = self._policy.newest_echo_at = self._boottime()
         found = self._policy.decide(message, *asked, now)
         if isinstance(found, policy.Goodbye):
@@ -50,7 +54,8 @@ class SessionsWithoutBroker:
             self.sessions.submit(found)
 
     def lines(self, session: str = "s1") -> list[dict[str, Any]]:
-        return [each for topic, lines in self.published if topic == f"talk/reply/bob/{session}/anna" for each in lines]
+        wanted = f"talk/reply/{_full_name(session)}/anna"
+        return [each for topic, lines in self.published if topic == wanted for each in lines]
 
     async def line(self, wanted: Callable[[dict[str, Any]], bool], session: str = "s1") -> dict[str, Any]:
         """Return the first line that matches. It may have been published before this call."""
@@ -67,10 +72,15 @@ class SessionsWithoutBroker:
             raise AssertionError(f"no such line within {PATIENCE} s: {self.published}") from None
 
     async def ask(self, fields: dict[str, Any], session: str = "s1") -> dict[str, Any]:
-        """Send a request as bob, and return the reply."""
+        """Send a request, and return the reply."""
         self.post(fields, session)
         return await self.line(lambda each: each.get("seq") == fields["seq"] and "ok" in each, session)
 
     def _publish(self, message: Message, _qos: int) -> None:
         self.published.append((message.topic, [json.loads(each) for each in message.payload.splitlines()]))
         self._more.set()
+
+
+def _full_name(session: str) -> str:
+    """Return the user and the session. The user is bob by default."""
+    return session if "/" in session else f"bob/{session}"

@@ -21,7 +21,9 @@ from talkcli.fleet.bridge.policy import (
 )
 from talkcli.fleet.payloads import Message
 from talkcli.frozen import replace
-from talkcli.goals.options import MAX_SENDER_NAME_CHARS, Cancel, Say, is_clients_id
+from talkcli.goals.goal import Goal, Sender
+from talkcli.goals.options import MAX_SENDER_NAME_CHARS, Append, Cancel, Say, is_clients_id
+from talkcli.goals.states import State
 from talkcli.protocol.lines import MAX_LINE_BYTES
 from talkcli.protocol.requests import REQUEST_TYPES
 
@@ -158,7 +160,7 @@ def test_correlation_data_that_is_too_long_is_not_returned(fields: object, code:
 
 
 def test_every_kind_of_request_except_hello_and_watch_can_be_forbidden() -> None:
-    assert {*policy.ALLOWABLE_REQUESTS, *policy.ALWAYS_ALLOWED} == {*REQUEST_TYPES}
+    assert {*policy.ALLOWABLE_REQUESTS, *policy.ALWAYS_ALLOWED, "append"} == {*REQUEST_TYPES}
     for kind in policy.ALWAYS_ALLOWED:
         assert accepted(decide(request({"request": kind}), allow=())).request.kind == kind
     for kind in policy.ALLOWABLE_REQUESTS:
@@ -166,6 +168,16 @@ def test_every_kind_of_request_except_hello_and_watch_can_be_forbidden() -> None
         assert refusal_code(decide(request(fields), allow=())) == "not_allowed"
         assert accepted(decide(request(fields), allow=(kind,))).request.kind == kind
     assert refusal_code(decide(request(b"hi", PLAIN), stale=True, allow=("cancel",))) == "not_allowed"
+
+
+@pytest.mark.parametrize("stale", [False, True])
+def test_text_may_be_added_wherever_sentences_are_allowed_even_late(stale: bool) -> None:
+    message = request({"request": "append", "id": "a", "text": "b"})
+    assert accepted(decide(message, stale=stale, allow=("say",))).request == Append("a", "b")
+    refused = decide(message, allow=("append", "cancel"))
+    assert refusal_code(refused) == "not_allowed"
+    assert isinstance(refused, Refusal)
+    assert "may not use say" in refused.error.message
 
 
 def test_a_stale_sentence_is_refused_but_a_stale_cancel_is_accepted() -> None:
@@ -272,11 +284,12 @@ def test_an_echo_older_than_the_newest_one_is_ignored() -> None:
 def test_the_last_thousand_ids_are_stored_with_the_servers_boot_id() -> None:
     ids = SentIds()
     for number in range(1200):
-        ids.add(f"goal-{number}", "1a1a")
-    ids.add("goal-200", "2b2b")  # added again, it becomes the newest
-    ids.add("more", "2b2b")
+        ids.add(f"goal-{number}", "1a1a", "bob")
+    ids.add("goal-200", "2b2b", "bob")  # added again, it becomes the newest
+    ids.add("more", "2b2b", "olga")
     known = {goal_id: ids.boot_of(goal_id) for goal_id in ("goal-200", "goal-201", "goal-202", "more")}
     assert known == {"goal-200": "2b2b", "goal-201": None, "goal-202": "1a1a", "more": "2b2b"}
+    assert [ids.user_of(goal_id) for goal_id in ("goal-202", "more", "goal-201")] == ["bob", "olga", None]
     ids.discard("more")
     assert ids.boot_of("more") is None
     ids.discard("never known")
@@ -354,3 +367,12 @@ def test_the_sender_name_of_a_remote_user_has_a_prefix_and_fits() -> None:
         == MAX_SENDER_NAME_CHARS
     )
     assert is_clients_id(f"{longest[:48]}-x{0:012x}")
+
+
+@pytest.mark.parametrize(
+    ("name", "user"),
+    [("mqtt:bob", "bob"), ("mqtt:bob patrol 2", "bob"), ("bob", None), (None, None)],
+)
+def test_the_user_of_a_remote_goal_is_part_of_its_senders_name(name: str | None, user: str | None) -> None:
+    assert policy.remote_user(Goal("a", State.PENDING, client=Sender(name=name))) == user
+    assert policy.remote_user(Goal("a", State.PENDING)) is None

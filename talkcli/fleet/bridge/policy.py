@@ -13,7 +13,7 @@ from talkcli.errors import BadRequest, LineTooLong, RequestRefused
 from talkcli.fleet import topics
 from talkcli.fleet.payloads import Message
 from talkcli.frozen import frozen, replace
-from talkcli.goals.options import MAX_SENDER_NAME_CHARS, Say
+from talkcli.goals.options import MAX_SENDER_NAME_CHARS, Append, Say
 from talkcli.protocol.events import failure, take_seq
 from talkcli.protocol.lines import MAX_LINE_BYTES, decode, encode
 from talkcli.protocol.requests import REQUEST_TYPES, read_request
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 STALE_CODE = "stale"
 #: Requests that are always allowed. They reveal nothing that the bridge doesn't publish anyway.
 ALWAYS_ALLOWED = ("hello", "watch")
-#: Requests that can be allowed with the option `--allow`.
-ALLOWABLE_REQUESTS = tuple(each for each in REQUEST_TYPES if each not in ALWAYS_ALLOWED)
+#: Requests that can be allowed with the option `--allow`. Clients that may use `say` may also use `append`.
+ALLOWABLE_REQUESTS = tuple(each for each in REQUEST_TYPES if each not in (*ALWAYS_ALLOWED, Append.kind))
 
 #: How often the bridge sends an echo to itself.
 ECHO_EVERY_S = 5.0
@@ -159,8 +159,9 @@ class Policy:
             if not repeatable:
                 raise BadRequest(f"correlation data must have at most {MAX_CORRELATION_BYTES} bytes", "bad_field")
             request = read_request(fields)
-            if request.kind not in self._allow:
-                words = f"remote clients may not use {request.kind} on this robot; add it to --allow of its bridge"
+            needed = Say.kind if isinstance(request, Append) else request.kind
+            if needed not in self._allow:
+                words = f"remote clients may not use {needed} on this robot; add it to --allow of its bridge"
                 raise BadRequest(words, "not_allowed")
             if isinstance(request, Say) and now - self.newest_echo_at > STALE_AFTER_S:
                 words = "the connection to the broker stalled; send the sentence again if it is still true"
@@ -195,27 +196,32 @@ def _parse_request_fields(kind: str, payload: bytes) -> JsonObject:
 
 
 class SentIds:
-    """The ids of recent goals, and the server that each goal was sent to.
+    """The ids of recent goals, their senders, and the server that each goal was sent to.
 
     A server is identified by its boot id.
     """
 
     def __init__(self) -> None:
-        #: for each goal id: the boot id of the goal's server, and whether the goal counts towards the limit
-        self._sent: dict[str, tuple[str, bool]] = {}
+        #: for each goal id: the boot id of the goal's server, the sender's user name, and whether the goal counts
+        #: towards the limit
+        self._sent: dict[str, tuple[str, str, bool]] = {}
 
     def boot_of(self, goal_id: str) -> str | None:
         """Return the boot id of the server that received a goal, or None if the goal is unknown."""
-        return self._sent.get(goal_id, (None, False))[0]
+        return self._sent[goal_id][0] if goal_id in self._sent else None
+
+    def user_of(self, goal_id: str) -> str | None:
+        """Return the name of the user who sent a goal, or None if the goal is unknown."""
+        return self._sent[goal_id][1] if goal_id in self._sent else None
 
     def is_counted(self, goal_id: str, boot: str) -> bool:
         """Return whether a goal was sent to the server with this boot id and counts towards the limit."""
-        return self._sent.get(goal_id) == (boot, True)
+        return self.boot_of(goal_id) == boot and self._sent[goal_id][2]
 
-    def add(self, goal_id: str, boot: str, *, counted: bool = True) -> None:
-        """Record that a goal was sent to the server with this boot id. Forget the oldest one if there are too many."""
+    def add(self, goal_id: str, boot: str, user: str, *, counted: bool = True) -> None:
+        """Record that a user sent a goal to the server with this boot id. Forget the oldest id if necessary."""
         self._sent.pop(goal_id, None)
-        self._sent[goal_id] = boot, counted
+        self._sent[goal_id] = boot, user, counted
         if len(self._sent) > MAX_REMEMBERED_IDS:
             del self._sent[next(iter(self._sent))]
 
@@ -309,6 +315,7 @@ def sender_name(user: str, name: str | None = None) -> str:
     return f"{topics.REMOTE_PREFIX}{user} {name}"[:MAX_SENDER_NAME_CHARS] if name else f"{topics.REMOTE_PREFIX}{user}"
 
 
-def is_remote(goal: Goal) -> bool:
-    """Return whether a goal was sent by a remote client."""
-    return goal.client is not None and (goal.client.name or "").startswith(topics.REMOTE_PREFIX)
+def remote_user(goal: Goal) -> str | None:
+    """Return the user name of the remote client that sent a goal, or None if the sender was a local client."""
+    name = (goal.client and goal.client.name) or ""
+    return name.removeprefix(topics.REMOTE_PREFIX).split(" ")[0] if name.startswith(topics.REMOTE_PREFIX) else None

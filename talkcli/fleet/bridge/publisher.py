@@ -20,7 +20,15 @@ from talkcli.fleet.payloads import LastGoal, Message, RobotStatus
 from talkcli.frozen import replace
 from talkcli.goals.options import MAX_LOG_GOALS
 from talkcli.goals.states import State
-from talkcli.protocol.events import PausedChanged, ServerStatus, StateChanged, from_json, goals, unfinished
+from talkcli.protocol.events import (
+    PausedChanged,
+    ServerStatus,
+    StateChanged,
+    TextAdded,
+    from_json,
+    goals,
+    unfinished,
+)
 from talkcli.protocol.features import FEATURES
 from talkcli.protocol.lines import decode, encode
 from talkcli.protocol.requests import Log, Watch
@@ -180,6 +188,8 @@ class Publisher:
         elif isinstance(event, PausedChanged):
             self._paused = event.paused
         else:
+            if isinstance(event, TextAdded):
+                self._add_text(event)
             return
         topic = topics.robot(self._sessions.name, topics.EVENT, str(message["event"]))
         self._publish(Message(topic, line + b"\n", expiry=EVENT_EXPIRY_S))
@@ -195,6 +205,14 @@ class Publisher:
             self._texts.pop(event.id, None)
             self._active = None if self._active == event.id else self._active
             self._last = event.goal or self._last
+
+    def _add_text(self, event: TextAdded) -> None:
+        """Add text to the beginning of a goal's text, and publish it if the status shows it."""
+        known = self._texts.get(event.id)
+        if known and len(known) < _MAX_STATUS_TEXT_CHARS:
+            self._texts[event.id] = (known + event.text)[:_MAX_STATUS_TEXT_CHARS]
+            if event.id == self._active and self._with_text:
+                self.schedule_status()
 
     # -- to the broker
 

@@ -22,7 +22,7 @@ from talkcli.fleet.link import boottime
 from talkcli.fleet.payloads import Message
 from talkcli.frozen import replace
 from talkcli.goals.goal import By, Goal, Sender
-from talkcli.goals.options import SHOWN_OPTIONS, Cancel, Say, Set
+from talkcli.goals.options import SHOWN_OPTIONS, Append, Cancel, Say, Set
 from talkcli.goals.states import State
 from talkcli.protocol.events import Result, StateChanged, failure, item, ok
 from talkcli.protocol.lines import MAX_LINE_BYTES, decode, encode
@@ -194,8 +194,8 @@ class RemoteSessions:
 
         The goal counts towards the limit even if it was sent with `preempt`, because the server doesn't report that.
         """
-        if policy.is_remote(goal) and self.ids.boot_of(goal.id) != boot:
-            self.ids.add(goal.id, boot)
+        if (user := policy.remote_user(goal)) and self.ids.boot_of(goal.id) != boot:
+            self.ids.add(goal.id, boot, user)
 
     def reset_pending(self, pending: tuple[Goal, ...], boot: str) -> None:
         """Replace the pending goals with those that the server has just reported."""
@@ -339,6 +339,9 @@ class RemoteSession:
             self.send_say(remote, request)
         elif isinstance(request, Cancel):
             self._send_cancel(remote, request)
+        elif isinstance(request, Append) and (owner := self._sessions.ids.user_of(request.id)) != self._user:
+            code = "not_sender" if owner else "unknown_goal"
+            self.refuse(remote, code, f"the goal {request.id} was not sent by {self._user}")
         else:
             if isinstance(request, Hello):
                 self._name = policy.sender_name(self._user, request.name)
@@ -358,12 +361,15 @@ class RemoteSession:
         assert server
         goal_id = say.id or self._new_goal_id()
         boot, counted = shared.ids.boot_of(goal_id), shared.goals.counts(say)
+        owner = shared.ids.user_of(goal_id) or self._user
         if boot not in (None, server.boot):
             words = f"{goal_id} was sent to a server that has ended; it may have been spoken"
             self.refuse(remote, "lost", words)
+        elif say.more and owner != self._user:
+            self.refuse(remote, "not_sender", f"the goal {goal_id} was not sent by {self._user}")
         elif has_room or (shared.goals.has_room(say) and not (counted and shared.waiting)):
             if self._send(_RemoteExchange(remote, remote.build_say(goal_id, boottime()), is_new=boot is None)):
-                shared.ids.add(goal_id, server.boot, counted=counted)
+                shared.ids.add(goal_id, server.boot, owner, counted=counted)
                 if counted:
                     shared.goals.add(goal_id, say.key)
         elif say.patient:
@@ -570,4 +576,5 @@ def _has_lasting_effect(remote: RemoteRequest) -> bool:
     A `patient` goal is dropped in that case.
     """
     request = remote.request
-    return not request.patient if isinstance(request, Say) else isinstance(request, Cancel | Set | Pause | Resume)
+    lasting = Append | Cancel | Set | Pause | Resume
+    return not request.patient if isinstance(request, Say) else isinstance(request, lasting)
