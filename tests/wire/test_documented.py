@@ -13,6 +13,7 @@ from talkcli.fleet.bridge import policy
 from talkcli.goals import states
 from talkcli.goals.goal import Goal
 from talkcli.goals.history import MAX_RECALLED_GOALS, MAX_REJECTED_GOALS, MAX_SPOKEN_GOALS
+from talkcli.goals.options import GROWTH_FACTOR, MAX_TEXT_BYTES, MAX_TEXT_CHARS
 from talkcli.goals.states import State
 from talkcli.protocol import events
 from talkcli.protocol.features import FEATURES
@@ -21,6 +22,7 @@ from talkcli.protocol.requests import REQUEST_TYPES
 from talkcli.server import connection, stream
 from talkcli.server.requests import MAX_CLIENT_REQUESTS, MAX_KEPT_REQUEST_BYTES, RECENT_GOALS, REQUEST_BYTES
 from talkcli.server.run import ServerSettings
+from talkcli.server.speech import MAX_UNHEARD_CHARS
 from tests.support.documents import FLEET, README, ROOT, WIRE, code_spans, first_column, tables
 from tests.support.surroundings import needs_packages
 
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
 
     from tests.support.processes import Talk
 
+NUMERALS = {5: "five"}
 ERRORS, LIMITS = tables(WIRE.section("Errors and limits"))
 
 
@@ -76,6 +79,10 @@ def test_limits_are_those_of_the_code() -> None:
     assert limits["a request"].startswith(f"{MAX_LINE_BYTES:,} bytes")
     assert f"within {connection.FIRST_REQUEST_S:g} s" in limits["the first request"]
     assert f"within {connection.LINE_LIMIT_S:g} s" in limits["a line"]
+    text = f"{MAX_TEXT_CHARS:,} characters (`--max-text`), or {NUMERALS[GROWTH_FACTOR]} times as many if it grows"
+    assert limits["a text"].startswith(text)
+    assert f"at most {MAX_TEXT_BYTES:,} bytes" in limits["a text"]
+    assert f"at most {MAX_UNHEARD_CHARS:,} characters are unheard" in limits["a growing text"]
     assert limits["invalid lines"].startswith(f"{connection.MAX_BAD_LINES} ")
     read = limits["a client that doesn't read"]
     assert f"{stream.CONGESTION_BYTES // 1024} KiB" in read
