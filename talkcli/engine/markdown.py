@@ -80,8 +80,8 @@ _PARTIAL_LINK = re.compile(
 )
 #: For each mark of emphasis, its end.
 _EMPHASIS = {
-    "*": re.compile(r"(?<![\s*\\])(?P<end>\*)(?![*a-zA-Z0-9\u00c0-\u024f])"),
-    "_": re.compile(r"(?<![\s_\\])(?P<end>_)(?!\w)"),
+    "*": re.compile(r"(?P<end>\*)(?<![\s*\\]\*)(?![*a-zA-Z0-9\u00c0-\u024f])"),
+    "_": re.compile(r"(?P<end>_)(?<![\s_\\]_)(?!\w)"),
 }
 
 

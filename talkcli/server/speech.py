@@ -61,8 +61,11 @@ require_fields(protocol.Speak, ENGINE_OPTIONS)
 
 
 def unheard_chars(record: Record) -> int:
-    """Return how many characters of a goal's text have not been heard yet."""
-    return len(record.say.text) - record.begun_end
+    """Return how many characters of a goal's text have not been heard yet, although they can be spoken.
+
+    If a goal waits for text, the rest of its text can't be spoken yet, or contains no words, such as a block of code.
+    """
+    return 0 if record.waits else len(record.say.text) - record.begun_end
 
 
 def elapsed() -> float:
@@ -322,6 +325,7 @@ class Speech:
         match event:
             case protocol.TextMissing():
                 scheduler.text_missing(event.id, now, missing=event.missing)
+                self._resume_appends(active)
                 publish = partial(self.subscribers.text_missing, event.id, time.time(), waits=event.missing)
                 self.notifications.add([publish])
                 self._set_timer()

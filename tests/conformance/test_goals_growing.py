@@ -71,6 +71,19 @@ def test_missing_text_is_feedback_and_ends_the_goal_after_the_limit(talk: Talk) 
     assert goal["message"] == "speech failed: no more text arrived for 1 s"
 
 
+def test_a_long_block_of_code_does_not_hold_its_sender_back(talk: Talk) -> None:
+    code = "```\n" + "x = 1\n" * 1_500
+    with talk.connect() as client:
+        goal_id = begin(client, "One.\n\n", format="markdown")
+        for text in (code, "y = 2\n" * 500, "```\nTwo."):
+            assert client.request("append", id=goal_id, text=text)["ok"]
+        assert client.request("append", id=goal_id, end=True)["ok"]
+        goal = result(client)
+    assert (goal["state"], len(goal["text"]) > MAX_UNHEARD_CHARS) == ("SUCCEEDED", True)
+    events = talk.watcher.events(goal_id)
+    assert [event["word"] for event in events if event["event"] == "word"] == ["One", "Two"]
+
+
 def test_only_its_own_connection_may_add_text(talk: Talk) -> None:
     with talk.connect() as client, talk.connect() as other:
         for goal_id in (begin(client), begin(client, id="mine/1")):

@@ -18,8 +18,9 @@ import pytest
 from talkcli import Client, Fleet, State
 from talkcli.cli.wait import CANCEL_TIMEOUT_S
 from talkcli.errors import Lost
+from tests.fleet.pretended import Pretended
 from tests.fleet.robot import LONG, Robot
-from tests.fleet.told import presence
+from tests.fleet.told import SERVER, presence
 from tests.support.bridge import Bridge, Desk, desk
 from tests.support.broker import Broker
 from tests.support.mqtt import Listener
@@ -182,6 +183,18 @@ def test_a_line_that_can_mean_no_robot_is_a_usage_error(lasting_robot: Robot, li
         done = somebody.run(*line.split())
     assert (done.code, done.out) == (2, ""), done
     assert words in done.err
+
+
+def test_markdown_is_only_sent_to_a_robot_whose_server_takes_it(lasting_robot: Robot) -> None:
+    done = lasting_robot.desk("say", "-w", "--markdown", "--id", "marked", "length=0 **hello**")
+    assert (done.code, lasting_robot.talk.goal("marked")["format"]) == (0, "markdown"), done
+    refused = "old-1: the server is 0.1.0 and can't take Markdown: restart it\n"
+    with Pretended(lasting_robot.broker, "old-1", lambda _: []) as robot, Desk(lasting_robot.broker) as somebody:
+        presence(robot, "old-1", server={**SERVER, "features": []})
+        done = somebody.run("--robot", "old-1", "say", "--markdown", "**hello**")
+        assert (done.code, done.out, done.err) == (9, "", f"talk: {refused}"), done
+        done = somebody.run("--robot", "old-*", "say", "--markdown", "**hello**")
+        assert (done.code, refused.removeprefix("old-1: ") in done.err) == (9, True), done
 
 
 def test_a_robot_is_asked_and_never_this_machine(broker: Broker) -> None:
