@@ -31,7 +31,7 @@ from talkcli.fleet.desk.link import ABSENCE_LIMIT_S, DeskLink
 from talkcli.fleet.desk.request import NoServer, RobotOffline
 from talkcli.fleet.link import Link, boottime
 from talkcli.frozen import replace
-from talkcli.goals.options import Cancel, Say, Set
+from talkcli.goals.options import Append, Cancel, Say, Set
 from talkcli.polling import wait_ready
 from talkcli.protocol.events import check_greeting
 from talkcli.protocol.lines import decode
@@ -119,6 +119,8 @@ class RobotConnection(Connection):
         self._absence_error: type[ServerUnavailable] = ServerUnavailable
         #: the ids of canceled goals, which are canceled again after each absence
         self._canceled: set[str] = set()
+        #: the ids of the goals whose texts this connection has begun, but not ended
+        self._growing: set[str] = set()
         #: queued lookups of goals, which are sent when earlier ones have been answered
         self._lookups: deque[Exchange] = deque()
 
@@ -170,6 +172,9 @@ class RobotConnection(Connection):
             return False
         self._published_at = time.monotonic()
         exchange.sent = True
+        if isinstance(request := exchange.request, Say | Append):
+            grows = request.more if isinstance(request, Say) else not (request.end or request.broken)
+            (self._growing.add if grows else self._growing.discard)(str(request.id))
         return True
 
     def answer_deadline(self, exchange: Exchange) -> float:
@@ -295,6 +300,9 @@ class RobotConnection(Connection):
             self._send_without_answer(Hello(self._sender))
         if self._canceled:
             self._send_without_answer(Cancel(tuple(self._canceled)))
+        self._growing &= self.listeners.goals.keys()
+        for goal_id in tuple(self._growing):
+            self._send_without_answer(Append(goal_id))  # Otherwise, the text would break off.
         self._lookups.clear()
         interrupted = [each for each in self.exchanges.values() if isinstance(each, RobotExchange)]
         self.exchanges = {each.number: each for each in interrupted}
