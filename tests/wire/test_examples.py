@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -13,10 +14,13 @@ import pytest
 
 from tests.support.documents import README, WIRE, Document
 from tests.support.surroundings import needs
+from tests.wire.test_recorded import differences
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from tests.conftest import MakeTalk
+    from tests.support.connection import Message
     from tests.support.processes import Talk
 
 #: The robot of the README's loop: it stays blocked until the sentence has been heard.
@@ -66,6 +70,23 @@ def test_line_of_socat_says_a_sentence(scripted: Talk) -> None:
     greeting, reply = map(json.loads, done.stdout.splitlines())
     assert (greeting["talk"], reply["goal"]["text"]) == (1, "battery low")
     assert scripted.watcher.wait_for_terminal(reply["goal"]["id"]) == "SUCCEEDED"
+
+
+def test_conversation_about_a_growing_text(make_talk: MakeTalk) -> None:
+    section = WIRE.section("Speak a text while it is written")
+    lines = re.findall(r"^    ([→←]) (.*)$", section, re.MULTILINE)
+    assert len(lines) == 13
+    unused: list[Message] = []
+    with make_talk("--player", "null", "--rate", "450").connect() as client:
+        for arrow, line in lines:
+            message = json.loads(line.replace(", …", ""))
+            if arrow == "→":
+                client.send(message)
+                continue
+            while not (found := [each for each in unused if not differences(message, each)]):
+                unused.append(client.receive())
+            unused.remove(found[0])
+    assert {each.get("event") for each in unused} == {"word"}
 
 
 @pytest.fixture
