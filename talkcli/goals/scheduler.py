@@ -408,6 +408,8 @@ class Scheduler:
         """Record whether the active goal is silent because the next part of its text is missing."""
         record = self._require_active(goal_id)
         record.waits = missing
+        if missing:
+            record.spoken_end = record.begun_end
         self._restart_stall(record, now)
 
     def voice_chosen(self, goal_id: str, voice: str, now: Now) -> list[Effect]:
@@ -434,6 +436,7 @@ class Scheduler:
         record = self._require_active(goal_id)
         record.duration = duration
         if record.broken:
+            record.spoken_end = record.begun_end
             return self._end(record, State.ABORTED, Reason.BROKEN_OFF, f"speech failed: {_BROKEN_OFF}", None, now)
         record.spoken_end = record.begun_end = len(record.say.text)
         words = "Talk completed successfully"

@@ -122,8 +122,15 @@ def test_a_growing_goal_is_known_again_by_its_first_text_and_shows_whether_it_gr
 def test_what_was_heard_of_a_broken_text_is_not_the_whole_text() -> None:
     robot = play("a more; append a text=bcdef; heard a; left a; completed a")
     goal = robot.goals["a"].snapshot()
-    assert (goal.text, goal.spoken) == ("abcdef", "abcd")
+    assert (goal.text, goal.spoken, goal.spoken_end) == ("abcdef", "abcd", 4)
     assert goal.message == "speech failed: its sender left before the text ended"
+
+
+def test_the_last_word_was_heard_to_its_end_if_text_is_missing() -> None:
+    robot = play("a more; append a text=bcd; heard a")
+    assert robot.goals["a"].snapshot().spoken_end == 0
+    assert robot.play("starved a").goals["a"].snapshot().spoken_end == 4
+    assert robot.play("cancel; stopped a").goals["a"].snapshot().spoken_end == 4
 
 
 def test_a_stall_is_due_at_its_limit_and_then_silence_is_due() -> None:
