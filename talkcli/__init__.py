@@ -10,12 +10,23 @@ TYPE_CHECKING = False  # importing `typing` would delay the start of the command
 if TYPE_CHECKING:
     from talkcli.client.client import Client
     from talkcli.client.goal import GoalHandle
+    from talkcli.client.stream import SpeechStream
     from talkcli.fleet.api import Fleet
     from talkcli.fleet.desk.request import Outcome
     from talkcli.fleet.payloads import Presence
     from talkcli.goals.goal import Goal
     from talkcli.goals.states import State
-    from talkcli.protocol.events import Canceled, PausedChanged, Result, ServerStatus, Snapshot, StateChanged, WordHeard
+    from talkcli.protocol.events import (
+        Canceled,
+        PausedChanged,
+        Result,
+        ServerStatus,
+        Snapshot,
+        StateChanged,
+        TextAdded,
+        TextMissing,
+        WordHeard,
+    )
 
 __version__ = "0.1.0"
 __all__ = [
@@ -30,8 +41,11 @@ __all__ = [
     "Result",
     "ServerStatus",
     "Snapshot",
+    "SpeechStream",
     "State",
     "StateChanged",
+    "TextAdded",
+    "TextMissing",
     "WordHeard",
     "__version__",
 ]
@@ -45,6 +59,7 @@ _MODULES = {
     "GoalHandle": "client.client",
     "Outcome": "fleet.desk.request",
     "Presence": "fleet.payloads",
+    "SpeechStream": "client.stream",
     "State": "goals.states",
 }
 

@@ -29,7 +29,7 @@ OUTPUT_FILE = Kind("string", (str,), "must be a string")
 FILE_MODE = Kind("string", (str,), "must be a string", "MODE")
 
 #: Options that can't be used with several robots.
-_SINGLE_ROBOT_OPTIONS = ("lines", "ahead", "feedback", "output")
+_SINGLE_ROBOT_OPTIONS = ("lines", "ahead", "stream", "feedback", "output")
 
 #: All exit codes, for `talk --help`. The help of some commands describes them more specifically.
 ALL_EXIT_CODES: ExitCodes = {

@@ -45,6 +45,7 @@ def _say_options() -> Iterator[Option]:
     yield option("--lines", FLAG, "Speak each line of standard input as it arrives.")
     words = "With --lines, keep at most N lines in the server's queue.  [default: 10]"
     yield option("--ahead", INTEGER, words, limits=(1, MAX_QUEUED_GOALS))
+    yield option("--stream", FLAG, "Speak standard input as one text, while it arrives.")
     words = "Write a WAV file instead of speaking. This needs no server, and '-' is standard output."
     yield option("-o, --output", OUTPUT_FILE, words, metavar="FILE.wav")
 
@@ -58,7 +59,7 @@ _OTHER_EXTENSIONS = (".aac", ".aiff", ".au", ".flac", ".m4a", ".mp3", ".mp4", ".
 
 def _say_fault(given: Mapping[str, Any], typed: frozenset[str]) -> str | None:
     """Return why these options of `say` can't be combined, as an error message, or None if they can."""
-    output, text, waits = given["output"], given["text"], given["wait"] or given["feedback"]
+    output, waits = given["output"], given["wait"] or given["feedback"]
     if output is not None:
         named = [long_flag(each, given[each.name]) for each in _SAY_OPTIONS if each.name in typed - _SERVERLESS_OPTIONS]
         if named:
@@ -66,18 +67,35 @@ def _say_fault(given: Mapping[str, Any], typed: frozenset[str]) -> str | None:
         extension = os.path.splitext(output)[1]
         if extension.lower() in _OTHER_EXTENSIONS:
             return f"--output writes WAV, not {extension}; name the file .wav, and convert it with ffmpeg or sox"
+    if fault := _input_fault(given, typed):
+        return fault
+    if given["flush"] and given["preempt"] is False:
+        return "--flush interrupts, but --queue waits; leave out one of them"
+    if given["timeout"] is not None and not waits and output is None:
+        return "--timeout only works with --wait; add --wait, or leave out --timeout"
+    return None
+
+
+def _input_fault(given: Mapping[str, Any], typed: frozenset[str]) -> str | None:
+    """Return why TEXT can't be combined with the options that read standard input, or None if it can."""
+    text = given["text"]
+    if given["stream"]:
+        if given["lines"]:
+            return "--stream speaks one text that grows, but --lines speaks each line; leave out one of them"
+        if text not in {(), ("-",)}:
+            return "--stream reads standard input; leave out TEXT"
+        if given["throttle"] is not None and given["key"] is None:
+            return "--stream can't compare the whole text; add --key, or leave out --throttle"
+    elif "stall" in typed:
+        return "--stall only works with --stream; add --stream, or leave out --stall"
     if given["lines"] and text:
         return "--lines reads standard input; leave out TEXT"
     if given["lines"] and given["id"] is not None:
         return "--lines speaks many lines, but --id can only name one goal; leave out one of them"
     if given["ahead"] is not None and not given["lines"]:
         return "--ahead only works with --lines; add --lines, or leave out --ahead"
-    if not given["lines"] and not text:
+    if not (given["lines"] or given["stream"] or text):
         return "TEXT is missing; type the sentence, or '-' to read standard input"
-    if given["flush"] and given["preempt"] is False:
-        return "--flush interrupts, but --queue waits; leave out one of them"
-    if given["timeout"] is not None and not waits and output is None:
-        return "--timeout only works with --wait; add --wait, or leave out --timeout"
     return None
 
 
@@ -190,6 +208,9 @@ _ROWS = (
 
         With --lines, the exit code is that of the first line that failed. The --ttl of a line starts when the line is
         read.
+
+        With --stream, speaking begins before the text has ended, for example while a language model writes it. If the
+        goal ends early, the command stops reading.
         """,
         function="say:say",
         fleet_function="several:say",
@@ -200,6 +221,7 @@ _ROWS = (
         talk say --key battery --throttle 60 "battery low"
         fortune | talk say -
         tail -n 0 -F log | talk say --lines --ttl 10
+        llm | talk say --stream --wait
         talk say -o hello.wav "hello"           needs no server
         talk say -o - "hello" | aplay
         """,

@@ -15,7 +15,7 @@ from talkcli.cli.show import Feedback, has_colour, note, show, show_json, termin
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
 from talkcli.polling import wait_ready
-from talkcli.protocol.events import PausedChanged, Result, StateChanged, WordHeard
+from talkcli.protocol.events import PausedChanged, Result, StateChanged, TextMissing, WordHeard
 from talkcli.terminal.goals import TEXT_NOT_KEPT
 from talkcli.terminal.text import MeasuredText, Screen, printable, width
 
@@ -72,6 +72,8 @@ class _LineFeedback(Feedback):
         elif isinstance(event, WordHeard):
             place = f"{event.number} {event.start}-{event.end} {event.time:.3f}"
             show(f"{printable(event.id)} word {place} {printable(event.word)}")
+        elif isinstance(event, TextMissing):
+            show(f"{printable(event.id)} {'WAITING' if event.waits else 'CONTINUES'}")
         elif isinstance(event, PausedChanged):
             show(f"{printable(event.id or '-')} {'PAUSED' if event.paused else 'RESUMED'}")
         elif isinstance(event, Result):
@@ -122,8 +124,14 @@ class _TerminalFeedback(Feedback):
             if line is None or (line.goal.id != goal.id and _is_spoken(event)):
                 line = self._line = _GoalLine(goal)
             if line.goal.id == goal.id:
-                line.update(event)
+                line.update(goal, event)
         self._paint()
+
+    def text_added(self, goal: Goal) -> None:
+        """Show the new text of the goal, if the line shows this goal."""
+        if self._line and self._line.goal.id == goal.id:
+            self._line.grow(goal.text or "")
+            self._paint()
 
     def note(self, message: str) -> None:
         """Write a message to standard error, and repaint the line below it."""
@@ -206,15 +214,25 @@ class _GoalLine:
         self.goal = goal
         self.paused = goal.paused
         self.state = State.PENDING if goal.state.terminal else goal.state
+        self.waits = goal.waits
         self.text = MeasuredText(TEXT_NOT_KEPT if goal.text is None else goal.text)
         heard = len(goal.spoken or "")
         #: the start and end of the current word, as indices into the text
         self.word = (heard, heard)
 
-    def update(self, event: Event) -> None:
-        """Update the current word or the state after an event."""
+    def grow(self, text: str) -> None:
+        """Add the end of a text that has grown."""
+        self.text.extend(text[len(self.text) :])
+
+    def update(self, goal: Goal, event: Event) -> None:
+        """Update the current word, the text or the state after an event."""
         if isinstance(event, WordHeard):
+            if goal.text is not None and event.end > len(self.text):
+                # Only the sender knows the new text before it is heard.
+                self.grow(goal.text if event.end <= len(goal.text) else goal.text.ljust(event.start) + event.word)
             self.word = (event.start, event.end)
+        elif isinstance(event, TextMissing):
+            self.waits = event.waits
         elif isinstance(event, StateChanged) and event.state is not State.PENDING:
             # A PENDING event may arrive late, when the goal is already in a later state.
             self.state = event.state
@@ -223,7 +241,9 @@ class _GoalLine:
         """Return the line as text with terminal codes, cut to the width of the terminal."""
         # Leave the last column free, because some terminals start a new line as soon as it is filled.
         columns = terminal_columns(sys.stdout) - 1
-        state = "PAUSED" if self.paused and self.state is State.ACTIVE else self.state.name
+        state = self.state.name
+        if self.state is State.ACTIVE and (self.paused or self.waits):
+            state = "PAUSED" if self.paused else "WAITING"
         head = f"{printable(self.goal.id)}  {Screen(colour=True).coloured(f'{state:<9}', self.state)}  "
         if columns - width(head) < _MIN_SENTENCE_COLUMNS:
             head = ""

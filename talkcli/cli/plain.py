@@ -152,7 +152,9 @@ def may_send_early(plain: PlainCommand) -> bool:
     """
     if named_robot(plain.common.get("robot"), plain.common.get("socket")):
         return False
-    return plain.command.name in _EARLY_COMMANDS and not plain.given.get("lines") and plain.given.get("text") != ("-",)
+    given = plain.given
+    reads_input = given.get("lines") or given.get("stream") or given.get("text") == ("-",)
+    return plain.command.name in _EARLY_COMMANDS and not reads_input
 
 
 def _connect_early(plain: PlainCommand, before_sending: Callable[[], None]) -> ConnectionAttempt | None:

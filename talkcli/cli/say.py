@@ -1,7 +1,7 @@
 """The command `talk say`, which speaks a text or writes the speech to a file.
 
-The module `stdin` reads standard input. This module must not import click, because simple command lines are run without
-it. Only `-o` imports the engine, because it works without a server.
+The modules `stdin` and `stream` read standard input. This module must not import click, because simple command lines
+are run without it. Only `-o` imports the engine, because it works without a server.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import os
 from talkcli.cli.command import read_value, replace_bad_bytes
 from talkcli.cli.interrupts import Interrupts, discard_unread_output
 from talkcli.cli.show import note, retry_without_output, show_error, show_if_possible, show_json, standard_output
-from talkcli.cli.wait import GoalReporter, seconds_left, timeout_error
+from talkcli.cli.wait import GoalReporter, seconds_left, timeout_error, wait_for_goal
 from talkcli.errors import EXIT_OK, Lost, UsageError
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import MARKDOWN, SOUND_OPTIONS
@@ -35,6 +35,8 @@ def say(
     name: str | None,
     lines: bool,
     ahead: int | None,
+    stream: bool,
+    stall: float,
     output: str | None,
     **goal_options: Any,
 ) -> int:
@@ -49,16 +51,20 @@ def say(
         name: the sender's name.
         lines: whether to speak each line of standard input.
         ahead: with `lines`, how many goals may be pending at once. None stands for the default.
+        stream: whether to speak standard input as one goal while it arrives.
+        stall: with `stream`, how long the goal waits for more text.
         output: the file to write, or None to speak.
         goal_options: the options of the goal.
     """
     wait = wait or feedback
     if output is None:
         discard_unread_output()
-    if lines:
+    if lines or stream:
+        common = (options, name, goal_options, wait, feedback, timeout)
         from talkcli.cli.stdin import LineSpeaker
+        from talkcli.cli.stream import StreamSpeaker
 
-        return LineSpeaker(options, name, goal_options, wait, feedback, timeout, ahead).run()
+        return (StreamSpeaker(*common, stall) if stream else LineSpeaker(*common, ahead)).run()
     found = _read_input(options, timeout, wait, feedback, output) if text == ("-",) else " ".join(text)
     if isinstance(found, int):
         return found  # nothing can be spoken
@@ -73,7 +79,7 @@ def say(
                 goal = client.say(sentence, follow=wait, feedback=feedback, **goal_options)
                 reporter = GoalReporter(options, feedback=feedback)
                 if wait and goal.state is not State.REJECTED:
-                    return _wait_for_goal(goal, interrupts, timeout, options, reporter)
+                    return wait_for_goal(goal, interrupts, timeout, options, reporter)
                 return retry_without_output(_report_sent, goal, options, reporter)
         except Lost as error:
             if interrupts.signal_number is None:
@@ -118,32 +124,6 @@ def _report_sent(goal: GoalHandle, options: CommonOptions, reporter: GoalReporte
     reporter.show_accepted(goal)
     code = reporter.report(goal.goal)
     return code if goal.state.terminal else EXIT_OK
-
-
-def _wait_for_goal(
-    goal: GoalHandle, interrupts: Interrupts, timeout: float | None, options: CommonOptions, reporter: GoalReporter
-) -> int:
-    """Wait until a goal has ended, or cancel it if interrupted or late. Report the end, and return the exit code.
-
-    The goal is cancelled if the wait is interrupted or times out. However, if an earlier command has already sent a
-    goal with the same id, that goal isn't cancelled.
-    """
-    try:
-        reporter.show_accepted(goal)
-        reporter.follow([goal], seconds_left(options.deadline(timeout)))
-    except (Interrupted, OSError) as error:
-        interrupts.record(error)
-        timed_out = interrupts.signal_number is None and not interrupts.reader_gone
-        if not goal.attached:
-            reporter.cancel(goal, interrupts)
-        if not timed_out:
-            return interrupts.exit_code
-        if goal.state is State.SUCCEEDED:
-            return EXIT_OK
-        raise timeout_error(timeout, f"{goal.id} was sent earlier and continues" if goal.attached else "") from None
-    finally:
-        retry_without_output(reporter.feedback.close)
-    return reporter.report(goal.goal)
 
 
 def _write_file(

@@ -77,7 +77,7 @@ def read_text(end: float | None, *, stop_without_reader: bool = False, any_lengt
         while any_length or len(data) <= MAX_TEXT_BYTES + len("\r\n"):
             if not wait_ready({0: select.POLLIN}, seconds_left(end), interrupts.watched):
                 raise TimedOut("standard input did not end in time; nothing was sent")
-            more = _read_available()
+            more = read_available()
             if more == b"":
                 return _decode_text(bytes(data))
             data += more or b""
@@ -160,7 +160,7 @@ class LineBuffer:
             yield self.take()
 
 
-def _read_available() -> bytes | None:
+def read_available() -> bytes | None:
     """Read from standard input, and return the data, b"" at its end, or None if no input is available yet."""
     try:
         return os.read(0, _STDIN_READ_BYTES)
@@ -420,7 +420,7 @@ class LineSpeaker:
             if watched.pop(0, None) is None:
                 raise
             wait_ready({}, 0, watched)  # raises Interrupted again if there was also a signal or closed output
-            data = _read_available()
+            data = read_available()
             if data is not None:
                 self._buffer.feed(data, time.monotonic())
             if self._unanswered or self._goals:  # read from the server even if there is always more input

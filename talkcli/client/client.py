@@ -22,7 +22,17 @@ from talkcli.client.goal import GoalHandle
 from talkcli.errors import Lost, UnknownGoal, UsageError
 from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.goal import Goal
-from talkcli.goals.options import MAX_ID_CHARS, MAX_IDS, MAX_LOG_GOALS, Cancel, Say, Set, bad_option, check_key
+from talkcli.goals.options import (
+    MAX_ID_CHARS,
+    MAX_IDS,
+    MAX_LOG_GOALS,
+    STALL_S,
+    Cancel,
+    Say,
+    Set,
+    bad_option,
+    check_key,
+)
 from talkcli.goals.states import State
 from talkcli.protocol.events import Canceled, ServerStatus, Snapshot, goal_in, goals
 from talkcli.protocol.lines import MAX_LINE_BYTES, request_line, write_request
@@ -33,6 +43,7 @@ if TYPE_CHECKING:
 
     from talkcli.client.connection import Connection
     from talkcli.client.core import OnReply
+    from talkcli.client.stream import SpeechStream
     from talkcli.goals.goal import JsonObject
     from talkcli.protocol.events import Event
 
@@ -197,7 +208,7 @@ class Client:
             format=format,
         )
         if not block and id is None:
-            request = replace(request, id=f"talk:{os.urandom(8).hex()}")
+            request = replace(request, id=_new_goal_id())
         handle, accepted = self._create_handle(request)
         if handle.state.terminal:
             return handle
@@ -207,6 +218,81 @@ class Client:
             handle._expect(request, time.monotonic())
             self._connection.submit(request, accepted, handle._fail)
         return handle
+
+    def stream(
+        self,
+        *,
+        preempt: bool | None = None,
+        flush: bool = False,
+        priority: int = 0,
+        ttl: float | None = None,
+        key: str | None = None,
+        throttle: float | None = None,
+        id: str | None = None,  # noqa: A002 - the option has this name everywhere
+        rate: int | None = None,
+        volume: float | None = None,
+        voice: str | None = None,
+        voice_only: bool = False,
+        pitch: int | None = None,
+        lead_in: int | None = None,
+        audible: bool | None = None,
+        data: JsonObject | None = None,
+        format: str = "text",  # noqa: A002 - the option has this name everywhere
+        stall: float = STALL_S,
+        feedback: bool = False,
+        patient: bool = False,
+    ) -> SpeechStream:
+        """Return a stream, whose text is spoken while it is written.
+
+            with talk.stream(preempt=True) as speech:
+                for token in model:
+                    if not speech.write(token):
+                        break
+            speech.wait()
+
+        The goal is sent with the first text that can be spoken. A text has at most 50,000 characters. If the connection
+        breaks, the client reconnects and continues the text.
+
+        The arguments are those of `say`, and `stall`: the seconds for which the goal waits for more text after all of
+        it was spoken, 1 to 60. After that, it is ABORTED with the reason `text_stalled`. A throttle needs a key,
+        because the whole text isn't known yet. If `id` is None, the client chooses an id.
+
+        Raises:
+            UsageError: a value is out of its range.
+            ProtocolMismatch: the server is too old for growing texts.
+        """
+        from talkcli.client.stream import SpeechStream  # rarely needed, and slow to import
+
+        say = Say(
+            "",
+            wait=True,
+            feedback=feedback,
+            patient=patient,
+            preempt=preempt,
+            flush=flush,
+            priority=priority,
+            ttl=ttl,
+            key=key,
+            throttle=throttle,
+            id=id,
+            rate=rate,
+            volume=volume,
+            voice=voice,
+            voice_only=voice_only,
+            pitch=pitch,
+            lead_in=lead_in,
+            audible=audible,
+            data=data,
+            format=format,
+            more=True,
+            stall=stall,
+        )
+        check(say)
+        if error := self._connection.unsupported(say):
+            raise error
+        if id is None and isinstance(self._connection, ReconnectingConnection):
+            say = replace(say, id=_new_goal_id())
+        return SpeechStream(self._connection, say)
 
     def follow(self, ids: Iterable[str] | None = None, *, feedback: bool = False) -> list[GoalHandle]:
         """Receive the events of goals that any client has sent, and return their handles.
@@ -421,6 +507,11 @@ class Client:
             yield event
         why = f"no more events from the server at {self.path}: {self._connection.ended}"
         raise Lost(buffer.closed or why)
+
+
+def _new_goal_id() -> str:
+    """Return a new random goal id."""
+    return f"talk:{os.urandom(8).hex()}"
 
 
 def check_id(goal_id: str) -> None:

@@ -31,10 +31,20 @@ from talkcli.errors import (
 )
 from talkcli.frozen import TYPE_CHECKING, frozen, replace
 from talkcli.goals.goal import Goal, read_fields
-from talkcli.goals.options import Say
+from talkcli.goals.options import Append, Say
 from talkcli.goals.states import State
 from talkcli.protocol import events
-from talkcli.protocol.events import PausedChanged, Result, ServerStatus, Snapshot, StateChanged, WordHeard, goals
+from talkcli.protocol.events import (
+    PausedChanged,
+    Result,
+    ServerStatus,
+    Snapshot,
+    StateChanged,
+    TextAdded,
+    TextMissing,
+    WordHeard,
+    goals,
+)
 from talkcli.protocol.features import FEATURES, missing_features
 from talkcli.protocol.lines import FIRST_NUMBER, LineSplitter, decode, request_line, write_request
 from talkcli.protocol.requests import Pause, Wait, Watch
@@ -58,8 +68,8 @@ SILENCE_LIMIT_S = 15.0
 MAX_UNSENT_BYTES = 256 * 1024
 #: The minimum TTL in a request, because 0 would mean no limit.
 MIN_TTL_S = 0.01
-#: Maximum number of buffered words and pauses. If there are more, the oldest are dropped. This is enough for the
-#: longest text, which has 10,000 characters and thus at most 5,000 words.
+#: Maximum number of buffered words, pauses and additions to texts. If there are more, the oldest are dropped. This is
+#: enough for 10,000 characters, which have at most 5,000 words.
 MAX_FEEDBACK_EVENTS = 5_000
 #: Maximum number of buffered state changes, which is enough for about 3,000 goals. If there are more, the reader's
 #: stream ends.
@@ -92,7 +102,7 @@ class EventBuffer:
         if self.closed is not None:
             return
         self._count += 1
-        if isinstance(event, WordHeard | PausedChanged):
+        if isinstance(event, WordHeard | TextAdded | TextMissing | PausedChanged):
             self._feedback.append((self._count, event))
         elif len(self._states) < MAX_STATE_EVENTS:
             self._states.append((self._count, event))
@@ -154,14 +164,14 @@ class EventListeners:
             for tracked in self._goals.pop(event.goal.id, set()):
                 tracked._update(event.goal)
             return
-        if isinstance(event, StateChanged | WordHeard | PausedChanged):
+        if isinstance(event, StateChanged | WordHeard | TextMissing | PausedChanged):
             for goal_id in self._goals if isinstance(event, PausedChanged) else [event.id]:
                 for tracked in self._goals.get(goal_id, set()):
                     tracked._hear(event)
             state = event.state if isinstance(event, StateChanged) and not event.goal else None
             if state is State.PENDING or (state and state.terminal):
                 return  # clients that watch all goals receive this event again, with the whole goal
-        elif not isinstance(event, Snapshot):
+        elif not isinstance(event, TextAdded | Snapshot):
             return
         for buffer in self.watches:
             buffer.add(event)
@@ -203,6 +213,10 @@ class TrackedGoal:
         if not self.goal.state.terminal:
             listeners.add(self)
 
+    def _grow(self, text: str) -> None:
+        """Add text that the server has accepted, unless the goal has ended. The Result has the whole text."""
+        self._update(replace(self.goal, text=(self.goal.text or "") + text))
+
     def _fail(self, error: TalkError) -> None:
         """End the goal because `say` failed: as LOST if the goal may be spoken, and otherwise as REJECTED."""
         from talkcli.goals.reasons import Reason  # rarely needed, and slow to import
@@ -225,7 +239,7 @@ class TrackedGoal:
         if not self.goal.state.terminal:
             self.goal = goal
 
-    def _hear(self, event: StateChanged | WordHeard | PausedChanged | Goal) -> None:
+    def _hear(self, event: StateChanged | WordHeard | TextMissing | PausedChanged | Goal) -> None:
         """Update the goal from an event or from its state after reconnecting, and buffer the event."""
         if self.goal.state.terminal:
             return
@@ -243,6 +257,8 @@ class TrackedGoal:
                 self.speech_paused = event.paused
                 paused = event.paused and event.id == self.goal.id and self.goal.state is State.ACTIVE
                 self.goal = replace(self.goal, paused=paused)
+            elif isinstance(event, TextMissing):
+                self.goal = replace(self.goal, waits=event.waits)
             if self._with_feedback:
                 self._buffer.add(event)
 
@@ -324,7 +340,10 @@ class Exchange:
     @property
     def slow(self) -> bool:
         """Whether there is no time limit for the answer."""
-        return isinstance(self.request, Pause) or (isinstance(self.request, Say) and self.request.patient)
+        request = self.request
+        if isinstance(request, Append):
+            return not request.broken
+        return isinstance(request, Pause) or (isinstance(request, Say) and request.patient)
 
     @property
     def over(self) -> bool:

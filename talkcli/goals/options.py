@@ -516,6 +516,7 @@ OPTIONS = (
         "aborted (`text_stalled`)",
         default=STALL_S,
         limits=(MIN_STALL_S, MAX_STALL_S),
+        help="With --stream, stop if no text arrives for SEC seconds. The time starts when all of it was spoken.",
     ),
     Option(
         "format",
@@ -705,15 +706,20 @@ def bad_text(text: str, max_chars: int | None = MAX_TEXT_CHARS) -> Refusal | Non
         text: the text.
         max_chars: the maximum length, or None for no limit.
     """
-    import unicodedata
-
     from talkcli.goals.reasons import Reason
 
     if refused := bad_characters(text, max_chars):
         return refused
-    if all(unicodedata.category(each) in _SILENT_CATEGORIES for each in text):
+    if not is_visible(text):
         return Reason.INVALID_TEXT, "the text is empty" if not text.strip() else "the text has no visible characters"
     return None
+
+
+def is_visible(text: str) -> bool:
+    """Return whether a text contains a visible character, so that it may be spoken."""
+    import unicodedata
+
+    return any(unicodedata.category(each) not in _SILENT_CATEGORIES for each in text)
 
 
 def bad_characters(text: str, max_chars: int | None, before_chars: int = 0) -> Refusal | None:

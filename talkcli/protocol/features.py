@@ -26,6 +26,7 @@ class Feature:
 
 #: All features, by name. Never remove one.
 FEATURES = {
+    "append": Feature("take growing texts", lambda request: request.get("more") is True),
     "markdown": Feature("take Markdown", lambda request: request.get("format") == "markdown"),
 }
 

@@ -14,7 +14,7 @@ from talkcli.goals.goal import message_details
 from talkcli.goals.options import format_number
 from talkcli.goals.states import State
 from talkcli.protocol.lines import encode
-from talkcli.terminal.text import COLUMN_GAP, TEXT_COLUMNS, Screen, fit_row, pad, printable, width, wrap
+from talkcli.terminal.text import COLUMN_GAP, ELLIPSIS, TEXT_COLUMNS, Screen, fit_row, pad, printable, width, wrap
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -87,11 +87,11 @@ def goal_lines(goal: Goal, screen: Screen, now: float) -> list[str]:
     state = screen.coloured(goal.state.name, goal.state)
     rows = [
         ("id", printable(goal.id)),
-        ("state", f"{state}, paused" if goal.paused and not goal.state.terminal else state),
+        ("state", ", ".join([state, *_interruptions(goal)])),
         ("reason", goal.reason and printable(goal.reason)),
         ("message", goal.message and printable(goal.message)),
         ("ended", _describe_cause(goal.by) if goal.by else None),
-        ("text", _quote(goal.text)),
+        ("text", _quote(_shown_text(goal))),
         ("spoken", _quote(goal.spoken)),
         ("heard", goal.heard and goal.heard != goal.duration and f"{goal.heard:.2f} s of audio"),
         ("from", _describe_sender(goal.client)),
@@ -209,7 +209,19 @@ def _tail_forms(goal: Goal, screen: Screen, now: float) -> list[str]:
 
 def quoted_text(goal: Goal, limit: int | None = None) -> str:
     """Return a goal's text in quotes, cut to `limit` characters, or a placeholder if it is no longer kept."""
-    return _quote(goal.text, limit) or TEXT_NOT_KEPT
+    return _quote(_shown_text(goal), limit) or TEXT_NOT_KEPT
+
+
+def _shown_text(goal: Goal) -> str | None:
+    """Return a goal's text, with an ellipsis if it may still grow, or None if it is no longer kept."""
+    return goal.text + ELLIPSIS if goal.text is not None and goal.more and not goal.state.terminal else goal.text
+
+
+def _interruptions(goal: Goal) -> list[str]:
+    """Return why an unfinished goal is silent at the moment, or an empty list."""
+    if goal.state.terminal:
+        return []
+    return ["paused"] * goal.paused + ["waiting for text"] * goal.waits
 
 
 def _quote(text: str | None, limit: int | None = None) -> str | None:
@@ -219,9 +231,9 @@ def _quote(text: str | None, limit: int | None = None) -> str | None:
 
 def _unfinished_details(goal: Goal, now: float) -> list[str]:
     """Return details of an unfinished goal, such as its priority and key."""
-    paused = "paused, " if goal.paused else ""
+    interruptions = "".join(f"{each}, " for each in _interruptions(goal))
     notes = [
-        None if goal.started_at is None else f"{paused}for {max(0.0, now - goal.started_at):.1f} s",
+        None if goal.started_at is None else f"{interruptions}for {max(0.0, now - goal.started_at):.1f} s",
         f"priority {goal.priority}" if goal.priority else None,
         None if goal.key is None else f'key "{printable(goal.key)}"',
         _describe_time_left(goal, now),

@@ -199,9 +199,19 @@ class MeasuredText:
     """A text with precomputed character widths, so that parts of it can be extracted quickly."""
 
     def __init__(self, text: str) -> None:
-        self._shown = [printable(each) for each in text]
+        self._shown: list[str] = []
         #: the column at which each character starts, followed by the column at which the text ends
-        self._columns = [0, *accumulate(map(width, self._shown))]
+        self._columns = [0]
+        self.extend(text)
+
+    def __len__(self) -> int:
+        return len(self._shown)
+
+    def extend(self, text: str) -> None:
+        """Add text at the end."""
+        added = [printable(each) for each in text]
+        self._shown += added
+        self._columns += accumulate(map(width, added), initial=self._columns.pop())
 
     @property
     def whole(self) -> str:

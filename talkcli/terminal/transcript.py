@@ -6,11 +6,20 @@ id, text, sender, reason.
 
 from __future__ import annotations
 
+import re
 import time
 
 from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.states import State
-from talkcli.protocol.events import PausedChanged, Snapshot, StateChanged, WordHeard, unfinished
+from talkcli.protocol.events import (
+    PausedChanged,
+    Snapshot,
+    StateChanged,
+    TextAdded,
+    TextMissing,
+    WordHeard,
+    unfinished,
+)
 from talkcli.terminal.goals import clock_time, listed_reason_forms, quoted_text, reason_forms, sender_forms
 from talkcli.terminal.text import (
     COLUMN_GAP,
@@ -40,6 +49,10 @@ _FIRST_ID_COLUMNS = 3
 _MAX_NAME_COLUMNS = 20
 #: The indentation of continuation lines, which is the width of the time column.
 _INDENT_COLUMNS = 10
+#: Complete sentences and lines. Text that is added to a goal is shown when one of them is complete.
+_COMPLETE_SENTENCES = re.compile(r".*(?:[.!?…][\"'”’»)]*\s|[。！？\n])", re.DOTALL)
+#: The length at which added text is shown even if no sentence is complete.
+_MAX_UNSHOWN_CHARS = 200
 #: The maximum number of unfinished goals to remember. The oldest goal is dropped first.
 _MAX_REMEMBERED_GOALS = 1000
 
@@ -94,6 +107,10 @@ class Transcript:
         self._full = full
         self._with_words = words
         self._goals: dict[str, Goal] = {}
+        #: how many characters of each growing text have been shown, by goal id
+        self._shown_chars: dict[str, int] = {}
+        #: the goals of which a word was heard since they last waited for text
+        self._heard: set[str] = set()
         self._paused = False
         self._robot, self._boot = robot, boot
         self._widths = widths or ColumnWidths()
@@ -109,10 +126,17 @@ class Transcript:
             return self._format_state_change(event, screen, now)
         if isinstance(event, PausedChanged):
             return [self._format_pause(event, screen, now)]
-        if isinstance(event, WordHeard) and self._with_words:
-            word = f"{printable(event.word)}{COLUMN_GAP}{event.time:.2f} s"
-            return [self._head_columns(event.at or now, "word", None, event.id, screen) + word]
-        return []  # results aren't shown, and words only on request
+        if isinstance(event, TextAdded | TextMissing):
+            return self._format_growth(event, screen, now)
+        if isinstance(event, WordHeard):
+            return self._format_word(event, screen, now)
+        return []  # results aren't shown
+
+    def _format_word(self, event: WordHeard, screen: Screen, now: float) -> list[str]:
+        """Remember that a word of the goal was heard, and return the line that shows it if words are shown."""
+        self._heard.add(event.id)
+        word = f"{printable(event.word)}{COLUMN_GAP}{event.time:.2f} s"
+        return [self._head_columns(event.at or now, "word", None, event.id, screen) + word] * self._with_words
 
     def _format_snapshot(self, event: Snapshot, screen: Screen, now: float) -> list[str]:
         """Remember the server's state, and return a line about the server and the lines of all unfinished goals."""
@@ -142,6 +166,8 @@ class Transcript:
         goal = self._goals.get(event.id)
         if event.state.terminal:
             self._goals.pop(event.id, None)
+            self._shown_chars.pop(event.id, None)
+            self._heard.discard(event.id)
         brief = event.state is State.PREEMPTING or (event.state is State.PENDING and starts_at_once)
         if brief and not self._full:
             return []
@@ -149,6 +175,28 @@ class Transcript:
         if goal is None:
             return [self._head_columns(at, event.state.name, event.state, event.id, screen).rstrip()]
         return self._format_goal(goal, event.state, at, screen)
+
+    def _format_growth(self, event: TextAdded | TextMissing, screen: Screen, now: float) -> list[str]:
+        """Remember added text, and return the lines that show its new sentences, or that the goal waits for text.
+
+        A goal also waits before its first word, until there is enough text. This isn't shown.
+        """
+        waits = isinstance(event, TextMissing) and event.waits and event.id in self._heard
+        goal, at, lines = self._goals.get(event.id), event.at or now, []
+        if goal is not None and goal.text is not None:
+            text = goal.text[: event.start] + event.text if isinstance(event, TextAdded) else goal.text
+            # The sentences that were complete at the beginning have been shown with the goal.
+            shown = self._shown_chars.get(event.id, _complete_chars(goal.text, 0))
+            is_due = waits or len(text) - shown > _MAX_UNSHOWN_CHARS
+            end = len(text) if is_due else _complete_chars(text, shown)
+            if added := text[shown:end].strip():
+                head = self._head_columns(at, "text", None, event.id, screen)
+                lines.append(fit_row(head, quoted_text(replace(goal, text=added, more=False)), [""], 0, screen))
+            self._goals[event.id], self._shown_chars[event.id] = replace(goal, text=text), end
+        if waits:
+            self._heard.discard(event.id)
+            lines.append(self._head_columns(at, "waiting", State.PREEMPTING, event.id, screen) + "for more text")
+        return lines
 
     def _format_pause(self, event: PausedChanged, screen: Screen, now: float) -> str:
         """Remember whether speech is paused, and return the line that says so."""
@@ -182,6 +230,12 @@ class Transcript:
         robot = [] if self._robot is None else [self._widths.pad_robot(self._robot, screen)]
         cells = (screen.coloured(pad(word, 10), state), self._widths.pad_goal_id(goal_id, screen))
         return COLUMN_GAP.join((clock_time(at), *robot, *cells, ""))
+
+
+def _complete_chars(text: str, start: int) -> int:
+    """Return the offset after the last complete sentence that follows the offset `start`."""
+    found = _COMPLETE_SENTENCES.match(text, start)
+    return found.end() if found else start
 
 
 def log_lines(goals: Sequence[Goal], screen: Screen, now: float) -> list[str]:

@@ -29,7 +29,8 @@ GROUND = {"errors", "frozen", "install", "paths", "peers", "polling", "processes
 FACE = {"", "__main__"}
 #: The pure modules outside `goals`, `protocol` and `terminal`, which are all pure.
 PURE = [
-    *("errors", "frozen", "client.core", "engine.child.cutting", "engine.child.words", "engine.markdown"),
+    *("errors", "frozen", "client.core", "client.growing"),
+    *("engine.child.cutting", "engine.child.words", "engine.markdown"),
     *("engine.child.synthesizers.guard", "engine.child.synthesizers.phonemes", "engine.child.synthesizers.vits"),
     *("fleet.payloads", "fleet.topics", "fleet.bridge.policy"),
     *("fleet.desk.request", "fleet.desk.table"),

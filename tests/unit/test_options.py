@@ -186,6 +186,10 @@ def test_the_librarys_parameters_agree_with_the_rows() -> None:
     assert parameters == {option.name: (own[option.name], option.default) for option in rows}
     typed = [option.name for option in rows if option.flags and option.name != "feedback"]
     assert [name for name in parameters if name in typed] == typed
+    streamed = declared(Client.stream)
+    only_said = {"text", "follow", "block"}
+    assert streamed.pop("stall") == (own["stall"], ROWS["stall"].default)
+    assert streamed == {name: kind for name, kind in declared(Client.say).items() if name not in only_said}
     assert list(declared(Client.set).items()) == [(row.name, (annotated(Set)[row.name], None)) for row in SETTINGS]
 
 
