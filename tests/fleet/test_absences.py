@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import subprocess
 import threading
 import time
 from typing import TYPE_CHECKING
@@ -20,7 +21,8 @@ from tests.support.proxy import Proxy
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
-    from tests.fleet.conftest import MakeRobot
+    from tests.conftest import MakeTalk
+    from tests.fleet.conftest import MakeBridge, MakeRobot
     from tests.support.broker import Broker
     from tests.support.processes import Finished
     from tests.support.proxy import Direction
@@ -90,6 +92,31 @@ def test_a_broker_that_is_killed_in_mid_sentence_costs_no_result(robot: Robot) -
         robot.bridge.await_online(within=BACK)
         assert robot.desk("say", "--wait", "back").code == 0
     assert robot.spoken == ["length=0.5 long", "one of its own", "back"]
+
+
+def test_a_growing_text_is_continued_after_the_broker_was_killed(
+    make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge
+) -> None:
+    talk = make_talk("--player", "null", "--rate", "450")
+    bridge = make_bridge(talk, broker, "anna")
+    with Desk(broker) as somebody:
+        options = ("--stall", "30", "--wait", "--id", "mine")
+        asked = somebody.start("--robot", "anna", "--json", "say", "--stream", *options, stdin=subprocess.PIPE)
+        for text in ("One. ", "Two. "):
+            assert asked.stdin
+            asked.stdin.write(text)
+            asked.stdin.flush()
+            if text == "Two. ":
+                broker.start()
+            talk.watcher.wait_until(lambda each, text=text: text.strip(". ") in each.get("word", ""), BACK)  # type: ignore[misc]
+            if text == "One. ":
+                broker.kill()
+                bridge.await_log("can't connect to the broker")
+        assert_one_result(somebody.finish(asked, stdin="Three."))
+    assert talk.goal("mine")["text"] == "One. Two. Three."
+    assert talk.watcher.states("mine") == ["PENDING", "ACTIVE", "SUCCEEDED"]
+    assert [each["word"] for each in talk.watcher.words("mine")] == ["One", "Two", "Three"]
+    bridge.await_online(within=BACK)
 
 
 @pytest.mark.parametrize("way", ["to_client", "to_broker"])

@@ -166,6 +166,7 @@ NUMBER, ONE_ROBOT = "a goal's number is only valid on one server", "only works w
     ("line", "words"),
     [
         ("say --lines", f"'talk say --lines' {ONE_ROBOT}"),
+        ("say --stream", f"'talk say --stream' {ONE_ROBOT}"),
         ("say -f hello", f"'talk say --feedback' {ONE_ROBOT}"),
         ("say -wf hello", f"'talk say --feedback' {ONE_ROBOT}"),
         ("say -o - hello", "'talk say --output' only works on this machine"),
