@@ -198,8 +198,9 @@ def test_typed_lines_are_highlighted_one_after_the_other(scripted: Talk, in_term
     assert terminal.screen.attributes == ""
 
 
-def test_aborted_goals_refer_to_the_doctor_unless_they_had_no_words(scripted: Talk) -> None:
-    for text, told in (("fail=audio_lost", True), ("fail=nothing_to_say", False), ("length=0", False)):
+def test_aborted_goals_refer_to_the_doctor_unless_their_texts_are_to_blame(scripted: Talk) -> None:
+    others = [f"fail={reason}" for reason in ("nothing_to_say", "text_stalled", "broken_off")]
+    for text, told in (("fail=audio_lost", True), ("length=0", False), *((each, False) for each in others)):
         assert scripted.run("say", "--wait", "--", text).err.endswith("; find out why with: talk doctor\n") == told
 
 

@@ -96,7 +96,8 @@ class GoalReporter:
             from talkcli.terminal.goals import describe_end
 
             words = describe_end(goal)
-            if goal.state is State.ABORTED and goal.reason != "nothing_to_say":
+            # The doctor can't find out why the text is unsuitable or incomplete.
+            if goal.state is State.ABORTED and goal.reason not in {"nothing_to_say", "text_stalled", "broken_off"}:
                 words += "; find out why with: talk doctor"
             self.feedback.note(f"{prefix}{words}")
         return EXIT_TIMEOUT if goal.exit_code is None else goal.exit_code
