@@ -140,6 +140,7 @@ def test_thousands_of_simple_lines_are_parsed_and_sent_alike(
         *("say low", "say battery low --wait", "--json say -w -t 2.5 --preempt -- -3 degrees", "cancel"),
         "say --queue --priority -1 --key=battery --throttle 60 --rate 150 x",
         "say --id a-1 --voice de --volume 0.5 --pitch 99 --as me Grüße",
+        *("say --stream -w", "say --stream --stall 9 -"),
         *("cancel --current 12 13", "status -q", "--socket /run/x status 12 --json", "wait 12 -t 10 -f"),
     ],
 )
@@ -163,6 +164,7 @@ def test_typical_script_lines_are_parsed_without_click(line: str) -> None:
         *(["say", "-w5", "x"], ["say", "x", "--flush", "--queue"], ["say", "x", "-t", "5"], ["say", "-wt", "0", "x"]),
         *(["status", "1", "2"], ["say", "x", "--ttl", "nan"], ["say", "x", "--key", ""], ["say", "x", "--wait=1"]),
         *(["say", "x", "--key", "k" * 65], ["say", "x", "--priority", "1000001"], ["say", "-o", "x.wav", "x"]),
+        *(["say", "--stream", "x"], ["say", "--stall", "5", "x"], ["say", "--stream", "--stall", "0"]),
     ],
 )
 def test_other_lines_are_left_to_click(line: list[str]) -> None:

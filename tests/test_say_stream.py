@@ -200,3 +200,17 @@ def test_a_terminal_shows_the_text_as_it_grows(talk: Talk) -> None:
         assert terminal.screen.lines[-2].endswith("  SUCCEEDED  Hello. How are you?")
     finally:
         terminal.close()
+
+
+def test_wait_shows_a_growing_text_as_far_as_it_was_heard(talk: Talk) -> None:
+    typing = Typing(talk, "say", "--stream", "-w")
+    typing.type("One. ")
+    terminal = Terminal([*TALK, "wait", "-f", typing.line()], talk.env, 80)
+    try:
+        terminal.wait_until(lambda screen: "WAITING    One." in screen.last)
+        typing.type("Two three. ")
+        terminal.wait_until(lambda screen: screen.last.rstrip().endswith("One. Two three"))
+        assert typing.end()[0] == terminal.finish() == 0
+        assert terminal.screen.lines[-2].endswith("  SUCCEEDED  One. Two three.")
+    finally:
+        terminal.close()

@@ -257,3 +257,12 @@ def test_the_view_fits_the_terminal_and_is_always_printable(text: str, start: in
     elif columns >= 15 and 0 <= start < len(text) and length > 0:
         assert lit
         assert shown.removeprefix(ELLIPSIS).removesuffix(ELLIPSIS) in sentence.whole
+
+
+@given(st.lists(st.text(st.sampled_from("a 日\n\u0301"), max_size=5)))
+def test_a_text_that_grows_is_measured_like_a_whole_one(parts: list[str]) -> None:
+    grown = MeasuredText("")
+    for part in parts:
+        grown.extend(part)
+    whole = MeasuredText("".join(parts))
+    assert (vars(grown), len(grown)) == (vars(whole), len("".join(parts)))

@@ -47,6 +47,13 @@ def test_drive_only_if_it_was_heard(scripted: Talk, scripted_shell: Shell) -> No
     assert "no server" in scripted_shell.run(script, "moving off").stdout
 
 
+@runs("Growing texts: In the library")
+def test_a_growing_text(speaking: Talk) -> None:
+    code = block("Growing texts: In the library") + "print(goal.state, goal.text)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=speaking.env, check=False)
+    assert (done.stdout, done.stderr) == ("SUCCEEDED Hello. How are you?\n", "")
+
+
 @runs("Recipes: Battery guard")
 def test_battery_guard(scripted: Talk, scripted_shell: Shell) -> None:
     battery = scripted_shell.directory / "capacity"

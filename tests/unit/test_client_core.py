@@ -29,9 +29,9 @@ from talkcli.errors import (
     UnknownGoal,
 )
 from talkcli.goals.goal import Goal
-from talkcli.goals.options import Cancel, Say
+from talkcli.goals.options import Append, Cancel, Say
 from talkcli.goals.states import State
-from talkcli.protocol.events import PausedChanged, Result, Snapshot, StateChanged, WordHeard
+from talkcli.protocol.events import PausedChanged, Result, Snapshot, StateChanged, TextAdded, TextMissing, WordHeard
 from talkcli.protocol.lines import decode, encode
 from talkcli.protocol.requests import Pause, Status, Wait
 
@@ -331,10 +331,14 @@ def test_each_line_of_an_answer_extends_its_deadline(core: ClientCore) -> None:
     send_all(core)
     receive(core, {"seq": 1, "recent": goal()}, now=3.0)
     assert core.answer_deadline(exchange) == 3.0 + TIMEOUT_S
-    slow = submit(core, Say("a", patient=True), now=1.0)
-    assert core.answer_deadline(slow) == 1.0 + TIMEOUT_S  # the request must be sent first
+    for request in (Say("a", patient=True), Append("a", "b"), Pause()):
+        slow = submit(core, request, now=1.0)
+        assert core.answer_deadline(slow) == 1.0 + TIMEOUT_S  # the request must be sent first
+        send_all(core)
+        assert core.answer_deadline(slow) == float("inf")
+    broken = submit(core, Append("a", broken=True), now=1.0)
     send_all(core)
-    assert core.answer_deadline(slow) == float("inf")
+    assert core.answer_deadline(broken) == 1.0 + TIMEOUT_S
 
 
 def test_a_silent_server_is_considered_gone(core: ClientCore) -> None:
@@ -569,8 +573,11 @@ def test_word_events_are_kept_only_with_feedback_and_unknown_events_never(core: 
         receive(core, {"seq": number, "ok": True, "goal": goal()})
     paused: JsonObject = {"event": "paused", "paused": True, "id": "g", "by": None, "n": 3}
     receive(core, {"event": "viseme", "id": "g"}, {"event": None}, {**word(1), "viseme": "o"}, paused)
+    receive(core, {"event": "waits", "id": "g", "waits": True, "n": 4})
+    assert plain.goal.waits
+    assert fed.goal.waits
     receive(core, {"event": "result", "goal": goal("SUCCEEDED")})
-    for tracked, kinds in ((plain, [Result]), (fed, [WordHeard, PausedChanged, Result])):
+    for tracked, kinds in ((plain, [Result]), (fed, [WordHeard, PausedChanged, TextMissing, Result])):
         assert [type(tracked._take()) for _ in kinds] == kinds
         assert tracked.speech_paused
 
@@ -592,6 +599,21 @@ def test_a_watch_gets_each_state_once_with_the_full_goal(core: ClientCore) -> No
     seen = [event for event in iter(watching.take, None) if isinstance(event, StateChanged)]
     assert [event.state for event in seen] == states
     assert [event.goal is not None for event in seen] == [True, False, True]
+
+
+def test_a_watch_gets_added_text(core: ClientCore) -> None:
+    watching = EventBuffer()
+    core.listeners.watches.add(watching)
+    tracked = say(core)
+    receive(core, {"seq": 1, "ok": True, "goal": goal()})
+    receive(core, {"event": "text", "id": "g", "start": 1, "text": "b", "n": 1})
+    receive(core, {"event": "waits", "id": "g", "waits": False, "n": 2})
+    assert list(iter(watching.take, None)) == [TextAdded("g", 1, "b", n=1), TextMissing("g", waits=False, n=2)]
+    tracked._grow("b")
+    assert tracked.goal.text == "ab"
+    receive(core, {"event": "result", "goal": goal("SUCCEEDED")})
+    tracked._grow("c")  # the reply came after the result, which has the whole text
+    assert tracked.goal.text == "a"
 
 
 def test_a_duplicate_event_is_kept_once() -> None:

@@ -12,8 +12,17 @@ from hypothesis import strategies as st
 from talkcli.frozen import replace
 from talkcli.goals.goal import By, Goal, Sender
 from talkcli.goals.states import State
-from talkcli.protocol.events import Event, PausedChanged, ServerStatus, Snapshot, StateChanged, WordHeard
-from talkcli.terminal.goals import reason_forms, sender_forms, setting_lines, status_lines
+from talkcli.protocol.events import (
+    Event,
+    PausedChanged,
+    ServerStatus,
+    Snapshot,
+    StateChanged,
+    TextAdded,
+    TextMissing,
+    WordHeard,
+)
+from talkcli.terminal.goals import goal_lines, reason_forms, sender_forms, setting_lines, status_lines
 from talkcli.terminal.text import Screen, cut, fit_row, width
 from talkcli.terminal.transcript import Transcript, log_lines
 
@@ -207,6 +216,56 @@ def test_words_are_shown_only_if_requested(words: bool, count: int) -> None:
     assert lines == ["12:00:00  word        4k7f-7  low  0.51 s"] * count
     lines = Transcript(full=False, words=words, boot="4k7f").lines(event, Screen(80), NOON)
     assert lines == ["12:00:00  word        7    low  0.51 s"] * count
+
+
+def test_a_growing_text_is_shown_by_sentences_and_waits_are_shown_once() -> None:
+    transcript = Transcript(full=False, words=False, boot="4k7f")
+    whole = ["One. Tw"]
+
+    def shown(event: Event) -> list[str]:
+        return [line.partition("  ")[2] for line in transcript.lines(event, Screen(80), NOON)]
+
+    def add(text: str) -> list[str]:
+        whole.append(text)
+        return shown(TextAdded(GOAL.id, len("".join(whole[:-1])), text, NOON))
+
+    heard, waits = WordHeard(GOAL.id, "One", 0, 3, 1, 0.0, NOON), TextMissing(GOAL.id, waits=True, at=NOON)
+    shown(StateChanged(GOAL.id, State.PENDING, NOON, goal=replace(GOAL, text=whole[0], more=True)))
+    (active,) = shown(StateChanged(GOAL.id, State.ACTIVE, NOON))
+    assert active.startswith('ACTIVE      7    "One. Tw…" ')
+    assert shown(waits) == []  # nothing was heard yet
+    assert [add("o"), add("."), add(" Th")] == [[], [], ['text        7    "Two."']]
+    assert shown(heard) == shown(replace(waits, waits=False)) == []
+    assert shown(waits) == ['text        7    "Th"', "waiting     7    for more text"]
+    assert shown(waits) == []
+    assert add("ree! 四。 5") == ['text        7    "ree! 四。"']
+    assert add("x" * 198) == []
+    assert add("x")[0].startswith('text        7    "5xxx')
+    (ended,) = shown(StateChanged(GOAL.id, State.SUCCEEDED, NOON, goal=replace(GOAL, text="One. Two.", duration=1.0)))
+    assert ended.startswith('SUCCEEDED   7    "One. Two." ')
+    hidden = replace(GOAL, text=None, more=True)
+    shown(StateChanged(GOAL.id, State.PENDING, NOON, goal=hidden))
+    assert add(" a. b") == []
+    assert transcript.lines(TextAdded("4k7f-8", 3, "a. b", NOON), Screen(80), NOON) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "state", "text", "now"),
+    [
+        ({"more": True, "waits": True}, "ACTIVE, waiting for text", '"battery low…"', "waiting for text, for 2.0 s"),
+        ({"more": True}, "ACTIVE", '"battery low…"', "for 2.0 s"),
+        ({"waits": True, "paused": True}, "ACTIVE, paused, waiting for text", '"battery low"', "paused, waiting for"),
+        ({"more": True, "waits": True, "state": State.ABORTED}, "ABORTED", '"battery low"', ""),
+    ],
+)
+def test_a_goal_that_waits_for_text_says_so(changes: dict[str, object], state: str, text: str, now: str) -> None:
+    goal = replace(GOAL, **{"state": State.ACTIVE, "started_at": NOON - 2, **changes})
+    rows = dict(line.split(maxsplit=1) for line in goal_lines(goal, Screen(), NOON))
+    assert (rows["state"], rows["text"]) == (state, text)
+    line = status_lines(ServerStatus(SERVER, goal, (), ()), Screen(120), NOON)[3]
+    assert text in line
+    assert now in line
+    assert ("waiting" in line) == ("waiting" in state)
 
 
 def test_forms_of_a_sender_get_shorter_and_keep_the_script() -> None:
