@@ -25,6 +25,9 @@ The words of a goal may come in any order. All other words, and words without th
 | `voice=ID` | reports that voice |
 | `linger=SECONDS` | leaves a process that holds the pipe of `TALK_LIVENESS_FD` open so long |
 
+The words of a text that grows are spoken in the same way: those that are complete take the length, and so do those that
+were added meanwhile. Then the engine reports that text is missing, or ends the goal if the text has ended.
+
 A pause delays everything that is planned, and meanwhile the engine shows that it is alive.
 
 A start is `fail`, `fail=REASON`, `hang`, `slow`, `slow=SECONDS` (0.5), `crash` or `exit=CODE`. It comes from the file

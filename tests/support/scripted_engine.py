@@ -30,7 +30,10 @@ class Goal:
     def __init__(self, say: protocol.Speak) -> None:
         self.id = say.id
         self.script = script.Script(say.text)
-        self.length = self.script.number("length", 0.1)
+        self.text, self.more, self.broken = say.text, say.more, say.broken
+        #: number of words that are planned or heard, and the seconds that they take
+        self.words, self.length = 0, 0.0
+        self.text_missing = self.grown = False
         self.plan: list[tuple[float, Callable[[], None]]] = []
         self.stopped = False
         #: since when a pause delays the plan
@@ -40,6 +43,21 @@ class Goal:
         """Plan an action, after those for the same time."""
         self.plan.append((due, action))
         self.plan.sort(key=lambda each: each[0])
+
+    def append(self, added: protocol.Append) -> None:
+        self.text += added.text
+        self.more, self.broken, self.grown = not added.end, added.broken, True
+
+    def take_words(self) -> list[tuple[int, int]]:
+        """Return the spans of the words that were not planned yet. The last one is left out if it may be incomplete."""
+        if self.grown:
+            self.script, self.grown = script.Script(self.text), False
+        spans = [] if "silent-start" in self.script else self.script.spans
+        if spans and spans[-1][1] == len(self.text) and (self.more or self.broken):
+            spans = spans[:-1]
+        new = spans[self.words : int(self.script.number("words", len(spans)))]
+        self.words += len(new)
+        return new
 
     def due(self, now: float) -> bool:
         first = self.plan[0][0] if self.plan else float("inf")
@@ -92,10 +110,16 @@ class Engine:
             self._start(command.list_voices)
         elif isinstance(command, protocol.Speak):
             self._say(command)
-        elif goal is None or not isinstance(command, protocol.Stop | protocol.Hold | protocol.Continue):
+        elif goal is None or not isinstance(
+            command, protocol.Append | protocol.Stop | protocol.Hold | protocol.Continue
+        ):
             pass  # of no importance without sound
         elif goal.id != command.id or goal.stopped:
             pass
+        elif isinstance(command, protocol.Append):
+            goal.append(command)
+            if goal.text_missing:
+                self._continue(goal)
         elif isinstance(command, protocol.Stop):
             self._stop(goal)
         elif isinstance(command, protocol.Hold):
@@ -122,7 +146,7 @@ class Engine:
             sys.exit(f"told to say {say.id} during {self._goal.id}")
         goal = self._goal = Goal(say)
         asked = goal.script
-        began = self._last = time.monotonic()
+        self._last = time.monotonic()
         if "hang" in (asked.act, asked.text("on-stop")):
             signal.signal(signal.SIGTERM, signal.SIG_IGN)  # before anybody can know that the goal has started
         if "linger" in asked:
@@ -134,16 +158,31 @@ class Engine:
             self._send(protocol.Ended(goal.id, protocol.OUTCOME_FAILED, Reason.MUTED, "the output is muted: card"))
             self._goal = None
             return
-        spans = [] if "silent-start" in asked else asked.spans[: int(asked.number("words", len(asked.spans)))]
-        for number, (start, end) in enumerate(spans):
-            at = goal.length * number / len(spans)
-            word = protocol.Word(goal.id, start, end, number + 1, round(at, 3))
-            goal.then(began + at, lambda word=word: self._send(word))  # type: ignore[misc]
+        self._continue(goal)
+
+    def _continue(self, goal: Goal) -> None:
+        """Plan the words that are new, report that text is missing, or end the goal."""
+        now, spans, asked = time.monotonic(), goal.take_words(), goal.script
+        if goal.text_missing != (missing := goal.more and not spans):
+            goal.text_missing = missing
+            self._send(protocol.TextMissing(goal.id, missing))
+        if missing:
+            return
+        begin, length = goal.length, asked.number("length", 0.1)
+        if not spans and begin:
+            length = 0.0  # all was heard before
+        for index, (start, end) in enumerate(spans):
+            at = length * index / len(spans)
+            word = protocol.Word(goal.id, start, end, goal.words - len(spans) + index + 1, round(begin + at, 3))
+            goal.then(now + at, lambda word=word: self._send(word))  # type: ignore[misc]
+        goal.length = round(begin + length, 6)
         act = asked.act
         if act:
-            goal.then(began + goal.length * asked.number("at", 0.5), lambda: self._act(act))
+            goal.then(now + length * asked.number("at", 0.5), lambda: self._act(act))
+        elif goal.more:
+            goal.then(now + length, lambda: self._continue(goal))
         elif "never-ends" not in asked:
-            goal.then(began + goal.length, lambda: self._end(protocol.OUTCOME_COMPLETED))
+            goal.then(now + length, lambda: self._end(protocol.OUTCOME_COMPLETED))
 
     def _report(self, goal: Goal) -> None:
         """Report the voice and the output if the script says so."""
