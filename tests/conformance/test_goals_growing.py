@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +17,9 @@ if TYPE_CHECKING:
     from tests.conftest import MakeTalk
     from tests.support.connection import Message
     from tests.support.processes import Talk
+
+#: A text that is spoken at once and for some time. While a goal waits for text, additions are answered at once.
+BEGINNING = "One two three four five six seven eight nine ten eleven twelve. And "
 
 
 @pytest.fixture
@@ -111,18 +113,14 @@ def test_a_new_connection_continues_a_text_whose_sender_chose_the_id(talk: Talk)
         assert result(client)["state"] == "SUCCEEDED"
 
 
-def half_close(client: Wire) -> None:
-    client._socket.shutdown(socket.SHUT_WR)
-
-
-@pytest.mark.parametrize("leave", [Wire.close, half_close])
+@pytest.mark.parametrize("leave", [Wire.close, Wire.half_close])
 def test_a_client_that_leaves_breaks_off_its_texts(talk: Talk, leave: Callable[[Wire], None]) -> None:
     with talk.connect() as client:
         active, waiting = begin(client, "One two. Three fo"), begin(client)
         talk.watcher.wait_for(active, "ACTIVE")
         leave(client)
         talk.watcher.wait_for(active, "ABORTED")
-        if leave is half_close:  # the results still arrive
+        if leave is Wire.half_close:  # the results still arrive
             assert {result(client)["id"], result(client)["id"]} == {active, waiting}
     goal = talk.goal(active)
     assert (goal["reason"], goal["spoken"]) == ("broken_off", "One two")
@@ -143,20 +141,20 @@ def test_a_sender_that_gives_up_stops_the_goal_at_once(talk: Talk) -> None:
 
 def test_the_reply_comes_when_enough_of_the_text_was_heard(talk: Talk) -> None:
     with talk.connect() as client:
-        goal_id = begin(client, "Word. ")
-        assert client.request("append", id=goal_id, text="word " * (MAX_UNHEARD_CHARS // 5 - 2))["ok"]
-        client.send({"seq": 99, "request": "append", "id": goal_id, "text": "word " * 3})
+        goal_id = begin(client, BEGINNING)
+        assert client.request("append", id=goal_id, text="word " * (MAX_UNHEARD_CHARS // 5 - 20))["ok"]
+        client.send({"seq": 99, "request": "append", "id": goal_id, "text": "word " * 20})
         assert client.request("status", id=goal_id)["goal"]["more"]  # other requests are answered meanwhile
         messages = client.events + client.items
         assert not any(message.get("seq") == 99 for message in messages)
         while (message := client.receive(20)).get("seq") != 99:
             pass
-    assert message["length"] == 6 + MAX_UNHEARD_CHARS - 10 + 15
+    assert message["length"] == len(BEGINNING) + MAX_UNHEARD_CHARS
 
 
 def test_a_held_back_reply_comes_at_the_end_of_the_goal(talk: Talk) -> None:
     with talk.connect() as client, talk.connect() as other:
-        goal_id = begin(client, "Word. ")
+        goal_id = begin(client, BEGINNING)
         for number in range(2):
             client.send({"seq": number, "request": "append", "id": goal_id, "text": "word " * 1_800})
         other.request("cancel", ids=[goal_id])
@@ -167,12 +165,12 @@ def test_a_held_back_reply_comes_at_the_end_of_the_goal(talk: Talk) -> None:
 
 def test_replies_beyond_the_limit_for_waiting_requests_come_at_once(talk: Talk) -> None:
     with talk.connect() as client:
-        goal_id = begin(client, "Word. ")
+        goal_id = begin(client, BEGINNING)
         for text in ("word " * 2_100, *[""] * MAX_CLIENT_REQUESTS):
             client.send({"request": "append", "id": goal_id, "text": text})
         while (reply := client.receive()).get("length") is None:
             pass
-        assert (reply["ok"], reply["length"]) == (True, 10_506)
+        assert (reply["ok"], reply["length"]) == (True, len(BEGINNING) + 10_500)
         assert client.request("status", id=goal_id)["goal"]["more"]
         assert client.items == []
         client.request("cancel")

@@ -97,6 +97,10 @@ class Wire(contextlib.AbstractContextManager["Wire"]):
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
 
+    def half_close(self) -> None:
+        """Send nothing more."""
+        self._socket.shutdown(socket.SHUT_WR)
+
     def close(self) -> None:
         """Close the connection."""
         self._socket.close()
