@@ -15,11 +15,13 @@ SECONDS = float(os.environ.get("TALK_TEST_FUZZ") or (30 if os.environ.get("CI") 
 TEXTS_PER_KIND = 12
 
 
+@pytest.mark.parametrize("growing", [False, True], ids=["whole", "growing"])
 @pytest.mark.parametrize("count", [25, pytest.param(None, marks=pytest.mark.slow)])
 @pytest.mark.timeout(int(SECONDS) + 300)
-def test_mutated_texts_end_once_and_never_overflow_a_buffer(count: int | None) -> None:
+def test_mutated_texts_end_once_and_never_overflow_a_buffer(count: int | None, growing: bool) -> None:
     before = len(os.listdir("/proc/self/fd"))
-    tally = speak_all(itertools.islice(cases(7, list_voices()), count), guarded=True, seconds=SECONDS)
+    texts = itertools.islice(cases(7, list_voices()), count)
+    tally = speak_all(texts, guarded=True, seconds=SECONDS, growing=growing)
     print(tally, *tally.deaths, sep="\n")
     assert not tally.faults, tally.faults
     assert not tally.overflows, tally.overflows

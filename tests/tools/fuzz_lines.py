@@ -28,6 +28,8 @@ LINES = [
     '{"request": "say", "text": "length=0 é 😀 \\ud83d", "data": {"a": [1, -2.5e3, null, "b"]}}',
     '{"request": "say", "text": "length=0", "key": "eta", "throttle": 0.5, "ttl": 2, "priority": -3, "flush": true}',
     '{"request": "say", "text": "length=0", "id": "dock17", "rate": 300, "volume": 0.25, "pitch": 70, "voice": "en"}',
+    '{"request": "say", "text": "length=0 one ", "more": true, "stall": 1, "wait": true, "feedback": true}',
+    '{"request": "append", "id": "grows1", "text": "two. ", "at": 13, "end": false, "broken": false}',
     '{"request": "wait", "ids": ["1b2d-1", "7"], "feedback": true}',
     '{"request": "cancel", "ids": ["1b2d-1"], "current": true, "before": null, "key": "eta"}',
     '{"request": "cancel"}',
@@ -40,19 +42,48 @@ LINES = [
     '{"request": "pause"}',
     '{"request": "resume"}',
 ]
+#: Values of the fields of an `append`. The first ones are right.
+_ADDITIONS: dict[str, tuple[object, ...]] = {
+    "text": ("two ", "two. ", "", " ", "\0", "\ud83d", "é 😀 ", "\n" * 50, "long " * 2_500, "длинный" * 1_500, None, 5),
+    "at": (13, 0, 17, 9, 1 << 40, -1, 1e300, 1.5, None, True, "13", [13]),
+    "end": (False, True, None, 0, "true"),
+    "broken": (False, False, False, False, True, None, 1),
+    "more": (True, 1),
+}
+#: Names of goals that the additions are for.
+_GROWING = 5
 _INSERTED = (b'"', b"{", b"}", b"[", b",", b"null", b"1e999", b"-", b"\\u0000")
 #: Lines on one connection. A hello follows each, because ten bad lines in a row end a connection.
 BATCH = 1_000
 _HELLO = b'{"request": "hello"}\n'
+#: Ends each batch, because an addition to a long text is answered only when the text was heard or its goal has ended.
+_CANCEL = b'{"request": "cancel"}\n'
 #: The server keeps texts, and events that its clients haven't read yet.
 _GROWTH_LIMIT_KB = 24 * 1024
 _REPLY_LIMIT_S = 60
 
 
+def additions(source: random.Random) -> Iterator[str]:
+    """Yield goals whose text grows, and additions to the latest ones, whose fields have all kinds of values."""
+    count = 0
+    while True:
+        if source.random() < 0.2:
+            count += 1
+            goal = {"request": "say", "id": f"grows{count}", "text": source.choice(("length=0 one ", "length=0 o"))}
+            yield json.dumps({**goal, "more": True, "stall": 1, "wait": source.random() < 0.5})
+        fields = {"id": f"grows{source.randrange(max(0, count - _GROWING), count + 2)}"}
+        chosen = source.sample([*_ADDITIONS], source.choice((1, 1, 1, 2, 2, 3, 4)))
+        yield json.dumps({"request": "append", **fields, **{name: source.choice(_ADDITIONS[name]) for name in chosen}})
+
+
 def mutated(source: random.Random) -> Iterator[bytes]:
     """Yield requests with some bytes changed, lost, doubled or taken from other requests."""
     whole = [each.encode() for each in LINES]
+    growing = additions(source)
     while True:
+        if source.random() < 0.2:
+            yield next(growing).encode() + b"\n"
+            continue
         line = bytearray(source.choice(whole))
         for _ in range(source.choice((0, 1, 1, 1, 2, 4, 16))):
             place = source.randrange(len(line) + 1)
@@ -97,13 +128,14 @@ def _speak(talk: Talk, text: str) -> None:
 
 
 def _send_batch(talk: Talk, batch: list[bytes], replies: Counter[str]) -> None:
-    wanted = replies.total() + 2 * len(batch)
+    wanted = replies.total() + 2 * len(batch) + 1
+    end = time.monotonic() + _REPLY_LIMIT_S  # the server shows that it is alive all the time
     with Raw(talk.socket) as raw:
         raw.socket.settimeout(_REPLY_LIMIT_S)
-        sender = threading.Thread(target=raw.send, args=(b"".join(each + _HELLO for each in batch),))
+        sender = threading.Thread(target=raw.send, args=(b"".join(each + _HELLO for each in batch) + _CANCEL,))
         sender.start()
         rest = b""
-        while replies.total() < wanted and (data := raw.receive(_REPLY_LIMIT_S)):
+        while replies.total() < wanted and time.monotonic() < end and (data := raw.receive(_REPLY_LIMIT_S)):
             raw.received.clear()
             *lines, rest = (rest + data).split(b"\n")
             for line in lines:
@@ -113,7 +145,7 @@ def _send_batch(talk: Talk, batch: list[bytes], replies: Counter[str]) -> None:
                     replies[code] += 1
                     assert code != "internal_error", line
         sender.join()
-    assert replies.total() == wanted, f"{wanted - replies.total()} of {2 * len(batch)} lines have no reply"
+    assert replies.total() == wanted, f"{wanted - replies.total()} of {2 * len(batch) + 1} lines have no reply"
 
 
 def main() -> None:

@@ -1,10 +1,11 @@
 """Speak mutated texts with all voices in engine processes, as `say -o` does, and count how often a process dies.
 
-    python -m tests.tools.fuzz_texts --count 20000 [--seed N | --seed today] [--seconds N] [--no-guard]
+    python -m tests.tools.fuzz_texts --count 20000 [--seed N | --seed today] [--seconds N] [--no-guard] [--growing]
 
 It prints each text that killed a process as a Python literal. The exit code is 1 if a goal didn't have exactly one end,
-if a process hung or left a traceback, or if the guard let a text through that overflows a buffer. The texts depend on
-the seed alone. They must not depend on the guard.
+if a process hung or left a traceback, if a word isn't in its place, or if the guard let a text through that overflows a
+buffer. The texts depend on the seed alone. They must not depend on the guard. With `--growing`, each text is sent in
+pieces of a few characters while it is spoken.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from typing import TYPE_CHECKING
 from unittest import mock
 
 from talkcli.engine import protocol
+from talkcli.engine.child.cutting import GrowingText
 from talkcli.engine.parent import process
 from talkcli.engine.parent.process import EngineFailed, PrivateEngine
 from talkcli.goals.options import bad_text
@@ -37,6 +39,8 @@ if TYPE_CHECKING:
 _RATE = 450
 #: Far above what the longest text takes, so that a busy machine is no failure.
 _START_LIMIT_S, _HANG_LIMIT_S = 20.0, 60.0
+#: Time after which the end of a piece may end a sentence, and how often it passes.
+_QUIET_S, _QUIET_CHANCE = 0.12, 0.02
 #: How a process dies that wrote past the end of a buffer. The guard prevents that.
 OVERFLOW = "SIGABRT"
 _WITHOUT_GUARD = "from talkcli.engine.child.synthesizers import guard; guard.guarded = lambda text, voice: text; "
@@ -293,8 +297,8 @@ def engine_command(guarded: bool) -> list[str]:
     return [*program, code if guarded else code.replace("from talkcli", f"{_WITHOUT_GUARD}from talkcli", 1)]
 
 
-def speak_all(texts: Iterable[Case], *, guarded: bool, seconds: float = float("inf")) -> Tally:
-    """Speak the texts until they or the time are used up."""
+def speak_all(texts: Iterable[Case], *, guarded: bool, seconds: float = float("inf"), growing: bool = False) -> Tally:
+    """Speak the texts, whole or in pieces, until they or the time are used up."""
     tally = Tally()
     command = engine_command(guarded)
     left = iter(texts)
@@ -305,22 +309,80 @@ def speak_all(texts: Iterable[Case], *, guarded: bool, seconds: float = float("i
             process, engine_command=lambda: command, START_LIMIT_S=_START_LIMIT_S, HANG_LIMIT_S=_HANG_LIMIT_S
         ),
     ):
-        while _speak_until_death(left, end, f"{directory}/spoken.wav", tally):
+        while _speak_until_death(left, end, f"{directory}/spoken.wav", tally, growing=growing):
             pass
     return tally
 
 
-def _speak_until_death(texts: Iterator[Case], end: float, path: str, tally: Tally) -> bool:
+def split(text: str, source: random.Random) -> Iterator[str]:
+    """Yield pieces of a text with any number of characters in each. The first one is a valid text."""
+    most, place, end = source.choice((1, 4, 8, 60)), 0, 0
+    while end < len(text):
+        end += source.randint(1, most)
+        if place or bad_text(text[:end]) is None:
+            yield text[place:end]
+            place = end
+
+
+def speak_growing(engine: PrivateEngine, goal: str, case: Case, pieces: Sequence[str], source: random.Random) -> None:
+    """Send a text in pieces, sometimes with a pause between two of them."""
+    engine.speak(protocol.Speak(goal, pieces[0], _RATE, 1.0, case.voice, 50, more=True))
+    for piece in pieces[1:]:
+        if source.random() < _QUIET_CHANCE:
+            time.sleep(_QUIET_S)
+        engine._process.send(protocol.Append(goal, piece, end=False))
+    engine._process.send(protocol.Append(goal, "", end=True))
+
+
+def find_lost_text(text: str, pieces: Iterable[str], source: random.Random) -> str | None:
+    """Cut a text that grows by these pieces, and return what is wrong with its parts, or None."""
+    growing, now, parts = GrowingText("", ended=False), 0.0, []
+
+    def take() -> None:
+        while (part := growing.next_part(now, source.choice((0.0, 0.1, 5.0)))) is not None:
+            parts.append(part)
+
+    for piece in pieces:
+        growing.append(piece, now)
+        now += source.choice((0.0, 0.01, 0.11, 1.1))
+        take()
+    growing.end()
+    take()
+    ends = [0, *(end for _, end in parts)]
+    if any(text[end:start].strip() or start < end for end, (start, _) in zip(ends, parts, strict=False)):
+        return f"parts overlap or leave text out: {parts}"
+    return f"the end is lost: {parts}" if text[ends[-1] :].strip() else None
+
+
+def find_misplaced_word(text: str, words: Iterable[protocol.Word]) -> str | None:
+    """Return what is wrong with the words of a goal, or None."""
+    before = 0
+    for number, word in enumerate(words, 1):
+        if word.number != number or not before <= word.start < word.end <= len(text):
+            return f"{word} is not in its place, after {before}"
+        before = word.end
+    return None
+
+
+def _speak_until_death(texts: Iterator[Case], end: float, path: str, tally: Tally, *, growing: bool) -> bool:
     """Speak texts in one engine process; return whether it died."""
     with PrivateEngine(protocol.Configure(os.getpid(), None, f"file:{path}", None, None)) as engine:
         engine.wait_for(protocol.Ready)
         # The first text is spoken even if the start took all the time.
         for number, case in enumerate(texts):
             tally.texts += 1
-            goal = f"f{number}"
+            goal, wrong, words = f"f{number}", None, []
             try:
-                engine.speak(protocol.Speak(goal, case.text, _RATE, 1.0, case.voice, 50))
-                ended = engine.wait_for(protocol.Ended)
+                if growing:
+                    source = random.Random(case.text)
+                    pieces = list(split(case.text, source))
+                    wrong = find_lost_text(case.text, pieces, source)
+                    speak_growing(engine, goal, case, pieces, source)
+                else:
+                    engine.speak(protocol.Speak(goal, case.text, _RATE, 1.0, case.voice, 50))
+                while not isinstance(event := next(engine.events), protocol.Ended):
+                    words += [event] if isinstance(event, protocol.Word) else []
+                ended = event
             except EngineFailed as error:
                 death = f"{error}: {case.voice} {case.text!a}"
                 tally.deaths.append(death)
@@ -329,8 +391,9 @@ def _speak_until_death(texts: Iterator[Case], end: float, path: str, tally: Tall
                 return True
             outcome = ended.reason or ended.outcome
             tally.outcomes[outcome] += 1
-            if ended.id != goal or outcome == "engine_failed":
-                tally.faults.append(f"{ended}: {case.voice} {case.text!a}")
+            wrong = wrong or find_misplaced_word(case.text, words)
+            if ended.id != goal or outcome == "engine_failed" or wrong:
+                tally.faults.append(f"{wrong or ended}: {case.voice} {case.text!a}")
             with contextlib.suppress(FileNotFoundError):  # there was nothing to say
                 os.unlink(path)
             if time.monotonic() >= end:
@@ -350,10 +413,11 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=float("inf"))
     parser.add_argument("--seed", default="1", help='a number, or "today"')
     parser.add_argument("--no-guard", action="store_true")
+    parser.add_argument("--growing", action="store_true", help="send each text in pieces")
     asked = parser.parse_args()
     seed = today() if asked.seed == "today" else int(asked.seed)
     texts = itertools.islice(cases(seed, list_voices()), asked.count)
-    tally = speak_all(texts, guarded=not asked.no_guard, seconds=asked.seconds)
+    tally = speak_all(texts, guarded=not asked.no_guard, seconds=asked.seconds, growing=asked.growing)
     print(*tally.deaths, *map("fault: {}".format, tally.faults), sep="\n")
     print(f"seed {seed}: {tally}, {len(tally.overflows)} overflows")
     return 1 if tally.faults or (tally.overflows and not asked.no_guard) else 0
