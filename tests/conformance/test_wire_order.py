@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from tests.support.processes import Talk
 
 KEYS = {
-    "id", "state", "status", "reason", "by", "message", "text", "format", "spoken", "priority", "key", "ttl", "data",
-    "client", "paused", "queued_at", "started_at", "ended_at", "duration", "voice", "output",
+    "id", "state", "status", "reason", "by", "message", "text", "format", "spoken", "spoken_end",
+    "heard", "priority", "key", "ttl", "data", "client", "paused", "more", "waits", "queued_at", "started_at",
+    "ended_at", "duration", "voice", "output",
 }  # fmt: skip
 
 
