@@ -11,7 +11,7 @@ from tests.support.documents import BENCHMARK, README, tables
 from tests.support.real_voice import real_voice
 from tests.support.sink import PROGRAMS
 from tests.support.surroundings import needs, needs_packages
-from tests.tools.bench import heard, load, marathon
+from tests.tools.bench import growing, heard, load, marathon
 from tests.tools.bench.__main__ import GROUPS, NAMED, measure
 from tests.tools.bench.stage import TALK, Options, Stage
 
@@ -43,6 +43,7 @@ def test_every_row_of_a_group_measures_something(stage: Stage, group: str, monke
         needs_packages("paho")
     for module, name, less in (
         *((load, "GOALS", 200), (load, "FEW", 250), (load, "MANY", 300), (load, "PENDING", 300), (load, "CLIENTS", 20)),
+        (growing, "TOKENS", 100),
         *((heard, "LONG_TEXT", heard.LONG_TEXT[:50]), (heard, "_TEXTS", 1), (marathon, "SERVERS", 1)),
     ):
         monkeypatch.setattr(module, name, less)

@@ -1,4 +1,4 @@
-"""Random goals from many clients with a fault every few seconds, for as long as one likes.
+"""Random goals and growing texts from many clients with a fault every few seconds, for as long as one likes.
 
     python -m tests.tools.soak --seconds 1800 [--seed N] [--every SECONDS | --kills] [--player aplay|pacat]
 
@@ -15,7 +15,8 @@ import os
 import random
 import time
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 
 from tests.support import usage
 from tests.support.processes import Talk
@@ -23,9 +24,11 @@ from tests.support.sink import Sink
 from tests.support.surroundings import short_directory
 from tests.tools.soak_clients import Narrator, Workers, send_goals
 from tests.tools.soak_faults import Faults
+from tests.tools.soak_growing import send_growing_texts
 from tests.tools.witness import Witness
 
-_CLIENTS = 8
+#: Clients with usual goals, and with texts that grow.
+_CLIENTS, _GROWING_CLIENTS = 8, 3
 #: Goals before the first census: then most of the history is full, and everything was used once.
 _WARM_UP_GOALS = 1_200
 _WARM_UP_LIMIT_S = 300.0
@@ -43,6 +46,7 @@ class Report:
     ends: Counter[tuple[str, str | None]]  # by state and reason
     faults: Counter[str]
     heard_whole: int = 0  # sentences
+    grown: Counter[tuple[str, str]] = field(default_factory=Counter)  # growing texts by what the client did
 
 
 class Soak:
@@ -98,13 +102,17 @@ class Soak:
                 faults.run(every, over)
         finally:
             clients.stop(f"after {faults.done}, the last was {faults.last}")
-        return Report(Counter(), faults.done, narrator.heard_whole)
+        return Report(Counter(), faults.done, narrator.heard_whole, self._grown)
 
     def _start_senders(self, phase: str) -> Workers:
         workers = Workers()
-        for number in range(_CLIENTS):
+        self._grown: Counter[tuple[str, str]] = Counter()
+        for number in range(_CLIENTS + _GROWING_CLIENTS):
             chance = random.Random(f"{self._seed} {phase} {number}")
-            workers.start(f"client {number}", lambda over, chance=chance: send_goals(self._talk, chance, over))  # type: ignore[misc]
+            send = partial(send_goals, self._talk)
+            if number >= _CLIENTS:
+                send = partial(send_growing_texts, self._talk, self._grown)
+            workers.start(f"client {number}", partial(send, chance))
         return workers
 
     def _settle(self) -> None:

@@ -26,7 +26,7 @@ _LOG = 2_200
 
 
 class Witness:
-    """Watches a server in a thread and checks the order of the states of each goal."""
+    """Watches a server in a thread and checks the order of the states of each goal, and how its text grows."""
 
     def __init__(self, path: str, *, restarts: bool = False) -> None:
         """`restarts`: connect again after the server has ended."""
@@ -36,6 +36,7 @@ class Witness:
         self._ended_ids: set[str] = set()
         self._active: str | None = None
         self._texts: dict[tuple[str, str], str] = {}
+        self._lengths: dict[str, int] = {}  # of the texts of the goals that have not ended
         self._begun: defaultdict[str, dict[tuple[str, str], float]] = defaultdict(dict)
         #: the number of ends by state and reason
         self.ends: Counter[tuple[str, str | None]] = Counter()
@@ -103,6 +104,7 @@ class Witness:
         with self._changed:
             self._active = active and active["id"]
             self._states = {each["id"]: each["state"] for each in [active, *waiting] if each}
+            self._lengths = {each["id"]: len(each["text"]) for each in [active, *waiting] if each}
             self._ended_ids = set()  # a new server may have the same ids
             for goal in [active, *waiting, *(each["goal"] for each in wire.items)]:
                 if goal:
@@ -117,19 +119,31 @@ class Witness:
             self._note(boot, wire.receive(_SILENCE_LIMIT_S))
 
     def _note(self, boot: str, event: Message) -> None:
+        if event.get("event") == "text":
+            self._grow(event["id"], event["start"], len(event["text"]))
         if event.get("event") != "state":
             return
         with self._changed:
             goal_id, state = event["id"], event["state"]
             if state != "REJECTED":  # a rejected goal may have the id of another one
                 self._check(goal_id, state)
-                if "goal" in event:
+                if state in TERMINAL:
+                    self._grow(goal_id, len(event["goal"]["text"]), 0)
+                    del self._lengths[goal_id]
+                elif "goal" in event:
                     self._texts[boot, goal_id] = event["goal"]["text"]
+                    self._lengths[goal_id] = len(event["goal"]["text"])
                 if state == "ACTIVE":
                     self._begin(boot, goal_id, event["at"])
             if state in TERMINAL:
                 self.ends[state, event["goal"]["reason"]] += 1
             self._changed.notify_all()
+
+    def _grow(self, goal_id: str, start: int, length: int) -> None:
+        """Check that a text grows at its end."""
+        if self._lengths.get(goal_id) != start:
+            self.faults.append(f"{goal_id}: text at {start}, but it has {self._lengths.get(goal_id)} characters")
+        self._lengths[goal_id] = start + length
 
     def _begin(self, boot: str, goal_id: str, at: float) -> None:
         self._begun[self._texts[boot, goal_id]].setdefault((boot, goal_id), at)

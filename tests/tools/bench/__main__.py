@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.errors import TalkError
-from tests.tools.bench import fleet, heard, load, machine, marathon, processes
+from tests.tools.bench import fleet, growing, heard, load, machine, marathon, processes
 from tests.tools.bench.stage import Options, Stage
 from tests.tools.bench.table import Row, as_table
 
@@ -34,6 +34,7 @@ GROUPS: dict[str, Callable[[Stage], list[Row]]] = {
     "preempt": heard.preempt,
     "gap": heard.gap,
     "long-text": heard.long_text,
+    "growing": growing.growing,
     "commands": processes.commands,
     "idle": processes.idle,
     "throughput": load.throughput,

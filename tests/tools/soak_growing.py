@@ -1,0 +1,200 @@
+"""A client of the soak whose texts grow while they are spoken, and end or break off in all ways."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from typing import TYPE_CHECKING, Any
+
+from talkcli.server.speech import MAX_UNHEARD_CHARS
+from tests.support.watcher import TERMINAL
+from tests.tools.soak_clients import PATIENCE_S
+
+if TYPE_CHECKING:
+    import random
+    import threading
+    from collections import Counter
+    from collections.abc import Callable
+
+    from tests.support.connection import Message, Wire
+    from tests.support.processes import Talk
+
+_STORY = (
+    "I found the charger. It is near the door, behind the table, at 3.5 metres. Shall I go there now? Dr. Brown waits "
+    "in room 12; he said: “Come in!” One two three four five six seven eight nine ten eleven twelve and so on "
+)
+_LONGEST = 90
+#: Seconds between two pieces of a text.
+_INTERVALS_S = (0.0, 0.005, 0.02, 0.1)
+#: The usual goals don't preempt those of a higher priority.
+_OPTIONS: tuple[dict[str, Any], ...] = (
+    *({}, {"preempt": True}, {"ttl": 1}, {"key": "grows"}, {"priority": 5}, {"priority": 5, "voice": "de"}),
+    *({"priority": 5, "preempt": True}, {"priority": 5, "preempt": True, "feedback": True}),
+)
+_numbers = itertools.count()
+
+
+def send_growing_texts(
+    talk: Talk, ends: Counter[tuple[str, str]], chance: random.Random, over: threading.Event
+) -> None:
+    """Send texts in pieces. Each goal must have one end, which says whether all of its text was spoken.
+
+    `ends` counts the goals by what the client did at the end, and by their reason or state.
+    """
+    while not over.is_set():
+        with talk.connect() as wire:
+            while not over.is_set():
+                text = _GrowingText(talk, wire, chance, over)
+                usable = text.send()
+                ends[text.way, text.end] += 1
+                over.wait(chance.random())
+                if not usable or chance.random() < 0.1:
+                    break
+
+
+class _GrowingText:
+    """A goal whose text grows."""
+
+    def __init__(self, talk: Talk, wire: Wire, chance: random.Random, over: threading.Event) -> None:
+        self._talk, self._wire, self._chance, self._over = talk, wire, chance, over
+        self.way = chance.choice(["ended", *_WAYS])
+        self._options = chance.choice(_OPTIONS) | {"more": True, "wait": True, "rate": 450, "stall": 1}
+        if self.way == "continued" or chance.random() < 0.3:
+            self._options["id"] = f"grows/{next(_numbers)}"
+        size, start = chance.choice((3, 5, 12)), chance.randrange(len(_STORY) - _LONGEST)
+        places = range(start, start + chance.randrange(10, _LONGEST), size)
+        self._begin, *self._pieces = [_STORY[at : at + size] for at in places]
+        self._id = self.end = ""
+        #: the text that the server has confirmed, and whether it has confirmed its end
+        self._text, self._ended = self._begin, False
+
+    def send(self) -> bool:
+        """Send the text, and check its end; return whether the connection can still be used."""
+        goal = self._wire.request("say", text=self._begin, **self._options)["goal"]
+        self._id = goal["id"]
+        if goal["state"] == "REJECTED":
+            self._check(self._result())
+            return True
+        assert goal["state"] == "PENDING", goal
+        usable = all(map(self._append, self._pieces)) and _WAYS[self.way](self)
+        self._check(self._result() if usable else self._status())
+        if usable:
+            reply = self._wire.request("append", id=self._id, text="too late")
+            assert reply["error"]["code"] == "goal_ended", reply
+        return usable
+
+    def _append(self, text: str = "", **fields: Any) -> bool:
+        """Add a piece, and return True."""
+        if not self._over.is_set():
+            time.sleep(self._chance.choice(_INTERVALS_S))
+        self._note(self._wire.request("append", id=self._id, text=text, at=len(self._text), **fields), text, fields)
+        return True
+
+    def _note(self, reply: Message, text: str, fields: dict[str, object]) -> None:
+        """Note what a reply confirms."""
+        if reply["ok"]:
+            self._text += text
+            self._ended = "end" in fields
+            assert reply["length"] == len(self._text), reply
+        else:
+            assert reply["error"]["code"] == "goal_ended", reply
+
+    def _result(self) -> Message:
+        """Return the goal when its result arrives."""
+        goal: Message = {}
+        while goal.get("id") != self._id:
+            try:
+                goal = self._wire.receive_event("result", PATIENCE_S)["goal"]
+            except TimeoutError:
+                told = f"{self._id}, {self.way}, has not ended"
+                raise AssertionError(f"{told}; the server: {self._talk.request('status')}") from None
+        return goal
+
+    def _status(self) -> Message:
+        """Return the goal when it has ended, asked for on other connections."""
+        end = time.monotonic() + PATIENCE_S
+        while (goal := self._talk.request("status", id=self._id)["goal"])["state"] not in TERMINAL:
+            assert time.monotonic() < end, f"{goal}, {self.way}, has not ended: {self._talk.request('status')}"
+            time.sleep(0.05)
+        assert isinstance(goal, dict)
+        return goal
+
+    def _check(self, goal: Message) -> None:
+        told = f"{self.way}, {len(self._text)} characters, {self._ended}: {goal}"
+        self.end = goal["reason"] or goal["state"]
+        assert goal["state"] in TERMINAL, told
+        assert self.end != "nothing_to_say", told
+        assert self.end != "broken_off" or self.way in _BREAKS, told
+        assert goal["text"] == self._text, told
+        assert not goal["more"], told
+        assert not goal["waits"], told
+        assert (goal["spoken_end"] or 0) <= len(self._text), told
+        assert goal["state"] != "SUCCEEDED" or (self._ended and goal["spoken_end"] == len(self._text)), told
+
+    # -- ways to end a text; each returns whether the connection can still be used
+
+    def _end(self) -> bool:
+        return self._append(end=True)
+
+    def _stall(self) -> bool:
+        return True
+
+    def _break(self) -> bool:
+        return self._append(broken=True)
+
+    def _cancel(self) -> bool:
+        assert self._wire.request("cancel", ids=[self._id])["ok"]
+        return True
+
+    def _preempt(self) -> bool:
+        assert self._wire.request("say", text="out of the way", rate=450, preempt=True)["ok"]
+        return self._append(end=True)
+
+    def _close(self) -> bool:
+        self._wire.close()
+        return False
+
+    def _half_close(self) -> bool:
+        self._wire.half_close()
+        self._check(self._result())
+        return False
+
+    def _continue(self) -> bool:
+        """Close the connection, and continue on another one, with the same first piece."""
+        self._wire.close()
+        with self._talk.connect() as self._wire:
+            reply = self._wire.request("say", text=self._begin, **self._options)
+            assert reply.get("attached"), reply
+            self._append("and the end.")
+            self._append(end=True)
+            self._check(self._result())
+        return False
+
+    def _exceed(self) -> bool:
+        """Add more than may be unheard, and cancel the goal before the reply comes."""
+        text = "long " * (MAX_UNHEARD_CHARS // 5 + 100)
+        self._wire.send({"seq": -1, "request": "append", "id": self._id, "text": text})
+        time.sleep(self._chance.random())
+        assert self._wire.request("cancel", ids=[self._id])["ok"]
+        items = self._wire.items
+        while not (replies := [each for each in items if each.get("seq") == -1]):
+            message = self._wire.receive()
+            (self._wire.events if "event" in message else items).append(message)
+        items.clear()
+        self._note(replies[0], text, {})
+        return True
+
+
+_WAYS: dict[str, Callable[[_GrowingText], bool]] = {
+    "ended": _GrowingText._end,
+    "stalled": _GrowingText._stall,
+    "broken off": _GrowingText._break,
+    "cancelled": _GrowingText._cancel,
+    "preempted": _GrowingText._preempt,
+    "closed": _GrowingText._close,
+    "half-closed": _GrowingText._half_close,
+    "continued": _GrowingText._continue,
+    "too much": _GrowingText._exceed,
+}
+#: What may break a text off.
+_BREAKS = frozenset({"broken off", "closed", "half-closed", "continued"})
