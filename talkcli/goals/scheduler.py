@@ -458,6 +458,8 @@ class Scheduler:
         record.duration = duration
         if record.state is State.PREEMPTING and reason is not Reason.NOT_SILENT:
             return self.stopped(goal_id, now)
+        if record.broken and reason is Reason.NOTHING_TO_SAY:  # no sentence was complete
+            return self.completed(goal_id, duration, now)
         return self._end(record, State.ABORTED, reason, f"speech failed: {message}", record.by, now)
 
     def stopped(self, goal_id: str, now: Now) -> list[Effect]:

@@ -6,6 +6,7 @@ import pytest
 
 from talkcli.errors import RequestRefused
 from talkcli.goals.options import GROWTH_FACTOR, MAX_TEXT_CHARS, Append
+from talkcli.goals.reasons import Reason
 from talkcli.goals.scheduler import CONFIRM_SILENCE_S
 from tests.unit.robot import play, rules
 
@@ -124,6 +125,12 @@ def test_what_was_heard_of_a_broken_text_is_not_the_whole_text() -> None:
     goal = robot.goals["a"].snapshot()
     assert (goal.text, goal.spoken, goal.spoken_end) == ("abcdef", "abcd", 4)
     assert goal.message == "speech failed: its sender left before the text ended"
+
+
+def test_a_text_that_breaks_off_before_its_first_sentence_is_complete_is_broken_off() -> None:
+    robot = play("a more; left a")
+    robot.collect(robot.scheduler.failed(robot.goals["a"].id, Reason.NOTHING_TO_SAY, "nothing", None, robot.now))
+    assert robot.outcome() == "a ABORTED broken_off"
 
 
 def test_the_last_word_was_heard_to_its_end_if_text_is_missing() -> None:
