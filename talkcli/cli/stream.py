@@ -15,7 +15,7 @@ from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.show import retry_without_output, show_if_possible
 from talkcli.cli.stdin import read_available
 from talkcli.cli.wait import GoalReporter, seconds_left, timeout_error, wait_for_goal
-from talkcli.errors import EXIT_OK, TalkError
+from talkcli.errors import EXIT_OK, Lost, ServerUnavailable, TalkError
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import Say
 from talkcli.goals.states import State
@@ -103,6 +103,10 @@ class StreamSpeaker:
                 self._options.connect(self._timeout, name=self._name, interrupt=interrupts.watched) as client,
             ):
                 return self._run_connected(client)
+        except (Lost, ServerUnavailable) as error:
+            if seconds_left(self._end) == 0:
+                raise timeout_error(self._timeout, error.message) from error
+            raise
         finally:
             retry_without_output(self._reporter.feedback.close)
         return interrupts.exit_code

@@ -61,7 +61,8 @@ class SpeechStream:
         """
         if self._closed:
             raise UsageError("the text has already ended; start another one with Client.stream")
-        self._text.write(text)
+        if not self._stopped:
+            self._text.write(text)
         return self._send()
 
     def end(self) -> None:
