@@ -103,21 +103,18 @@ class _GrowingText:
         """Return the goal when its result arrives."""
         goal: Message = {}
         while goal.get("id") != self._id:
-            try:
-                goal = self._wire.receive_event("result", PATIENCE_S)["goal"]
-            except TimeoutError:
-                told = f"{self._id}, {self.way}, has not ended"
-                raise AssertionError(f"{told}; the server: {self._talk.request('status')}") from None
+            goal = self._wire.receive_event("result", PATIENCE_S)["goal"]
         return goal
 
     def _status(self) -> Message:
         """Return the goal when it has ended, asked for on other connections."""
         end = time.monotonic() + PATIENCE_S
-        while (goal := self._talk.request("status", id=self._id)["goal"])["state"] not in TERMINAL:
+        while True:
+            goal: Message = self._talk.request("status", id=self._id)["goal"]
+            if goal["state"] in TERMINAL:
+                return goal
             assert time.monotonic() < end, f"{goal}, {self.way}, has not ended: {self._talk.request('status')}"
             time.sleep(0.05)
-        assert isinstance(goal, dict)
-        return goal
 
     def _check(self, goal: Message) -> None:
         told = f"{self.way}, {len(self._text)} characters, {self._ended}: {goal}"
@@ -125,22 +122,11 @@ class _GrowingText:
         assert goal["state"] in TERMINAL, told
         assert self.end != "nothing_to_say", told
         assert self.end != "broken_off" or self.way in _BREAKS, told
-        assert goal["text"] == self._text, told
-        assert not goal["more"], told
-        assert not goal["waits"], told
+        assert (goal["text"], goal["more"], goal["waits"]) == (self._text, False, False), told
         assert (goal["spoken_end"] or 0) <= len(self._text), told
         assert goal["state"] != "SUCCEEDED" or (self._ended and goal["spoken_end"] == len(self._text)), told
 
     # -- ways to end a text; each returns whether the connection can still be used
-
-    def _end(self) -> bool:
-        return self._append(end=True)
-
-    def _stall(self) -> bool:
-        return True
-
-    def _break(self) -> bool:
-        return self._append(broken=True)
 
     def _cancel(self) -> bool:
         assert self._wire.request("cancel", ids=[self._id])["ok"]
@@ -186,9 +172,9 @@ class _GrowingText:
 
 
 _WAYS: dict[str, Callable[[_GrowingText], bool]] = {
-    "ended": _GrowingText._end,
-    "stalled": _GrowingText._stall,
-    "broken off": _GrowingText._break,
+    "ended": lambda text: text._append(end=True),
+    "stalled": lambda _: True,
+    "broken off": lambda text: text._append(broken=True),
     "cancelled": _GrowingText._cancel,
     "preempted": _GrowingText._preempt,
     "closed": _GrowingText._close,
