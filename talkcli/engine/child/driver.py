@@ -328,8 +328,10 @@ class Driver:
         self._playback = playback = Playback(runner, self._notify_word)
         runner.duration = None
         try:
+            sound = self._sound
             for part, is_last in self._parts(text, playback):
-                self._synthesizer.speak(part, replace(self._sound, ends_sentence=is_last), playback)
+                self._synthesizer.speak(part, replace(sound, ends_text=is_last), playback)
+                sound = replace(sound, begins_text=False)
             runner.duration = round(playback.finish(), 6)
             runner.gaps = playback.gaps
         except Stopped:
@@ -355,7 +357,7 @@ class Driver:
             part = growing.next_part(now, buffered)
             if part is not None:
                 self._runner.report_text_missing(False)
-                playback.begin_part(part[0])
+                playback.begin_part(part[0], is_last=growing.finished)
                 yield growing.text[slice(*part)], growing.finished
             elif growing.finished:
                 return

@@ -270,6 +270,8 @@ class Playback:
         self._text_was_missing = False
         #: offset in the text, and in the samples, of the part of the text that is being synthesized
         self._part_start = self._part_begin = 0
+        #: whether another part may follow, which can be synthesized during the pause before it
+        self._part_follows = False
         #: lengths in seconds of the gaps caused by late samples
         self.gaps: list[float] = []
         #: time at which the player began to play silence during a pause
@@ -337,16 +339,17 @@ class Playback:
 
     # -- methods for the driver
 
-    def begin_part(self, start: int) -> None:
+    def begin_part(self, start: int, *, is_last: bool) -> None:
         """Continue with another part of the text, which begins at this offset."""
-        self._part_start, self._part_begin = start, self._samples.end
+        self._part_start, self._part_begin, self._part_follows = start, self._samples.end, not is_last
 
     def buffered(self) -> float:
         """Return how many seconds of sound the player has left. The result is 0 if the sound goes into a file."""
         if self._feed is None or not self._feed.player.real_time:
             return 0.0
+        unsent = self._seconds(self._samples.end - self._sent)
         # The clock doesn't count the last milliseconds as heard until all samples have been sent.
-        return max(0.0, self._feed.buffered(time.monotonic()) - MIN_PLAYER_BUFFER_S)
+        return max(0.0, self._feed.buffered(time.monotonic()) + unsent - MIN_PLAYER_BUFFER_S)
 
     def await_text(self, until: float) -> None:
         """Keep playing until more text may have arrived, or until this monotonic time."""
@@ -492,7 +495,7 @@ class Playback:
         while True:
             if self._runner.hold_number:
                 self._keep_silent(feed)
-            if self._sent == self._sendable_end(feed):
+            if self._sent == self._sendable_end(feed) or (self._part_follows and self._only_silence_is_unsent()):
                 self._update_progress(feed)  # the next samples may not arrive for a long time
                 return
             taken = self._offer_next(feed)
@@ -510,7 +513,9 @@ class Playback:
         if self._runner.hold_number:
             self._keep_silent(feed)
         feed.player.ended()  # check for a failure here, because the wait below doesn't report it
-        self._wait_for_player(feed, until, more, has_samples=False)
+        if self._sent < self._sendable_end(feed):
+            self._offer_next(feed)
+        self._wait_for_player(feed, until, more, has_samples=self._sent < self._sendable_end(feed))
         self._update_progress(feed)
         feed.progress_at = time.monotonic()  # until now, the player had nothing to play
 
@@ -573,6 +578,11 @@ class Playback:
                 self.gaps.append(silent)
         self._sent += taken
         return taken
+
+    def _only_silence_is_unsent(self) -> bool:
+        """Return whether all samples that the player hasn't accepted are silent."""
+        unsent = self._samples.end - self._sent
+        return self._samples.trailing_silence(unsent) == unsent
 
     def _sendable_end(self, feed: PlayerFeed) -> int:
         """Return the offset up to which samples may be sent for now.

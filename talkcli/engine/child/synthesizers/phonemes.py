@@ -77,7 +77,7 @@ class SpeechPart:
     ends_sentence: bool
 
 
-def split_text(phonemizer: Phonemizer, text: str, *, ends_sentence: bool = True) -> Iterator[SpeechPart]:
+def split_text(phonemizer: Phonemizer, text: str, *, ends_text: bool = True) -> Iterator[SpeechPart]:
     """Split a text into parts that a model can speak at once.
 
     A text without any speech has no parts. The phonemizer is used only while a part is being requested.
@@ -85,7 +85,7 @@ def split_text(phonemizer: Phonemizer, text: str, *, ends_sentence: bool = True)
     Args:
         phonemizer: converts text to phonemes.
         text: the text.
-        ends_sentence: whether the end of the text is the end of a sentence, even if there is no mark.
+        ends_text: whether no other part of the text follows, so that a pause is made even if there is no mark.
     """
     phonemes: list[str] = []
     words: list[tuple[int, int, int]] = []
@@ -121,7 +121,7 @@ def split_text(phonemizer: Phonemizer, text: str, *, ends_sentence: bool = True)
                 yield finish(ends_sentence=True)
         offset += len(clause)
     if phonemes:
-        yield finish(ends_sentence=ends_sentence)
+        yield finish(ends_sentence=ends_text)
 
 
 def _split_long_groups(groups: Sequence[str]) -> Iterator[str]:

@@ -140,7 +140,7 @@ class Piper:
             sink.begin(description.rate, self.voice)
             with self._espeak.phonemizer(description.espeak_voice) as phonemizer:
                 run = ModelRun()
-                phonemes = split_text(phonemizer, text, ends_sentence=settings.ends_sentence)
+                phonemes = split_text(phonemizer, text, ends_text=settings.ends_text)
                 parts = _speak_parts(model, phonemes, speaker, settings, run)
                 self._write_sound(parts, description.rate, run, sink)
         except MemoryError as error:
@@ -192,7 +192,7 @@ def _speak_parts(
         VoiceFileError: The model is faulty, or doesn't know any of the phonemes.
     """
     pause = int(_PAUSE_S * model.description.rate)
-    first, unknown = True, ""
+    cut_silence, first, unknown = settings.begins_text, True, ""
     for part in parts:
         ids, places = _phoneme_ids(part.phonemes, model.description.phoneme_ids)
         if not places:
@@ -215,8 +215,9 @@ def _speak_parts(
             loudest = max(loudest, float(levels.max()))
             audible = (levels > _PAUSE_LEVEL).nonzero()[0]
             quiet = len(samples) - 1 - int(audible[-1]) if len(audible) else quiet + len(samples)
-            if first:
-                samples, words, first = *_cut_leading_silence(samples, levels, words, model.description.rate), False
+            if first and cut_silence:
+                samples, words = _cut_leading_silence(samples, levels, words, model.description.rate)
+            first = False
             silent.append((_to_bytes(samples, settings.volume), words))
             if loudest >= _SPEECH_LEVEL:
                 yield from silent
