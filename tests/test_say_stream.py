@@ -174,11 +174,10 @@ def test_the_whole_text_must_not_be_too_long(make_talk: MakeTalk) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--stream", "hello"], "--stream reads standard input; leave out TEXT"),
-        (["--stream", "-", "hello"], "--stream reads standard input; leave out TEXT"),
-        (["--stream", "--lines"], "--stream speaks one text that grows, but --lines speaks each line; leave out one"),
+        (["--stream", "hello"], "--stream speaks standard input as one text; leave out TEXT and --lines"),
+        (["--stream", "-", "hello"], "--stream speaks standard input as one text"),
+        (["--stream", "--lines"], "--stream speaks standard input as one text"),
         (["--stream", "-o", "x.wav"], "--output writes a file without a server; leave out --stream"),
-        (["--stream", "--throttle", "5"], "--stream can't compare the whole text; add --key, or leave out --throttle"),
         (["--stall", "5", "hello"], "--stall only works with --stream; add --stream, or leave out --stall"),
         (["--stream", "--stall", "0"], "--stall: must be 1 to 60, got 0"),
         (["--stream", "--robot", "@all"], "'talk say --stream' only works with one robot"),

@@ -79,14 +79,9 @@ def _say_fault(given: Mapping[str, Any], typed: frozenset[str]) -> str | None:
 def _input_fault(given: Mapping[str, Any], typed: frozenset[str]) -> str | None:
     """Return why TEXT can't be combined with the options that read standard input, or None if it can."""
     text = given["text"]
-    if given["stream"]:
-        if given["lines"]:
-            return "--stream speaks one text that grows, but --lines speaks each line; leave out one of them"
-        if text not in {(), ("-",)}:
-            return "--stream reads standard input; leave out TEXT"
-        if given["throttle"] is not None and given["key"] is None:
-            return "--stream can't compare the whole text; add --key, or leave out --throttle"
-    elif "stall" in typed:
+    if given["stream"] and (given["lines"] or text not in {(), ("-",)}):
+        return "--stream speaks standard input as one text; leave out TEXT and --lines"
+    if "stall" in typed and not given["stream"]:
         return "--stall only works with --stream; add --stream, or leave out --stall"
     if given["lines"] and text:
         return "--lines reads standard input; leave out TEXT"

@@ -127,12 +127,6 @@ class _TerminalFeedback(Feedback):
                 line.update(goal, event)
         self._paint()
 
-    def text_added(self, goal: Goal) -> None:
-        """Show the new text of the goal, if the line shows this goal."""
-        if self._line and self._line.goal.id == goal.id:
-            self._line.grow(goal.text or "")
-            self._paint()
-
     def note(self, message: str) -> None:
         """Write a message to standard error, and repaint the line below it."""
         with self._writing:
@@ -220,22 +214,19 @@ class _GoalLine:
         #: the start and end of the current word, as indices into the text
         self.word = (heard, heard)
 
-    def grow(self, text: str) -> None:
-        """Add the end of a text that has grown."""
-        self.text.extend(text[len(self.text) :])
-
     def update(self, goal: Goal, event: Event) -> None:
         """Update the current word, the text or the state after an event."""
+        text = goal.text or ""
         if isinstance(event, WordHeard):
-            if goal.text is not None and event.end > len(self.text):
-                # Only the sender knows the new text before it is heard.
-                self.grow(goal.text if event.end <= len(goal.text) else goal.text.ljust(event.start) + event.word)
+            if goal.text is not None and event.end > len(text):  # only the sender knows the new text before it is heard
+                text = text.ljust(event.start) + event.word
             self.word = (event.start, event.end)
         elif isinstance(event, TextMissing):
             self.waits = event.waits
         elif isinstance(event, StateChanged) and event.state is not State.PENDING:
             # A PENDING event may arrive late, when the goal is already in a later state.
             self.state = event.state
+        self.text.extend(text[len(self.text) :])
 
     def render(self) -> str:
         """Return the line as text with terminal codes, cut to the width of the terminal."""

@@ -11,7 +11,7 @@ import os
 from talkcli.cli.command import read_value, replace_bad_bytes
 from talkcli.cli.interrupts import Interrupts, discard_unread_output
 from talkcli.cli.show import note, retry_without_output, show_error, show_if_possible, show_json, standard_output
-from talkcli.cli.wait import GoalReporter, seconds_left, timeout_error, wait_for_goal
+from talkcli.cli.wait import GoalReporter, seconds_left, timeout_error
 from talkcli.errors import EXIT_OK, Lost, UsageError
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import MARKDOWN, SOUND_OPTIONS
@@ -60,11 +60,11 @@ def say(
     if output is None:
         discard_unread_output()
     if lines or stream:
-        common = (options, name, goal_options, wait, feedback, timeout)
         from talkcli.cli.stdin import LineSpeaker
         from talkcli.cli.stream import StreamSpeaker
 
-        return (StreamSpeaker(*common, stall) if stream else LineSpeaker(*common, ahead)).run()
+        given = (options, name, {**goal_options, "stall": stall}, wait, feedback, timeout)
+        return (StreamSpeaker(*given) if stream else LineSpeaker(*given, ahead=ahead)).run()
     found = _read_input(options, timeout, wait, feedback, output) if text == ("-",) else " ".join(text)
     if isinstance(found, int):
         return found  # nothing can be spoken
@@ -79,7 +79,10 @@ def say(
                 goal = client.say(sentence, follow=wait, feedback=feedback, **goal_options)
                 reporter = GoalReporter(options, feedback=feedback)
                 if wait and goal.state is not State.REJECTED:
-                    return wait_for_goal(goal, interrupts, timeout, options, reporter)
+                    end = options.deadline(timeout)
+                    return reporter.wait_for(
+                        goal, interrupts, timeout, lambda goal: reporter.follow([goal], seconds_left(end))
+                    )
                 return retry_without_output(_report_sent, goal, options, reporter)
         except Lost as error:
             if interrupts.signal_number is None:

@@ -356,9 +356,6 @@ class Feedback:
     def show(self, goal: Goal, event: Event) -> None:
         """Show an event of this goal. The base class shows nothing."""
 
-    def text_added(self, goal: Goal) -> None:
-        """Show that the text of this goal has grown. The base class shows nothing."""
-
     def note(self, message: str) -> None:
         """Write a message to standard error without disturbing the display."""
         note(message)

@@ -20,7 +20,7 @@ from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.show import note, retry_without_output, show_error, show_if_possible, write_error_line
 from talkcli.cli.wait import CANCEL_TIMEOUT_S, GoalReporter, seconds_left, timeout_error
 from talkcli.client.core import MIN_TTL_S
-from talkcli.errors import EXIT_OK, ServerUnavailable, TalkError, TimedOut, UsageError
+from talkcli.errors import EXIT_OK, Lost, ServerUnavailable, TalkError, TimedOut, UsageError
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import MAX_TEXT_BYTES, MAX_TEXT_CHARS, Say, format_number
@@ -77,7 +77,7 @@ def read_text(end: float | None, *, stop_without_reader: bool = False, any_lengt
         while any_length or len(data) <= MAX_TEXT_BYTES + len("\r\n"):
             if not wait_ready({0: select.POLLIN}, seconds_left(end), interrupts.watched):
                 raise TimedOut("standard input did not end in time; nothing was sent")
-            more = read_available()
+            more = _read_available()
             if more == b"":
                 return _decode_text(bytes(data))
             data += more or b""
@@ -160,7 +160,7 @@ class LineBuffer:
             yield self.take()
 
 
-def read_available() -> bytes | None:
+def _read_available() -> bytes | None:
     """Read from standard input, and return the data, b"" at its end, or None if no input is available yet."""
     try:
         return os.read(0, _STDIN_READ_BYTES)
@@ -176,8 +176,8 @@ def _decode_text(data: bytes) -> str:
     return data.decode(errors="surrogateescape").rstrip("\r\n")
 
 
-class LineSpeaker:
-    """Speaks the lines of standard input for `say --lines`, each line as a goal."""
+class InputSpeaker:
+    """A base class for the commands that speak standard input while it arrives."""
 
     def __init__(
         self,
@@ -187,7 +187,6 @@ class LineSpeaker:
         wait: bool,
         feedback: bool,
         timeout: float | None,
-        ahead: int | None,
     ) -> None:
         """Initialise the speaker without connecting to the server.
 
@@ -198,19 +197,67 @@ class LineSpeaker:
             wait: whether to wait until the goals have ended.
             feedback: whether to show each word as it is heard.
             timeout: seconds for the whole command; None for no limit.
-            ahead: how many goals may be pending at once; None for the default.
         """
-        self._options = options
-        self._name = name
-        self._goal_options = goal_options
-        self._wait = wait
+        self._options, self._name, self._goal_options, self._wait = options, name, goal_options, wait
         self._reporter = GoalReporter(options, feedback=feedback)
         self._feedback = self._reporter.feedback
         self._timeout, self._end = timeout, options.deadline(timeout) or _NO_LIMIT
-        self._max_pending = ahead or _DEFAULT_PENDING_GOALS
-        self._ttl: float | None = goal_options["ttl"] or None
-        self._buffer = LineBuffer(self._ttl)
         self._interrupts = Interrupts(output=wait)
+
+    def run(self) -> int:
+        """Connect, send the input and, with --wait, wait until all goals have ended. Return the exit code."""
+        options, interrupts = self._options, self._interrupts
+        try:
+            with interrupts, options.connect(self._timeout, name=self._name, interrupt=interrupts.watched) as client:
+                self._client, self._connection = client, client._connection
+                return self._run_connected()
+        except (Lost, ServerUnavailable):
+            if time.monotonic() >= self._end:
+                raise timeout_error(self._timeout) from None
+            raise
+        finally:
+            retry_without_output(self._feedback.close)
+        return interrupts.exit_code
+
+    def _run_connected(self) -> int:
+        """Send the input and follow the goals until done. Return the exit code."""
+        raise NotImplementedError
+
+    def _await_input(self, wait: Callable[[], object], *, wants_input: bool) -> bytes | None:
+        """Call a function that waits until it is interrupted, and return the input that has interrupted it, or None.
+
+        Raises:
+            Interrupted: a signal or closed output has interrupted it.
+        """
+        watched = self._interrupts.watched
+        if wants_input:
+            watched[0] = select.POLLIN
+        try:
+            wait()
+        except Interrupted:
+            if watched.pop(0, None) is None:
+                raise
+            wait_ready({}, 0, watched)  # raises Interrupted again if there was also a signal or closed output
+            return _read_available()
+        finally:
+            watched.pop(0, None)
+        return None
+
+
+class LineSpeaker(InputSpeaker):
+    """Speaks the lines of standard input for `say --lines`, each line as a goal."""
+
+    def __init__(self, *given: Any, ahead: int | None) -> None:
+        """Initialise the speaker without connecting to the server.
+
+        Args:
+            given: the arguments of `InputSpeaker`.
+            ahead: how many goals may be pending at once; None for the default.
+        """
+        super().__init__(*given)
+        self._max_pending = ahead or _DEFAULT_PENDING_GOALS
+        self._ttl: float | None = self._goal_options["ttl"] or None
+        self._buffer = LineBuffer(self._ttl)
         #: the number of the line that was sent but hasn't been accepted or rejected yet, or None
         self._sending: int | None = None
         #: the goal and its unanswered request, or None
@@ -224,24 +271,6 @@ class LineSpeaker:
         self._error: TalkError | None = None
         #: the line number and the exit code of the first failure, or None
         self._failure: tuple[int, int] | None = None
-
-    def run(self) -> int:
-        """Connect, send all lines and, with --wait, wait until their goals have ended. Return the exit code."""
-        interrupts = self._interrupts
-        try:
-            with (
-                interrupts,
-                self._options.connect(self._timeout, name=self._name, interrupt=interrupts.watched) as client,
-            ):
-                self._client, self._connection = client, client._connection
-                return self._run_connected()
-        except ServerUnavailable:
-            if time.monotonic() >= self._end:
-                raise timeout_error(self._timeout) from None
-            raise
-        finally:
-            retry_without_output(self._feedback.close)
-        return interrupts.exit_code
 
     def _run_connected(self) -> int:
         """Send all lines and follow their goals until done or interrupted. Report errors, and return the exit code."""
@@ -393,7 +422,6 @@ class LineSpeaker:
 
     def _wait_for_news(self) -> None:
         """Wait for input, an answer or an event, until a line expires or time is up. Add any input to the buffer."""
-        watched = self._interrupts.watched
         first = self._buffer.first
         end = min(first.end, self._end) if first and self._error is None else self._end
         was_full = self._full
@@ -409,24 +437,13 @@ class LineSpeaker:
         # request.
         since = self._unanswered[1].heard_at if self._unanswered and not self._goals else 0.0
         wait = partial(self._connection.wait_until, has_news, since=since)
-        if self._wants_input:
-            watched[0] = select.POLLIN
-        try:
-            if self._unanswered or self._goals:
-                wait(end)
-            else:
-                wait_ready({}, seconds_left(end), watched)
-        except Interrupted:
-            if watched.pop(0, None) is None:
-                raise
-            wait_ready({}, 0, watched)  # raises Interrupted again if there was also a signal or closed output
-            data = read_available()
-            if data is not None:
-                self._buffer.feed(data, time.monotonic())
-            if self._unanswered or self._goals:  # read from the server even if there is always more input
+        idle = not (self._unanswered or self._goals)
+        pause = partial(wait_ready, {}, seconds_left(end), self._interrupts.watched) if idle else partial(wait, end)
+        data = self._await_input(pause, wants_input=self._wants_input)
+        if data is not None:
+            self._buffer.feed(data, time.monotonic())
+            if not idle:  # read from the server even if there is always more input
                 wait(time.monotonic(), interruptible=False)
-        finally:
-            watched.pop(0, None)
 
     def _report_goals(self) -> None:
         """Forget goals that have ended. With --wait, first report their events in the order of the lines."""

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from talkcli.client.client import GoalHandle
     from talkcli.goals.goal import Goal
 
+    Follow = Callable[[GoalHandle], None]
+
 #: How long to wait for silence after cancelling a goal.
 CANCEL_TIMEOUT_S = 1.0
 
@@ -123,40 +125,28 @@ class GoalReporter:
             retry_without_output(self.feedback.note, f"goal {goal.id} {problem}")
         retry_without_output(self.report, goal.goal)
 
+    def wait_for(self, goal: GoalHandle, interrupts: Interrupts, timeout: float | None, follow: Follow) -> int:
+        """Wait until a goal has ended, or cancel it if interrupted or late. Report the end, and return the exit code.
 
-def wait_for_goal(
-    goal: GoalHandle,
-    interrupts: Interrupts,
-    timeout: float | None,
-    options: CommonOptions,
-    reporter: GoalReporter,
-    follow: Callable[[GoalHandle], None] | None = None,
-) -> int:
-    """Wait until a goal has ended, or cancel it if interrupted or late. Report the end, and return the exit code.
-
-    The goal is cancelled if the wait is interrupted or times out. However, if an earlier command has already sent a
-    goal with the same id, that goal isn't cancelled. `follow` waits and shows the goal's events; the default is the
-    reporter's function.
-    """
-    try:
-        reporter.show_accepted(goal)
-        if follow:
+        The goal is cancelled if the wait is interrupted or times out. However, if an earlier command has already sent a
+        goal with the same id, that goal isn't cancelled. `follow` waits, and shows the goal's events.
+        """
+        try:
+            self.show_accepted(goal)
             follow(goal)
-        else:
-            reporter.follow([goal], seconds_left(options.deadline(timeout)))
-    except (Interrupted, OSError) as error:
-        interrupts.record(error)
-        timed_out = interrupts.signal_number is None and not interrupts.reader_gone
-        if not goal.attached:
-            reporter.cancel(goal, interrupts)
-        if not timed_out:
-            return interrupts.exit_code
-        if goal.state is State.SUCCEEDED:
-            return EXIT_OK
-        raise timeout_error(timeout, f"{goal.id} was sent earlier and continues" if goal.attached else "") from None
-    finally:
-        retry_without_output(reporter.feedback.close)
-    return reporter.report(goal.goal)
+        except (Interrupted, OSError) as error:
+            interrupts.record(error)
+            timed_out = interrupts.signal_number is None and not interrupts.reader_gone
+            if not goal.attached:
+                self.cancel(goal, interrupts)
+            if not timed_out:
+                return interrupts.exit_code
+            if goal.state is State.SUCCEEDED:
+                return EXIT_OK
+            raise timeout_error(timeout, f"{goal.id} was sent earlier and continues" if goal.attached else "") from None
+        finally:
+            retry_without_output(self.feedback.close)
+        return self.report(goal.goal)
 
 
 def wait(options: CommonOptions, ids: tuple[str, ...], timeout: float | None, feedback: bool) -> int:

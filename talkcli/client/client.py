@@ -22,17 +22,7 @@ from talkcli.client.goal import GoalHandle
 from talkcli.errors import Lost, UnknownGoal, UsageError
 from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.goal import Goal
-from talkcli.goals.options import (
-    MAX_ID_CHARS,
-    MAX_IDS,
-    MAX_LOG_GOALS,
-    STALL_S,
-    Cancel,
-    Say,
-    Set,
-    bad_option,
-    check_key,
-)
+from talkcli.goals.options import MAX_ID_CHARS, MAX_IDS, MAX_LOG_GOALS, STALL_S, Cancel, Say, Set, bad_option, check_key
 from talkcli.goals.states import State
 from talkcli.protocol.events import Canceled, ServerStatus, Snapshot, goal_in, goals
 from talkcli.protocol.lines import MAX_LINE_BYTES, request_line, write_request
@@ -185,28 +175,9 @@ class Client:
             Interrupted: a patient goal was waiting for room, in one of `talk`'s own commands. The goal is not spoken if
                 the client is then closed, because the server notices that within 5 s.
         """
-        request = Say(
-            text,
-            wait=follow or feedback,
-            feedback=feedback,
-            patient=patient,
-            preempt=preempt,
-            flush=flush,
-            priority=priority,
-            ttl=ttl,
-            key=key,
-            throttle=throttle,
-            id=id,
-            rate=rate,
-            volume=volume,
-            voice=voice,
-            voice_only=voice_only,
-            pitch=pitch,
-            lead_in=lead_in,
-            audible=audible,
-            data=data,
-            format=format,
-        )
+        # The other parameters have the names of the request's fields.
+        given = {name: value for name, value in locals().items() if name not in {"self", "follow", "block"}}
+        request = Say(wait=follow or feedback, **given)
         if not block and id is None:
             request = replace(request, id=_new_goal_id())
         handle, accepted = self._create_handle(request)
@@ -261,37 +232,15 @@ class Client:
             UsageError: a value is out of its range.
             ProtocolMismatch: the server is too old for growing texts.
         """
-        from talkcli.client.stream import SpeechStream  # rarely needed, and slow to import
-
-        say = Say(
-            "",
-            wait=True,
-            feedback=feedback,
-            patient=patient,
-            preempt=preempt,
-            flush=flush,
-            priority=priority,
-            ttl=ttl,
-            key=key,
-            throttle=throttle,
-            id=id,
-            rate=rate,
-            volume=volume,
-            voice=voice,
-            voice_only=voice_only,
-            pitch=pitch,
-            lead_in=lead_in,
-            audible=audible,
-            data=data,
-            format=format,
-            more=True,
-            stall=stall,
-        )
+        given = {name: value for name, value in locals().items() if name != "self"}  # see `say`
+        say = Say("", wait=True, more=True, **given)
         check(say)
         if error := self._connection.unsupported(say):
             raise error
         if id is None and isinstance(self._connection, ReconnectingConnection):
             say = replace(say, id=_new_goal_id())
+        from talkcli.client.stream import SpeechStream  # rarely needed, and slow to import
+
         return SpeechStream(self._connection, say)
 
     def follow(self, ids: Iterable[str] | None = None, *, feedback: bool = False) -> list[GoalHandle]:

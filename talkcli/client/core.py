@@ -34,17 +34,7 @@ from talkcli.goals.goal import Goal, read_fields
 from talkcli.goals.options import Append, Say
 from talkcli.goals.states import State
 from talkcli.protocol import events
-from talkcli.protocol.events import (
-    PausedChanged,
-    Result,
-    ServerStatus,
-    Snapshot,
-    StateChanged,
-    TextAdded,
-    TextMissing,
-    WordHeard,
-    goals,
-)
+from talkcli.protocol.events import PausedChanged, Result, ServerStatus, Snapshot, StateChanged, WordHeard, goals
 from talkcli.protocol.features import FEATURES, missing_features
 from talkcli.protocol.lines import FIRST_NUMBER, LineSplitter, decode, request_line, write_request
 from talkcli.protocol.requests import Pause, Wait, Watch
@@ -102,7 +92,7 @@ class EventBuffer:
         if self.closed is not None:
             return
         self._count += 1
-        if isinstance(event, WordHeard | TextAdded | TextMissing | PausedChanged):
+        if isinstance(event, WordHeard | events.TextAdded | events.TextMissing | PausedChanged):
             self._feedback.append((self._count, event))
         elif len(self._states) < MAX_STATE_EVENTS:
             self._states.append((self._count, event))
@@ -164,14 +154,14 @@ class EventListeners:
             for tracked in self._goals.pop(event.goal.id, set()):
                 tracked._update(event.goal)
             return
-        if isinstance(event, StateChanged | WordHeard | TextMissing | PausedChanged):
+        if isinstance(event, StateChanged | WordHeard | events.TextMissing | PausedChanged):
             for goal_id in self._goals if isinstance(event, PausedChanged) else [event.id]:
                 for tracked in self._goals.get(goal_id, set()):
                     tracked._hear(event)
             state = event.state if isinstance(event, StateChanged) and not event.goal else None
             if state is State.PENDING or (state and state.terminal):
                 return  # clients that watch all goals receive this event again, with the whole goal
-        elif not isinstance(event, TextAdded | Snapshot):
+        elif not isinstance(event, events.TextAdded | Snapshot):
             return
         for buffer in self.watches:
             buffer.add(event)
@@ -239,7 +229,7 @@ class TrackedGoal:
         if not self.goal.state.terminal:
             self.goal = goal
 
-    def _hear(self, event: StateChanged | WordHeard | TextMissing | PausedChanged | Goal) -> None:
+    def _hear(self, event: StateChanged | WordHeard | events.TextMissing | PausedChanged | Goal) -> None:
         """Update the goal from an event or from its state after reconnecting, and buffer the event."""
         if self.goal.state.terminal:
             return
@@ -257,7 +247,7 @@ class TrackedGoal:
                 self.speech_paused = event.paused
                 paused = event.paused and event.id == self.goal.id and self.goal.state is State.ACTIVE
                 self.goal = replace(self.goal, paused=paused)
-            elif isinstance(event, TextMissing):
+            elif isinstance(event, events.TextMissing):
                 self.goal = replace(self.goal, waits=event.waits)
             if self._with_feedback:
                 self._buffer.add(event)

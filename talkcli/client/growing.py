@@ -22,9 +22,10 @@ class TextSender:
         self._length = 0
         #: the goal's id, or None until the server has accepted the goal
         self._goal_id: str | None = None
-        self._ended = False
-        #: whether the server knows that the text has ended
-        self._end_sent = False
+        #: whether no more text will be added
+        self.ended = False
+        #: whether the server has the whole text
+        self.finished = False
         #: the request that has not been answered, or None
         self._open: Say | Append | None = None
 
@@ -32,56 +33,42 @@ class TextSender:
         """Add text at the end."""
         self._unsent = _join_surrogates(self._unsent + text)
 
-    def end(self) -> None:
-        """Declare the text complete."""
-        self._ended = True
-
-    @property
-    def finished(self) -> bool:
-        """Whether the server has the whole text."""
-        return self._end_sent
-
     def next_request(self) -> Say | Append | None:
         """Return the next request, or None if there is nothing to send.
 
         A request is returned until it has been answered. After a broken connection, it can be sent again, because the
         server ignores text that it already has.
         """
-        if self._open is None:
-            self._open = self._create_request()
+        self._open = self._open or self._create_request()
         return self._open
 
     def accepted(self, goal_id: str) -> str:
         """Record that the server has accepted the open request, and return the text that it has added."""
         request = self._open
         assert request
-        self._goal_id, self._open = goal_id, None
-        self._unsent = self._unsent[len(request.text) :]
+        self.refused()
+        self._goal_id = goal_id
         self._length += len(request.text)
-        self._end_sent = request.end if isinstance(request, Append) else not request.more
+        self.finished = request.end if isinstance(request, Append) else not request.more
         return request.text
 
     def refused(self) -> None:
-        """Drop the text of the open request, because the server has refused it."""
-        self._unsent, self._open = self._unsent[len(self._open.text if self._open else "") :], None
+        """Forget the open request and its text."""
+        if self._open:
+            self._unsent, self._open = self._unsent[len(self._open.text) :], None
 
     def _create_request(self) -> Say | Append | None:
         """Return a request for the text that can be sent now, or None."""
         text = self._unsent[:MAX_TEXT_CHARS]
-        is_last = self._ended and len(text) == len(self._unsent)
-        if not is_last and _is_first_half(text[-1:]):  # the other half follows
+        is_last = self.ended and len(text) == len(self._unsent)
+        if not is_last and "\ud800" <= text[-1:] <= "\udbff":  # the other half of a surrogate pair follows
             text = text[:-1]
         if self._goal_id is not None:
-            has_news = text or (is_last and not self._end_sent)
+            has_news = text or (is_last and not self.finished)
             return Append(self._goal_id, text, self._length, is_last) if has_news else None
         if is_last or is_visible(text) or len(text) == MAX_TEXT_CHARS:
             return replace(self._say, text=text, more=not is_last)
         return None
-
-
-def _is_first_half(character: str) -> bool:
-    """Return whether a character is the first half of a surrogate pair."""
-    return "\ud800" <= character <= "\udbff"
 
 
 def _join_surrogates(text: str) -> str:

@@ -5,22 +5,22 @@
 
 from __future__ import annotations
 
-import time
 from contextlib import suppress
 
 from talkcli.client.goal import GoalHandle
 from talkcli.client.growing import TextSender
-from talkcli.errors import Lost, RequestRefused, ServerUnavailable, TalkError, UnknownGoal, UsageError
+from talkcli.errors import Lost, RequestRefused, ServerUnavailable, TalkError, UnknownGoal
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import Append, Say
 from talkcli.goals.states import State
 
 if TYPE_CHECKING:
-    from types import TracebackType
-
     from talkcli.client.connection import Connection
     from talkcli.goals.goal import JsonObject
+
+#: How many times an addition is sent again. The limit matters if the request itself breaks the connection.
+_MAX_RESENDS = 5
 
 
 class SpeechStream:
@@ -40,8 +40,6 @@ class SpeechStream:
         self._text = TextSender(say)
         #: whether the server takes no more text, because the goal has ended or is being stopped
         self._refused = False
-        #: whether the caller can't write any more
-        self._closed = False
 
     def write(self, text: str) -> bool:
         """Add text at the end, and return whether the goal can still take text.
@@ -53,33 +51,14 @@ class SpeechStream:
             False if the goal has ended or is being stopped, for example because it was preempted or cancelled.
 
         Raises:
-            UsageError: an option of the goal is out of its range, or the text has already ended.
             RequestRefused: the server refused this text, for example because the whole text is longer than 50,000
                 characters (`text_too_long`). The goal still has the earlier text.
             ServerUnavailable: the server can't be reached. Nothing was sent.
             Lost: the connection broke, and the client could not reconnect. The goal is LOST.
         """
-        if self._closed:
-            raise UsageError("the text has already ended; start another one with Client.stream")
         if not self._stopped:
             self._text.write(text)
         return self._send()
-
-    def end(self) -> None:
-        """Declare the text complete. Nothing is sent if there is no goal. The errors are those of `write`."""
-        if not self._closed:
-            self._closed = True
-            if self.goal:
-                self._text.end()
-                self._send()
-
-    def break_off(self) -> None:
-        """Stop the goal at once, because its text will never be complete. Errors of the connection are ignored."""
-        if not self._closed:
-            self._closed = True
-            if self.goal and not self._stopped:
-                with suppress(TalkError):
-                    self._connection.request(Append(self.goal.id, broken=True))
 
     def wait(self, timeout: float | None = None) -> Goal | None:
         """Wait until the goal has ended, and return it, or return None if there is no goal.
@@ -91,13 +70,13 @@ class SpeechStream:
     def __enter__(self) -> SpeechStream:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if kind is None:
-            self.end()
-        else:
-            self.break_off()
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if self.goal and kind is None:
+            self._text.ended = True
+            self._send()
+        elif self.goal and not self._stopped:
+            with suppress(TalkError):
+                self._connection.request(Append(self.goal.id, broken=True))
 
     # -- internal
 
@@ -108,37 +87,36 @@ class SpeechStream:
 
     def _send(self) -> bool:
         """Send all text that can be sent, and return whether the goal can still take text."""
-        give_up = float("inf")
+        connection, resends = self._connection, 0
         while not self._stopped and (request := self._text.next_request()):
             if isinstance(request, Say):
                 self._begin_goal(request)
                 continue
             try:
-                self._connection.request(request, self._add_text)
+                connection.request(request, self._add_text)
             except RequestRefused as error:
                 self._process_error(error)
             except (Lost, ServerUnavailable) as error:
-                give_up = min(give_up, time.monotonic() + self._connection._patience)
-                self._await_reconnection(error, give_up)
+                # Wait until the client has reconnected, or until it gives up and the goal is LOST.
+                connection.wait_until(lambda: self._stopped or connection.absent_since is None, None)
+                resends += 1
+                if connection.ended is not None or connection.absent_since is not None or resends > _MAX_RESENDS:
+                    self._process_error(error)
+                    raise Lost(f"{error.message}; the sentence may still be spoken") from error
         return not self._stopped
 
-    def _begin_goal(self, request: Say) -> None:
-        """Send the goal with the beginning of its text, and wait for the server's answer."""
+    def _begin_goal(self, request: Say) -> GoalHandle:
+        """Send the goal with the beginning of its text, wait for the server's answer, and return the handle."""
         handle = GoalHandle(self._connection, Goal("", State.PENDING))
-        handle._expect(request, time.monotonic())
-        self.goal = handle
 
         def on_reply(reply: JsonObject, _: list[JsonObject]) -> None:
             handle._accept(reply)
             handle._listen(feedback=request.feedback)
             self._text.accepted(handle.id)
+            self.goal = handle
 
-        try:
-            self._connection.request(request, on_reply)
-        except TalkError as error:
-            with self._connection.changed:
-                handle._fail(error)
-            raise
+        self._connection.request(request, on_reply)
+        return handle
 
     def _add_text(self, *_: object) -> None:
         """Record that the server has accepted the open request to add text."""
@@ -160,17 +138,3 @@ class SpeechStream:
         else:
             with self._connection.changed:
                 self.goal._mark_lost(f"{error.message}; the sentence may still be spoken")
-
-    def _await_reconnection(self, error: TalkError, give_up: float) -> None:
-        """Wait until the client has reconnected or the goal has ended.
-
-        Raises:
-            Lost: the client can't reconnect in time.
-        """
-        connection = self._connection
-        in_time = time.monotonic() < give_up and connection.wait_until(
-            lambda: connection.absent_since is None or self._stopped, give_up
-        )
-        if connection.ended is not None or connection.absent_since is not None or not in_time:
-            self._process_error(error)
-            raise Lost(f"{error.message}; the sentence may still be spoken") from error

@@ -11,15 +11,7 @@ import time
 
 from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.states import State
-from talkcli.protocol.events import (
-    PausedChanged,
-    Snapshot,
-    StateChanged,
-    TextAdded,
-    TextMissing,
-    WordHeard,
-    unfinished,
-)
+from talkcli.protocol.events import PausedChanged, Snapshot, StateChanged, TextAdded, TextMissing, WordHeard, unfinished
 from talkcli.terminal.goals import clock_time, listed_reason_forms, quoted_text, reason_forms, sender_forms
 from talkcli.terminal.text import (
     COLUMN_GAP,
@@ -51,8 +43,6 @@ _MAX_NAME_COLUMNS = 20
 _INDENT_COLUMNS = 10
 #: Complete sentences and lines. Text that is added to a goal is shown when one of them is complete.
 _COMPLETE_SENTENCES = re.compile(r".*(?:[.!?…][\"'”’»)]*\s|[。！？\n])", re.DOTALL)
-#: The length at which added text is shown even if no sentence is complete.
-_MAX_UNSHOWN_CHARS = 200
 #: The maximum number of unfinished goals to remember. The oldest goal is dropped first.
 _MAX_REMEMBERED_GOALS = 1000
 
@@ -187,8 +177,7 @@ class Transcript:
             text = goal.text[: event.start] + event.text if isinstance(event, TextAdded) else goal.text
             # The sentences that were complete at the beginning have been shown with the goal.
             shown = self._shown_chars.get(event.id, _complete_chars(goal.text, 0))
-            is_due = waits or len(text) - shown > _MAX_UNSHOWN_CHARS
-            end = len(text) if is_due else _complete_chars(text, shown)
+            end = len(text) if waits else _complete_chars(text, shown)
             if added := text[shown:end].strip():
                 head = self._head_columns(at, "text", None, event.id, screen)
                 lines.append(fit_row(head, quoted_text(replace(goal, text=added, more=False)), [""], 0, screen))

@@ -36,7 +36,7 @@ def requests(writes: Iterable[str | None]) -> list[list[Say | Append]]:
     found = []
     for text in writes:
         if text is END:
-            sender.end()
+            sender.ended = True
         else:
             sender.write(text)
         found.append(list(sent(sender)))
