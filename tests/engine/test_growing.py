@@ -91,6 +91,13 @@ def test_missing_text_is_reported_once_and_so_is_its_end(engine: Spawned) -> Non
     assert (ended.outcome, ended.gaps, len(engine.words())) == (protocol.OUTCOME_COMPLETED, 0, 2)
 
 
+def test_missing_text_is_reported_if_the_silence_at_the_end_is_held_back(sink: Sink) -> None:
+    before = "from talkcli.engine.child.players import chooser; chooser.HandoverTimes.silence_to_cut = lambda *_: 1.0"
+    with Spawned("aplay", environment=sink.env, before=before) as engine:
+        grow(engine, "One. ", end=False)
+        assert [engine.until(protocol.TextMissing).missing for _ in range(3)] == [True, False, True]
+
+
 def test_the_end_of_a_text_may_come_after_all_of_it_was_heard(engine: Spawned) -> None:
     grow(engine, "One.", end=False)
     assert [engine.until(protocol.TextMissing).missing for _ in range(3)] == [True, False, True]

@@ -347,7 +347,7 @@ class Playback:
         """Return how many seconds of sound the player has left. The result is 0 if the sound goes into a file."""
         if self._feed is None or not self._feed.player.real_time:
             return 0.0
-        unsent = self._seconds(self._samples.end - self._sent)
+        unsent = self._seconds(self._sendable_end(self._feed) - self._sent)  # without silence that is held back
         # The clock doesn't count the last milliseconds as heard until all samples have been sent.
         return max(0.0, self._feed.buffered(time.monotonic()) + unsent - MIN_PLAYER_BUFFER_S)
 
