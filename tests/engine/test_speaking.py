@@ -63,7 +63,7 @@ def _length(ended: protocol.Ended) -> float:
 # -- the start
 
 
-def test_a_process_gets_ready_and_lists_its_voices() -> None:
+def test_a_process_becomes_ready_and_lists_its_voices() -> None:
     with Spawned() as engine:
         ready = engine.until(protocol.Ready)
         assert (ready.driver, ready.player) == ("espeak", "null")
@@ -76,7 +76,7 @@ def test_a_process_gets_ready_and_lists_its_voices() -> None:
         assert isinstance(engine.event(), protocol.Started)
 
 
-def test_voices_that_are_known_are_not_listed() -> None:
+def test_voices_that_the_server_knows_are_not_listed() -> None:
     with Spawned(list_voices=False) as engine:
         assert engine.spoken("yes").outcome == protocol.OUTCOME_COMPLETED
         engine.leave()
@@ -109,7 +109,7 @@ def test_a_process_gets_no_more_than_half_of_the_machines_memory(less: int) -> N
 
 
 @limits()
-def test_words_come_as_they_are_heard_and_only_forward(engine: Spawned) -> None:
+def test_words_are_reported_in_order_when_they_are_heard(engine: Spawned) -> None:
     text = "this one é 日本 😀 battery low, please."
     began, late = time.monotonic(), []
     engine.say(text)
@@ -125,7 +125,7 @@ def test_words_come_as_they_are_heard_and_only_forward(engine: Spawned) -> None:
     assert min(late) >= 0
 
 
-def test_a_goal_in_hand_is_told_to_be_alive(engine: Spawned) -> None:
+def test_signs_of_life_are_sent_while_a_goal_is_spoken(engine: Spawned) -> None:
     last = time.monotonic()
     engine.say("a.\n\n\n\na", rate=120)  # the second word comes after some `Alive` messages
     alive = 0
@@ -137,14 +137,14 @@ def test_a_goal_in_hand_is_told_to_be_alive(engine: Spawned) -> None:
     assert alive > 1
 
 
-def test_a_text_without_anything_to_say_ends_with_nothing_to_say(engine: Spawned) -> None:
+def test_a_text_without_words_fails_with_nothing_to_say(engine: Spawned) -> None:
     for text in ("", "  \n", "...", "\x01\x02", "«»"):
         ended = engine.spoken(text, f"goal {text!a}")
         assert (ended.outcome, ended.reason) == (protocol.OUTCOME_FAILED, "nothing_to_say")
     assert engine.spoken("yes", "g2").outcome == protocol.OUTCOME_COMPLETED
 
 
-def test_control_characters_are_no_commands_and_keep_the_offsets(writing: Spawned) -> None:
+def test_control_characters_are_not_commands_and_keep_the_offsets(writing: Spawned) -> None:
     plain = _length(writing.spoken("a    b one two", "g1"))
     assert writing.spoken("a \x01\x00\x1bb one two", "g2").outcome == protocol.OUTCOME_COMPLETED
     assert writing.words("g1")[-1].start == writing.words("g2")[-1].start == len("a    b one ")
@@ -152,14 +152,14 @@ def test_control_characters_are_no_commands_and_keep_the_offsets(writing: Spawne
     assert _length(writing.spoken("a \x0180Sb one two", "g3")) < plain * 2.5
 
 
-def test_settings_belong_to_their_goal(writing: Spawned) -> None:
+def test_settings_apply_only_to_their_goal(writing: Spawned) -> None:
     text = "the battery is low, please come home"
     fast = _length(writing.spoken(text, "g1", rate=400))
     assert _length(writing.spoken(text, "g2", rate=100, voice="en-us")) > 2 * fast
     assert abs(_length(writing.spoken(text, "g3", rate=400)) - fast) < 0.15
 
 
-def test_an_unknown_voice_fails_with_near_matches_and_the_next_goal_is_spoken(engine: Spawned) -> None:
+def test_an_unknown_voice_fails_one_goal_and_suggests_similar_names(engine: Spawned) -> None:
     ended = engine.spoken("yes", voice="en-uss")
     assert (ended.outcome, ended.reason) == (protocol.OUTCOME_FAILED, "unknown_voice")
     assert ended.message is not None
@@ -179,7 +179,7 @@ def test_a_stop_for_another_goal_is_ignored(engine: Spawned) -> None:
     assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
 
 
-def test_a_stop_that_comes_with_the_sentence_is_obeyed(engine: Spawned) -> None:
+def test_a_stop_sent_together_with_the_sentence_is_obeyed(engine: Spawned) -> None:
     engine.send(protocol.Speak("g1", "one two three four five", 200, 1.0, None, 50), protocol.Stop("g1"))
     assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_STOPPED
     assert engine.words() == []
@@ -188,7 +188,7 @@ def test_a_stop_that_comes_with_the_sentence_is_obeyed(engine: Spawned) -> None:
 # -- idle, and exit
 
 
-def test_a_crash_leaves_no_core(engine: Spawned) -> None:
+def test_a_crash_leaves_no_core_dump(engine: Spawned) -> None:
     soft, _ = resource.prlimit(engine.process.pid, resource.RLIMIT_CORE)
     assert soft in (0, 1)  # bytes; 0 if the hard limit is 0
 
@@ -206,13 +206,13 @@ def _switches(pid: int) -> str:
         return next(line for line in file if line.startswith("voluntary_ctxt_switches"))
 
 
-def test_an_orphan_ends_before_it_starts() -> None:
+def test_a_process_without_its_server_exits_at_once() -> None:
     with Spawned(server=1) as engine:
         assert engine.event() is None
         assert engine.process.wait(5) == 0
 
 
-def test_the_process_ends_with_its_server_and_so_does_its_player(player: Player, tmp_path: Path) -> None:
+def test_the_process_and_its_player_end_with_the_server(player: Player, tmp_path: Path) -> None:
     begun = tmp_path / "begun"
     os.mkfifo(begun)
     with Spawned(player.command(f"open({str(begun)!r}, 'w').close()\n{NEVER_READS}")) as engine:

@@ -72,7 +72,7 @@ def _process(thread: Thread) -> EngineProcess:
 # -- pauses
 
 
-def test_a_goal_is_held_beyond_any_limit_and_goes_on_where_it_was(start: Start) -> None:
+def test_a_pause_may_exceed_all_limits_and_resumes_in_place(start: Start) -> None:
     thread = start(HANG_LIMIT_S=0.7, HOLD_LIMIT_S=0.7)
     began = time.monotonic()
     _hold(thread, "length=0.4 slow-pause=0.1 two three four")
@@ -84,7 +84,7 @@ def test_a_goal_is_held_beyond_any_limit_and_goes_on_where_it_was(start: Start) 
     assert [each.number for each in thread.seen if isinstance(each, protocol.Word)] == [1, 2, 3, 4, 5]
 
 
-def test_a_pause_has_no_limit_once_the_goal_goes_on(start: Start) -> None:
+def test_a_resumed_goal_need_not_confirm_its_pause(start: Start) -> None:
     thread = start(HOLD_LIMIT_S=0.2)
     _hold(thread, "length=0.5 ignore-pause")
     thread.engine.resume("g1")
@@ -92,7 +92,7 @@ def test_a_pause_has_no_limit_once_the_goal_goes_on(start: Start) -> None:
     assert not _pauses(thread)
 
 
-def test_a_pause_that_is_not_confirmed_ends_the_process(start: Start) -> None:
+def test_an_unconfirmed_pause_kills_the_process(start: Start) -> None:
     thread = start(HOLD_LIMIT_S=0.3)
     asked = time.monotonic()
     _hold(thread, "never-ends ignore-pause")
@@ -102,7 +102,7 @@ def test_a_pause_that_is_not_confirmed_ends_the_process(start: Start) -> None:
     assert thread.spoken("yes", "g2").outcome == OUTCOME_COMPLETED
 
 
-def test_paused_is_posted_when_the_process_is_silent_and_not_after_a_resume(start: Start) -> None:
+def test_a_pause_is_reported_at_silence_but_not_after_a_resume(start: Start) -> None:
     thread = start()
     asked = time.monotonic()
     _hold(thread, "length=0.7 slow-pause=0.3")
@@ -115,7 +115,7 @@ def test_paused_is_posted_when_the_process_is_silent_and_not_after_a_resume(star
     assert _pauses(thread) == 1
 
 
-def test_an_answer_to_an_earlier_pause_is_no_answer_to_this_one(start: Start) -> None:
+def test_a_late_confirmation_does_not_count_for_a_new_pause(start: Start) -> None:
     thread = start()
     _hold(thread, "length=0.6 stale-pause slow-pause=0.2")
     thread.engine.resume("g1")
@@ -126,7 +126,7 @@ def test_an_answer_to_an_earlier_pause_is_no_answer_to_this_one(start: Start) ->
     assert _pauses(thread) == 1
 
 
-def test_a_goal_that_waits_for_a_process_is_held_by_the_thread(start: Start) -> None:
+def test_a_goal_waiting_for_a_process_is_paused_by_the_thread(start: Start) -> None:
     thread = start("slow=0.4")
     thread.say("two words")
     thread.engine.pause("g1", 1)
@@ -138,7 +138,7 @@ def test_a_goal_that_waits_for_a_process_is_held_by_the_thread(start: Start) -> 
     assert thread.until(protocol.Ended).outcome == OUTCOME_COMPLETED
 
 
-def test_a_goal_that_is_held_by_the_thread_is_stopped_at_once(start: Start) -> None:
+def test_a_goal_paused_by_the_thread_is_stopped_at_once(start: Start) -> None:
     thread = start("slow=0.5")
     thread.say("two words")
     thread.engine.pause("g1", 1)
@@ -148,7 +148,7 @@ def test_a_goal_that_is_held_by_the_thread_is_stopped_at_once(start: Start) -> N
 
 
 @pytest.mark.parametrize("on_stop", ["", "on-stop=crash"])
-def test_a_paused_goal_is_stopped(start: Start, on_stop: str) -> None:
+def test_a_paused_goal_can_be_stopped(start: Start, on_stop: str) -> None:
     thread = start()
     _hold(thread, f"never-ends {on_stop}")
     thread.until(protocol.Held)
@@ -193,7 +193,7 @@ def answers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Callabl
 
 
 @pytest.mark.parametrize("followed", [True, False])
-def test_the_process_is_told_whether_a_goal_follows(answers: Callable[..., Thread], followed: bool) -> None:
+def test_the_process_learns_whether_another_goal_waits(answers: Callable[..., Thread], followed: bool) -> None:
     told = (
         'protocol.Ended(command.id, protocol.OUTCOME_COMPLETED, None, f"{command.next_waits} {command.next_is_neural}")'
     )
@@ -205,7 +205,7 @@ def test_the_process_is_told_whether_a_goal_follows(answers: Callable[..., Threa
     assert thread.until(protocol.Ended) == protocol.Ended("g1", OUTCOME_COMPLETED, None, f"{followed} True")
 
 
-def test_a_process_that_takes_no_goal_is_ended(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_that_accepts_no_goal_is_replaced(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
     """The next process gets the goal."""
     thread = start()
     monkeypatch.setattr(_process(thread), "send", lambda _: False)
@@ -214,7 +214,7 @@ def test_a_process_that_takes_no_goal_is_ended(start: Start, monkeypatch: pytest
     assert thread.until(protocol.Ended) == SPOKEN
 
 
-def test_a_goal_that_is_sent_to_a_process_in_its_death_is_spoken_by_the_next(start: Start) -> None:
+def test_a_goal_sent_to_a_dying_process_is_spoken_by_the_next(start: Start) -> None:
     thread = start()
     thread.until(protocol.Ready)
     for number in range(10):
@@ -225,7 +225,7 @@ def test_a_goal_that_is_sent_to_a_process_in_its_death_is_spoken_by_the_next(sta
         assert ended == protocol.Ended(f"g{number}", OUTCOME_COMPLETED, duration=0.01)
 
 
-def test_a_goal_for_which_two_processes_die_before_they_begin_with_it_ends(start: Start) -> None:
+def test_a_goal_fails_if_two_processes_die_before_starting_it(start: Start) -> None:
     thread = start()
     ended = thread.spoken("silent-start length=0 crash")
     assert (ended.outcome, ended.reason) == (OUTCOME_FAILED, "engine_crashed")
@@ -233,7 +233,7 @@ def test_a_goal_for_which_two_processes_die_before_they_begin_with_it_ends(start
     assert thread.spoken("yes", "g2").outcome == OUTCOME_COMPLETED
 
 
-def test_a_process_that_was_given_up_gets_no_other_goal(start: Start) -> None:
+def test_an_abandoned_process_gets_no_other_goal(start: Start) -> None:
     thread = start()
     thread.say("never-ends ignore-stop")
     thread.until(protocol.Word)
@@ -243,7 +243,7 @@ def test_a_process_that_was_given_up_gets_no_other_goal(start: Start) -> None:
     assert thread.engine._process is not lost
 
 
-def test_a_goal_that_ended_before_it_was_given_up_costs_no_process(start: Start) -> None:
+def test_abandoning_a_goal_that_has_ended_keeps_the_process(start: Start) -> None:
     thread = start()
     thread.spoken("length=0")
     process = thread.engine._process
@@ -253,14 +253,14 @@ def test_a_goal_that_ended_before_it_was_given_up_costs_no_process(start: Start)
     assert thread.engine._process is process
 
 
-def test_a_closed_process_takes_no_command(start: Start) -> None:
+def test_a_closed_process_accepts_no_command(start: Start) -> None:
     thread = start()
     process = _process(thread)
     thread.close()
     assert not process.send(protocol.Stop("g1"))
 
 
-def test_a_goal_that_is_handed_in_just_before_the_end_ends(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_goal_submitted_just_before_the_shutdown_ends(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
     thread, held = start(), threading.Event()
     post = thread.engine._post
 
@@ -281,7 +281,9 @@ def test_a_goal_that_is_handed_in_just_before_the_end_ends(start: Start, monkeyp
 # -- the process
 
 
-def test_a_thread_that_stood_still_hears_the_engine_first(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_suspended_thread_reads_messages_before_it_checks_limits(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """After the machine or the server was suspended, messages are read before time limits are checked."""
     standing = [0.7]
 
@@ -303,7 +305,7 @@ def test_a_thread_that_stood_still_hears_the_engine_first(start: Start, monkeypa
     assert not standing
 
 
-def test_a_start_that_hangs_is_tried_again_and_fails_a_goal_each_time_after_a_while(
+def test_a_hanging_start_is_retried_and_later_fails_one_goal_each_time(
     start: Start, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     behaviour = tmp_path / "start"
@@ -351,7 +353,7 @@ def _watching(process: EngineProcess, posted: list[Report]) -> Supervisor:
 
 
 @pytest.mark.parametrize("spoken", [True, False])
-def test_a_process_that_dies_while_idle_was_of_use_if_it_has_spoken(spoken: bool) -> None:
+def test_a_process_that_dies_idle_is_replaced_sooner_if_it_has_spoken(spoken: bool) -> None:
     process = cast("EngineProcess", Undying())
     engine = _watching(process, [])
     engine._restarts.start_failed(0.0, 0.0, None)
@@ -367,7 +369,7 @@ def test_a_process_that_dies_while_idle_was_of_use_if_it_has_spoken(spoken: bool
 
 
 @pytest.mark.parametrize("in_time", [True, False])
-def test_a_goal_ends_once_when_its_process_is_gone_or_should_be(monkeypatch: pytest.MonkeyPatch, in_time: bool) -> None:
+def test_a_goal_ends_once_when_its_process_is_gone_or_overdue(monkeypatch: pytest.MonkeyPatch, in_time: bool) -> None:
     posted: list[Report] = []
     undying = Undying()
     process = cast("EngineProcess", undying)
@@ -397,7 +399,7 @@ def test_a_goal_ends_once_when_its_process_is_gone_or_should_be(monkeypatch: pyt
 LACKING = "no library"
 
 
-def test_the_wait_grows_with_each_process_that_never_got_ready_or_died_as_soon_as_it_was() -> None:
+def test_the_restart_delay_grows_with_each_failed_start_or_early_death() -> None:
     failing, dying, now = RestartPolicy(100.0), RestartPolicy(100.0), 100.0
     for wait in (*RESTART_DELAYS_S, RESTART_DELAYS_S[-1], RESTART_DELAYS_S[-1]):
         failing.start_failed(now, now, LACKING)
@@ -407,7 +409,7 @@ def test_the_wait_grows_with_each_process_that_never_got_ready_or_died_as_soon_a
 
 
 @pytest.mark.parametrize(("age", "had_goal"), [(MIN_LIFETIME_S / 2, True), (MIN_LIFETIME_S * 2, False)])
-def test_a_process_that_was_of_use_costs_no_wait_and_resets_it(age: float, had_goal: bool) -> None:
+def test_the_death_of_a_useful_process_resets_the_delay(age: float, had_goal: bool) -> None:
     restarts = RestartPolicy(100.0)
     for _ in range(4):
         restarts.start_failed(100.0, 100.0, None)
@@ -417,7 +419,7 @@ def test_a_process_that_was_of_use_costs_no_wait_and_resets_it(age: float, had_g
     assert restarts.next_start_at == 200.0 + RESTART_DELAYS_S[0]
 
 
-def test_a_cause_that_stays_is_an_error_until_the_next_start_says_otherwise() -> None:
+def test_a_permanent_error_lasts_until_a_start_fails_without_one() -> None:
     restarts = RestartPolicy(100.0)
     assert not restarts.start_failed(100.0, 100.0, LACKING)
     assert restarts.permanent_error == LACKING
@@ -428,7 +430,7 @@ def test_a_cause_that_stays_is_an_error_until_the_next_start_says_otherwise() ->
     assert restarts.permanent_error is None
 
 
-def test_a_start_costs_a_goal_only_if_it_began_long_after_there_was_a_process() -> None:
+def test_a_failed_start_fails_a_goal_only_long_after_the_last_process() -> None:
     restarts = RestartPolicy(100.0)
     assert not restarts.start_failed(100.0 + WAITED + 5, 100.0 + WAITED - 0.1, None)
     assert restarts.start_failed(100.0 + WAITED, 100.0 + WAITED, None)
@@ -455,7 +457,7 @@ def _complaining(script: str) -> tuple[list[str], str]:
     return lines, words
 
 
-def test_lines_are_passed_on_when_they_are_whole_and_the_last_is_a_crashs_own() -> None:
+def test_complete_lines_are_reported_and_the_last_one_explains_the_exit() -> None:
     lines, words = _complaining("for each in (b'one\\ntw', b'o\\n\\n  \\n thr\\xffee'): os.write(2, each)")
     assert lines == ["one", "two", " thr\ufffdee"]
     assert words == "it exited with status 0 (thr\ufffdee)"
@@ -464,7 +466,7 @@ def test_lines_are_passed_on_when_they_are_whole_and_the_last_is_a_crashs_own() 
     )
 
 
-def test_lines_that_are_too_many_are_counted_and_told_with_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_omitted_lines_are_counted_and_reported_with_the_next_line(monkeypatch: pytest.MonkeyPatch) -> None:
     passed: list[Report] = []
     engine, now = Supervisor(CONFIGURE, passed.append), 1000.0
     monkeypatch.setattr(time, "monotonic", lambda: now)
@@ -484,7 +486,7 @@ def test_lines_that_are_too_many_are_counted_and_told_with_the_next(monkeypatch:
     engine._actions.close()
 
 
-def test_standard_error_is_posted_and_a_traceback_before_the_crash(answers: Callable[..., Thread]) -> None:
+def test_standard_error_and_a_traceback_are_reported_before_the_crash(answers: Callable[..., Thread]) -> None:
     complains = """
 for word in command.text.split():
     if word == "raise":
@@ -508,7 +510,7 @@ tell(protocol.Ended(command.id, protocol.OUTCOME_COMPLETED))
 # -- the queue of actions
 
 
-def test_nothing_is_lost_and_nothing_overtakes_if_several_threads_hand_in() -> None:
+def test_actions_of_several_threads_are_neither_lost_nor_reordered() -> None:
     queue, done = ActionQueue(), list[tuple[int, int]]()
     count = 1000
 
@@ -528,7 +530,7 @@ def test_nothing_is_lost_and_nothing_overtakes_if_several_threads_hand_in() -> N
     queue.close()
 
 
-def test_a_queue_takes_any_number_of_actions_and_those_that_come_after_its_end() -> None:
+def test_a_queue_takes_any_number_of_actions_and_ignores_later_ones() -> None:
     queue, done = ActionQueue(), list[int]()
     for number in range(100_000):  # more than there is room for bytes that wake the thread
         queue.call(lambda number=number: done.append(number))  # type: ignore[misc]

@@ -253,7 +253,7 @@ def _plain(synthesizer: Synthesizer) -> list[str]:
     return [each for each in found if each != REAL_VOICE or each == synthesizer.voice]
 
 
-def test_voices_have_ids_and_one_of_them_is_in_force(
+def test_voices_have_unique_ids_and_include_the_current_one(
     made: tuple[Synthesizer, str],
 ) -> None:
     synthesizer, own = made
@@ -266,7 +266,7 @@ def test_voices_have_ids_and_one_of_them_is_in_force(
 
 
 @limits()
-def test_each_voice_is_loaded_soon_by_its_id_with_a_variant_or_without(synthesizer: Synthesizer) -> None:
+def test_a_voice_is_loaded_quickly_with_or_without_a_variant(synthesizer: Synthesizer) -> None:
     """Of the many that libespeak-ng has, some do: `test_voices.py` loads and speaks with all of them."""
     plain = _plain(synthesizer)
     variants = [each.id for each in synthesizer.voices() if each.id.startswith("+")]
@@ -279,7 +279,7 @@ def test_each_voice_is_loaded_soon_by_its_id_with_a_variant_or_without(synthesiz
         _spoken(synthesizer, "a")
 
 
-def test_the_voice_is_the_one_that_was_loaded_last(made: tuple[Synthesizer, str], synthesizer: Synthesizer) -> None:
+def test_the_voice_that_was_loaded_last_speaks(made: tuple[Synthesizer, str], synthesizer: Synthesizer) -> None:
     before = _spoken(synthesizer)
     other = next(each for each in reversed(_plain(synthesizer)) if each != made[1])
     synthesizer.load(other)
@@ -290,7 +290,7 @@ def test_the_voice_is_the_one_that_was_loaded_last(made: tuple[Synthesizer, str]
 
 
 @pytest.mark.parametrize("voice", ["no such voice", "", "no/such+voice", "\ud800"])
-def test_a_voice_that_cannot_be_had_leaves_the_one_before(synthesizer: Synthesizer, voice: str) -> None:
+def test_an_unknown_voice_leaves_the_current_one_unchanged(synthesizer: Synthesizer, voice: str) -> None:
     before, spoken = synthesizer.voice, _spoken(synthesizer, sound=SpeechSettings(rate=300))
     with pytest.raises(UnknownVoice) as caught:
         synthesizer.load(voice)
@@ -303,9 +303,7 @@ def test_a_voice_that_cannot_be_had_leaves_the_one_before(synthesizer: Synthesiz
 
 
 @pytest.mark.parametrize("text", [*TEXTS, *SILENT], ids=range(len(TEXTS) + len(SILENT)))
-def test_any_text_is_spoken_with_its_words_if_it_has_any_and_nothing_of_it_stays(
-    synthesizer: Synthesizer, pitched: bool, text: str
-) -> None:
+def test_any_text_is_spoken_without_affecting_the_next_one(synthesizer: Synthesizer, pitched: bool, text: str) -> None:
     """The tape holds the order: the rate, then words before their samples, at positions that never decrease."""
     alone = _spoken(synthesizer)
     tape = _spoken(synthesizer, text, SpeechSettings(rate=450, volume=0.1, pitch=99 if pitched else 50))
@@ -322,13 +320,13 @@ def test_any_text_is_spoken_with_its_words_if_it_has_any_and_nothing_of_it_stays
     _assert_alike(_spoken(synthesizer), alone)
 
 
-def test_the_words_of_a_sentence_are_told_with_their_places_in_the_text(synthesizer: Synthesizer) -> None:
+def test_words_are_reported_with_their_positions_in_the_text(synthesizer: Synthesizer) -> None:
     tape = _spoken(synthesizer)
     words = [TEXT[start : start + length].strip(",") for start, length, _ in tape.words]
     assert words == TEXT.replace(",", "").split()
 
 
-def test_rate_volume_and_pitch_of_a_sentence_are_obeyed_or_refused(synthesizer: Synthesizer, pitched: bool) -> None:
+def test_rate_volume_and_pitch_are_obeyed_or_refused(synthesizer: Synthesizer, pitched: bool) -> None:
     usual = _spoken(synthesizer)
     assert _spoken(synthesizer, sound=SpeechSettings(rate=400)).seconds < 0.8 * usual.seconds
     assert _spoken(synthesizer, sound=SpeechSettings(rate=100)).seconds > 1.3 * usual.seconds
@@ -346,7 +344,7 @@ def test_rate_volume_and_pitch_of_a_sentence_are_obeyed_or_refused(synthesizer: 
     _assert_alike(_spoken(synthesizer), usual)
 
 
-def test_libespeak_speaks_on_as_before_after_it_was_asked_how_another_language_sounds() -> None:
+def test_phonemes_of_another_language_do_not_change_espeaks_voice() -> None:
     espeak = _espeak()
     own = espeak.voice
     try:
@@ -359,7 +357,7 @@ def test_libespeak_speaks_on_as_before_after_it_was_asked_how_another_language_s
         espeak.load(own)
 
 
-def test_the_end_of_a_spelling_waits_for_nothing_and_the_next_sentence_for_the_library() -> None:
+def test_closing_a_phonemizer_does_not_wait_but_the_next_sentence_does() -> None:
     espeak = _espeak()
     before, tape = _spoken(espeak), Tape()
     asked, go = threading.Event(), threading.Event()
@@ -422,7 +420,7 @@ def test_a_sentence_ends_where_libespeak_makes_a_pause(language: str, text: str,
         ("write", 5, Stopped()),
     ],
 )
-def test_an_error_of_the_output_comes_out_at_once_and_the_output_is_left_alone(
+def test_an_error_of_the_output_is_raised_at_once_without_further_calls(
     synthesizer: Synthesizer, at: str, after: int, fails: Exception
 ) -> None:
     alone = _spoken(synthesizer)
@@ -435,7 +433,7 @@ def test_an_error_of_the_output_comes_out_at_once_and_the_output_is_left_alone(
     _assert_alike(_spoken(synthesizer), alone)
 
 
-def test_an_output_that_takes_its_time_is_waited_for(synthesizer: Synthesizer) -> None:
+def test_a_synthesizer_waits_for_a_slow_output(synthesizer: Synthesizer) -> None:
     """As long as it has not returned, nothing more comes: that is how a sentence is held."""
     inside = False
 

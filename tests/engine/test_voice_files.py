@@ -59,7 +59,7 @@ print(json.dumps([[dirs.user_data_dir, *dirs.site_data_dir.split(":")], dirs.use
     "variables", [{}, {"XDG_DATA_HOME": "/d", "XDG_CACHE_HOME": "/c", "XDG_DATA_DIRS": "/a:/b"}, {"XDG_DATA_HOME": ""}]
 )
 @pytest.mark.usefixtures("home")
-def test_the_places_are_those_of_platformdirs(monkeypatch: pytest.MonkeyPatch, variables: dict[str, str]) -> None:
+def test_the_directories_are_those_of_platformdirs(monkeypatch: pytest.MonkeyPatch, variables: dict[str, str]) -> None:
     for name in ("XDG_DATA_DIRS", "TALK_VOICES"):
         monkeypatch.delenv(name)
     for name, value in variables.items():
@@ -71,7 +71,7 @@ def test_the_places_are_those_of_platformdirs(monkeypatch: pytest.MonkeyPatch, v
     assert cache_directory() == cache
 
 
-def test_a_voice_is_found_in_the_first_of_its_places(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_voice_is_taken_from_the_first_directory_that_has_it(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first, package = home / "first", home / "lib" / "any_piper_voice" / "data"
     monkeypatch.setenv("TALK_VOICES", f"{home / 'nowhere'}:{first}")
     monkeypatch.setattr(sys, "path", [str(home / "lib")])
@@ -85,7 +85,7 @@ def test_a_voice_is_found_in_the_first_of_its_places(home: Path, monkeypatch: py
     }
 
 
-def test_only_models_that_can_be_named_are_voices(home: Path) -> None:
+def test_only_models_with_a_valid_name_are_voices(home: Path) -> None:
     for name in (".hidden", "a#b", "good", "a\nb", "\x1b[31mred", "\u202eleft", "ni\udcffce"):
         tiny_voice.put(home / "v", name)
     (home / "v" / ".onnx").touch()
@@ -104,14 +104,14 @@ def test_a_voice_is_listed_with_language_quality_and_speakers(home: Path) -> Non
     ]
 
 
-def test_a_speaker_without_a_name_to_type_goes_by_its_number(home: Path) -> None:
+def test_a_speaker_without_a_usable_name_is_listed_by_number(home: Path) -> None:
     names = {"amused": 0, "\x1b[31m": 1, "x" * 65: 2, "": 3, "calm": 5, "beyond": 6}
     tiny_voice.put(home / "v", "a", config=tiny_voice.description(num_speakers=6, speaker_id_map=names))
     (voice,) = installed_voices()
     assert voice.speakers == ("amused", "1", "2", "3", "4", "calm")
 
 
-def test_a_very_long_name_in_a_json_is_cut_if_it_is_told(home: Path) -> None:
+def test_very_long_names_in_the_json_are_shortened(home: Path) -> None:
     told = tiny_voice.description(language="l" * 1000, dataset="d" * 1000)
     told["audio"] = {"sample_rate": 8000, "quality": "q" * 1000}
     told["espeak"] = {"voice": "e" * 1000}
@@ -123,7 +123,7 @@ def test_a_very_long_name_in_a_json_is_cut_if_it_is_told(home: Path) -> None:
 
 
 @pytest.mark.parametrize("where", ["model", "json", "directory", "above"])
-def test_a_file_that_everybody_may_write_is_refused(home: Path, where: str) -> None:
+def test_a_file_that_anyone_can_write_is_refused(home: Path, where: str) -> None:
     path = tiny_voice.put(home / "up" / "v", "a")
     wrong = {"model": path, "json": beside(path), "directory": path.parent, "above": path.parent.parent}[where]
     wrong.chmod(0o646 if wrong.is_file() else 0o757)
@@ -135,7 +135,7 @@ def test_a_file_that_everybody_may_write_is_refused(home: Path, where: str) -> N
     open_checked(str(beside(path)), model=str(path)).close()
 
 
-def test_all_that_others_may_write_is_named_with_one_command_that_mends_it(home: Path) -> None:
+def test_the_error_names_all_unsafe_paths_and_one_command_to_fix_them(home: Path) -> None:
     path = tiny_voice.put(home / "up" / "my voices", "a")
     wrong = [beside(path), path.parent, path]
     for each in wrong:
@@ -168,7 +168,7 @@ ME = os.geteuid()
     ids=["own", "its member", "another member", "another name", "another's own", "not its own", "unknown", "nobody's"],
 )
 @pytest.mark.skipif(ME != 0, reason="only root may give a file to any group")
-def test_a_file_that_only_the_users_own_group_may_write_is_the_users(
+def test_only_a_group_that_is_private_to_the_user_may_write_a_file(
     home: Path,
     monkeypatch: pytest.MonkeyPatch,
     user: tuple[str, int] | None,
@@ -201,7 +201,9 @@ def test_a_file_that_only_the_users_own_group_may_write_is_the_users(
 
 
 @pytest.mark.skipif(not hasattr(os, "setxattr"), reason="access control lists are asked for on Linux alone")
-def test_an_access_list_is_seen_behind_the_users_own_group(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_access_control_list_is_checked_even_if_the_group_is_private(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tiny_voice.put(home / "v", "a")
     path.chmod(0o664)
     monkeypatch.setattr(models, "_is_private_group", lambda _user, _group: True)
@@ -219,7 +221,7 @@ def test_an_access_list_is_seen_behind_the_users_own_group(home: Path, monkeypat
         open_checked(str(path))
 
 
-def test_a_directory_that_is_everybodys_may_be_above_if_it_is_sticky_but_not_hold_the_voice(home: Path) -> None:
+def test_a_sticky_directory_may_be_above_the_voices_but_not_contain_them(home: Path) -> None:
     path = tiny_voice.put(home / "up" / "v", "a")
     (home / "up").chmod(0o1777)
     open_checked(str(path)).close()
@@ -230,7 +232,7 @@ def test_a_directory_that_is_everybodys_may_be_above_if_it_is_sticky_but_not_hol
 
 @pytest.mark.parametrize("what", ["file", "directory"])
 @pytest.mark.parametrize("where", ["between", "there"])
-def test_no_link_on_the_way_may_be_where_everybody_may_write(home: Path, what: str, where: str) -> None:
+def test_a_link_in_a_directory_that_anyone_can_write_is_refused(home: Path, what: str, where: str) -> None:
     path = tiny_voice.put(home / "there", "a")
     end = path if what == "file" else path.parent
     for name in ("between", "v"):
@@ -248,7 +250,7 @@ def test_no_link_on_the_way_may_be_where_everybody_may_write(home: Path, what: s
         open_checked(str(way))
 
 
-def test_a_link_to_itself_and_a_pipe_are_refused_and_not_waited_for(home: Path) -> None:
+def test_a_link_to_itself_and_a_pipe_are_refused_without_waiting(home: Path) -> None:
     path = tiny_voice.put(home / "v", "a")
     path.unlink()
     path.symlink_to(path)
@@ -296,7 +298,9 @@ def test_another_users_file_or_link_is_refused(home: Path) -> None:
         ({"inference": {"length_scale": 1e9}}, "is not a valid factor"),
     ],
 )
-def test_a_json_of_no_voice_is_refused_in_words(home: Path, beside: bytes | dict[str, Any], why: str) -> None:
+def test_an_invalid_json_is_refused_with_a_readable_message(
+    home: Path, beside: bytes | dict[str, Any], why: str
+) -> None:
     path = tiny_voice.put(home / "v", "a")
     told = path.parent / "a.onnx.json"
     told.write_bytes(beside if isinstance(beside, bytes) else json.dumps(tiny_voice.description(**beside)).encode())
@@ -337,7 +341,7 @@ def _keep(cache: ModelCache, key: str, content: bytes = b"encoder") -> str | Non
     return given[-1]
 
 
-def test_halves_are_found_again_by_their_key_and_half_of_them_is_nothing(home: Path) -> None:
+def test_halves_are_found_by_their_key_only_if_both_exist(home: Path) -> None:
     cache = ModelCache(str(home / "c"))
     with pytest.raises(FileNotFoundError):
         cache.find(KEY)
@@ -354,7 +358,7 @@ def test_halves_are_found_again_by_their_key_and_half_of_them_is_nothing(home: P
         cache.find(KEY)
 
 
-def test_the_oldest_halves_go_past_the_limit_and_no_other_file(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_the_oldest_halves_are_removed_above_the_limit(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(inference, "MAX_CACHE_BYTES", 85)
     cache = ModelCache(str(home / "c"))
     others = ["joe.onnx", "notes.new", "x.encoder.onnx", f"{KEY}.txt", "settings"]
@@ -374,7 +378,7 @@ def test_the_oldest_halves_go_past_the_limit_and_no_other_file(home: Path, monke
 
 
 @pytest.mark.parametrize(("hours", "left"), [(0.9, 1), (1.1, 0)])
-def test_the_unfinished_halves_of_a_writer_go_after_an_hour(home: Path, hours: float, left: int) -> None:
+def test_unfinished_halves_are_removed_after_an_hour(home: Path, hours: float, left: int) -> None:
     cache = ModelCache(str(home / "c"))
     folder = home / "c" / f"{_key('b')}x7f3.new"
     folder.mkdir()
@@ -384,7 +388,7 @@ def test_the_unfinished_halves_of_a_writer_go_after_an_hour(home: Path, hours: f
     assert len([each for each in _kept(home / "c") if each.endswith(".new")]) == left
 
 
-def test_a_writer_that_fails_keeps_nothing_and_a_cache_that_is_gone_is_done_without(home: Path) -> None:
+def test_a_failed_write_or_a_missing_cache_stores_nothing(home: Path) -> None:
     def fails(_: str | None) -> None:
         raise ValueError("broken")
 
@@ -399,7 +403,7 @@ def test_a_writer_that_fails_keeps_nothing_and_a_cache_that_is_gone_is_done_with
 
 
 @pytest.mark.parametrize("mode", [0o755, 0o777])
-def test_a_cache_that_others_may_read_or_write_is_none(home: Path, mode: int) -> None:
+def test_a_cache_that_others_can_read_or_write_is_refused(home: Path, mode: int) -> None:
     (home / "c").mkdir()
     (home / "c").chmod(mode)
     with pytest.raises(PermissionError, match="other users can access"):

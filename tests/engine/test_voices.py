@@ -74,7 +74,7 @@ def test_the_variants_are_listed_after_the_voices() -> None:
     assert Voice("+f3", None, "variant female3") in variants
 
 
-def test_every_word_of_every_voice_is_found_whatever_its_case() -> None:
+def test_every_voice_is_found_by_each_of_its_names_in_any_case() -> None:
     for voice in listed():
         for word in (voice.id, voice.name, voice.id.rpartition("/")[2], voice.language):
             for each in (word, word.upper(), word.lower()) if word else ():
@@ -84,7 +84,7 @@ def test_every_word_of_every_voice_is_found_whatever_its_case() -> None:
                 assert word != voice.language or found.language == voice.language, (each, found)
 
 
-def test_the_library_sets_every_voice_that_is_found() -> None:
+def test_the_library_accepts_every_voice_that_is_found() -> None:
     wanted = [each.id for each in listed()] + [f"{voice.id}+Andy" for voice in plain()]
     ids = [each.id for each in (find_voice(each, listed()) for each in wanted) if each is not None]
     assert len(ids) == len(wanted)
@@ -99,7 +99,7 @@ def test_the_library_sets_every_voice_that_is_found() -> None:
     assert json.loads(done.stdout) == [[0, each] for each in ids]
 
 
-def test_every_voice_can_be_spoken_with_under_each_of_its_words(tmp_path: Path) -> None:
+def test_every_voice_can_speak_under_each_of_its_names(tmp_path: Path) -> None:
     with Spawned(f"file:{tmp_path / 'x.wav'}") as engine:
         words = [word for voice in plain() for word in (voice.id, voice.name, voice.language) if word]
         for number, word in enumerate(words):
@@ -196,7 +196,7 @@ def test_a_language_means_the_servers_neural_voice(wanted: str, preferred: str, 
     assert found(wanted, preferred) == expected
 
 
-def test_a_voice_without_a_language_is_no_languages() -> None:
+def test_a_voice_without_a_language_matches_no_language() -> None:
     voices = (*listed(), Voice("piper/broken", None, "broken"))
     assert find_voice("", voices, "piper/broken") is None
 
@@ -216,7 +216,7 @@ def test_a_voice_without_a_language_is_no_languages() -> None:
         ("", set()),
     ],
 )
-def test_the_languages_that_a_code_or_an_english_name_means(wanted: str, expected: set[str]) -> None:
+def test_a_code_or_an_english_name_matches_its_languages(wanted: str, expected: set[str]) -> None:
     assert matching_languages(wanted, (*listed(), *NEURAL)) == expected
 
 
@@ -241,7 +241,7 @@ def test_the_languages_that_a_code_or_an_english_name_means(wanted: str, expecte
         ("joe+f3", "unknown voice \"joe+f3\"; did you mean 'joe'?"),
     ],
 )
-def test_a_voice_that_is_not_found_says_which_ones_it_could_be(wanted: str, words: str) -> None:
+def test_the_error_for_an_unclear_voice_lists_the_possible_ones(wanted: str, words: str) -> None:
     assert unknown_voice_message(wanted, (*listed(), *NEURAL)).startswith(words)
 
 
@@ -259,7 +259,7 @@ def test_a_voice_that_is_not_found_says_which_ones_it_could_be(wanted: str, word
         ("germna+f3", "German"),
     ],
 )
-def test_an_unknown_voice_is_told_what_comes_near(wanted: str, near: str) -> None:
+def test_similar_names_are_suggested_for_an_unknown_voice(wanted: str, near: str) -> None:
     told = unknown_voice_message(wanted, listed())
     assert told.startswith(f'unknown voice "{wanted}"; did you mean ')
     assert told.endswith("? list all voices with: talk voices")
@@ -267,7 +267,7 @@ def test_an_unknown_voice_is_told_what_comes_near(wanted: str, near: str) -> Non
     assert repr(near) in told
 
 
-def test_a_word_of_any_length_is_answered_shortly() -> None:
+def test_a_very_long_name_gets_a_short_error() -> None:
     for wanted in ("x" * 60_000, "en-us+" + "y" * 60_000):
         assert find_voice(wanted, listed()) is None
         assert len(unknown_voice_message(wanted, listed())) < 200
@@ -276,7 +276,7 @@ def test_a_word_of_any_length_is_answered_shortly() -> None:
 # -- other drivers'
 
 
-def test_of_another_driver_and_another_system_no_neural_voice_is_proposed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_neural_voices_are_not_suggested_for_other_drivers_or_systems(monkeypatch: pytest.MonkeyPatch) -> None:
     told = unknown_voice_message("piper/en", (*listed(), *NEURAL), "dummy")
     assert told == '"piper/en" is a neural voice, which the driver "dummy" does not support; leave out --driver'
     monkeypatch.setattr(sys, "platform", "darwin")
@@ -287,7 +287,7 @@ def test_of_another_driver_and_another_system_no_neural_voice_is_proposed(monkey
     assert "unknown voice" in unknown_voice_message("anna", (), "nsss")
 
 
-def test_the_voices_of_another_driver_may_be_called_after_persons_and_with_a_plus() -> None:
+def test_voices_of_other_drivers_may_have_a_plus_in_their_names() -> None:
     voices = (Voice("com.apple.Alex", "en_US", "Alex"), Voice("com.apple.Daniel", "en_GB", "Daniel+"))
     assert "did you mean 'Daniel+'" in unknown_voice_message("Danel", voices)
     assert "en_GB" not in unknown_voice_message("Danel", voices)
@@ -298,12 +298,14 @@ def test_the_voices_of_another_driver_may_be_called_after_persons_and_with_a_plu
 @pytest.mark.parametrize(
     ("languages", "language"), [(["en-US", "en-GB"], "en-US"), ([b"\x05en-us"], "en-us"), ([None], None), ([], None)]
 )
-def test_a_language_is_listed_however_another_driver_tells_it(languages: list[object], language: str | None) -> None:
+def test_a_language_is_listed_in_any_form_that_another_driver_uses(
+    languages: list[object], language: str | None
+) -> None:
     engine = SimpleNamespace(getProperty=lambda _: [SimpleNamespace(id="a", name="Anna", languages=languages)])
     assert list_voices(engine) == (Voice("a", language, "Anna"),)
 
 
-def test_mbrolas_voices_are_listed_if_they_are_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mbrola_voices_are_listed_if_they_are_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     known = [Voice("mb/mb-de4-en", "en", "german-mbrola-4-en"), Voice("mb/mb-us1", "en-us", "us-mbrola-1")]
     monkeypatch.setattr(espeak, "_list_voices", lambda *_: known)
     monkeypatch.setattr(espeak, "_MBROLA_PATHS", (f"{tmp_path}/{{0}}/{{0}}",))
@@ -319,7 +321,7 @@ def test_mbrolas_voices_are_listed_if_they_are_installed(tmp_path: Path, monkeyp
 # -- a goal's own
 
 
-def test_after_a_goals_own_or_an_unknown_voice_the_default_sounds_as_before(tmp_path: Path) -> None:
+def test_a_goals_voice_does_not_change_how_the_default_sounds(tmp_path: Path) -> None:
     """As the library's own, which sets everything anew for each sentence; some voices leave their speed behind."""
     target = tmp_path / "x.wav"
     unknown = ["nosuch", "nosuch", "en-us+nosuch", "mb-us1"]
