@@ -1,4 +1,4 @@
-"""The benchmark's rows measure something, and the documents show the rows that it has."""
+"""The benchmark's rows measure something, and the documents show the same rows."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ if TYPE_CHECKING:
 TABLES = tables(BENCHMARK.text)
 
 
-def form(name: str, goal: str) -> tuple[str, str]:
-    """Return a row's name without its numbers, which a short run does not share, and its goal."""
+def without_numbers(name: str, goal: str) -> tuple[str, str]:
+    """Return a row's goal, and its name without numbers, which differ in a short run."""
     return re.sub(r"[0-9][0-9,.]*", "#", name.replace("`", "")), goal
 
 
 @pytest.fixture(scope="module")
 def stage() -> Iterator[Stage]:
     needs(TALK, *PROGRAMS)
-    with Stage(Options(rounds=1, idle=1, sentences=2)) as found:
-        yield found
+    with Stage(Options(rounds=1, idle=1, sentences=2)) as result:
+        yield result
 
 
 @pytest.mark.slow
@@ -41,17 +41,19 @@ def test_every_row_of_a_group_measures_something(stage: Stage, group: str, monke
     if group == "fleet":
         needs("mosquitto", "openssl")
         needs_packages("paho")
-    for module, name, less in (
+    for module, name, smaller in (
         *((load, "GOALS", 200), (load, "FEW", 250), (load, "MANY", 300), (load, "PENDING", 300), (load, "CLIENTS", 20)),
         *((heard, "LONG_TEXT", heard.LONG_TEXT[:50]), (heard, "_TEXTS", 1), (marathon, "SERVERS", 1)),
     ):
-        monkeypatch.setattr(module, name, less)
+        monkeypatch.setattr(module, name, smaller)
     rows = measure(group, stage)
     assert [each.failure for each in rows if each.failure] == []
     assert all(len(each.cells()) == len(TABLES[0][0]) and each.values for each in rows)
-    if group not in ("neural", "marathon"):  # which no table shows
-        known = {form(row[0], row[7]) for table in TABLES for row in table[1:]}
-        assert {form(each.name, each.goal) for each in rows} <= known, f"a table in {BENCHMARK.name} is out of date"
+    if group not in ("neural", "marathon"):  # no table shows these
+        known = {without_numbers(row[0], row[7]) for table in TABLES for row in table[1:]}
+        assert {without_numbers(each.name, each.goal) for each in rows} <= known, (
+            f"a table in {BENCHMARK.name} is out of date"
+        )
 
 
 def test_the_readme_quotes_numbers_from_the_table() -> None:

@@ -1,4 +1,4 @@
-"""The client library: the options, results and errors of its calls, against a server with the scripted engine."""
+"""The options, results and errors of the client library, with a scripted server."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def client(scripted: Talk) -> Iterator[Client]:
 
 
 def test_wait_returns_the_ended_goal(scripted: Talk, client: Client) -> None:
-    client.pause()  # the goal must still be pending below
+    client.pause()  # the goal must still be pending when it is checked
     handle = client.say("length=0.1 battery low", data={"from": "the test"})
     assert handle.state is State.PENDING
     client.resume()
@@ -75,13 +75,13 @@ def test_a_goal_continues_after_a_wait_has_timed_out(scripted: Talk, client: Cli
     assert scripted.goal(handle.id)["state"] == "ACTIVE"
     assert handle.cancel().state is State.PREEMPTED
     assert handle.wait(0).reason == "canceled"
-    assert handle.cancel() is handle.goal  # again: it has ended
+    assert handle.cancel() is handle.goal  # a second time: the goal has ended
 
 
 def test_cancel_stops_only_the_selected_goals(client: Client, scripted: Talk) -> None:
     handles = [client.say(f"never-ends {number}") for number in range(5)]
     scripted.watcher.wait_for_word(handles[0].id)
-    assert client.cancel([]).canceled == ()  # none is not all
+    assert client.cancel([]).canceled == ()  # an empty list doesn't mean all goals
     assert [each.id for each in client.cancel([handles[4].id]).canceled] == [handles[4].id]
     done = client.cancel(before=handles[1].id.rpartition("-")[2])
     assert {each.id: each.state for each in done.canceled} == {
@@ -152,8 +152,8 @@ def test_a_say_without_an_answer_is_an_error() -> None:
 
 
 def test_a_refusal_is_read_even_if_the_server_hangs_up_at_once() -> None:
-    says = b'{"talk": 1, "error": "permission_denied", "message": "not you"}\n'
-    with short_directory() as home, FakeServer(f"{home}/s", [says], closes=True, listens=False):
+    refusal = b'{"talk": 1, "error": "permission_denied", "message": "not you"}\n'
+    with short_directory() as home, FakeServer(f"{home}/s", [refusal], closes=True, listens=False):
         for _ in range(100):  # the server may have hung up before the client says hello
             with pytest.raises(AccessDenied, match="not you"), Client(f"{home}/s"):
                 pass
@@ -162,13 +162,13 @@ def test_a_refusal_is_read_even_if_the_server_hangs_up_at_once() -> None:
 def test_calls_of_a_closed_client_fail_and_its_goals_are_lost(client: Client) -> None:
     handle = client.say("length=0.2")
     client.close()
-    client.close()  # a second time is no error
+    client.close()  # a second time is not an error
     with pytest.raises(ServerUnavailable):
         client.status()
     assert handle.wait(1).state is State.LOST
 
 
-@pytest.mark.parametrize("reads", [False, True], ids=["alone", "while a thread reads"])
+@pytest.mark.parametrize("reads", [False, True], ids=["no other thread", "while a thread reads"])
 def test_closing_a_client_in_a_forked_child_keeps_the_parents_connection(client: Client, reads: bool) -> None:
     goal = client.say("never-ends words=1", feedback=True)
     next(goal.feedback(5))
@@ -176,7 +176,7 @@ def test_closing_a_client_in_a_forked_child_keeps_the_parents_connection(client:
     if reads:
         waiting.start()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # of threads beside a fork
+        warnings.simplefilter("ignore", DeprecationWarning)  # about a fork with several threads
         child = os.fork()
     if child == 0:
         try:
@@ -205,7 +205,7 @@ def test_a_full_server_answers_urgent_clients_and_refuses_others(make_talk: Make
             SocketConnection(talk.socket, patience=0.5)
         assert 0.5 <= time.monotonic() - began < 2.5
         late = talk.start("say", "--wait", "length=0")
-    assert talk.finish(late).code == 0  # it came in when there was room
+    assert talk.finish(late).code == 0  # it was admitted when a place became free
 
 
 SETTINGS = {"rate": 200, "volume": 1.0, "voice": None, "pitch": 50, "preempt": False, "ttl": None}
@@ -213,16 +213,16 @@ SETTINGS = {"rate": 200, "volume": 1.0, "voice": None, "pitch": 50, "preempt": F
 
 @pytest.fixture(scope="module")
 def untouched() -> Iterator[Client]:
-    """A client of a server that tests must leave as it was: it has spoken nothing, and has its initial settings."""
+    """A client of a server that tests must not change. It has spoken nothing, and has its initial settings."""
     with contextlib.closing(Talk(scripted=True)) as talk, Client(talk.socket) as result:
         yield result
         talk.stop()
 
 
-TAKEN = [each for each in OPTIONS if each.name not in {"wait", "format"}]
+ROWS = [each for each in OPTIONS if each.name not in {"wait", "format"}]
 
 
-@pytest.mark.parametrize("row", TAKEN, ids=lambda each: each.name)
+@pytest.mark.parametrize("row", ROWS, ids=lambda each: each.name)
 def test_a_value_of_the_wrong_type_is_refused_and_nothing_is_sent(untouched: Client, row: Option) -> None:
     with pytest.raises(UsageError, match=f"'{row.name}' must be"):
         untouched.say(**{"text": "hello", row.name: object()})  # type: ignore[arg-type]
@@ -234,7 +234,7 @@ def test_a_value_of_the_wrong_type_is_refused_and_nothing_is_sent(untouched: Cli
 
 @pytest.mark.parametrize("options", [{"rate": 79}, {"ttl": math.nan}, {"id": "17"}, {"data": {"a": math.nan}}])
 def test_a_value_out_of_range_is_refused_and_nothing_is_sent(untouched: Client, options: dict[str, Any]) -> None:
-    """`tests/unit/test_options.py` has all limits."""
+    """`tests/unit/test_options.py` tests all limits."""
     with pytest.raises(UsageError):
         untouched.say("hello", **options)
     with pytest.raises(UsageError):
@@ -257,11 +257,13 @@ def test_the_options_of_a_goal_reach_the_server(client: Client) -> None:
     assert first.wait(5).state is State.PREEMPTED
     ended = [each.wait(5) for each in (higher, last)]
     assert [each.state for each in ended] == [State.SUCCEEDED] * 2
-    assert (ended[0].started_at or 0) < (ended[1].started_at or 0)  # of a higher priority: not flushed, and first
+    assert (ended[0].started_at or 0) < (
+        ended[1].started_at or 0
+    )  # a higher priority is not flushed, and is spoken first
 
 
 def test_the_same_id_and_text_attach_to_the_existing_goal(client: Client, scripted: Talk) -> None:
-    scripted.request("pause")  # no word may come before the second handle is attached
+    scripted.request("pause")  # the second handle must be attached before the first word
     first = client.say("length=0.2 one", id="door.1", feedback=True)
     with Client(scripted.socket) as other:
         second = other.say("length=0.2 one", id="door.1", feedback=True)
@@ -288,14 +290,14 @@ def test_a_patient_goal_waits_for_room_in_the_queue(make_talk: MakeTalk) -> None
         states: list[State] = []
         thread = threading.Thread(target=lambda: states.append(client.say("length=0", patient=True).wait(10).state))
         thread.start()
-        assert active.cancel().state is State.PREEMPTED  # the same client goes on beside it
+        assert active.cancel().state is State.PREEMPTED  # the waiting thread doesn't block the client
         assert other.cancel([pending.id]).canceled[0].id == pending.id
         thread.join(10)
         assert states == [State.SUCCEEDED]
 
 
 def test_a_patient_goal_is_not_spoken_after_its_sender_hangs_up(make_talk: MakeTalk, tmp_path: Path) -> None:
-    """The server notices that a waiting client has hung up when it shows that it is alive."""
+    """The server notices a hang-up the next time it reports that it is alive."""
     talk = make_talk("--max-queue", "1", program=patched_serve(tmp_path, subscribers__CLIENT_ALIVE_INTERVAL_S=0.5))
     with Client(talk.socket) as client:
         active = client.say("never-ends")
@@ -303,9 +305,9 @@ def test_a_patient_goal_is_not_spoken_after_its_sender_hangs_up(make_talk: MakeT
         pending = client.say("length=0")
         with talk.connect() as wire:
             wire.send({"seq": 1, "request": "say", "text": "length=0 never heard", "patient": True})
-            wire.request("hello")  # by its reply, the goal has been taken
+            wire.request("hello")  # its reply shows that the goal has been received
         while client.status().server["clients"] != 2:  # the watcher and this client
-            time.sleep(0.05)  # no event tells that a client has gone
+            time.sleep(0.05)  # no event reports that a client has gone
         active.cancel()
         assert pending.wait(5).state is State.SUCCEEDED
         assert client.say("length=0").wait(5).state is State.SUCCEEDED
@@ -330,10 +332,10 @@ def test_cancel_by_key_stops_every_goal_with_that_key(client: Client) -> None:
 def test_long_lists_of_ids_are_split_into_lines_of_legal_length() -> None:
     assert batches([]) == []
     assert batches(["a", "b", "a"]) == [("a", "b")]
-    for each in ("a" * 64, '"' * 64, "\x01" * 64, "🤖" * 64, "\ud800" * 64, "7"):
-        ids = [f"{each}{number}" for number in range(2_000)]
+    for prefix in ("a" * 64, '"' * 64, "\x01" * 64, "🤖" * 64, "\ud800" * 64, "7"):
+        ids = [f"{prefix}{number}" for number in range(2_000)]
         parts = batches(ids)
-        assert [one for part in parts for one in part] == ids
+        assert [goal_id for part in parts for goal_id in part] == ids
         longest = max(len(encode({"request": "cancel", "ids": list(part), "key": "\ud800" * 64})) for part in parts)
         assert longest < MAX_LINE_BYTES - 1_000
 
@@ -378,18 +380,18 @@ def test_pause_stops_speech_and_resume_continues_it(client: Client, scripted: Ta
     assert client.resume() is None
     handle = client.say("length=0.3 one two", feedback=True)
     scripted.watcher.wait_for_word(handle.id)
-    held = client.pause()
-    assert held
-    assert (held.id, held.state, held.paused) == (handle.id, State.ACTIVE, True)
-    assert client.pause() == held  # a second pause is no error
+    paused = client.pause()
+    assert paused
+    assert (paused.id, paused.state, paused.paused) == (handle.id, State.ACTIVE, True)
+    assert client.pause() == paused  # a second pause is not an error
     assert (handle.speech_paused, handle.goal.paused) == (True, True)
     waiting = client.say("length=0", preempt=False)
     assert (waiting.speech_paused, waiting.state) == (True, State.PENDING)
     with pytest.raises(TimeoutError):
         handle.wait(0.4)
-    gone_on = client.resume()
-    assert gone_on
-    assert (gone_on.id, gone_on.paused) == (handle.id, False)
+    resumed = client.resume()
+    assert resumed
+    assert (resumed.id, resumed.paused) == (handle.id, False)
     events = list(handle.events(5))
     assert [each.paused for each in events if isinstance(each, PausedChanged)] == [True, False]
     assert [each.state for each in events if isinstance(each, StateChanged)][-1] is State.SUCCEEDED

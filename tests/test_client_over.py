@@ -1,4 +1,4 @@
-"""The library over a transport that is no socket."""
+"""The library with a transport other than a socket."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Scripted(Connection):
         super().__init__(PATIENCE)
         self.path, self.boot = "nowhere", "fake"
         self.asked: list[Request] = []
-        #: events that the next wait receives
+        #: Events for the next calls that wait.
         self.coming: list[JsonObject] = []
 
     def _send(self, exchange: Exchange) -> None:
@@ -50,7 +50,7 @@ class Scripted(Connection):
     def _answer(self, exchange: Exchange, **fields: object) -> None:
         self.receive(encode({"seq": exchange.number, **fields}), time.monotonic())
 
-    def _step(self, timeout: float, interruptible: bool) -> None:  # noqa: ARG002 - nothing takes time here
+    def _step(self, timeout: float, interruptible: bool) -> None:  # noqa: ARG002 - nothing blocks here
         with self.changed:
             if self.coming:
                 self.listeners.publish(from_json(self.coming.pop(0)))
@@ -98,7 +98,7 @@ def test_a_handle_needs_no_client(scripted: Scripted) -> None:
     assert scripted.asked == [Cancel(("g",)), Cancel(("g",))]
     late = GoalHandle(scripted, Goal("g", State.PENDING))
     late.events()
-    assert late.state is State.ACTIVE, "as the server says that it is by now"
+    assert late.state is State.ACTIVE, "the current state at the server"
     scripted.coming = [result()]
     assert late.wait().state is State.SUCCEEDED
     assert scripted.asked[2:] == [Wait(("g",))]

@@ -1,4 +1,4 @@
-"""The library without waiting, and across breaks: goals that are sent later or never, and a server that comes back."""
+"""Calls of the library that don't block, and lost connections: goals sent later or never, and server restarts."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from talkcli.protocol.events import Event
     from tests.support.processes import Talk
 
-#: Seconds in which a call counts as one that does not wait.
-AT_ONCE_S = 0.05
+#: A call that takes no longer than this doesn't block.
+NONBLOCKING_S = 0.05
 
 
 @pytest.fixture
@@ -40,13 +40,13 @@ def client(scripted: Talk) -> Iterator[Client]:
 
 
 def poll_until(handle: GoalHandle, done: Callable[[GoalHandle], bool], limit: float = PATIENCE) -> list[Event]:
-    """Poll a goal as a loop does, until something is true of it, and return its events."""
+    """Poll a goal until a condition is true, and return its events."""
     found: list[Event] = []
     end = time.monotonic() + limit
     while True:
         began = time.monotonic()
         event = handle.poll()
-        assert_within(time.monotonic() - began, AT_ONCE_S, "a poll")
+        assert_within(time.monotonic() - began, NONBLOCKING_S, "a poll")
         if event:
             found.append(event)
         elif done(handle):
@@ -69,8 +69,8 @@ def cancel_often(handle: GoalHandle) -> None:
         handle.request_cancel()
 
 
-def cut(client: Client) -> None:
-    """Break the connection, while the server goes on."""
+def disconnect(client: Client) -> None:
+    """Break the connection. The server keeps running."""
     connection = client._connection
     connection._socket.shutdown(socket.SHUT_RDWR)  # type: ignore[attr-defined]
 
@@ -80,7 +80,7 @@ def restart(talk: Talk) -> None:
     talk.start_server()
 
 
-# Without waiting
+# Nonblocking calls
 
 
 def test_a_nonblocking_say_returns_an_id_at_once(client: Client) -> None:
@@ -123,7 +123,7 @@ def test_a_nonblocking_say_may_be_rejected_or_not_followed(client: Client) -> No
 
 
 def test_calls_do_not_wait_for_a_frozen_server_and_send_the_rest_later(scripted: Talk) -> None:
-    """More is said than the socket holds: what is left is sent by later calls, as long as it may still be sent."""
+    """The goals exceed the socket's buffer. Later calls send the rest, unless it is too late."""
     text = "length=0 " + "a" * 8_000
     with limits(), Client(scripted.socket, timeout=60) as client:
         client.pause()
@@ -132,7 +132,7 @@ def test_calls_do_not_wait_for_a_frozen_server_and_send_the_rest_later(scripted:
         while len(handles) < 500 and not (handles and handles[-1].state.terminal):
             began = time.monotonic()
             handles.append(client.say(text, priority=len(handles), block=False))
-            assert_within(time.monotonic() - began, AT_ONCE_S, "a say that does not wait")
+            assert_within(time.monotonic() - began, NONBLOCKING_S, "a nonblocking say")
         assert (handles[-1].state, handles[-1].goal.reason) == (State.REJECTED, "not_sent")
         assert f"{MAX_UNSENT_BYTES >> 10} KiB" in (handles[-1].goal.message or "")
         assert len(handles) > MAX_UNSENT_BYTES / len(text)
@@ -181,7 +181,7 @@ def test_a_partly_sent_goal_is_rejected_and_the_client_reconnects(scripted: Talk
         assert followed.wait(PATIENCE).state in {State.PREEMPTED, State.LOST}
 
 
-# Across breaks
+# Lost connections
 
 
 def test_a_restart_loses_all_goals_and_the_client_uses_the_new_server(client: Client, scripted: Talk) -> None:
@@ -210,7 +210,7 @@ def test_goals_are_followed_again_after_a_reconnect_to_the_same_server(client: C
     pending, ending = client.say("length=0"), client.say("length=0", priority=1)
     with Client(scripted.socket) as other:
         scripted.watcher.wait_for_word(active.id)
-        cut(client)
+        disconnect(client)
         other.cancel([ending.id])
         assert [each.state for each in (pending, ending)] == [State.PENDING] * 2
         assert client.status().active
@@ -224,13 +224,13 @@ def test_goals_are_followed_again_after_a_reconnect_to_the_same_server(client: C
 def test_a_watch_continues_after_a_reconnect_with_a_new_snapshot(client: Client, scripted: Talk) -> None:
     watch = client.events(reconnect=True)
     assert isinstance(next(watch), Snapshot)
-    cut(client)
+    disconnect(client)
     assert isinstance(next(watch), Snapshot)
     client.say("length=0", follow=False)
     assert isinstance(next(watch), StateChanged)
     seen: list[Event] = []
     taking = threading.Thread(
-        target=lambda: seen.extend(itertools.takewhile(lambda each: not_of(each, "hello"), watch))
+        target=lambda: seen.extend(itertools.takewhile(lambda each: lacks_word(each, "hello"), watch))
     )
     taking.start()
     restart(scripted)
@@ -242,7 +242,7 @@ def test_a_watch_continues_after_a_reconnect_with_a_new_snapshot(client: Client,
 
 
 def test_watching_threads_survive_a_server_outage(client: Client, scripted: Talk) -> None:
-    """One of the threads tries to connect, and the others wait for it without a limit."""
+    """One of the threads tries to connect. The others wait for it without a limit."""
     watches = [client.events(reconnect=True) for _ in range(3)]
     for watch in watches:
         next(watch)
@@ -254,8 +254,8 @@ def test_watching_threads_survive_a_server_outage(client: Client, scripted: Talk
         assert {type(each.result(PATIENCE)) for each in found} == {Snapshot}
 
 
-def not_of(event: Event, word: str) -> bool:
-    """Return whether an event is not the first of a goal with this word."""
+def lacks_word(event: Event, word: str) -> bool:
+    """Return whether an event contains no goal with this word in its text."""
     return not (isinstance(event, StateChanged) and event.goal and word in (event.goal.text or ""))
 
 
@@ -266,8 +266,8 @@ def test_calls_fail_at_once_while_no_server_runs(client: Client, scripted: Talk)
             began = time.monotonic()
             with pytest.raises(ServerUnavailable, match=r"no server|nothing was sent"):
                 act()
-            assert_within(time.monotonic() - began, AT_ONCE_S, "a call without a server")
-    time.sleep(1)  # the pause between two attempts is as long as it can be
+            assert_within(time.monotonic() - began, NONBLOCKING_S, "a call without a server")
+    time.sleep(1)  # after 1 s, the pause between two attempts has its maximum length
     scripted.start_server()
     handle = client.say("length=0", block=False)
     began = time.monotonic()
@@ -306,7 +306,7 @@ def test_the_timeout_must_be_positive(timeout: float) -> None:
 
 # A robot's loop
 
-#: A robot that is blocked for all of its ride, except for a moment after it was heard; it notes how late it is.
+#: A robot that is blocked during its whole ride, except briefly after it has spoken. It records how late its loop is.
 ROBOT = """
 import json
 import sys
@@ -345,7 +345,7 @@ print(json.dumps(robot.lateness))
 
 
 def test_the_readmes_loop_is_never_late_and_speaks_after_outages(scripted: Talk) -> None:
-    """The server is stopped for 7 s and killed once, beside the same loop without `talk`."""
+    """The server is stopped for 7 s and killed once. The same loop without `talk` runs at the same time."""
     (example,) = [each for each in README.examples("python", "Use it from Python") if "robot.drives" in each]
     programs = [ROBOT.format(loop=example), ROBOT.format(loop="while robot.drives():\n    pass")]
     with limits(), contextlib.ExitStack() as stack:
@@ -353,7 +353,7 @@ def test_the_readmes_loop_is_never_late_and_speaks_after_outages(scripted: Talk)
         for each in programs:
             loop = subprocess.Popen([sys.executable, "-c", each, "14"], env=scripted.env, stdout=subprocess.PIPE)
             loops.append(stack.enter_context(loop))
-            stack.callback(loop.kill)  # it ends by itself, unless the test fails
+            stack.callback(loop.kill)  # needed only if the test fails
         scripted.watcher.wait_for(None, "SUCCEEDED")
         scripted.freeze()
         time.sleep(7)

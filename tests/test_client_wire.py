@@ -1,4 +1,4 @@
-"""The client library against a server that follows a script: time limits, ends, interrupts, and bounded buffers."""
+"""The client library with a scripted peer: time limits, lost connections, interrupts and limited line lengths."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 
-def unanswered(peer: Peer) -> None:
+def ignore_say(peer: Peer) -> None:
     peer.receive("say")
 
 
@@ -55,15 +55,15 @@ def test_a_reply_to_pause_may_take_longer_than_the_timeout() -> None:
         peer.reply("resume", paused=False, goal=None)
 
     with serving(play) as path, Client.over(SocketConnection(path, patience=0.2)) as client:
-        held = client.pause()
-        assert held
-        assert held.state is State.ACTIVE
+        paused = client.pause()
+        assert paused
+        assert paused.state is State.ACTIVE
         assert client.resume() is None
 
 
 def test_a_silent_server_is_considered_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("talkcli.client.core.SILENCE_LIMIT_S", 0.3)
-    with serving(unanswered) as path, Client.over(SocketConnection(path, patience=5)) as client:
+    with serving(ignore_say) as path, Client.over(SocketConnection(path, patience=5)) as client:
         began = time.monotonic()
         with pytest.raises(Lost, match=r"nothing for 0\.3 s"):
             client.say("a", patient=True)
@@ -103,7 +103,7 @@ def test_feedback_times_out_even_while_words_arrive() -> None:
         with pytest.raises(TimeoutError, match=r"g has not ended after 0\.3 s"):
             words.extend(handle.feedback(0.3))
         assert words
-        assert 0.3 <= time.monotonic() - began < 3  # what had been read by then is handed out, and no more
+        assert 0.3 <= time.monotonic() - began < 3  # only words that had been read by then are returned
 
 
 @pytest.mark.parametrize("timeout", [0, 0.1])
@@ -122,7 +122,7 @@ def test_events_received_by_the_deadline_are_returned(timeout: float) -> None:
             seen.extend(handle.events(timeout))
         assert [each.state for each in seen if isinstance(each, StateChanged)] == [State.PENDING, State.ACTIVE]
         with pytest.raises(TimeoutError):
-            next(handle.events(timeout))  # each event is handed out once
+            next(handle.events(timeout))  # each event is returned once
 
 
 def test_a_result_received_before_the_server_disconnects_counts() -> None:
@@ -179,7 +179,7 @@ def test_a_malformed_message_ends_the_connection_and_blocks_no_caller() -> None:
 
 @pytest.fixture
 def interrupt() -> Iterator[tuple[int, int]]:
-    """A descriptor that interrupts, and the one that is written to for it."""
+    """A pipe that interrupts the client: its reading end and its writing end."""
     pipe = os.pipe()
     yield pipe
     for each in pipe:
@@ -209,14 +209,14 @@ def test_an_interrupt_ends_a_wait_and_loses_no_event(
 
 
 @pytest.mark.parametrize(
-    ("kind", "do"),
+    ("kind", "call"),
     [
         ("watch", lambda client: [*client.events()]),
         ("say", lambda client: client.say("a", patient=True)),
         ("pause", Client.pause),
     ],
 )
-def test_an_interrupt_ends_a_long_call(interrupt: tuple[int, int], kind: str, do: Callable[[Client], object]) -> None:
+def test_an_interrupt_ends_a_long_call(interrupt: tuple[int, int], kind: str, call: Callable[[Client], object]) -> None:
     def play(peer: Peer) -> None:
         request = peer.receive(kind)
         if kind == "watch":
@@ -226,7 +226,7 @@ def test_an_interrupt_ends_a_long_call(interrupt: tuple[int, int], kind: str, do
     with serving(play) as path:
         client = Client.over(SocketConnection(path, interrupt={interrupt[0]: select.POLLIN}))
         with client, pytest.raises(Interrupted):
-            do(client)
+            call(client)
 
 
 def test_a_handle_with_feedback_gets_pause_events() -> None:
@@ -263,7 +263,7 @@ def test_a_watch_ends_when_its_iterator_is_dropped() -> None:
     with serving(play) as path, Client(path) as client:
         for _ in client.events():
             break
-        client.events()  # not even begun
+        client.events()  # never iterated
         client.status()
         watches = client._connection.listeners.watches
         assert watches is not None

@@ -1,4 +1,4 @@
-"""How `talk doctor` gathers facts: sockets, engine processes, programs that hang or are missing, and system files."""
+"""How `talk doctor` examines sockets, engine processes, programs and system files."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from talkcli.doctor.report import Finding
     from tests.conftest import MakeTalk
 
-#: No user of this sound.
+#: A user without access to this machine's sound.
 STRANGER = UserSession(4141, "stranger", gids=(4242,))
 PW_NODES = """
 \tid 31, type PipeWire:Interface:Node/3
@@ -52,7 +52,7 @@ PW_NODES = """
 
 @pytest.fixture
 def home(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """Return a directory with all usual places of a socket, except the system's."""
+    """Return a directory that contains all usual socket paths, except the system's."""
     with short_directory() as path:
         os.makedirs(f"{path}/run/talk", 0o700)
         monkeypatch.setenv("TMPDIR", path)
@@ -61,7 +61,7 @@ def home(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 
 
 def no_server(named: str | None = None) -> Finding:
-    """Return the finding about the missing server, with this TALK_SOCKET."""
+    """Return the finding about the missing server. `named` is the value of TALK_SOCKET."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TALK_SOCKET", named or "")
         client, finding = server.connect(None, None)
@@ -81,8 +81,8 @@ def test_the_state_of_each_usual_socket_path_is_described(home: str) -> None:
         assert found.next == step
 
     check("not found", "talk serve")
-    with socket.socket(socket.AF_UNIX) as left:
-        left.bind(path)
+    with socket.socket(socket.AF_UNIX) as stale:
+        stale.bind(path)
     check("no server responds (left over from an earlier server)", "talk serve (it replaces the old socket)")
     os.unlink(path)
     write(Path(path), "")
@@ -152,7 +152,7 @@ def test_another_users_server_is_reported_and_receives_no_data(home: str) -> Non
     path = f"{home}/run/talk/talk.sock"
     with impostor(path) as heard:
         found = no_server()
-        assert heard() == b"b''\n", "it hung up without a word"
+        assert heard() == b"b''\n", "it hung up without sending anything"
     assert f"{path}: another user's server (uid {NOBODY})" in found.message
     assert f"if you trust uid {NOBODY}, run: talk --socket {path} doctor" in str(found.next)
 
@@ -160,8 +160,8 @@ def test_another_users_server_is_reported_and_receives_no_data(home: str) -> Non
 # Engine processes
 
 
-def unable(directory: Path, named: str | None = None) -> Finding:
-    """Return why an engine process cannot start that finds the modules and libraries of this directory first."""
+def engine_fault(directory: Path, named: str | None = None) -> Finding:
+    """Return why an engine process can't start that searches this directory first for modules and libraries."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(directory)
         env = environment(str(directory), LD_LIBRARY_PATH=str(directory))
@@ -173,7 +173,7 @@ def unable(directory: Path, named: str | None = None) -> Finding:
 
 
 def test_the_reason_why_an_engine_cannot_start_is_reported(tmp_path: Path) -> None:
-    found = unable(tmp_path, "klingon-7")
+    found = engine_fault(tmp_path, "klingon-7")
     assert (found.check, 'unknown voice "klingon-7"' in found.message) == ("voices", True)
     (tmp_path / "libespeak-ng.so.1").write_bytes(b"no library")
     library = os.path.join(os.path.dirname(espeakng_loader.__file__), "libespeak-ng.so")
@@ -187,7 +187,7 @@ def test_the_reason_why_an_engine_cannot_start_is_reported(tmp_path: Path) -> No
         ("pyttsx3", "import os\nos.kill(os.getpid(), 11)", "SIGSEGV"),
     ):
         write(tmp_path / f"{name}.py", f"{text}\n")
-        found = unable(tmp_path)
+        found = engine_fault(tmp_path)
         assert (found.check, words in found.message) == ("libespeak-ng", True), found
         assert "apt-get install" in str(found.next)
         (tmp_path / f"{name}.py").unlink()
@@ -197,9 +197,9 @@ def test_the_reason_why_an_engine_cannot_start_is_reported(tmp_path: Path) -> No
 
 
 def env_with(directory: Path, **scripts: str) -> dict[str, str]:
-    """Return an environment with these programs and no others on its PATH."""
-    for name, does in scripts.items():
-        write(directory / name.replace("_", "-"), f"#!/bin/sh\n{does}\n", 0o755)
+    """Return an environment with only these programs on its PATH."""
+    for name, script in scripts.items():
+        write(directory / name.replace("_", "-"), f"#!/bin/sh\n{script}\n", 0o755)
     return {"PATH": str(directory)}
 
 
@@ -226,8 +226,8 @@ def test_a_hanging_program_is_killed_with_its_children(tmp_path: Path, monkeypat
     child = int((tmp_path / "pid").read_text())
     end = time.monotonic() + 5
     while _runs(child):
-        assert time.monotonic() < end, "its child goes on"
-        time.sleep(0.01)  # nothing tells of the end of a process that is no child of ours
+        assert time.monotonic() < end, "its child is still running"
+        time.sleep(0.01)  # the end of another program's child isn't reported
 
 
 def test_a_child_that_keeps_a_programs_output_open_is_not_awaited(tmp_path: Path) -> None:
@@ -278,7 +278,7 @@ def test_a_device_is_looked_up_in_its_players_list(tmp_path: Path) -> None:
     found = sound.check_device(env, "aplay", "robot_speaker")
     assert (found.state, "robot_speaker is not in the list of aplay -L" in found.message) == (WARNING, True)
     assert "plughw:CARD=Device,DEV=0" in found.message
-    assert sound.check_device(env, "pacat", None).state == OK, "it is a fault only if a device is named"
+    assert sound.check_device(env, "pacat", None).state == OK, "it is a fault only if a device is given"
     found = sound.check_device(env, "pacat", "usb")
     assert (found.state, found.next) == (WARNING, "sudo apt-get install -y pulseaudio-utils")
     env = env_with(tmp_path, aplay="exit 0")
@@ -348,7 +348,7 @@ def test_the_volume_is_read_from_the_active_mixer(tmp_path: Path) -> None:
 
 @pytest.fixture
 def nodes(tmp_path: Path) -> str:
-    """Return a directory with the device files of a card that only its group may open, and of one for everybody."""
+    """Return a directory with device files: one card is for its group only, and one for everybody."""
     for name, mode in (("pcmC0D0p", 0o660), ("pcmC0D0c", 0o660), ("pcmC1D0p", 0o666)):
         write(tmp_path / name, "", mode)
     return str(tmp_path)
@@ -361,7 +361,7 @@ def test_access_to_a_card_depends_on_user_group_and_mode(nodes: str, monkeypatch
     found = sound.check_access(SoundServer(), STRANGER, nodes)
     assert (found.state, found.next) == (WARNING, f"sudo usermod -aG {name} stranger, and log in again")
     assert found.message == f"user stranger may not open {nodes}/pcmC0D0p, and is not in the group {name}"
-    assert sound.check_access(SoundServer("PipeWire"), STRANGER, nodes).state == OK, "it opens them"
+    assert sound.check_access(SoundServer("PipeWire"), STRANGER, nodes).state == OK, "the sound server opens the cards"
     member = UserSession(4141, "member", gids=(group,))
     assert sound.check_access(SoundServer(), member, nodes).message == (
         f"user member may open the cards (in the group {name})"
@@ -389,7 +389,9 @@ def test_a_server_of_the_same_user_is_examined_with_its_environment(tmp_path: Pa
     with subprocess.Popen(["sh", "-c", "sleep 98; :", "--player", "x"], env=env, start_new_session=True) as process:
         try:
             end = time.monotonic() + 5
-            while sound._read_environment(process.pid) != env:  # the process has ours until its program has started
+            while (
+                sound._read_environment(process.pid) != env
+            ):  # the process has our environment until its program has started
                 assert time.monotonic() < end
             found, seen = sound.find_session(process.pid)
             assert seen == env

@@ -1,4 +1,4 @@
-"""`talk doctor` and neural voices: the packages that they need, their files, and the voice in use, loaded and timed."""
+"""How `talk doctor` checks neural voices: their packages, their files, and the voice in use."""
 
 from __future__ import annotations
 
@@ -30,35 +30,35 @@ if TYPE_CHECKING:
 
 __all__ = ["home"]
 
-#: Hides the voices of packages, so that only the voices of a test are found.
-ALONE = """
+#: Hides the voices of packages, so that only the test's voices are found.
+WITHOUT_PACKAGES = """
 import importlib, sys
 from talkcli.engine import models
 models._PACKAGE_SUFFIX = "no such package"
 """
 TRIED = r"is in use: loaded in \d+\.\d s, speaks \d+\.\d times as fast as real time, uses \d+ MB"
-LIMIT = 20.0
+LIMIT_S = 20.0
 
 
 @pytest.fixture
 def alone(home: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
-    """Return an environment with the voice that hums, and no other."""
+    """Return an environment whose only neural voice is the tiny test voice."""
     needs_packages(*NEURAL_PACKAGES)
     monkeypatch.setattr("talkcli.engine.models._PACKAGE_SUFFIX", "no such package")
     tiny_voice.put(Path(home) / "v", "tiny")
-    return _environment(home, tmp_path, ALONE)
+    return _environment(home, tmp_path, WITHOUT_PACKAGES)
 
 
 def _environment(home: str, tmp_path: Path, code: str) -> dict[str, str]:
-    """Return an environment without a server, in which each Python runs this code first."""
+    """Return an environment without a server, in which each Python process runs this code first."""
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "sitecustomize.py").write_text(code)
     env = environment(home, TALK_SOCKET=f"{home}/s", TALK_VOICES=f"{home}/v", TALK_PLAYER=f"file:{home}/said.wav")
     return {**env, "PYTHONPATH": f"{tmp_path / 'site'}:{env.get('PYTHONPATH', '')}"}
 
 
-def _found(used: str | None, env: dict[str, str], limit: float = LIMIT) -> dict[str, Finding]:
-    """Return the findings about the voices of this environment, by their checks."""
+def _found(used: str | None, env: dict[str, str], limit: float = LIMIT_S) -> dict[str, Finding]:
+    """Return the findings about the voices in this environment, by name of the check."""
     found = voice.check_neural(used, EngineOptions(env=env), limit, None)
     return {each.check: each for each in found}
 
@@ -102,7 +102,7 @@ def test_faulty_files_are_reported_one_by_one_with_the_next_step(alone: dict[str
         (b"no model", 1, "is not an ONNX model", "download the voice again, from a source that you trust"),
         (None, 2, "only one of them has several speakers", "download both again"),
     ],
-    ids=["garbage", "another's json"],
+    ids=["garbage", "wrong json"],
 )
 def test_the_fault_of_a_voice_that_cannot_speak_is_reported(
     alone: dict[str, str], home: str, model: bytes | None, speakers: int, words: str, step: str
@@ -144,16 +144,16 @@ def test_a_slow_import_is_not_reported_as_a_broken_package(monkeypatch: pytest.M
 def test_the_servers_voice_is_tried_in_the_servers_environment(alone: dict[str, str]) -> None:
     silent = {name: value for name, value in alone.items() if name != "TALK_PLAYER"}
     with serving(silent, "--voice", "piper/ti"), Client(alone["TALK_SOCKET"]) as client:
-        limit = time.monotonic() + LIMIT
+        limit = time.monotonic() + LIMIT_S
         while not re.search("loaded", str(client.status().server["neural_voices"])):
             assert time.monotonic() < limit
             time.sleep(0.02)
-        # The directory of the voices is in the server's environment alone.
+        # Only the server's environment names the directory of the voices.
         found = doctor({name: value for name, value in silent.items() if name != "TALK_VOICES"}, "--silent")
     assert re.match(f"piper/tiny {TRIED}", found["neural voice"]["message"]), found
 
 
-# Whether and how the doctor looks
+# Which voice is tried
 
 
 HERE, SERVED = UserSession(0, "root"), UserSession(0, "root", server_pid=7)
@@ -161,7 +161,7 @@ UNKNOWN = EngineReport(reason="unknown_voice", message="x")
 
 
 def started(voice: str | None = None, *voices: str, driver: str = "espeak") -> EngineReport:
-    """Return the report of an engine; `voice`: the neural voice in its settings, `voices`: all of its voices."""
+    """Return the report of an engine. `voice` is the neural voice in its settings, and `voices` are all its voices."""
     return EngineReport(Ready(driver, None, None, voice), voices)
 
 
@@ -178,14 +178,16 @@ def test_only_the_voice_in_use_is_tried(home: str, monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(voice, "check_neural", check_neural)
 
-    def tried(used: str | None, engine: EngineReport, here: UserSession = HERE, **told: object) -> list[str | None]:
-        env = {"TALK_VOICES": f"{home}/v"} if told.pop("installed", False) else {}
+    def tried(
+        used: str | None, engine: EngineReport, session: UserSession = HERE, **server: object
+    ) -> list[str | None]:
+        env = {"TALK_VOICES": f"{home}/v"} if server.pop("installed", False) else {}
         examination = examine.LocalExamination(None, silent=True)
-        if told:
-            examination._client, examination._server = cast("Client", object()), {"voice": used, **told}
+        if server:
+            examination._client, examination._server = cast("Client", object()), {"voice": used, **server}
         else:
             monkeypatch.setenv("TALK_VOICE", used or "")
-        examination._engine, examination._session, examination._env = engine, here, env
+        examination._engine, examination._session, examination._env = engine, session, env
         asked.clear()
         found = list(examination._check_neural())
         assert not found or found[0].message == "the server's neural voices: piper/a"
@@ -199,7 +201,7 @@ def test_only_the_voice_in_use_is_tried(home: str, monkeypatch: pytest.MonkeyPat
     assert tried("tiny", UNKNOWN, installed=True) == ["tiny"]
     assert tried("none", UNKNOWN, installed=True) == [None]
     voices = {"piper/a": {"state": "loaded"}}
-    assert tried(None, ESPEAK, neural_voices=voices) == [], "the files of the server can't be seen"
+    assert tried(None, ESPEAK, neural_voices=voices) == [], "the server's files can't be examined"
     assert tried(None, ESPEAK, SERVED, neural_voices=voices) == [None]
 
 
@@ -216,7 +218,7 @@ assert not {"onnxruntime", "numpy"} & {*sys.modules}, sys.modules.keys()
     subprocess.run([sys.executable, "-c", code], env=env, check=True, timeout=60)
 
 
-# How a voice is tried
+# The trial of a voice
 
 
 def test_the_trial_of_a_slow_voice_is_aborted(alone: dict[str, str]) -> None:
@@ -240,30 +242,30 @@ def test_a_signal_ends_the_trial(alone: dict[str, str]) -> None:
     options = EngineOptions(env=alone, interrupt={readable: 1})
     try:
         with pytest.raises(Interrupted):
-            list(voice.check_neural("piper/tiny", options, LIMIT, None))
+            list(voice.check_neural("piper/tiny", options, LIMIT_S, None))
     finally:
         os.close(readable)
         os.close(writable)
 
 
-# Judgements
+# Findings
 
 
-FAILED_THEN = {"piper/a": {"state": "loaded", "why": None}, "piper/b": {"state": "failed", "why": "x is no model"}}
+SERVER_VOICES = {"piper/a": {"state": "loaded", "why": None}, "piper/b": {"state": "failed", "why": "x is no model"}}
 
 
 def test_the_servers_status_is_reported_if_voices_cannot_be_examined() -> None:
-    (found,) = voice.judge_server_voices(FAILED_THEN)
+    (found,) = voice.judge_server_voices(SERVER_VOICES)
     assert (found.state, found.message) == (WARNING, "the server cannot speak with the voice piper/b: x is no model")
     assert found.next == "check whether this is still true: talk set --voice piper/b"
-    (found,) = voice.judge_server_voices({"piper/a": FAILED_THEN["piper/a"]})
+    (found,) = voice.judge_server_voices({"piper/a": SERVER_VOICES["piper/a"]})
     assert (found.state, found.message) == (OK, "the server's neural voices: piper/a")
     assert voice.judge_server_voices({}) == []
 
 
 def test_a_voice_that_fails_only_on_the_server_is_a_warning() -> None:
     trial = VoiceTrial(load_s=0.5, speed=9.0)
-    assert voice.judge_trial("piper/b", trial, FAILED_THEN).state == WARNING
+    assert voice.judge_trial("piper/b", trial, SERVER_VOICES).state == WARNING
     assert voice.judge_trial("piper/b", trial, {}).state == OK
 
 
@@ -290,7 +292,7 @@ def test_a_failed_voice_is_a_warning_if_the_server_falls_back_to_espeak(
     trial = VoiceTrial(fault=("x is no model", "download it again"))
 
     def packages(used: str | None, server_voices: dict[str, object] | None) -> str:
-        return next(voice.check_neural(used, EngineOptions(env={}), LIMIT, server_voices)).state
+        return next(voice.check_neural(used, EngineOptions(env={}), LIMIT_S, server_voices)).state
 
     for server_voices, state in ((None, FAILURE), ({}, WARNING)):
         assert voice.judge_trial("piper/a", trial, server_voices).state == state

@@ -1,4 +1,4 @@
-"""A request is sent once, before the rest of the client is imported, and its goal is cancelled with the client."""
+"""Early requests: a client sends its request once, before most of its imports. A signal still cancels the goal."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 def start(path: str) -> subprocess.Popen[str]:
-    """Start `talk say --wait hello` with the server at this place."""
+    """Start `talk say --wait hello` with the server at this path."""
     env = clean_environment(os.path.dirname(path), {"TALK_SOCKET": path})
     words = [*TALK, "say", "--wait", "hello"]
     return subprocess.Popen(words, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -51,7 +51,7 @@ def listening_at(path: str, backlog: int = 8) -> Iterator[socket.socket]:
 def test_a_signal_during_the_imports_cancels_the_sent_goal(number: signal.Signals) -> None:
     def play(peer: Peer) -> None:
         asked = peer.receive("say")
-        # At this moment the client has sent its request, and has most of its modules still to import.
+        # The client has sent its request, but hasn't imported most of its modules yet.
         client.send_signal(number)
         peer.send({"seq": asked["seq"], "ok": True, "goal": goal("PENDING")})
         peer.reply("cancel")
@@ -63,23 +63,23 @@ def test_a_signal_during_the_imports_cancels_the_sent_goal(number: signal.Signal
     assert (client.returncode, out) == (128 + number, "g\n"), err
 
 
-def assert_hello_is_sent_once(serve: Callable[[socket.socket], None], said: list[dict[str, Any]]) -> None:
-    """Run `talk say hello` with this server, which appends the requests that it gets to `said`."""
+def assert_hello_is_sent_once(serve: Callable[[socket.socket], None], requests: list[dict[str, Any]]) -> None:
+    """Run `talk say hello` with this server, which appends the received requests to `requests`."""
     with short_directory() as directory, listening_at(f"{directory}/s") as listening:
         thread = threading.Thread(target=serve, args=[listening], daemon=True)
         thread.start()
         done = run([*TALK, "say", "hello"], clean_environment(directory, {"TALK_SOCKET": f"{directory}/s"}))
         thread.join(PATIENCE)
     assert (done.code, done.out, done.err) == (0, "g\n", "")
-    assert said == [{"request": "hello"}, {"seq": 1, "request": "say", "text": "hello"}]
+    assert requests == [{"request": "hello"}, {"seq": 1, "request": "say", "text": "hello"}]
 
 
-def answer(connected: socket.socket, said: list[dict[str, Any]]) -> None:
+def answer(connected: socket.socket, requests: list[dict[str, Any]]) -> None:
     """Read two requests, accept the goal, and read until the client hangs up."""
     with connected.makefile("rb") as file:
-        said.extend(json.loads(file.readline()) for _ in range(2))
-        connected.sendall(json.dumps({"seq": said[1]["seq"], "ok": True, "goal": goal("PENDING")}).encode() + b"\n")
-        said.extend(json.loads(each) for each in file)
+        requests.extend(json.loads(file.readline()) for _ in range(2))
+        connected.sendall(json.dumps({"seq": requests[1]["seq"], "ok": True, "goal": goal("PENDING")}).encode() + b"\n")
+        requests.extend(json.loads(line) for line in file)
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def answer(connected: socket.socket, said: list[dict[str, Any]]) -> None:
         [GREETING.replace(b'{"talk": 1,', b'{ "talk":1,')],
         [GREETING[:-1] + b"\n" + b'{"event": "alive"}\n'],
     ],
-    ids=["at once", "in parts", "late", "written otherwise", "with more"],
+    ids=["at once", "in parts", "late", "other spacing", "with an event"],
 )
 def test_a_request_is_sent_once_however_the_server_greets(greeting: list[bytes]) -> None:
     said: list[dict[str, Any]] = []
@@ -101,20 +101,20 @@ def test_a_request_is_sent_once_however_the_server_greets(greeting: list[bytes])
         with connected:
             for part in greeting:
                 connected.sendall(part)
-                time.sleep(0.3 if part is not greeting[-1] else 0)  # longer than a client waits before it imports all
+                time.sleep(0.3 if part is not greeting[-1] else 0)  # longer than a client waits before its imports
             answer(connected, said)
 
     assert_hello_is_sent_once(serve, said)
 
 
 def test_a_request_is_sent_again_if_the_server_hangs_up() -> None:
-    """As if the server ended, and a socket unit started the next one."""
+    """For example if the server ended, and a socket unit started the next one."""
     said: list[dict[str, Any]] = []
 
     def serve(listening: socket.socket) -> None:
         connected, _ = listening.accept()
         with connected:
-            connected.recv(1, socket.MSG_PEEK)  # unread when it is closed, which breaks the connection
+            connected.recv(1, socket.MSG_PEEK)  # closing a socket with unread bytes breaks the connection
         connected, _ = listening.accept()
         with connected:
             connected.sendall(GREETING)
@@ -124,7 +124,7 @@ def test_a_request_is_sent_again_if_the_server_hangs_up() -> None:
 
 
 def test_the_request_is_sent_before_the_client_is_imported(scripted: Talk) -> None:
-    """These imports would delay the first word."""
+    """The imports would delay the first word."""
     code = (
         "import sys\n"
         "from talkcli.client import connect\n"
@@ -169,31 +169,31 @@ def test_a_waiting_client_delays_its_imports(scripted: Talk) -> None:
 
 
 def test_a_client_yields_the_processor_and_loses_no_reply(monkeypatch: pytest.MonkeyPatch) -> None:
-    ours, theirs = socket.socketpair()
-    attempt = ConnectionAttempt(ours, "s", hello_sent=True, request_sent=b"request\n")
-    with ours, theirs:
+    client_end, server_end = socket.socketpair()
+    attempt = ConnectionAttempt(client_end, "s", hello_sent=True, request_sent=b"request\n")
+    with client_end, server_end:
         for answer in (b"", b"reply\n"):
-            theirs.sendall(answer)
+            server_end.sendall(answer)
             monkeypatch.setattr("talkcli.client.connect.time.process_time", lambda: 0.1)
             began = time.monotonic()
             yield_processor(attempt, None)
             assert time.monotonic() - began >= 0.1
             monkeypatch.setattr("talkcli.client.connect.time.process_time", lambda: PATIENCE)
             began = time.monotonic()
-            yield_processor(attempt, 0.05)  # its own limit comes first
-            yield_processor(attempt, None)  # and a slow machine's client waits for a moment only
+            yield_processor(attempt, 0.05)  # its own limit is shorter
+            yield_processor(attempt, None)  # on a slow machine, the wait has a maximum
             assert time.monotonic() - began < PATIENCE
         monkeypatch.setattr("talkcli.client.connect._LONGEST_YIELD_S", PATIENCE)
-        assert ours.recv(100) == b"reply\n"
+        assert client_end.recv(100) == b"reply\n"
         began = time.monotonic()
         for refused in (b'{"seq": 1, "ok": false}\n', b'{"goal": {"state": "REJECTED"}}\n'):
-            theirs.sendall(refused)
-            yield_processor(attempt, None)  # there is nothing to wait for
-            assert (os.get_blocking(ours.fileno()), ours.recv(100)) == (False, refused)
-        theirs.close()
-        yield_processor(attempt, None)  # nor is there when the server is gone
+            server_end.sendall(refused)
+            yield_processor(attempt, None)  # a refusal needs no wait
+            assert (os.get_blocking(client_end.fileno()), client_end.recv(100)) == (False, refused)
+        server_end.close()
+        yield_processor(attempt, None)  # the server is gone
         assert time.monotonic() - began < PATIENCE
-        assert (os.get_blocking(ours.fileno()), ours.recv(1)) == (False, b"")
+        assert (os.get_blocking(client_end.fileno()), client_end.recv(1)) == (False, b"")
 
 
 def test_simple_commands_import_neither_click_nor_slow_modules(scripted: Talk) -> None:
@@ -240,7 +240,7 @@ def test_a_server_with_a_full_backlog_is_not_skipped() -> None:
             found = reach(None)
             assert (found.socket, found.backlog_full, found.failures[-1][0]) == (None, True, first)
         listening.setblocking(False)
-        with pytest.raises(BlockingIOError):  # no client came to the second place
+        with pytest.raises(BlockingIOError):  # no client connected to the second socket
             listening.accept()
 
 
@@ -277,14 +277,14 @@ def test_a_server_that_refuses_the_client_is_skipped(early: bool) -> None:
         os.unlink(second)
         with pytest.raises(AccessDenied, match=f"(?s)tried:\n  {first}: the server refused the connection: not you\n"):
             connect(None, hello(None, urgent=False), attempt=attempt())
-    assert set(heard) == {b'{"request": "hello"}\n'}, "what was asked is for the server that takes it"
+    assert set(heard) == {b'{"request": "hello"}\n'}, "the request is only for the server that admits the client"
 
 
-# Signals while a client waits
+# Signals during a wait
 
 
-def to_another_thread(number: signal.Signals) -> None:
-    """Have the kernel give a signal to another thread than the main one, which keeps waiting."""
+def signal_another_thread(number: signal.Signals) -> None:
+    """Send a signal to a thread other than the main thread, which keeps waiting."""
     thread = threading.Thread(target=lambda: signal.pthread_kill(threading.get_ident(), number))
     thread.start()
     thread.join()
@@ -294,13 +294,13 @@ def to_another_thread(number: signal.Signals) -> None:
 def test_a_signal_to_another_thread_ends_the_wait(number: signal.Signals) -> None:
     began = time.monotonic()
     with Interrupts() as interrupts:
-        sender = threading.Timer(0.1, to_another_thread, [number])
+        sender = threading.Timer(0.1, signal_another_thread, [number])
         sender.start()
         wait_ready({}, 10, interrupts.watched)
     sender.join()
     assert interrupts.exit_code == 128 + number
     assert time.monotonic() - began < 5
-    assert signal.set_wakeup_fd(-1) == -1  # nothing is left behind
+    assert signal.set_wakeup_fd(-1) == -1  # the wake-up descriptor is removed
 
 
 def test_during_cleanup_only_a_first_signal_ends_the_wait() -> None:

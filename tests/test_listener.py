@@ -1,4 +1,4 @@
-"""The socket, the lock and the directory of a server, a socket that is passed to it, and clients of other users."""
+"""The server's socket, lock file and directory, passed sockets, and clients of other users."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ os.execv(sys.argv[2], sys.argv[2:])
 
 
 def refused(home: str, *words: str, code: int = 11, **extra: str) -> str:
-    """Assert that a server does not start, and return its message."""
+    """Assert that a server doesn't start, and return its error message."""
     done = run([*SERVE, *words], environment(home, **extra))
     assert (done.code, done.out) == (code, ""), done
     assert "Traceback" not in done.err
@@ -70,7 +70,7 @@ def test_a_second_server_reports_the_current_lock_holder(home: str) -> None:
         reader = threading.Thread(target=lambda: found.append(listener._read_holder(file.fileno())))
         reader.start()
         reader.join(0.1)
-        assert reader.is_alive(), f"it named {found}, which has ended"
+        assert reader.is_alive(), f"it returned {found}, which has ended"
         file.seek(0)
         file.truncate()
         file.write(f"{os.getpid()}\n".encode())
@@ -161,7 +161,7 @@ def test_a_refused_client_of_another_user_exits_with_10(home: str) -> None:
             assert done.err.endswith("or start your own server with: talk serve\n")
         done = run([*client, "status"], {**theirs, "TALK_SOCKET": path})
         assert done.err.endswith("or unset TALK_SOCKET to try the usual places\n")
-        assert "talk serve\n" not in done.err, "it would listen at that place, too"
+        assert "talk serve\n" not in done.err, "a new server would use the same path"
     with serving(environment(home), "--socket", path, "--socket-mode", "0666"):
         assert run([*client, "--socket", path, "say", "--wait", "hi"], theirs).code == 0
 

@@ -25,7 +25,7 @@ LONG = "please step back from the door and from the lift " * 5
 
 
 def numbers(ids: list[str]) -> list[str]:
-    """Return the ids of the server's goals as lists show them."""
+    """Return the short form of goal ids that lists show."""
     return [each.partition("-")[2] for each in ids]
 
 
@@ -82,7 +82,7 @@ def test_log_shows_the_latest_goals_oldest_first(scripted: Talk) -> None:
 
 
 def test_lines_are_aligned_and_fit_the_terminal(scripted: Talk, history: list[str]) -> None:
-    """Other widths are tested in `tests/unit/test_transcript.py`."""
+    """`tests/unit/test_transcript.py` tests other widths."""
     columns = 80
     env = {"TERM": "xterm", **scripted.env}
     with Terminal([*TALK, "log"], env, columns) as shown:

@@ -1,4 +1,4 @@
-"""`talk pause` and `talk resume`: their messages, output and exit codes. Other tests compare what is heard."""
+"""The messages, output and exit codes of `talk pause` and `talk resume`. Other tests compare the sound."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ def test_pause_and_resume_report_the_affected_goal(scripted: Talk, held: str) ->
     assert scripted.goal(held)["paused"] is False
     again = scripted.run("resume")
     assert (again.code, again.out, again.err) == (0, "", f"talk: speech continues with goal {held}\n")
-    told = json.loads(scripted.run("pause", "--json").out)
-    assert (told["paused"], told["goal"]["id"], told["goal"]["paused"]) == (True, held, True)
-    told = json.loads(scripted.run("resume", "--json").out)
-    assert (told["paused"], told["goal"]["id"], told["goal"]["paused"]) == (False, held, False)
+    reply = json.loads(scripted.run("pause", "--json").out)
+    assert (reply["paused"], reply["goal"]["id"], reply["goal"]["paused"]) == (True, held, True)
+    reply = json.loads(scripted.run("resume", "--json").out)
+    assert (reply["paused"], reply["goal"]["id"], reply["goal"]["paused"]) == (False, held, False)
     for command in ("pause", "resume"):
         quiet = scripted.run(command, "-q")
         assert (quiet.code, quiet.out, quiet.err) == (0, "", "")
@@ -62,14 +62,14 @@ def test_status_shows_the_paused_goal(scripted: Talk, held: str) -> None:
     scripted.run("cancel")
 
 
-def begin(talk: Talk, text: str) -> str:
+def say_until_heard(talk: Talk, text: str) -> str:
     goal_id = talk.run("say", text).id
-    talk.watcher.wait_for_word(goal_id)  # at ACTIVE, the engine may still be starting
+    talk.watcher.wait_for_word(goal_id)  # the engine may still be starting when the goal is ACTIVE
     return goal_id
 
 
 def test_a_resume_answers_a_pause_that_is_not_silent_yet(scripted: Talk) -> None:
-    goal = begin(scripted, "never-ends slow-pause=1")
+    goal = say_until_heard(scripted, "never-ends slow-pause=1")
     with scripted.connect() as wire:
         wire.send_raw(b'{"seq": 1, "request": "pause"}\n{"seq": 2, "request": "resume"}\n')
         first, second = wire.receive(), wire.receive()
@@ -82,7 +82,7 @@ def test_a_resume_answers_a_pause_that_is_not_silent_yet(scripted: Talk) -> None
 
 
 def test_a_late_confirmation_does_not_answer_the_next_pause(scripted: Talk) -> None:
-    begin(scripted, "never-ends stale-pause slow-pause=0.4")
+    say_until_heard(scripted, "never-ends stale-pause slow-pause=0.4")
     with scripted.connect() as wire:
         wire.send_raw(b'{"seq": 1, "request": "pause"}\n{"seq": 2, "request": "resume"}\n')
         asked = time.monotonic()
@@ -95,7 +95,7 @@ def test_a_late_confirmation_does_not_answer_the_next_pause(scripted: Talk) -> N
 def test_each_unconfirmed_pause_fails_after_its_own_time_limit(make_talk: MakeTalk, tmp_path: Path) -> None:
     limit = 0.5
     talk = make_talk(program=patched_serve(tmp_path, requests__PAUSE_ANSWER_S=limit))
-    begin(talk, "never-ends ignore-pause")
+    say_until_heard(talk, "never-ends ignore-pause")
     with talk.connect() as wire:
         wire.send({"seq": 1, "request": "pause"})
         with pytest.raises(TimeoutError):

@@ -1,4 +1,4 @@
-"""Plain command lines are read without click, but alike, and sent before the rest is imported."""
+"""Simple command lines are parsed without click, but with the same result, and sent before most imports."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from talkcli.protocol.requests import Request
 
 PLAIN = [*COMMANDS]
-#: The options of a goal.
-GIVEN = [each.name for each in Say.options if each.flags and each.name not in {"wait", "feedback"}]
+#: The options that become fields of a goal.
+GOAL_OPTIONS = [each.name for each in Say.options if each.flags and each.name not in {"wait", "feedback"}]
 TYPED = ParameterSource.COMMANDLINE
 ROWS = [*COMMON_OPTIONS, *(option for each in COMMANDS.values() for option in each.options)]
 SPELLINGS = {form: each for each in ROWS for part in each.flags.split("/") for form in part.split(", ")}
@@ -50,7 +50,7 @@ WORDS = [
 ]
 FLAGS = [form for form, each in SPELLINGS.items() if each.kind is FLAG]
 VALUED = st.tuples(st.sampled_from(OPTIONS), st.sampled_from(["1", "0.5", "90", "k"]))
-#: Mostly plain pieces: a flag, an option with a value that fits most, words; and now and then anything.
+#: Parts of command lines: flags, options with a usually valid value, words, and sometimes arbitrary parts.
 PIECES = st.one_of(
     st.sampled_from(FLAGS).map(lambda each: [each]),
     VALUED.map(list),
@@ -68,7 +68,7 @@ ENVIRONMENTS = st.sampled_from([{}, {"TALK_NAME": "patrol"}, {"TALK_NAME": ""}])
 
 
 def by_click(arguments: list[str]) -> tuple[str, dict[str, Any], CommonOptions]:
-    """Return the command, its options and arguments, and the common ones, as click reads them; UsageError."""
+    """Return the command, its options and arguments, and the common options, as click parses them."""
     options = CommonOptions()
     with talk.make_context("talk", list(arguments), obj=options) as group:
         name, command, rest = talk.resolve_command(group, [*group._protected_args, *group.args])
@@ -80,8 +80,8 @@ def by_click(arguments: list[str]) -> tuple[str, dict[str, Any], CommonOptions]:
 
 
 @contextlib.contextmanager
-def named(environment: Mapping[str, str]) -> Iterator[None]:
-    """Have this variable for the name of the sender, or none."""
+def sender_name(environment: Mapping[str, str]) -> Iterator[None]:
+    """Set or delete the variable TALK_NAME."""
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("TALK_NAME", raising=False)
         for name, value in environment.items():
@@ -89,7 +89,7 @@ def named(environment: Mapping[str, str]) -> Iterator[None]:
         yield
 
 
-def assert_read_alike(arguments: list[str]) -> None:
+def assert_parsed_like_click(arguments: list[str]) -> None:
     found = plain.read(arguments, os.environ)
     if not found:
         return
@@ -101,13 +101,13 @@ def assert_read_alike(arguments: list[str]) -> None:
     assert (found.common.get("json", False), found.common.get("quiet", False)) == (options.json, options.quiet)
 
 
-def assert_sent_as_by_the_library(arguments: list[str]) -> None:
+def assert_sent_like_the_library(arguments: list[str]) -> None:
     found = plain.read(arguments, os.environ)
     sent = found and sent_early(found)
     if not found or not sent:
         return
-    request = library_sends(found)[1]
-    assert sent == written(found)
+    request = library_requests(found)[1]
+    assert sent == library_messages(found)
     if isinstance(request, Say):
         check(request)
         assert too_long(request) is None
@@ -118,9 +118,9 @@ def assert_sent_as_by_the_library(arguments: list[str]) -> None:
 def test_simple_lines_are_parsed_like_click_and_sent_like_the_library(
     arguments: list[str], environment: Mapping[str, str]
 ) -> None:
-    with named(environment):
-        assert_read_alike(arguments)
-        assert_sent_as_by_the_library(arguments)
+    with sender_name(environment):
+        assert_parsed_like_click(arguments)
+        assert_sent_like_the_library(arguments)
 
 
 @pytest.mark.slow
@@ -129,9 +129,9 @@ def test_simple_lines_are_parsed_like_click_and_sent_like_the_library(
 def test_thousands_of_simple_lines_are_parsed_and_sent_alike(
     arguments: list[str], environment: Mapping[str, str]
 ) -> None:
-    with named(environment):
-        assert_read_alike(arguments)
-        assert_sent_as_by_the_library(arguments)
+    with sender_name(environment):
+        assert_parsed_like_click(arguments)
+        assert_sent_like_the_library(arguments)
 
 
 @pytest.mark.parametrize(
@@ -170,16 +170,16 @@ def test_other_lines_are_left_to_click(line: list[str]) -> None:
 
 
 def sent_early(found: plain.PlainCommand) -> tuple[JsonObject, JsonObject] | None:
-    """Return the requests that are sent early for a command; None if there are none."""
+    """Return the requests that are sent early for a command; None if nothing is sent early."""
     return plain.early_messages(found) if plain.may_send_early(found) else None
 
 
-def library_sends(found: plain.PlainCommand) -> tuple[Hello, Request]:
+def library_requests(found: plain.PlainCommand) -> tuple[Hello, Request]:
     """Return the requests that the client library sends for a command."""
     name, command = found.given.get("name") or os.environ.get("TALK_NAME") or None, found.command.name
     hello = Hello(name, urgent=command in {"cancel", "status"})
     if command == "say":
-        text, options = " ".join(found.given["text"]), {each: found.given[each] for each in GIVEN}
+        text, options = " ".join(found.given["text"]), {each: found.given[each] for each in GOAL_OPTIONS}
         feedback = found.given["feedback"]
         return hello, Say(text, wait=found.given["wait"] or feedback, feedback=feedback, **options)
     if command == "cancel":
@@ -189,9 +189,9 @@ def library_sends(found: plain.PlainCommand) -> tuple[Hello, Request]:
     return hello, others[command]
 
 
-def written(found: plain.PlainCommand) -> tuple[JsonObject, JsonObject]:
-    """Return the requests that the client library sends for a command, as they go over the wire."""
-    hello, request = library_sends(found)
+def library_messages(found: plain.PlainCommand) -> tuple[JsonObject, JsonObject]:
+    """Return the requests that the client library sends for a command, in JSON."""
+    hello, request = library_requests(found)
     return write_request(hello), write_request(request)
 
 
@@ -212,7 +212,7 @@ def test_any_text_is_sent_early_unchanged(text: str) -> None:
 def test_a_request_that_only_the_server_checks_is_sent_early(line: list[str]) -> None:
     found = plain.read(line, {})
     assert found
-    assert sent_early(found) == written(found)
+    assert sent_early(found) == library_messages(found)
 
 
 @pytest.mark.parametrize(

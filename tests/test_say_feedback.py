@@ -1,4 +1,4 @@
-"""`say --feedback` and `wait --feedback` in a pipe print a line or an object for each event, at once."""
+"""`say --feedback` and `wait --feedback` print each event to a pipe at once, as a line or an object."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ if TYPE_CHECKING:
 
 
 def lines_of(client: Process) -> Iterator[str]:
-    """Return the client's lines as they come."""
+    """Yield the client's lines as they arrive."""
     assert client.stdout
     return (each.rstrip("\n") for each in client.stdout)
 
 
-#: Spoken until it is stopped, with ten words a second, so that a client that follows it soon prints one.
+#: Ten words per second until it is stopped, so that a client that follows it soon prints one.
 TALKING = "never-ends length=60 " + "word " * 600
 
 
@@ -46,7 +46,7 @@ def test_json_prints_the_protocols_events_and_then_the_result(scripted: Talk) ->
     done = scripted.run("--json", "say", "-wf", "--", "length=0.2 battery low")
     *events, result = objects(done.out)
     goal_id = events[0]["id"]
-    # A watcher gets the whole goal, too.
+    # A watcher's events also contain the whole goal.
     told = [
         {name: value for name, value in each.items() if name != "goal"} for each in scripted.watcher.events(goal_id)
     ]
@@ -67,12 +67,12 @@ def test_the_last_object_is_the_result_for_every_outcome(scripted: Talk) -> None
     client = scripted.start("--json", "say", "-f", TALKING)
     lines = lines_of(client)
     goal_id = json.loads(next(lines))["id"]
-    as_lines = scripted.start("wait", "-f", goal_id)
-    found = lines_of(as_lines)
+    waiting = scripted.start("wait", "-f", goal_id)
+    found = lines_of(waiting)
     assert next(found).startswith(f"{goal_id} ")
     scripted.kill()
     assert (json.loads(list(lines)[-1])["goal"]["state"], list(found)[-1]) == ("LOST", f"{goal_id} LOST")
-    assert (client.wait(10), as_lines.wait(10)) == (12, 12)
+    assert (client.wait(10), waiting.wait(10)) == (12, 12)
 
 
 def test_pause_and_resume_are_shown(scripted: Talk) -> None:
@@ -121,7 +121,7 @@ def test_wait_without_ids_follows_all_current_goals(scripted: Talk) -> None:
         assert scripted.run(*words).code == 0
     states = [each for each in lines if " word " not in each]
     assert states == [
-        f"{first} PAUSED",  # once, not once for each goal
+        f"{first} PAUSED",  # once for all goals
         f"{first} RESUMED",
         f"{first} PREEMPTING",
         f"{first} PREEMPTED",
@@ -129,7 +129,7 @@ def test_wait_without_ids_follows_all_current_goals(scripted: Talk) -> None:
         f"{second} ABORTED",
     ]
     assert scripted.finish(client).err == ""
-    assert client.returncode == 0  # only goals that are named can fail
+    assert client.returncode == 0  # without ids, failures don't count
 
 
 def test_wait_for_an_ended_goal_shows_its_state(scripted: Talk) -> None:

@@ -1,4 +1,4 @@
-"""`say --lines`: each line of standard input is a goal. Few are pending, and none is spoken too late or twice."""
+"""`say --lines`: each line of standard input is a goal. Few are pending, and none is spoken late or twice."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Typing:
         return self._output.readline().rstrip("\n")
 
     def end(self, number: signal.Signals | None = None) -> tuple[int, list[str], str]:
-        """Send it a signal, or close its input. Return its exit code, the rest of its output, and its messages."""
+        """Send the client a signal, or close its input. Return its exit code, remaining output and messages."""
         if number is None:
             self._input.close()
         else:
@@ -69,7 +69,7 @@ def test_each_line_is_a_goal_and_its_id_is_printed(scripted: Talk) -> None:
     assert scripted.watcher.texts("ACTIVE") == said
     for words in ([], ["-f"], ["-w", "--json"]):
         done = scripted.run("say", "--lines", *words, stdin="\n\r\n")
-        assert (done.code, done.out, done.err) == (0, "", ""), "nothing to say is success"
+        assert (done.code, done.out, done.err) == (0, "", ""), "empty input is a success"
 
 
 def test_endless_input_is_spoken_line_by_line(scripted: Talk) -> None:
@@ -91,7 +91,12 @@ def test_options_apply_to_each_line_with_the_remaining_ttl(scripted: Talk) -> No
     text = "length=0.5 one\n\0\nlength=0 two\nlength=0 three\n"
     done = scripted.run("--json", "say", "--lines", *options, stdin=text)
     goals = [json.loads(each) for each in done.out.splitlines()]
-    assert [each["state"] for each in goals] == ["PENDING", "REJECTED", "PENDING", "PENDING"]  # as accepted
+    assert [each["state"] for each in goals] == [
+        "PENDING",
+        "REJECTED",
+        "PENDING",
+        "PENDING",
+    ]  # when the server accepted them
     goals.pop(1)
     assert [(each["priority"], each["client"]["name"]) for each in goals] == [(3, "reader")] * 3
     first, second, third = [each["ttl"] for each in goals]
@@ -104,7 +109,7 @@ def test_options_apply_to_each_line_with_the_remaining_ttl(scripted: Talk) -> No
 
 
 def test_a_refused_line_is_reported_by_number_and_the_rest_is_spoken(scripted: Talk) -> None:
-    widest = "\N{GRINNING FACE}" * 10_000  # the most bytes that a text may have, beside the end of its line
+    widest = "\N{GRINNING FACE}" * 10_000  # the longest text in bytes, without its line end
     lines = ["length=0 one", "", "nul \0", "length=0 two", "x" * 10_001, "y" * 300_000, "length=0 three"]
     text = "\n".join([*lines, f"{widest}\r", f"{widest}a\r\n"])
     done = scripted.run("say", "--lines", stdin=text)
@@ -167,12 +172,12 @@ def test_few_lines_are_pending_so_that_others_have_room(scripted: Talk, words: l
     typing.type("\n".join(lines))
     ids = [typing.line() for _ in range(ahead + 1)]
     scripted.watcher.wait_for_word(ids[0])
-    theirs = scripted.run("say", "length=0 theirs").id
+    theirs = scripted.run("say", "length=0 other").id
     scripted.run("cancel", ids[0])
     scripted.watcher.wait_for_terminal(theirs)
     typing.end()
     scripted.watcher.wait_until(lambda _: len(scripted.watcher.texts("SUCCEEDED")) == len(lines))
-    assert scripted.watcher.texts("PENDING") == [*lines[: ahead + 1], "length=0 theirs", *lines[ahead + 1 :]]
+    assert scripted.watcher.texts("PENDING") == [*lines[: ahead + 1], "length=0 other", *lines[ahead + 1 :]]
 
 
 def test_a_line_replaces_a_pending_line_with_its_key_despite_the_limit(scripted: Talk) -> None:
@@ -194,10 +199,10 @@ def test_lines_whose_ttl_expires_while_they_wait_are_dropped(make_talk: MakeTalk
     typing = Typing(talk, "say", "--lines", "--ttl", "0.3", *words)
     typing.type("length=0 one\nlength=0 two\nlength=0 three\n")
     if "--ttl=0" in words or "-q" in words:
-        time.sleep(0.4)  # nothing tells that time passes
+        time.sleep(0.4)  # no event to wait for
     else:
         notes: list[str] = []
-        while len(notes) < 2:  # with --wait, other lines tell how the line that was sent ended
+        while len(notes) < 2:  # with --wait, other notes report the result of the sent line
             notes += [each for each in [typing.errors.readline()] if "was not sent" in each or not each]
         assert time.monotonic() - began >= 0.3
         assert notes == [f"talk: line {number} was not sent: its ttl of 0.3 s is over\n" for number in (2, 3)]
@@ -207,7 +212,7 @@ def test_lines_whose_ttl_expires_while_they_wait_are_dropped(make_talk: MakeTalk
     assert talk.run("wait").code == 0
     assert talk.watcher.texts("ACTIVE")[1:] == (
         [f"length=0 {each}" for each in ("one", "two", "three")] if "--ttl=0" in words else []
-    )  # the first line waited for room at the server, which counts, too
+    )  # the ttl includes the time that the first line waited for room
     if "--json" in words:
         goals = [json.loads(each) for each in out]
         assert sorted((each["state"], each["reason"], each["text"]) for each in goals) == [
@@ -220,7 +225,7 @@ def test_a_line_is_spoken_after_a_long_pause_in_the_input(scripted: Talk) -> Non
     typing = Typing(scripted, "say", "--lines")
     typing.type("length=0 one\n")
     scripted.watcher.wait_for(typing.line(), "SUCCEEDED")
-    time.sleep(SILENCE_LIMIT_S + 1)  # the server needn't show that it is alive
+    time.sleep(SILENCE_LIMIT_S + 1)  # an idle server doesn't report that it is alive
     typing.type("length=0 two\n")
     scripted.watcher.wait_for(typing.line(), "SUCCEEDED")
     assert typing.end()[0] == 0
@@ -236,7 +241,7 @@ def test_fast_input_is_spoken_within_its_ttl_and_delays_no_other_client(scripted
         typed[f"length=0.3 {number}"] = time.time()
         typing.type(f"length=0.3 {number}\n")
         if number == 50:
-            theirs = scripted.start("say", "--wait", "length=0 theirs")
+            theirs = scripted.start("say", "--wait", "length=0 other")
     assert scripted.finish(theirs).code == 0
     assert typing.end()[0] == 0
     assert scripted.run("wait").code == 0
@@ -260,7 +265,7 @@ def test_only_as_much_input_is_read_as_can_be_kept(scripted: Talk, words: list[s
     with client:
         while room.poll(10_000 if written < most else 500):
             written += os.write(pipe, b"length=0 line\n" * 1_000)
-            assert written < most + 400_000  # what the pipe holds, and what is read at once, come on top
+            assert written < most + 400_000  # the pipe and the read buffer hold more
         assert written >= most
         client.kill()
         client.wait(10)
@@ -280,7 +285,7 @@ def test_several_hundred_lines_are_spoken_per_second(make_talk: MakeTalk) -> Non
     lines = [f"length=0 {number}" for number in range(600)]
     with limits():
         done = talk.run("say", "--lines", "--wait", stdin="\n".join(lines))
-        assert_within(done.seconds, 3.0, f"{len(lines)} lines")  # one second on an idle machine
+        assert_within(done.seconds, 3.0, f"{len(lines)} lines")  # takes one second on an idle machine
     assert (done.code, len(done.out.split())) == (0, len(lines))
 
 
@@ -301,12 +306,12 @@ def test_an_endless_line_is_read_with_bounded_memory(scripted: Talk) -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 def test_a_signal_cancels_only_the_clients_own_goals(make_talk: MakeTalk, number: signal.Signals) -> None:
     talk = make_talk("--max-queue", "4", scripted=True)
-    theirs = talk.run("say", "--priority", "-1", "length=0 theirs").id
+    theirs = talk.run("say", "--priority", "-1", "length=0 other").id
     talk.watcher.wait_for_terminal(theirs)
     typing = Typing(talk, "say", "--lines", "--wait")
     typing.type(ENDLESS + "second\nthird\n")
     ids = [typing.line() for _ in range(3)]
-    theirs = talk.run("say", "length=0 theirs").id
+    theirs = talk.run("say", "length=0 other").id
     talk.watcher.wait_for_word(ids[0])
     began = time.monotonic()
     code, out, err = typing.end(number)
@@ -317,7 +322,7 @@ def test_a_signal_cancels_only_the_clients_own_goals(make_talk: MakeTalk, number
     assert [talk.watcher.wait_for_terminal(each) for each in ids] == ["PREEMPTED", "RECALLED", "RECALLED"]
     assert talk.watcher.wait_for_terminal(theirs) == "SUCCEEDED"
     assert talk.watcher.states(ids[2]) == ["PENDING", "RECALLED"]
-    typing = Typing(talk, "say", "--lines")  # without --wait, its goals go on
+    typing = Typing(talk, "say", "--lines")  # without --wait, its goals continue
     typing.type(f"{ENDLESS}\nsecond\n")
     ids = [typing.line() for _ in range(2)]
     assert typing.end(number) == (128 + number, [], "")
@@ -330,7 +335,7 @@ def test_a_line_that_waits_for_room_is_not_spoken_after_a_signal(make_talk: Make
     typing = Typing(talk, "say", "--lines", *words)
     typing.type(ENDLESS + "second\nthird\nfourth\n")
     talk.watcher.wait_until(lambda each: bool(each.get("goal")) and each["goal"]["text"] == "second")
-    # The client may not know of it yet, and the third line causes no event.
+    # The client may not have its reply yet, and the third line causes no event.
     code, out, err = typing.end(signal.SIGINT)
     assert code == 130
     assert re.search("line [23] may not have been accepted, and the lines after it were not sent", err)
@@ -354,7 +359,7 @@ def test_the_timeout_applies_to_all_lines_together(scripted: Talk) -> None:
     assert [scripted.watcher.wait_for_terminal(each) for each in ids] == ["PREEMPTED", "RECALLED"]
     began = time.monotonic()
     silent = Typing(scripted, "say", "--lines", "-w", "-t", "0.2")
-    assert silent.client.wait(10) == 124  # with nothing to read, and nothing to wait for
+    assert silent.client.wait(10) == 124  # without any input or goals
     assert time.monotonic() - began >= 0.2
     assert scripted.run("say", "--lines", "-w", "-t", "1e300", stdin="length=0\n").code == 0
 
@@ -380,7 +385,7 @@ def test_a_lost_idle_server_is_reported_with_the_next_line(scripted: Talk) -> No
     scripted.kill()
     typing.type("into the void\n")
     code, _, err = typing.end()
-    assert code == 5  # that of the first line that failed
+    assert code == 5  # for the first line that failed
     assert "line 2 may not have been accepted" in err
 
 
@@ -398,7 +403,7 @@ def test_a_missing_server_is_reported_before_input_is_read() -> None:
 
 
 def piped(talk: Talk, *words: str, read: bool = True) -> tuple[Forked, int]:
-    """Start `say --lines` with its output in a pipe, and return it with the reading end, which may be closed."""
+    """Start `say --lines` with a pipe as its output. Return it with the reading end, which is closed unless `read`."""
     reader, writer = os.pipe()
     if not read:
         os.close(reader)

@@ -25,19 +25,19 @@ class Lines:
     def __init__(self, talk: Talk, *words: str) -> None:
         self.process = talk.start("watch", *words)
         self.lines: list[str] = []
-        self.next("")  # the first line says that it watches
+        self.next("")  # the first line confirms that it watches
 
-    def next(self, words: str) -> str:
-        """Read up to the line that contains these words, and return it."""
+    def next(self, text: str) -> str:
+        """Read up to the line that contains this text, and return it."""
         assert self.process.stdout
         for line in self.process.stdout:
             self.lines.append(line.rstrip("\n"))
-            if words in line:
+            if text in line:
                 return self.lines[-1]
-        raise AssertionError(f"no line with {words!r} in {self.lines}")
+        raise AssertionError(f"no line with {text!r} in {self.lines}")
 
     def end(self) -> int:
-        """Press Ctrl-C, and return the exit code. Nothing more may be printed."""
+        """Send SIGINT, and return the exit code. Nothing more may be printed."""
         self.process.send_signal(signal.SIGINT)
         code = self.process.wait(10)
         assert self.process.stdout
@@ -47,7 +47,7 @@ class Lines:
 
 
 def number(goal_id: str) -> str:
-    """Return the number by which a goal of the server is shown."""
+    """Return the short form of a goal's id."""
     return goal_id.partition("-")[2]
 
 
@@ -181,7 +181,7 @@ def test_an_idle_watcher_uses_no_processor_time(scripted: Talk) -> None:
     before = _switches(watch.process.pid)
     scripted.run("voices")  # time passes, and no goal is sent
     scripted.run("status")
-    assert _switches(watch.process.pid) - before <= 1  # the server may show once that it is alive
+    assert _switches(watch.process.pid) - before <= 1  # the server may report once that it is alive
     assert watch.end() == 130
 
 
