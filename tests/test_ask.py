@@ -42,7 +42,7 @@ def test_status_shows_the_settings_and_the_details_of_each_goal(busy: Talk) -> N
     done = busy.run("status")
     lines = done.out.splitlines()
     assert (done.code, done.err) == (0, "")
-    assert [each[:9].rstrip() for each in lines] == ["server", "engine", "settings", "now", "queue", "", "said", ""]
+    assert [line[:9].rstrip() for line in lines] == ["server", "engine", "settings", "now", "queue", "", "said", ""]
     assert re.match(r'now      \d+ +ACTIVE     "never-ends please .*"  from \S.*, for \d+\.\d s$', lines[3])
     assert re.search(r'"battery low" +from \S.*, priority 7, key "battery, low", (1 min )?\d+ s left$', lines[4])
     assert re.search(r'door:open +PENDING    "the door is open"  from "patrol"$', lines[5])
@@ -65,19 +65,19 @@ def test_status_fits_the_terminal(busy: Talk, columns: int) -> None:
         assert part in text
     assert 'from "patrol"' in text
     assert columns < 120 or "priority" in text  # only details that fit are shown
-    goals = [each for each in lines if "PENDING" in each]
+    goals = [line for line in lines if "PENDING" in line]
     assert goals[0].index('"') == goals[1].index('"')
     assert b"\x1b[1;32mACTIVE" in shown.raw
 
 
 def test_status_of_one_goal_shows_all_its_details(busy: Talk) -> None:
     pending = json.loads(busy.run("--json", "status").out)["pending"][0]
-    lines = dict(each.split(None, 1) for each in busy.run("status", pending["id"]).out.splitlines())
+    lines = dict(line.split(None, 1) for line in busy.run("status", pending["id"]).out.splitlines())
     assert lines["state"] == "PENDING"
     assert (lines["priority"], lines["key"], lines["text"]) == ("7", '"battery, low"', '"battery low"')
     assert re.fullmatch(r"90 s, (1 min \d+ s|\d+\.\d s) left", lines["ttl"])
     busy.request("say", text="with data", id="d", data={"room": "d'été\x1b"})
-    lines = dict(each.split(None, 1) for each in busy.run("status", "d").out.splitlines())
+    lines = dict(line.split(None, 1) for line in busy.run("status", "d").out.splitlines())
     assert lines["data"] == r'{"room": "d' + "'" + r'été\\u001b"}'
     assert lines["priority"] == "0"
     assert not {"key", "ttl", "started", "reason"} & lines.keys()
@@ -99,7 +99,7 @@ def test_ids_of_maximum_length_leave_room_for_the_text(scripted: Talk) -> None:
     for command in ("status", "log"):
         with Terminal([*TALK, command], {"TERM": "xterm", **scripted.env}, 80) as shown:
             shown.finish()
-            line = next(each for each in shown.lines if "SUCCEEDED" in each)
+            line = next(line for line in shown.lines if "SUCCEEDED" in line)
         assert width(line) <= 80
         assert '"length=0"' in line
         assert "i" * 64 in scripted.run(command).out
@@ -113,10 +113,10 @@ def test_status_of_one_goal_wraps_its_whole_text_to_the_terminal(scripted: Talk,
         assert shown.finish() == 0
         lines = shown.lines
     assert max(map(width, lines)) <= columns
-    first = next(number for number, each in enumerate(lines) if each.startswith("text "))
-    more = [each for each in lines[first + 1 :] if each.startswith(" ")]
-    assert {each[:9] for each in more} == {" " * 9}
-    assert f'"{text}"' in " ".join(each[9:].rstrip() for each in lines)
+    first = next(number for number, line in enumerate(lines) if line.startswith("text "))
+    more = [line for line in lines[first + 1 :] if line.startswith(" ")]
+    assert {line[:9] for line in more} == {" " * 9}
+    assert f'"{text}"' in " ".join(line[9:].rstrip() for line in lines)
     assert f'text     "{text}"' in scripted.run("status", "long").out.splitlines()
 
 
@@ -143,7 +143,7 @@ def settings(talk: Talk) -> dict[str, str]:
     """Return the settings as `talk set` prints them."""
     done = talk.run("set")
     assert (done.code, done.err) == (0, "")
-    return dict(each.split() for each in done.out.splitlines())
+    return dict(line.split() for line in done.out.splitlines())
 
 
 def test_set_without_options_prints_the_settings(shared: Talk) -> None:
@@ -172,14 +172,12 @@ def test_set_without_options_prints_the_settings(shared: Talk) -> None:
         (["--ttl", "0"], "ttl", None, "0"),
     ],
 )
-def test_set_changes_only_the_given_setting(
-    shared: Talk, options: list[str], name: str, value: object, shown: str
-) -> None:
+def test_set_changes_only_this_setting(shared: Talk, options: list[str], name: str, value: object, shown: str) -> None:
     changed = json.loads(shared.run("--json", "set", *options).out)
     assert changed[name] == value
     assert settings(shared) == {**DEFAULTS, name: shown}
     described = shared.request("status")["server"]
-    assert {each: described[each] for each in changed} == changed
+    assert {setting: described[setting] for setting in changed} == changed
 
 
 def test_the_printed_settings_can_be_used_as_options(shared: Talk) -> None:
@@ -231,7 +229,7 @@ def test_cancel_stops_exactly_the_goals_that_its_selectors_match(scripted: Talk)
     active = scripted.run("say", "--key", "battery", "never-ends").id
     scripted.watcher.wait_for_word(active)
     keys = ("door", "battery", "lift", "hall")
-    door, battery, lift, hall = (scripted.run("say", "--key", each, "waits").id for each in keys)
+    door, battery, lift, hall = (scripted.run("say", "--key", key, "waits").id for key in keys)
     for key in ("nothing", "batter", "BATTERY", "-"):
         done = scripted.run("cancel", "--key", key)
         assert (done.code, done.out, done.err) == (0, "", "")
@@ -240,7 +238,7 @@ def test_cancel_stops_exactly_the_goals_that_its_selectors_match(scripted: Talk)
         assert (done.code, done.out) == (2, "")
         assert "key" in done.err or "--before" in done.err
     done = scripted.run("--json", "cancel", "--key", "door", lift)
-    assert {json.loads(each)["id"] for each in done.out.splitlines()} == {door, lift}
+    assert {json.loads(line)["id"] for line in done.out.splitlines()} == {door, lift}
     assert scripted.goal(active)["state"] == "ACTIVE"
     done = scripted.run("cancel", "--key", "battery")
     assert (done.code, set(done.out.split()), done.err) == (0, {active, battery}, "")

@@ -47,16 +47,14 @@ def test_every_row_of_a_group_measures_something(stage: Stage, group: str, monke
     ):
         monkeypatch.setattr(module, name, smaller)
     rows = measure(group, stage)
-    assert [each.failure for each in rows if each.failure] == []
-    assert all(len(each.cells()) == len(TABLES[0][0]) and each.values for each in rows)
+    assert [row.failure for row in rows if row.failure] == []
+    assert all(len(row.cells()) == len(TABLES[0][0]) and row.values for row in rows)
     if group not in ("neural", "marathon"):  # no table shows these
         known = {without_numbers(row[0], row[7]) for table in TABLES for row in table[1:]}
-        assert {without_numbers(each.name, each.goal) for each in rows} <= known, (
-            f"a table in {BENCHMARK.name} is out of date"
-        )
+        assert {without_numbers(row.name, row.goal) for row in rows} <= known, f"{BENCHMARK.name} is out of date"
 
 
 def test_the_readme_quotes_numbers_from_the_table() -> None:
-    told = re.findall(r"\d[\d.,]* (?:ms|MB|%)", README.section("Speed"))
-    assert len(told) == 5
-    assert set(told) <= {cell for row in TABLES[0] for cell in row}
+    figures = re.findall(r"\d[\d.,]* (?:ms|MB|%)", README.section("Speed"))
+    assert len(figures) == 5
+    assert set(figures) <= {cell for row in TABLES[0] for cell in row}

@@ -48,11 +48,11 @@ def serving(path: str, *greetings: bytes) -> Iterator[None]:
         listening.listen()
 
         def serve() -> None:
-            for each in greetings:
+            for greeting in greetings:
                 connected, _ = listening.accept()
                 with connected:
-                    connected.sendall(each)
-                    while each and connected.recv(65536):
+                    connected.sendall(greeting)
+                    while greeting and connected.recv(65536):
                         pass
 
         thread = threading.Thread(target=serve, daemon=True)
@@ -107,7 +107,7 @@ def test_a_client_reaches_a_server_that_starts_while_it_tries(
         attempt.socket.close()
     assert len(waits.pauses) == 3 + len(greetings) - 1
     low, high = connect.RETRY_PAUSE_S
-    assert all(low <= each <= high for each in waits.pauses)
+    assert all(low <= seconds <= high for seconds in waits.pauses)
 
 
 @pytest.mark.parametrize(
@@ -163,7 +163,7 @@ def test_the_greeting_and_replies_may_take_the_remaining_time(
         end = None if left is None else time.monotonic() + left
         connection = SocketConnection(path, keep_trying=keep_trying, end=end)
         connection.close()
-    assert all(least <= each <= most for each in waits.others)
+    assert all(least <= seconds <= most for seconds in waits.others)
     assert max(least, 4) <= connection._patience <= max(most, 5)
 
 

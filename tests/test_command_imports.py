@@ -48,8 +48,8 @@ def imported(env: dict[str, str], *command: str) -> set[str]:
 
 @pytest.mark.parametrize("command", OTHERS, ids=" ".join)
 def test_a_command_imports_no_unused_modules(scripted: Talk, command: tuple[str, ...]) -> None:
-    found = imported(scripted.env, "-m", "talkcli", *command)
-    assert "talkcli" in found
+    modules = imported(scripted.env, "-m", "talkcli", *command)
+    assert "talkcli" in modules
     useless = {*HEAVY, *(CLIENT if " ".join(command) in WITHOUT_SERVER else [])}
     # A command can't avoid the imports of click: platform and subprocess with Python 3.10.
-    assert useless & (found - imported(scripted.env, "-c", "import click")) == set()
+    assert useless & (modules - imported(scripted.env, "-c", "import click")) == set()

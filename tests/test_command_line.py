@@ -109,11 +109,11 @@ def test_json_output_has_the_documented_fields(scripted: Talk) -> None:
     assert (pending["state"], pending["text"], pending["spoken"]) == ("PENDING", "behind it", None)
     status = json.loads(scripted.run("status", "--json").out)
     assert status.keys() == {"server", "active", "pending", "recent"}
-    assert (status["active"]["id"], [each["id"] for each in status["pending"]]) == (goal["id"], [pending["id"]])
+    assert (status["active"]["id"], [goal["id"] for goal in status["pending"]]) == (goal["id"], [pending["id"]])
     assert json.loads(scripted.run("status", "--json", goal["id"]).out).keys() == GOAL
-    canceled = [json.loads(each) for each in scripted.run("cancel", "--json").out.splitlines()]
-    assert {each["id"]: each["state"] for each in canceled} == {goal["id"]: "PREEMPTED", pending["id"]: "RECALLED"}
-    assert all(each.keys() == GOAL for each in canceled)
+    canceled = [json.loads(line) for line in scripted.run("cancel", "--json").out.splitlines()]
+    assert {goal["id"]: goal["state"] for goal in canceled} == {goal["id"]: "PREEMPTED", pending["id"]: "RECALLED"}
+    assert all(goal.keys() == GOAL for goal in canceled)
     ended = json.loads(scripted.run("--json", "say", "--wait", "length=0").out)
     assert (ended.keys(), ended["state"], ended["status"]) == (GOAL, "SUCCEEDED", 3)
     assert json.loads(scripted.run("--json", "wait", ended["id"]).out) == ended
@@ -194,7 +194,7 @@ def test_arguments_and_output_are_utf8_in_every_locale(scripted: Talk) -> None:
     )
     goal = scripted.goal(done.out.strip())
     assert (goal["text"], goal["key"], goal["client"]["name"]) == ("length=0 a\ufffd b é", "日", "é")
-    few: dict[str, str] = {each: scripted.env[each] for each in ("PYTHONPATH", "TALK_SOCKET") if each in scripted.env}
+    few: dict[str, str] = {name: scripted.env[name] for name in ("PYTHONPATH", "TALK_SOCKET") if name in scripted.env}
     for env in ({**scripted.env, "LANG": "C", "LC_ALL": "C"}, few):
         done = run([*TALK, "--json", "say", "--wait", "--", "d'été 日本"], env)
         assert (done.code, json.loads(done.out)["text"]) == (0, "d'été 日本")
@@ -229,8 +229,8 @@ def test_json_on_a_terminal_is_escaped_without_changing_its_meaning(scripted: Ta
         shown.finish()
         line = shown.raw.decode().split("\r\n")[0]
     assert not RAW.search(line), repr(line)
-    for each in (r"\u009b31m \u007f \ue000 \udb40\udc01", "Grüße 日本 👩", r"\u202epatrol"):
-        assert each in line
+    for part in (r"\u009b31m \u007f \ue000 \udb40\udc01", "Grüße 日本 👩", r"\u202epatrol"):
+        assert part in line
     assert json.dumps(text)[1:-1] in json.dumps(json.loads(line))
     if command != ["watch"]:  # a program gets the text unchanged
         assert json.loads(scripted.run(*words).out)
@@ -277,7 +277,7 @@ def test_the_installed_script_imports_only_main() -> None:
     script = Path(cli.__file__).with_name("talk")
     assert os.access(script, os.X_OK)
     lines = script.read_text("utf-8").splitlines()
-    assert (lines[0], [each for each in lines if "import" in each.split()]) == (
+    assert (lines[0], [line for line in lines if "import" in line.split()]) == (
         "#!python",
         ["from talkcli.cli import main"],
     )
@@ -298,14 +298,12 @@ def test_the_installed_script_imports_only_main() -> None:
         (GREETING, 3, "no_server", "connection to the server was lost"),
     ],
 )
-def test_an_incompatible_process_at_the_socket_is_reported(
-    greeting: bytes, code: int, error: str, message: str
-) -> None:
+def test_an_incompatible_process_is_reported(greeting: bytes, code: int, error: str, message: str) -> None:
     with short_directory() as home, FakeServer(f"{home}/s", [greeting], closes=True):
         env = clean_environment(home, {"TALK_SOCKET": f"{home}/s"})
-        began = time.monotonic()
+        started_at = time.monotonic()
         done = run([*TALK, "--json", "status"], env)
-        assert time.monotonic() - began < 2
+        assert time.monotonic() - started_at < 2
     reported = error_of(done.err)
     assert (done.code, reported["code"], reported["exit"]) == (code, error, code)
     assert message in reported["message"]

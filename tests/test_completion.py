@@ -64,7 +64,7 @@ def offered(line: str, env: Mapping[str, str]) -> list[tuple[str, str]]:
     request = {"_TALK_COMPLETE": "fish_complete", "COMP_WORDS": line, "COMP_CWORD": ""}
     done = run(TALK, {**env, **request})
     assert (done.code in {0, 1}, done.err) == (True, ""), done
-    lines = [each.removeprefix("plain,").partition("\t") for each in done.out.splitlines() if each]
+    lines = [line.removeprefix("plain,").partition("\t") for line in done.out.splitlines() if line]
     return [(value, words) for value, _, words in lines]
 
 
@@ -114,24 +114,24 @@ def test_commands_options_and_values_are_offered_without_a_server(tmp_path: path
         ("talk serve --vo", {"--volume", "--voice", "--voice-memory"}),
         ("talk serve --player ", {"pulse", "aplay", "pacat", "pw-cat", "null"}),
         ("talk serve --player=p", {"--player=pulse", "--player=pacat", "--player=pw-cat"}),
-        *((each, {"file"}) for each in ("talk --socket /etc/pa", "talk say -o x")),
+        *((line, {"file"}) for line in ("talk --socket /etc/pa", "talk say -o x")),
         ("talk completion ", set(FILES)),
-        *((each, set()) for each in ("talk say ", "talk nonsense --x", "talk cancel --nonsense", 'talk cancel "')),
+        *((line, set()) for line in ("talk say ", "talk nonsense --x", "talk cancel --nonsense", 'talk cancel "')),
     ):
         assert {value for value, _ in offered(line, env)} == expected, line
 
 
 def test_every_command_and_option_is_offered_with_its_help(tmp_path: pathlib.Path) -> None:
     env = environment(str(tmp_path), TALK_SOCKET=f"{tmp_path}/none")
-    assert dict(offered("talk ", env)) == {each.name: each.summary for each in COMMANDS.values()}
+    assert dict(offered("talk ", env)) == {command.name: command.summary for command in COMMANDS.values()}
     assert {value for value, _ in offered("talk --", env)} >= {"--socket", "--json", "--version"}
     for command in COMMANDS:
         options = dict(offered(f"talk {command} --", env))
         assert {"--socket", "--json", "--quiet", "--help"} <= options.keys()
         # Shells show the help next to the option, and cut it if it is too long.
-        assert [each for each in options.values() if len(each) > 60 or not re.fullmatch(r"[A-Z].*[^.]\.", each)] == []
-        shown = "".join((surface.HERE / f"help-{each}.txt").read_text("utf-8") for each in (command, "talk"))
-        assert not [each for each in options if each not in shown]
+        assert [text for text in options.values() if len(text) > 60 or not re.fullmatch(r"[A-Z].*[^.]\.", text)] == []
+        shown = "".join((surface.HERE / f"help-{name}.txt").read_text("utf-8") for name in (command, "talk"))
+        assert not [option for option in options if option not in shown]
 
 
 def test_goal_ids_are_offered_with_their_texts(busy: tuple[Talk, list[str]]) -> None:
@@ -198,9 +198,9 @@ def test_completion_is_silent_and_quick_whatever_the_server_does(greeting: bytes
         env = environment(home, TALK_SOCKET=f"{home}/s")
 
         def seconds(line: str) -> float:
-            began = time.monotonic()
+            started_at = time.monotonic()
             assert offered(line, env) == []
-            return time.monotonic() - began
+            return time.monotonic() - started_at
 
         lines = ["talk cancel ", "talk status ", "talk cancel --key ", "talk say --voice "]
         with ThreadPoolExecutor(len(lines)) as pool:
@@ -276,8 +276,8 @@ def test_shells_complete_and_quote_ids_keys_and_options(busy: tuple[Talk, list[s
     }
     with contextlib.ExitStack() as stack:
         shell = Shell(name, talk, stack)
-        found = {line: shell.complete(line) for line in expected}
-    assert found == expected
+        completed = {line: shell.complete(line) for line in expected}
+    assert completed == expected
     assert "rror" not in shell.terminal.text
 
 
@@ -290,10 +290,10 @@ def test_the_readmes_start_files_load_the_completion(busy: tuple[Talk, list[str]
     before = f"mkdir -p ~/.config/fish; echo '. {BASH_COMPLETION}' > ~/.bashrc\n"
     with contextlib.ExitStack() as stack:
         shell = Shell(name, talk, stack, before + block("Completion"))
-        found = [shell.complete(line) for line in ("talk st", "talk cancel /door:o")]
+        completed = [shell.complete(line) for line in ("talk st", "talk cancel /door:o")]
         if name == "bash":  # through bash-completion
             assert shell.complete("sudo talk cancel --before=/door:") == "sudo talk cancel --before=/door:open/1 "
-    assert found == ["talk status ", "talk cancel /door:open/1 "]
+    assert completed == ["talk status ", "talk cancel /door:open/1 "]
     assert "rror" not in shell.terminal.text
 
 

@@ -70,14 +70,14 @@ def doctor(env: Mapping[str, str], *options: str, code: int = 4) -> dict[str, di
     ended, out, err = run_talk(["--json", "doctor", *options], env, LIMIT_S)
     assert (ended, err) == (code, ""), out
     findings = [json.loads(line) for line in out.splitlines()]
-    for each in findings:
-        assert list(each) == ["check", "state", "message", "next"]
-        assert each["state"] in {"ok", "warning", "failed"}
-        assert (each["next"] is None) == (each["state"] == "ok"), each
-    assert [findings[each]["check"] for each in (0, -1)] == ["python", "sentence"]
-    assert len({each["check"] for each in findings}) == len(findings)
-    assert code == (4 if any(each["state"] == "failed" for each in findings) else 0), out
-    return {each["check"]: each for each in findings}
+    for finding in findings:
+        assert list(finding) == ["check", "state", "message", "next"]
+        assert finding["state"] in {"ok", "warning", "failed"}
+        assert (finding["next"] is None) == (finding["state"] == "ok"), finding
+    assert [findings[index]["check"] for index in (0, -1)] == ["python", "sentence"]
+    assert len({finding["check"] for finding in findings}) == len(findings)
+    assert code == (4 if any(finding["state"] == "failed" for finding in findings) else 0), out
+    return {finding["check"]: finding for finding in findings}
 
 
 @pytest.fixture
@@ -98,12 +98,12 @@ def logged(talk: Talk) -> list[Message]:
 
 def test_without_faults_the_doctors_sentence_is_heard(robot: Talk, sink: Sink) -> None:
     with sink.record() as recording:
-        found = doctor(robot.env, code=0)
-    assert list(found) == CHECKS
-    assert "eSpeak NG" in found["libespeak-ng"]["message"]
-    assert f"{robot.socket} (TALK_SOCKET, process {robot.pid})" in found["socket"]["message"]
-    assert "plays to null" in found["sound server"]["message"]
-    assert "through the server, pulse" in found["sentence"]["message"]
+        findings = doctor(robot.env, code=0)
+    assert list(findings) == CHECKS
+    assert "eSpeak NG" in findings["libespeak-ng"]["message"]
+    assert f"{robot.socket} (TALK_SOCKET, process {robot.pid})" in findings["socket"]["message"]
+    assert "plays to null" in findings["sound server"]["message"]
+    assert "through the server, pulse" in findings["sentence"]["message"]
     goal = logged(robot)[-1]
     assert (goal["text"], goal["state"], goal["client"]["name"]) == (SENTENCE_TEXT, "SUCCEEDED", "talk doctor")
     assert extent(recording.samples)
@@ -136,18 +136,18 @@ def test_silent_neither_waits_for_goals_nor_adds_any(robot: Talk) -> None:
         second = client.say("and one that waits")
         assert doctor(robot.env, "--silent", code=0)["sentence"]["state"] == "ok"
         status = client.status()
-        assert (status.active and status.active.id, [each.id for each in status.pending]) == (first.id, [second.id])
+        assert (status.active and status.active.id, [goal.id for goal in status.pending]) == (first.id, [second.id])
         assert logged(robot) == before
 
 
 def test_a_muted_sink_is_a_failure_although_the_sentence_was_played(robot: Talk, sink: Sink) -> None:
     sink.pactl("set-sink-mute", "null", "1")
     try:
-        found = doctor(robot.env, "--silent")
+        findings = doctor(robot.env, "--silent")
     finally:
         sink.pactl("set-sink-mute", "null", "0")
-    assert found["sentence"]["state"] == "ok"
-    assert (found["loudness"]["state"], found["loudness"]["message"]) == ("failed", "the default sink is muted")
+    assert findings["sentence"]["state"] == "ok"
+    assert (findings["loudness"]["state"], findings["loudness"]["message"]) == ("failed", "the default sink is muted")
 
 
 def test_sound_is_not_checked_here_if_the_socket_is_forwarded(robot: Talk, sink: Sink) -> None:
@@ -160,15 +160,16 @@ def test_sound_is_not_checked_here_if_the_socket_is_forwarded(robot: Talk, sink:
             assert forwarder.poll() is None
             time.sleep(0.01)  # socat doesn't report when it listens
         with sink.record() as recording:
-            found = doctor(robot.env, "--socket", forwarded, code=0)
+            findings = doctor(robot.env, "--socket", forwarded, code=0)
     finally:
         forwarder.kill()
         forwarder.wait()
     assert (
-        "on another machine or in a container: to check its sound, run talk doctor there" in found["session"]["message"]
+        "on another machine or in a container: to check its sound, run talk doctor there"
+        in findings["session"]["message"]
     )
-    assert not found.keys() & {"player", "device", "cards", "group", "sound server", "loudness"}
-    assert "through the server, pulse" in found["sentence"]["message"]
+    assert not findings.keys() & {"player", "device", "cards", "group", "sound server", "loudness"}
+    assert "through the server, pulse" in findings["sentence"]["message"]
     assert extent(recording.samples)
 
 
@@ -197,10 +198,10 @@ def test_a_failed_custom_player_is_reported_with_a_command_to_test_it(make_talk:
     shown = done.out.splitlines()[-1]
     assert "sentence      ABORTED, audio_" in shown
     assert shown.endswith(f"no such card -> {step}")
-    found = doctor(talk.env, "--silent")
-    assert found["sentence"]["next"] == step
-    assert found["recent goals"]["state"] == "warning"
-    assert "ABORTED: the last goal, " in found["recent goals"]["message"]
+    findings = doctor(talk.env, "--silent")
+    assert findings["sentence"]["next"] == step
+    assert findings["recent goals"]["state"] == "warning"
+    assert "ABORTED: the last goal, " in findings["recent goals"]["message"]
 
 
 @pytest.mark.slow
@@ -208,12 +209,12 @@ def test_a_hanging_sound_server_is_reported(make_talk: MakeTalk, private_sink: C
     sink = private_sink()
     talk = make_talk(sink=sink, forked=False)
     sink.freeze()
-    found = doctor(talk.env)
+    findings = doctor(talk.env)
     sink.thaw()
-    assert found["sound server"]["state"] == "warning"
-    assert "does not answer from the server" in found["sound server"]["message"]
-    assert found["sentence"]["state"] == "failed"
-    assert found["sentence"]["next"] == found["sound server"]["next"]
+    assert findings["sound server"]["state"] == "warning"
+    assert "does not answer from the server" in findings["sound server"]["message"]
+    assert findings["sentence"]["state"] == "failed"
+    assert findings["sentence"]["next"] == findings["sound server"]["next"]
 
 
 # The sentence, sent to a server
@@ -229,10 +230,10 @@ def test_no_sentence_stays_in_the_queue_of_a_paused_server(scripted: Talk) -> No
 
 def test_a_sentence_that_waits_too_long_is_cancelled(scripted: Talk) -> None:
     with Client(scripted.socket) as client:
-        goals = [client.say(f"{each} never-ends") for each in ("one", "two", "three", "four")]
-        began = time.monotonic()
+        goals = [client.say(f"{number} never-ends") for number in ("one", "two", "three", "four")]
+        started_at = time.monotonic()
         played = sentence.speak_by_server(client, SENTENCE_TEXT, 0.3)
-        assert time.monotonic() - began < 8
+        assert time.monotonic() - started_at < 8
         assert (played.state, played.reason) == (State.RECALLED, "late")
         assert played.message == "not spoken: it was still waiting behind 4 goals after 0.3 s"
         assert (goals[0].state, len(client.status().pending)) == (State.ACTIVE, 3)
@@ -285,38 +286,38 @@ def test_a_signal_cancels_the_sentence(scripted: Talk) -> None:
 @pytest.mark.usefixtures("nobody_serves")
 def test_without_a_server_the_doctors_own_engine_is_heard(home: str, sink: Sink) -> None:
     with sink.record() as recording:
-        found = doctor(environment(home, **sink.env, TALK_SOCKET=f"{home}/s"))
+        findings = doctor(environment(home, **sink.env, TALK_SOCKET=f"{home}/s"))
         recording.wait_until_quiet(0.2)
     assert extent(recording.samples)
-    assert {each["check"] for each in found.values() if each["state"] == "failed"} == {"socket"}
-    assert found["socket"]["next"] == "unset TALK_SOCKET, or start a server there: talk serve"
-    assert "by talk doctor's own engine, pulse" in found["sentence"]["message"]
-    assert "server" not in found
+    assert {finding["check"] for finding in findings.values() if finding["state"] == "failed"} == {"socket"}
+    assert findings["socket"]["next"] == "unset TALK_SOCKET, or start a server there: talk serve"
+    assert "by talk doctor's own engine, pulse" in findings["sentence"]["message"]
+    assert "server" not in findings
 
 
 @pytest.mark.usefixtures("nobody_serves")
 def test_without_sound_the_players_error_message_is_shown(home: str) -> None:
     needs("aplay")
-    found = doctor(environment(home, TALK_PLAYER="aplay", ALSA_CONFIG_PATH="/dev/null"))
-    assert found["sentence"]["message"].startswith("ABORTED, audio_device: aplay: audio open error")
-    assert found["sound server"]["state"] == "warning"
-    assert "PULSE_SERVER" in found["sound server"]["message"]
+    findings = doctor(environment(home, TALK_PLAYER="aplay", ALSA_CONFIG_PATH="/dev/null"))
+    assert findings["sentence"]["message"].startswith("ABORTED, audio_device: aplay: audio open error")
+    assert findings["sound server"]["state"] == "warning"
+    assert "PULSE_SERVER" in findings["sound server"]["message"]
 
 
 def test_a_missing_library_fails_its_own_check_and_the_sentence(home: str, tmp_path: Path) -> None:
     write(tmp_path / "pyttsx3.py", "raise ModuleNotFoundError('No module named pyttsx3', name='pyttsx3')\n")
-    found = doctor({**file_player(home), **python_path(tmp_path)})
-    assert (found["pyttsx3"]["state"], found["sentence"]["state"]) == ("failed", "failed")
-    assert "pip install pyttsx3" in found["pyttsx3"]["next"]
+    findings = doctor({**file_player(home), **python_path(tmp_path)})
+    assert (findings["pyttsx3"]["state"], findings["sentence"]["state"]) == ("failed", "failed")
+    assert "pip install pyttsx3" in findings["pyttsx3"]["next"]
 
 
 def test_a_server_that_disconnects_is_reported(home: str) -> None:
     greeting = b'{"talk": 1, "version": "0.1", "pid": 1, "boot": "abcd"}\n'
     with FakeServer(f"{home}/s", [greeting], closes=True):
-        found = doctor(file_player(home), "--silent")["server"]
-    assert found["state"] == "failed"
-    assert "connection to the server was lost" in found["message"]
-    assert "restart it" in found["next"]
+        finding = doctor(file_player(home), "--silent")["server"]
+    assert finding["state"] == "failed"
+    assert "connection to the server was lost" in finding["message"]
+    assert "restart it" in finding["next"]
 
 
 def test_hanging_programs_only_delay_the_doctor(home: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -326,13 +327,13 @@ def test_hanging_programs_only_delay_the_doctor(home: str, monkeypatch: pytest.M
     monkeypatch.setattr(os, "environ", {**env, "PATH": f"{home}/run:{env['PATH']}"})
     monkeypatch.setattr(sound, "PROGRAM_LIMIT_S", 0.3)
     monkeypatch.setattr(examine, "SENTENCE_LIMIT_S", 0.6)
-    began = time.monotonic()
+    started_at = time.monotonic()
     findings = list(examine.LocalExamination(None, silent=False).findings())
-    assert time.monotonic() - began < LIMIT_S / 2
+    assert time.monotonic() - started_at < LIMIT_S / 2
     assert next_step(findings)
-    found = {each.check: each.message for each in findings}
-    assert "no answer within 0.3 s" in found["device"]
-    assert "does not answer" in found["sound server"]
+    messages = {finding.check: finding.message for finding in findings}
+    assert "no answer within 0.3 s" in messages["device"]
+    assert "does not answer" in messages["sound server"]
 
 
 def test_a_signal_ends_the_doctor(home: str) -> None:
@@ -349,9 +350,9 @@ def test_a_signal_ends_the_doctor(home: str) -> None:
 def test_the_doctors_process_does_not_load_the_speech_libraries(home: str) -> None:
     code = (
         "import sys\nfrom talkcli.doctor.examine import LocalExamination\n"
-        "found = [each.check for each in LocalExamination(None, silent=True).findings()]\n"
-        "assert found[-1] == 'sentence'\n"
-        "print([each for each in ('pyttsx3', 'espeakng_loader', 'asyncio') if each in sys.modules], end='')\n"
+        "findings = [*LocalExamination(None, silent=True).findings()]\n"
+        "assert findings[-1].check == 'sentence'\n"
+        "print([name for name in ('pyttsx3', 'espeakng_loader', 'asyncio') if name in sys.modules], end='')\n"
         "print('espeak' in open('/proc/self/maps').read() if sys.platform == 'linux' else False)\n"
     )
     done = subprocess.run(

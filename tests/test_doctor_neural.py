@@ -59,8 +59,8 @@ def _environment(home: str, tmp_path: Path, code: str) -> dict[str, str]:
 
 def _found(used: str | None, env: dict[str, str], limit: float = LIMIT_S) -> dict[str, Finding]:
     """Return the findings about the voices in this environment, by name of the check."""
-    found = voice.check_neural(used, EngineOptions(env=env), limit, None)
-    return {each.check: each for each in found}
+    findings = voice.check_neural(used, EngineOptions(env=env), limit, None)
+    return {finding.check: finding for finding in findings}
 
 
 def test_the_voice_in_use_is_loaded_and_timed(alone: dict[str, str]) -> None:
@@ -90,10 +90,10 @@ def test_faulty_files_are_reported_one_by_one_with_the_next_step(alone: dict[str
     words = f"piper/a: {json} and {model} can be changed by other users, which is unsafe"
     assert files.message == f"{words}; also faulty: piper/b, piper/c"
     subprocess.run(["/bin/sh", "-c", str(files.next)], check=True)
-    found = _found(None, alone)
-    assert found["voice files"].message.startswith(f"piper/b: {place}/b.onnx.json does not exist")
-    assert found["voice files"].next == "download it from the source of the model"
-    assert "neural voice" not in found, "no voice is in use"
+    findings = _found(None, alone)
+    assert findings["voice files"].message.startswith(f"piper/b: {place}/b.onnx.json does not exist")
+    assert findings["voice files"].next == "download it from the source of the model"
+    assert "neural voice" not in findings, "no voice is in use"
 
 
 @pytest.mark.parametrize(
@@ -108,11 +108,11 @@ def test_the_fault_of_a_voice_that_cannot_speak_is_reported(
     alone: dict[str, str], home: str, model: bytes | None, speakers: int, words: str, step: str
 ) -> None:
     tiny_voice.put(Path(home) / "v", "bad", model or tiny_voice.model(speakers=speakers))
-    found = _found("piper/bad", alone)["neural voice"]
-    assert found.state == FAILURE
-    assert found.message.startswith(f"piper/bad is in use: {home}/v/bad.onnx")
-    assert words in found.message
-    assert found.next == step
+    finding = _found("piper/bad", alone)["neural voice"]
+    assert finding.state == FAILURE
+    assert finding.message.startswith(f"piper/bad is in use: {home}/v/bad.onnx")
+    assert words in finding.message
+    assert finding.next == step
 
 
 @pytest.mark.parametrize(
@@ -126,19 +126,19 @@ def test_a_broken_package_is_reported(tmp_path: Path, code: str, words: str, ste
     needs_packages(*NEURAL_PACKAGES)
     package = f"import os\nassert os.environ['ORT_DISABLE_TELEMETRY'] == '1'\n{code}\n"
     (tmp_path / "onnxruntime.py").write_text(package)
-    found = _found(used, {**os.environ, "PYTHONPATH": str(tmp_path)})
-    assert found["neural"].state == (FAILURE if used else WARNING)
-    assert re.match(f"onnxruntime .* cannot be imported: {re.escape(words)}$", found["neural"].message)
-    assert str(found["neural"].next).startswith(step)
-    assert "neural voice" not in found
+    findings = _found(used, {**os.environ, "PYTHONPATH": str(tmp_path)})
+    assert findings["neural"].state == (FAILURE if used else WARNING)
+    assert re.match(f"onnxruntime .* cannot be imported: {re.escape(words)}$", findings["neural"].message)
+    assert str(findings["neural"].next).startswith(step)
+    assert "neural voice" not in findings
 
 
 def test_a_slow_import_is_not_reported_as_a_broken_package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     needs_packages(*NEURAL_PACKAGES)
     monkeypatch.setattr(voice, "_IMPORT_LIMIT_S", 0.2)
     (tmp_path / "onnxruntime.py").write_text("import time\ntime.sleep(60)\n")
-    found = _found(None, {**os.environ, "PYTHONPATH": str(tmp_path)}, 5.0)["neural"]
-    assert (found.state, found.next) == (WARNING, "run talk doctor again when this machine is less busy")
+    finding = _found(None, {**os.environ, "PYTHONPATH": str(tmp_path)}, 5.0)["neural"]
+    assert (finding.state, finding.next) == (WARNING, "run talk doctor again when this machine is less busy")
 
 
 def test_the_servers_voice_is_tried_in_the_servers_environment(alone: dict[str, str]) -> None:
@@ -149,8 +149,8 @@ def test_the_servers_voice_is_tried_in_the_servers_environment(alone: dict[str, 
             assert time.monotonic() < limit
             time.sleep(0.02)
         # Only the server's environment names the directory of the voices.
-        found = doctor({name: value for name, value in silent.items() if name != "TALK_VOICES"}, "--silent")
-    assert re.match(f"piper/tiny {TRIED}", found["neural voice"]["message"]), found
+        findings = doctor({name: value for name, value in silent.items() if name != "TALK_VOICES"}, "--silent")
+    assert re.match(f"piper/tiny {TRIED}", findings["neural voice"]["message"]), findings
 
 
 # Which voice is tried
@@ -170,28 +170,26 @@ ESPEAK = started()
 
 def test_only_the_voice_in_use_is_tried(home: str, monkeypatch: pytest.MonkeyPatch) -> None:
     tiny_voice.put(Path(home) / "v", "tiny")
-    asked: list[str | None] = []
+    tried_voices: list[str | None] = []
 
     def check_neural(used: str | None, *_: object) -> list[Finding]:
-        asked.append(used)
+        tried_voices.append(used)
         return []
 
     monkeypatch.setattr(voice, "check_neural", check_neural)
 
-    def tried(
-        used: str | None, engine: EngineReport, session: UserSession = HERE, **server: object
-    ) -> list[str | None]:
+    def tried(used: str | None, engine: EngineReport, user: UserSession = HERE, **server: object) -> list[str | None]:
         env = {"TALK_VOICES": f"{home}/v"} if server.pop("installed", False) else {}
         examination = examine.LocalExamination(None, silent=True)
         if server:
             examination._client, examination._server = cast("Client", object()), {"voice": used, **server}
         else:
             monkeypatch.setenv("TALK_VOICE", used or "")
-        examination._engine, examination._session, examination._env = engine, session, env
-        asked.clear()
-        found = list(examination._check_neural())
-        assert not found or found[0].message == "the server's neural voices: piper/a"
-        return [*asked]
+        examination._engine, examination._session, examination._env = engine, user, env
+        tried_voices.clear()
+        findings = list(examination._check_neural())
+        assert not findings or findings[0].message == "the server's neural voices: piper/a"
+        return [*tried_voices]
 
     assert tried(None, ESPEAK) == tried("de", ESPEAK) == []
     assert tried("piper/ti", started(driver="dummy"), driver="dummy") == []
@@ -222,8 +220,8 @@ assert not {"onnxruntime", "numpy"} & {*sys.modules}, sys.modules.keys()
 
 
 def test_the_trial_of_a_slow_voice_is_aborted(alone: dict[str, str]) -> None:
-    found = _found("piper/tiny", alone, 0.01)["neural voice"]
-    assert found.message == "piper/tiny is in use: loading and speaking took more than 0.01 s"
+    finding = _found("piper/tiny", alone, 0.01)["neural voice"]
+    assert finding.message == "piper/tiny is in use: loading and speaking took more than 0.01 s"
 
 
 def test_a_voice_that_crashes_the_engine_process_is_reported(home: str, tmp_path: Path) -> None:
@@ -255,11 +253,12 @@ SERVER_VOICES = {"piper/a": {"state": "loaded", "why": None}, "piper/b": {"state
 
 
 def test_the_servers_status_is_reported_if_voices_cannot_be_examined() -> None:
-    (found,) = voice.judge_server_voices(SERVER_VOICES)
-    assert (found.state, found.message) == (WARNING, "the server cannot speak with the voice piper/b: x is no model")
-    assert found.next == "check whether this is still true: talk set --voice piper/b"
-    (found,) = voice.judge_server_voices({"piper/a": SERVER_VOICES["piper/a"]})
-    assert (found.state, found.message) == (OK, "the server's neural voices: piper/a")
+    (finding,) = voice.judge_server_voices(SERVER_VOICES)
+    assert finding.state == WARNING
+    assert finding.message == "the server cannot speak with the voice piper/b: x is no model"
+    assert finding.next == "check whether this is still true: talk set --voice piper/b"
+    (finding,) = voice.judge_server_voices({"piper/a": SERVER_VOICES["piper/a"]})
+    assert (finding.state, finding.message) == (OK, "the server's neural voices: piper/a")
     assert voice.judge_server_voices({}) == []
 
 
@@ -302,5 +301,5 @@ def test_a_failed_voice_is_a_warning_if_the_server_falls_back_to_espeak(
 
 def test_a_missing_package_is_reported_with_its_install_command() -> None:
     words = f"the voice piper/a cannot be loaded: numpy is missing; install it with: {install.neural()}"
-    found = voice.judge_engine("2.99", EngineReport(reason="unknown_voice", message=words), server=None)[-1]
-    assert (found.check, found.next) == ("voices", install.neural())
+    finding = voice.judge_engine("2.99", EngineReport(reason="unknown_voice", message=words), server=None)[-1]
+    assert (finding.check, finding.next) == ("voices", install.neural())

@@ -68,8 +68,8 @@ def server_for(clients: int) -> Iterator[Callable[[bytes], Client]]:
     try:
         yield connect
     finally:
-        for each in list(served.connections):
-            each.stream.abort()
+        for connection in list(served.connections):
+            connection.stream.abort()
         for client in made:
             client.socket.close()
 
@@ -84,10 +84,10 @@ async def test_a_waiting_client_is_admitted_when_another_leaves() -> None:
     with server_for(1) as connect:
         first, second, third = connect(b""), connect(b""), connect(b"")
         await turns()
-        assert [each.heard() for each in (first, second, third)] == [["greeting"], [], []]
+        assert [client.heard() for client in (first, second, third)] == [["greeting"], [], []]
         first.socket.close()
         await turns()
-        assert sorted(each.heard() for each in (second, third)) == [[], ["greeting"]]
+        assert sorted(client.heard() for client in (second, third)) == [[], ["greeting"]]
     with server_for(1) as connect:
         first = connect(HELLO)
         await turns()
@@ -116,10 +116,10 @@ async def test_a_full_server_admits_urgent_clients_and_lets_silent_ones_wait() -
 async def test_a_server_that_ends_first_answers_all_received_requests() -> None:
     served, count = Server(ServerSettings(), cast("Any", Unused())), 3 * LINES_PER_TURN
     client, idle = Client(SAY * count + STATUS), Client()
-    for each in (client, idle):
-        ClientConnection(served, served.speech.streams, each.server_end).begin()
+    for end in (client, idle):
+        ClientConnection(served, served.speech.streams, end.server_end).begin()
     await served._close_connections()
     assert client.heard() == ["greeting", *["True"] * count, *["goal"] * count, "True"]
-    for each in (client, idle):
-        assert each.server_end.fileno() == -1
-        each.socket.close()
+    for end in (client, idle):
+        assert end.server_end.fileno() == -1
+        end.socket.close()

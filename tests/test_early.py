@@ -50,10 +50,10 @@ def listening_at(path: str, backlog: int = 8) -> Iterator[socket.socket]:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 def test_a_signal_during_the_imports_cancels_the_sent_goal(number: signal.Signals) -> None:
     def play(peer: Peer) -> None:
-        asked = peer.receive("say")
+        request = peer.receive("say")
         # The client has sent its request, but hasn't imported most of its modules yet.
         client.send_signal(number)
-        peer.send({"seq": asked["seq"], "ok": True, "goal": goal("PENDING")})
+        peer.send({"seq": request["seq"], "ok": True, "goal": goal("PENDING")})
         peer.reply("cancel")
         peer.send(result("RECALLED"))
 
@@ -94,7 +94,7 @@ def answer(connected: socket.socket, requests: list[dict[str, Any]]) -> None:
     ids=["at once", "in parts", "late", "other spacing", "with an event"],
 )
 def test_a_request_is_sent_once_however_the_server_greets(greeting: list[bytes]) -> None:
-    said: list[dict[str, Any]] = []
+    requests: list[dict[str, Any]] = []
 
     def serve(listening: socket.socket) -> None:
         connected, _ = listening.accept()
@@ -102,14 +102,14 @@ def test_a_request_is_sent_once_however_the_server_greets(greeting: list[bytes])
             for part in greeting:
                 connected.sendall(part)
                 time.sleep(0.3 if part is not greeting[-1] else 0)  # longer than a client waits before its imports
-            answer(connected, said)
+            answer(connected, requests)
 
-    assert_hello_is_sent_once(serve, said)
+    assert_hello_is_sent_once(serve, requests)
 
 
 def test_a_request_is_sent_again_if_the_server_hangs_up() -> None:
     """For example if the server ended, and a socket unit started the next one."""
-    said: list[dict[str, Any]] = []
+    requests: list[dict[str, Any]] = []
 
     def serve(listening: socket.socket) -> None:
         connected, _ = listening.accept()
@@ -118,9 +118,9 @@ def test_a_request_is_sent_again_if_the_server_hangs_up() -> None:
         connected, _ = listening.accept()
         with connected:
             connected.sendall(GREETING)
-            answer(connected, said)
+            answer(connected, requests)
 
-    assert_hello_is_sent_once(serve, said)
+    assert_hello_is_sent_once(serve, requests)
 
 
 def test_the_request_is_sent_before_the_client_is_imported(scripted: Talk) -> None:
@@ -130,11 +130,11 @@ def test_the_request_is_sent_before_the_client_is_imported(scripted: Talk) -> No
         "from talkcli.client import connect\n"
         "send_early = connect.send_early\n"
         "def spy(*arguments):\n"
-        "    found = send_early(*arguments)\n"
-        "    assert found and found.request_sent\n"
+        "    attempt = send_early(*arguments)\n"
+        "    assert attempt and attempt.request_sent\n"
         "    heavy = {{'click', 'json', 're', 'enum', 'socket', 'typing', 'talkcli.client.client'}}\n"
         "    print(sorted(heavy & {{*sys.modules}}))\n"
-        "    return found\n"
+        "    return attempt\n"
         "connect.send_early = spy\n"
         "from talkcli.cli import run\n"
         "assert run({}) == 0\n"
@@ -142,7 +142,7 @@ def test_the_request_is_sent_before_the_client_is_imported(scripted: Talk) -> No
     )
     for words in (["say", "--wait", "length=0"], ["status"], ["cancel"], ["pause"]):
         done = run([sys.executable, "-c", code.format(words)], scripted.env)
-        assert [done.out.splitlines()[each] for each in (0, -1) if done.out] == ["[]", "False"], done
+        assert [done.out.splitlines()[index] for index in (0, -1) if done.out] == ["[]", "False"], done
 
 
 def test_a_waiting_client_delays_its_imports(scripted: Talk) -> None:
@@ -175,24 +175,24 @@ def test_a_client_yields_the_processor_and_loses_no_reply(monkeypatch: pytest.Mo
         for answer in (b"", b"reply\n"):
             server_end.sendall(answer)
             monkeypatch.setattr("talkcli.client.connect.time.process_time", lambda: 0.1)
-            began = time.monotonic()
+            started_at = time.monotonic()
             yield_processor(attempt, None)
-            assert time.monotonic() - began >= 0.1
+            assert time.monotonic() - started_at >= 0.1
             monkeypatch.setattr("talkcli.client.connect.time.process_time", lambda: PATIENCE)
-            began = time.monotonic()
+            started_at = time.monotonic()
             yield_processor(attempt, 0.05)  # its own limit is shorter
             yield_processor(attempt, None)  # on a slow machine, the wait has a maximum
-            assert time.monotonic() - began < PATIENCE
+            assert time.monotonic() - started_at < PATIENCE
         monkeypatch.setattr("talkcli.client.connect._LONGEST_YIELD_S", PATIENCE)
         assert client_end.recv(100) == b"reply\n"
-        began = time.monotonic()
+        started_at = time.monotonic()
         for refused in (b'{"seq": 1, "ok": false}\n', b'{"goal": {"state": "REJECTED"}}\n'):
             server_end.sendall(refused)
             yield_processor(attempt, None)  # a refusal needs no wait
             assert (os.get_blocking(client_end.fileno()), client_end.recv(100)) == (False, refused)
         server_end.close()
         yield_processor(attempt, None)  # the server is gone
-        assert time.monotonic() - began < PATIENCE
+        assert time.monotonic() - started_at < PATIENCE
         assert (os.get_blocking(client_end.fileno()), client_end.recv(1)) == (False, b"")
 
 
@@ -202,7 +202,7 @@ def test_simple_commands_import_neither_click_nor_slow_modules(scripted: Talk) -
     code = (
         "import sys; from talkcli.cli import run\n"
         "for words in {}: assert run(words) == 0\n"
-        "print([each for each in {} if each in sys.modules])"
+        "print([name for name in {} if name in sys.modules])"
     )
     words = [["say", "--wait", "length=0"], ["status"], ["cancel"], ["wait"], ["log"], ["voices"], ["set"]]
     done = run([sys.executable, "-c", code.format([*words, ["set", "--rate", "150"]], heavy)], scripted.env)
@@ -224,9 +224,9 @@ def test_ctrl_c_before_the_greeting_prints_no_traceback() -> None:
 def test_a_server_with_a_full_backlog_is_not_skipped() -> None:
     with short_directory() as directory, contextlib.ExitStack() as stack:
         first, second = f"{directory}/runtime/talk/talk.sock", f"{directory}/runtime-{os.getuid()}/talk/talk.sock"
-        for each in (first, second):
-            os.makedirs(os.path.dirname(each))
-            listening = stack.enter_context(listening_at(each, 0 if each == first else 8))
+        for path in (first, second):
+            os.makedirs(os.path.dirname(path))
+            listening = stack.enter_context(listening_at(path, 0 if path == first else 8))
         with contextlib.suppress(BlockingIOError):
             while True:
                 waiting = stack.enter_context(socket.socket(socket.AF_UNIX))
@@ -237,8 +237,8 @@ def test_a_server_with_a_full_backlog_is_not_skipped() -> None:
             patch.setenv("TMPDIR", directory)
             assert first in client_sockets(None)
             assert second in client_sockets(None)
-            found = reach(None)
-            assert (found.socket, found.backlog_full, found.failures[-1][0]) == (None, True, first)
+            attempt = reach(None)
+            assert (attempt.socket, attempt.backlog_full, attempt.failures[-1][0]) == (None, True, first)
         listening.setblocking(False)
         with pytest.raises(BlockingIOError):  # no client connected to the second socket
             listening.accept()
@@ -292,14 +292,14 @@ def signal_another_thread(number: signal.Signals) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_to_another_thread_ends_the_wait(number: signal.Signals) -> None:
-    began = time.monotonic()
+    started_at = time.monotonic()
     with Interrupts() as interrupts:
         sender = threading.Timer(0.1, signal_another_thread, [number])
         sender.start()
         wait_ready({}, 10, interrupts.watched)
     sender.join()
     assert interrupts.exit_code == 128 + number
-    assert time.monotonic() - began < 5
+    assert time.monotonic() - started_at < 5
     assert signal.set_wakeup_fd(-1) == -1  # the wake-up descriptor is removed
 
 

@@ -38,9 +38,9 @@ SHORT = ("cancel", "status", "log", "set", "pause", "resume", "voices", "wait", 
 
 
 def command(name: str) -> ClickCommand:
-    found = talk.get_command(click.Context(talk), name)
-    assert isinstance(found, ClickCommand), name
-    return found
+    result = talk.get_command(click.Context(talk), name)
+    assert isinstance(result, ClickCommand), name
+    return result
 
 
 def too_wide(text: str, columns: int = 80) -> list[str]:
@@ -67,8 +67,8 @@ def test_talk_without_arguments_shows_every_command_on_one_screen() -> None:
 
 def test_the_help_of_talk_lists_all_exit_codes() -> None:
     out = golden_help("talk")
-    classes = [each for each in vars(errors).values() if isinstance(each, type) and issubclass(each, errors.TalkError)]
-    used = {each.exit_code for each in classes} | set(states.EXIT_CODES.values())
+    classes = [cls for cls in vars(errors).values() if isinstance(cls, type) and issubclass(cls, errors.TalkError)]
+    used = {cls.exit_code for cls in classes} | set(states.EXIT_CODES.values())
     used |= {errors.EXIT_OK, errors.EXIT_ERROR, errors.EXIT_USAGE, errors.EXIT_DIFFER, errors.EXIT_TIMEOUT}
     shown = re.findall(r"(?m)^  (\S+) +\S", out.partition("\nExit codes:\n")[2])
     assert shown == [*map(str, sorted(used)), f"{errors.EXIT_SIGNAL}+n"]
@@ -90,9 +90,9 @@ def test_the_help_of_a_command_has_a_purpose_examples_and_options(name: str) -> 
     assert too_wide(out) == []
     assert out.endswith("\n\nCommon options and exit codes: talk --help\n")
     assert len(out.splitlines()) <= 24 or name not in SHORT
-    found = re.findall(r"(?m)^([A-Z][a-z ]+:)$", out)
-    own = any(isinstance(each, click.Option) and each.expose_value for each in command(name).params)
-    assert found == ["Examples:", *["Options:"] * own, *["Exit codes:"] * (name in WITH_EXIT_CODES)]
+    headings = re.findall(r"(?m)^([A-Z][a-z ]+:)$", out)
+    own = any(isinstance(parameter, click.Option) and parameter.expose_value for parameter in command(name).params)
+    assert headings == ["Examples:", *["Options:"] * own, *["Exit codes:"] * (name in WITH_EXIT_CODES)]
     purpose = (command(name).help or "").partition("\n\n")[0]
     assert purpose.endswith((".", ":", ","))
     assert len(purpose) > 30
@@ -103,20 +103,20 @@ def test_the_help_of_a_command_has_a_purpose_examples_and_options(name: str) -> 
         codes = [*(command(name).exit_codes or {})]
         assert {*map(str, codes)} <= {*map(str, ALL_EXIT_CODES), "4-7"}
         assert re.findall(r"(?m)^  (\d\S*) +\S", out.partition("\nExit codes:\n")[2]) == [*map(str, codes)]
-        assert [each for each in codes if isinstance(each, int)] == sorted(
-            each for each in codes if isinstance(each, int)
+        assert [code for code in codes if isinstance(code, int)] == sorted(
+            code for code in codes if isinstance(code, int)
         )
 
 
 @pytest.mark.parametrize("name", commands.COMMANDS)
 def test_every_option_is_explained(name: str) -> None:
-    for each in command(name).params:
-        if isinstance(each, click.Option):
-            assert each.help, each.name
-            assert each.help[0].isupper(), each.name
-            assert each.help.endswith((".", "]")), each.name
-            named = each.metavar or (each.is_flag and "-") or each.type.get_metavar(each, click.Context(command(name)))
-            assert named in {"-", "N", "X"} or each.metavar, f"{each.name} shows click's default name for its value"
+    for option in command(name).params:
+        if isinstance(option, click.Option):
+            assert option.help, option.name
+            assert option.help[0].isupper(), option.name
+            assert option.help.endswith((".", "]")), option.name
+            default = option.type.get_metavar(option, click.Context(command(name)))
+            assert option.metavar or option.is_flag or default in {"-", "N", "X"}, f"{option.name} shows {default}"
 
 
 @pytest.mark.parametrize("name", commands.COMMANDS)
@@ -125,7 +125,7 @@ def test_the_examples_are_valid_command_lines(name: str) -> None:
     seen = []
     for line in command(name).row.examples.strip().splitlines():
         for part in re.findall(r"\btalk ((?:\"[^\"]*\"|[^|;&)\"])*)", re.split(r"(?<=\S)   +", line.strip())[0]):
-            words = [each for each in shlex.split(part.partition("'")[0]) if each != "--json"]
+            words = [argument for argument in shlex.split(part.partition("'")[0]) if argument != "--json"]
             seen.append(words[0])
             with command(words[0]).make_context(words[0], words[1:], parent=click.Context(talk)) as context:
                 assert context.params is not None
@@ -150,14 +150,11 @@ def test_messages_wrap_between_words_on_a_terminal(columns: int, lines: int) -> 
 
 def test_a_command_in_a_message_is_not_wrapped() -> None:
     command = "sudo python3 -m venv /opt/talk && sudo /opt/talk/bin/pip install ."
-    for message in (
-        f"one two {'three ' * 20}'{command}' four {'five ' * 20}",
-        f"{'one ' * 30}start one with: {command}",
-    ):
+    for message in (f"one {'two ' * 20}'{command}' three {'four ' * 20}", f"{'one ' * 30}start one with: {command}"):
         lines = show._wrap(message).splitlines()
         assert len(lines) > 2
-        assert sum(command in each for each in lines) == 1
-        assert " ".join(each.strip() for each in lines) == message.strip()
+        assert sum(command in line for line in lines) == 1
+        assert " ".join(line.strip() for line in lines) == message.strip()
 
 
 def test_the_error_for_a_wrong_value_names_its_variable() -> None:
@@ -189,9 +186,7 @@ def test_a_missing_sound_device_is_reported_and_used_once_it_appears(make_talk: 
     ("options", "server"),
     [("--player null", ""), ("--player file:said.wav", ""), ("--player cat", ""), ("-q", ""), ("", "unix:/there")],
 )
-def test_a_missing_sound_device_is_not_reported_if_none_is_needed(
-    make_talk: MakeTalk, options: str, server: str
-) -> None:
+def test_a_sound_device_that_is_not_needed_may_be_missing(make_talk: MakeTalk, options: str, server: str) -> None:
     talk = make_talk(*options.split(), env={"PULSE_SERVER": server}, watched=False)
     assert "no sound device" not in talk.log
 
@@ -209,7 +204,7 @@ def test_without_a_player_the_log_names_packages_to_install(make_talk: MakeTalk,
     talk = make_talk(env={"PATH": str(tmp_path)}, watched=False)
     talk.run("voices")  # the engine is ready before it lists them
     note = "no player found; install alsa-utils (aplay), pulseaudio-utils (pacat) or pipewire-bin (pw-cat)\n"
-    assert next(each for each in talk.log.splitlines(True) if "engine ready" in each).endswith(f", {note}")
+    assert next(line for line in talk.log.splitlines(True) if "engine ready" in line).endswith(f", {note}")
 
 
 def test_an_output_file_of_another_format_is_refused(tmp_path: pathlib.Path) -> None:

@@ -18,5 +18,5 @@ def test_an_idle_server_switches_context_at_most_once_a_second(make_talk: MakeTa
     assert talk.run("say", "--wait", "--", "ready").code == 0
     processes = [talk.pid, *descendants(talk.pid)]
     assert len(processes) == 2, "the server, and its engine process"
-    found = taken_in(processes, MEASURED_S)
-    assert found.switches <= MEASURED_S, found
+    usage = taken_in(processes, MEASURED_S)
+    assert usage.switches <= MEASURED_S, usage

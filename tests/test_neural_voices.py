@@ -39,7 +39,7 @@ LONG = "this goes on and on " * 30
 #: Runs first in each Python process: models load only after the file HOLD is removed, and may take more memory.
 SITE = """
 import importlib.abc, importlib.util, os, sys, time
-class Held(importlib.abc.MetaPathFinder):
+class Delay(importlib.abc.MetaPathFinder):
     def find_spec(self, name, path=None, target=None):
         if name != "talkcli.engine.child.synthesizers.inference":
             return None
@@ -49,15 +49,15 @@ class Held(importlib.abc.MetaPathFinder):
         def executed(module):
             execute(module)
             init = module.Model.__init__
-            def held(model, path, *rest):
+            def delayed(model, path, *rest):
                 while os.path.exists(os.environ["HOLD"]):
                     time.sleep(0.01)
                 init(model, path, *rest)
                 model.ballast = b"x" * int(os.environ.get("BALLAST_BYTES", 0))
-            module.Model.__init__ = held
+            module.Model.__init__ = delayed
         spec.loader.exec_module = executed
         return spec
-sys.meta_path.insert(0, Held())
+sys.meta_path.insert(0, Delay())
 """
 
 
@@ -106,9 +106,9 @@ class Robot:
 
     def neural(self, voice: str = TINY) -> dict[str, Any]:
         """Return the server's description of a neural voice."""
-        found = self.client.status().server["neural_voices"]
-        assert isinstance(found, dict)
-        return dict(found.get(voice, {"state": None}))
+        voices = self.client.status().server["neural_voices"]
+        assert isinstance(voices, dict)
+        return dict(voices.get(voice, {"state": None}))
 
     def until(self, condition: Callable[[], object]) -> None:
         limit = time.monotonic() + LIMIT
@@ -144,7 +144,7 @@ def test_a_goal_and_those_behind_it_wait_for_its_voice(env: dict[str, str], hold
     with _robot(env) as robot:
         first, second = robot.say(), robot.say("behind", None)
         robot.until(lambda: robot.neural() == {"state": "loading", "why": None})
-        assert [robot.state(each) for each in (first, second)] == ["PENDING", "PENDING"]
+        assert [robot.state(goal) for goal in (first, second)] == ["PENDING", "PENDING"]
         assert "voice    piper/tiny loading" in run([*TALK, "status"], env).out
         hold.unlink()
         assert robot.heard(first) == ("SUCCEEDED", TINY)
@@ -232,8 +232,8 @@ def test_two_voices_that_exceed_the_memory_limit_speak_in_turn(env: dict[str, st
     tiny_voice.put(tmp_path / "voices", "second")
     with _robot(env, "--voice-memory", "0") as robot:
         names = (TINY, "piper/second", TINY)
-        goals = [robot.say(voice=each) for each in names]
-        assert [robot.heard(each) for each in goals] == [("SUCCEEDED", each) for each in names]
+        goals = [robot.say(voice=name) for name in names]
+        assert [robot.heard(goal) for goal in goals] == [("SUCCEEDED", name) for name in names]
         assert "unloaded voice piper/tiny to make room" in robot.server.log
 
 
@@ -319,7 +319,7 @@ def test_goals_fail_at_once_if_the_engine_cannot_start(env: dict[str, str], tmp_
     with _robot(env, "--voice", TINY) as robot:
         robot.until(lambda: "pyttsx3 is missing" in robot.server.log)
         goals = [robot.say("hello", None), robot.say(voice_only=True), robot.say("behind", "en")]
-        assert [each.wait(LIMIT).reason for each in goals] == ["engine_failed"] * 3
+        assert [goal.wait(LIMIT).reason for goal in goals] == ["engine_failed"] * 3
 
 
 def test_an_engine_that_hangs_while_loading_is_replaced(env: dict[str, str], hold: Path) -> None:
@@ -383,15 +383,15 @@ def test_voices_are_listed_with_quality_and_speakers(env: dict[str, str], tmp_pa
     several = tiny_voice.description(speakers=2, language="de_DE")
     tiny_voice.put(tmp_path / "voices", "two", tiny_voice.model(speakers=2), several)
     with serving(env):
-        lines = [each.split(maxsplit=2) for each in run([*TALK, "voices"], env).out.splitlines()]
-        assert [each for each in lines if each[0] in {"piper/broken", "piper/tiny", "piper/two"}] == [
+        lines = [line.split(maxsplit=2) for line in run([*TALK, "voices"], env).out.splitlines()]
+        assert [line for line in lines if line[0] in {"piper/broken", "piper/tiny", "piper/two"}] == [
             ["piper/broken", "en-us", "tiny, low"],
             ["piper/tiny", "en-us", "tiny, low"],
             ["piper/two", "de-de", "tiny, low, 2 speakers"],
         ]
-        found = [json.loads(each) for each in run([*TALK, "--json", "voices"], env).out.splitlines()]
-        assert {*map(tuple, found)} == {("id", "language", "name", "quality", "speakers")}
-        more = {each["id"]: (each["quality"], each["speakers"]) for each in found}
+        voices = [json.loads(line) for line in run([*TALK, "--json", "voices"], env).out.splitlines()]
+        assert {*map(tuple, voices)} == {("id", "language", "name", "quality", "speakers")}
+        more = {voice["id"]: (voice["quality"], voice["speakers"]) for voice in voices}
         assert (more["piper/tiny"], more["piper/two"]) == (("low", None), ("low", ["p0", "p1"]))
         assert more["gmw/en-US"] == (None, None)
         listed = run([*TALK, "voices", "--language", "en"], env).out.split()
@@ -418,9 +418,9 @@ def test_text_from_a_voices_files_is_always_escaped(env: dict[str, str], tmp_pat
             run([*TALK, "status"], env),
             run([*TALK, "log"], env),
         ]
-    assert any("piper/evil" in each.out for each in shown)
-    assert [each.code for each in shown[2:5]] == [4, 4, 5]
-    for text in (server.log, *(each.out + each.err for each in shown)):
+    assert any("piper/evil" in done.out for done in shown)
+    assert [done.code for done in shown[2:5]] == [4, 4, 5]
+    for text in (server.log, *(done.out + done.err for done in shown)):
         assert not {"\x1b", "\x07", "\u202e"} & {*text}, text
         assert max(map(len, text.splitlines()), default=0) < 1000
 
@@ -428,16 +428,16 @@ def test_text_from_a_voices_files_is_always_escaped(env: dict[str, str], tmp_pat
 def test_every_voice_offered_by_completion_exists(env: dict[str, str]) -> None:
     with serving(env):
         listed = [json.loads(line) for line in run([*TALK, "--json", "voices"], env).out.splitlines()]
-        found = {
-            each: [value for value, _ in offered(f"talk say --voice {each}", env)] for each in ("", "pi", "ti", "E")
+        offers = {
+            typed: [value for value, _ in offered(f"talk say --voice {typed}", env)] for typed in ("", "pi", "ti", "E")
         }
     voices = tuple(Voice(**fields) for fields in listed)
-    for typed, values in found.items():
-        for each in values:
-            assert find_voice(each, voices) is not None, (typed, each)
-    assert {"piper/tiny", "piper/broken", "en-us"} <= {*found[""]}
-    assert {"piper/broken", "piper/tiny"} <= {*found["pi"]}
-    assert found["ti"] == []
+    for typed, values in offers.items():
+        for value in values:
+            assert find_voice(value, voices) is not None, (typed, value)
+    assert {"piper/tiny", "piper/broken", "en-us"} <= {*offers[""]}
+    assert {"piper/broken", "piper/tiny"} <= {*offers["pi"]}
+    assert offers["ti"] == []
 
 
 def test_a_neural_voice_is_refused_with_another_driver(env: dict[str, str]) -> None:
@@ -478,8 +478,8 @@ def test_a_drivers_voice_precedes_a_neural_voice_of_the_same_name(env: dict[str,
     with serving(env, "--rate", "450", "--voice", "en"):
         assert heard(env) == "gmw/en"
         assert run([*TALK, "set", "--voice", "tiny"], env).code == 0
-        found = [heard(env, "--voice-only", "--voice", each) for each in ("en-us", "EN", "gmw/en-US")]
-        assert found == ["piper/tiny", "piper/tiny", "gmw/en-US"], "the language of a neural voice selects that voice"
+        used = [heard(env, "--voice-only", "--voice", voice) for voice in ("en-us", "EN", "gmw/en-US")]
+        assert used == ["piper/tiny", "piper/tiny", "gmw/en-US"], "the language of a neural voice selects that voice"
 
 
 def test_an_unknown_voice_or_speaker_is_refused(env: dict[str, str], tmp_path: Path) -> None:
@@ -523,7 +523,7 @@ def test_a_neural_voice_contacts_no_host_and_changes_no_file(env: dict[str, str]
             os.kill(talk, signal.SIGTERM)  # strace doesn't forward signals
             server.process.wait(LIMIT)
     lines = trace.read_text(errors="replace").splitlines()
-    assert any("onnxruntime" in each for each in lines)
+    assert any("onnxruntime" in line for line in lines)
     home = env["HOME"]
     own = (f'"{home}"', f'"{home}/s', f'"{home}/.cache"', f'"{home}/.cache/talk', '"/dev/null"')
-    assert [each for each in lines if _SIDE_EFFECTS.search(each) and not any(place in each for place in own)] == []
+    assert [line for line in lines if _SIDE_EFFECTS.search(line) and not any(place in line for place in own)] == []

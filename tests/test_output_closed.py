@@ -85,13 +85,13 @@ def test_a_full_disk_is_reported_with_a_readable_message(scripted: Talk, command
 
 def test_an_io_error_is_not_mistaken_for_a_closed_reader(scripted: Talk) -> None:
     with open("/proc/self/mem", "r+b") as broken:  # nothing can be written to address 0
-        found = run_to(scripted, os.dup(broken.fileno()), "status")
-    assert found == (1, "talk: can't write to standard output: Input/output error\n")
+        result = run_to(scripted, os.dup(broken.fileno()), "status")
+    assert result == (1, "talk: can't write to standard output: Input/output error\n")
 
 
 def test_a_closed_standard_error_changes_no_exit_code(scripted: Talk) -> None:
     done = bash(scripted, "talk status 4k7f-99 2>&-; echo $?; talk say -w fail=audio_lost 2>&-; echo $?")
-    assert [each for each in done.stdout.splitlines() if "-" not in each] == ["8", "4"]
+    assert [line for line in done.stdout.splitlines() if "-" not in line] == ["8", "4"]
 
 
 # Output that can't be written from the start
@@ -101,7 +101,7 @@ def test_a_goal_is_spoken_even_if_its_id_cannot_be_printed(scripted: Talk) -> No
     bash(scripted, "talk say length=0 >&-")
     run_to(scripted, "/dev/full", "say", "length=0")
     unread(scripted, "say", "length=0")
-    assert [scripted.watcher.wait_for_terminal(each) for each in scripted.watcher.goals()] == ["SUCCEEDED"] * 3
+    assert [scripted.watcher.wait_for_terminal(goal) for goal in scripted.watcher.goals()] == ["SUCCEEDED"] * 3
 
 
 @pytest.mark.parametrize("words", ["say", "say -w", "--json say -wf", "say -wq"])
@@ -193,7 +193,7 @@ SLOW = f"{ENDLESS} slow-stop=0.2"
 )
 def test_a_goal_is_cancelled_if_its_reader_goes_away(scripted: Talk, words: list[str], kind: dict[str, bool]) -> None:
     reader = Reader(scripted, *words, ENDLESS, **kind)
-    goal = scripted.watcher.wait_until(lambda each: each.get("event") == "word")["id"]
+    goal = scripted.watcher.wait_until(lambda event: event.get("event") == "word")["id"]
     assert reader.leave() == CLOSED
     assert scripted.goal(goal)["state"] == "PREEMPTED"  # the client waited for it
     assert scripted.goal(goal)["by"]["client"]["pid"] == reader.client.pid
@@ -202,7 +202,7 @@ def test_a_goal_is_cancelled_if_its_reader_goes_away(scripted: Talk, words: list
 def test_a_pending_goal_is_recalled_if_its_reader_goes_away(scripted: Talk) -> None:
     first = scripted.run("say", ENDLESS).id
     reader = Reader(scripted, "say", "-w", "second")
-    scripted.watcher.wait_until(lambda each: bool(each.get("goal")) and each["goal"]["text"] == "second")
+    scripted.watcher.wait_until(lambda event: bool(event.get("goal")) and event["goal"]["text"] == "second")
     assert reader.leave() == CLOSED
     assert scripted.watcher.wait_for_terminal(scripted.watcher.goals()[-1]) == "RECALLED"
     assert scripted.goal(first)["state"] == "ACTIVE"
@@ -218,7 +218,7 @@ def test_a_signal_decides_the_exit_code_even_if_the_reader_has_gone(
 ) -> None:
     number = signal.SIGINT if first == "reader" else signal.SIGHUP
     reader = Reader(scripted, *words.split(), SLOW, **kind)
-    goal = scripted.watcher.wait_until(lambda each: each.get("event") == "word")["id"]
+    goal = scripted.watcher.wait_until(lambda event: event.get("event") == "word")["id"]
     if first == "reader":
         reader.client.send_signal(signal.SIGSTOP)
         reader.client.send_signal(number)
@@ -245,7 +245,7 @@ def test_a_second_signal_does_not_change_the_exit_code(scripted: Talk, words: st
         assert client.stdin
         client.stdin.write(f"{SLOW}\n")
         client.stdin.flush()
-    goal = scripted.watcher.wait_until(lambda each: each.get("event") == "word")["id"]
+    goal = scripted.watcher.wait_until(lambda event: event.get("event") == "word")["id"]
     client.send_signal(first)
     scripted.watcher.wait_for(goal, "PREEMPTING")
     client.send_signal(signal.SIGHUP)
@@ -313,7 +313,7 @@ def test_sighup_cancels_the_goal_of_say_unless_nohup_blocks_it(scripted: Talk) -
     for words, code, state in ((["say", "-w"], 129, "PREEMPTED"), (["wait"], 129, "ACTIVE")):
         goal = scripted.run("say", ENDLESS).id if words == ["wait"] else None
         client = scripted.start(*words, goal or ENDLESS)
-        goal = goal or scripted.watcher.wait_until(lambda each: each.get("event") == "word")["id"]
+        goal = goal or scripted.watcher.wait_until(lambda event: event.get("event") == "word")["id"]
         _wait_until_caught(client, signal.SIGHUP)
         client.send_signal(signal.SIGHUP)
         assert scripted.finish(client).code == code
@@ -336,7 +336,7 @@ def _wait_until_caught(client: Process, number: int) -> None:
     while True:
         assert client.poll() is None, "the client has ended"
         with open(f"/proc/{client.pid}/status", encoding="utf-8") as status:
-            caught = next(int(each.split()[1], 16) for each in status if each.startswith("SigCgt:"))
+            caught = next(int(line.split()[1], 16) for line in status if line.startswith("SigCgt:"))
         if caught >> (number - 1) & 1:
             return
         time.sleep(0.002)

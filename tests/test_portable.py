@@ -26,13 +26,13 @@ PATH = os.pathsep.join([str(Path(__file__).parent / "support" / "macos"), str(Pa
 _SHOW_PLATFORM = "import sys, os, fcntl, select, socket; print(sys.platform, os.path.exists('/proc/self'), *({} & {}))"
 _IMPORT_ALL = """
 import importlib, pkgutil, click, talkcli
-names = [each.name for each in pkgutil.walk_packages(talkcli.__path__, "talkcli.")]
+names = [module.name for module in pkgutil.walk_packages(talkcli.__path__, "talkcli.")]
 for name in names:
     if not name.endswith("__main__"):
         importlib.import_module(name)
 from talkcli.cli.click_app import talk
 with click.Context(talk, info_name="talk") as parent:
-    commands = {each: talk.get_command(parent, each) for each in talk.list_commands(parent)}
+    commands = {name: talk.get_command(parent, name) for name in talk.list_commands(parent)}
     for name, command in commands.items():
         with click.Context(command, info_name=name, parent=parent) as context:
             assert "exit codes: talk --help" in command.get_help(context), name
@@ -57,8 +57,8 @@ def test_the_linux_interfaces_are_hidden() -> None:
 
 def test_every_module_can_be_imported_and_every_command_has_help() -> None:
     modules = sum(1 for _ in Path(talkcli.__path__[0]).rglob("*.py"))
-    found = on_macos(sys.executable, "-c", _IMPORT_ALL)
-    assert found == f"{modules - 1} {len(COMMANDS)}\n"  # the package itself is already imported
+    counts = on_macos(sys.executable, "-c", _IMPORT_ALL)
+    assert counts == f"{modules - 1} {len(COMMANDS)}\n"  # the package itself is already imported
     assert "Exit codes:" in on_macos(*TALK, "--help")
 
 
@@ -79,17 +79,17 @@ def test_speech_can_be_awaited_paused_cancelled_and_examined(make_talk: MakeTalk
     assert [line.split()[-1] for line in words.splitlines() if " word " in line] == ["one", "two", "three"]
 
     assert server.run("pause").code == 0
-    ids = [server.run("say", each).id for each in ("one", "two", "three")]
+    ids = [server.run("say", text).id for text in ("one", "two", "three")]
     assert server.run("cancel", ids[1]).id == ids[1]
     assert server.run("resume").code == 0
     assert server.run("wait").code == 0
-    assert [server.goal(each)["state"] for each in ids] == ["SUCCEEDED", "RECALLED", "SUCCEEDED"]
+    assert [server.goal(goal_id)["state"] for goal_id in ids] == ["SUCCEEDED", "RECALLED", "SUCCEEDED"]
 
     done = server.run("doctor", "--silent", "--json")
-    found = {each["check"]: each for each in map(json.loads, done.out.splitlines())}
+    findings = {finding["check"]: finding for finding in map(json.loads, done.out.splitlines())}
     assert done.err == ""
-    assert {"python", "pyttsx3", "socket", "server", "settings", "sentence"} <= found.keys()
-    assert found["server"]["state"] == found["sentence"]["state"] == "ok"
+    assert {"python", "pyttsx3", "socket", "server", "settings", "sentence"} <= findings.keys()
+    assert findings["server"]["state"] == findings["sentence"]["state"] == "ok"
 
 
 def test_a_player_is_awaited_and_killed_and_its_failure_is_reported(make_talk: MakeTalk) -> None:

@@ -64,9 +64,9 @@ def test_each_line_is_a_goal_and_its_id_is_printed(scripted: Talk) -> None:
     ids = done.out.split()
     assert len(ids) == 4
     scripted.watcher.wait_for_terminal(ids[-1])
-    said = ["length=0 one", "length=0 two", "length=0 -x 日本", "length=0 last"]
-    assert [scripted.goal(each)["text"] for each in ids] == said
-    assert scripted.watcher.texts("ACTIVE") == said
+    texts = ["length=0 one", "length=0 two", "length=0 -x 日本", "length=0 last"]
+    assert [scripted.goal(goal_id)["text"] for goal_id in ids] == texts
+    assert scripted.watcher.texts("ACTIVE") == texts
     for words in ([], ["-f"], ["-w", "--json"]):
         done = scripted.run("say", "--lines", *words, stdin="\n\r\n")
         assert (done.code, done.out, done.err) == (0, "", ""), "empty input is a success"
@@ -90,21 +90,16 @@ def test_options_apply_to_each_line_with_the_remaining_ttl(scripted: Talk) -> No
     options = ("--as", "reader", "--priority", "3", "--ttl", "9", "--ahead", "1")
     text = "length=0.5 one\n\0\nlength=0 two\nlength=0 three\n"
     done = scripted.run("--json", "say", "--lines", *options, stdin=text)
-    goals = [json.loads(each) for each in done.out.splitlines()]
-    assert [each["state"] for each in goals] == [
-        "PENDING",
-        "REJECTED",
-        "PENDING",
-        "PENDING",
-    ]  # when the server accepted them
+    goals = [json.loads(line) for line in done.out.splitlines()]
+    assert [goal["state"] for goal in goals] == ["PENDING", "REJECTED", "PENDING", "PENDING"]  # the first state
     goals.pop(1)
-    assert [(each["priority"], each["client"]["name"]) for each in goals] == [(3, "reader")] * 3
-    first, second, third = [each["ttl"] for each in goals]
+    assert [(goal["priority"], goal["client"]["name"]) for goal in goals] == [(3, "reader")] * 3
+    first, second, third = [goal["ttl"] for goal in goals]
     assert 9 >= first >= second > third
     assert third <= 8.5
     ended = scripted.run("--json", "say", "--lines", "-w", "--key", "k", stdin="length=0\nfail=audio_lost\n")
-    goals = [json.loads(each) for each in ended.out.splitlines()]
-    assert {each["key"] for each in goals} == {"k"}
+    goals = [json.loads(line) for line in ended.out.splitlines()]
+    assert {goal["key"] for goal in goals} == {"k"}
     assert (goals[-1]["state"], ended.code) == ("ABORTED", 4)
 
 
@@ -115,7 +110,7 @@ def test_a_refused_line_is_reported_by_number_and_the_rest_is_spoken(scripted: T
     done = scripted.run("say", "--lines", stdin=text)
     assert (done.code, len(done.out.split())) == (5, 4)
     notes = done.err.splitlines()
-    assert [each.split(":")[1] for each in notes] == [" line 3", " line 5", " line 6", " line 9"]
+    assert [line.split(":")[1] for line in notes] == [" line 3", " line 5", " line 6", " line 9"]
     for note, words in zip(notes, ("NUL", "10,001 characters", "300,000 bytes", "40,002 bytes"), strict=True):
         assert words in note
     quiet = scripted.run("-q", "say", "--lines", stdin=text)
@@ -134,8 +129,8 @@ def test_a_line_with_invalid_utf8_is_reported_and_spoken(scripted: Talk) -> None
         "talk: line 4, column 1: the byte 0xff is not valid UTF-8, so it is not spoken",
         "talk: line 5, column 15: the byte 0xc3 is not valid UTF-8, so it is not spoken",
     ]
-    said = ["length=0 one", "length=0 t\ufffdw\ufffdo", "\ufffd", "length=0 three\ufffd"]
-    assert scripted.watcher.texts("ACTIVE")[:4] == said
+    texts = ["length=0 one", "length=0 t\ufffdw\ufffdo", "\ufffd", "length=0 three\ufffd"]
+    assert scripted.watcher.texts("ACTIVE")[:4] == texts
     assert quiet.stderr == b""
 
 
@@ -154,15 +149,15 @@ def test_wait_reports_failures_and_exits_with_the_first_one(scripted: Talk) -> N
 def test_feedback_shows_the_events_of_all_lines(scripted: Talk) -> None:
     done = scripted.run("say", "--lines", "-f", stdin="length=0.1 a\nlength=0.1 b\n")
     assert done.code == 0
-    shown = [each.split(" ", 1) for each in done.out.splitlines()]
-    assert [each for _, each in shown] == [
+    shown = [line.split(" ", 1) for line in done.out.splitlines()]
+    assert [event for _, event in shown] == [
         "PENDING", "ACTIVE", "word 1 0-10 0.000 length=0.1", "word 2 11-12 0.050 a", "SUCCEEDED",
         "PENDING", "ACTIVE", "word 1 0-10 0.000 length=0.1", "word 2 11-12 0.050 b", "SUCCEEDED",
     ]  # fmt: skip
     as_objects = scripted.run("--json", "say", "--lines", "-f", stdin="length=0\n\0\n")
-    found = [json.loads(each) for each in as_objects.out.splitlines()]
-    assert [each["goal"]["state"] for each in found if each["event"] == "result"].count("REJECTED") == 1
-    assert {"word", "state", "result"} == {each["event"] for each in found}
+    events = [json.loads(line) for line in as_objects.out.splitlines()]
+    assert [event["goal"]["state"] for event in events if event["event"] == "result"].count("REJECTED") == 1
+    assert {"word", "state", "result"} == {event["event"] for event in events}
 
 
 @pytest.mark.parametrize(("words", "ahead"), [([], 10), (["--ahead", "2", "--wait"], 2)])
@@ -172,9 +167,9 @@ def test_few_lines_are_pending_so_that_others_have_room(scripted: Talk, words: l
     typing.type("\n".join(lines))
     ids = [typing.line() for _ in range(ahead + 1)]
     scripted.watcher.wait_for_word(ids[0])
-    theirs = scripted.run("say", "length=0 other").id
+    other = scripted.run("say", "length=0 other").id
     scripted.run("cancel", ids[0])
-    scripted.watcher.wait_for_terminal(theirs)
+    scripted.watcher.wait_for_terminal(other)
     typing.end()
     scripted.watcher.wait_until(lambda _: len(scripted.watcher.texts("SUCCEEDED")) == len(lines))
     assert scripted.watcher.texts("PENDING") == [*lines[: ahead + 1], "length=0 other", *lines[ahead + 1 :]]
@@ -184,7 +179,7 @@ def test_a_line_replaces_a_pending_line_with_its_key_despite_the_limit(scripted:
     typing = Typing(scripted, "say", "--lines", "--key", "k", "--ahead", "1")
     typing.type(ENDLESS + "length=0 old\nlength=0 older\nlength=0 new\n")
     ids = [typing.line() for _ in range(4)]
-    assert [scripted.goal(each)["state"] for each in ids] == ["ACTIVE", "RECALLED", "RECALLED", "PENDING"]
+    assert [scripted.goal(goal_id)["state"] for goal_id in ids] == ["ACTIVE", "RECALLED", "RECALLED", "PENDING"]
     assert typing.end()[0] == 0
 
 
@@ -193,9 +188,9 @@ def test_a_line_replaces_a_pending_line_with_its_key_despite_the_limit(scripted:
 )
 def test_lines_whose_ttl_expires_while_they_wait_are_dropped(make_talk: MakeTalk, words: list[str], code: int) -> None:
     talk = make_talk("--max-queue", "1", scripted=True)
-    theirs = [talk.run("say", each).id for each in (ENDLESS, "never-ends")]
-    talk.watcher.wait_for_word(theirs[0])
-    began = time.monotonic()
+    others = [talk.run("say", text).id for text in (ENDLESS, "never-ends")]
+    talk.watcher.wait_for_word(others[0])
+    started_at = time.monotonic()
     typing = Typing(talk, "say", "--lines", "--ttl", "0.3", *words)
     typing.type("length=0 one\nlength=0 two\nlength=0 three\n")
     if "--ttl=0" in words or "-q" in words:
@@ -203,20 +198,20 @@ def test_lines_whose_ttl_expires_while_they_wait_are_dropped(make_talk: MakeTalk
     else:
         notes: list[str] = []
         while len(notes) < 2:  # with --wait, other notes report the result of the sent line
-            notes += [each for each in [typing.errors.readline()] if "was not sent" in each or not each]
-        assert time.monotonic() - began >= 0.3
+            notes += [line for line in [typing.errors.readline()] if "was not sent" in line or not line]
+        assert time.monotonic() - started_at >= 0.3
         assert notes == [f"talk: line {number} was not sent: its ttl of 0.3 s is over\n" for number in (2, 3)]
-    talk.run("cancel", *theirs)
-    found, out, err = typing.end()
-    assert (found, "was not sent" in err) == (code, False)
+    talk.run("cancel", *others)
+    exit_code, out, err = typing.end()
+    assert (exit_code, "was not sent" in err) == (code, False)
     assert talk.run("wait").code == 0
     assert talk.watcher.texts("ACTIVE")[1:] == (
-        [f"length=0 {each}" for each in ("one", "two", "three")] if "--ttl=0" in words else []
+        [f"length=0 {word}" for word in ("one", "two", "three")] if "--ttl=0" in words else []
     )  # the ttl includes the time that the first line waited for room
     if "--json" in words:
-        goals = [json.loads(each) for each in out]
-        assert sorted((each["state"], each["reason"], each["text"]) for each in goals) == [
-            ("RECALLED", "expired", f"length=0 {each}") for each in ("one", "three", "two")
+        goals = [json.loads(line) for line in out]
+        assert sorted((goal["state"], goal["reason"], goal["text"]) for goal in goals) == [
+            ("RECALLED", "expired", f"length=0 {word}") for word in ("one", "three", "two")
         ]
 
 
@@ -235,17 +230,17 @@ def test_a_line_is_spoken_after_a_long_pause_in_the_input(scripted: Talk) -> Non
 def test_fast_input_is_spoken_within_its_ttl_and_delays_no_other_client(scripted: Talk) -> None:
     ttl, seconds, typed = 1.0, 2, {}
     typing = Typing(scripted, "-q", "say", "--lines", "--ttl", f"{ttl}")
-    began = time.monotonic()
+    started_at = time.monotonic()
     for number in range(50 * seconds):
-        time.sleep(max(0.0, began + number / 50 - time.monotonic()))
+        time.sleep(max(0.0, started_at + number / 50 - time.monotonic()))
         typed[f"length=0.3 {number}"] = time.time()
         typing.type(f"length=0.3 {number}\n")
         if number == 50:
-            theirs = scripted.start("say", "--wait", "length=0 other")
-    assert scripted.finish(theirs).code == 0
+            other_client = scripted.start("say", "--wait", "length=0 other")
+    assert scripted.finish(other_client).code == 0
     assert typing.end()[0] == 0
     assert scripted.run("wait").code == 0
-    goals = [each["goal"] for each in scripted.watcher.events() if each.get("state") == "SUCCEEDED"]
+    goals = [event["goal"] for event in scripted.watcher.events() if event.get("state") == "SUCCEEDED"]
     ages = [goal["started_at"] - typed[goal["text"]] for goal in goals if goal["text"] in typed]
     assert len(ages) > 2 * seconds
     assert_within(max(ages), ttl + 0.2, "the oldest line that is spoken")
@@ -274,7 +269,7 @@ def test_only_as_much_input_is_read_as_can_be_kept(scripted: Talk, words: list[s
 def test_lines_wait_for_room_and_none_is_lost(make_talk: MakeTalk) -> None:
     talk = make_talk("--max-queue", "3", scripted=True)
     lines = [f"length=0.02 {number}" for number in range(30)]
-    done = talk.run("say", "--lines", stdin="".join(f"{each}\n" for each in lines))
+    done = talk.run("say", "--lines", stdin="".join(f"{line}\n" for line in lines))
     assert (done.code, done.err, len(set(done.out.split()))) == (0, "", len(lines))
     talk.watcher.wait_for_terminal(done.out.split()[-1])
     assert talk.watcher.texts("SUCCEEDED") == lines
@@ -306,21 +301,21 @@ def test_an_endless_line_is_read_with_bounded_memory(scripted: Talk) -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 def test_a_signal_cancels_only_the_clients_own_goals(make_talk: MakeTalk, number: signal.Signals) -> None:
     talk = make_talk("--max-queue", "4", scripted=True)
-    theirs = talk.run("say", "--priority", "-1", "length=0 other").id
-    talk.watcher.wait_for_terminal(theirs)
+    other = talk.run("say", "--priority", "-1", "length=0 other").id
+    talk.watcher.wait_for_terminal(other)
     typing = Typing(talk, "say", "--lines", "--wait")
     typing.type(ENDLESS + "second\nthird\n")
     ids = [typing.line() for _ in range(3)]
-    theirs = talk.run("say", "length=0 other").id
+    other = talk.run("say", "length=0 other").id
     talk.watcher.wait_for_word(ids[0])
-    began = time.monotonic()
+    started_at = time.monotonic()
     code, out, err = typing.end(number)
-    assert time.monotonic() - began < 3
+    assert time.monotonic() - started_at < 3
     assert (code, out) == (128 + number, [])
     assert f"talk: {ids[0]}: Talk preempted" in err
     assert "removed 2 waiting lines from the queue" in err
-    assert [talk.watcher.wait_for_terminal(each) for each in ids] == ["PREEMPTED", "RECALLED", "RECALLED"]
-    assert talk.watcher.wait_for_terminal(theirs) == "SUCCEEDED"
+    assert [talk.watcher.wait_for_terminal(goal_id) for goal_id in ids] == ["PREEMPTED", "RECALLED", "RECALLED"]
+    assert talk.watcher.wait_for_terminal(other) == "SUCCEEDED"
     assert talk.watcher.states(ids[2]) == ["PENDING", "RECALLED"]
     typing = Typing(talk, "say", "--lines")  # without --wait, its goals continue
     typing.type(f"{ENDLESS}\nsecond\n")
@@ -334,7 +329,7 @@ def test_a_line_that_waits_for_room_is_not_spoken_after_a_signal(make_talk: Make
     talk = make_talk("--max-queue", "1", scripted=True)
     typing = Typing(talk, "say", "--lines", *words)
     typing.type(ENDLESS + "second\nthird\nfourth\n")
-    talk.watcher.wait_until(lambda each: bool(each.get("goal")) and each["goal"]["text"] == "second")
+    talk.watcher.wait_until(lambda event: bool(event.get("goal")) and event["goal"]["text"] == "second")
     # The client may not have its reply yet, and the third line causes no event.
     code, out, err = typing.end(signal.SIGINT)
     assert code == 130
@@ -342,8 +337,8 @@ def test_a_line_that_waits_for_room_is_not_spoken_after_a_signal(make_talk: Make
     assert talk.watcher.texts("ACTIVE") == [ENDLESS.rstrip()]
     assert talk.watcher.texts("PENDING")[:2] == [ENDLESS.rstrip(), "second"]
     if "--json" in words:
-        last = [json.loads(each) for each in out][-2:]
-        states = [each["goal"]["state"] if "event" in each else each["state"] for each in last]
+        last = [json.loads(line) for line in out][-2:]
+        states = [result["goal"]["state"] if "event" in result else result["state"] for result in last]
         assert sorted(states) == ["PREEMPTED", "RECALLED"]
     assert talk.run("--json", "status").out.count('"PENDING"') == 0
 
@@ -356,11 +351,11 @@ def test_the_timeout_applies_to_all_lines_together(scripted: Talk) -> None:
     assert code == 124
     assert "Talk preempted" in err
     assert err.splitlines()[-1] == "talk: timed out after 0.5 s"
-    assert [scripted.watcher.wait_for_terminal(each) for each in ids] == ["PREEMPTED", "RECALLED"]
-    began = time.monotonic()
+    assert [scripted.watcher.wait_for_terminal(goal_id) for goal_id in ids] == ["PREEMPTED", "RECALLED"]
+    started_at = time.monotonic()
     silent = Typing(scripted, "say", "--lines", "-w", "-t", "0.2")
     assert silent.client.wait(10) == 124  # without any input or goals
-    assert time.monotonic() - began >= 0.2
+    assert time.monotonic() - started_at >= 0.2
     assert scripted.run("say", "--lines", "-w", "-t", "1e300", stdin="length=0\n").code == 0
 
 
@@ -375,7 +370,7 @@ def test_the_client_exits_if_the_server_goes_away(scripted: Talk, words: list[st
     _, out, err = typing.end()
     assert "lost the connection to the server" in err
     assert ("may still be spoken" in err) == bool(words)
-    assert [each for each in out if "LOST" in each] == ([f"{first} LOST"] if words == ["-f"] else [])
+    assert [line for line in out if "LOST" in line] == ([f"{first} LOST"] if words == ["-f"] else [])
 
 
 def test_a_lost_idle_server_is_reported_with_the_next_line(scripted: Talk) -> None:
@@ -433,14 +428,15 @@ def test_the_clients_goals_are_cancelled_if_its_reader_goes_away(scripted: Talk,
         assert client.stdin
         client.stdin.write(f"{ENDLESS}second\n")
         client.stdin.flush()
-        second = scripted.watcher.wait_until(lambda each: bool(each.get("goal")) and each["goal"]["text"] == "second")
+        second = scripted.watcher.wait_until(lambda event: (event.get("goal") or {}).get("text") == "second")
         first = scripted.watcher.goals()[0]
         scripted.watcher.wait_for_word(first)
         if ended:
             client.stdin.close()
         os.close(reader)
         assert client.wait(10) == 141
-    assert [scripted.watcher.wait_for_terminal(each) for each in (first, second["id"])] == ["PREEMPTED", "RECALLED"]
+    assert scripted.watcher.wait_for_terminal(first) == "PREEMPTED"
+    assert scripted.watcher.wait_for_terminal(second["id"]) == "RECALLED"
 
 
 def test_an_unreadable_standard_input_is_reported(scripted: Talk) -> None:

@@ -57,23 +57,23 @@ def test_contradictions_and_values_out_of_range_are_usage_errors(words: list[str
     """`tests/golden/errors.txt` has many more cases."""
     done = alone("say", *words)
     assert (done.code, done.out) == (2, ""), done
-    assert [each for each in hints if each not in done.err] == [], done.err
+    assert [hint for hint in hints if hint not in done.err] == [], done.err
 
 
 def test_preempt_queue_flush_and_priority_reach_the_server(make_talk: MakeTalk) -> None:
     talk = make_talk("--preempt", scripted=True)
     first = busy(talk)
-    queued = [talk.run("say", "--queue", "--priority", each, "length=0").id for each in ("-1", "0", "5")]
-    assert [talk.watcher.states(each) for each in queued] == [["PENDING"]] * 3
+    queued = [talk.run("say", "--queue", "--priority", priority, "length=0").id for priority in ("-1", "0", "5")]
+    assert [talk.watcher.states(goal_id) for goal_id in queued] == [["PENDING"]] * 3
     assert talk.run("say", "--wait", "--preempt", "--priority", "9", "length=0").code == 0
     assert talk.watcher.wait_for_terminal(first) == "PREEMPTED"
-    assert {talk.watcher.wait_for_terminal(each) for each in queued} == {"SUCCEEDED"}
-    begun = [each["id"] for each in talk.watcher.events() if each.get("state") == "ACTIVE"]
+    assert {talk.watcher.wait_for_terminal(goal_id) for goal_id in queued} == {"SUCCEEDED"}
+    begun = [event["id"] for event in talk.watcher.events() if event.get("state") == "ACTIVE"]
     assert begun[2:] == queued[::-1]
     first = busy(talk)
-    pending, important = (talk.run("say", "--queue", "--priority", each, "length=0").id for each in ("0", "1"))
+    pending, important = (talk.run("say", "--queue", "--priority", priority, "length=0").id for priority in ("0", "1"))
     assert talk.run("say", "--wait", "--flush", "length=0 now").code == 0
-    ends = [talk.watcher.wait_for_terminal(each) for each in (first, pending, important)]
+    ends = [talk.watcher.wait_for_terminal(goal_id) for goal_id in (first, pending, important)]
     assert ends == ["PREEMPTED", "RECALLED", "SUCCEEDED"]
 
 
@@ -194,8 +194,8 @@ def test_output_writes_a_file_without_a_server(tmp_path: Path) -> None:
     file = tmp_path / "said.wav"
     done = alone("say", "-o", str(file), "--", "battery", "low")
     assert (done.code, done.out, done.err) == (0, "", "")
-    with wave.open(str(file)) as found:
-        seconds = found.getnframes() / found.getframerate()
+    with wave.open(str(file)) as audio:
+        seconds = audio.getnframes() / audio.getframerate()
     report = json.loads(alone("--json", "say", "-o", str(file), "battery low").out)
     assert report["output"] == str(file)
     assert report["text"] == "battery low"
@@ -250,8 +250,8 @@ def test_output_accepts_a_text_of_any_length(tmp_path: Path) -> None:
         )
     report = json.loads(by_input.stdout)
     assert (by_input.returncode, report["text"]) == (0, text)
-    with wave.open(str(tmp_path / "x.wav")) as found:
-        assert found.getnframes() / found.getframerate() == pytest.approx(report["seconds"], abs=0.01)
+    with wave.open(str(tmp_path / "x.wav")) as audio:
+        assert audio.getnframes() / audio.getframerate() == pytest.approx(report["seconds"], abs=0.01)
 
 
 def test_the_error_for_a_long_text_suggests_lines(scripted: Talk) -> None:

@@ -34,8 +34,8 @@ def in_terminal(scripted: Talk) -> Iterator[Run]:
         return opened[-1]
 
     yield start
-    for each in opened:
-        each.close()
+    for terminal in opened:
+        terminal.close()
 
 
 def painted(terminal: Terminal, columns: int = 80) -> Iterator[Screen]:
@@ -83,7 +83,7 @@ def test_a_long_text_scrolls_and_is_shown_whole_at_the_end(scripted: Talk, in_te
     assert len(set(lit)) > 20
     goal_id = scripted.watcher.goals()[0]
     whole = f"{goal_id}  SUCCEEDED  {text}"
-    assert "".join(each.ljust(50) for each in terminal.screen.lines).rstrip() == whole
+    assert "".join(line.ljust(50) for line in terminal.screen.lines).rstrip() == whole
 
 
 @pytest.mark.parametrize("columns", [5, 30])
@@ -161,7 +161,7 @@ def test_a_terminal_without_colour_gets_one_line_per_event(scripted: Talk, in_te
     assert terminal.finish() == 0
     goal_id = scripted.watcher.goals()[0]
     events = ["PENDING", "ACTIVE", "word 1 0-10 0.000 length=0.2", "word 2 11-14 0.100 low", "SUCCEEDED"]
-    assert terminal.screen.lines == [*(f"{goal_id} {each}" for each in events), ""]
+    assert terminal.screen.lines == [*(f"{goal_id} {event}" for event in events), ""]
     assert b"\x1b" not in terminal.raw
 
 
@@ -177,9 +177,9 @@ def test_wait_shows_the_active_goal_and_all_results(scripted: Talk, in_terminal:
     terminal.wait_until(lambda screen: screen.last == f"{first}  ACTIVE     never-ends words=1 first")
     scripted.run("cancel", first)
     assert terminal.finish() == 6  # the first goal's exit code
-    shown = [each.split("  ")[0:2] for each in terminal.screen.lines[:3]]
+    shown = [line.split("  ")[0:2] for line in terminal.screen.lines[:3]]
     assert shown == [[third, "RECALLED"], [first, "PREEMPTED"], [second, "SUCCEEDED"]]
-    assert [each[:5] for each in terminal.screen.lines[3:]] == ["talk:", "talk:", ""]
+    assert [line[:5] for line in terminal.screen.lines[3:]] == ["talk:", "talk:", ""]
 
 
 def test_typed_lines_are_highlighted_one_after_the_other(scripted: Talk, in_terminal: Run) -> None:
@@ -189,11 +189,11 @@ def test_typed_lines_are_highlighted_one_after_the_other(scripted: Talk, in_term
     terminal.resize(90)
     terminal.type(b"\0\nlength=0.1 two\n\x04")
     assert terminal.finish() == 5
-    first, second = (each for each in scripted.watcher.goals() if "ACTIVE" in scripted.watcher.states(each))
+    first, second = (goal for goal in scripted.watcher.goals() if "ACTIVE" in scripted.watcher.states(goal))
     lines = terminal.screen.lines
     assert f"{first}  SUCCEEDED  length=0.5 words=1 one" in lines
     assert f"{second}  SUCCEEDED  length=0.1 two" in lines
-    assert [each for each in lines if each.startswith("talk: line 2: ")] != []
+    assert [line for line in lines if line.startswith("talk: line 2: ")] != []
     assert lines[-1] == ""
     assert terminal.screen.attributes == ""
 
@@ -231,7 +231,7 @@ def test_a_sentence_is_cut_around_the_current_word() -> None:
 
 
 def test_wide_characters_take_two_columns() -> None:
-    assert [width(each) for each in ("a", "日", "ｱ", "Ａ", "👩", "e\u0301", "…")] == [1, 2, 1, 2, 2, 1, 1]
+    assert [width(character) for character in ("a", "日", "ｱ", "Ａ", "👩", "e\u0301", "…")] == [1, 2, 1, 2, 2, 1, 1]
     assert width("❤\ufe0f") == width("🇩🇪") / 2 == 2  # some terminals use fewer columns, none uses more
     heard, lit, ahead = MeasuredText("日本語" * 10).view(12, 15, 11)
     assert width(heard + lit + ahead) <= 11
@@ -250,7 +250,7 @@ def test_the_view_fits_the_terminal_and_is_always_printable(text: str, start: in
     heard, lit, ahead = sentence.view(start, start + length, columns)
     shown = heard + lit + ahead
     assert width(shown) <= max(0, columns)
-    assert shown.isprintable() or all(each.isprintable() or each in "\u0301\ufe0f" for each in shown)
+    assert shown.isprintable() or all(character.isprintable() or character in "\u0301\ufe0f" for character in shown)
     if width(sentence.whole) <= columns:
         assert shown == sentence.whole
     elif columns >= 15 and 0 <= start < len(text) and length > 0:

@@ -64,8 +64,8 @@ class Pair:
     def __init__(self) -> None:
         ours, self.client = socket.socketpair()
         self.socket = CountingSocket(fileno=ours.detach())
-        for each in (self.socket, self.client):
-            each.setblocking(False)
+        for end in (self.socket, self.client):
+            end.setblocking(False)
         self.recorder = Recorder()
         self.stream = ClientStream(ClientStreams(), self.socket, self.recorder)
 
@@ -267,10 +267,10 @@ async def test_the_client_with_the_largest_backlog_is_dropped_at_the_limit(monke
         pairs[0].stream.write(b"x" * 1_000)
         pairs[1].stream.count_held(1_500)  # like a list that the client doesn't read
         pairs[1].stream.count_held(500)
-        assert not any(each.stream.closing for each in pairs)
+        assert not any(pair.stream.closing for pair in pairs)
         pairs[2].stream.write(b"x" * 1_000)
         await until_lost(pairs[1])
-        assert [each.stream.closing for each in pairs] == [False, True, False]
+        assert [pair.stream.closing for pair in pairs] == [False, True, False]
         assert streams.unread_bytes == 2 * (1_000_000 - taken) + 2_000
         pairs[1].stream.count_held(-2_000)  # must have no effect after the stream has ended
         assert len(pairs[0].receive()) == taken

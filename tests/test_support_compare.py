@@ -94,9 +94,9 @@ def test_a_sentence_is_recognised_despite_gaps_and_lost_samples(low: Samples) ->
         for wrong in (low[at + 9000 :], low[at + 5000 :]):
             with pytest.raises(AssertionError):
                 assert_heard(recorded(begun, wrong), [low])
-    for each in heard:
-        assert compare(recorded(each), low).same
-        assert_heard(recorded(each), [low])
+    for samples in heard:
+        assert compare(recorded(samples), low).same
+        assert_heard(recorded(samples), [low])
     assert_heard(recorded(heard[-1], SILENCE, low), [low, low])
 
 
@@ -107,7 +107,7 @@ def test_a_wrong_sentence_is_detected(low: Samples) -> None:
     gap = np.concatenate([low[:9000], zeros(3000), low[12000:]])
     lost = np.delete(low, slice(9000, 9240))
     twice = np.delete(low, [*range(9000, 9072), *range(15000, 15072)])
-    wrong = [(each, low) for each in (*cut, gap, stutter, lost, twice, low_it)]
+    wrong = [(samples, low) for samples in (*cut, gap, stutter, lost, twice, low_it)]
     for heard, expected in [*wrong, (right, left)]:
         with pytest.raises(AssertionError, match="not heard correctly"):
             assert_heard(recorded(heard), [expected])
@@ -200,7 +200,7 @@ def test_quiet_samples_next_to_a_pause_belong_to_the_sentence() -> None:
 
 def test_similarity_distinguishes_sentences_whose_samples_vary() -> None:
     """One process speaks the sentence a fifth time, with a gap because the player ran dry."""
-    low, left, right = (Sentence(each, rate=450) for each in (LOW, LEFT, RIGHT))
+    low, left, right = (Sentence(text, rate=450) for text in (LOW, LEFT, RIGHT))
     first, *_, again = render([low, left, right, left, low])
     gap = zeros(RATE // 40)
     for at in (4_000, 13_000):

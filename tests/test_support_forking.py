@@ -57,11 +57,11 @@ def test_a_forked_command_ends_like_a_started_one(env: dict[str, str]) -> None:
         (["sya"], 2, "", "did you mean"),
         (["status"], 3, "", "talk serve"),
     ):
-        found = run_forked(words, env)
-        assert (found[0], found[1].startswith(out), err in found[2]) == (code, True, True), found
+        result = run_forked(words, env)
+        assert (result[0], result[1].startswith(out), err in result[2]) == (code, True, True), result
         command = [sys.executable, "-m", "talkcli", *words]
         started = subprocess.run(command, env=env, capture_output=True, text=True, timeout=LIMIT_S, check=False)
-        assert found == (started.returncode, started.stdout, started.stderr)
+        assert result == (started.returncode, started.stdout, started.stderr)
 
 
 def test_an_early_signal_is_not_lost(env: dict[str, str]) -> None:
@@ -101,12 +101,12 @@ def test_sigint_and_sigterm_give_the_exit_codes_of_a_shell(env: dict[str, str]) 
 def test_input_environment_and_directory_can_be_set(env: dict[str, str], tmp_path: pathlib.Path) -> None:
     assert env["TALK_SOCKET"] in run_forked(["status"], env)[2]
     assert env["TALK_SOCKET"] not in run_forked(["status"], {**env, "TALK_SOCKET": "/nowhere/else"})[2]
-    for each in ("one", "two"):
-        (tmp_path / each).mkdir()
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
         with pytest.MonkeyPatch.context() as patch:
-            patch.chdir(tmp_path / each)
+            patch.chdir(tmp_path / name)
             assert run_forked(["say", "-o", "here.wav", "-"], env, "grün, 日本\n") == (0, "", "")
-        assert (tmp_path / each / "here.wav").stat().st_size > 1000
+        assert (tmp_path / name / "here.wav").stat().st_size > 1000
 
 
 def test_a_forked_server_dies_with_its_parent(env: dict[str, str]) -> None:

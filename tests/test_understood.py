@@ -82,9 +82,9 @@ def test_a_neural_voice_is_understood_as_well_as_espeak(make_talk: MakeTalk, sin
         for voice, mistakes in wrong.items():
             with sink.record() as recording:
                 say(talk, sentence, voice)
-            found = recognize(recording.samples, SENTENCES)
-            if found != sentence:
-                mistakes.append((sentence, found))
+            recognised = recognize(recording.samples, SENTENCES)
+            if recognised != sentence:
+                mistakes.append((sentence, recognised))
     assert len(wrong[REAL_VOICE]) <= min(1, len(wrong[ESPEAK])), wrong
 
 

@@ -58,7 +58,7 @@ class Client:
 
     def goals(self) -> list[str]:
         """Return the texts of the goals in the recorded replies."""
-        return [str(cast("Any", each)["goal"]["text"]) for each in self.replies]
+        return [str(cast("Any", reply)["goal"]["text"]) for reply in self.replies]
 
 
 class Engine:
@@ -160,7 +160,7 @@ async def test_the_memory_for_all_waiting_requests_is_limited() -> None:
 
 
 @pytest.mark.parametrize(
-    "request_", [Say("w", data={"a": [[] for _ in range(300)]}), Wait(ids=tuple(f"{each}" for each in range(400)))]
+    "request_", [Say("w", data={"a": [[] for _ in range(300)]}), Wait(ids=tuple(f"{number}" for number in range(400)))]
 )
 @in_loop
 async def test_small_values_are_counted_with_their_real_memory_use(request_: Say | Wait) -> None:
@@ -278,13 +278,13 @@ async def test_a_new_watcher_gets_only_events_after_its_snapshot(monkeypatch: py
     server, watcher = Server(count), Client()
     server.fill(1 + count)
     server.ask(Client(), Cancel(before=f"4k7f-{count + 1}"))
-    told: list[str] = []
+    numbers: list[str] = []
     subscribed = server.speech.subscribers
-    monkeypatch.setattr(subscribed, "watch", lambda _: told.append(str(subscribed._numbers)))
+    monkeypatch.setattr(subscribed, "watch", lambda _: numbers.append(str(subscribed._numbers)))
     server.ask(watcher, Watch())
-    assert (told, server.speech.notifications.done) == ([], False)
+    assert (numbers, server.speech.notifications.done) == ([], False)
     await all_notified(server.speech.notifications)
-    assert told == [str(subscribed._numbers)]
+    assert numbers == [str(subscribed._numbers)]
 
 
 @in_loop
@@ -319,16 +319,16 @@ async def test_the_wait_for_clients_that_do_not_read_is_limited(monkeypatch: pyt
 
 @in_loop
 async def test_nested_notifications_are_sent_in_order_despite_a_bug() -> None:
-    told: list[str] = []
+    sent: list[str] = []
     notifications = Notifications(cast("Any", Readers()))
 
     def first() -> None:
-        told.append("first")
-        notifications.add([lambda: told.append("of the first")])
+        sent.append("first")
+        notifications.add([lambda: sent.append("of the first")])
         raise ZeroDivisionError("a bug")
 
-    notifications.add([first, lambda: told.append("second")])
-    assert told == ["first", "of the first", "second"]
+    notifications.add([first, lambda: sent.append("second")])
+    assert sent == ["first", "of the first", "second"]
 
 
 class _RecordingEngine:
@@ -359,8 +359,8 @@ async def test_many_words_at_once_do_not_block_clients() -> None:
     words = [protocol.Word("4k7f-1", 0, 1, number, 0.0) for number in range(count)]
 
     def post_all() -> None:
-        for each in words:
-            served.report(each)
+        for word in words:
+            served.report(word)
 
     thread = threading.Thread(target=post_all)
     thread.start()

@@ -67,7 +67,7 @@ def test_in_a_pipe_every_event_is_printed_at_once_as_a_full_line(scripted: Talk)
     watch.next("PREEMPTING")
     assert re.search(rf'PREEMPTED   {goal_id} +"{LONG}"  canceled by .*, pid \d+$', watch.next("PREEMPTED"))
     assert watch.end() == 130
-    assert not any("\x1b" in each or "never-ends  " in each or " word " in each for each in watch.lines)
+    assert not any("\x1b" in line or "never-ends  " in line or " word " in line for line in watch.lines)
 
 
 def test_watch_starts_with_the_current_goals(scripted: Talk) -> None:
@@ -90,9 +90,9 @@ def test_words_are_shown_with_feedback(scripted: Talk) -> None:
     watch = Lines(scripted, "-f")
     goal_id = scripted.run("say", "battery low\x1b[m").id
     watch.next("SUCCEEDED")
-    words = [each for each in watch.lines if "  word  " in each]
+    words = [line for line in watch.lines if "  word  " in line]
     heads = rf"\S+  word        {number(goal_id)} +"
-    assert [re.sub(heads, "", each) for each in words] == ["battery  0.00 s", r"low\x1b[m  0.05 s"]
+    assert [re.sub(heads, "", line) for line in words] == ["battery  0.00 s", r"low\x1b[m  0.05 s"]
     assert watch.end() == 130
 
 
@@ -105,7 +105,7 @@ def test_json_prints_the_protocols_events(scripted: Talk) -> None:
     watch.next("SUCCEEDED")
     assert watch.end() == 130
     scripted.watcher.wait_for_terminal(goal_id)
-    assert [json.loads(each) for each in watch.lines[1:]] == scripted.watcher.events()
+    assert [json.loads(line) for line in watch.lines[1:]] == scripted.watcher.events()
 
 
 def test_the_clients_that_paused_and_resumed_are_shown(scripted: Talk) -> None:

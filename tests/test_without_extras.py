@@ -39,11 +39,11 @@ def test_servers_and_clients_import_no_fleet_modules(tmp_path: Path) -> None:
             for command in COMMANDS:
                 done = run([*TALK, *command], env)
                 assert done.code == 0, done
-    found = imported(tmp_path)
-    assert len(found) > len(COMMANDS)
-    for names in found.values():
+    modules = imported(tmp_path)
+    assert len(modules) > len(COMMANDS)
+    for names in modules.values():
         assert "talkcli" in names
-        assert not {each for each in names if f"{each}.".startswith(("paho.", "talkcli.fleet."))}
+        assert not {name for name in names if f"{name}.".startswith(("paho.", "talkcli.fleet."))}
 
 
 @pytest.mark.parametrize(
@@ -63,7 +63,7 @@ def test_without_the_extra_fleet_commands_name_the_missing_package(words: list[s
 
 
 #: Modules that only neural voices use. A server needs the other `NEURAL_MODULES` anyway.
-NEURAL_ONLY = {*NEURAL_PACKAGES, *(each for each in NEURAL_MODULES if each.startswith("talkcli."))}
+NEURAL_ONLY = {*NEURAL_PACKAGES, *(name for name in NEURAL_MODULES if name.startswith("talkcli."))}
 #: How much the memory of two starts may differ.
 SLACK_KB = 400
 CLIENT_COMMANDS = (["voices"], ["status"], ["say", "--wait", "hello"])
@@ -95,26 +95,26 @@ def measure(directory: Path, *options: str, without: Sequence[str] = ()) -> Cost
             (engine,) = children(pid)
             counted = usage.wait_until(pid, lambda now: now.processes == 2)
             threads = len(os.listdir(f"/proc/{engine}/task"))
-    found = imported(directory)
-    clients = frozenset().union(*(names for each, names in found.items() if each not in {pid, engine}))
-    return Cost(found[pid], found[engine], clients, counted, threads)
+    modules = imported(directory)
+    clients = frozenset().union(*(names for process, names in modules.items() if process not in {pid, engine}))
+    return Cost(modules[pid], modules[engine], clients, counted, threads)
 
 
 def test_unused_neural_packages_cost_no_imports_threads_or_memory(tmp_path: Path) -> None:
     needs_packages(*NEURAL_PACKAGES)
     installed, missing = measure(tmp_path / "with"), measure(tmp_path / "without", without=NEURAL_PACKAGES)
-    assert all("talkcli" in each for each in (installed.server, installed.engine, installed.clients))
+    assert all("talkcli" in modules for modules in (installed.server, installed.engine, installed.clients))
     assert (installed.server | installed.engine | installed.clients) & NEURAL_ONLY == set()
     assert installed.engine & {*NEURAL_MODULES} == set()
-    for each in ("server", "engine", "clients", "threads"):
-        assert getattr(installed, each) == getattr(missing, each)
-    for each in ("processes", "threads"):
-        assert getattr(installed.counted, each) == getattr(missing.counted, each)
+    for field in ("server", "engine", "clients", "threads"):
+        assert getattr(installed, field) == getattr(missing, field)
+    for field in ("processes", "threads"):
+        assert getattr(installed.counted, field) == getattr(missing.counted, field)
     assert installed.counted.memory == pytest.approx(missing.counted.memory, abs=SLACK_KB)
 
 
 def test_only_the_engine_imports_modules_for_a_neural_voice(tmp_path: Path) -> None:
     needs_packages(*NEURAL_PACKAGES)
-    found = measure(tmp_path, "--voice", "piper/tiny")
-    assert {*NEURAL_PACKAGES} <= found.engine
-    assert (found.server | found.clients) & NEURAL_ONLY == set()
+    cost = measure(tmp_path, "--voice", "piper/tiny")
+    assert {*NEURAL_PACKAGES} <= cost.engine
+    assert (cost.server | cost.clients) & NEURAL_ONLY == set()
