@@ -62,7 +62,7 @@ def serving(path: str, *greetings: bytes) -> Iterator[None]:
 
 
 class Waits:
-    """Replaces the pauses between attempts with calls of `act`, and records the length of all waits."""
+    """A replacement for `wait_ready` that calls `act` instead of pausing, and records the length of all waits."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, act: Callable[[int], object] = lambda _: None) -> None:
         self.pauses: list[float] = []

@@ -138,8 +138,8 @@ def test_standard_output_contains_only_data(scripted: Talk) -> None:
 
 
 def test_options_work_before_and_after_the_command(scripted: Talk) -> None:
-    for words in (["--socket", scripted.socket, "status"], ["status", "--socket", scripted.socket]):
-        done = run([*TALK, *words], {**scripted.env, "TALK_SOCKET": "/nowhere"})
+    for arguments in (["--socket", scripted.socket, "status"], ["status", "--socket", scripted.socket]):
+        done = run([*TALK, *arguments], {**scripted.env, "TALK_SOCKET": "/nowhere"})
         assert done.code == 0, done.err
         assert f"pid {scripted.pid}" in done.out
     assert run([*TALK, "status"], {**scripted.env, "TALK_SOCKET": "/nowhere"}).code == 3
@@ -154,16 +154,16 @@ def local(scripted: Talk, tmp_path: Path) -> dict[str, str]:
 
 
 def test_an_empty_socket_option_is_refused(scripted: Talk, local: dict[str, str]) -> None:
-    for words in (["--socket", "", "say", "hello"], ["--socket=", "cancel"], ["serve", "--socket", ""]):
-        done = run([*TALK, *words], local)
+    for arguments in (["--socket", "", "say", "hello"], ["--socket=", "cancel"], ["serve", "--socket", ""]):
+        done = run([*TALK, *arguments], local)
         assert (done.code, done.out) == (2, "")
         assert "--socket: must not be empty; check the variable that it comes from" in done.err
     assert scripted.watcher.goals() == []
 
 
 def test_empty_variables_count_as_unset(scripted: Talk, local: dict[str, str]) -> None:
-    for words in (["say", "length=0"], ["say", "--lines"], ["wait"], ["status"], ["voices"]):
-        done = run([*TALK, *words], {**local, "TALK_NAME": ""})
+    for arguments in (["say", "length=0"], ["say", "--lines"], ["wait"], ["status"], ["voices"]):
+        done = run([*TALK, *arguments], {**local, "TALK_NAME": ""})
         assert done.code == 0, done
     assert scripted.goal(scripted.watcher.goals()[0])["client"]["name"] is None
     with pytest.MonkeyPatch.context() as patch:
@@ -186,8 +186,8 @@ def test_an_invalid_utf8_name_prevents_speech_but_not_cancel(scripted: Talk, loc
 
 def test_arguments_and_output_are_utf8_in_every_locale(scripted: Talk) -> None:
     ascii_only = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0", "TALK_NAME": "é"}
-    words = ["say", "-w", "--key", "日", "--", "length=0 a\udcff b é"]
-    done = run([*TALK, *words], {**scripted.env, **ascii_only})
+    arguments = ["say", "-w", "--key", "日", "--", "length=0 a\udcff b é"]
+    done = run([*TALK, *arguments], {**scripted.env, **ascii_only})
     assert (done.code, done.err) == (
         0,
         "talk: line 1, column 11: the byte 0xff is not valid UTF-8, so it is not spoken\n",
@@ -207,7 +207,8 @@ def test_text_from_others_is_always_escaped(scripted: Talk) -> None:
     scripted.run("say", "--wait", "--as", "b\x1b]0;title\x07", "-t", "0.1", "--", f"{HOSTILE} pending")
     shown = [scripted.run("status").out, scripted.run("status", goal_id).out]
     # If a script forgets the quotes, talk takes text for commands, options or ids.
-    shown += [scripted.run(*words, HOSTILE).err for words in (["wait"], ["cancel"], ["status"], ["cancel", "--before"])]
+    commands = (["wait"], ["cancel"], ["status"], ["cancel", "--before"])
+    shown += [scripted.run(*command, HOSTILE).err for command in commands]
     shown += [scripted.run(HOSTILE).err, scripted.run("say", f"--{HOSTILE}").err, scripted.run("voices", HOSTILE).err]
     shown += [scripted.run("voices", "--language", HOSTILE).err, scripted.log]
     for text in shown:
@@ -221,8 +222,8 @@ def test_text_from_others_is_always_escaped(scripted: Talk) -> None:
 def test_json_on_a_terminal_is_escaped_without_changing_its_meaning(scripted: Talk, command: list[str]) -> None:
     text = f'length=0 {HOSTILE} \x9b31m \x7f \ue000 \U000e0001 "quoted" \\ Grüße 日本 👩'
     scripted.run("say", "--wait", "--id", "shared", "--as", "\u202epatrol", "--", text)
-    words = ["--json", *command, *(["--", text] if command[0] == "say" else [])]
-    with Terminal([*TALK, *words], scripted.env) as shown:
+    arguments = ["--json", *command, *(["--", text] if command[0] == "say" else [])]
+    with Terminal([*TALK, *arguments], scripted.env) as shown:
         shown.wait_for("\n")
         if command == ["watch"]:
             shown.type(b"\x03")
@@ -233,8 +234,8 @@ def test_json_on_a_terminal_is_escaped_without_changing_its_meaning(scripted: Ta
         assert part in line
     assert json.dumps(text)[1:-1] in json.dumps(json.loads(line))
     if command != ["watch"]:  # a program gets the text unchanged
-        assert json.loads(scripted.run(*words).out)
-        assert "\x9b31m \x7f" in scripted.run(*words).out
+        assert json.loads(scripted.run(*arguments).out)
+        assert "\x9b31m \x7f" in scripted.run(*arguments).out
 
 
 def test_colours_are_used_only_on_terminals(scripted: Talk) -> None:
@@ -257,8 +258,8 @@ def test_colours_are_used_only_on_terminals(scripted: Talk) -> None:
 def test_standard_input_is_read_only_on_request(scripted: Talk) -> None:
     assert json.loads(scripted.run("--json", "say", "-", stdin="one\ntwo\n").out)["text"] == "one\ntwo"
     assert json.loads(scripted.run("--json", "say", "-", "and", stdin="unread").out)["text"] == "- and"
-    for words in (["say", "hello"], ["status"], ["cancel"], ["wait"]):
-        client = scripted.start(*words, stdin=subprocess.PIPE)  # never closed
+    for arguments in (["say", "hello"], ["status"], ["cancel"], ["wait"]):
+        client = scripted.start(*arguments, stdin=subprocess.PIPE)  # never closed
         assert client.wait(10) == 0
 
 

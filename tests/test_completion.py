@@ -65,7 +65,7 @@ def offered(line: str, env: Mapping[str, str]) -> list[tuple[str, str]]:
     done = run(TALK, {**env, **request})
     assert (done.code in {0, 1}, done.err) == (True, ""), done
     lines = [line.removeprefix("plain,").partition("\t") for line in done.out.splitlines() if line]
-    return [(value, words) for value, _, words in lines]
+    return [(value, text) for value, _, text in lines]
 
 
 def values(line: str, talk: Talk) -> list[str]:
@@ -162,9 +162,9 @@ def test_keys_and_voices_are_offered(busy: tuple[Talk, list[str]]) -> None:
 
 def test_long_texts_are_shortened_and_untypable_keys_are_omitted(scripted: Talk) -> None:
     scripted.request("say", text=f"never-ends {'x' * 1000}", key="a\x1b[31mb")
-    ((_, words),) = offered("talk cancel ", scripted.env)
-    assert len(words) < 80
-    assert words.endswith("…")
+    ((_, text),) = offered("talk cancel ", scripted.env)
+    assert len(text) < 80
+    assert text.endswith("…")
     scripted.request("say", text="waits", key="two\nlines")
     scripted.request("say", text="waits", key="fine")
     assert values("talk cancel --key ", scripted) == ["fine"]

@@ -74,10 +74,10 @@ def no_server(named: str | None = None) -> Finding:
 def test_the_state_of_each_usual_socket_path_is_described(home: str) -> None:
     path = f"{home}/run/talk/talk.sock"
 
-    def check(words: str, step: str) -> None:
+    def check(message: str, step: str) -> None:
         finding = no_server()
         others = ("/run/talk/talk.sock: not found", f"{home}/runtime-{os.getuid()}/talk/talk.sock: not found")
-        assert [part for part in (f"{path}: {words}", *others) if part not in finding.message] == []
+        assert [part for part in (f"{path}: {message}", *others) if part not in finding.message] == []
         assert finding.next == step
 
     check("not found", "talk serve")
@@ -102,17 +102,17 @@ def test_a_talk_socket_that_is_not_a_socket_is_reported(home: str) -> None:
 
 @pytest.mark.usefixtures("nobody_serves")
 @pytest.mark.parametrize(
-    ("greeting", "words", "step"),
+    ("greeting", "message", "step"),
     [
         ("220 mail ready", "is not a talk server", "restart the server on"),
         ('{"talk": 2, "version": "9"}', "upgrade", "install the same version of talk"),
         ('{"talk": 1, "error": "permission_denied"}', "refused", "--socket-mode 0660"),
     ],
 )
-def test_a_process_that_admits_no_client_is_reported(home: str, greeting: str, words: str, step: str) -> None:
+def test_a_process_that_admits_no_client_is_reported(home: str, greeting: str, message: str, step: str) -> None:
     with FakeServer(f"{home}/s", [f"{greeting}\n".encode()], closes=True):
         finding = no_server(f"{home}/s")
-    assert words in finding.message
+    assert message in finding.message
     assert step in str(finding.next)
 
 
@@ -159,7 +159,7 @@ def test_another_users_server_is_reported_and_receives_no_data(home: str) -> Non
 
 
 def engine_fault(directory: Path, named: str | None = None) -> Finding:
-    """Return why an engine process can't start that searches this directory first for modules and libraries."""
+    """Return the fault of an engine process that searches this directory first for modules and libraries."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(directory)
         env = environment(str(directory), LD_LIBRARY_PATH=str(directory))
@@ -175,7 +175,7 @@ def test_the_reason_why_an_engine_cannot_start_is_reported(tmp_path: Path) -> No
     assert (finding.check, 'unknown voice "klingon-7"' in finding.message) == ("voices", True)
     (tmp_path / "libespeak-ng.so.1").write_bytes(b"no library")
     library = os.path.join(os.path.dirname(espeakng_loader.__file__), "libespeak-ng.so")
-    for name, text, words in (
+    for name, text, message in (
         ("espeakng_loader", "raise ModuleNotFoundError('', name='espeakng_loader')", "libespeak-ng is missing"),
         (
             "espeakng_loader",
@@ -186,7 +186,7 @@ def test_the_reason_why_an_engine_cannot_start_is_reported(tmp_path: Path) -> No
     ):
         write(tmp_path / f"{name}.py", f"{text}\n")
         finding = engine_fault(tmp_path)
-        assert (finding.check, words in finding.message) == ("libespeak-ng", True), finding
+        assert (finding.check, message in finding.message) == ("libespeak-ng", True), finding
         assert "apt-get install" in str(finding.next)
         (tmp_path / f"{name}.py").unlink()
 

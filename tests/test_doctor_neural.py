@@ -87,8 +87,8 @@ def test_faulty_files_are_reported_one_by_one_with_the_next_step(alone: dict[str
     files = _found(None, alone)["voice files"]
     assert files.state == WARNING
     json, model = f"{place}/a.onnx.json", f"{place}/a.onnx"
-    words = f"piper/a: {json} and {model} can be changed by other users, which is unsafe"
-    assert files.message == f"{words}; also faulty: piper/b, piper/c"
+    message = f"piper/a: {json} and {model} can be changed by other users, which is unsafe"
+    assert files.message == f"{message}; also faulty: piper/b, piper/c"
     subprocess.run(["/bin/sh", "-c", str(files.next)], check=True)
     findings = _found(None, alone)
     assert findings["voice files"].message.startswith(f"piper/b: {place}/b.onnx.json does not exist")
@@ -97,7 +97,7 @@ def test_faulty_files_are_reported_one_by_one_with_the_next_step(alone: dict[str
 
 
 @pytest.mark.parametrize(
-    ("model", "speakers", "words", "step"),
+    ("model", "speakers", "message", "step"),
     [
         (b"no model", 1, "is not an ONNX model", "download the voice again, from a source that you trust"),
         (None, 2, "only one of them has several speakers", "download both again"),
@@ -105,30 +105,30 @@ def test_faulty_files_are_reported_one_by_one_with_the_next_step(alone: dict[str
     ids=["garbage", "wrong json"],
 )
 def test_the_fault_of_a_voice_that_cannot_speak_is_reported(
-    alone: dict[str, str], home: str, model: bytes | None, speakers: int, words: str, step: str
+    alone: dict[str, str], home: str, model: bytes | None, speakers: int, message: str, step: str
 ) -> None:
     tiny_voice.put(Path(home) / "v", "bad", model or tiny_voice.model(speakers=speakers))
     finding = _found("piper/bad", alone)["neural voice"]
     assert finding.state == FAILURE
     assert finding.message.startswith(f"piper/bad is in use: {home}/v/bad.onnx")
-    assert words in finding.message
+    assert message in finding.message
     assert finding.next == step
 
 
 @pytest.mark.parametrize(
-    ("code", "words", "step", "used"),
+    ("code", "message", "step", "used"),
     [
         ("os.kill(os.getpid(), 4)", "it was killed by SIGILL", "this processor is too old", "piper/tiny"),
         ("raise ImportError('no libgomp.so.1')", "ImportError: no libgomp.so.1", "install it again", None),
     ],
 )
-def test_a_broken_package_is_reported(tmp_path: Path, code: str, words: str, step: str, used: str | None) -> None:
+def test_a_broken_package_is_reported(tmp_path: Path, code: str, message: str, step: str, used: str | None) -> None:
     needs_packages(*NEURAL_PACKAGES)
     package = f"import os\nassert os.environ['ORT_DISABLE_TELEMETRY'] == '1'\n{code}\n"
     (tmp_path / "onnxruntime.py").write_text(package)
     findings = _found(used, {**os.environ, "PYTHONPATH": str(tmp_path)})
     assert findings["neural"].state == (FAILURE if used else WARNING)
-    assert re.match(f"onnxruntime .* cannot be imported: {re.escape(words)}$", findings["neural"].message)
+    assert re.match(f"onnxruntime .* cannot be imported: {re.escape(message)}$", findings["neural"].message)
     assert str(findings["neural"].next).startswith(step)
     assert "neural voice" not in findings
 
@@ -300,6 +300,6 @@ def test_a_failed_voice_is_a_warning_if_the_server_falls_back_to_espeak(
 
 
 def test_a_missing_package_is_reported_with_its_install_command() -> None:
-    words = f"the voice piper/a cannot be loaded: numpy is missing; install it with: {install.neural()}"
-    finding = voice.judge_engine("2.99", EngineReport(reason="unknown_voice", message=words), server=None)[-1]
+    message = f"the voice piper/a cannot be loaded: numpy is missing; install it with: {install.neural()}"
+    finding = voice.judge_engine("2.99", EngineReport(reason="unknown_voice", message=message), server=None)[-1]
     assert (finding.check, finding.next) == ("voices", install.neural())

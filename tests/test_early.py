@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 def start(path: str) -> subprocess.Popen[str]:
     """Start `talk say --wait hello` with the server at this path."""
     env = clean_environment(os.path.dirname(path), {"TALK_SOCKET": path})
-    words = [*TALK, "say", "--wait", "hello"]
-    return subprocess.Popen(words, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    command = [*TALK, "say", "--wait", "hello"]
+    return subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 @contextlib.contextmanager
@@ -140,8 +140,8 @@ def test_the_request_is_sent_before_the_client_is_imported(scripted: Talk) -> No
         "assert run({}) == 0\n"
         "print('click' in sys.modules)\n"
     )
-    for words in (["say", "--wait", "length=0"], ["status"], ["cancel"], ["pause"]):
-        done = run([sys.executable, "-c", code.format(words)], scripted.env)
+    for arguments in (["say", "--wait", "length=0"], ["status"], ["cancel"], ["pause"]):
+        done = run([sys.executable, "-c", code.format(arguments)], scripted.env)
         assert [done.out.splitlines()[index] for index in (0, -1) if done.out] == ["[]", "False"], done
 
 
@@ -158,14 +158,14 @@ def test_a_waiting_client_delays_its_imports(scripted: Talk) -> None:
         "from talkcli.cli import run\n"
         "assert run({}) == 0\n"
     )
-    for words, stands_back in (
+    for arguments, stands_back in (
         (["say", "--wait", "-q", "length=0.3"], True),
         (["say", "--wait", "--feedback", "-q", "length=0.3"], False),
         (["say", "-q", "length=0.3"], False),
         (["status", "-q"], False),
     ):
-        done = run([sys.executable, "-c", code.format(words)], scripted.env)
-        assert ("stood back set()" in done.out.splitlines()) == stands_back, (words, done)
+        done = run([sys.executable, "-c", code.format(arguments)], scripted.env)
+        assert ("stood back set()" in done.out.splitlines()) == stands_back, (arguments, done)
 
 
 def test_a_client_yields_the_processor_and_loses_no_reply(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -201,11 +201,11 @@ def test_simple_commands_import_neither_click_nor_slow_modules(scripted: Talk) -
     heavy += ["talkcli.server", "talkcli.goals.scheduler", "talkcli.engine"]
     code = (
         "import sys; from talkcli.cli import run\n"
-        "for words in {}: assert run(words) == 0\n"
+        "for arguments in {}: assert run(arguments) == 0\n"
         "print([name for name in {} if name in sys.modules])"
     )
-    words = [["say", "--wait", "length=0"], ["status"], ["cancel"], ["wait"], ["log"], ["voices"], ["set"]]
-    done = run([sys.executable, "-c", code.format([*words, ["set", "--rate", "150"]], heavy)], scripted.env)
+    commands = [["say", "--wait", "length=0"], ["status"], ["cancel"], ["wait"], ["log"], ["voices"], ["set"]]
+    done = run([sys.executable, "-c", code.format([*commands, ["set", "--rate", "150"]], heavy)], scripted.env)
     assert done.out.splitlines()[-1] == "[]", done
 
 

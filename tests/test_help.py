@@ -61,8 +61,8 @@ def test_talk_without_arguments_shows_every_command_on_one_screen() -> None:
     assert (done.code, done.err, too_wide(out)) == (0, "", [])
     assert len(out.splitlines()) < 24  # one line is for the prompt
     assert re.findall(r"(?m)^  ([a-z]+)  +[A-Z]", out) == [*commands.COMMANDS]
-    for words in ("talk serve &", "talk say ", "talk doctor", "talk --help", "talk COMMAND --help"):
-        assert words in out
+    for text in ("talk serve &", "talk say ", "talk doctor", "talk --help", "talk COMMAND --help"):
+        assert text in out
 
 
 def test_the_help_of_talk_lists_all_exit_codes() -> None:
@@ -76,10 +76,10 @@ def test_the_help_of_talk_lists_all_exit_codes() -> None:
     assert "TALK_DEBUG" in out
 
 
-@pytest.mark.parametrize("words", [["-h"], ["say", "-h"]])
-def test_h_shows_the_help_in_the_width_of_the_terminal(words: list[str]) -> None:
-    assert alone(*words, COLUMNS="80").out == golden_help(words[0] if words[1:] else "talk")
-    done = alone(*words, COLUMNS="120")
+@pytest.mark.parametrize("arguments", [["-h"], ["say", "-h"]])
+def test_h_shows_the_help_in_the_width_of_the_terminal(arguments: list[str]) -> None:
+    assert alone(*arguments, COLUMNS="80").out == golden_help(arguments[0] if arguments[1:] else "talk")
+    done = alone(*arguments, COLUMNS="120")
     assert (done.code, done.err, too_wide(done.out, 120)) == (0, "", [])
     assert too_wide(done.out)
 
@@ -125,9 +125,9 @@ def test_the_examples_are_valid_command_lines(name: str) -> None:
     seen = []
     for line in command(name).row.examples.strip().splitlines():
         for part in re.findall(r"\btalk ((?:\"[^\"]*\"|[^|;&)\"])*)", re.split(r"(?<=\S)   +", line.strip())[0]):
-            words = [argument for argument in shlex.split(part.partition("'")[0]) if argument != "--json"]
-            seen.append(words[0])
-            with command(words[0]).make_context(words[0], words[1:], parent=click.Context(talk)) as context:
+            arguments = [argument for argument in shlex.split(part.partition("'")[0]) if argument != "--json"]
+            seen.append(arguments[0])
+            with command(arguments[0]).make_context(arguments[0], arguments[1:], parent=click.Context(talk)) as context:
                 assert context.params is not None
     assert name in seen
 
@@ -137,13 +137,13 @@ def test_the_examples_are_valid_command_lines(name: str) -> None:
 
 @pytest.mark.parametrize(("columns", "lines"), [(60, 4), (80, 3), (200, 2)])
 def test_messages_wrap_between_words_on_a_terminal(columns: int, lines: int) -> None:
-    words = ["say", "--wiat", "hello"]
+    arguments = ["say", "--wiat", "hello"]
     with short_directory() as home:
-        with Terminal([*TALK, *words], environment(home), columns) as shown:
+        with Terminal([*TALK, *arguments], environment(home), columns) as shown:
             assert shown.finish() == 2
             assert max(map(len, shown.lines)) <= columns
             assert shown.screen.wraps == 0
-        whole = run([*TALK, *words], environment(home)).err
+        whole = run([*TALK, *arguments], environment(home)).err
     assert " ".join(" ".join(shown.lines).split()) == " ".join(whole.split())
     assert len(shown.lines) == lines
 
@@ -216,8 +216,8 @@ def test_an_output_file_of_another_format_is_refused(tmp_path: pathlib.Path) -> 
 def test_a_mistyped_key_is_reported_only_on_a_terminal(scripted: Talk) -> None:
     scripted.run("say", "--key", "battery", "never-ends")
     hint = "talk: no goal has the key 'batery'; did you mean 'battery'?\n"
-    for words, expected in (("batery", hint), ("door", ""), ("batery -q", ""), ("battery", r"\w{4}-\d+\n")):
-        with Terminal([*TALK, "cancel", "--key", *words.split()], scripted.env) as shown:
+    for arguments, expected in (("batery", hint), ("door", ""), ("batery -q", ""), ("battery", r"\w{4}-\d+\n")):
+        with Terminal([*TALK, "cancel", "--key", *arguments.split()], scripted.env) as shown:
             assert shown.finish() == 0
             assert re.fullmatch(expected.replace("?", r"\?"), shown.text)
     assert scripted.run("cancel", "--key", "batery").err == ""  # for scripts, a key without goals is normal

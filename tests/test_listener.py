@@ -29,9 +29,9 @@ os.execv(sys.argv[2], sys.argv[2:])
 """
 
 
-def refused(home: str, *words: str, code: int = 11, **extra: str) -> str:
+def refused(home: str, *arguments: str, code: int = 11, **extra: str) -> str:
     """Assert that a server doesn't start, and return its error message."""
-    done = run([*SERVE, *words], environment(home, **extra))
+    done = run([*SERVE, *arguments], environment(home, **extra))
     assert (done.code, done.out) == (code, ""), done
     assert "Traceback" not in done.err
     return done.err
@@ -99,16 +99,16 @@ def test_a_server_that_cannot_start_leaves_no_lock_file(home: str) -> None:
     assert "can't listen at" in refused(home, "--socket", f"{home}/{'s' * (120 - len(home))}")
 
 
-@pytest.mark.parametrize("words", ["is not a regular file", "is a symbolic link", "is a hard link"])
-def test_an_unsafe_lock_file_is_reported_and_left_unchanged(home: str, words: str) -> None:
+@pytest.mark.parametrize("fault", ["is not a regular file", "is a symbolic link", "is a hard link"])
+def test_an_unsafe_lock_file_is_reported_and_left_unchanged(home: str, fault: str) -> None:
     with open(f"{home}/precious", "w", encoding="utf-8") as file:
         file.write("precious")
-    if "regular" in words:
+    if "regular" in fault:
         os.mkfifo(f"{home}/s.lock")
     else:
-        (os.symlink if "symbolic" in words else os.link)(f"{home}/precious", f"{home}/s.lock")
+        (os.symlink if "symbolic" in fault else os.link)(f"{home}/precious", f"{home}/s.lock")
     message = refused(home, "--socket", f"{home}/s")
-    assert f"the lock file {home}/s.lock {words}" in message
+    assert f"the lock file {home}/s.lock {fault}" in message
     assert "remove it" in message
     with open(f"{home}/precious", encoding="utf-8") as file:
         assert file.read() == "precious"
@@ -152,9 +152,9 @@ def test_a_refused_client_of_another_user_exits_with_10(home: str) -> None:
     client = ["setpriv", f"--reuid={NOBODY}", "--clear-groups", "/usr/bin/python3", "-m", "talkcli"]
     other_user = environment(home, PYTHONPATH=f"{home}/lib", PYTHONDONTWRITEBYTECODE="1")
     with serving(environment(home), "--socket", path):
-        for mode, words in ((0o600, ["status"]), (0o666, ["say", "hello"])):
+        for mode, arguments in ((0o600, ["status"]), (0o666, ["say", "hello"])):
             os.chmod(path, mode)
-            done = run([*client, "--socket", path, *words], other_user)
+            done = run([*client, "--socket", path, *arguments], other_user)
             assert (done.code, done.out) == (10, ""), done
             assert "Traceback" not in done.err
             assert "its owner can let you in with: talk serve --socket-mode 0660" in done.err

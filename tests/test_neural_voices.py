@@ -441,30 +441,30 @@ def test_every_voice_offered_by_completion_exists(env: dict[str, str]) -> None:
 
 
 def test_a_neural_voice_is_refused_with_another_driver(env: dict[str, str]) -> None:
-    words = '"piper/tiny" is a neural voice, which the driver "dummy" does not support; leave out --driver'
+    message = '"piper/tiny" is a neural voice, which the driver "dummy" does not support; leave out --driver'
     done = run([*TALK, "serve", "--driver", "dummy", "--voice", "piper/tiny"], env)
-    assert (done.code, words in done.err) == (2, True), done
+    assert (done.code, message in done.err) == (2, True), done
     with serving(env, "--driver", "dummy"):
         done = run([*TALK, "say", "--voice", "piper/tiny", "hello"], env)
-        assert (done.code, words in done.err) == (5, True), done
+        assert (done.code, message in done.err) == (5, True), done
         done = run([*TALK, "set", "--voice", "piper/tiny"], env)
-        assert (done.code, words in done.err) == (2, True), done
+        assert (done.code, message in done.err) == (2, True), done
 
 
 def test_without_the_extra_neural_voices_are_listed_but_refused(env: dict[str, str], tmp_path: Path) -> None:
     (tmp_path / "site" / "sitecustomize.py").write_text(WITHOUT.format(names=["onnxruntime"]))
     bare = {**env, "PYTHONPATH": str(tmp_path / "site")}
-    words = f"onnxruntime is missing; install it with: {install.neural()}"
+    message = f"onnxruntime is missing; install it with: {install.neural()}"
     done = run([*TALK, "serve", "--player", "null", "--voice", "piper/tiny"], bare)
-    assert (done.code, words in done.err) == (2, True), done
+    assert (done.code, message in done.err) == (2, True), done
     with serving(bare):
         assert "piper/tiny" in run([*TALK, "voices"], env).out
         done = run([*TALK, "--json", "say", "--voice", "piper/tiny", "hello"], env)
         goal = json.loads(done.out)
         assert (done.code, goal["state"], goal["reason"]) == (5, "REJECTED", "unknown_voice")
-        assert words in goal["message"]
+        assert message in goal["message"]
         done = run([*TALK, "set", "--voice", "piper/tiny"], env)
-        assert (done.code, words in done.err) == (2, True), done
+        assert (done.code, message in done.err) == (2, True), done
         assert run([*TALK, "say", "--wait", "hello"], env).code == 0
 
 
@@ -486,18 +486,18 @@ def test_an_unknown_voice_or_speaker_is_refused(env: dict[str, str], tmp_path: P
     several = tiny_voice.description(speakers=2)
     tiny_voice.put(tmp_path / "voices", "two", tiny_voice.model(speakers=2), several)
     with serving(env, "--rate", "450"):
-        for voice, words in (
+        for voice, message in (
             ("piper/tiny#1", 'no speaker "1"; the voice has one speaker'),
             ("piper/two#2", 'no speaker "2"; the voice has 2 speakers, 0 to 1'),
             ("piper/two#nobody", 'no speaker "nobody"'),
         ):
             done = run([*TALK, "say", "--voice", voice, "hello"], env)
-            assert (done.code, words in done.err) == (5, True), done
+            assert (done.code, message in done.err) == (5, True), done
         for voice in ("piper/tiny#0", "piper/two#1", "piper/two#p1"):
             assert heard(env, "--voice-only", "--voice", voice) == voice
-    for voice, words in (("piper/tiny#4", "the voice has one speaker"), ("piper/none", 'unknown voice "piper/none"')):
+    for voice, message in (("piper/tiny#4", "the voice has one speaker"), ("piper/none", 'unknown voice "piper/none"')):
         done = run([*TALK, "serve", "--player", "null", "--voice", voice], env)
-        assert (done.code, words in done.err) == (2, True), done
+        assert (done.code, message in done.err) == (2, True), done
 
 
 #: System calls that change a file or use the internet, successful or not.

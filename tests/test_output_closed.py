@@ -41,11 +41,11 @@ def bash(talk: Talk, script: str) -> subprocess.CompletedProcess[str]:
     return done
 
 
-def run_to(talk: Talk, output: int | str, *words: str, stdin: str | None = None) -> tuple[int, str]:
+def run_to(talk: Talk, output: int | str, *arguments: str, stdin: str | None = None) -> tuple[int, str]:
     """Run `talk` with this file as its output, and return its exit code and its standard error."""
     descriptor = os.open(output, os.O_WRONLY) if isinstance(output, str) else output
     source = subprocess.DEVNULL if stdin is None else subprocess.PIPE
-    client = Forked(words, talk.env, stdin=source, stdout=descriptor, stderr=subprocess.PIPE)
+    client = Forked(arguments, talk.env, stdin=source, stdout=descriptor, stderr=subprocess.PIPE)
     os.close(descriptor)
     err = client.communicate(stdin, timeout=20)[1]
     assert "Traceback" not in err
@@ -64,8 +64,8 @@ def unread(talk: Talk, *command: str) -> tuple[int, str]:
 
 def test_a_command_whose_reader_has_gone_exits_with_141(scripted: Talk) -> None:
     scripted.run("say", "--wait", "length=0")
-    for words in (["status"], ["--json", "status"], ["voices"], ["--json", "voices"], ["log"], ["set"], ["--help"]):
-        assert unread(scripted, *words) == (CLOSED, ""), words
+    for arguments in (["status"], ["--json", "status"], ["voices"], ["--json", "voices"], ["log"], ["set"], ["--help"]):
+        assert unread(scripted, *arguments) == (CLOSED, ""), arguments
     done = bash(scripted, "talk status | head -n 1; echo ${PIPESTATUS[0]}")
     first, code = done.stdout.splitlines()
     assert (first.startswith("server   pid "), done.stderr) == (True, "")
@@ -104,18 +104,18 @@ def test_a_goal_is_spoken_even_if_its_id_cannot_be_printed(scripted: Talk) -> No
     assert [scripted.watcher.wait_for_terminal(goal) for goal in scripted.watcher.goals()] == ["SUCCEEDED"] * 3
 
 
-@pytest.mark.parametrize("words", ["say", "say -w", "--json say -wf", "say -wq"])
-def test_say_waits_even_if_its_output_was_closed_from_the_start(scripted: Talk, words: str) -> None:
-    for closed in [">&-", "1</dev/null"] if words in {"say -w", "--json say -wf"} else []:
-        done = bash(scripted, f"(talk {words} length=0.2; echo $? >&2) {closed}")
+@pytest.mark.parametrize("arguments", ["say", "say -w", "--json say -wf", "say -wq"])
+def test_say_waits_even_if_its_output_was_closed_from_the_start(scripted: Talk, arguments: str) -> None:
+    for closed in [">&-", "1</dev/null"] if arguments in {"say -w", "--json say -wf"} else []:
+        done = bash(scripted, f"(talk {arguments} length=0.2; echo $? >&2) {closed}")
         assert (done.stdout, done.stderr) == ("", "0\n")
-    assert unread(scripted, *words.split(), "length=0.2") == (0, "")
+    assert unread(scripted, *arguments.split(), "length=0.2") == (0, "")
     for goal in scripted.watcher.goals():
-        if words == "say":
+        if arguments == "say":
             scripted.watcher.wait_for_terminal(goal)
         assert scripted.goal(goal)["state"] == "SUCCEEDED"  # it ended before the command did
-    code, err = unread(scripted, *words.split(), "fail=audio_lost")
-    assert (code, "speech failed" in err) == ((0, False) if words == "say" else (4, words != "say -wq"))
+    code, err = unread(scripted, *arguments.split(), "fail=audio_lost")
+    assert (code, "speech failed" in err) == ((0, False) if arguments == "say" else (4, arguments != "say -wq"))
 
 
 def test_wait_waits_even_if_its_output_was_closed_from_the_start(scripted: Talk) -> None:
@@ -126,28 +126,28 @@ def test_wait_waits_even_if_its_output_was_closed_from_the_start(scripted: Talk)
     assert scripted.goal(goal)["state"] == "ABORTED"
 
 
-@pytest.mark.parametrize("words", ["say -w", "--json say -wf", "wait", "wait -f", "--json wait"])
-def test_a_client_waits_for_its_goal_even_if_the_disk_is_full(scripted: Talk, words: str) -> None:
+@pytest.mark.parametrize("arguments", ["say -w", "--json say -wf", "wait", "wait -f", "--json wait"])
+def test_a_client_waits_for_its_goal_even_if_the_disk_is_full(scripted: Talk, arguments: str) -> None:
     for text, state, code in (("length=0.2", "SUCCEEDED", 1), ("fail=audio_lost length=0.2", "ABORTED", 4)):
-        given = scripted.run("say", text).id if "wait" in words else text
-        ended, err = run_to(scripted, "/dev/full", *words.split(), given)
+        given = scripted.run("say", text).id if "wait" in arguments else text
+        ended, err = run_to(scripted, "/dev/full", *arguments.split(), given)
         goal = scripted.watcher.goals()[-1]
         assert scripted.goal(goal)["state"] == state  # the command waited for it
-        notes = [] if words == "wait" else [FULL]
+        notes = [] if arguments == "wait" else [FULL]
         notes += (
             [f"talk: {goal}: speech failed: scripted audio_lost; find out why with: talk doctor\n"]
             if state == "ABORTED"
             else []
         )
         assert sorted(err.splitlines(True)) == sorted(notes)
-        assert ended == (0 if words == "wait" and code == 1 else code)  # `wait` prints nothing
+        assert ended == (0 if arguments == "wait" and code == 1 else code)  # `wait` prints nothing
 
 
-@pytest.mark.parametrize("words", ["", "--json", "-w", "--json -f"])
-def test_lines_are_spoken_even_if_the_disk_is_full(scripted: Talk, words: str) -> None:
-    for first, code in (("length=0 a", 1), ("fail=audio_lost", 4) if words[-2:] in {"-w", "-f"} else ("nul \0", 5)):
+@pytest.mark.parametrize("options", ["", "--json", "-w", "--json -f"])
+def test_lines_are_spoken_even_if_the_disk_is_full(scripted: Talk, options: str) -> None:
+    for first, code in (("length=0 a", 1), ("fail=audio_lost", 4) if options[-2:] in {"-w", "-f"} else ("nul \0", 5)):
         lines = f"{first}\nlength=0 b\n"
-        ended, err = run_to(scripted, "/dev/full", "say", "--lines", *words.split(), stdin=lines)
+        ended, err = run_to(scripted, "/dev/full", "say", "--lines", *options.split(), stdin=lines)
         goal = scripted.watcher.goals()[-1]
         assert scripted.watcher.wait_for_terminal(goal) == "SUCCEEDED"
         assert scripted.goal(goal)["text"] == "length=0 b"
@@ -160,12 +160,11 @@ def test_lines_are_spoken_even_if_the_disk_is_full(scripted: Talk, words: str) -
 class Reader:
     """The reader of a client's output."""
 
-    def __init__(self, talk: Talk, *words: str, errors: bool = False, terminal: bool = False) -> None:
+    def __init__(self, talk: Talk, *arguments: str, errors: bool = False, terminal: bool = False) -> None:
         """`errors`: also read standard error; `terminal`: use a terminal that doesn't control the client."""
         self.descriptor, client_end = os.openpty() if terminal else os.pipe()
-        self.client = Forked(
-            words, talk.env, stdout=client_end, stderr=client_end if errors else subprocess.PIPE, start_new_session=True
-        )
+        stderr = client_end if errors else subprocess.PIPE
+        self.client = Forked(arguments, talk.env, stdout=client_end, stderr=stderr, start_new_session=True)
         os.close(client_end)
         _wait_until_caught(self.client, signal.SIGHUP)  # now the client has checked its output once
 
@@ -182,7 +181,7 @@ SLOW = f"{ENDLESS} slow-stop=0.2"
 
 
 @pytest.mark.parametrize(
-    ("words", "kind"),
+    ("arguments", "kind"),
     [
         (["say", "-w"], {}),
         (["say", "-wf"], {}),
@@ -191,8 +190,8 @@ SLOW = f"{ENDLESS} slow-stop=0.2"
         (["-q", "say", "-w"], {"terminal": True, "errors": True}),
     ],
 )
-def test_a_goal_is_cancelled_if_its_reader_goes_away(scripted: Talk, words: list[str], kind: dict[str, bool]) -> None:
-    reader = Reader(scripted, *words, ENDLESS, **kind)
+def test_a_goal_is_cancelled_if_its_reader_leaves(scripted: Talk, arguments: list[str], kind: dict[str, bool]) -> None:
+    reader = Reader(scripted, *arguments, ENDLESS, **kind)
     goal = scripted.watcher.wait_until(lambda event: event.get("event") == "word")["id"]
     assert reader.leave() == CLOSED
     assert scripted.goal(goal)["state"] == "PREEMPTED"  # the client waited for it
@@ -210,14 +209,14 @@ def test_a_pending_goal_is_recalled_if_its_reader_goes_away(scripted: Talk) -> N
 
 @pytest.mark.parametrize("first", ["reader", "signal"])
 @pytest.mark.parametrize(
-    ("words", "kind"),
+    ("arguments", "kind"),
     [("say -wf", {}), ("--json say -wf", {"terminal": True}), ("--json say -w", {"errors": True})],
 )
 def test_a_signal_decides_the_exit_code_even_if_the_reader_has_gone(
-    scripted: Talk, words: str, kind: dict[str, bool], first: str
+    scripted: Talk, arguments: str, kind: dict[str, bool], first: str
 ) -> None:
     number = signal.SIGINT if first == "reader" else signal.SIGHUP
-    reader = Reader(scripted, *words.split(), SLOW, **kind)
+    reader = Reader(scripted, *arguments.split(), SLOW, **kind)
     goal = scripted.watcher.wait_until(lambda event: event.get("event") == "word")["id"]
     if first == "reader":
         reader.client.send_signal(signal.SIGSTOP)
@@ -235,12 +234,12 @@ def test_a_signal_decides_the_exit_code_even_if_the_reader_has_gone(
 
 
 @pytest.mark.parametrize(
-    ("words", "first"),
+    ("arguments", "first"),
     [("say -w", signal.SIGINT), ("say -wf", signal.SIGHUP), ("say -w --lines", signal.SIGHUP)],
 )
-def test_a_second_signal_does_not_change_the_exit_code(scripted: Talk, words: str, first: signal.Signals) -> None:
-    lines = "--lines" in words
-    client = scripted.start(*words.split(), *([] if lines else [SLOW]), stdin=subprocess.PIPE)
+def test_a_second_signal_does_not_change_the_exit_code(scripted: Talk, arguments: str, first: signal.Signals) -> None:
+    lines = "--lines" in arguments
+    client = scripted.start(*arguments.split(), *([] if lines else [SLOW]), stdin=subprocess.PIPE)
     if lines:
         assert client.stdin
         client.stdin.write(f"{SLOW}\n")
@@ -257,8 +256,8 @@ def test_a_second_signal_does_not_change_the_exit_code(scripted: Talk, words: st
 def test_nothing_is_spoken_if_the_reader_goes_away_while_text_is_read(scripted: Talk, shared: bool) -> None:
     reader_end, client_end = socket.socketpair()  # like sshd's for a command
     reader, output = (-1, client_end.fileno()) if shared else os.pipe()
-    words = ["say", "-w", "-"]
-    client = Forked(words, scripted.env, stdin=client_end.fileno(), stdout=output, stderr=subprocess.PIPE)
+    arguments = ["say", "-w", "-"]
+    client = Forked(arguments, scripted.env, stdin=client_end.fileno(), stdout=output, stderr=subprocess.PIPE)
     client_end.close()
     reader_end.send(b"half of a sen")
     while fcntl.ioctl(reader_end, termios.TIOCOUTQ, b"    ") != b"\0\0\0\0":  # no event reports that it was read
@@ -285,34 +284,34 @@ def test_a_text_is_spoken_if_its_sender_closes_only_the_input(scripted: Talk) ->
         assert scripted.goal(reader_end.recv(100).decode().strip())["state"] == "SUCCEEDED"
 
 
-@pytest.mark.parametrize("words", [["say", "-w"], ["say", "-wf"]])
-def test_a_closed_reader_of_an_attached_client_cancels_nothing(scripted: Talk, words: list[str]) -> None:
+@pytest.mark.parametrize("arguments", [["say", "-w"], ["say", "-wf"]])
+def test_a_closed_reader_of_an_attached_client_cancels_nothing(scripted: Talk, arguments: list[str]) -> None:
     text = "never-ends length=60 " + "word " * 600  # ten words per second
     scripted.run("say", "--id", "mine", text)
     scripted.watcher.wait_for_word("mine")
-    reader = Reader(scripted, *words, "--id", "mine", text)
+    reader = Reader(scripted, *arguments, "--id", "mine", text)
     assert os.read(reader.descriptor, 4) == b"mine"
     assert reader.leave() == CLOSED
     assert scripted.goal("mine")["state"] == "ACTIVE"
 
 
 @pytest.mark.parametrize(
-    ("words", "terminal"),
+    ("arguments", "terminal"),
     [(["wait"], True), (["wait", "-f"], False), (["wait", "-f"], True), (["--json", "wait"], False)],
 )
-def test_a_closed_reader_ends_wait_and_cancels_nothing(scripted: Talk, words: list[str], terminal: bool) -> None:
+def test_a_closed_reader_ends_wait_and_cancels_nothing(scripted: Talk, arguments: list[str], terminal: bool) -> None:
     goal = scripted.run("say", ENDLESS).id
-    reader = Reader(scripted, *words, goal, terminal=terminal)
-    if terminal and words == ["wait", "-f"]:
+    reader = Reader(scripted, *arguments, goal, terminal=terminal)
+    if terminal and arguments == ["wait", "-f"]:
         assert os.read(reader.descriptor, 1)
     assert reader.leave() == CLOSED
     assert scripted.goal(goal)["state"] in {"PENDING", "ACTIVE"}
 
 
 def test_sighup_cancels_the_goal_of_say_unless_nohup_blocks_it(scripted: Talk) -> None:
-    for words, code, state in ((["say", "-w"], 129, "PREEMPTED"), (["wait"], 129, "ACTIVE")):
-        goal = scripted.run("say", ENDLESS).id if words == ["wait"] else None
-        client = scripted.start(*words, goal or ENDLESS)
+    for arguments, code, state in ((["say", "-w"], 129, "PREEMPTED"), (["wait"], 129, "ACTIVE")):
+        goal = scripted.run("say", ENDLESS).id if arguments == ["wait"] else None
+        client = scripted.start(*arguments, goal or ENDLESS)
         goal = goal or scripted.watcher.wait_until(lambda event: event.get("event") == "word")["id"]
         _wait_until_caught(client, signal.SIGHUP)
         client.send_signal(signal.SIGHUP)

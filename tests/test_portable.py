@@ -64,7 +64,7 @@ def test_every_module_can_be_imported_and_every_command_has_help() -> None:
 
 @pytest.mark.parametrize(("platform", "driver"), [("darwin", "dummy"), ("linux", "espeak")])
 def test_speech_can_be_awaited_paused_cancelled_and_examined(make_talk: MakeTalk, platform: str, driver: str) -> None:
-    """The cases are macOS by its name, and a Linux without its interfaces."""
+    """One case also sets the name of the platform. The other only hides Linux's interfaces."""
     env = {"PYTHONPATH": PATH, "TALK_TEST_PLATFORM": platform}
     server = make_talk("--player", "null", "--rate", "450", driver=driver, env=env)
     done = server.run("--json", "say", "--wait", "battery low")

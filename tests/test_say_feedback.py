@@ -117,8 +117,8 @@ def test_wait_without_ids_follows_all_current_goals(scripted: Talk) -> None:
     client = scripted.start("wait", "-f")
     lines = lines_of(client)
     assert next(lines).startswith(f"{first} word ")
-    for words in (["pause"], ["resume"], ["cancel", first]):
-        assert scripted.run(*words).code == 0
+    for arguments in (["pause"], ["resume"], ["cancel", first]):
+        assert scripted.run(*arguments).code == 0
     states = [line for line in lines if " word " not in line]
     assert states == [
         f"{first} PAUSED",  # once for all goals

@@ -29,8 +29,8 @@ ENDLESS = "never-ends words=1\n"
 class Typing:
     """A client whose standard input stays open."""
 
-    def __init__(self, talk: Talk, *words: str) -> None:
-        self.client = talk.start(*words, stdin=subprocess.PIPE)
+    def __init__(self, talk: Talk, *arguments: str) -> None:
+        self.client = talk.start(*arguments, stdin=subprocess.PIPE)
         assert self.client.stdin
         assert self.client.stdout
         assert self.client.stderr
@@ -67,8 +67,8 @@ def test_each_line_is_a_goal_and_its_id_is_printed(scripted: Talk) -> None:
     texts = ["length=0 one", "length=0 two", "length=0 -x 日本", "length=0 last"]
     assert [scripted.goal(goal_id)["text"] for goal_id in ids] == texts
     assert scripted.watcher.texts("ACTIVE") == texts
-    for words in ([], ["-f"], ["-w", "--json"]):
-        done = scripted.run("say", "--lines", *words, stdin="\n\r\n")
+    for options in ([], ["-f"], ["-w", "--json"]):
+        done = scripted.run("say", "--lines", *options, stdin="\n\r\n")
         assert (done.code, done.out, done.err) == (0, "", ""), "empty input is a success"
 
 
@@ -111,8 +111,8 @@ def test_a_refused_line_is_reported_by_number_and_the_rest_is_spoken(scripted: T
     assert (done.code, len(done.out.split())) == (5, 4)
     notes = done.err.splitlines()
     assert [line.split(":")[1] for line in notes] == [" line 3", " line 5", " line 6", " line 9"]
-    for note, words in zip(notes, ("NUL", "10,001 characters", "300,000 bytes", "40,002 bytes"), strict=True):
-        assert words in note
+    for note, excerpt in zip(notes, ("NUL", "10,001 characters", "300,000 bytes", "40,002 bytes"), strict=True):
+        assert excerpt in note
     quiet = scripted.run("-q", "say", "--lines", stdin=text)
     assert (quiet.code, quiet.out, quiet.err) == (5, "", "")
 
@@ -120,8 +120,8 @@ def test_a_refused_line_is_reported_by_number_and_the_rest_is_spoken(scripted: T
 def test_a_line_with_invalid_utf8_is_reported_and_spoken(scripted: Talk) -> None:
     data = b"length=0 one\n\nlength=0 t\xffw\xfeo\n\xff\nlength=0 three\xc3"
     done, quiet = (
-        subprocess.run([*TALK, *words], env=scripted.env, input=data, capture_output=True, timeout=60, check=False)
-        for words in (["say", "--lines", "--wait"], ["-q", "say", "--lines"])
+        subprocess.run([*TALK, *arguments], env=scripted.env, input=data, capture_output=True, timeout=60, check=False)
+        for arguments in (["say", "--lines", "--wait"], ["-q", "say", "--lines"])
     )
     assert (done.returncode, len(done.stdout.split())) == (0, 4)
     assert done.stderr.decode().splitlines() == [
@@ -160,9 +160,9 @@ def test_feedback_shows_the_events_of_all_lines(scripted: Talk) -> None:
     assert {"word", "state", "result"} == {event["event"] for event in events}
 
 
-@pytest.mark.parametrize(("words", "ahead"), [([], 10), (["--ahead", "2", "--wait"], 2)])
-def test_few_lines_are_pending_so_that_others_have_room(scripted: Talk, words: list[str], ahead: int) -> None:
-    typing = Typing(scripted, "say", "--lines", *words)
+@pytest.mark.parametrize(("options", "ahead"), [([], 10), (["--ahead", "2", "--wait"], 2)])
+def test_few_lines_are_pending_so_that_others_have_room(scripted: Talk, options: list[str], ahead: int) -> None:
+    typing = Typing(scripted, "say", "--lines", *options)
     lines = [ENDLESS.rstrip(), *(f"length=0 {number}" for number in range(20))]
     typing.type("\n".join(lines))
     ids = [typing.line() for _ in range(ahead + 1)]
@@ -184,16 +184,16 @@ def test_a_line_replaces_a_pending_line_with_its_key_despite_the_limit(scripted:
 
 
 @pytest.mark.parametrize(
-    ("words", "code"), [([], 0), (["-q", "--wait"], 6), (["--json", "--wait"], 6), (["--ttl=0"], 0)]
+    ("options", "code"), [([], 0), (["-q", "--wait"], 6), (["--json", "--wait"], 6), (["--ttl=0"], 0)]
 )
-def test_lines_whose_ttl_expires_while_they_wait_are_dropped(make_talk: MakeTalk, words: list[str], code: int) -> None:
+def test_lines_whose_ttl_expires_are_dropped(make_talk: MakeTalk, options: list[str], code: int) -> None:
     talk = make_talk("--max-queue", "1", scripted=True)
     others = [talk.run("say", text).id for text in (ENDLESS, "never-ends")]
     talk.watcher.wait_for_word(others[0])
     started_at = time.monotonic()
-    typing = Typing(talk, "say", "--lines", "--ttl", "0.3", *words)
+    typing = Typing(talk, "say", "--lines", "--ttl", "0.3", *options)
     typing.type("length=0 one\nlength=0 two\nlength=0 three\n")
-    if "--ttl=0" in words or "-q" in words:
+    if "--ttl=0" in options or "-q" in options:
         time.sleep(0.4)  # no event to wait for
     else:
         notes: list[str] = []
@@ -206,9 +206,9 @@ def test_lines_whose_ttl_expires_while_they_wait_are_dropped(make_talk: MakeTalk
     assert (exit_code, "was not sent" in err) == (code, False)
     assert talk.run("wait").code == 0
     assert talk.watcher.texts("ACTIVE")[1:] == (
-        [f"length=0 {word}" for word in ("one", "two", "three")] if "--ttl=0" in words else []
+        [f"length=0 {word}" for word in ("one", "two", "three")] if "--ttl=0" in options else []
     )  # the ttl includes the time that the first line waited for room
-    if "--json" in words:
+    if "--json" in options:
         goals = [json.loads(line) for line in out]
         assert sorted((goal["state"], goal["reason"], goal["text"]) for goal in goals) == [
             ("RECALLED", "expired", f"length=0 {word}") for word in ("one", "three", "two")
@@ -248,9 +248,9 @@ def test_fast_input_is_spoken_within_its_ttl_and_delays_no_other_client(scripted
     assert_within(other["started_at"] - other["queued_at"], 1, "the other client's sentence")
 
 
-@pytest.mark.parametrize(("words", "most"), [(["--ttl", "60"], 1_000_000), ([], 0)])
-def test_only_as_much_input_is_read_as_can_be_kept(scripted: Talk, words: list[str], most: int) -> None:
-    client = Forked(["say", "--lines", *words], scripted.env, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)
+@pytest.mark.parametrize(("options", "most"), [(["--ttl", "60"], 1_000_000), ([], 0)])
+def test_only_as_much_input_is_read_as_can_be_kept(scripted: Talk, options: list[str], most: int) -> None:
+    client = Forked(["say", "--lines", *options], scripted.env, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)
     assert client.stdin
     pipe = client.stdin.fileno()
     os.write(pipe, ENDLESS.encode())
@@ -324,10 +324,10 @@ def test_a_signal_cancels_only_the_clients_own_goals(make_talk: MakeTalk, number
     assert talk.goal(ids[1])["state"] == "PENDING"
 
 
-@pytest.mark.parametrize("words", [["--json", "--wait"], ["-f"]])
-def test_a_line_that_waits_for_room_is_not_spoken_after_a_signal(make_talk: MakeTalk, words: list[str]) -> None:
+@pytest.mark.parametrize("options", [["--json", "--wait"], ["-f"]])
+def test_a_line_that_waits_for_room_is_not_spoken_after_a_signal(make_talk: MakeTalk, options: list[str]) -> None:
     talk = make_talk("--max-queue", "1", scripted=True)
-    typing = Typing(talk, "say", "--lines", *words)
+    typing = Typing(talk, "say", "--lines", *options)
     typing.type(ENDLESS + "second\nthird\nfourth\n")
     talk.watcher.wait_until(lambda event: bool(event.get("goal")) and event["goal"]["text"] == "second")
     # The client may not have its reply yet, and the third line causes no event.
@@ -336,7 +336,7 @@ def test_a_line_that_waits_for_room_is_not_spoken_after_a_signal(make_talk: Make
     assert re.search("line [23] may not have been accepted, and the lines after it were not sent", err)
     assert talk.watcher.texts("ACTIVE") == [ENDLESS.rstrip()]
     assert talk.watcher.texts("PENDING")[:2] == [ENDLESS.rstrip(), "second"]
-    if "--json" in words:
+    if "--json" in options:
         last = [json.loads(line) for line in out][-2:]
         states = [result["goal"]["state"] if "event" in result else result["state"] for result in last]
         assert sorted(states) == ["PREEMPTED", "RECALLED"]
@@ -359,18 +359,18 @@ def test_the_timeout_applies_to_all_lines_together(scripted: Talk) -> None:
     assert scripted.run("say", "--lines", "-w", "-t", "1e300", stdin="length=0\n").code == 0
 
 
-@pytest.mark.parametrize("words", [[], ["-f"]])
-def test_the_client_exits_if_the_server_goes_away(scripted: Talk, words: list[str]) -> None:
-    typing = Typing(scripted, "say", "--lines", *words)
+@pytest.mark.parametrize("options", [[], ["-f"]])
+def test_the_client_exits_if_the_server_goes_away(scripted: Talk, options: list[str]) -> None:
+    typing = Typing(scripted, "say", "--lines", *options)
     typing.type(ENDLESS)
     first = typing.line().split()[0]
     scripted.watcher.wait_for_word(first)
     scripted.kill()
-    assert typing.client.wait(10) == (12 if words else 3)
+    assert typing.client.wait(10) == (12 if options else 3)
     _, out, err = typing.end()
     assert "lost the connection to the server" in err
-    assert ("may still be spoken" in err) == bool(words)
-    assert [line for line in out if "LOST" in line] == ([f"{first} LOST"] if words == ["-f"] else [])
+    assert ("may still be spoken" in err) == bool(options)
+    assert [line for line in out if "LOST" in line] == ([f"{first} LOST"] if options == ["-f"] else [])
 
 
 def test_a_lost_idle_server_is_reported_with_the_next_line(scripted: Talk) -> None:
@@ -397,19 +397,20 @@ def test_a_missing_server_is_reported_before_input_is_read() -> None:
         assert b"talk serve" in err
 
 
-def piped(talk: Talk, *words: str, read: bool = True) -> tuple[Forked, int]:
+def piped(talk: Talk, *arguments: str, read: bool = True) -> tuple[Forked, int]:
     """Start `say --lines` with a pipe as its output. Return it with the reading end, which is closed unless `read`."""
     reader, writer = os.pipe()
     if not read:
         os.close(reader)
-    client = Forked(["say", "--lines", *words], talk.env, stdin=subprocess.PIPE, stdout=writer, stderr=subprocess.PIPE)
+    command = ["say", "--lines", *arguments]
+    client = Forked(command, talk.env, stdin=subprocess.PIPE, stdout=writer, stderr=subprocess.PIPE)
     os.close(writer)
     return client, reader
 
 
-@pytest.mark.parametrize(("words", "read"), [([], False), (["-f"], False), ([], True)])
-def test_lines_are_spoken_if_the_reader_of_their_ids_has_gone(scripted: Talk, words: list[str], read: bool) -> None:
-    client, reader = piped(scripted, *words, read=read)
+@pytest.mark.parametrize(("options", "read"), [([], False), (["-f"], False), ([], True)])
+def test_lines_are_spoken_if_the_reader_of_their_ids_has_gone(scripted: Talk, options: list[str], read: bool) -> None:
+    client, reader = piped(scripted, *options, read=read)
     assert client.stdin
     client.stdin.write("length=0 a\n")
     client.stdin.flush()
@@ -421,9 +422,9 @@ def test_lines_are_spoken_if_the_reader_of_their_ids_has_gone(scripted: Talk, wo
     scripted.watcher.wait_until(lambda _: scripted.watcher.texts("SUCCEEDED") == ["length=0 a", "length=0 b"])
 
 
-@pytest.mark.parametrize(("words", "ended"), [(["--wait"], True), (["--wait", "--json"], False), (["-f"], False)])
-def test_the_clients_goals_are_cancelled_if_its_reader_goes_away(scripted: Talk, words: list[str], ended: bool) -> None:
-    client, reader = piped(scripted, *words)
+@pytest.mark.parametrize(("options", "ended"), [(["--wait"], True), (["--wait", "--json"], False), (["-f"], False)])
+def test_goals_are_cancelled_if_the_reader_goes_away(scripted: Talk, options: list[str], ended: bool) -> None:
+    client, reader = piped(scripted, *options)
     with client:
         assert client.stdin
         client.stdin.write(f"{ENDLESS}second\n")
@@ -440,10 +441,11 @@ def test_the_clients_goals_are_cancelled_if_its_reader_goes_away(scripted: Talk,
 
 
 def test_an_unreadable_standard_input_is_reported(scripted: Talk) -> None:
-    for words in (["--lines"], ["-"]):
+    for arguments in (["--lines"], ["-"]):
         with open(os.devnull, "wb") as write_only:
+            command = [*TALK, "say", *arguments]
             done = subprocess.run(
-                [*TALK, "say", *words], env=scripted.env, stdin=write_only, capture_output=True, timeout=20, check=False
+                command, env=scripted.env, stdin=write_only, capture_output=True, timeout=20, check=False
             )
         assert (done.returncode, done.stdout) == (2, b"")
         assert b"can't read standard input: Bad file descriptor" in done.stderr

@@ -34,7 +34,7 @@ def busy(talk: Talk) -> str:
 
 
 @pytest.mark.parametrize(
-    ("words", "hints"),
+    ("arguments", "hints"),
     [
         (["--lines", "-"], ["--lines", "TEXT"]),
         (["--lines", "--id", "mine"], ["--lines", "--id"]),
@@ -53,9 +53,9 @@ def busy(talk: Talk) -> str:
         (["--lead-in", "5001", "hello"], ["--lead-in", "5000"]),
     ],
 )
-def test_contradictions_and_values_out_of_range_are_usage_errors(words: list[str], hints: list[str]) -> None:
+def test_contradictions_and_values_out_of_range_are_usage_errors(arguments: list[str], hints: list[str]) -> None:
     """`tests/golden/errors.txt` has many more cases."""
-    done = alone("say", *words)
+    done = alone("say", *arguments)
     assert (done.code, done.out) == (2, ""), done
     assert [hint for hint in hints if hint not in done.err] == [], done.err
 
@@ -93,8 +93,8 @@ def test_expired_and_replaced_goals_exit_with_6(scripted: Talk) -> None:
 def test_a_throttled_goal_exits_with_0_and_prints_no_id(scripted: Talk) -> None:
     throttled = ["say", "--key", "battery", "--throttle", "60"]
     assert scripted.run(*throttled, "--wait", "length=0").code == 0
-    for words in ([], ["-f"]):
-        done = scripted.run(*throttled, *words, "length=0")
+    for options in ([], ["-f"]):
+        done = scripted.run(*throttled, *options, "length=0")
         assert (done.code, done.out) == (0, ""), done
         assert "less than 60 s ago" in done.err
         assert done.err.count("\n") == 1
@@ -158,8 +158,8 @@ def test_a_goal_with_a_chosen_id_is_spoken_once(scripted: Talk) -> None:
     text = "fail=audio_lost message=no_cable"
     assert scripted.run("say", "--id", "dock-17a", text).out == "dock-17a\n"
     scripted.watcher.wait_for_terminal("dock-17a")
-    for words, out in (([], "dock-17a\n"), (["--wait", "-f"], "dock-17a ABORTED\n")):
-        done = scripted.run("say", "--id", "dock-17a", *words, text)  # the result is already known
+    for options, out in (([], "dock-17a\n"), (["--wait", "-f"], "dock-17a ABORTED\n")):
+        done = scripted.run("say", "--id", "dock-17a", *options, text)  # the result is already known
         assert (done.code, done.out) == (4, out)
         assert done.err == "talk: dock-17a: speech failed: no cable; find out why with: talk doctor\n"
     goal = json.loads(scripted.run("--json", "say", "--id", "dock-17a", text).out)
@@ -217,8 +217,8 @@ def test_output_omits_and_reports_invalid_utf8_bytes(tmp_path: Path) -> None:
     assert (tmp_path / "said.wav").read_bytes() == (tmp_path / hidden).read_bytes()
 
 
-def _seconds_of(tmp_path: Path, *words: str, **env: str) -> float:
-    done = alone("--json", "say", "-o", str(tmp_path / "x.wav"), *words, "one two three four five six", **env)
+def _seconds_of(tmp_path: Path, *arguments: str, **env: str) -> float:
+    done = alone("--json", "say", "-o", str(tmp_path / "x.wav"), *arguments, "one two three four five six", **env)
     assert done.code == 0, done.err
     return float(json.loads(done.out)["seconds"])
 
@@ -243,10 +243,10 @@ def test_output_can_be_standard_output(tmp_path: Path) -> None:
 
 def test_output_accepts_a_text_of_any_length(tmp_path: Path) -> None:
     text = f"one {' ' * 45_000} two"  # exceeds the limits of a goal in characters and in bytes
-    words = ["--json", "say", "-o", str(tmp_path / "x.wav"), "--rate", "450"]
+    arguments = ["--json", "say", "-o", str(tmp_path / "x.wav"), "--rate", "450"]
     with short_directory() as home:
         by_input = subprocess.run(
-            [*TALK, *words, "-"], input=text, env=environment(home), capture_output=True, text=True, check=False
+            [*TALK, *arguments, "-"], input=text, env=environment(home), capture_output=True, text=True, check=False
         )
     report = json.loads(by_input.stdout)
     assert (by_input.returncode, report["text"]) == (0, text)
@@ -255,8 +255,8 @@ def test_output_accepts_a_text_of_any_length(tmp_path: Path) -> None:
 
 
 def test_the_error_for_a_long_text_suggests_lines(scripted: Talk) -> None:
-    for words, typed in ((["-"], "one two. " * 2000), (["-w", "-"], "x" * 50_000), (["-w", "x" * 10_001], None)):
-        done = scripted.run("say", *words, stdin=typed)
+    for arguments, typed in ((["-"], "one two. " * 2000), (["-w", "-"], "x" * 50_000), (["-w", "x" * 10_001], None)):
+        done = scripted.run("say", *arguments, stdin=typed)
         assert (done.code, done.out) == (5, "")
         assert "10,000" in done.err
         assert "talk say --lines" in done.err
@@ -278,13 +278,13 @@ def test_output_prefers_options_to_environment_variables(tmp_path: Path) -> None
 
 
 def test_a_failed_output_reports_an_error_and_leaves_no_file(tmp_path: Path) -> None:
-    for words, code in (
+    for arguments, code in (
         (["-o", f"{tmp_path}/no/x.wav", "hello"], 1),
         (["-o", str(tmp_path), "hello"], 2),
         (["-o", f"{tmp_path}/x.wav", ""], 5),
         (["-o", f"{tmp_path}/x.wav", "-t", "0.001", "hello"], 124),
     ):
-        done = alone("say", *words)
+        done = alone("say", *arguments)
         assert (done.code, done.out) == (code, ""), done
         assert done.err
     assert os.listdir(tmp_path) == []

@@ -29,8 +29,8 @@ def in_terminal(scripted: Talk) -> Iterator[Run]:
     """Return a function that runs `talk` in a terminal: `in_terminal("say", "-wf", "--", text, columns=40)`."""
     opened: list[Terminal] = []
 
-    def start(*words: str, columns: int = 80, **env: str) -> Terminal:
-        opened.append(Terminal([*TALK, *words], {**scripted.env, **env}, columns))
+    def start(*arguments: str, columns: int = 80, **env: str) -> Terminal:
+        opened.append(Terminal([*TALK, *arguments], {**scripted.env, **env}, columns))
         return opened[-1]
 
     yield start

@@ -31,35 +31,35 @@ def env() -> Iterator[dict[str, str]]:
         yield clean_environment(home, {"TALK_SOCKET": f"{home}/s"})
 
 
-def piped(words: list[str], env: dict[str, str]) -> Forked:
-    return Forked(words, env, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+def piped(arguments: list[str], env: dict[str, str]) -> Forked:
+    return Forked(arguments, env, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
-def run_forked(words: list[str], env: dict[str, str], text: str | None = None) -> tuple[int, str, str]:
+def run_forked(arguments: list[str], env: dict[str, str], text: str | None = None) -> tuple[int, str, str]:
     """Run a forked `talk`, and return its exit code, output and errors."""
-    process = piped(words, env)
+    process = piped(arguments, env)
     out, err = process.communicate(text, LIMIT_S)
     return process.wait(LIMIT_S), out, err
 
 
 def serving(env: dict[str, str], *, session: bool = False) -> Forked:
     """Start a server, and return it when it is ready."""
-    words = ["serve", "--player", "null"]
-    process = Forked(words, env, stderr=subprocess.PIPE, start_new_session=session)
+    arguments = ["serve", "--player", "null"]
+    process = Forked(arguments, env, stderr=subprocess.PIPE, start_new_session=session)
     assert process.stderr
     assert any("ready on " in line for line in process.stderr)
     return process
 
 
 def test_a_forked_command_ends_like_a_started_one(env: dict[str, str]) -> None:
-    for words, code, out, err in (
+    for arguments, code, out, err in (
         (["--version"], 0, "talk ", ""),
         (["sya"], 2, "", "did you mean"),
         (["status"], 3, "", "talk serve"),
     ):
-        result = run_forked(words, env)
+        result = run_forked(arguments, env)
         assert (result[0], result[1].startswith(out), err in result[2]) == (code, True, True), result
-        command = [sys.executable, "-m", "talkcli", *words]
+        command = [sys.executable, "-m", "talkcli", *arguments]
         started = subprocess.run(command, env=env, capture_output=True, text=True, timeout=LIMIT_S, check=False)
         assert result == (started.returncode, started.stdout, started.stderr)
 

@@ -22,8 +22,8 @@ LONG = "moving to the charger on the second floor, please step back from the doo
 class Lines:
     """A `talk watch` whose standard output is a pipe."""
 
-    def __init__(self, talk: Talk, *words: str) -> None:
-        self.process = talk.start("watch", *words)
+    def __init__(self, talk: Talk, *arguments: str) -> None:
+        self.process = talk.start("watch", *arguments)
         self.lines: list[str] = []
         self.next("")  # the first line confirms that it watches
 
@@ -51,8 +51,8 @@ def number(goal_id: str) -> str:
     return goal_id.partition("-")[2]
 
 
-def at_terminal(talk: Talk, columns: int, *words: str, **env: str) -> Terminal:
-    return Terminal([*TALK, *words], {"TERM": "xterm", **talk.env, **env}, columns)
+def at_terminal(talk: Talk, columns: int, *arguments: str, **env: str) -> Terminal:
+    return Terminal([*TALK, *arguments], {"TERM": "xterm", **talk.env, **env}, columns)
 
 
 def test_in_a_pipe_every_event_is_printed_at_once_as_a_full_line(scripted: Talk) -> None:

@@ -47,14 +47,14 @@ def test_servers_and_clients_import_no_fleet_modules(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "words",
+    "arguments",
     [["--robot", "anna", "status"], ["say", "--robot", "anna", "hello"], ["--robot", "anna", "doctor"], ["watch"]],
 )
-def test_without_the_extra_fleet_commands_name_the_missing_package(words: list[str], tmp_path: Path) -> None:
+def test_without_the_extra_fleet_commands_name_the_missing_package(arguments: list[str], tmp_path: Path) -> None:
     env = record_imports(
         tmp_path, environment(str(tmp_path), TALK_ROBOT="anna", TALK_BROKER="mqtt://127.0.0.1"), ["paho"]
     )
-    done = run([*TALK, *words], env)
+    done = run([*TALK, *arguments], env)
     assert (done.code, done.out) == (2, "")
     assert done.err == f"talk: a fleet needs paho-mqtt; install it with: {install.command('paho-mqtt')}\n"
 
