@@ -113,7 +113,7 @@ async def test_a_full_server_admits_urgent_clients_and_lets_silent_ones_wait() -
 
 
 @in_loop
-async def test_a_server_that_ends_first_answers_all_received_requests() -> None:
+async def test_a_server_answers_all_received_requests_before_it_ends() -> None:
     served, count = Server(ServerSettings(), cast("Any", Unused())), 3 * LINES_PER_TURN
     client, idle = Client(SAY * count + STATUS), Client()
     for end in (client, idle):

@@ -163,7 +163,7 @@ def test_typical_script_lines_are_parsed_without_click(line: str) -> None:
         *(["say", "x", "--key", "k" * 65], ["say", "x", "--priority", "1000001"], ["say", "-o", "x.wav", "x"]),
     ],
 )
-def test_other_lines_are_left_to_click(line: list[str]) -> None:
+def test_other_lines_are_parsed_by_click(line: list[str]) -> None:
     assert plain.read(line, {}) is None
 
 

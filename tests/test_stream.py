@@ -31,7 +31,7 @@ class CountingSocket(socket.socket):
 
 
 class Recorder(asyncio.Protocol):
-    """Records the calls of a stream."""
+    """A protocol that records the calls of its stream."""
 
     def __init__(self) -> None:
         self.data = b""
