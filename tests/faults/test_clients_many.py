@@ -214,7 +214,7 @@ def test_a_server_with_a_full_backlog_does_not_block_clients(scripted: Talk, com
                     connected = stack.enter_context(socket.socket(socket.AF_UNIX))
                     connected.setblocking(False)
                     connected.connect(scripted.socket)
-            for client in [scripted.start(*words) for words in commands]:
+            for client in [scripted.start(*args) for args in commands]:
                 done = scripted.finish(client, timeout=10)
                 assert (done.code, done.out) == (3, ""), done
                 assert "restart it if it hangs" in done.err

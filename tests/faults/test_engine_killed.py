@@ -201,10 +201,10 @@ def _feeding(talk: Talk, player: int) -> bool:
 
 def _assert_lost(talk: Talk, goal_id: str, number: signal.Signals) -> Message:
     """Assert that a goal was ABORTED because its engine got this signal, and return the goal."""
-    reason, words, _ = SIGNALS[number]
+    reason, error, _ = SIGNALS[number]
     assert await_end(talk, goal_id, HANG) == "ABORTED"
     goal = talk.goal(goal_id)
-    assert_aborted(goal, reason, words)
+    assert_aborted(goal, reason, error)
     return goal
 
 
@@ -299,8 +299,8 @@ def test_a_player_that_cannot_be_reaped_does_not_block_the_next_goal(
             talk, goal, limit = talks[case], goals[case], STUCK[case][1]
             assert await_end(talk, goal, limit + 2) == "ABORTED"
             ended = talk.watcher.arrived(talk.watcher.wait_for(goal, "ABORTED")) - started_at[case]
-            words = "silence was not confirmed" if case == "stopped" else "the player could not be stopped"
-            assert_aborted(talk.goal(goal), "not_silent", words)
+            error = "silence was not confirmed" if case == "stopped" else "the player could not be stopped"
+            assert_aborted(talk.goal(goal), "not_silent", error)
             assert_within(ended, limit, f"the end of a goal that was {case}")
         for case, talk in talks.items():
             player = players[case]

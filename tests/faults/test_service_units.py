@@ -62,9 +62,9 @@ def command_of(unit: str) -> list[str]:
     return [word.replace("%%", "%").replace("$$", "$") for word in shlex.split(line)]
 
 
-def passing_command(passed: socket.socket, *words: str) -> list[str]:
+def passing_command(passed: socket.socket) -> list[str]:
     """Return a command that starts a scripted server with this socket."""
-    return [sys.executable, "-S", "-c", PASS_SOCKET, str(passed.fileno()), *SCRIPTED, *words]
+    return [sys.executable, "-S", "-c", PASS_SOCKET, str(passed.fileno()), *SCRIPTED]
 
 
 def assert_valid_unit(home: str, name: str, **units: str) -> None:

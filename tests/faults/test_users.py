@@ -82,8 +82,8 @@ def as_user(uid: int, *groups: int) -> list[str]:
 
 
 def stranger(path: str, *requests: dict[str, object], groups: Sequence[int] = ()) -> subprocess.CompletedProcess[str]:
-    words = [*as_user(NOBODY, *groups), PYTHON, "-c", STRANGER, path, *map(json.dumps, requests)]
-    return subprocess.run(words, cwd="/", capture_output=True, text=True, timeout=20, check=False)
+    command = [*as_user(NOBODY, *groups), PYTHON, "-c", STRANGER, path, *map(json.dumps, requests)]
+    return subprocess.run(command, cwd="/", capture_output=True, text=True, timeout=20, check=False)
 
 
 @contextlib.contextmanager
