@@ -44,7 +44,7 @@ def test_row_07_clients_of_a_killed_server_report_their_goals_lost(scripted: Tal
     for client in (sayer, behind):
         done = scripted.finish(client)
         assert done.code == 12
-        assert_within(done.seconds, 1, "LOST")
+        assert_within(done.seconds, 1, "the end of a client whose server was killed")
         assert "may still be spoken" in done.err
     goal = json.loads(done.out)
     assert (goal["id"], goal["state"], goal["status"], goal["reason"]) == (pending_id, "LOST", 9, "lost")
