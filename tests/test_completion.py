@@ -204,8 +204,8 @@ def test_completion_is_silent_and_quick_with_any_server(greeting: bytes | None) 
 
         lines = ["talk cancel ", "talk status ", "talk cancel --key ", "talk say --voice "]
         with ThreadPoolExecutor(len(lines)) as pool:
-            took = list(pool.map(seconds, lines))
-    assert_within(max(took), 3, "a completion")  # at most two timeouts, and the start of a program
+            durations = list(pool.map(seconds, lines))
+    assert_within(max(durations), 3, "a completion")  # at most two timeouts, and the start of a program
 
 
 # Real shells

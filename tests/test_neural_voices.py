@@ -333,7 +333,7 @@ def test_an_engine_that_hangs_while_loading_is_replaced(env: dict[str, str], hol
         assert robot.heard(goal) == ("SUCCEEDED", TINY)
 
 
-# -- lists, files, refusals
+# -- lists, files, refused voices
 
 
 def test_gaps_on_a_slow_machine_are_reported(env: dict[str, str], tmp_path: Path) -> None:

@@ -68,8 +68,8 @@ def test_preempt_queue_flush_and_priority_reach_the_server(make_talk: MakeTalk) 
     assert talk.run("say", "--wait", "--preempt", "--priority", "9", "length=0").code == 0
     assert talk.watcher.wait_for_terminal(first) == "PREEMPTED"
     assert {talk.watcher.wait_for_terminal(goal_id) for goal_id in queued} == {"SUCCEEDED"}
-    begun = [event["id"] for event in talk.watcher.events() if event.get("state") == "ACTIVE"]
-    assert begun[2:] == queued[::-1]
+    started = [event["id"] for event in talk.watcher.events() if event.get("state") == "ACTIVE"]
+    assert started[2:] == queued[::-1]
     first = busy(talk)
     pending, important = (talk.run("say", "--queue", "--priority", priority, "length=0").id for priority in ("0", "1"))
     assert talk.run("say", "--wait", "--flush", "length=0 now").code == 0

@@ -62,8 +62,8 @@ class Pair:
     """A stream, its recorded calls, and the client's end of the socket."""
 
     def __init__(self) -> None:
-        ours, self.client = socket.socketpair()
-        self.socket = CountingSocket(fileno=ours.detach())
+        server_end, self.client = socket.socketpair()
+        self.socket = CountingSocket(fileno=server_end.detach())
         for end in (self.socket, self.client):
             end.setblocking(False)
         self.recorder = Recorder()

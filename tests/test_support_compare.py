@@ -89,11 +89,11 @@ def test_a_sentence_is_recognised_despite_gaps_and_lost_samples(low: Samples) ->
     assert result.heard == result.expected
     heard = [low, (low // 2).astype(np.int16), np.delete(low, slice(9000, 9041)), np.delete(low, slice(9000, 9072))]
     for at, lost in ((9000, 0), (9000, 41), (27000, 0), (27000, 41)):
-        begun = np.concatenate([low[:at], zeros(1500), low[at + lost : at + 6000], zeros(700)])
-        heard.append(np.concatenate([begun, low[at + 6000 :]]))
+        first_part = np.concatenate([low[:at], zeros(1500), low[at + lost : at + 6000], zeros(700)])
+        heard.append(np.concatenate([first_part, low[at + 6000 :]]))
         for wrong in (low[at + 9000 :], low[at + 5000 :]):
             with pytest.raises(AssertionError):
-                assert_heard(recorded(begun, wrong), [low])
+                assert_heard(recorded(first_part, wrong), [low])
     for samples in heard:
         assert compare(recorded(samples), low).same
         assert_heard(recorded(samples), [low])
@@ -163,23 +163,23 @@ def test_a_sentence_is_found_directly_after_a_stopped_one(silence: int) -> None:
 def test_a_stopped_or_paused_sentence_is_recognised_despite_a_gap(low: Samples, dry: int | None) -> None:
     (left,) = render([LEFT])
     gap, dry = zeros(900 if dry else 0), dry or 0
-    begun = np.concatenate([low[:dry], gap, low[dry:20000]])
-    assert assert_only_beginning(recorded(begun), low) == pytest.approx(20000 / RATE, abs=0.1)
-    for wrong in ([low[:dry], gap, left[dry:20000]], [begun, low[-20000:]]):
+    first_part = np.concatenate([low[:dry], gap, low[dry:20000]])
+    assert assert_only_beginning(recorded(first_part), low) == pytest.approx(20000 / RATE, abs=0.1)
+    for wrong in ([low[:dry], gap, left[dry:20000]], [first_part, low[-20000:]]):
         with pytest.raises(AssertionError):
             assert_only_beginning(recorded(*wrong), low)
     with pytest.raises(AssertionError, match="nothing was heard"):
         assert_only_beginning(SILENCE, low)
     at = 16000 - len(gap)
-    paused_s = assert_resumed(recorded(begun[:16000], PAUSE, low[at:]), low, 1.9)
+    paused_s = assert_resumed(recorded(first_part[:16000], PAUSE, low[at:]), low, 1.9)
     assert paused_s == pytest.approx(2, abs=0.3)
-    assert_resumed(recorded(begun[:16000], PAUSE, low[at - 800 :]), low, 1.9, repeated=0.05)
+    assert_resumed(recorded(first_part[:16000], PAUSE, low[at - 800 :]), low, 1.9, repeated=0.05)
     for pause, rest in (
         *((PAUSE, low[at + 900 :]), (PAUSE, low[at - 1100 :]), (PAUSE, low[:0]), (PAUSE[:RATE], low[at:])),
         *((low[:0], low[at:]), (PAUSE, without_end(low, 0.1)[at:])),
     ):
         with pytest.raises(AssertionError):
-            assert_resumed(recorded(begun[:16000], pause, rest), low, 1.9)
+            assert_resumed(recorded(first_part[:16000], pause, rest), low, 1.9)
 
 
 def test_quiet_samples_next_to_a_pause_belong_to_the_sentence() -> None:
@@ -190,12 +190,12 @@ def test_quiet_samples_next_to_a_pause_belong_to_the_sentence() -> None:
     quiet = [place for place in places if np.abs(sentence[place - 8 : place + 1]).max() < LOUD and place > 9000]
     assert quiet
     for at in (sample for place in quiet for sample in (place + 1, place + 100)):
-        begun = np.concatenate([sentence[:5000], zeros(900), sentence[5000:at]])
-        assert_resumed(recorded(begun, PAUSE, sentence[at:]), sentence, 1.9)
-        assert_resumed(recorded(begun, PAUSE, sentence[at - 800 :]), sentence, 1.9, repeated=0.05)
+        first_part = np.concatenate([sentence[:5000], zeros(900), sentence[5000:at]])
+        assert_resumed(recorded(first_part, PAUSE, sentence[at:]), sentence, 1.9)
+        assert_resumed(recorded(first_part, PAUSE, sentence[at - 800 :]), sentence, 1.9, repeated=0.05)
         for wrong in (sentence[at + 1500 :], sentence[at - 1500 :]):
             with pytest.raises(AssertionError):
-                assert_resumed(recorded(begun, PAUSE, wrong), sentence, 1.9, repeated=0.05)
+                assert_resumed(recorded(first_part, PAUSE, wrong), sentence, 1.9, repeated=0.05)
 
 
 def test_similarity_distinguishes_sentences_whose_samples_vary() -> None:

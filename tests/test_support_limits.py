@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
 @pytest.fixture
 def control() -> Iterator[MakeControl]:
-    """Return a function that makes controls. They take 10 ms before the limited block, and `beside` seconds in it."""
+    """Return a function that makes controls. They take 10 ms before the limited block, and `control_s` in it."""
 
-    def make(beside: float) -> Callable[[], float]:
+    def make(control_s: float) -> Callable[[], float]:
         times = iter([0.01] * 5)
-        return lambda: next(times, beside)
+        return lambda: next(times, control_s)
 
     yield make
     take_unmeasured()  # keep these out of the summary
@@ -46,10 +46,10 @@ def test_a_late_result_beside_a_late_control_is_not_measured(control: MakeContro
 
 
 @pytest.mark.parametrize(
-    ("beside", "seconds", "limit"), [(0.01, 0.11, 0.1), (0.019, 0.11, 0.1), (0.03, 0.35, 0.1), (0.03, 0.091, 0.02)]
+    ("control_s", "seconds", "limit"), [(0.01, 0.11, 0.1), (0.019, 0.11, 0.1), (0.03, 0.35, 0.1), (0.03, 0.091, 0.02)]
 )
-def test_an_unexplained_late_result_fails(control: MakeControl, beside: float, seconds: float, limit: float) -> None:
-    with pytest.raises(AssertionError, match="it took"), limits(control(beside)):
+def test_an_unexplained_late_result_fails(control: MakeControl, control_s: float, seconds: float, limit: float) -> None:
+    with pytest.raises(AssertionError, match="it took"), limits(control(control_s)):
         assert_within(seconds, limit, "it")
     assert take_unmeasured() == []
 
