@@ -66,8 +66,8 @@ def make_bridge() -> Iterator[MakeBridge]:
     bridges: list[Bridge] = []
     with contextlib.ExitStack() as stack:
 
-        def make(*words: Any, online: bool = True, **named: Any) -> Bridge:
-            bridges.append(bridge := stack.enter_context(Bridge(*words, **named)))
+        def make(*arguments: Any, online: bool = True, **named: Any) -> Bridge:
+            bridges.append(bridge := stack.enter_context(Bridge(*arguments, **named)))
             if online:
                 bridge.await_online()
             return bridge
@@ -141,8 +141,8 @@ def fleet_of(broker: Broker, monkeypatch: pytest.MonkeyPatch, *, grace: float = 
     from talkcli.fleet.desk import link
 
     monkeypatch.setattr(link, "RETAINED_GRACE_S", grace)  # mosquitto tells at once all that it keeps
-    for each in [name for name in os.environ if name.startswith("TALK_") and not name.startswith("TALK_TEST_")]:
-        monkeypatch.delenv(each)
+    for name in [name for name in os.environ if name.startswith("TALK_") and not name.startswith("TALK_TEST_")]:
+        monkeypatch.delenv(name)
     if user:
         monkeypatch.setenv("TALK_MQTT_USER", user)
     return Fleet(broker.url)

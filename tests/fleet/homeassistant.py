@@ -52,29 +52,29 @@ VALUES = {
 def faults(topic: str, payload: bytes) -> list[str]:
     """Return what Home Assistant would not accept of a device."""
     device = json.loads(payload)
-    entities = [each for each in device["components"].values() if len(each) > 1]
-    parts = [("payload", device), *((each, device[each]) for each in ("device", "origin"))]
-    parts += [("availability", each) for each in device["availability"]]
-    parts += [(each["platform"], each) for each in entities]
-    found = [] if TOPIC.fullmatch(topic) else [topic]
+    entities = [component for component in device["components"].values() if len(component) > 1]
+    parts = [("payload", device), *((key, device[key]) for key in ("device", "origin"))]
+    parts += [("availability", availability) for availability in device["availability"]]
+    parts += [(entity["platform"], entity) for entity in entities]
+    errors = [] if TOPIC.fullmatch(topic) else [topic]
     for kind, part in parts:
         required, allowed = KEYS[kind]
-        found += [f"{kind}: {each}" for each in (required - part.keys()) | (part.keys() - allowed)]
+        errors += [f"{kind}: {key}" for key in (required - part.keys()) | (part.keys() - allowed)]
         texts = {key: json.dumps(value) for key, value in part.items()}
-        found += [
+        errors += [
             f"{kind}: {key}: {text}" for key, text in texts.items() if not re.fullmatch(VALUES.get(key, _TEXT), text)
         ]
-    if len({each["unique_id"] for each in entities}) < len(entities):
-        found.append("two entities have the same unique_id")
-    found += [each["name"] for each in entities if ("options" in each) != (each.get("device_class") == "enum")]
-    return found
+    if len({entity["unique_id"] for entity in entities}) < len(entities):
+        errors.append("two entities have the same unique_id")
+    errors += [entity["name"] for entity in entities if ("options" in entity) != (entity.get("device_class") == "enum")]
+    return errors
 
 
 def rendered(template: str, payload: bytes) -> str:
     """Return the text that a template makes of a message."""
-    words, filtered, _ = template.removeprefix("{{ ").removesuffix(" }}").partition(" | tojson")
-    said = json.loads(payload, object_hook=lambda each: SimpleNamespace(**each))
-    value = eval(words, {"value_json": said})
+    expression, filtered, _ = template.removeprefix("{{ ").removesuffix(" }}").partition(" | tojson")
+    message = json.loads(payload, object_hook=lambda fields: SimpleNamespace(**fields))
+    value = eval(expression, {"value_json": message})
     return json.dumps(value, default=vars) if filtered else str(value)
 
 
@@ -89,16 +89,16 @@ class HomeAssistant(Listener):
 
     def device(self) -> dict[str, Any]:
         """Wait for a device, and return its payload; from now on its entities have states."""
-        message = self.await_message(lambda each: bool(TOPIC.fullmatch(each.topic) and each.payload))
+        message = self.await_message(lambda message: bool(TOPIC.fullmatch(message.topic) and message.payload))
         assert faults(message.topic, message.payload) == []
-        topics = {each["topic"] for each in message.json["availability"]}
-        for each in topics | {message.json["components"]["state"]["state_topic"]}:
-            assert self.subscribe(each) <= 1
+        topics = {availability["topic"] for availability in message.json["availability"]}
+        for topic in topics | {message.json["components"]["state"]["state_topic"]}:
+            assert self.subscribe(topic) <= 1
         return message.json
 
-    def await_states(self, device: dict[str, Any], **wanted: str) -> None:
+    def await_states(self, device: dict[str, Any], **expected: str) -> None:
         """Wait until the entities are in these states."""
-        self.await_message(lambda _: all(self._state(device, key) == state for key, state in wanted.items()))
+        self.await_message(lambda _: all(self._state(device, key) == state for key, state in expected.items()))
 
     def command(self, device: dict[str, Any], key: str, text: str = "PRESS") -> int:
         """Press a button, or send a message by the notifier; return the broker's reason code."""
@@ -106,10 +106,10 @@ class HomeAssistant(Listener):
         return self.publish(entity["command_topic"], text, entity["qos"], entity.get("retain", False))
 
     def _state(self, device: dict[str, Any], key: str) -> str | None:
-        told = {each.topic: each.payload for each in self.messages}
+        payloads = {message.topic: message.payload for message in self.messages}
         (presence,) = device["availability"]
-        if rendered(presence["value_template"], told.get(presence["topic"]) or b'{"online": false}') != "online":
+        if rendered(presence["value_template"], payloads.get(presence["topic"]) or b'{"online": false}') != "online":
             return "unavailable"
         entity = device["components"][key]
-        payload = told.get(entity["state_topic"])
+        payload = payloads.get(entity["state_topic"])
         return rendered(entity["value_template"], payload) if payload else None

@@ -28,39 +28,43 @@ if TYPE_CHECKING:
     from tests.support.processes import Clients, Finished
 
 #: Seconds in which started robots are online, even if they share two processors.
-THERE_LIMIT = 30.0
+ONLINE_LIMIT_S = 30.0
 #: Robots that start or end at the same time.
 _AT_ONCE = 8
 _ROOT = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 
 
-class Roll(Listener):
+class PresenceListener(Listener):
     """A listener to the presences of all robots."""
 
     def __init__(self, broker: Broker) -> None:
         super().__init__(broker, "talk/robot/+/presence")
 
-    def __enter__(self) -> Roll:
+    def __enter__(self) -> PresenceListener:
         return self
 
-    def await_there(self, names: Iterable[str], within: float = THERE_LIMIT) -> float:
+    def await_online(self, names: Iterable[str], within: float = ONLINE_LIMIT_S) -> float:
         """Wait until these robots are online with a server, and return the monotonic time of the last one."""
-        missing = wanted = set(names)
+        missing = expected = set(names)
 
         def complete(message: Message) -> bool:
             nonlocal missing
             name = {message.topic.split("/")[2]}
-            told = message.json if message.payload else {}
-            missing = missing - name if told.get("online") and told.get("server") else missing | (name & wanted)
+            presence = message.json if message.payload else {}
+            missing = (
+                missing - name if presence.get("online") and presence.get("server") else missing | (name & expected)
+            )
             return not missing
 
-        found = self.find(complete, within)
-        assert found, f"{len(missing)} are not online within {within} s: {sorted(missing)[:10]}"
-        return found.arrived
+        last = self.find(complete, within)
+        assert last, f"{len(missing)} are not online within {within} s: {sorted(missing)[:10]}"
+        return last.arrived
 
-    def await_gone(self, name: str, within: float = THERE_LIMIT) -> None:
+    def await_offline(self, name: str, within: float = ONLINE_LIMIT_S) -> None:
         self.await_message(
-            lambda each: each.topic.split("/")[2] == name and bool(each.payload) and each.json.get("online") is False,
+            lambda message: (
+                message.topic.split("/")[2] == name and bool(message.payload) and message.json.get("online") is False
+            ),
             within,
         )
 
@@ -81,8 +85,8 @@ class RealRobots(contextlib.AbstractContextManager["RealRobots"]):
         with contextlib.ExitStack() as stack:
             self._stack = stack.enter_context(contextlib.ExitStack())
             _together(self.add, names)
-            with Roll(broker) as roll:
-                roll.await_there(names)
+            with PresenceListener(broker) as presences:
+                presences.await_online(names)
             stack.pop_all()
 
     def __exit__(self, kind: object, *_error: object) -> None:
@@ -106,11 +110,11 @@ class RealRobots(contextlib.AbstractContextManager["RealRobots"]):
 
     def each(self, action: Callable[[Robot], Any]) -> list[Any]:
         """Return the results of an action for each robot, sorted by their names."""
-        return _together(action, [self._by_name[each] for each in self.names])
+        return _together(action, [self._by_name[name] for name in self.names])
 
     def spoken(self) -> dict[str, list[str]]:
         """Return the texts that each robot has begun to speak."""
-        return dict(zip(self.names, self.each(lambda each: each.spoken), strict=True))
+        return dict(zip(self.names, self.each(lambda robot: robot.spoken), strict=True))
 
 
 def _end(robot: Robot) -> None:
@@ -122,12 +126,12 @@ def _end(robot: Robot) -> None:
         robot.talk.check()
 
 
-def _together(action: Callable[[Any], Any], those: Collection[Any]) -> list[Any]:
+def _together(action: Callable[[Any], Any], items: Collection[Any]) -> list[Any]:
     """Return the results of an action that is done for several at once; raise the first error when all are done."""
     with ThreadPoolExecutor(_AT_ONCE) as pool:
-        done = [pool.submit(action, each) for each in those]
+        done = [pool.submit(action, item) for item in items]
         wait(done)
-    return [each.result() for each in done]
+    return [future.result() for future in done]
 
 
 class SimulatedRobots(contextlib.AbstractContextManager["SimulatedRobots"]):
@@ -139,7 +143,7 @@ class SimulatedRobots(contextlib.AbstractContextManager["SimulatedRobots"]):
         with contextlib.ExitStack() as stack:
             self._directory = stack.enter_context(short_directory("sim-"))
             stack.callback(self._kill)
-            for first, end in pairwise(count * each // processes for each in range(processes + 1)):
+            for first, end in pairwise(count * part // processes for part in range(processes + 1)):
                 self._start(["--robots", str(end - first), "--first", str(first + 1), "--broker", broker.url])
             self._stack = stack.pop_all()
 
@@ -155,27 +159,27 @@ class SimulatedRobots(contextlib.AbstractContextManager["SimulatedRobots"]):
         """Return when each robot began to speak a goal (monotonic time). No robot may have begun it twice."""
         with open(f"{self._directory}/spoken", encoding="utf-8") as file:
             *lines, _unfinished = file.read().split("\n")
-        found = [each for each in map(json.loads, lines) if each["id"] == goal_id]
-        result = {each["robot"]: each["at"] for each in found}
-        assert len(result) == len(found), (
-            f"{goal_id} was spoken more than once: {Counter(each['robot'] for each in found)}"
+        entries = [entry for entry in map(json.loads, lines) if entry["id"] == goal_id]
+        result = {entry["robot"]: entry["at"] for entry in entries}
+        assert len(result) == len(entries), (
+            f"{goal_id} was spoken more than once: {Counter(entry['robot'] for entry in entries)}"
         )
         return result
 
-    def await_there(self, within: float = THERE_LIMIT) -> None:
+    def await_online(self, within: float = ONLINE_LIMIT_S) -> None:
         """Wait until all robots are online for the first time."""
         end = time.monotonic() + within
-        for each in self._processes:
-            assert each.stdout
-            found, _, _ = select.select([each.stdout], [], [], max(0.0, end - time.monotonic()))
-            assert found, f"simulated robots are not online within {within} s: {self.log[-2000:]}"
-            assert "online" in each.stdout.readline(), self.log[-2000:]
+        for process in self._processes:
+            assert process.stdout
+            ready, _, _ = select.select([process.stdout], [], [], max(0.0, end - time.monotonic()))
+            assert ready, f"simulated robots are not online within {within} s: {self.log[-2000:]}"
+            assert "online" in process.stdout.readline(), self.log[-2000:]
 
-    def await_spoken(self, goal_id: str, within: float = THERE_LIMIT) -> None:
+    def await_spoken(self, goal_id: str, within: float = ONLINE_LIMIT_S) -> None:
         """Wait until all robots have begun to speak a goal."""
         end = time.monotonic() + within
-        while (begun := len(self.spoken(goal_id))) < len(self.names):
-            assert time.monotonic() < end, f"{begun} of {len(self.names)} speak {goal_id} within {within} s"
+        while (started := len(self.spoken(goal_id))) < len(self.names):
+            assert time.monotonic() < end, f"{started} of {len(self.names)} speak {goal_id} within {within} s"
             time.sleep(0.05)  # nothing tells when a file grows
 
     def assert_spoken_once(self, goal_id: str) -> float:
@@ -186,16 +190,16 @@ class SimulatedRobots(contextlib.AbstractContextManager["SimulatedRobots"]):
 
     def stop(self) -> None:
         """End the processes by SIGTERM, and check them."""
-        for each in self._processes:
-            each.terminate()
-        for each in self._processes:
-            code = each.wait(STOP_LIMIT + len(self.names) / 100)
+        for process in self._processes:
+            process.terminate()
+        for process in self._processes:
+            code = process.wait(STOP_LIMIT + len(self.names) / 100)
             assert code == 0, f"simulated robots ended with {code}: {self.log[-2000:]}"
-        for words in ("Traceback", "a bug"):
-            assert words not in self.log, self.log[-2000:]
+        for text in ("Traceback", "a bug"):
+            assert text not in self.log, self.log[-2000:]
 
-    def _start(self, words: Sequence[str]) -> None:
-        command = [sys.executable, "-m", "tests.tools.simulated", *words, "--spoken", f"{self._directory}/spoken"]
+    def _start(self, arguments: Sequence[str]) -> None:
+        command = [sys.executable, "-m", "tests.tools.simulated", *arguments, "--spoken", f"{self._directory}/spoken"]
         with open(f"{self._directory}/log", "ab") as log:
             process = subprocess.Popen(
                 dying_with_parent(command),
@@ -209,34 +213,34 @@ class SimulatedRobots(contextlib.AbstractContextManager["SimulatedRobots"]):
         self._processes.append(process)
 
     def _kill(self) -> None:
-        for each in self._processes:
-            each.kill()
-            each.wait()
-            assert each.stdout
-            each.stdout.close()
+        for process in self._processes:
+            process.kill()
+            process.wait()
+            assert process.stdout
+            process.stdout.close()
 
 
 def request(robots: RealRobots, name: str, **fields: Any) -> None:
-    for reply in robots.each(lambda each: each.talk.request(name, **fields)):
+    for reply in robots.each(lambda robot: robot.talk.request(name, **fields)):
         assert reply["ok"], reply
 
 
 def at_once(clients: Clients, *lines: Sequence[str]) -> list[Finished]:
     """Run several commands at the same time."""
-    return [clients.finish(each) for each in [clients.start(*line) for line in lines]]
+    return [clients.finish(client) for client in [clients.start(*line) for line in lines]]
 
 
-def told(done: Finished) -> dict[str, tuple[str, str, int]]:
+def printed_outcomes(done: Finished) -> dict[str, tuple[str, str, int]]:
     """Return the id, the state and the code that a desk printed for each robot."""
     lines = [line.split() for line in done.out.splitlines()]
-    found = {robot: (goal_id, state, int(code)) for robot, goal_id, state, code in lines}
-    assert len(found) == len(lines), f"a robot twice: {done.out}"
-    return found
+    outcomes = {robot: (goal_id, state, int(code)) for robot, goal_id, state, code in lines}
+    assert len(outcomes) == len(lines), f"a robot twice: {done.out}"
+    return outcomes
 
 
 def objects(done: Finished) -> dict[str, dict[str, Any]]:
     """Return the object that a desk printed for each robot."""
-    return {each["robot"]: each for each in map(json.loads, done.out.splitlines())}
+    return {outcome["robot"]: outcome for outcome in map(json.loads, done.out.splitlines())}
 
 
 def alike(names: Sequence[str], goal_id: str, state: str, code: int) -> dict[str, tuple[str, str, int]]:
@@ -244,7 +248,7 @@ def alike(names: Sequence[str], goal_id: str, state: str, code: int) -> dict[str
     return dict.fromkeys(names, (goal_id, state, code))
 
 
-def assert_told(done: Finished, code: int, wanted: Mapping[str, tuple[str, str, int]], summary: str) -> None:
+def assert_outcomes(done: Finished, code: int, expected: Mapping[str, tuple[str, str, int]], summary: str) -> None:
     """Assert what a desk printed for each robot, its exit code, and its summary."""
-    assert told(done) == wanted, done
+    assert printed_outcomes(done) == expected, done
     assert (done.code, done.err.splitlines()[-1:]) == (code, [f"talk: {summary}"]), done

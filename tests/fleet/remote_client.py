@@ -36,15 +36,15 @@ class RemoteClient(contextlib.AbstractContextManager["RemoteClient"]):
 
     @property
     def lines(self) -> list[Message]:
-        return [json.loads(line) for each in self.listener.messages for line in each.payload.splitlines()]
+        return [json.loads(line) for message in self.listener.messages for line in message.payload.splitlines()]
 
     def send(
         self, payload: object, *, to: str = ANNA, kind: str = "request", response: str | None = "", **more: Any
     ) -> None:
         """Publish an object, a text or bytes. `response`: another response topic, or None."""
-        where = self.response if response == "" else response
+        topic = self.response if response == "" else response
         data = payload if isinstance(payload, str | bytes) else json.dumps(payload, ensure_ascii=False)
-        self.listener.publish(f"{to}/{kind}/{self._user}", data, response=where, **more)
+        self.listener.publish(f"{to}/{kind}/{self._user}", data, response=topic, **more)
 
     def ask(self, request: str, *, to: str = ANNA, **fields: object) -> Message:
         """Send a request, and return the reply."""
@@ -63,7 +63,7 @@ class RemoteClient(contextlib.AbstractContextManager["RemoteClient"]):
         return goal
 
     def reply(self, number: int | None, within: float = PATIENCE) -> Message:
-        return self.line(lambda each: each.get("seq") == number and "ok" in each, within)
+        return self.line(lambda line: line.get("seq") == number and "ok" in line, within)
 
     def result(self, goal_id: str, within: float = 20) -> Message:
         """Return a goal after its end."""
@@ -77,9 +77,9 @@ class RemoteClient(contextlib.AbstractContextManager["RemoteClient"]):
     def hang_up(self) -> None:
         self.send(b"")
 
-    def line(self, wanted: Callable[[Message], bool], within: float = PATIENCE) -> Message:
+    def line(self, matches: Callable[[Message], bool], within: float = PATIENCE) -> Message:
         """Return the first wanted line, also of those that came before."""
-        self.listener.find(lambda _: any(map(wanted, self.lines)), within)
-        found = list(filter(wanted, self.lines))
+        self.listener.find(lambda _: any(map(matches, self.lines)), within)
+        found = list(filter(matches, self.lines))
         assert found, f"no such line within {within} s: {self.lines}"
         return found[0]

@@ -39,13 +39,13 @@ class Robot:
         """The texts that it has begun to speak since the start of its server."""
         return self.talk.watcher.texts("ACTIVE")
 
-    def desk(self, *words: str, timeout: float = 20) -> Finished:
+    def desk(self, *arguments: str, timeout: float = 20) -> Finished:
         """Run one command at a desk: `robot.desk("say", "--wait", "--", "battery low")`."""
-        return desk(self.broker, self.name, *words, timeout=timeout)
+        return desk(self.broker, self.name, *arguments, timeout=timeout)
 
     def listen(self, *topics: str) -> Listener:
         """Return a listener to its presence, which has come already, and to other topics under its name."""
-        listener = Listener(self.broker, self.presence, *(f"talk/robot/{self.name}/{each}" for each in topics))
+        listener = Listener(self.broker, self.presence, *(f"talk/robot/{self.name}/{topic}" for topic in topics))
         try:
             listener.await_message(self.is_online)
         except BaseException:
@@ -54,15 +54,15 @@ class Robot:
         return listener
 
     def is_online(self, message: Message) -> bool:
-        told = self._told(message)
-        return bool(told.get("online") and told["server"])
+        presence = self._told(message)
+        return bool(presence.get("online") and presence["server"])
 
     def is_offline(self, message: Message) -> bool:
         return self._told(message).get("online") is False
 
     def is_without_server(self, message: Message) -> bool:
-        told = self._told(message)
-        return bool(told.get("online") and told["server"] is None)
+        presence = self._told(message)
+        return bool(presence.get("online") and presence["server"] is None)
 
     def _told(self, message: Message) -> dict[str, object]:
         return message.json if message.topic == self.presence and message.payload else {}

@@ -36,9 +36,9 @@ AT_ONCE = 1.0
 LONGEST_LINE = 64 * 1024
 
 
-def assert_refused(done: Finished, code: int, words: str) -> None:
+def assert_refused(done: Finished, code: int, expected: str) -> None:
     assert (done.code, done.out) == (code, ""), done
-    assert words in done.err, done
+    assert expected in done.err, done
 
 
 def assert_spoken(robot: Robot, *texts: str) -> None:
@@ -47,13 +47,16 @@ def assert_spoken(robot: Robot, *texts: str) -> None:
     assert robot.spoken == [*texts, "control"]
 
 
-def test_a_robot_that_is_offline_is_told_at_once_and_speaks_nothing_of_it_when_it_comes(robot: Robot) -> None:
+def test_an_offline_robot_is_reported_at_once_and_never_gets_the_goal(robot: Robot) -> None:
     assert robot.bridge.terminate() == 0
     with limits():
-        for name, words in (("anna", "anna is offline, so nothing was sent"), ("nobody", "no robot 'nobody' is known")):
+        for name, expected in (
+            ("anna", "anna is offline, so nothing was sent"),
+            ("nobody", "no robot 'nobody' is known"),
+        ):
             done = desk(robot.broker, name, "say", "--wait", "nobody hears this")
             assert_within(done.seconds, AT_ONCE, "a say to a robot that is not there")
-            assert_refused(done, 3, words)
+            assert_refused(done, 3, expected)
     with RemoteClient(robot.broker, "olga") as olga:  # which doesn't look first
         olga.post("say", text="nor this")
         olga.send("nor that", kind="say", response=None)
@@ -63,7 +66,7 @@ def test_a_robot_that_is_offline_is_told_at_once_and_speaks_nothing_of_it_when_i
         assert olga.lines == []
 
 
-def test_a_broker_that_is_not_there_is_told_and_nothing_is_spoken_when_it_is_back(robot: Robot) -> None:
+def test_a_missing_broker_is_reported_and_never_gets_the_goal(robot: Robot) -> None:
     robot.broker.kill()
     assert_refused(robot.desk("say", "hello"), 3, f"can't connect to the broker at {robot.broker.url}")
     robot.broker.start()
@@ -72,7 +75,7 @@ def test_a_broker_that_is_not_there_is_told_and_nothing_is_spoken_when_it_is_bac
 
 
 @in_loop
-async def test_a_connection_that_breaks_under_an_answer_is_made_again(
+async def test_a_bridge_reconnects_if_it_is_disconnected_while_it_replies(
     scripted: Talk, broker: Broker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The request was read, and the answer can't be sent while the bridge still waits for room for it."""
@@ -84,11 +87,11 @@ async def test_a_connection_that_breaks_under_an_answer_is_made_again(
             raise ConnectionResetError
         return original(client, data)
 
-    async def until(wanted: Callable[[], bool]) -> None:
-        while not wanted():  # noqa: ASYNC110 - a bridge tells nobody
+    async def until(condition: Callable[[], bool]) -> None:
+        while not condition():  # noqa: ASYNC110 - a bridge tells nobody
             await asyncio.sleep(0.01)
 
-    asyncio.get_running_loop().set_exception_handler(lambda _loop, told: bugs.append(told))
+    asyncio.get_running_loop().set_exception_handler(lambda _loop, context: bugs.append(context))
     settings = BridgeSettings("anna", ("say",), socket=scripted.socket)
     bridge = Bridge(settings, lambda: brokers.from_environment(broker.env()))
     work = asyncio.create_task(bridge.run())
@@ -96,10 +99,10 @@ async def test_a_connection_that_breaks_under_an_answer_is_made_again(
     with RemoteClient(broker, "olga") as olga, Listener(broker, "talk/robot/anna/presence") as listener:
         monkeypatch.setattr(paho.Client, "_sock_send", send)
         olga.send({"seq": 1, "request": "set", "rate": 200})
-        gone = await asyncio.to_thread(listener.await_message, lambda each: not each.json["online"], PATIENCE)
+        gone = await asyncio.to_thread(listener.await_message, lambda message: not message.json["online"], PATIENCE)
         # Once the broker has passed on the new presence, it has processed the robot's subscriptions, too.
         await asyncio.to_thread(
-            listener.await_message, lambda each: each.json["online"] and each.arrived > gone.arrived, PATIENCE
+            listener.await_message, lambda message: message.json["online"] and message.arrived > gone.arrived, PATIENCE
         )
         olga.send({"seq": 2, "request": "say", "text": "hello"})
         assert (await asyncio.to_thread(olga.reply, 2))["ok"]
@@ -122,14 +125,14 @@ def test_a_cancel_arrives_after_a_flood(robot: Robot) -> None:
             olga.listener.find(lambda _: bool(olga.lines), 0.1)
 
 
-def test_a_goal_that_comes_several_times_is_spoken_once(robot: Robot) -> None:
+def test_a_goal_that_arrives_several_times_is_spoken_once(robot: Robot) -> None:
     line = '{"seq": %d, "request": "say", "id": "once", "text": "only once"}'
     with RemoteClient(robot.broker, "olga") as olga:
         for seq in (1, 2, 3):
             olga.send(line % seq)
         olga.send(line % 4, to="talk/group/all")
         replies = [olga.reply(seq) for seq in (1, 2, 3, 4)]
-    assert [(each["ok"], each["goal"]["id"], each.get("attached", False)) for each in replies] == [
+    assert [(reply["ok"], reply["goal"]["id"], reply.get("attached", False)) for reply in replies] == [
         (True, "once", False),
         *[(True, "once", True)] * 3,
     ]
@@ -139,7 +142,7 @@ def test_a_goal_that_comes_several_times_is_spoken_once(robot: Robot) -> None:
 
 
 @pytest.mark.parametrize("bridge", ["the same", "another"])
-def test_a_goal_that_an_earlier_server_had_is_not_sent_to_the_next(robot: Robot, bridge: str) -> None:
+def test_a_goal_of_an_earlier_server_is_not_sent_to_the_next(robot: Robot, bridge: str) -> None:
     assert robot.desk("say", "--wait", "--id", "mine", "only once").code == 0
     if bridge == "another":
         robot.bridge.kill()
@@ -148,12 +151,14 @@ def test_a_goal_that_an_earlier_server_had_is_not_sent_to_the_next(robot: Robot,
     robot.talk.kill()
     robot.talk.start_server()
     with robot.listen() as listener:
-        listener.await_message(lambda each: robot.is_online(each) and each.json["server"]["pid"] == robot.talk.pid)
+        listener.await_message(
+            lambda message: robot.is_online(message) and message.json["server"]["pid"] == robot.talk.pid
+        )
     assert_refused(robot.desk("say", "--id", "mine", "only once"), 12, "it may have been spoken")
     assert_spoken(robot)
 
 
-def test_a_retained_message_is_dropped_as_it_comes(robot: Robot) -> None:
+def test_a_new_retained_message_is_dropped(robot: Robot) -> None:
     robot.talk.run("say", "--id", "mine", "--", LONG)
     robot.talk.watcher.wait_for("mine", "ACTIVE")
     with RemoteClient(robot.broker, "olga") as olga:
@@ -162,14 +167,12 @@ def test_a_retained_message_is_dropped_as_it_comes(robot: Robot) -> None:
             olga.send(text, retain=True, kind=kind, response=None)
         assert olga.ask("status", id="mine")["goal"]["state"] == "ACTIVE"
         assert olga.ask("cancel")["ok"]
-        assert not [each for each in olga.lines if each.get("seq") == 99]
+        assert not [line for line in olga.lines if line.get("seq") == 99]
     assert "retained" in robot.bridge.log
     assert_spoken(robot, LONG)
 
 
-def test_a_message_that_the_broker_has_kept_is_not_spoken(
-    make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge
-) -> None:
+def test_an_old_retained_message_is_not_spoken(make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge) -> None:
     talk = make_talk(scripted=True)
     talk.run("say", "--id", "mine", "--", LONG)
     with RemoteClient(broker, "olga") as olga:
@@ -185,7 +188,7 @@ def test_a_message_that_the_broker_has_kept_is_not_spoken(
         assert olga.lines == []
 
 
-def test_a_malformed_request_is_answered_with_the_error_of_the_wire(lasting_robot: Robot) -> None:
+def test_a_malformed_request_gets_the_protocols_error(lasting_robot: Robot) -> None:
     """`tests/unit/test_fleet_policy.py` has all of these errors."""
     status = b'{"seq": 7, "request": "status"}'
     before = lasting_robot.spoken
@@ -194,20 +197,20 @@ def test_a_malformed_request_is_answered_with_the_error_of_the_wire(lasting_robo
         assert olga.reply(7)["ok"]
         for payload, code in ((b'["say", "hello"]', "bad_json"), (status.ljust(LONGEST_LINE), "line_too_long")):
             olga.send(payload)
-            assert olga.line(lambda each: each.get("ok") is False and each["error"]["code"] == code)  # noqa: B023
+            assert olga.line(lambda line: line.get("ok") is False and line["error"]["code"] == code)  # noqa: B023
         assert olga.ask("status")["ok"]  # it goes on
     assert lasting_robot.spoken == before
 
 
-def test_a_desk_may_do_what_the_robot_allows_and_nothing_else(make_robot: MakeRobot) -> None:
+def test_a_robot_accepts_only_allowed_requests(make_robot: MakeRobot) -> None:
     anna = make_robot("anna")
     assert_refused(anna.desk("set", "--rate", "300"), 10, "anna: remote clients may not use set on this robot")
     bert = make_robot("bert", "--allow", "say,set")
     assert bert.bridge.await_online()["allow"] == ["say", "set"]
     assert bert.desk("set", "--rate", "300").code == 0
     assert bert.talk.request("set")["settings"]["rate"] == 300
-    for each in ("cancel", "status"):
-        assert_refused(bert.desk(each), 10, f"bert: remote clients may not use {each} on this robot")
+    for request in ("cancel", "status"):
+        assert_refused(bert.desk(request), 10, f"bert: remote clients may not use {request} on this robot")
     assert bert.desk("say", "hello").code == 0
 
 
@@ -228,21 +231,21 @@ TEXTS = (
 
 def is_plain(log: str) -> bool:
     """Return whether a log has nothing in it that a terminal would obey."""
-    return all(each == "\n" or each.isprintable() for each in log)
+    return all(char == "\n" or char.isprintable() for char in log)
 
 
-def test_a_plain_text_is_spoken_as_it_stands_and_no_log_has_control_characters(robot: Robot) -> None:
+def test_plain_text_is_spoken_verbatim_and_logged_without_control_chars(robot: Robot) -> None:
     talk, watcher = robot.talk, robot.talk.watcher
     before = talk.request("set")["settings"]
     with RemoteClient(robot.broker, "olga") as olga:
-        for each in TEXTS:
-            olga.send(each, kind="say", response=None)
+        for text in TEXTS:
+            olga.send(text, kind="say", response=None)
         watcher.wait_until(lambda _: len(watcher.texts("PENDING")) == len(TEXTS))
         assert watcher.texts("PENDING") == list(TEXTS)
-        assert {talk.goal(each)["client"]["name"] for each in watcher.goals()} == {"mqtt:olga"}
+        assert {talk.goal(goal_id)["client"]["name"] for goal_id in watcher.goals()} == {"mqtt:olga"}
         olga.send("\x1b[31m--key no such", kind="cancel", response=None)  # any payload cancels everything
-        for each in watcher.goals():
-            watcher.wait_for_terminal(each)
+        for text in watcher.goals():
+            watcher.wait_for_terminal(text)
         for request in (
             {"request": EVIL},
             {"request": "say", "text": "x", EVIL: 1},
@@ -263,33 +266,35 @@ def test_a_plain_text_is_spoken_as_it_stands_and_no_log_has_control_characters(r
     assert is_plain(talk.log), talk.log
 
 
-def test_a_robot_publishes_nothing_on_the_response_topic_of_another(lasting_robot: Robot) -> None:
+def test_a_robot_does_not_publish_on_the_response_topic_of_another_user(lasting_robot: Robot) -> None:
     """`tests/unit/test_fleet_topics.py` has all forms of such topics."""
     responses = {"talk/reply/otto/session/anna", "talk/robot/bert/say/olga", "elsewhere"}
     before = lasting_robot.spoken
     with Listener(lasting_robot.broker, "#") as everything, RemoteClient(lasting_robot.broker, "olga") as olga:
-        for each in responses:
-            olga.send({"request": "say", "text": "hello"}, response=each)
+        for topic in responses:
+            olga.send({"request": "say", "text": "hello"}, response=topic)
         assert olga.ask("status")["ok"]
-        assert not responses & {each.topic for each in everything.messages}
+        assert not responses & {message.topic for message in everything.messages}
     assert lasting_robot.spoken == before
 
 
 def test_with_no_text_only_the_remote_client_reads_a_sentence(broker: Broker, make_robot: MakeRobot) -> None:
     robot = make_robot("anna", "--no-text")
-    with Listener(broker, "talk/robot/anna/+", "talk/robot/anna/event/+") as everybody:
+    with Listener(broker, "talk/robot/anna/+", "talk/robot/anna/event/+") as listener:
         done = robot.desk("say", "--wait", "--feedback", "--key", "door", "the secret word")
         assert (done.code, "secret" in done.out) == (0, True), done
         assert robot.talk.run("say", "--wait", "--key", "door", "another secret").code == 0
-        everybody.await_message(lambda each: each.topic.endswith("/state") and each.json["state"] == "SUCCEEDED")
-        everybody.await_message(lambda each: each.topic.endswith("/status") and "SUCCEEDED" in each.text)
-        told = everybody.messages
-    assert {each.topic.rpartition("/")[2] for each in told} >= {"state", "status", "presence"}
-    assert [each for each in told if "secret" in each.text] == []
+        listener.await_message(
+            lambda message: message.topic.endswith("/state") and message.json["state"] == "SUCCEEDED"
+        )
+        listener.await_message(lambda message: message.topic.endswith("/status") and "SUCCEEDED" in message.text)
+        messages = listener.messages
+    assert {message.topic.rpartition("/")[2] for message in messages} >= {"state", "status", "presence"}
+    assert [message for message in messages if "secret" in message.text] == []
 
 
 @pytest.mark.timeout(20)
-def test_broker_that_dies_while_it_is_answered_ends_the_connection(broker: Broker) -> None:
+def test_a_broker_that_dies_during_a_reply_ends_the_connection(broker: Broker) -> None:
     """The answer is sent from the callback, which must not wait for a broker that is gone."""
     needs_packages("paho")
     from talkcli.fleet.link import Link

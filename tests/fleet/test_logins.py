@@ -26,11 +26,11 @@ SECRET = "correct horse battery staple"
 LET_IN = 3
 
 
-def assert_refused(broker: Broker, code: int, words: str, **login: Any) -> None:
+def assert_refused(broker: Broker, code: int, expected: str, **login: Any) -> None:
     """Assert that a desk with this login ends with this code and says this."""
-    with Desk(broker, **login) as somebody:
-        done = somebody.run("--robot", "nobody", "status")
-    assert (done.code, done.out, words in done.err) == (code, "", True), done
+    with Desk(broker, **login) as operator:
+        done = operator.run("--robot", "nobody", "status")
+    assert (done.code, done.out, expected in done.err) == (code, "", True), done
     assert SECRET not in done.err
 
 
@@ -38,7 +38,7 @@ def assert_let_in(broker: Broker, **login: Any) -> None:
     assert_refused(broker, LET_IN, "no robot 'nobody'", **login)
 
 
-def test_only_the_right_password_lets_in() -> None:
+def test_a_login_needs_the_right_password() -> None:
     hint = "set TALK_MQTT_USER and TALK_MQTT_PASSWORD_FILE for your login"
     with Broker(secure=True, users={"olga": SECRET}) as broker:
         assert_let_in(broker, user="olga")
@@ -47,7 +47,7 @@ def test_only_the_right_password_lets_in() -> None:
         assert_refused(broker, 10, "rejected the login of an anonymous user")
 
 
-def test_only_a_valid_certificate_of_the_ca_is_trusted() -> None:
+def test_a_broker_needs_a_valid_certificate_of_the_ca() -> None:
     untrusted = "the broker's certificate is not trusted"
     with Broker(secure=True) as broker:
         assert_let_in(broker)
@@ -60,7 +60,7 @@ def test_only_a_valid_certificate_of_the_ca_is_trusted() -> None:
         assert_refused(broker, 10, "expired")
 
 
-def test_a_certificate_is_a_login_for_a_robot_and_for_a_desk(make_talk: MakeTalk, make_bridge: MakeBridge) -> None:
+def test_robots_and_desks_can_log_in_with_a_certificate(make_talk: MakeTalk, make_bridge: MakeBridge) -> None:
     rules = topics.access_rules(OPERATORS) + "\n\nuser watcher\ntopic read #\n"
     other, own = stranger().client("olga"), authority().client("olga")
     hint = "set TALK_MQTT_CERT and TALK_MQTT_KEY to a certificate that it accepts"
@@ -72,18 +72,18 @@ def test_a_certificate_is_a_login_for_a_robot_and_for_a_desk(make_talk: MakeTalk
         talk = make_talk(scripted=True)
         bridge = make_bridge(talk, broker, "anna", cert="anna", online=False)
         with Listener(broker, "talk/robot/anna/presence", cert="watcher") as listener:
-            listener.await_message(lambda each: bool(each.payload and each.json["server"]), within=10)
-        with Desk(broker, cert="olga", env={"TALK_MQTT_USER": "olga"}) as somebody:
-            done = somebody.run("--robot", "anna", "say", "--wait", "--feedback", "hello")
+            listener.await_message(lambda message: bool(message.payload and message.json["server"]), within=10)
+        with Desk(broker, cert="olga", env={"TALK_MQTT_USER": "olga"}) as operator:
+            done = operator.run("--robot", "anna", "say", "--wait", "--feedback", "hello")
             assert done.code == 0, done
-        with Desk(broker, cert="otto", env={"TALK_MQTT_USER": "olga"}) as somebody:  # which only claims to be olga
-            done = somebody.run("--robot", "anna", "say", "hello")
+        with Desk(broker, cert="otto", env={"TALK_MQTT_USER": "olga"}) as operator:  # which only claims to be olga
+            done = operator.run("--robot", "anna", "say", "hello")
             assert done.code == 10, done
         assert talk.watcher.texts("ACTIVE") == ["hello"]
         assert bridge.terminate() == 0
 
 
-def test_a_password_is_sent_in_clear_text_to_another_machine_only_with_insecure() -> None:
+def test_a_password_is_sent_without_tls_only_with_insecure() -> None:
     """0.0.0.0 is this machine, but no rule says so."""
     with Broker(users={"olga": SECRET}) as broker:
         elsewhere = {"TALK_BROKER": f"mqtt://0.0.0.0:{broker.port}"}
@@ -91,8 +91,8 @@ def test_a_password_is_sent_in_clear_text_to_another_machine_only_with_insecure(
         before = broker.log.count("New connection")
         assert_refused(broker, 2, "in clear text", user="olga", env=elsewhere)
         assert broker.log.count("New connection") == before
-        with Desk(broker, user="olga", env=elsewhere) as somebody:
-            assert somebody.run("--robot", "nobody", "--insecure", "status").code == LET_IN
+        with Desk(broker, user="olga", env=elsewhere) as operator:
+            assert operator.run("--robot", "nobody", "--insecure", "status").code == LET_IN
 
 
 def test_a_password_is_shown_nowhere(make_talk: MakeTalk, make_bridge: MakeBridge) -> None:
@@ -100,12 +100,12 @@ def test_a_password_is_shown_nowhere(make_talk: MakeTalk, make_bridge: MakeBridg
         talk = make_talk(scripted=True)
         bridge = make_bridge(talk, broker, "anna", user="anna", observer="watcher")
         with Listener(broker, "#", user="watcher", password="other") as listener:
-            with Desk(broker, user="anna") as somebody:
-                done = somebody.run("--robot", "anna", "--json", "say", "--wait", "hello")
+            with Desk(broker, user="anna") as operator:
+                done = operator.run("--robot", "anna", "--json", "say", "--wait", "hello")
                 assert done.code == 0, done
-            listener.await_message(lambda each: each.topic.endswith("/state") and b"SUCCEEDED" in each.payload)
-            listener.await_message(lambda each: each.topic.endswith("/status"))
-            published = b"".join(each.topic.encode() + each.payload for each in listener.messages)
+            listener.await_message(lambda message: message.topic.endswith("/state") and b"SUCCEEDED" in message.payload)
+            listener.await_message(lambda message: message.topic.endswith("/status"))
+            published = b"".join(message.topic.encode() + message.payload for message in listener.messages)
         assert SECRET not in command_line(bridge.pid)
         with open(f"/proc/{bridge.pid}/environ", "rb") as environ:
             assert SECRET.encode() not in environ.read()
@@ -114,7 +114,7 @@ def test_a_password_is_shown_nowhere(make_talk: MakeTalk, make_bridge: MakeBridg
             assert SECRET not in shown
 
 
-def test_a_robot_reads_its_password_again_and_keeps_the_last_one_it_could_read(
+def test_the_password_file_is_read_again_and_the_last_password_is_kept(
     make_talk: MakeTalk, make_bridge: MakeBridge
 ) -> None:
     """The broker may be mended, or the password file, and nobody may be there to start the bridge again."""
@@ -136,7 +136,7 @@ def test_a_robot_reads_its_password_again_and_keeps_the_last_one_it_could_read(
 # The access control list; `tests/unit/test_fleet_topics.py` has its rules
 
 
-def test_a_fleet_works_by_the_rules_and_a_login_without_rights_is_told_what_is_missing(
+def test_the_printed_access_rules_allow_only_what_a_login_needs(
     make_talk: MakeTalk, secure_broker: Broker, make_bridge: MakeBridge
 ) -> None:
     robots = []
@@ -145,8 +145,8 @@ def test_a_fleet_works_by_the_rules_and_a_login_without_rights_is_told_what_is_m
         bridge = make_bridge(talk, secure_broker, name, user=name, observer="olga", groups=["warehouse"])
         robots.append(Robot(talk, secure_broker, bridge))
     anna, bert = robots
-    for words in (["say", "--wait", "--feedback", "hello"], ["status"], ["log"], ["cancel"]):
-        assert desk(secure_broker, "anna", *words, user="olga").code == 0
+    for arguments in (["say", "--wait", "--feedback", "hello"], ["status"], ["log"], ["cancel"]):
+        assert desk(secure_broker, "anna", *arguments, user="olga").code == 0
     for user in (*OTHERS, "bert"):  # a login without rules, and another robot's
         done = desk(secure_broker, "anna", "say", "hello", user=user)
         assert (done.code, done.out) == (10, ""), done
@@ -158,12 +158,12 @@ def test_a_fleet_works_by_the_rules_and_a_login_without_rights_is_told_what_is_m
         assert olga.ask("hello", to="talk/robot/bert")["ok"]
     bert.talk.watcher.wait_for(None, "SUCCEEDED")
     assert (anna.spoken, bert.spoken) == (["hello"], ["plain"])
-    for each in robots:
-        assert "right" not in each.bridge.log, each.bridge.log
+    for robot in robots:
+        assert "right" not in robot.bridge.log, robot.bridge.log
 
 
 @pytest.mark.slow
-def test_a_bridge_that_logs_in_as_another_robot_says_that_it_has_no_rights(
+def test_a_bridge_with_the_login_of_another_robot_reports_missing_rights(
     make_talk: MakeTalk, secure_broker: Broker, make_bridge: MakeBridge
 ) -> None:
     """The bridge notices because nothing that it sends to itself comes back."""

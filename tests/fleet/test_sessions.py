@@ -64,13 +64,13 @@ async def await_clients(talk: Talk, most: int) -> None:
 
 @pytest.mark.parametrize("waits", ["for room", "for a result", "for events"])
 @in_loop
-async def test_a_remote_client_that_is_silent_for_90_s_is_gone_whatever_it_waits_for(
+async def test_a_waiting_remote_client_is_gone_after_90_s_of_silence(
     talk: Talk, pass_time: Callable[[float], None], waits: str
 ) -> None:
     anna = SessionsWithoutBroker(talk.socket)
     if waits == "for room":
-        for each in range(20):
-            await anna.ask(say(each), "s2")
+        for number in range(20):
+            await anna.ask(say(number), "s2")
         anna.post(say(100, patient=True, wait=True, id="patient"))
         await anna.ask({"seq": 101, "request": "hello"})
         assert [request.seq for request, _, _ in anna.sessions.waiting] == [100]
@@ -83,7 +83,7 @@ async def test_a_remote_client_that_is_silent_for_90_s_is_gone_whatever_it_waits
         anna.sessions.tick()
         if waits == "for events":
             await anna.ask(say(1), "s3")
-    assert not [each for each in anna.lines() if each.get("event") == "gone"]
+    assert not [line for line in anna.lines() if line.get("event") == "gone"]
     pass_time(GONE - 88 + 0.1)
     anna.sessions.tick()
     assert "must send hello every 30 s" in anna.lines()[-1]["message"]
@@ -95,37 +95,37 @@ async def test_a_remote_client_that_is_silent_for_90_s_is_gone_whatever_it_waits
 
 
 @in_loop
-async def test_a_remote_client_that_says_hello_keeps_what_it_waits_for(
+async def test_a_remote_client_that_sends_hello_keeps_its_session(
     talk: Talk, pass_time: Callable[[float], None]
 ) -> None:
     anna = SessionsWithoutBroker(talk.socket)
     goal = await anna.ask(say(1, wait=True))
-    for each in range(2, 8):
+    for number in range(2, 8):
         pass_time(30)
         anna.sessions.tick()
-        await anna.ask({"seq": each, "request": "hello"})
+        await anna.ask({"seq": number, "request": "hello"})
     await anna.ask({"seq": 10, "request": "cancel"})
-    ended = await anna.line(lambda each: each.get("event") == "result")
+    ended = await anna.line(lambda line: line.get("event") == "result")
     assert ended["goal"]["id"] == goal["goal"]["id"]
     anna.sessions.end_all()
 
 
 @in_loop
-async def test_a_remote_client_to_whom_nothing_is_owed_is_let_go_without_a_word(
+async def test_the_session_of_an_idle_remote_client_ends_without_a_message(
     talk: Talk, pass_time: Callable[[float], None]
 ) -> None:
     anna = SessionsWithoutBroker(talk.socket)
     before = talk.request("status")["server"]["clients"]
     await anna.ask({"seq": 1, "request": "status"})
-    told = anna.lines()
+    lines = anna.lines()
     pass_time(GONE + 0.1)
     anna.sessions.tick()
     await await_clients(talk, before)
-    assert anna.lines() == told
+    assert anna.lines() == lines
 
 
 @in_loop
-async def test_requests_before_a_goodbye_are_carried_out_except_goals_that_wait_for_room(talk: Talk) -> None:
+async def test_only_goals_that_wait_for_room_are_dropped_by_a_goodbye(talk: Talk) -> None:
     """With and without a connection to the server. A client that returns after a goodbye gets answers again."""
     anna = SessionsWithoutBroker(talk.socket)
     before = talk.request("status")["server"]["clients"]
@@ -141,25 +141,25 @@ async def test_requests_before_a_goodbye_are_carried_out_except_goals_that_wait_
     await await_clients(talk, before)
     with talk.connect() as wire:
         wire.request("status")
-        assert sorted(each["pending"]["id"] for each in wire.items) == ["last", "of-s1", "of-s2", "of-s3"]
+        assert sorted(item["pending"]["id"] for item in wire.items) == ["last", "of-s1", "of-s2", "of-s3"]
     assert anna.lines("s1") == []
 
 
 @in_loop
-async def test_a_cancel_takes_the_place_of_the_remote_client_that_is_silent_for_longest(
+async def test_a_cancel_replaces_the_remote_client_that_was_silent_longest(
     talk: Talk, pass_time: Callable[[float], None]
 ) -> None:
     anna = SessionsWithoutBroker(talk.socket)
-    for each in range(32):
-        await anna.ask({"seq": 1, "request": "watch"}, f"w{each}")
+    for number in range(32):
+        await anna.ask({"seq": 1, "request": "watch"}, f"w{number}")
         pass_time(0.1)
     await anna.ask({"seq": 2, "request": "hello"}, "w0")
     assert (await anna.ask({"seq": 3, "request": "log"}, "another"))["error"]["code"] == "busy"
     assert (await anna.ask({"seq": 3, "request": "cancel"}, "urgent"))["ok"]
     await anna.ask(say(4), "w0")
-    for each in range(32):
-        gone = [line for line in anna.lines(f"w{each}") if line.get("event") == "gone"]
-        assert bool(gone) == (each == 1), each
+    for number in range(32):
+        gone = [line for line in anna.lines(f"w{number}") if line.get("event") == "gone"]
+        assert bool(gone) == (number == 1), number
     assert (await anna.ask({"seq": 4, "request": "status"}, "urgent"))["ok"]  # in its existing session
     assert (await anna.ask({"seq": 5, "request": "log"}, "another"))["ok"]  # it isn't waiting for anything now
     await anna.ask({"seq": 5, "request": "cancel"}, "w0")
@@ -167,7 +167,7 @@ async def test_a_cancel_takes_the_place_of_the_remote_client_that_is_silent_for_
 
 
 @in_loop
-async def test_remote_clients_that_come_and_go_at_a_server_that_hangs_take_32_connections_and_no_threads() -> None:
+async def test_clients_of_a_hung_server_take_32_connections_and_no_threads() -> None:
     """A closed connection stays in the backlog. A client that leaves before its turn is not connected."""
     with short_directory() as directory, socket.socket(socket.AF_UNIX) as listening:
         listening.bind(f"{directory}/s")
@@ -176,17 +176,17 @@ async def test_remote_clients_that_come_and_go_at_a_server_that_hangs_take_32_co
         anna = SessionsWithoutBroker(f"{directory}/s")
         before = threading.active_count()
         for _ in range(100):
-            for each in range(3):
-                anna.post({"seq": 1, "request": "status"}, f"s{each}")
+            for number in range(3):
+                anna.post({"seq": 1, "request": "status"}, f"s{number}")
                 await asyncio.sleep(0)  # so that it begins
-                anna.post(b"", f"s{each}")
+                anna.post(b"", f"s{number}")
         await asyncio.sleep(0)
         assert threading.active_count() == before
         for _ in range(32):
             listening.accept()[0].close()
         anna.post({"seq": 2, "request": "status"})
         (await asyncio.to_thread(listening.accept))[0].close()
-        answer = await anna.line(lambda each: each.get("seq") == 2)
+        answer = await anna.line(lambda line: line.get("seq") == 2)
         assert answer["error"]["code"] == "no_server"
         listening.setblocking(False)
         with pytest.raises(BlockingIOError):
@@ -194,7 +194,7 @@ async def test_remote_clients_that_come_and_go_at_a_server_that_hangs_take_32_co
 
 
 @in_loop
-async def test_a_session_that_ends_keeps_its_slot_until_the_server_has_greeted() -> None:
+async def test_an_ended_session_keeps_its_slot_until_the_server_greets() -> None:
     with short_directory() as directory, socket.socket(socket.AF_UNIX) as listening:
         listening.bind(f"{directory}/s")
         listening.listen()
@@ -202,18 +202,18 @@ async def test_a_session_that_ends_keeps_its_slot_until_the_server_has_greeted()
         anna = SessionsWithoutBroker(f"{directory}/s")
         slots = anna.sessions.dialing = asyncio.Semaphore(1)
         anna.post({"seq": 1, "request": "log"})
-        with (await asyncio.to_thread(listening.accept))[0] as server, server.makefile("rb") as said:
+        with (await asyncio.to_thread(listening.accept))[0] as server, server.makefile("rb") as file:
             anna.post(b"")
             await asyncio.sleep(0.1)
             assert slots.locked()
             server.sendall(encode(greeting(__version__, 7, "a1b2")))
             await asyncio.wait_for(slots.acquire(), 5)
-            assert await asyncio.to_thread(said.readlines) == [encode({"request": "hello", "name": "mqtt:bob"})]
+            assert await asyncio.to_thread(file.readlines) == [encode({"request": "hello", "name": "mqtt:bob"})]
     gc.collect()  # reports sockets that were left open
 
 
 @in_loop
-async def test_a_session_without_a_free_descriptor_gives_its_slot_back(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_session_without_a_free_descriptor_returns_its_slot(monkeypatch: pytest.MonkeyPatch) -> None:
     def none_left(*_: object) -> None:
         raise OSError("Too many open files")
 
@@ -226,10 +226,10 @@ async def test_a_session_without_a_free_descriptor_gives_its_slot_back(monkeypat
 
 
 @in_loop
-async def test_all_remote_clients_hold_four_mebibytes_and_a_cancel_is_taken_beyond(talk: Talk) -> None:
+async def test_requests_of_all_clients_are_limited_to_4_mib_except_cancels(talk: Talk) -> None:
     anna = SessionsWithoutBroker(talk.socket)
-    for each in range(20):
-        await anna.ask(say(each), "full")
+    for number in range(20):
+        await anna.ask(say(number), "full")
     long = {"text": "a", "patient": True, "data": {"more": "x" * 900}}
     blanks = b" " * 60_000
     line = json.dumps({"seq": 1, "request": "say", **long}).encode()
@@ -238,9 +238,9 @@ async def test_all_remote_clients_hold_four_mebibytes_and_a_cancel_is_taken_beyo
         for _ in range(40):
             anna.post(line + blanks, f"s{session}")
         await anna.ask({"seq": 2, "request": "hello"}, f"s{session}")
-        refused.append([each for each in anna.lines(f"s{session}") if each.get("ok") is False])
-    assert [bool(each) for each in refused] == [False, True, True]
-    assert {each["error"]["code"] for each in refused[1]} == {"busy"}
+        refused.append([line for line in anna.lines(f"s{session}") if line.get("ok") is False])
+    assert [bool(lines) for lines in refused] == [False, True, True]
+    assert {line["error"]["code"] for line in refused[1]} == {"busy"}
     assert (4 << 20) - 61_000 < anna.sessions.count_waiting_bytes() <= 4 << 20
     assert (await anna.ask({"seq": 3, "request": "cancel"}, "another"))["ok"]
     assert anna.sessions.count_waiting_bytes() == 0
@@ -249,19 +249,19 @@ async def test_all_remote_clients_hold_four_mebibytes_and_a_cancel_is_taken_beyo
 
 @pytest.mark.parametrize(("wait", "feedback"), [(False, False), (True, False), (False, True)])
 @in_loop
-async def test_a_goal_that_never_reached_the_server_is_told_as_the_server_would(
+async def test_a_goal_that_never_reached_the_server_is_reported_in_its_format(
     talk: Talk, wait: bool, feedback: bool
 ) -> None:
     anna = SessionsWithoutBroker(talk.socket)
-    for each in range(20):
-        await anna.ask(say(each), "full")
+    for number in range(20):
+        await anna.ask(say(number), "full")
     more = {"wait": wait, "feedback": feedback, "key": "k", "priority": -2}
     anna.post(say(1, id="waits", patient=True, **more))
     await anna.ask(say(2, id="mine", **more))
     await anna.ask({"seq": 3, "request": "cancel", "ids": ["waits"]}, "another")
-    await anna.line(lambda each: each.get("seq") == 1)
+    await anna.line(lambda line: line.get("seq") == 1)
     for number, state, reason in ((1, "RECALLED", "canceled"), (2, "REJECTED", "queue_full")):
-        (reply,) = [each for each in anna.lines() if each.get("seq") == number]
+        (reply,) = [line for line in anna.lines() if line.get("seq") == number]
         goal = reply["goal"]
         assert (reply["ok"], goal["state"], goal["reason"]) == (True, state, reason)
         assert (goal["text"], goal["key"], goal["priority"]) == (f"sentence {number}", "k", -2)
@@ -269,20 +269,20 @@ async def test_a_goal_that_never_reached_the_server_is_told_as_the_server_would(
         assert bool(goal["by"]) == (number == 1)
         assert (goal["id"] == "waits") == (number == 1)  # a rejected goal never has the id that its client chose
         assert goal["id"] != "mine"
-        told = [each for each in anna.lines() if "event" in each and goal["id"] in json.dumps(each)]
-        assert [each["event"] for each in told] == (["state", "result"] if wait or feedback else [])
-        assert all(each["goal"] == goal for each in told[1:])
+        events = [line for line in anna.lines() if "event" in line and goal["id"] in json.dumps(line)]
+        assert [event["event"] for event in events] == (["state", "result"] if wait or feedback else [])
+        assert all(event["goal"] == goal for event in events[1:])
     anna.sessions.end_all()
 
 
 @in_loop
-async def test_an_answer_that_is_too_long_for_the_broker_has_no_words_or_is_an_error(talk: Talk) -> None:
+async def test_a_reply_too_long_for_the_broker_has_no_text_or_is_an_error(talk: Talk) -> None:
     anna = SessionsWithoutBroker(talk.socket, room=3_000)
-    for each in range(20):
-        await anna.ask(say(each), "full")
+    for number in range(20):
+        await anna.ask(say(number), "full")
     goal = (await anna.ask(say(1, text="long " * 1_000, wait=True)))["goal"]
     assert (goal["state"], goal["reason"], goal["text"]) == ("REJECTED", "queue_full", None)
-    ended = await anna.line(lambda each: each.get("event") == "result")
+    ended = await anna.line(lambda line: line.get("event") == "result")
     assert ended["goal"] == goal
     await anna.ask({"seq": 2, "request": "cancel"})
     anna.sessions.end_all()

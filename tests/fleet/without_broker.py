@@ -38,28 +38,28 @@ class SessionsWithoutBroker:
         """Send a request as bob, from an object or bytes. An empty payload is a goodbye."""
         payload = fields if isinstance(fields, bytes) else json.dumps(fields).encode()
         topic, response = "talk/robot/anna/request/bob", f"talk/reply/bob/{session}"
-        asked = topics.parse_request(topic)
-        assert asked
+        parsed = topics.parse_request(topic)
+        assert parsed
         message = Message(topic, payload, response=response, correlation=correlation)
         now = self._policy.newest_echo_at = self._boottime()
-        found = self._policy.decide(message, *asked, now)
-        if isinstance(found, policy.Goodbye):
-            self.sessions.handle_goodbye(found.user, found.reply_topic)
+        decision = self._policy.decide(message, *parsed, now)
+        if isinstance(decision, policy.Goodbye):
+            self.sessions.handle_goodbye(decision.user, decision.reply_topic)
         else:
-            assert isinstance(found, policy.RemoteRequest), found
-            self.sessions.submit(found)
+            assert isinstance(decision, policy.RemoteRequest), decision
+            self.sessions.submit(decision)
 
     def lines(self, session: str = "s1") -> list[dict[str, Any]]:
-        return [each for topic, lines in self.published if topic == f"talk/reply/bob/{session}/anna" for each in lines]
+        return [line for topic, lines in self.published if topic == f"talk/reply/bob/{session}/anna" for line in lines]
 
     async def line(self, wanted: Callable[[dict[str, Any]], bool], session: str = "s1") -> dict[str, Any]:
         """Return the first line that matches. It may have been published before this call."""
 
         async def find() -> dict[str, Any]:
-            while not (found := list(filter(wanted, self.lines(session)))):
+            while not (matches := list(filter(wanted, self.lines(session)))):
                 self._more.clear()
                 await self._more.wait()
-            return found[0]
+            return matches[0]
 
         try:
             return await asyncio.wait_for(find(), PATIENCE)
@@ -69,8 +69,8 @@ class SessionsWithoutBroker:
     async def ask(self, fields: dict[str, Any], session: str = "s1") -> dict[str, Any]:
         """Send a request as bob, and return the reply."""
         self.post(fields, session)
-        return await self.line(lambda each: each.get("seq") == fields["seq"] and "ok" in each, session)
+        return await self.line(lambda line: line.get("seq") == fields["seq"] and "ok" in line, session)
 
     def _publish(self, message: Message, _qos: int) -> None:
-        self.published.append((message.topic, [json.loads(each) for each in message.payload.splitlines()]))
+        self.published.append((message.topic, [json.loads(line) for line in message.payload.splitlines()]))
         self._more.set()

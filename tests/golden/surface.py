@@ -106,68 +106,70 @@ REQUESTS: tuple[dict[str, Any], ...] = (
 
 def surface() -> dict[str, str]:
     """Return the text of each file of the surface by its name."""
-    found = {f"help-{name or 'talk'}": text for name, text in _helps()}
-    return {**found, "errors": _errors(), "library": _library(), "wire": _wire()}
+    files = {f"help-{name or 'talk'}": text for name, text in _helps()}
+    return {**files, "errors": _errors(), "library": _library(), "wire": _wire()}
 
 
 def write() -> None:
     """Write all files, and delete those that are no longer needed."""
-    for each in HERE.glob("*.txt"):
-        each.unlink()
+    for path in HERE.glob("*.txt"):
+        path.unlink()
     for name, text in surface().items():
         (HERE / f"{name}.txt").write_text(text, encoding="utf-8")
 
 
-def _alone(home: str, words: list[str]) -> tuple[int, str, str]:
+def _run_without_server(home: str, arguments: list[str]) -> tuple[int, str, str]:
     """Run `talk` without a server and without sound; return its exit code and its output, with HOME for its place."""
-    done = run([*TALK, *words], environment(home, TALK_SOCKET=f"{home}/s", COLUMNS="80", PULSE_SERVER="unix:/nowhere"))
+    done = run(
+        [*TALK, *arguments], environment(home, TALK_SOCKET=f"{home}/s", COLUMNS="80", PULSE_SERVER="unix:/nowhere")
+    )
     return done.code, done.out.replace(home, "HOME"), done.err.replace(home, "HOME")
 
 
 def _helps() -> Iterator[tuple[str, str]]:
     with short_directory() as home:
         for name in ("", *COMMANDS):
-            code, out, err = _alone(home, [*([name] if name else []), "--help"])
+            code, out, err = _run_without_server(home, [*([name] if name else []), "--help"])
             assert (code, err) == (0, ""), name
             yield name, out
 
 
 def _errors() -> str:
-    told = []
+    results = []
     with short_directory() as home:
         for line in (f"{command} {words}".strip() for command, lines in ERRORS for words in lines):
-            code, out, err = _alone(home, shlex.split(line))
-            told.append(f"$ talk {line}\n{_indented(out)}{_indented(err, '! ')}= {code}\n")
-    return "\n".join(told)
+            code, out, err = _run_without_server(home, shlex.split(line))
+            results.append(f"$ talk {line}\n{_indented(out)}{_indented(err, '! ')}= {code}\n")
+    return "\n".join(results)
 
 
 def _indented(text: str, mark: str = "  ") -> str:
-    return "".join(f"{mark}{each}\n" for each in text.splitlines())
+    return "".join(f"{mark}{line}\n" for line in text.splitlines())
 
 
 def _library() -> str:
     """Return the names in `talkcli` with their public members, and the errors."""
     lines = [f"__all__ = {talkcli.__all__}"]
     for name in talkcli.__all__:
-        found = getattr(talkcli, name)
-        if isinstance(found, type):
-            lines += ["", f"class {name}", *_members(found)]
+        value = getattr(talkcli, name)
+        if isinstance(value, type):
+            lines += ["", f"class {name}", *_members(value)]
     lines += ["", "errors"]
-    for each in vars(errors).values():
-        if isinstance(each, type) and issubclass(each, errors.TalkError):
-            (base, *_) = each.__bases__
-            lines.append(f"    {each.__name__}({base.__name__}): code {each.code}, exit {each.exit_code}")
+    for value in vars(errors).values():
+        if isinstance(value, type) and issubclass(value, errors.TalkError):
+            (base, *_) = value.__bases__
+            lines.append(f"    {value.__name__}({base.__name__}): code {value.code}, exit {value.exit_code}")
     return "\n".join(lines) + "\n"
 
 
-def _members(found: type) -> Iterator[str]:
-    if hasattr(found, "__members__"):
-        yield from (f"    {each.name} = {each.value}" for each in found)  # type: ignore[attr-defined]
+def _members(kind: type) -> Iterator[str]:
+    if hasattr(kind, "__members__"):
+        yield from (f"    {member.name} = {member.value}" for member in kind)  # type: ignore[attr-defined]
         return
-    if "__init__" in vars(found) and not vars(found).get("__annotations__"):
-        yield f"    def __init__{inspect.signature(found.__init__)}"  # type: ignore[misc]
-    yield from (f"    {name}: {kind}" for name, kind in inspect.get_annotations(found).items())
-    for name, member in sorted(vars(found).items()):
+    if "__init__" in vars(kind) and not vars(kind).get("__annotations__"):
+        yield f"    def __init__{inspect.signature(kind.__init__)}"  # type: ignore[misc]
+    yield from (f"    {name}: {kind}" for name, kind in inspect.get_annotations(kind).items())
+    for name, member in sorted(vars(kind).items()):
         if name.startswith("_"):
             continue
         if isinstance(member, property):
@@ -201,9 +203,9 @@ def _wire() -> str:
 def _steady(value: Any, name: str = "") -> Any:
     """Return a message with the types of the values that differ from run to run; messages for people stay."""
     if isinstance(value, dict):
-        return {key: _steady(each, key) for key, each in value.items()}
+        return {key: _steady(item, key) for key, item in value.items()}
     if isinstance(value, list):
-        return [_steady(each) for each in value]
+        return [_steady(item) for item in value]
     if name in VARIES - {"message", "clients"} or name == "boot":
         return "null" if value is None else type(value).__name__
     return value

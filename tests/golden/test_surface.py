@@ -5,7 +5,7 @@ from __future__ import annotations
 from tests.golden import surface
 
 
-def test_surface_is_unchanged() -> None:
+def test_the_public_surface_is_unchanged() -> None:
     """To update the files: `python -m tests.golden.surface`."""
-    files = {each.stem: each.read_text("utf-8").splitlines() for each in surface.HERE.glob("*.txt")}
+    files = {path.stem: path.read_text("utf-8").splitlines() for path in surface.HERE.glob("*.txt")}
     assert {name: text.splitlines() for name, text in surface.surface().items()} == files

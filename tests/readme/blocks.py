@@ -22,18 +22,18 @@ _PARTS = re.compile(
 
 
 def _blocks() -> dict[str, tuple[str, str]]:
-    found: dict[str, tuple[str, str]] = {}
+    blocks: dict[str, tuple[str, str]] = {}
     heading, lead = "", ""
-    for part in (each for document in DOCUMENTS for each in _PARTS.finditer(document.text)):
+    for part in (part for document in DOCUMENTS for part in _PARTS.finditer(document.text)):
         if part["heading"]:
             heading, lead = part["heading"].replace("`", ""), ""
         elif part["lead"]:
             lead = f": {part['lead']}"
         else:
             name = f"{heading}{lead}"
-            number = 1 + sum(each == name or each.startswith(f"{name} #") for each in found)
-            found[name if number == 1 else f"{name} #{number}"] = part["language"], part["code"]
-    return found
+            number = 1 + sum(existing == name or existing.startswith(f"{name} #") for existing in blocks)
+            blocks[name if number == 1 else f"{name} #{number}"] = part["language"], part["code"]
+    return blocks
 
 
 #: The language and the text of each block, by its name.
@@ -50,8 +50,8 @@ def block(name: str) -> str:
 
 def commands(name: str) -> list[str]:
     """Return the commands of a block of which each stands on a line of its own, without the notes beside them."""
-    lines = (re.sub(r"(^|\s)#\s.*$", "", each).strip() for each in block(name).splitlines())
-    return [each for each in lines if each]
+    lines = (re.sub(r"(^|\s)#\s.*$", "", line).strip() for line in block(name).splitlines())
+    return [line for line in lines if line]
 
 
 def runs(*names: str) -> Callable[[_F], _F]:

@@ -24,14 +24,14 @@ _ALL, _ANYWHERE = "all", "before the command; all but `--version` also after it"
 def options() -> str:
     """Return the table of commands and their options: first what every command has, then each command's own."""
     context = click.Context(talk, info_name="talk")
-    shared = {each.name for each in talk.params}
+    shared = {parameter.name for parameter in talk.params}
     lines = ["| command | option | meaning |\n| --- | --- | --- |\n", f"| {_ALL} | | {_ANYWHERE} |\n"]
     lines += _rows(talk.params, context)
     for name, row in COMMANDS.items():
         command = talk.get_command(context, name)
         assert command
         lines.append(f"| `{name}` | | {_words(row.summary)} |\n")
-        own = [each for each in command.params if each.name not in shared]
+        own = [parameter for parameter in command.params if parameter.name not in shared]
         lines += _rows(own, click.Context(command, parent=context, info_name=name))
     return "".join(lines)
 
@@ -42,13 +42,13 @@ def requests() -> str:
     for kind, request in REQUEST_TYPES.items():
         meaning = request.meaning.removesuffix(".")
         lines.append(f"| `{kind}` | | | | {meaning[0].lower()}{meaning[1:]} |\n")
-        lines += [_field(each, changes=request is Set) for each in request.options]
+        lines += [_field(option, changes=request is Set) for option in request.options]
     return "".join(lines)
 
 
 def reasons() -> str:
     """Return the table of the reasons why goals end."""
-    rows = (f"| `{each}` | {', '.join(map(str, each.states))} | {each.meaning} |\n" for each in Reason)
+    rows = (f"| `{reason}` | {', '.join(map(str, reason.states))} | {reason.meaning} |\n" for reason in Reason)
     return "".join(["| reason | state | why |\n| --- | --- | --- |\n", *rows])
 
 
@@ -70,12 +70,12 @@ def _values(option: Option) -> str:
 
 
 #: What is made: by the name that stands around it, the document where that is, and how.
-MADE = {"options": (COMMAND_LINE, options), "requests": (WIRE, requests), "reasons": (WIRE, reasons)}
+TABLES = {"options": (COMMAND_LINE, options), "requests": (WIRE, requests), "reasons": (WIRE, reasons)}
 
 
 def current(name: str) -> str:
     """Return the text of a document with the list of this name as it is now."""
-    document, make = MADE[name]
+    document, make = TABLES[name]
     begin, end = f"<!-- {name}: begin -->\n", f"<!-- {name}: end -->\n"
     before, rest = document.text.split(begin)
     _, after = rest.split(end)
@@ -83,14 +83,14 @@ def current(name: str) -> str:
 
 
 def _rows(parameters: list[click.Parameter], context: click.Context) -> list[str]:
-    records = [each.get_help_record(context) for each in parameters if isinstance(each, click.Option)]
+    records = [parameter.get_help_record(context) for parameter in parameters if isinstance(parameter, click.Option)]
     return [f"| | `{_cell(left)}` | {_words(right)} |\n" for left, right in filter(None, records)]
 
 
 def _words(text: str) -> str:
     """Return help as it stands in a table: what is typed, and names of variables, as code; no link made of brackets."""
     quoted = r"'(-|default|talk [^']*|aplay [^']*|pactl [^']*|pw-cli [^']*)'"
-    text = re.sub(rf"{quoted}|(?<![\w`'-])(--[a-z][a-z-]*)", lambda found: f"`{found[1] or found[2]}`", _cell(text))
+    text = re.sub(rf"{quoted}|(?<![\w`'-])(--[a-z][a-z-]*)", lambda match: f"`{match[1] or match[2]}`", _cell(text))
     text = re.sub(r"\b(TALK_[A-Z]+)\b", r"`\1`", text)
     return re.sub(r"\s+", " ", text).replace("<", "&lt;").replace("*", "\\*")
 
@@ -100,6 +100,6 @@ def _cell(text: str) -> str:
 
 
 if __name__ == "__main__":
-    for _name, (_document, _) in MADE.items():
+    for _name, (_document, _) in TABLES.items():
         _document.text = current(_name)  # the wire's document has two of the tables
         _document.path.write_text(_document.text, encoding="utf-8")

@@ -75,16 +75,16 @@ class Shell:
         if shutil.which("jq") is None:
             self._python("jq", _JQ)
 
-    def program(self, name: str, script: str, where: Path | None = None) -> None:
+    def program(self, name: str, script: str, directory: Path | None = None) -> None:
         """Put a program on the PATH, or elsewhere."""
-        path = (where or self._bin) / name
+        path = (directory or self._bin) / name
         path.write_text(f"#!/bin/sh\n{script}\n", encoding="utf-8")
         path.chmod(0o755)
 
-    def stand_in(self, name: str, then: str = "exit 0", where: Path | None = None) -> None:
+    def stand_in(self, name: str, then: str = "exit 0", directory: Path | None = None) -> None:
         """Put a program on the PATH that records its arguments, and then runs this script."""
         calls = self.directory / f"{name}.calls"
-        self.program(name, f"{{ printf '%s\\037' \"$@\"; echo; }} >> {calls}\n{then}", where)
+        self.program(name, f"{{ printf '%s\\037' \"$@\"; echo; }} >> {calls}\n{then}", directory)
 
     def ssh(self) -> None:
         """Put an ssh on the PATH that runs the command here."""
@@ -94,21 +94,21 @@ class Shell:
         """Return the arguments of each call of a stand-in."""
         path = self.directory / f"{name}.calls"
         lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-        return [each.split("\037")[:-1] for each in lines]
+        return [line.split("\037")[:-1] for line in lines]
 
     def run(self, script: str, *arguments: str, limit: float = LIMIT, **env: str) -> subprocess.CompletedProcess[str]:
         """Run a script to its end, which must come within `limit` seconds."""
-        began = self.start(script, *arguments, **env)
+        process = self.start(script, *arguments, **env)
         # Until it is reaped, its number is that of its group, so the processes that it left can be ended.
-        wait_until(lambda: os.waitid(os.P_PID, began.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is not None, limit)
-        os.killpg(began.pid, signal.SIGKILL)
-        out, err = began.communicate(timeout=LIMIT)
+        wait_until(lambda: os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is not None, limit)
+        os.killpg(process.pid, signal.SIGKILL)
+        out, err = process.communicate(timeout=LIMIT)
         assert "Traceback" not in err, err
-        return subprocess.CompletedProcess(script, began.returncode, out, err)
+        return subprocess.CompletedProcess(script, process.returncode, out, err)
 
     def start(self, script: str, *arguments: str, **env: str) -> subprocess.Popen[str]:
         """Start a script in a session of its own."""
-        began = subprocess.Popen(
+        process = subprocess.Popen(
             ["sh", "-c", script, "sh", *arguments],
             env={**self.env, **env},
             cwd=self.directory,
@@ -118,8 +118,8 @@ class Shell:
             text=True,
             start_new_session=True,
         )
-        self._running.append(began)
-        return began
+        self._running.append(process)
+        return process
 
     def wait_for_call(self, name: str, count: int) -> list[list[str]]:
         """Wait until a stand-in was called so many times; return the calls."""
@@ -127,10 +127,10 @@ class Shell:
         return self.calls(name)
 
     def close(self) -> None:
-        for each in self._running:
-            if each.returncode is None:
-                os.killpg(each.pid, signal.SIGKILL)
-                each.communicate()
+        for process in self._running:
+            if process.returncode is None:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.communicate()
 
     def _python(self, name: str, code: str) -> None:
         path = self.directory / f"{name}.py"

@@ -37,7 +37,7 @@ LIMIT = 90.0
 #: The settings of this machine that pip needs to reach its registry.
 _OF_PIP = re.compile("(?i)PIP_(CERT|CONFIG|.*INDEX|FIND|TRUST|DEFAULT).*|.*_proxy|SSL_CERT_FILE|REQUESTS_CA_BUNDLE")
 #: Files that a checkout has, but no clone.
-_MADE = shutil.ignore_patterns(".git", ".venv", "__pycache__", ".*_cache", ".hypothesis", "dist", "build")
+_GENERATED_FILES = shutil.ignore_patterns(".git", ".venv", "__pycache__", ".*_cache", ".hypothesis", "dist", "build")
 _SUDO = """system=SYSTEM
 for word in "$@"; do
     case $word in /opt/* | /usr/local/*) word=$system$word ;; esac
@@ -59,7 +59,7 @@ def newcomer(tmp_path: pathlib.Path) -> Iterator[Shell]:
     home = tmp_path / "home"
     home.mkdir()
     (home / ".hushlogin").touch()  # Ubuntu's bash greets a newcomer
-    shutil.copytree(ROOT, home / "talk", ignore=_MADE, symlinks=True)
+    shutil.copytree(ROOT, home / "talk", ignore=_GENERATED_FILES, symlinks=True)
     with short_directory() as directory:
         env = clean_environment(str(home), _settings_of_pip()) | {"TALK_SOCKET": f"{directory}/s", "SHELL": "/bin/bash"}
         env.pop("PYTHONPATH", None)  # it would find this checkout, installed or not
@@ -71,9 +71,9 @@ def newcomer(tmp_path: pathlib.Path) -> Iterator[Shell]:
 
 def _settings_of_pip() -> dict[str, str]:
     settings = {name: value for name, value in os.environ.items() if _OF_PIP.fullmatch(name)}
-    for each in ("~/.config/pip/pip.conf", "~/.pip/pip.conf"):  # HOME is another one there
-        if os.path.exists(os.path.expanduser(each)):
-            settings.setdefault("PIP_CONFIG_FILE", os.path.expanduser(each))
+    for path in ("~/.config/pip/pip.conf", "~/.pip/pip.conf"):  # HOME is another one there
+        if os.path.exists(os.path.expanduser(path)):
+            settings.setdefault("PIP_CONFIG_FILE", os.path.expanduser(path))
     return settings
 
 
@@ -81,8 +81,19 @@ def _needs_a_registry(shell: Shell, *packages: str) -> None:
     """Skip the test if pip reaches no registry; fail in CI."""
     made = shell.run("python3 -m venv registry", limit=LIMIT)
     assert made.returncode == 0, made
-    words = ["registry/bin/pip", "--timeout", "10", "--retries", "1", "download", "-q", "--no-deps", "-d", "downloaded"]
-    done = shell.run(" ".join([*words, *packages]), limit=LIMIT)
+    command = [
+        "registry/bin/pip",
+        "--timeout",
+        "10",
+        "--retries",
+        "1",
+        "download",
+        "-q",
+        "--no-deps",
+        "-d",
+        "downloaded",
+    ]
+    done = shell.run(" ".join([*command, *packages]), limit=LIMIT)
     if done.returncode == 0:
         return
     reason = f"pip reaches no registry: {(done.stderr.strip().splitlines() or ['it says nothing'])[-1]}"
@@ -93,7 +104,7 @@ def _needs_a_registry(shell: Shell, *packages: str) -> None:
 
 @pytest.mark.slow
 @runs("Start")
-def test_first_command_speaks(newcomer: Shell) -> None:
+def test_the_first_command_speaks(newcomer: Shell) -> None:
     """From a fresh checkout to the sentence. `kill %1` ends the server."""
     needs("bash")
     _needs_a_registry(newcomer, "click")
@@ -110,7 +121,7 @@ def test_first_command_speaks(newcomer: Shell) -> None:
 
 
 @runs("Start #2")
-def test_first_command_without_sound_leaves_something_to_listen_to(tmp_path: pathlib.Path) -> None:
+def test_the_first_command_can_write_a_file_instead(tmp_path: pathlib.Path) -> None:
     command = block("Start #2")
     assert command.replace(" --player file:ready.wav", "") == block("Start")
     with short_directory() as place:
@@ -122,20 +133,20 @@ def test_first_command_without_sound_leaves_something_to_listen_to(tmp_path: pat
     assert (done.returncode, shell.calls("pip")) == (0, [["install", "."]]), done
     assert "no sound device" not in done.stderr
     with wave.open(f"{tmp_path}/ready.wav") as file:
-        said = np.frombuffer(file.readframes(file.getnframes()), np.int16)
-    assert_heard(said, render([Sentence("talk is ready")]))
+        samples = np.frombuffer(file.readframes(file.getnframes()), np.int16)
+    assert_heard(samples, render([Sentence("talk is ready")]))
 
 
 @pytest.mark.slow
 @runs("Install: For one user", "Install: For all users")
-def test_installations(newcomer: Shell) -> None:
+def test_talk_can_be_installed_for_one_user_or_all_users(newcomer: Shell) -> None:
     """With the real pipx and pip. A message that names a missing package gives the command that installs it."""
     needs("bash")
     _needs_a_registry(newcomer, "pipx")
     newcomer.stand_in("apt-get")
     newcomer.stand_in("sudo", _SUDO.replace("SYSTEM", f"{newcomer.directory}/system"))
-    for each in ("opt", "usr/local/bin"):
-        (newcomer.directory / "system" / each).mkdir(parents=True)
+    for path in ("opt", "usr/local/bin"):
+        (newcomer.directory / "system" / path).mkdir(parents=True)
     done = newcomer.run("registry/bin/pip install -q pipx && ln -s ../registry/bin/pipx bin/pipx", limit=LIMIT)
     assert done.returncode == 0, done
     for users, talk in (("one user", ".local/bin/talk"), ("all users", "system/usr/local/bin/talk")):
@@ -144,9 +155,9 @@ def test_installations(newcomer: Shell) -> None:
         assert done.returncode == 0, done
         assert newcomer.run(f"{newcomer.directory}/{talk} --version").stdout.startswith("talk ")
     assert newcomer.run(f"{newcomer.directory}/{talk} say -o hello.wav -- hello && test -s hello.wav").returncode == 0
-    found = newcomer.run("PATH=/usr/bin:/bin bash -ic 'type -ap talk' 2> bash.log")
+    result = newcomer.run("PATH=/usr/bin:/bin bash -ic 'type -ap talk' 2> bash.log")
     talk = f"{newcomer.directory}/.local/bin/talk"
-    assert talk in found.stdout.splitlines(), found  # an older `talk` may come before it
+    assert talk in result.stdout.splitlines(), result  # an older `talk` may come before it
     for command in (f"say -o said.wav --voice {REAL_VOICE} hello", "--robot anna status"):
         failed = newcomer.run(f"{talk} {command}")
         advice = re.search(r"\S+ inject talkcli .*", failed.stderr)
@@ -158,19 +169,19 @@ def test_installations(newcomer: Shell) -> None:
 
 
 @runs("Start #3")
-def test_ci_runs_the_second_command() -> None:
+def test_ci_runs_the_readmes_test_command() -> None:
     """CI takes the command from the README, and runs the slow tests after it."""
     needs("bash")
     ci = (ROOT / ".ci/run").read_text(encoding="utf-8")
-    finds = next(each for each in ci.splitlines() if each.startswith("test_command="))
+    finds = next(line for line in ci.splitlines() if line.startswith("test_command="))
     done = subprocess.run(["bash", "-c", f'{finds}; echo "$test_command"'], cwd=ROOT, capture_output=True, check=True)
     assert done.stdout.decode() == block("Start #3")
-    steps = [each for each in ci.splitlines() if each and not each.startswith("step ")]
+    steps = [line for line in ci.splitlines() if line and not line.startswith("step ")]
     assert steps[-2:] == ['eval "$test_command"', '"$bin/pytest" -n 4 -m slow']
 
 
 @runs("Choose a voice: Neural voices")
-def test_two_commands_speak_by_a_neural_voice(tmp_path: pathlib.Path) -> None:
+def test_two_commands_set_up_a_neural_voice(tmp_path: pathlib.Path) -> None:
     needs_packages(*NEURAL_PACKAGES, REAL_PACKAGE)
     install, serve = commands("Choose a voice: Neural voices")
     assert install.split()[-1].replace("-", "_") == REAL_PACKAGE

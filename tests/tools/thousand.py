@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from talkcli.fleet.broker import from_environment
 from talkcli.fleet.desk.watch import read_robots
-from tests.fleet.many import RealRobots, Roll, SimulatedRobots
+from tests.fleet.many import PresenceListener, RealRobots, SimulatedRobots
 from tests.support.bridge import Bridge, Desk
 from tests.support.broker import Broker
 from tests.support.mqtt import Listener
@@ -51,7 +51,7 @@ class MeasuredFleet:
         self._goals = 0
         self.broker = stack.enter_context(Broker(settings=_SETTINGS))
         self.simulated = stack.enter_context(SimulatedRobots(self.broker, options.robots, processes=4))
-        self.simulated.await_there(_LIMIT_S)
+        self.simulated.await_online(_LIMIT_S)
         self.real = stack.enter_context(RealRobots(self.broker, [f"real-{n + 1}" for n in range(options.real)]))
         env = {"TALK_ROBOT": "@all", **_STARTED}
         self.desk = stack.enter_context(Desk(self.broker, user="desk", password=False, env=env))
@@ -170,8 +170,8 @@ def measure_broker(fleet: MeasuredFleet) -> None:
     time.sleep(1)  # so that all robots have tried in vain
     fleet.broker.start()
     up = time.monotonic()
-    with Roll(fleet.broker) as roll:
-        _print("broker back → last robot back", [roll.await_there(fleet.names, _LIMIT_S) - up])
+    with PresenceListener(fleet.broker) as presences:
+        _print("broker back → last robot back", [presences.await_online(fleet.names, _LIMIT_S) - up])
     fleet.finish(speaking)
     fleet.check(goal, began)
     time.sleep(_REST_S)

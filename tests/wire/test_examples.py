@@ -48,9 +48,9 @@ print(*robot.lips)
 """
 
 
-def only(document: Document, language: str, title: str | None, mark: str) -> str:
+def only_example(document: Document, language: str, title: str | None, mark: str) -> str:
     """Return the one example of a section, or of a whole document, that contains this mark."""
-    (found,) = [each for each in document.examples(language, title) if mark in each]
+    (found,) = [example for example in document.examples(language, title) if mark in example]
     return found
 
 
@@ -60,9 +60,9 @@ def run(talk: Talk, *command: str) -> subprocess.CompletedProcess[str]:
     return done
 
 
-def test_line_of_socat_says_a_sentence(scripted: Talk) -> None:
+def test_a_goal_can_be_sent_with_socat(scripted: Talk) -> None:
     needs("socat")
-    done = run(scripted, "sh", "-c", only(WIRE, "sh", None, "socat -t 5"))
+    done = run(scripted, "sh", "-c", only_example(WIRE, "sh", None, "socat -t 5"))
     greeting, reply = map(json.loads, done.stdout.splitlines())
     assert (greeting["talk"], reply["goal"]["text"]) == (1, "battery low")
     assert scripted.watcher.wait_for_terminal(reply["goal"]["id"]) == "SUCCEEDED"
@@ -72,11 +72,11 @@ def test_line_of_socat_says_a_sentence(scripted: Talk) -> None:
 def shell_client(tmp_path: Path) -> str:
     needs("socat")
     path = tmp_path / "say.sh"
-    path.write_text(only(WIRE, "sh", "Two clients", "say.sh"), encoding="utf-8")
+    path.write_text(only_example(WIRE, "sh", "Two clients", "say.sh"), encoding="utf-8")
     return str(path)
 
 
-def test_client_in_shell(scripted: Talk, shell_client: str) -> None:
+def test_the_shell_client_reports_each_result(scripted: Talk, shell_client: str) -> None:
     ends = {
         'she said "go", \\o/ and\nleft': ("SUCCEEDED", 0),
         '"event": "result", "state": "ABORTED"': ("SUCCEEDED", 0),
@@ -86,14 +86,16 @@ def test_client_in_shell(scripted: Talk, shell_client: str) -> None:
     for text, (state, code) in ends.items():
         done = run(scripted, "sh", shell_client, text)
         assert (done.stdout, done.returncode) == (f"{state}\n", code)
-    told = [each["goal"]["text"] for each in scripted.watcher.events() if each.get("state") in ("PENDING", "REJECTED")]
-    assert told == [each.replace("\n", " ") for each in ends]
+    spoken = [
+        event["goal"]["text"] for event in scripted.watcher.events() if event.get("state") in ("PENDING", "REJECTED")
+    ]
+    assert spoken == [text.replace("\n", " ") for text in ends]
     scripted.stop()
     done = run(scripted, "sh", shell_client, "battery low")
     assert (done.stdout, done.returncode) == ("no result\n", 1)
 
 
-def test_client_in_shell_cancels_on_ctrl_c(scripted: Talk, shell_client: str) -> None:
+def test_the_shell_client_cancels_its_goal_on_ctrl_c(scripted: Talk, shell_client: str) -> None:
     with subprocess.Popen(["sh", shell_client, "never-ends"], env=scripted.env, start_new_session=True) as client:
         goal = scripted.watcher.wait_for(None, "ACTIVE")["id"]
         os.killpg(client.pid, signal.SIGINT)
@@ -101,29 +103,29 @@ def test_client_in_shell_cancels_on_ctrl_c(scripted: Talk, shell_client: str) ->
     assert scripted.watcher.wait_for_terminal(goal) == "PREEMPTED"
 
 
-def test_client_in_plain_python(scripted: Talk) -> None:
-    example = only(WIRE, "python", "Two clients", "socket")
+def test_the_plain_python_client_prints_the_words(scripted: Talk) -> None:
+    example = only_example(WIRE, "python", "Two clients", "socket")
     assert "talkcli" not in example
     done = run(scripted, sys.executable, "-c", example)
     assert done.returncode == 0, done
-    *told, last = done.stdout.splitlines()
+    *words, last = done.stdout.splitlines()
     assert last == "SUCCEEDED Talk completed successfully"
-    assert [each.split()[1] for each in told] == ["battery", "low,", "going", "home"]
-    times = [float(each.split()[0]) for each in told]
+    assert [line.split()[1] for line in words] == ["battery", "low,", "going", "home"]
+    times = [float(line.split()[0]) for line in words]
     assert times == sorted(times)
     refused = run(scripted, sys.executable, "-c", example.replace('"feedback": True', '"melody": True'))
     assert (refused.returncode, refused.stdout) == (1, "")
     assert "melody" in refused.stderr
 
 
-def test_first_example_of_the_library(scripted: Talk) -> None:
-    done = run(scripted, sys.executable, "-c", only(README, "python", "Use it from Python", "battery low"))
+def test_the_first_example_of_the_library_prints_the_words(scripted: Talk) -> None:
+    done = run(scripted, sys.executable, "-c", only_example(README, "python", "Use it from Python", "battery low"))
     assert done.returncode == 0, done
-    assert [each.split(": ")[1] for each in done.stdout.splitlines()] == ["follow", "me", "to", "the", "charger"]
+    assert [line.split(": ")[1] for line in done.stdout.splitlines()] == ["follow", "me", "to", "the", "charger"]
 
 
-def test_loop_of_a_robot(scripted: Talk) -> None:
-    example = only(README, "python", "Use it from Python", "robot.drives")
+def test_the_loop_of_a_robot_speaks(scripted: Talk) -> None:
+    example = only_example(README, "python", "Use it from Python", "robot.drives")
     done = run(scripted, sys.executable, "-c", ROBOT.format(example=example))
     assert (done.returncode, done.stdout, done.stderr) == (0, "please let me pass\n", "")
 
@@ -136,11 +138,13 @@ def test_loop_of_a_robot(scripted: Talk) -> None:
     ],
     ids=["nobody is in the way any more", "the server is killed"],
 )
-def test_loop_of_a_robot_whose_goal_is_cut_short(
+def test_the_loop_of_a_robot_handles_an_aborted_goal(
     scripted: Talk, on_word: str, lights: str, shown: str, state: str | None
 ) -> None:
     """The loop cancels a goal that has become needless, and flashes the lights if the goal is lost."""
-    example = only(README, "python", "Use it from Python", "robot.drives").replace("please let me pass", "never-ends")
+    example = only_example(README, "python", "Use it from Python", "robot.drives").replace(
+        "please let me pass", "never-ends"
+    )
     robot = ROBOT.replace("self.lips.append(word)", on_word.format(pid=scripted.pid))
     robot = robot.replace('raise SystemExit("nobody heard it")', lights)
     scripted.unfinished = state is None

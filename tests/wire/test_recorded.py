@@ -30,7 +30,7 @@ RECORDINGS = sorted(Path(__file__).parent.glob("*.txt"))
 #: The recorded server's `boot`: the first half of its goals' ids.
 BOOT = "k3fz"
 #: SHA-256 of each recording, so that nobody edits one without meaning to.
-NEVER_EDITED = {
+CHECKSUMS = {
     "protocol-1": "5a39d2af4e6c797d4d449d37623fd96d9f78ea4f33952ef545dc1e4e552212fd",
     "protocol-1-audible": "d027e998482272e961e2bebded96fb3d2d3dc4e2410b2d2fd6c0ea2076ce131a",
     "protocol-1-lead-in": "3f3263930adb3116d5329efa626e6eaefc47f16290d539d36e352152bc22067e",
@@ -52,34 +52,34 @@ class Line:
     """A line of a recording: "connect", ">" from the client or "<" from the server."""
 
     number: int
-    what: str
+    kind: str
     text: str
 
     @property
     def message(self) -> Message:
-        found = json.loads(self.text)
-        assert isinstance(found, dict), self
-        return found
+        message = json.loads(self.text)
+        assert isinstance(message, dict), self
+        return message
 
 
 def read(recording: Path) -> list[Line]:
     rows = enumerate(recording.read_text(encoding="utf-8").splitlines(), 1)
     lines = [Line(number, *row.partition(" ")[::2]) for number, row in rows if not row.startswith("#")]
-    assert {each.what for each in lines} == {"connect", ">", "<"}
+    assert {line.kind for line in lines} == {"connect", ">", "<"}
     return lines
 
 
-def said_by_server() -> list[Line]:
-    return [each for recording in RECORDINGS for each in read(recording) if each.what == "<"]
+def server_lines() -> list[Line]:
+    return [line for recording in RECORDINGS for line in read(recording) if line.kind == "<"]
 
 
 def differences(recorded: object, now: object, varies: Collection[str] = VARIES, name: str = "") -> list[str]:
     """Return the differences between a recorded message and one of today; a field added since is no difference."""
     if isinstance(recorded, dict) and isinstance(now, dict):
-        found = [f"{name}.{each} is missing" for each in recorded.keys() - now.keys()]
+        result = [f"{name}.{key} is missing" for key in recorded.keys() - now.keys()]
         for key in recorded.keys() & now.keys():
-            found += differences(recorded[key], now[key], varies, f"{name}.{key}")
-        return found
+            result += differences(recorded[key], now[key], varies, f"{name}.{key}")
+        return result
     return [] if _alike(name.rpartition(".")[2], recorded, now, varies) else [f"{name}: {recorded!r}, now {now!r}"]
 
 
@@ -88,7 +88,7 @@ def _alike(key: str, recorded: object, now: object, varies: Collection[str]) -> 
         return recorded is now or key in MAY_BE_NULL & set(varies)
     if key == "spoken" and varies:
         return isinstance(now, str)  # how far a goal came that was stopped
-    kinds = [int if isinstance(each, float) else type(each) for each in (recorded, now)]
+    kinds = [int if isinstance(value, float) else type(value) for value in (recorded, now)]
     return kinds[0] is kinds[1] and (key in varies or recorded == now)
 
 
@@ -101,53 +101,55 @@ def next_message(raw: Raw, seen: int, kinds: set[str]) -> tuple[Message, int]:
             return message, seen
 
 
-@pytest.mark.parametrize("recording", RECORDINGS, ids=lambda each: each.stem)
-def test_server_still_says_what_was_recorded(recording: Path, make_talk: MakeTalk) -> None:
+@pytest.mark.parametrize("recording", RECORDINGS, ids=lambda path: path.stem)
+def test_the_server_still_sends_the_recorded_messages(recording: Path, make_talk: MakeTalk) -> None:
     talk = make_talk(scripted=True, watched=False)
     with Raw(talk.socket) as raw:
         boot = raw.receive_lines(1)[0]["boot"]
     lines = read(recording)
-    kinds = {each.message["event"] for each in lines if each.what == "<" and "event" in each.message} - {"alive"}
+    kinds = {line.message["event"] for line in lines if line.kind == "<" and "event" in line.message} - {"alive"}
     raw, seen = Raw(talk.socket), 0
     try:
         for line in lines:
             text = line.text.replace(f'"{BOOT}', f'"{boot}')
-            if line.what == "connect":
+            if line.kind == "connect":
                 raw.socket.close()
                 raw, seen = Raw(talk.socket), 0
-            elif line.what == ">":
+            elif line.kind == ">":
                 raw.send(text.encode() + b"\n")
             else:
                 message, seen = next_message(raw, seen, kinds)
-                found = differences(json.loads(text), message)
-                assert not found, f"line {line.number} of {recording.name}: {found}\nrecorded: {text}\nnow: {message}"
+                changes = differences(json.loads(text), message)
+                assert not changes, (
+                    f"line {line.number} of {recording.name}: {changes}\nrecorded: {text}\nnow: {message}"
+                )
     finally:
         raw.socket.close()
 
 
-@pytest.mark.parametrize("recording", RECORDINGS, ids=lambda each: each.stem)
-def test_recording_is_what_it_was(recording: Path) -> None:
-    assert sha256(recording.read_bytes()).hexdigest() == NEVER_EDITED[recording.stem], (
+@pytest.mark.parametrize("recording", RECORDINGS, ids=lambda path: path.stem)
+def test_recordings_are_never_edited(recording: Path) -> None:
+    assert sha256(recording.read_bytes()).hexdigest() == CHECKSUMS[recording.stem], (
         f"{recording.name} was edited: record new messages in a file of their own, and add that file's sum here"
     )
 
 
 def test_every_request_and_field_is_recorded() -> None:
-    recorded: dict[str, set[str]] = {each: set() for each in REQUEST_TYPES}
-    for line in [each for recording in RECORDINGS for each in read(recording) if each.what == ">"]:
+    recorded: dict[str, set[str]] = {kind: set() for kind in REQUEST_TYPES}
+    for line in [line for recording in RECORDINGS for line in read(recording) if line.kind == ">"]:
         try:
             message = line.message
         except ValueError:
             continue  # a malformed line was recorded, too
         recorded.setdefault(message.get("request", ""), set()).update(message)
-    missing = {kind: {each.name for each in REQUEST_TYPES[kind].options} - recorded[kind] for kind in REQUEST_TYPES}
+    missing = {kind: {option.name for option in REQUEST_TYPES[kind].options} - recorded[kind] for kind in REQUEST_TYPES}
     assert not any(missing.values()), f"record these in a file of their own beside {RECORDINGS[0].name}: {missing}"
     assert all("request" in recorded[kind] for kind in REQUEST_TYPES)
 
 
-def test_client_of_today_understands_every_recorded_line() -> None:
+def test_the_client_understands_every_recorded_line() -> None:
     known = 0
-    for line in said_by_server():
+    for line in server_lines():
         message = decode(line.text.encode())
         assert message == line.message
         if "talk" in message:

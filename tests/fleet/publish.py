@@ -23,10 +23,10 @@ def presence(
     server: dict[str, Any] | None = SERVER,
 ) -> None:
     """Publish that a robot is online, or that it has gone."""
-    said: dict[str, Any] = {"talk": 1, "online": online, "session": session, "groups": ["all", *groups]}
+    payload: dict[str, Any] = {"talk": 1, "online": online, "session": session, "groups": ["all", *groups]}
     if online:
-        said |= {"version": "0.1.0", "since": time.time() - 7200, "allow": ["say"], "server": server}
-    publisher.publish(f"talk/robot/{name}/presence", said, retain=True)
+        payload |= {"version": "0.1.0", "since": time.time() - 7200, "allow": ["say"], "server": server}
+    publisher.publish(f"talk/robot/{name}/presence", payload, retain=True)
 
 
 def status(
@@ -42,13 +42,13 @@ def status(
 ) -> None:
     """Publish the goal that a robot speaks, and the last goal, which ended an hour ago."""
     ended = {"id": last, "state": state, "reason": None, "text": "said before", "at": time.time() - 3600}
-    said = {"active": active, "text": text, "pending": pending, "paused": paused, "last": ended if last else None}
-    publisher.publish(f"talk/robot/{name}/status", said, retain=True)
+    payload = {"active": active, "text": text, "pending": pending, "paused": paused, "last": ended if last else None}
+    publisher.publish(f"talk/robot/{name}/status", payload, retain=True)
 
 
 def event(publisher: Listener, name: str, goal: str, state: str, text: str | None = None) -> None:
     """Publish a state of a goal, with the whole goal if there is a text."""
-    said: dict[str, Any] = {"event": "state", "id": goal, "state": state, "n": 1, "at": time.time()}
+    payload: dict[str, Any] = {"event": "state", "id": goal, "state": state, "n": 1, "at": time.time()}
     if text is not None:
-        said["goal"] = {"id": goal, "state": state, "text": text}
-    publisher.publish(f"talk/robot/{name}/event/state", said)
+        payload["goal"] = {"id": goal, "state": state, "text": text}
+    publisher.publish(f"talk/robot/{name}/event/state", payload)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
-from tests.fleet import told
+from tests.fleet import publish
 from tests.support.mqtt import Listener
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from tests.support.broker import Broker
 
 
-class Pretended(Listener):
+class FakeRobot(Listener):
     """A robot at a broker, online until it is closed."""
 
     def __init__(
@@ -28,11 +28,11 @@ class Pretended(Listener):
     ) -> None:
         """`answer` returns the lines of the answer to a request."""
         self._robot, self._answer_to = name, answer
-        topics = [f"talk/robot/{name}/request/+", *(f"talk/group/{each}/request/+" for each in ("all", *groups))]
+        topics = [f"talk/robot/{name}/request/+", *(f"talk/group/{group}/request/+" for group in ("all", *groups))]
         super().__init__(broker, *topics)
-        told.presence(self, name, groups=groups)
+        publish.presence(self, name, groups=groups)
 
-    def __enter__(self) -> Pretended:
+    def __enter__(self) -> FakeRobot:
         return self
 
     def close(self) -> None:
