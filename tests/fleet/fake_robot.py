@@ -1,4 +1,4 @@
-"""A robot without bridge and server: it answers requests as a test wants it."""
+"""A robot without a bridge or a server. The test chooses its replies."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class FakeRobot(Listener):
-    """A robot at a broker, online until it is closed."""
+    """A robot that is online until it is closed."""
 
     def __init__(
         self,
@@ -26,7 +26,7 @@ class FakeRobot(Listener):
         answer: Callable[[dict[str, Any]], Sequence[dict[str, Any]]],
         groups: Sequence[str] = (),
     ) -> None:
-        """`answer` returns the lines of the answer to a request."""
+        """`answer` returns the lines of the reply to a request."""
         self._robot, self._answer_to = name, answer
         topics = [f"talk/robot/{name}/request/+", *(f"talk/group/{group}/request/+" for group in ("all", *groups))]
         super().__init__(broker, *topics)
@@ -36,7 +36,7 @@ class FakeRobot(Listener):
         return self
 
     def close(self) -> None:
-        """Have the broker forget the robot, and end the connection."""
+        """Clear the robot's presence, and disconnect."""
         if self.ended is None:
             self.publish(f"talk/robot/{self._robot}/presence", b"", retain=True)
         super().close()

@@ -1,4 +1,4 @@
-"""Home Assistant's rules for a device that is announced by MQTT discovery, and a client that goes by them.
+"""Home Assistant's rules for MQTT device discovery, and a client that follows them.
 
 The rules are those of www.home-assistant.io/integrations/mqtt: device discovery payload, notify, button, sensor, binary
 sensor. Home Assistant itself is not installed here.
@@ -16,14 +16,14 @@ from tests.support.mqtt import Listener
 if TYPE_CHECKING:
     from tests.support.broker import Broker
 
-#: A topic on which Home Assistant hears of a device.
+#: A topic on which a device is announced to Home Assistant.
 TOPIC = re.compile(r"homeassistant/device/(?:[a-zA-Z0-9_-]+/)?[a-zA-Z0-9_-]+/config")
-#: What Home Assistant says once it has started.
+#: The topic and the message that Home Assistant publishes when it has started.
 BIRTH = ("homeassistant/status", "online")
 _ANY = {"platform", "unique_id", "name", "qos", "icon", "json_attributes_topic", "json_attributes_template"}
 _COMMAND = {*_ANY, "command_topic", "retain"}
 _STATE = {*_ANY, "state_topic", "value_template", "device_class"}
-#: The keys that a part of the payload must have, and all keys that it may have.
+#: The required and the allowed keys of each part of the payload.
 KEYS = {
     "payload": ({"device", "origin", "components"}, {"device", "origin", "components", "availability", "qos"}),
     "device": ({"identifiers", "name"}, {"identifiers", "name", "manufacturer", "model", "sw_version"}),
@@ -34,13 +34,13 @@ KEYS = {
     "sensor": ({"unique_id", "state_topic"}, {*_STATE, "options", "state_class"}),
     "binary_sensor": ({"unique_id", "state_topic"}, {*_STATE, "payload_on", "payload_off"}),
 }
-#: A template in words that Jinja and Python read alike; Jinja takes `items` and the like for methods.
+#: A template that means the same in Jinja and Python. In Jinja, names such as `items` are methods.
 _WORD = (
     r"value_json(?:\.(?!items\b|keys\b|values\b|get\b|pop\b|copy\b)\w+)*|'\w+'|if|else|and|or|not|None|\{\}|\| tojson"
 )
 _TEMPLATE = rf'"\{{\{{ (?:\(?(?:{_WORD})\)? )+\}}\}}"'
 _TEXT, _TEXTS = '".+"', r'\[".+"\]'
-#: How a value looks in JSON; others are texts.
+#: The JSON form of a value. Values that are not listed are texts.
 VALUES = {
     "qos": "[012]", "retain": "true|false", "name": f"{_TEXT}|null", "identifiers": _TEXTS, "options": _TEXTS,
     "device_class": '"(enum|running|sound)"', "state_class": '"measurement"', "command_topic": '"[^+#]+"',
@@ -50,7 +50,7 @@ VALUES = {
 
 
 def faults(topic: str, payload: bytes) -> list[str]:
-    """Return what Home Assistant would not accept of a device."""
+    """Return the errors that Home Assistant would find in the announcement of a device."""
     device = json.loads(payload)
     entities = [component for component in device["components"].values() if len(component) > 1]
     parts = [("payload", device), *((key, device[key]) for key in ("device", "origin"))]
@@ -71,7 +71,7 @@ def faults(topic: str, payload: bytes) -> list[str]:
 
 
 def rendered(template: str, payload: bytes) -> str:
-    """Return the text that a template makes of a message."""
+    """Return the result of a template for a message."""
     expression, filtered, _ = template.removeprefix("{{ ").removesuffix(" }}").partition(" | tojson")
     message = json.loads(payload, object_hook=lambda fields: SimpleNamespace(**fields))
     value = eval(expression, {"value_json": message})
@@ -79,7 +79,7 @@ def rendered(template: str, payload: bytes) -> str:
 
 
 class HomeAssistant(Listener):
-    """A Home Assistant that has started, and hears of devices."""
+    """A Home Assistant that has started, and listens for devices."""
 
     def __init__(self, broker: Broker, **more: Any) -> None:
         super().__init__(broker, "homeassistant/device/#", **more)
@@ -88,7 +88,7 @@ class HomeAssistant(Listener):
         return self
 
     def device(self) -> dict[str, Any]:
-        """Wait for a device, and return its payload; from now on its entities have states."""
+        """Wait for a device, subscribe to its states, and return its announcement."""
         message = self.await_message(lambda message: bool(TOPIC.fullmatch(message.topic) and message.payload))
         assert faults(message.topic, message.payload) == []
         topics = {availability["topic"] for availability in message.json["availability"]}
@@ -101,7 +101,7 @@ class HomeAssistant(Listener):
         self.await_message(lambda _: all(self._state(device, key) == state for key, state in expected.items()))
 
     def command(self, device: dict[str, Any], key: str, text: str = "PRESS") -> int:
-        """Press a button, or send a message by the notifier; return the broker's reason code."""
+        """Press a button or send a message to the notifier, and return the broker's reason code."""
         entity = device["components"][key]
         return self.publish(entity["command_topic"], text, entity["qos"], entity.get("retain", False))
 

@@ -1,4 +1,4 @@
-"""Many robots at one broker: real ones, and hundreds of simulated ones."""
+"""Many robots at one broker, real and simulated."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ if TYPE_CHECKING:
     from tests.support.mqtt import Message
     from tests.support.processes import Clients, Finished
 
-#: Seconds in which started robots are online, even if they share two processors.
+#: Time for started robots to come online, even on two processors.
 ONLINE_LIMIT_S = 30.0
-#: Robots that start or end at the same time.
+#: Number of robots that are started or stopped at the same time.
 _AT_ONCE = 8
 _ROOT = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 
 
 class PresenceListener(Listener):
-    """A listener to the presences of all robots."""
+    """A listener for the presence of all robots."""
 
     def __init__(self, broker: Broker) -> None:
         super().__init__(broker, "talk/robot/+/presence")
@@ -51,9 +51,8 @@ class PresenceListener(Listener):
             nonlocal missing
             name = {message.topic.split("/")[2]}
             presence = message.json if message.payload else {}
-            missing = (
-                missing - name if presence.get("online") and presence.get("server") else missing | (name & expected)
-            )
+            online = presence.get("online") and presence.get("server")
+            missing = missing - name if online else missing | (name & expected)
             return not missing
 
         last = self.find(complete, within)
@@ -70,15 +69,15 @@ class PresenceListener(Listener):
 
 
 class RealRobots(contextlib.AbstractContextManager["RealRobots"]):
-    """Robots with a scripted engine, each with a server and a bridge of its own, all online.
+    """Online robots with the scripted engine. Each has its own server and bridge.
 
-    After a block without an exception, all robots are ended by SIGTERM and checked.
+    After a block without an exception, all robots are stopped with SIGTERM and checked.
     """
 
     def __init__(
         self, broker: Broker, names: Sequence[str], groups: Sequence[str] = (), options: Sequence[str] = ()
     ) -> None:
-        """Start the robots. `groups` and `options` are for each bridge."""
+        """Start the robots. Each bridge gets the `groups` and `options`."""
         self.broker = broker
         self._groups, self._options = groups, options
         self._by_name: dict[str, Robot] = {}
@@ -102,18 +101,18 @@ class RealRobots(contextlib.AbstractContextManager["RealRobots"]):
         return sorted(self._by_name)
 
     def add(self, name: str) -> Robot:
-        # Both are forks of a process that outlives this thread. A process that dies with its parent would end with it.
+        # Both processes are forked from a process that outlives this thread, so they don't die with the thread.
         talk = self._stack.enter_context(contextlib.closing(Talk(scripted=True)))
         bridge = self._stack.enter_context(Bridge(talk, self.broker, name, *self._options, groups=self._groups))
         self._by_name[name] = robot = Robot(talk, self.broker, bridge)
         return robot
 
     def each(self, action: Callable[[Robot], Any]) -> list[Any]:
-        """Return the results of an action for each robot, sorted by their names."""
+        """Run an action for all robots, and return the results in the order of the robots' names."""
         return _together(action, [self._by_name[name] for name in self.names])
 
     def spoken(self) -> dict[str, list[str]]:
-        """Return the texts that each robot has begun to speak."""
+        """Return the texts that each robot has started to speak."""
         return dict(zip(self.names, self.each(lambda robot: robot.spoken), strict=True))
 
 
@@ -127,7 +126,7 @@ def _end(robot: Robot) -> None:
 
 
 def _together(action: Callable[[Any], Any], items: Collection[Any]) -> list[Any]:
-    """Return the results of an action that is done for several at once; raise the first error when all are done."""
+    """Run an action for several items in parallel, and return the results or raise the first error at the end."""
     with ThreadPoolExecutor(_AT_ONCE) as pool:
         done = [pool.submit(action, item) for item in items]
         wait(done)
@@ -135,7 +134,7 @@ def _together(action: Callable[[Any], Any], items: Collection[Any]) -> list[Any]
 
 
 class SimulatedRobots(contextlib.AbstractContextManager["SimulatedRobots"]):
-    """Simulated robots in processes of their own, started; see `tests.tools.simulated`."""
+    """Simulated robots in separate processes (see `tests.tools.simulated`)."""
 
     def __init__(self, broker: Broker, count: int, *, processes: int = 1) -> None:
         self.names = [f"sim-{number + 1:04d}" for number in range(count)]
@@ -156,7 +155,7 @@ class SimulatedRobots(contextlib.AbstractContextManager["SimulatedRobots"]):
             return file.read()
 
     def spoken(self, goal_id: str) -> dict[str, float]:
-        """Return when each robot began to speak a goal (monotonic time). No robot may have begun it twice."""
+        """Return the monotonic time at which each robot started a goal. No robot may have started it twice."""
         with open(f"{self._directory}/spoken", encoding="utf-8") as file:
             *lines, _unfinished = file.read().split("\n")
         entries = [entry for entry in map(json.loads, lines) if entry["id"] == goal_id]
@@ -176,25 +175,25 @@ class SimulatedRobots(contextlib.AbstractContextManager["SimulatedRobots"]):
             assert "online" in process.stdout.readline(), self.log[-2000:]
 
     def await_spoken(self, goal_id: str, within: float = ONLINE_LIMIT_S) -> None:
-        """Wait until all robots have begun to speak a goal."""
+        """Wait until all robots have started to speak a goal."""
         end = time.monotonic() + within
         while (started := len(self.spoken(goal_id))) < len(self.names):
             assert time.monotonic() < end, f"{started} of {len(self.names)} speak {goal_id} within {within} s"
-            time.sleep(0.05)  # nothing tells when a file grows
+            time.sleep(0.05)  # a growing file sends no event
 
     def assert_spoken_once(self, goal_id: str) -> float:
-        """Assert that every robot has begun a goal once, and return the monotonic time of the last one."""
+        """Assert that each robot has started a goal once, and return the monotonic time of the last start."""
         spoken = self.spoken(goal_id)
         assert spoken.keys() == set(self.names), f"not spoken by {set(self.names) - spoken.keys()}"
         return max(spoken.values())
 
     def stop(self) -> None:
-        """End the processes by SIGTERM, and check them."""
+        """Stop the processes with SIGTERM, and check them."""
         for process in self._processes:
             process.terminate()
         for process in self._processes:
             code = process.wait(STOP_LIMIT + len(self.names) / 100)
-            assert code == 0, f"simulated robots ended with {code}: {self.log[-2000:]}"
+            assert code == 0, f"simulated robots exited with {code}: {self.log[-2000:]}"
         for text in ("Traceback", "a bug"):
             assert text not in self.log, self.log[-2000:]
 
@@ -231,24 +230,24 @@ def at_once(clients: Clients, *lines: Sequence[str]) -> list[Finished]:
 
 
 def printed_outcomes(done: Finished) -> dict[str, tuple[str, str, int]]:
-    """Return the id, the state and the code that a desk printed for each robot."""
+    """Return the goal's id, the state and the exit code that a desk printed for each robot."""
     lines = [line.split() for line in done.out.splitlines()]
     outcomes = {robot: (goal_id, state, int(code)) for robot, goal_id, state, code in lines}
-    assert len(outcomes) == len(lines), f"a robot twice: {done.out}"
+    assert len(outcomes) == len(lines), f"a robot was printed twice: {done.out}"
     return outcomes
 
 
 def objects(done: Finished) -> dict[str, dict[str, Any]]:
-    """Return the object that a desk printed for each robot."""
+    """Return the JSON object that a desk printed for each robot."""
     return {outcome["robot"]: outcome for outcome in map(json.loads, done.out.splitlines())}
 
 
 def alike(names: Sequence[str], goal_id: str, state: str, code: int) -> dict[str, tuple[str, str, int]]:
-    """Return what a desk prints if all robots end alike."""
+    """Return the outcomes that a desk prints if all robots have the same one."""
     return dict.fromkeys(names, (goal_id, state, code))
 
 
 def assert_outcomes(done: Finished, code: int, expected: Mapping[str, tuple[str, str, int]], summary: str) -> None:
-    """Assert what a desk printed for each robot, its exit code, and its summary."""
+    """Assert the outcomes, the exit code and the summary of a command."""
     assert printed_outcomes(done) == expected, done
     assert (done.code, done.err.splitlines()[-1:]) == (code, [f"talk: {summary}"]), done

@@ -1,4 +1,4 @@
-"""What a bridge publishes for a robot, published by a test."""
+"""Functions that publish the messages of a bridge."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def presence(
     groups: Sequence[str] = (),
     server: dict[str, Any] | None = SERVER,
 ) -> None:
-    """Publish that a robot is online, or that it has gone."""
+    """Publish that a robot is online or offline."""
     payload: dict[str, Any] = {"talk": 1, "online": online, "session": session, "groups": ["all", *groups]}
     if online:
         payload |= {"version": "0.1.0", "since": time.time() - 7200, "allow": ["say"], "server": server}
@@ -40,14 +40,14 @@ def status(
     pending: int = 0,
     paused: bool = False,
 ) -> None:
-    """Publish the goal that a robot speaks, and the last goal, which ended an hour ago."""
+    """Publish the active goal of a robot, and its last goal, which ended an hour ago."""
     ended = {"id": last, "state": state, "reason": None, "text": "said before", "at": time.time() - 3600}
     payload = {"active": active, "text": text, "pending": pending, "paused": paused, "last": ended if last else None}
     publisher.publish(f"talk/robot/{name}/status", payload, retain=True)
 
 
 def event(publisher: Listener, name: str, goal: str, state: str, text: str | None = None) -> None:
-    """Publish a state of a goal, with the whole goal if there is a text."""
+    """Publish the state of a goal, and the full goal if `text` is given."""
     payload: dict[str, Any] = {"event": "state", "id": goal, "state": state, "n": 1, "at": time.time()}
     if text is not None:
         payload["goal"] = {"id": goal, "state": state, "text": text}

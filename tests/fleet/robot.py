@@ -1,4 +1,4 @@
-"""A robot of a fleet: its server, its bridge, and their broker."""
+"""A robot of a fleet, with its server, bridge and broker."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ class Robot:
 
     @property
     def spoken(self) -> list[str]:
-        """The texts that it has begun to speak since the start of its server."""
+        """The texts that the robot has started to speak since its server started."""
         return self.talk.watcher.texts("ACTIVE")
 
     def desk(self, *arguments: str, timeout: float = 20) -> Finished:
-        """Run one command at a desk: `robot.desk("say", "--wait", "--", "battery low")`."""
+        """Run a command at a desk: `robot.desk("say", "--wait", "--", "battery low")`."""
         return desk(self.broker, self.name, *arguments, timeout=timeout)
 
     def listen(self, *topics: str) -> Listener:
-        """Return a listener to its presence, which has come already, and to other topics under its name."""
+        """Return a listener that has received the presence, and that also listens on `topics` of this robot."""
         listener = Listener(self.broker, self.presence, *(f"talk/robot/{self.name}/{topic}" for topic in topics))
         try:
             listener.await_message(self.is_online)
@@ -54,15 +54,19 @@ class Robot:
         return listener
 
     def is_online(self, message: Message) -> bool:
-        presence = self._told(message)
+        presence = self._presence_in(message)
         return bool(presence.get("online") and presence["server"])
 
+    def has_current_server(self, message: Message) -> bool:
+        """Return whether the robot is online with its current server process."""
+        return self.is_online(message) and message.json["server"]["pid"] == self.talk.pid
+
     def is_offline(self, message: Message) -> bool:
-        return self._told(message).get("online") is False
+        return self._presence_in(message).get("online") is False
 
     def is_without_server(self, message: Message) -> bool:
-        presence = self._told(message)
+        presence = self._presence_in(message)
         return bool(presence.get("online") and presence["server"] is None)
 
-    def _told(self, message: Message) -> dict[str, object]:
+    def _presence_in(self, message: Message) -> dict[str, object]:
         return message.json if message.topic == self.presence and message.payload else {}

@@ -1,4 +1,4 @@
-"""Requests to a robot by the broker, and what the robot publishes there: a real server, a real broker, a bridge."""
+"""Requests to a bridge, and the messages that it publishes. The server and the broker are real."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
     from tests.support.mqtt import Message as Published
     from tests.support.processes import Talk
 
-#: Seconds in which a robot must have come back to a broker, or a server to its robot.
+#: Seconds until a bridge has found a new server.
 BACK = 15.0
 
 
 @pytest.fixture
 def client(lasting_robot: Robot) -> Iterator[RemoteClient]:
-    """A remote client of the robot that the tests share; in the end nothing of it is left there."""
+    """A remote client of the shared robot. Its goals are cancelled, and its session ends, after the test."""
     with RemoteClient(lasting_robot.broker) as result:
         yield result
         result.ask("cancel")
@@ -39,17 +39,17 @@ def client(lasting_robot: Robot) -> Iterator[RemoteClient]:
 
 
 def texts_before(client: RemoteClient, talk: Talk) -> list[str]:
-    """Return all texts that the robot was asked to say before, once it has looked at all messages."""
-    client.result(client.say("the last of them", wait=True)["id"])
+    """Return the texts of all earlier goals, after the robot has processed all messages."""
+    client.result(client.say("the last goal", wait=True)["id"])
     with talk.connect() as wire:
         wire.request("log", count=100)
         *others, last = [item["goal"]["text"] for item in wire.items]
-    assert last == "the last of them"
+    assert last == "the last goal"
     return others
 
 
 def fill(robot: Robot, client: RemoteClient) -> None:
-    """Pause the robot, and have as many goals wait as may from afar."""
+    """Pause the robot, and use all places for remote goals."""
     robot.talk.request("pause")
     assert [client.say(f"{number}")["state"] for number in range(20)] == ["PENDING"] * 20
 
@@ -59,16 +59,16 @@ def is_reply(topic: str, number: int, message: Published) -> bool:
 
 
 def retained(broker: Broker, topic: str, wanted: Callable[[Any], bool] = bool, within: float = 5) -> Message:
-    """Return the retained message of a topic, once it is wanted."""
+    """Wait until the retained message of a topic matches, and return it."""
     with Listener(broker, topic) as listener:
         return listener.await_message(lambda message: bool(message.payload) and wanted(message.json), within).json
 
 
-# Requests and answers
+# Requests and replies
 
 
 def test_a_remote_goal_has_the_same_events_as_a_local_one(lasting_robot: Robot, client: RemoteClient) -> None:
-    """Words may be lost on their way, results may not."""
+    """Word events are sent with QoS 0, and results with QoS 1."""
     goal = client.say("battery low", feedback=True)
     assert (goal["state"], goal["text"]) == ("PENDING", "battery low")
     ended = client.result(goal["id"])
@@ -148,18 +148,16 @@ def test_a_request_is_refused_only_if_it_is_too_long_for_the_server(client: Remo
     longest = "\N{GRINNING FACE}" * 10_000
     assert client.say(longest)["state"] == "PENDING"
     ids = json.dumps({"seq": 1000, "request": "wait", "ids": ["a" * 12] * 4096}, separators=(",", ":"))
-    assert len(ids) < 65_536  # and with blanks, as this server's library writes it, it is longer
+    assert len(ids) < 65_536  # but the bridge sends it with blanks, which makes it too long
     client.send(ids.encode())
     assert client.reply(1000)["error"]["code"] == "line_too_long"
     client.ask("cancel")
 
 
-# The share of the queue
+# Places in the queue
 
 
-def test_remote_clients_have_20_places_in_the_queue_and_local_ones_the_rest(
-    lasting_robot: Robot, client: RemoteClient
-) -> None:
+def test_remote_clients_have_20_places_in_the_queue(lasting_robot: Robot, client: RemoteClient) -> None:
     lasting_robot.talk.request("pause")
     goals = [client.say(f"flood {number}", wait=True) for number in range(25)]
     assert [goal["state"] for goal in goals] == ["PENDING"] * 20 + ["REJECTED"] * 5
@@ -174,7 +172,7 @@ def test_remote_clients_have_20_places_in_the_queue_and_local_ones_the_rest(
     fire = client.say("fire", preempt=True)
     assert fire["state"] == "PENDING"
     goals = [client.say(f"flood {number}") for number in range(21)]
-    assert [goal["state"] for goal in goals] == ["PENDING"] * 20 + ["REJECTED"], "fire was counted"
+    assert [goal["state"] for goal in goals] == ["PENDING"] * 20 + ["REJECTED"], "fire took a place"
     fire = client.say("fire", preempt=True)
     assert fire["state"] == "PENDING"
     assert client.ask("cancel")["count"] == 21
@@ -191,7 +189,7 @@ def test_patient_goals_wait_for_room_in_their_order(lasting_robot: Robot, client
     fill(lasting_robot, client)
     client.send({"seq": 100, "request": "say", "text": "patient", "patient": True, "wait": True})
     client.send({"seq": 101, "request": "say", "text": "behind it", "patient": True})
-    client.ask("status")  # behind them
+    client.ask("status")  # the bridge has read the requests before it
     assert not [line for line in client.lines if line.get("seq") in (100, 101)]
     client.ask("cancel", ids=[robot_goals(lasting_robot)[0]["id"]])
     assert client.reply(100)["goal"]["state"] == "PENDING"
@@ -209,12 +207,10 @@ def test_a_remote_client_that_waits_for_room_gets_alive_events(lasting_robot: Ro
 
 
 @pytest.mark.parametrize("case", ["here", "by its id", "elsewhere", "at the robot"])
-def test_a_cancel_from_any_client_recalls_goals_that_wait_for_room(
-    lasting_robot: Robot, client: RemoteClient, case: str
-) -> None:
+def test_any_client_can_cancel_goals_that_wait_for_room(lasting_robot: Robot, client: RemoteClient, case: str) -> None:
     fill(lasting_robot, client)
     client.send({"seq": 100, "request": "say", "text": "patient", "patient": True, "wait": True, "id": "p"})
-    client.ask("status")  # the one before has been looked at
+    client.ask("status")  # the bridge has read the request before it
     if case == "at the robot":
         assert lasting_robot.talk.request("cancel")["count"] == 20
     elif case == "elsewhere":
@@ -233,14 +229,14 @@ def test_a_cancel_from_any_client_recalls_goals_that_wait_for_room(
 
 def test_a_goodbye_recalls_goals_that_wait_for_room_and_disconnects(lasting_robot: Robot, client: RemoteClient) -> None:
     fill(lasting_robot, client)
-    with lasting_robot.talk.connect() as wire:  # one for all questions, so that no closing one is counted
+    with lasting_robot.talk.connect() as wire:  # one connection for all requests, so that a closing one isn't counted
         before = wire.request("status")["server"]["clients"]
         client.send({"seq": 100, "request": "say", "text": "patient", "patient": True})
         client.ask("status")
         client.hang_up()
         end = time.monotonic() + 5
         while wire.request("status")["server"]["clients"] >= before:
-            assert time.monotonic() < end, "the bridge keeps its connection"
+            assert time.monotonic() < end, "the bridge keeps its connection to the server"
     with RemoteClient(lasting_robot.broker, "eve") as eve:
         assert eve.ask("cancel")["count"] == 20
         assert eve.say("next")["state"] == "PENDING"
@@ -248,9 +244,7 @@ def test_a_goodbye_recalls_goals_that_wait_for_room_and_disconnects(lasting_robo
         eve.ask("cancel")
 
 
-def test_a_remote_client_with_more_than_64_waiting_requests_is_refused(
-    lasting_robot: Robot, client: RemoteClient
-) -> None:
+def test_more_than_64_waiting_requests_of_a_client_are_refused(lasting_robot: Robot, client: RemoteClient) -> None:
     lasting_robot.talk.request("pause")
     for number in range(100):
         client.send({"seq": number, "request": "say", "text": f"{number}", "patient": True})
@@ -261,7 +255,7 @@ def test_a_remote_client_with_more_than_64_waiting_requests_is_refused(
 
 
 def robot_goals(robot: Robot) -> list[Message]:
-    """Return the goals that wait at the robot's server, in their order."""
+    """Return the pending goals of the robot's server in their order."""
     with robot.talk.connect() as wire:
         wire.request("status")
         return [item["pending"] for item in wire.items if "pending" in item]
@@ -289,12 +283,7 @@ def test_a_goal_rejected_by_an_earlier_server_may_be_sent_again(robot: Robot) ->
         client.say("too late", id="bob-1", ttl=-1)
         robot.talk.kill()
         robot.talk.start_server()
-        retained(
-            robot.broker,
-            f"{ANNA}/presence",
-            lambda presence: (presence["server"] or {}).get("pid") == robot.talk.pid,
-            BACK,
-        )
+        retained(robot.broker, robot.presence, lambda new: (new["server"] or {}).get("pid") == robot.talk.pid, BACK)
         assert client.say("in time", id="bob-1")["state"] == "PENDING"
 
 
@@ -328,11 +317,11 @@ def test_a_hung_server_counts_as_missing_until_it_responds(robot: Robot) -> None
 
 
 def test_the_status_after_a_cancel_shows_the_final_state(robot: Robot) -> None:
-    """It doesn't tell PREEMPTING first, and the end a second later."""
+    """It isn't PREEMPTING first, with the final state a second later."""
     with RemoteClient(robot.broker) as client, Listener(robot.broker, f"{ANNA}/status") as listener:
         goal = client.say("never-ends")
         listener.await_message(lambda message: message.json["active"] == goal["id"])
-        time.sleep(1.1)  # that nothing is told before the next may be, is no event
+        time.sleep(1.1)  # the next status may be sent a second after the last
         sent_at = time.monotonic()
         client.ask("cancel")
         status = listener.await_message(lambda message: message.arrived > sent_at).json
@@ -348,9 +337,7 @@ def test_every_change_is_an_event_and_the_status_is_sent_once_a_second(robot: Ro
         text = "never-ends battery low"
         with Listener(robot.broker, f"{ANNA}/event/+", f"{ANNA}/status") as listener:
             goal = client.say(text, wait=True)
-            listener.await_message(
-                lambda message: message.topic.endswith("event/state") and message.json["state"] == "ACTIVE"
-            )
+            listener.await_message(lambda event: event.topic.endswith("/state") and event.json["state"] == "ACTIVE")
             client.ask("pause")
             listener.await_message(lambda message: message.topic.endswith("event/paused"))
             status = listener.await_message(lambda message: message.topic.endswith("status") and message.json["paused"])
@@ -368,7 +355,7 @@ def test_every_change_is_an_event_and_the_status_is_sent_once_a_second(robot: Ro
             assert [state["state"] for state in states] == ["PENDING", "ACTIVE", "PREEMPTING", "PREEMPTED"]
             assert states[-1]["goal"] == ended
             assert [event["paused"] for event in payloads(listener.messages, "event/paused")] == [True, False]
-            # What the broker had kept, of a robot that had said nothing, came when that was asked for.
+            # The retained status, without goals, arrived after the subscription, so its time doesn't count.
             statuses = [message for message in listener.messages if message.topic.endswith("status")]
             times = [message.arrived for message in statuses if message.json["active"] or message.json["last"]]
             assert len(times) > 1

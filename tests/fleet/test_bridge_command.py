@@ -1,4 +1,4 @@
-"""`talk bridge` as a command: refused options, printed units and rules, and words for a supervisor."""
+"""The command `talk bridge`: usage errors, printed units and access rules, and systemd notifications."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def run_bridge(home: str, *arguments: str, **extra: str) -> tuple[int, str, str]
 
 
 @pytest.mark.parametrize(
-    ("arguments", "env", "expected"),
+    ("arguments", "env", "error"),
     [
         ("", {}, "--name is missing"),
         ("--name a/b", {}, "--name: 'a/b' is not a valid name; it must have 1 to 59 characters"),
@@ -49,11 +49,9 @@ def run_bridge(home: str, *arguments: str, **extra: str) -> tuple[int, str, str]
         ("--name anna", {"TALK_BROKER": "mqtts://b", "TALK_MQTT_CA": "/no"}, "TALK_MQTT_CA: /no: No such file"),
     ],
 )
-def test_a_usage_error_names_the_mistake_and_the_next_step(
-    home: str, arguments: str, env: dict[str, str], expected: str
-) -> None:
+def test_usage_errors_name_the_next_step(home: str, arguments: str, env: dict[str, str], error: str) -> None:
     code, out, err = run_bridge(home, *arguments.split(), **env)
-    assert (code, out, expected in err, "Traceback" in err, "hunter2" in err) == (2, "", True, False, False), err
+    assert (code, out, error in err, "Traceback" in err, "hunter2" in err) == (2, "", True, False, False), err
 
 
 def test_only_printing_works_without_paho(home: str, tmp_path: Path) -> None:
@@ -93,9 +91,7 @@ def command_of(unit: str) -> list[str]:
         ("system", "/etc/systemd/system", "/etc/talk/bridge.env"),
     ],
 )
-def test_a_unit_names_its_path_its_environment_file_and_its_options(
-    home: str, name: str, folder: str, environment_file: str
-) -> None:
+def test_a_unit_names_its_path_and_options(home: str, name: str, folder: str, environment_file: str) -> None:
     unit = printed_unit(home, name)
     head = unit.partition("\n[Unit]\n")[0].splitlines()
     assert head[0].startswith(f"# {folder}/talk-bridge.service: ")
@@ -105,7 +101,7 @@ def test_a_unit_names_its_path_its_environment_file_and_its_options(
     assert all(line.startswith("#") and len(line) <= 120 for line in head)
     settings = {
         "EnvironmentFile": environment_file, "Type": "notify", "WatchdogSec": "30", "Restart": "on-failure",
-        "RestartPreventExitStatus": "2",  # not 11: the other bridge of its name may go
+        "RestartPreventExitStatus": "2",  # not 11: the other bridge with this name may end
         "RestartSec": "10", "StartLimitIntervalSec": "0", "RestrictAddressFamilies": "AF_UNIX AF_INET AF_INET6",
     }  # fmt: skip
     if name == "system":

@@ -1,4 +1,4 @@
-"""A command at a desk: the output that it has at the robot, its way there, and a broker that loses an answer."""
+"""Commands to one robot: their output compared with the robot's own, and faults of the broker."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ if TYPE_CHECKING:
     from tests.support.processes import Clients, Finished, Process
 
 ALLOW = ("--allow", "say,cancel,status,wait,log,voices,pause,resume,set")
-#: The server's uptime, which differs between two commands.
+#: The server's uptime, which differs between commands.
 _UPTIME = re.compile(r'up \d+ s|"uptime": [\d.]+')
 
 
 @pytest.fixture(scope="module")
 def open_robot() -> Iterator[Robot]:
-    """A robot that allows all requests, and has spoken."""
+    """A robot that allows all requests. It has spoken a goal and rejected another."""
     with Broker() as broker, contextlib.closing(Talk(["--player", "null", "--rate", "450"])) as talk:
         with Bridge(talk, broker, "anna", *ALLOW) as bridge:
             bridge.await_online()
@@ -84,13 +84,13 @@ def comparable(done: Finished) -> tuple[int, str, str]:
 def test_a_command_has_the_same_output_as_on_the_robot(open_robot: Robot, line: str, code: int) -> None:
     local = open_robot.talk.run(*line.split())
     remote = open_robot.desk(*line.split())
-    open_robot.talk.request("resume")  # the other tests speak
+    open_robot.talk.request("resume")  # other tests need a robot that isn't paused
     assert comparable(remote) == comparable(local)
     assert remote.code == code, remote
 
 
 def test_a_sentence_has_the_same_output_while_it_is_spoken(open_robot: Robot) -> None:
-    """Its id and the times of its words differ."""
+    """Only the id and the times of the words differ."""
     shown: list[tuple[int, str, str]] = []
     for client in (open_robot.talk, Desk(open_robot.broker, env={"TALK_ROBOT": "anna"})):
         with contextlib.nullcontext(client) if isinstance(client, Talk) else client:
@@ -121,7 +121,7 @@ def test_a_remote_watch_shows_the_same_events_as_a_local_one(open_robot: Robot) 
             process.send_signal(signal.SIGINT)
             assert client.finish(process).code == 130
     local, remote = seen
-    assert json.loads(remote[0]).keys() == json.loads(local[0]).keys()  # how many clients there are is another number
+    assert json.loads(remote[0]).keys() == json.loads(local[0]).keys()  # the number of clients differs
     assert remote[1:] == local[1:]
     assert len([line for line in remote if '"event": "word"' in line]) == 3
 
@@ -177,9 +177,7 @@ def test_ctrl_c_cancels_lines_of_a_command_that_has_run_for_a_while(robot: Robot
         ("--robot= status", "empty"),
     ],
 )
-def test_a_command_that_cannot_be_sent_to_a_robot_is_a_usage_error(
-    lasting_robot: Robot, line: str, expected: str
-) -> None:
+def test_a_command_that_no_robot_can_run_is_a_usage_error(lasting_robot: Robot, line: str, expected: str) -> None:
     with Desk(lasting_robot.broker, env={"TALK_BROKER": ""} if "TALK_BROKER" in expected else {}) as operator:
         done = operator.run(*line.split())
     assert (done.code, done.out) == (2, ""), done
@@ -187,7 +185,7 @@ def test_a_command_that_cannot_be_sent_to_a_robot_is_a_usage_error(
 
 
 def test_a_command_for_a_robot_never_reaches_the_local_server(broker: Broker) -> None:
-    """Plain lines, which are sent before anything is imported, and others."""
+    """This includes simple commands, which are sent before most modules are imported."""
     with short_directory() as home, socket.socket(socket.AF_UNIX) as local:
         local.bind(f"{home}/s")
         local.listen()
@@ -198,7 +196,7 @@ def test_a_command_for_a_robot_never_reaches_the_local_server(broker: Broker) ->
                 for client in [operator.start(*options, *line.split()) for line in lines]:
                     done = operator.finish(client)
                     assert (done.code, "no robot 'nobody'" in done.err) == (3, True), done
-        with pytest.raises(BlockingIOError):  # nobody has connected
+        with pytest.raises(BlockingIOError):  # no command has connected
             local.accept()
 
 
@@ -213,7 +211,7 @@ def test_options_override_variables_and_a_robot_overrides_a_socket(open_robot: R
 
 
 def completions(robot: Robot, line: str, **env: str) -> list[str]:
-    """Return the values that fish offers at the end of a line."""
+    """Return the completions of a command line in fish."""
     variables = {"_TALK_COMPLETE": "fish_complete", "COMP_WORDS": line, "COMP_CWORD": ""}
     with Desk(robot.broker, env={**env, **variables}) as operator:
         done = operator.run()
@@ -236,16 +234,16 @@ def test_completion_offers_online_robots_and_their_goals(robot: Robot) -> None:
     robot.broker.start()
 
 
-# A broker that takes less than it should, or loses an answer
+# A broker that limits messages or loses a reply
 
 
-#: Longer than the broker takes, shorter than a robot takes.
+#: Too long for the broker, but not for a robot.
 TOO_LONG = "word " * 1_200
 
 
 @pytest.fixture
 def client(lasting_robot: Robot) -> Iterator[Client]:
-    """A client of the robot in this process."""
+    """A `Client` of the robot."""
     with Fleet(lasting_robot.broker.url).robot("anna") as client:
         yield client
 
@@ -256,7 +254,7 @@ def test_a_text_too_long_for_the_broker_is_refused_before_it_is_sent(make_talk: 
         done = desk(broker, "anna", "say", "--wait", "--", TOO_LONG)
         assert (done.code, done.out) == (1, "")
         assert "the broker accepts at most 3,072; nothing was sent" in done.err
-        with Desk(broker, env={"TALK_MQTT_USER": "o" * 59}) as operator:  # a name as long as may be
+        with Desk(broker, env={"TALK_MQTT_USER": "o" * 59}) as operator:  # the longest allowed name
             assert operator.run("--robot", "anna", "say", "--wait", "--rate", "450", "--", "short").code == 0
 
 
@@ -290,7 +288,7 @@ def test_a_goal_may_be_sent_from_several_threads(client: Client) -> None:
     assert sum(not handle.attached for handle in handles) == 1
 
 
-@pytest.mark.slow  # a broker doesn't tell that it keeps something back, so the whole patience of 5 s is waited for
+@pytest.mark.slow  # a broker doesn't report withheld messages, so the desk waits for its limit of 5 s
 def test_a_login_that_may_not_read_replies_is_refused_before_sending(make_talk: MakeTalk) -> None:
     rules = "user anna\ntopic readwrite #\n\nuser olga\ntopic write talk/#\ntopic read talk/robot/+/presence\n"
     with (

@@ -1,4 +1,4 @@
-"""`talk --robot anna doctor` names the obstacles between a desk, a broker and a robot, and the next step."""
+"""`talk --robot anna doctor` checks the broker, the login and the robot, and names the next step."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
     from tests.fleet.robot import Robot
     from tests.support.processes import Finished, Talk
 
-#: Seconds in which the doctor ends, whatever it finds: each of its steps has ten.
+#: Time for the doctor to end. Each of its steps takes at most 10 s.
 LIMIT = 60.0
-#: The checks if all is well.
+#: The checks if none fails.
 WELL = ["broker", "login", "anonymous", "name", "rights", "bridge"]
 PRESENCE: dict[str, Any] = {
     "talk": 1, "version": __version__, "online": True, "session": "5e55", "since": 1000.0, "groups": ["warehouse"],
@@ -49,7 +49,7 @@ def with_paho() -> None:
 
 
 def findings(done: Finished, code: int) -> dict[str, dict[str, str]]:
-    """Return the findings by their checks, in their order, and assert the exit code."""
+    """Assert the exit code, and return the findings by the name of their check."""
     assert (done.code, done.err) == (code, ""), done
     results = [json.loads(line) for line in done.out.splitlines()]
     for finding in results:
@@ -61,15 +61,13 @@ def doctor(
     at: Broker, name: str = "anna", *, code: int = 4, user: str | None = None, password: str | bool = True,
     cert: str | None = None, env: Mapping[str, str] | None = None,
 ) -> dict[str, dict[str, str]]:  # fmt: skip
-    """Run the doctor at a desk, and return its findings."""
+    """Run the doctor at a desk, and return its findings by the name of their check."""
     with Desk(at, user=user, password=password, cert=cert, env=env) as desk:
         return findings(desk.run("--json", "--robot", name, "doctor", timeout=LIMIT), code)
 
 
-def publish_presence(
-    at: Broker, name: str, user: str | None = None, cert: str | None = None, **changed: object
-) -> None:
-    """Have the broker keep the presence of a robot."""
+def publish_robot(at: Broker, name: str, user: str | None = None, cert: str | None = None, **changed: object) -> None:
+    """Publish the presence of a robot."""
     with Listener(at, user=user, cert=cert) as listener:
         listener.publish(topics.robot(name, topics.PRESENCE), PRESENCE | changed, retain=True)
 
@@ -113,7 +111,7 @@ def test_the_robot_may_be_named_by_a_variable(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.slow
 def test_a_silent_bridge_fails_although_its_robot_seems_online(broker: Broker) -> None:
-    publish_presence(broker, "anna")
+    publish_robot(broker, "anna")
     started_at = time.monotonic()
     results = doctor(broker)
     assert time.monotonic() - started_at < 20
@@ -123,8 +121,8 @@ def test_a_silent_bridge_fails_although_its_robot_seems_online(broker: Broker) -
 
 
 def test_a_robot_that_is_offline_or_has_no_server_gets_no_request(broker: Broker) -> None:
-    publish_presence(broker, "anna", online=False)
-    publish_presence(broker, "bert", server=None)
+    publish_robot(broker, "anna", online=False)
+    publish_robot(broker, "bert", server=None)
     for name, expected in (("anna", "anna is offline"), ("bert", "it has no talk server")):
         results = doctor(broker, name)
         assert list(results) == WELL[:-1]
@@ -133,15 +131,15 @@ def test_a_robot_that_is_offline_or_has_no_server_gets_no_request(broker: Broker
 
 
 def test_similar_names_are_suggested_for_an_unknown_robot() -> None:
-    """Both doctors run at once, as each waits a second for the broker's retained messages."""
+    """Both doctors run at once because each waits a second for retained messages."""
     with Broker(users={"olga": "o"}, anonymous=True) as broker, Desk(broker, user="olga") as desk:
-        publish_presence(broker, "anna")
+        publish_robot(broker, "anna")
         clients = [desk.start("--json", "--robot", name, "doctor") for name in ("Ana", "zebra")]
         near, far = (findings(desk.finish(client), 4) for client in clients)
     assert near["name"]["message"] == "the broker knows no robot named 'Ana'; known robots: anna"
     assert near["name"]["next"] == "talk --robot anna doctor"
     assert far["name"]["next"] == "on the robot, run: talk bridge --name zebra"
-    assert near["anonymous"]["state"] == "warning"  # it lets its users in, and anybody else
+    assert near["anonymous"]["state"] == "warning"  # the broker also accepts clients without a login
 
 
 # Rights
@@ -166,12 +164,10 @@ def test_a_robot_can_check_the_rights_of_its_own_login(secure_broker: Broker) ->
             done = desk.run("--robot", "anna", "doctor")
         assert (done.code, done.err) == (0, "talk: the broker accepts this robot's messages; 1 warning\n")
         assert "'anna' is free" in done.out
-        publish_presence(secure_broker, "anna", user="anna")
+        publish_robot(secure_broker, "anna", user="anna")
         results = doctor(secure_broker, user="anna", code=0)
         assert results["name"]["message"].startswith("anna is online")
-        assert not [
-            message for message in listener.messages if message.retain and not message.topic.endswith("/presence")
-        ]
+        assert not [item for item in listener.messages if item.retain and not item.topic.endswith("/presence")]
 
 
 def test_topics_that_a_robot_may_not_write_or_read_are_listed() -> None:
@@ -183,7 +179,7 @@ def test_topics_that_a_robot_may_not_write_or_read_are_listed() -> None:
     assert results["rights"]["next"].endswith("talk bridge --print-acl")
 
 
-# The way to the broker, and the login
+# The connection to the broker, and the login
 
 
 @pytest.mark.parametrize(
@@ -249,7 +245,7 @@ def test_a_refused_login_is_reported_with_the_variables_to_set(secure_broker: Br
 
 def test_only_a_client_with_a_certificate_can_log_in() -> None:
     with Broker(certificates=True) as broker:
-        publish_presence(broker, "anna", cert="anna", online=False)
+        publish_robot(broker, "anna", cert="anna", online=False)
         results = doctor(broker, cert="olga", env={"TALK_MQTT_USER": "olga"})
         assert results["login"]["message"] == "as 'olga', with a certificate"
         assert results["anonymous"]["state"] == "ok"
@@ -264,13 +260,13 @@ def test_a_signal_ends_a_doctor_that_waits_for_a_login() -> None:
         with Desk(broker, env={"TALK_BROKER": f"mqtt://{HOST}:{mute.getsockname()[1]}"}) as desk:
             client = desk.start("--robot", "anna", "doctor")
             mute.accept()[0].close()
-            with mute.accept()[0]:  # it waits for the answer to its login
+            with mute.accept()[0]:  # the doctor waits for the reply to its login
                 client.terminate()
                 done = desk.finish(client, 3)
     assert done.code == 143
 
 
-# Judgements
+# Judgements of results
 
 
 def test_an_invalid_robot_name_is_a_usage_error() -> None:
@@ -320,8 +316,6 @@ def test_rights_cannot_be_tested_if_the_broker_disconnects() -> None:
         ({"paused": True}, "warning", "talk --robot anna resume"),
     ],
 )
-def test_a_failed_engine_or_a_paused_server_is_a_warning(
-    change: dict[str, object], state: str, step: str | None
-) -> None:
+def test_a_failed_engine_and_a_pause_are_warnings(change: dict[str, object], state: str, step: str | None) -> None:
     finding = judging.judge_server_status("anna", SERVER | change, 0.001)
     assert (finding.state, finding.next) == (state, step)

@@ -1,4 +1,4 @@
-"""`talk fleet status` and `talk fleet watch` at a desk, in a pipe and on a terminal."""
+"""`talk fleet status` and `talk fleet watch`, in a pipe and on a terminal."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @pytest.fixture
 def robots(broker: Broker) -> Iterator[Listener]:
-    """A publisher for three robots, one of which is offline, and one without a server."""
+    """A publisher that has published three robots. One is offline, and one has no server."""
     with Listener(broker) as publisher:
         publish.presence(publisher, "wh-2", online=False, groups=["warehouse"])
         publish.presence(publisher, "wh-1", groups=["warehouse"])
@@ -42,7 +42,7 @@ def run(broker: Broker, *arguments: str, user: str | None = None, **env: str) ->
 
 
 def listed(done: Finished) -> list[str]:
-    """Return the robots that a table lists."""
+    """Return the names of the robots in a table."""
     assert done.code == 0, done
     head, *lines = done.out.splitlines()
     assert head.startswith("ROBOT ")
@@ -88,8 +88,8 @@ def test_the_status_shows_what_the_bridge_published(robot: Robot) -> None:
 
 @pytest.mark.usefixtures("robots")
 def test_robots_are_selected_by_name_glob_or_group(broker: Broker) -> None:
-    for text, picked in (("anna", ["anna"]), ("wh-*", ["wh-1", "wh-2"]), ("@warehouse", ["wh-1", "wh-2"])):
-        assert listed(run(broker, "--robot", text, "fleet", "status")) == picked
+    for text, selected in (("anna", ["anna"]), ("wh-*", ["wh-1", "wh-2"]), ("@warehouse", ["wh-1", "wh-2"])):
+        assert listed(run(broker, "--robot", text, "fleet", "status")) == selected
     assert listed(run(broker, "fleet", "status", TALK_ROBOT="@all")) == ["anna", "wh-1", "wh-2"]
 
 
@@ -118,7 +118,7 @@ def test_a_missing_broker_exits_with_3_and_missing_rights_with_10(secure_broker:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "env", "expected"),
+    ("args", "env", "error"),
     [
         (["fleet"], {}, "WHAT is missing; choose one of status, watch"),
         (["fleet", "list"], {}, "'list' is not one of 'status', 'watch'"),
@@ -128,15 +128,13 @@ def test_a_missing_broker_exits_with_3_and_missing_rights_with_10(secure_broker:
         (["fleet", "status"], {"TALK_BROKER": ""}, "TALK_BROKER is not set; name your broker"),
     ],
 )
-def test_a_usage_error_names_the_mistake(
-    broker: Broker, arguments: list[str], env: dict[str, str], expected: str
-) -> None:
-    done = run(broker, *arguments, **env)
-    assert (done.code, done.out, expected in done.err) == (2, "", True), done
+def test_a_usage_error_names_the_mistake(broker: Broker, args: list[str], env: dict[str, str], error: str) -> None:
+    done = run(broker, *args, **env)
+    assert (done.code, done.out, error in done.err) == (2, "", True), done
 
 
 def test_600_robots_are_listed_despite_mosquittos_message_queue(broker: Broker) -> None:
-    """It sends 20 at once and queues 1,000; it drops others, unless the client asks for more at once."""
+    """Mosquitto drops messages beyond 20 in flight and 1,000 queued, unless the client accepts more in flight."""
     with Listener(broker) as publisher:
         for number in range(600):
             publish.presence(publisher, f"wh-{number:03}")

@@ -1,4 +1,4 @@
-"""The library for a fleet: the robots of a broker, one robot as a client, several at once, and errors."""
+"""The class `Fleet`: listing robots, a client of one robot, requests to several robots, and errors."""
 
 from __future__ import annotations
 
@@ -25,11 +25,12 @@ if TYPE_CHECKING:
     from talkcli import Outcome
     from tests.fleet.many import RealRobots
 
-PAIR, BOTH = ["wh-1", "wh-2"], ("wh-*", "@warehouse")
+#: Two robots, and the selections that match both.
+PAIR, SELECTIONS = ["wh-1", "wh-2"], ("wh-*", "@warehouse")
 
 
 def results(outcomes: Iterable[Outcome]) -> dict[str, tuple[str, int]]:
-    """Return the state and the exit code of each robot, which has one outcome."""
+    """Assert that each robot has one outcome, and return its state and exit code."""
     every = list(outcomes)
     assert all(outcome.last for outcome in every)
     assert len({outcome.robot for outcome in every}) == len(every)
@@ -40,7 +41,7 @@ def alike(state: str, code: int = 0, names: Iterable[str] = PAIR) -> dict[str, t
     return dict.fromkeys(names, (state, code))
 
 
-def descriptors() -> int:
+def count_descriptors() -> int:
     return len(os.listdir("/proc/self/fd"))
 
 
@@ -84,11 +85,11 @@ def test_a_goal_has_the_same_id_on_all_robots(fleet: Fleet, to: str, names: list
 
 def test_cancel_cancels_a_goal_on_all_robots(fleet: Fleet, pair: RealRobots) -> None:
     assert pair["wh-1"].talk.request("say", id="before-it", text=LONG)["ok"]
-    outcomes = fleet.say("wh-*", LONG, id="given-up")
+    outcomes = fleet.say("wh-*", LONG, id="canceled-later")
     with pytest.raises(TimeoutError, match=r"0 of 2 robots have finished after 0\.1 s"):
         list(outcomes.results(0.1))
-    pair["wh-2"].talk.watcher.wait_for("given-up", "ACTIVE")
-    pair["wh-1"].talk.watcher.wait_for("given-up", "PENDING")
+    pair["wh-2"].talk.watcher.wait_for("canceled-later", "ACTIVE")
+    pair["wh-1"].talk.watcher.wait_for("canceled-later", "PENDING")
     outcomes.cancel()
     assert results(outcomes.results(5)) == {"wh-1": ("RECALLED", 6), "wh-2": ("PREEMPTED", 7)}
     assert pair["wh-1"].talk.goal("before-it")["state"] == "ACTIVE"
@@ -108,7 +109,7 @@ def test_the_goal_of_a_closed_request_is_still_spoken(fleet: Fleet, pair: RealRo
 
 
 def test_a_fleet_has_the_requests_of_a_client(fleet: Fleet, pair: RealRobots) -> None:
-    to, goal = "@warehouse", "held"
+    to, goal = "@warehouse", "paused"
     request(pair, "say", id=goal, text=LONG, key="door")
     paused = list(fleet.pause(to))
     assert results(paused) == alike("PAUSED")
@@ -128,7 +129,7 @@ def test_a_fleet_has_the_requests_of_a_client(fleet: Fleet, pair: RealRobots) ->
 
 @pytest.mark.usefixtures("fleet")
 def test_a_goal_has_the_name_of_its_sender(pair: RealRobots) -> None:
-    for to in (*BOTH, "wh-1"):
+    for to in (*SELECTIONS, "wh-1"):
         for outcome in Fleet(pair.broker.url, name="shift-plan").say(to, "length=0"):
             assert outcome.goal
             assert outcome.goal.client
@@ -136,33 +137,33 @@ def test_a_goal_has_the_name_of_its_sender(pair: RealRobots) -> None:
 
 
 def test_requests_leave_no_descriptors_open(fleet: Fleet) -> None:
-    assert results(fleet.status("wh-*"))  # what is imported once, opens what stays open
+    assert results(fleet.status("wh-*"))  # imports may open descriptors that stay open
     gc.collect()
-    before = descriptors()
-    for to in BOTH:
+    before = count_descriptors()
+    for to in SELECTIONS:
         assert results(fleet.say(to, "length=0")) == alike("SUCCEEDED")
         fleet.status(to).close()
         with fleet.status(to) as outcomes:
             assert next(iter(outcomes)).exit_code == 0
-            assert descriptors() > before
+            assert count_descriptors() > before
         with pytest.raises(UsageError):
             fleet.say(to, "hello", rate=9)
         with pytest.raises(ServerUnavailable):
             list(fleet.status("nobody*"))
-    assert descriptors() == before
+    assert count_descriptors() == before
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
-@pytest.mark.parametrize("to", BOTH)
+@pytest.mark.parametrize("to", SELECTIONS)
 def test_an_abandoned_request_leaves_no_descriptors_open(fleet: Fleet, to: str) -> None:
     list(fleet.status(to))
     gc.collect()
-    before = descriptors()
+    before = count_descriptors()
     for _ in range(5):
         for _ in fleet.status(to):
             break
     gc.collect()
-    assert descriptors() == before
+    assert count_descriptors() == before
 
 
 def test_a_refused_request_leaves_no_descriptors_open(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -176,8 +177,8 @@ def test_a_refused_request_leaves_no_descriptors_open(monkeypatch: pytest.Monkey
             assert results(fleet.say("wh-*", "hello")) == {"wh-1": ("REFUSED", 10)}
             with pytest.raises(AccessDenied, match="does not allow 'olga'"):
                 list(fleet.say("@warehouse", "hello"))
-            before = before or descriptors()
-        assert descriptors() == before
+            before = before or count_descriptors()
+        assert count_descriptors() == before
 
 
 def test_a_failure_on_a_robot_is_an_outcome_with_its_error(fleet: Fleet) -> None:
@@ -191,7 +192,7 @@ def test_a_failure_on_a_robot_is_an_outcome_with_its_error(fleet: Fleet) -> None
 
 
 @pytest.mark.parametrize(
-    ("ask", "expected"),
+    ("ask", "error"),
     [
         (lambda fleet: fleet.say("@all", "hello", rate=9), "the rate must be 80 to 450 words per minute, got 9"),
         (lambda fleet: fleet.say("@all", b"hello"), "'text' must be a string"),
@@ -205,12 +206,10 @@ def test_a_failure_on_a_robot_is_an_outcome_with_its_error(fleet: Fleet) -> None
         (lambda fleet: fleet.robot("wh-*"), "invalid robot name 'wh-*'"),
     ],
 )
-def test_an_invalid_request_raises_before_anything_is_sent(
-    fleet: Fleet, ask: Callable[[Fleet], Any], expected: str
-) -> None:
+def test_an_invalid_request_raises_before_it_is_sent(fleet: Fleet, ask: Callable[[Fleet], Any], error: str) -> None:
     with pytest.raises(UsageError) as caught:
         ask(fleet)
-    assert expected in str(caught.value)
+    assert error in str(caught.value)
 
 
 @pytest.mark.parametrize(

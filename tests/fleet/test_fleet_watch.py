@@ -1,4 +1,4 @@
-"""`FleetWatch` sees robots and their goals, also after the broker was away. A publisher speaks for the robots."""
+"""`FleetWatch`, also with a broker that was away. A publisher stands in for the robots."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ if TYPE_CHECKING:
 
 
 class BackgroundWatch(contextlib.AbstractContextManager["BackgroundWatch"]):
-    """A watch in a thread of its own, which `with` starts and ends."""
+    """A `FleetWatch` in its own thread, which `with` starts and ends."""
 
     def __init__(self, broker: Broker, selection: str | None = None) -> None:
         self._watch = FleetWatch(from_environment(broker.env()), Selection(selection) if selection else None)
         self._queue: queue.SimpleQueue[FleetEvent | Exception] = queue.SimpleQueue()
         self._wake, self._write = os.pipe()
         self._thread = threading.Thread(target=self._read, daemon=True)
-        #: all events after the first, as far as `find` has looked
+        #: all events after the snapshot that `find` has inspected
         self.seen: list[FleetEvent] = []
 
     def __enter__(self) -> BackgroundWatch:
@@ -63,7 +63,7 @@ class BackgroundWatch(contextlib.AbstractContextManager["BackgroundWatch"]):
         os.close(self._write)
 
     def find(self, kind: type[Any], wanted: Callable[[Any], bool] = lambda _: True) -> Any:
-        """Wait for the first event of a kind, and return it; raise the error that has ended the watch."""
+        """Return the first matching event of a kind, or raise the error that ended the watch."""
         found = [event for event in self.seen if isinstance(event, kind) and wanted(event)]
         while not found:
             each = self._queue.get(timeout=PATIENCE)
@@ -79,20 +79,20 @@ class BackgroundWatch(contextlib.AbstractContextManager["BackgroundWatch"]):
                 self._queue.put(event)
         except Interrupted:
             pass
-        except Exception as error:  # noqa: BLE001 - the test's own thread raises it
+        except Exception as error:  # noqa: BLE001 - `find` raises it
             self._queue.put(error)
 
 
 @pytest.fixture
 def robots(broker: Broker) -> Iterator[Listener]:
-    """A publisher for the robots."""
+    """A publisher of the robots' messages."""
     with Listener(broker) as publisher:
         yield publisher
 
 
 @pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A desk that reconnects soon after its broker is back."""
+def fast_reconnect(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Makes a watch reconnect soon after its broker is back."""
     monkeypatch.setattr(link, "_MAX_BROKER_PAUSE_S", 0.1)
 
 
@@ -121,7 +121,7 @@ def test_changed_presences_are_reported_and_renewed_ones_are_not(broker: Broker,
         publish.presence(robots, "anna", server=None)
         publish.presence(robots, "anna", server={**publish.SERVER, "boot": "8abc"})
         publish.presence(robots, "anna", online=False)
-        robots.publish("talk/robot/anna/presence", "", retain=True)  # cleared: it is gone already
+        robots.publish("talk/robot/anna/presence", "", retain=True)  # cleared, but the robot is gone already
         publish.presence(robots, "anna", session="6666")
         watcher.find(RobotChanged, lambda event: event.now and event.now.session == "6666")
         changes = [event.now for event in watcher.seen if isinstance(event, RobotChanged)]
@@ -147,25 +147,25 @@ def test_malformed_events_are_left_out(broker: Broker, robots: Listener) -> None
         assert (len(watcher.seen), states) == (3, [State.PENDING, State.ACTIVE, State.SUCCEEDED])
 
 
-@pytest.mark.parametrize(("text", "picked"), [("anna", ["anna"]), ("wh-*", ["wh-1"]), ("@night", ["anna", "wh-1"])])
-def test_only_selected_robots_are_watched(broker: Broker, robots: Listener, text: str, picked: list[str]) -> None:
+@pytest.mark.parametrize(("text", "selected"), [("anna", ["anna"]), ("wh-*", ["wh-1"]), ("@night", ["anna", "wh-1"])])
+def test_only_selected_robots_are_watched(broker: Broker, robots: Listener, text: str, selected: list[str]) -> None:
     publish.presence(robots, "anna", groups=["night"])
     with BackgroundWatch(broker, text) as watcher:
         publish.presence(robots, "bert")
         publish.presence(robots, "wh-1", groups=["night"])
         for name in ("bert", "anna", "wh-1"):
             publish.event(robots, name, "a-1", "ACTIVE")
-        watcher.find(RobotEvent, lambda event: event.name == picked[-1])
-        assert {*names(watcher.seen)} == {*picked}
+        watcher.find(RobotEvent, lambda event: event.name == selected[-1])
+        assert {*names(watcher.seen)} == {*selected}
 
 
-@pytest.mark.usefixtures("quick")
+@pytest.mark.usefixtures("fast_reconnect")
 def test_after_a_disconnect_each_change_is_reported_once(broker: Broker, robots: Listener) -> None:
     for name in ("anna", "bert", "carl", "dora"):
         publish.presence(robots, name)
         publish.status(robots, name, last=f"{name}-1")
     with BackgroundWatch(broker) as watcher:
-        publish.event(robots, "bert", "bert-2", "SUCCEEDED", "heard of")
+        publish.event(robots, "bert", "bert-2", "SUCCEEDED", "known")
         watcher.find(RobotEvent)
         broker.kill()
         away = watcher.find(BrokerAway)
@@ -191,7 +191,7 @@ def test_after_a_disconnect_each_change_is_reported_once(broker: Broker, robots:
         assert sorted(event.name for event in changes) == ["bert", "carl"]
 
 
-@pytest.mark.usefixtures("quick")
+@pytest.mark.usefixtures("fast_reconnect")
 def test_a_robot_that_does_not_return_with_its_broker_is_gone(
     broker: Broker, robots: Listener, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -225,12 +225,12 @@ def test_goals_spoken_while_a_robot_was_offline_are_reported_later(broker: Broke
         assert sum(isinstance(event, EventsMissed) for event in watcher.seen) == 1
 
 
-@pytest.mark.usefixtures("quick")
+@pytest.mark.usefixtures("fast_reconnect")
 def test_a_watch_fails_if_the_broker_stays_away(broker: Broker, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(watch, "ABSENCE_LIMIT_S", 0.5)
     with BackgroundWatch(broker) as watcher:
         broker.kill()
-        # The second if a busy machine has not tried once by then.
+        # The second reason, if a busy machine hasn't tried to reconnect by then.
         why = "(can't connect to the broker at .*refused|the connection to the broker at .* was lost)"
         with pytest.raises(Lost, match=rf"was unreachable for 0\.5 s: {why}$"):
             watcher.find(BrokerBack)

@@ -1,4 +1,4 @@
-"""A robot as a device of Home Assistant's, with a real robot and broker; see `tests.fleet.homeassistant`."""
+"""A robot as a device of Home Assistant, with a real robot and broker (see `tests.fleet.homeassistant`)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from tests.fleet.conftest import MakeBridge, MakeRobot
 
 ANNA = "homeassistant/device/talk/anna/config"
-#: The name r2.d2 has a dot, so its topic has another form.
+#: The topic for the name r2.d2. A dot is not allowed in such a topic.
 DOTTED = "homeassistant/device/talk-dots/r2_dd2/config"
 
 
@@ -90,7 +90,7 @@ def test_a_device_is_unavailable_without_its_server_or_its_robot(make_robot: Mak
 
 def test_a_robot_without_the_option_is_not_announced(robot: Robot) -> None:
     assert robot.desk("say", "--wait", "hello").code == 0
-    assert "homeassistant" not in robot.broker.log  # neither published nor subscribed to
+    assert "homeassistant" not in robot.broker.log  # the bridge neither published nor subscribed
     with HomeAssistant(robot.broker) as home:
         assert home.publish(*BIRTH) == NO_SUBSCRIBERS
 

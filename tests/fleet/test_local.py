@@ -1,4 +1,4 @@
-"""The bridge's connection to its server. No data may get lost, and no resources may leak."""
+"""The bridge's connection to its server."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ pytestmark = pytest.mark.timeout(20)
 
 @pytest.fixture
 def listening() -> Iterator[socket.socket]:
-    """A server's socket; the test greets."""
+    """The socket of a server. The test sends the greeting."""
     with short_directory() as directory, socket.socket(socket.AF_UNIX) as listening:
         listening.bind(f"{directory}/s")
         listening.listen()
@@ -51,7 +51,7 @@ async def accepted(listening: socket.socket) -> socket.socket:
 
 @contextlib.asynccontextmanager
 async def greeted(listening: socket.socket) -> AsyncIterator[tuple[LocalConnection, socket.socket]]:
-    """A connection, and the server's end of it."""
+    """Connect to the socket, and yield both ends of the connection."""
     dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
     with await accepted(listening) as server:
         server.sendall(GREETING)
@@ -102,13 +102,13 @@ async def test_lines_that_do_not_fit_into_the_socket_are_sent_later_in_order(lis
         local.close()
 
 
-@pytest.mark.parametrize("closed_by", ["the server", "the bridge"])
+@pytest.mark.parametrize("closed_by", ["server", "bridge"])
 @in_loop
 async def test_a_read_returns_when_the_connection_ends(listening: socket.socket, closed_by: str) -> None:
     async with greeted(listening) as (local, server):
         reading = asyncio.create_task(local.read())
         await asyncio.sleep(0.05)
-        if closed_by == "the server":
+        if closed_by == "server":
             server.close()
         else:
             local.abort()
@@ -129,12 +129,12 @@ async def test_a_server_that_sends_much_does_not_block_the_loop(listening: socke
                 sent += server.send(b'{"event": "alive"}\n' * 500)
         turns = reads = received = 0
 
-        def look() -> None:
+        def count_turn() -> None:
             nonlocal turns
             turns += 1
-            asyncio.get_running_loop().call_soon(look)
+            asyncio.get_running_loop().call_soon(count_turn)
 
-        look()
+        count_turn()
         while received < sent // 19:
             received += len(await local.read())
             reads += 1
@@ -144,7 +144,7 @@ async def test_a_server_that_sends_much_does_not_block_the_loop(listening: socke
 
 @in_loop
 async def test_a_connection_ends_if_a_line_cannot_be_sent(listening: socket.socket) -> None:
-    """After a partly sent line, the next line would be read as part of the same request."""
+    """After a partly sent line, the server would read the next line as part of the same request."""
     async with greeted(listening) as (local, server):
         lines(server, 1)
         reading = asyncio.create_task(local.read())
@@ -164,7 +164,7 @@ async def test_a_refused_connection_raises_busy_or_unavailable(
     monkeypatch.setattr("talkcli.client.connect.ANSWER_LIMIT_S", 0.3)
     dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
     with contextlib.suppress(TimeoutError):
-        while not dialing.done():  # a busy server is tried again
+        while not dialing.done():  # `dial` retries while the server is busy
             listening.settimeout(0.5)
             with await accepted(listening) as server:
                 server.sendall(answer)
@@ -181,8 +181,8 @@ async def test_the_next_socket_is_tried_if_a_server_refuses_this_user(
         first.bind(f"{directory}/s")
         first.listen()
         first.settimeout(PATIENCE)
-        places = [first.getsockname(), listening.getsockname()]
-        monkeypatch.setattr("talkcli.paths.client_sockets", lambda _: places)
+        sockets = [first.getsockname(), listening.getsockname()]
+        monkeypatch.setattr("talkcli.paths.client_sockets", lambda _: sockets)
         dialing = asyncio.create_task(dial(None, "bob"))
         with await accepted(first) as refusing:
             refusing.sendall(encode({"talk": 1, "error": "forbidden", "message": "not you"}))

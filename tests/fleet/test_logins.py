@@ -1,4 +1,4 @@
-"""Logins at a broker, the trust in it, secrets, and the access control list that talk prints."""
+"""Logins, certificates, secrets and access rules at a broker."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ if TYPE_CHECKING:
     from tests.fleet.conftest import MakeBridge
 
 SECRET = "correct horse battery staple"
-#: The exit code of a desk that was let in, and finds no robot there.
-LET_IN = 3
+#: The exit code of a desk that can log in, but finds no robot.
+LOGGED_IN = 3
 
 
 def assert_refused(broker: Broker, code: int, expected: str, **login: Any) -> None:
-    """Assert that a desk with this login ends with this code and says this."""
+    """Assert the exit code and the error message of a desk with this login."""
     with Desk(broker, **login) as operator:
         done = operator.run("--robot", "nobody", "status")
     assert (done.code, done.out, expected in done.err) == (code, "", True), done
     assert SECRET not in done.err
 
 
-def assert_let_in(broker: Broker, **login: Any) -> None:
-    assert_refused(broker, LET_IN, "no robot 'nobody'", **login)
+def assert_logged_in(broker: Broker, **login: Any) -> None:
+    assert_refused(broker, LOGGED_IN, "no robot 'nobody'", **login)
 
 
 def test_a_login_needs_the_right_password() -> None:
     hint = "set TALK_MQTT_USER and TALK_MQTT_PASSWORD_FILE for your login"
     with Broker(secure=True, users={"olga": SECRET}) as broker:
-        assert_let_in(broker, user="olga")
+        assert_logged_in(broker, user="olga")
         assert_refused(broker, 10, "rejected the login of 'olga'", user="olga", password="wrong")
         assert_refused(broker, 10, hint, user="olga", password=False)
         assert_refused(broker, 10, "rejected the login of an anonymous user")
@@ -50,11 +50,11 @@ def test_a_login_needs_the_right_password() -> None:
 def test_a_broker_needs_a_valid_certificate_of_the_ca() -> None:
     untrusted = "the broker's certificate is not trusted"
     with Broker(secure=True) as broker:
-        assert_let_in(broker)
+        assert_logged_in(broker)
         for env in ({"TALK_MQTT_CA": stranger().file}, {"TALK_MQTT_CA": ""}):
             assert_refused(broker, 10, untrusted, env=env)
             assert_refused(broker, 10, "set TALK_MQTT_CA", env=env)
-        # The certificate is for localhost and 127.0.0.1 alone.
+        # The certificate is only for localhost and 127.0.0.1.
         assert_refused(broker, 10, untrusted, env={"TALK_BROKER": f"mqtts://0.0.0.0:{broker.port}"})
     with Broker(expired=True) as broker:
         assert_refused(broker, 10, "expired")
@@ -76,7 +76,7 @@ def test_robots_and_desks_can_log_in_with_a_certificate(make_talk: MakeTalk, mak
         with Desk(broker, cert="olga", env={"TALK_MQTT_USER": "olga"}) as operator:
             done = operator.run("--robot", "anna", "say", "--wait", "--feedback", "hello")
             assert done.code == 0, done
-        with Desk(broker, cert="otto", env={"TALK_MQTT_USER": "olga"}) as operator:  # which only claims to be olga
+        with Desk(broker, cert="otto", env={"TALK_MQTT_USER": "olga"}) as operator:  # otto claims to be olga
             done = operator.run("--robot", "anna", "say", "hello")
             assert done.code == 10, done
         assert talk.watcher.texts("ACTIVE") == ["hello"]
@@ -84,15 +84,15 @@ def test_robots_and_desks_can_log_in_with_a_certificate(make_talk: MakeTalk, mak
 
 
 def test_a_password_is_sent_without_tls_only_with_insecure() -> None:
-    """0.0.0.0 is this machine, but no rule says so."""
+    """0.0.0.0 is this machine, but isn't treated as local."""
     with Broker(users={"olga": SECRET}) as broker:
         elsewhere = {"TALK_BROKER": f"mqtt://0.0.0.0:{broker.port}"}
-        assert_let_in(broker, user="olga")  # at 127.0.0.1 nobody listens in between
+        assert_logged_in(broker, user="olga")  # no one can eavesdrop on 127.0.0.1
         before = broker.log.count("New connection")
         assert_refused(broker, 2, "in clear text", user="olga", env=elsewhere)
         assert broker.log.count("New connection") == before
         with Desk(broker, user="olga", env=elsewhere) as operator:
-            assert operator.run("--robot", "nobody", "--insecure", "status").code == LET_IN
+            assert operator.run("--robot", "nobody", "--insecure", "status").code == LOGGED_IN
 
 
 def test_a_password_is_shown_nowhere(make_talk: MakeTalk, make_bridge: MakeBridge) -> None:
@@ -117,13 +117,13 @@ def test_a_password_is_shown_nowhere(make_talk: MakeTalk, make_bridge: MakeBridg
 def test_the_password_file_is_read_again_and_the_last_password_is_kept(
     make_talk: MakeTalk, make_bridge: MakeBridge
 ) -> None:
-    """The broker may be mended, or the password file, and nobody may be there to start the bridge again."""
+    """The login or the password file may be repaired later, and the bridge must not need a restart."""
     with Broker(users={"anna": SECRET, "watcher": "other"}) as broker:
         talk = make_talk(scripted=True)
         bridge = make_bridge(talk, broker, "anna", user="anna", password="wrong", observer="watcher", online=False)
         bridge.await_log("rejected the login of 'anna'")
         assert bridge.running
-        file = broker.env("anna")["TALK_MQTT_PASSWORD_FILE"]  # which has the right one now
+        file = broker.env("anna")["TALK_MQTT_PASSWORD_FILE"]  # the file has the right password now
         bridge.await_online(15)
         os.remove(file)
         broker.kill()
@@ -133,7 +133,7 @@ def test_the_password_file_is_read_again_and_the_last_password_is_kept(
         assert SECRET not in bridge.log
 
 
-# The access control list; `tests/unit/test_fleet_topics.py` has its rules
+# The access rules. `tests/unit/test_fleet_topics.py` tests each rule.
 
 
 def test_the_printed_access_rules_allow_only_what_a_login_needs(
@@ -166,7 +166,7 @@ def test_the_printed_access_rules_allow_only_what_a_login_needs(
 def test_a_bridge_with_the_login_of_another_robot_reports_missing_rights(
     make_talk: MakeTalk, secure_broker: Broker, make_bridge: MakeBridge
 ) -> None:
-    """The bridge notices because nothing that it sends to itself comes back."""
+    """The bridge notices because the messages that it sends to itself don't return."""
     talk = make_talk(scripted=True)
     with Listener(secure_broker, "talk/robot/+/presence", user="olga") as olga:
         bridge = make_bridge(talk, secure_broker, "anna", user="bert", online=False)

@@ -1,4 +1,4 @@
-"""Many robots at once: each speaks once, and its end is told once."""
+"""Many robots at the same time. Each speaks a goal once, and each result is reported once."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 FIVE = [f"robot-{number}" for number in range(1, 6)]
 GROUP = "warehouse"
-#: Seconds in which all robots are back after the broker, and after which an absent robot is LOST.
+#: Seconds until all robots have reconnected, and until the goal of an absent robot is LOST.
 BACK, ABSENCE = 15.0, 30.0
-#: Seconds of a cancel, and of a sentence of one second.
+#: Time limits in seconds for a cancel, and for a goal of one second.
 CANCEL, SENTENCE = 1.0, 3.0
 
 
@@ -34,14 +34,14 @@ def broker() -> Iterator[Broker]:
 
 @pytest.fixture(scope="module")
 def robots(broker: Broker) -> Iterator[RealRobots]:
-    """Five robots that are online after each test. Each test has texts of its own."""
+    """Five robots that are online after each test. Each test uses different texts."""
     with RealRobots(broker, FIVE, [GROUP]) as result:
         yield result
 
 
 @pytest.fixture
 def desk(broker: Broker) -> Iterator[Desk]:
-    """A desk that asks all robots."""
+    """A desk that selects all robots."""
     with Desk(broker, env={"TALK_ROBOT": "@all"}) as result:
         yield result
 
@@ -56,7 +56,7 @@ def counts(robots: RealRobots, text: str) -> Counter[str]:
 
 
 def test_each_robot_speaks_a_repeated_group_goal_once(robots: RealRobots, broker: Broker) -> None:
-    line = '{"seq": %d, "request": "say", "id": "once", "text": "once by each", "wait": true}'
+    line = '{"seq": %d, "request": "say", "id": "once", "text": "spoken once", "wait": true}'
     with RemoteClient(broker, "olga") as olga:
         response = ["-D", "publish", "response-topic", olga.response]
         for seq in (1, 2):
@@ -71,7 +71,7 @@ def test_each_robot_speaks_a_repeated_group_goal_once(robots: RealRobots, broker
 
         olga.listener.find(lambda _: replies().total() == 2 * len(FIVE), 5)
         assert replies() == {(1, False): len(FIVE), (2, True): len(FIVE)}
-    assert counts(robots, "once by each") == Counter(FIVE)
+    assert counts(robots, "spoken once") == Counter(FIVE)
 
 
 def test_robots_that_come_and_go_have_the_right_results(robots: RealRobots, desk: Desk, broker: Broker) -> None:
@@ -119,30 +119,28 @@ def test_a_desk_can_command_103_robots() -> None:
     names = ["anna", "bert", "carl"]
     with Broker() as broker, SimulatedRobots(broker, 100) as simulated, RealRobots(broker, names) as real:
         simulated.await_online()
-        all_names = [*names, *simulated.names]
+        fleet = [*names, *simulated.names]
         with Desk(broker, env={"TALK_ROBOT": "@all"}) as desk, limits():
             waiting = desk.start("say", "--wait", "--id", "long", "--", "length=60 long")
             await_active(real, "long")
             simulated.await_spoken("long")
             cancelled = desk.run("cancel")
-            assert_outcomes(cancelled, 0, alike(all_names, "long", "PREEMPTED", 0), "103 of 103 robots succeeded")
+            assert_outcomes(cancelled, 0, alike(fleet, "long", "PREEMPTED", 0), "103 of 103 robots succeeded")
             assert_within(cancelled.seconds, CANCEL, "a cancel of 103 robots")
-            assert_outcomes(
-                desk.finish(waiting), 7, alike(all_names, "long", "PREEMPTED", 7), "0 of 103 robots succeeded"
-            )
+            assert_outcomes(desk.finish(waiting), 7, alike(fleet, "long", "PREEMPTED", 7), "0 of 103 robots succeeded")
             done = desk.run("say", "--wait", "--id", "short", "--", "length=1 short")
-            assert_outcomes(done, 0, alike(all_names, "short", "SUCCEEDED", 0), "103 of 103 robots succeeded")
-            assert_within(done.seconds, SENTENCE, "a sentence of a second by 103 robots")
+            assert_outcomes(done, 0, alike(fleet, "short", "SUCCEEDED", 0), "103 of 103 robots succeeded")
+            assert_within(done.seconds, SENTENCE, "a goal of a second on 103 robots")
             waiting = desk.start("say", "--wait", "--id", "meanwhile", "--", "length=2 meanwhile")
             await_active(real, "meanwhile")
             broker.kill()
-            real.each(lambda robot: robot.bridge.await_log("can't connect to the broker"))  # it has tried to connect
+            real.each(lambda robot: robot.bridge.await_log("can't connect to the broker"))
             broker.start()
             up = time.monotonic()
             with PresenceListener(broker) as presences:
-                assert_within(presences.await_online(all_names) - up, BACK, "103 robots after the broker was back")
+                assert_within(presences.await_online(fleet) - up, BACK, "the reconnection of 103 robots")
             done = desk.finish(waiting, timeout=BACK + 10)
-            assert_outcomes(done, 0, alike(all_names, "meanwhile", "SUCCEEDED", 0), "103 of 103 robots succeeded")
+            assert_outcomes(done, 0, alike(fleet, "meanwhile", "SUCCEEDED", 0), "103 of 103 robots succeeded")
         for goal_id in ("long", "short", "meanwhile"):
             simulated.assert_spoken_once(goal_id)
         spoken = ["length=60 long", "length=1 short", "length=2 meanwhile"]

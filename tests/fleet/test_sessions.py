@@ -1,4 +1,4 @@
-"""Sessions of remote clients: how they end, and their limits. The tests use a real server and no broker."""
+"""Sessions of remote clients: how they end, and their limits. The server is real, and there is no broker."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ GONE = 90.0
 
 @pytest.fixture
 def talk(make_talk: MakeTalk) -> Talk:
-    """A silent server that is paused."""
+    """A paused server without sound."""
     talk = make_talk("--player", "null")
     talk.request("pause")
     return talk
@@ -39,7 +39,7 @@ def talk(make_talk: MakeTalk) -> Talk:
 
 @pytest.fixture
 def pass_time(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
-    """Advances the clock of the running event loop."""
+    """A function that advances the clock of the running event loop."""
     passed = 0.0
 
     def move(seconds: float) -> None:
@@ -62,26 +62,26 @@ async def await_clients(talk: Talk, most: int) -> None:
         await asyncio.sleep(0.01)
 
 
-@pytest.mark.parametrize("waits", ["for room", "for a result", "for events"])
+@pytest.mark.parametrize("waits_for", ["room", "a result", "events"])
 @in_loop
 async def test_a_waiting_remote_client_is_gone_after_90_s_of_silence(
-    talk: Talk, pass_time: Callable[[float], None], waits: str
+    talk: Talk, pass_time: Callable[[float], None], waits_for: str
 ) -> None:
     anna = SessionsWithoutBroker(talk.socket)
-    if waits == "for room":
+    if waits_for == "room":
         for number in range(20):
             await anna.ask(say(number), "s2")
         anna.post(say(100, patient=True, wait=True, id="patient"))
         await anna.ask({"seq": 101, "request": "hello"})
         assert [request.seq for request, _, _ in anna.sessions.waiting] == [100]
-    elif waits == "for a result":
+    elif waits_for == "a result":
         await anna.ask(say(100, wait=True))
     else:
         await anna.ask({"seq": 100, "request": "watch"})
     for _ in range(8):  # lines sent to the client don't prove that it is alive
         pass_time(11)
         anna.sessions.tick()
-        if waits == "for events":
+        if waits_for == "events":
             await anna.ask(say(1), "s3")
     assert not [line for line in anna.lines() if line.get("event") == "gone"]
     pass_time(GONE - 88 + 0.1)
@@ -95,9 +95,7 @@ async def test_a_waiting_remote_client_is_gone_after_90_s_of_silence(
 
 
 @in_loop
-async def test_a_remote_client_that_sends_hello_keeps_its_session(
-    talk: Talk, pass_time: Callable[[float], None]
-) -> None:
+async def test_hello_keeps_the_session_of_a_remote_client(talk: Talk, pass_time: Callable[[float], None]) -> None:
     anna = SessionsWithoutBroker(talk.socket)
     goal = await anna.ask(say(1, wait=True))
     for number in range(2, 8):
@@ -111,9 +109,7 @@ async def test_a_remote_client_that_sends_hello_keeps_its_session(
 
 
 @in_loop
-async def test_the_session_of_an_idle_remote_client_ends_without_a_message(
-    talk: Talk, pass_time: Callable[[float], None]
-) -> None:
+async def test_an_idle_remote_client_loses_its_session_silently(talk: Talk, pass_time: Callable[[float], None]) -> None:
     anna = SessionsWithoutBroker(talk.socket)
     before = talk.request("status")["server"]["clients"]
     await anna.ask({"seq": 1, "request": "status"})
@@ -132,7 +128,7 @@ async def test_only_goals_that_wait_for_room_are_dropped_by_a_goodbye(talk: Talk
     await anna.ask({"seq": 1, "request": "hello"}, "s2")
     for session in ("s1", "s2", "s3"):
         anna.post(say(2, id=f"of-{session}"), session)
-        if session != "s2":  # which the server would take at once
+        if session != "s2":  # this session is connected, so the server would accept the goal at once
             anna.post(say(3, id=f"of-{session}-patient", patient=True), session)
         anna.post(b"", session)
     assert (await anna.ask({"seq": 4, "request": "hello"}, "s3"))["ok"]
@@ -146,9 +142,7 @@ async def test_only_goals_that_wait_for_room_are_dropped_by_a_goodbye(talk: Talk
 
 
 @in_loop
-async def test_a_cancel_replaces_the_remote_client_that_was_silent_longest(
-    talk: Talk, pass_time: Callable[[float], None]
-) -> None:
+async def test_a_cancel_ends_the_longest_silent_session(talk: Talk, pass_time: Callable[[float], None]) -> None:
     anna = SessionsWithoutBroker(talk.socket)
     for number in range(32):
         await anna.ask({"seq": 1, "request": "watch"}, f"w{number}")
@@ -161,14 +155,14 @@ async def test_a_cancel_replaces_the_remote_client_that_was_silent_longest(
         gone = [line for line in anna.lines(f"w{number}") if line.get("event") == "gone"]
         assert bool(gone) == (number == 1), number
     assert (await anna.ask({"seq": 4, "request": "status"}, "urgent"))["ok"]  # in its existing session
-    assert (await anna.ask({"seq": 5, "request": "log"}, "another"))["ok"]  # it isn't waiting for anything now
+    assert (await anna.ask({"seq": 5, "request": "log"}, "another"))["ok"]  # that session waits for nothing now
     await anna.ask({"seq": 5, "request": "cancel"}, "w0")
     anna.sessions.end_all()
 
 
 @in_loop
 async def test_clients_of_a_hung_server_take_32_connections_and_no_threads() -> None:
-    """A closed connection stays in the backlog. A client that leaves before its turn is not connected."""
+    """A closed connection stays in the backlog. A client that leaves before its turn is never connected."""
     with short_directory() as directory, socket.socket(socket.AF_UNIX) as listening:
         listening.bind(f"{directory}/s")
         listening.listen(256)
@@ -178,7 +172,7 @@ async def test_clients_of_a_hung_server_take_32_connections_and_no_threads() -> 
         for _ in range(100):
             for number in range(3):
                 anna.post({"seq": 1, "request": "status"}, f"s{number}")
-                await asyncio.sleep(0)  # so that it begins
+                await asyncio.sleep(0)  # so that the session starts to connect
                 anna.post(b"", f"s{number}")
         await asyncio.sleep(0)
         assert threading.active_count() == before
@@ -249,9 +243,7 @@ async def test_requests_of_all_clients_are_limited_to_4_mib_except_cancels(talk:
 
 @pytest.mark.parametrize(("wait", "feedback"), [(False, False), (True, False), (False, True)])
 @in_loop
-async def test_a_goal_that_never_reached_the_server_is_reported_in_its_format(
-    talk: Talk, wait: bool, feedback: bool
-) -> None:
+async def test_a_bridge_reports_its_own_results_like_the_server(talk: Talk, wait: bool, feedback: bool) -> None:
     anna = SessionsWithoutBroker(talk.socket)
     for number in range(20):
         await anna.ask(say(number), "full")

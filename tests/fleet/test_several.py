@@ -1,4 +1,4 @@
-"""Commands to several robots: their outcomes, refused requests, and commands that take a while."""
+"""Commands to several robots: outcomes, usage errors, and commands that take a while."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PAIR = ["wh-1", "wh-2"]
 ALL_SUCCEEDED = "talk: 2 of 2 robots succeeded\n"
 
 
-#: Requests to both robots before a command, by name; {} is a goal of the command's own.
+#: Requests to both robots before a command, by the name of the scene. {} is the command's own goal.
 SCENES: dict[str, list[dict[str, str]]] = {
     "nothing": [],
     "spoken": [{"name": "say", "id": "{}", "text": "length=0"}],
@@ -38,7 +38,7 @@ SCENES: dict[str, list[dict[str, str]]] = {
     "speaking": [{"name": "say", "id": "{}", "text": LONG}],
     "paused": [{"name": "say", "id": "{}", "text": LONG}, {"name": "pause"}],
 }
-#: A command, the scene, the goal that is shown ({first}: that of the first command), its state, a key of the object.
+#: A command, its scene, the id that is shown ({first}: of the first command's goal), the state, and a key of the JSON.
 COMMANDS: list[tuple[str, str, str, str, str | None]] = [
     ("say --id {} hello", "nothing", "{}", "PENDING", "goal"),
     ("say --wait --id {} hello", "nothing", "{}", "SUCCEEDED", "goal"),
@@ -78,7 +78,7 @@ def test_the_outcome_of_each_robot_is_a_line_or_an_object(
     assert printed_outcomes(plain) == alike(PAIR, shown[0], state, 0)
     assert (plain.code, plain.err) == (0, ALL_SUCCEEDED)
     assert (quiet.code, quiet.err) == (0, "")
-    if command.startswith("status"):  # which was asked for nothing else
+    if command.startswith("status"):  # its output is not only an acknowledgement
         assert printed_outcomes(quiet) == alike(PAIR, shown[2], state, 0)
     else:
         assert quiet.out == ""
@@ -105,9 +105,7 @@ def test_each_selected_goal_has_a_line(pair: RealRobots, desk: Desk) -> None:
     prepare(pair, "waiting", "a-goal")
     with Listener(pair.broker, "talk/reply/+/+/+") as answers:
         named, unnamed = desk.start("wait", "before-a-goal", "a-goal"), desk.start("wait")
-        assert answers.find(
-            lambda _: sum(b'"ok": true' in message.payload for message in answers.messages) == 4, PATIENCE
-        )
+        assert answers.find(lambda _: sum(b'"ok": true' in reply.payload for reply in answers.messages) == 4, PATIENCE)
     done = desk.run("cancel")
     assert sorted(done.out.splitlines()) == [
         f"{name} {rest}" for name in PAIR for rest in ("a-goal RECALLED 0", "before-a-goal PREEMPTED 0")
@@ -117,9 +115,9 @@ def test_each_selected_goal_has_a_line(pair: RealRobots, desk: Desk) -> None:
     assert sorted(waited.out.splitlines()) == [
         f"{name} {rest}" for name in PAIR for rest in ("a-goal RECALLED 6", "before-a-goal PREEMPTED 7")
     ]
-    # Of a robot with several failures the first counts, in the order in which its goals were named.
+    # If a robot has several failures, the first one counts, in the order of the arguments.
     assert (waited.code, waited.err.splitlines()[-1]) == (7, "talk: 0 of 2 robots succeeded")
-    waited = desk.finish(unnamed)  # how goals ended that were not named is no failure
+    waited = desk.finish(unnamed)  # results of goals that weren't named don't count as failures
     assert (waited.code, waited.err, len(waited.out.splitlines())) == (0, ALL_SUCCEEDED, 4)
 
 
@@ -159,7 +157,7 @@ def test_the_text_is_read_as_for_one_robot(pair: RealRobots, desk: Desk) -> None
         assert (done.code, "the text is empty" in done.err) == (5, True)
 
 
-# Requests that are refused before anything is sent
+# Commands that are refused before anything is sent
 
 NUMBER, ONE_ROBOT = "a goal's number is only valid on one server", "only works with one robot; name it"
 
@@ -209,15 +207,15 @@ def test_an_invalid_id_is_refused_at_once(desk: Desk, line: list[str], code: int
     assert (done.code, done.out, expected in done.err) == (code, "", True), done
 
 
-# Commands that take a while: interrupted, out of time, without a reader, on a terminal
+# Commands that take a while
 
 
-#: A glob and a group that pick both.
-PICKS = ("wh-*", "@warehouse")
-#: Seconds in which it is told that a robot is offline, while others speak.
+#: A glob and a group that select both robots.
+SELECTIONS = ("wh-*", "@warehouse")
+#: Seconds until an offline robot is shown while others speak.
 AT_ONCE = 1.0
-#: The bytes that clear the count from a terminal's line.
-WIPED = "\r\x1b[2K"
+#: The characters that clear the count from a terminal's line.
+CLEAR_LINE = "\r\x1b[2K"
 
 
 def await_state(pair: RealRobots, goal_id: str, state: str) -> None:
@@ -225,14 +223,14 @@ def await_state(pair: RealRobots, goal_id: str, state: str) -> None:
 
 
 def states(pair: RealRobots, goal_id: str) -> list[str]:
-    """Return the state of this goal at each robot."""
+    """Return the state of a goal on each robot."""
     return [goal["state"] for goal in pair.each(lambda robot: robot.talk.goal(goal_id))]
 
 
-@pytest.mark.parametrize("to", PICKS)
+@pytest.mark.parametrize("to", SELECTIONS)
 def test_ctrl_c_cancels_the_goal_on_all_robots(pair: RealRobots, desk: Desk, to: str) -> None:
-    """One robot speaks the goal; at the other it waits behind another goal, which goes on."""
-    before, goal = (f"{name}-{PICKS.index(to)}" for name in ("before", "interrupted"))
+    """One robot speaks the goal. On the other, it waits behind another goal, which is not cancelled."""
+    before, goal = (f"{name}-{SELECTIONS.index(to)}" for name in ("before", "interrupted"))
     assert pair["wh-2"].talk.request("say", id=before, text=LONG)["ok"]
     waiting = desk.start("--robot", to, "say", "--wait", "--id", goal, "--", LONG)
     pair["wh-1"].talk.watcher.wait_for(goal, "ACTIVE")
@@ -241,7 +239,7 @@ def test_ctrl_c_cancels_the_goal_on_all_robots(pair: RealRobots, desk: Desk, to:
     done = desk.finish(waiting)
     expected = {"wh-1": (goal, "PREEMPTED", 7), "wh-2": (goal, "RECALLED", 6)}
     assert_outcomes(done, 130, expected, "0 of 2 robots succeeded")
-    assert done.seconds < 1, "it waited for more than the silence of both"
+    assert done.seconds < 1, "the command waited for more than the results"
     assert states(pair, goal) == ["PREEMPTED", "RECALLED"]
     assert pair["wh-2"].talk.goal(before)["state"] == "ACTIVE"
 
@@ -259,7 +257,7 @@ def test_ctrl_c_keeps_the_results_of_robots_that_are_done(pair: RealRobots, desk
 
 
 def test_a_timeout_cancels_only_goals_of_its_own_command_and_exits_with_124(pair: RealRobots, desk: Desk) -> None:
-    """A goal of others that was waited for is left alone; a robot counts as asked if all its goals have ended."""
+    """`wait` doesn't cancel goals. A robot has finished if all goals that were named have ended."""
     request(pair, "say", id="over", text="length=0")
     request(pair, "say", id="in-front", text=LONG)
     await_state(pair, "in-front", "ACTIVE")
@@ -267,7 +265,7 @@ def test_a_timeout_cancels_only_goals_of_its_own_command_and_exits_with_124(pair
     waited, by_glob, by_group = at_once(
         desk,
         ["wait", *late, "over", "in-front"],
-        *(["--robot", to, "say", "--wait", *late, "--id", f"late-{PICKS.index(to)}", "hello"] for to in PICKS),
+        *(["--robot", to, "say", "--wait", *late, "--id", f"late-{n}", "hello"] for n, to in enumerate(SELECTIONS)),
     )
     for done, goal in ((by_glob, "late-0"), (by_group, "late-1")):
         assert_outcomes(done, 124, alike(PAIR, goal, "RECALLED", 6), "0 of 2 robots succeeded")
@@ -282,9 +280,7 @@ def test_an_interrupted_wait_does_not_cancel_goals(pair: RealRobots, desk: Desk)
     request(pair, "say", id="others", text=LONG)
     with Listener(pair.broker, "talk/reply/+/+/+") as answers:
         waiting = desk.start("--robot", "@warehouse", "wait")
-        assert answers.find(
-            lambda _: sum(b'"ok": true' in message.payload for message in answers.messages) == 2, PATIENCE
-        )
+        assert answers.find(lambda _: sum(b'"ok": true' in reply.payload for reply in answers.messages) == 2, PATIENCE)
     waiting.send_signal(signal.SIGINT)
     done = desk.finish(waiting)
     assert (done.code, done.out, done.err) == (130, "", "talk: not done: wh-1, wh-2\ntalk: 0 of 2 robots succeeded\n")
@@ -306,7 +302,7 @@ def test_without_wait_the_goal_is_spoken_even_if_the_reader_goes_away(pair: Real
     waiting = desk.start("say", "--id", "never-read", "hello")
     assert waiting.stdout
     waiting.stdout.close()
-    assert waiting.wait(PATIENCE) in (0, 141)  # 141 if it tries to write
+    assert waiting.wait(PATIENCE) in (0, 141)  # 141 if the command tries to write
     assert pair.each(lambda robot: robot.talk.watcher.wait_for_terminal("never-read")) == ["SUCCEEDED"] * 2
 
 
@@ -323,18 +319,18 @@ def test_an_offline_robot_is_shown_at_once_and_never_speaks_the_goal(robot: Robo
             for process in waiting:
                 assert process.stdout
                 assert process.stdout.readline() == "late - OFFLINE 3\n"
-                assert_within(time.monotonic() - started_at, AT_ONCE, "that a robot is offline, while another speaks")
+                assert_within(time.monotonic() - started_at, AT_ONCE, "the line of an offline robot")
         late.bridge.start()
         late.bridge.await_online()
         for goal in goals.values():
             robot.talk.watcher.wait_for(goal, "PENDING")
         assert robot.desk("cancel").code == 0
         assert [desk.finish(process).code for process in waiting] == [13, 13]
-        assert late.desk("say", "--wait", "this alone").code == 0
-    assert late.talk.watcher.texts("PENDING") == ["this alone"]
+        assert late.desk("say", "--wait", "spoken later").code == 0
+    assert late.talk.watcher.texts("PENDING") == ["spoken later"]
 
 
-# Terminals
+# On a terminal
 
 
 def test_a_terminal_counts_finished_robots_and_is_left_clean(pair: RealRobots, desk: Desk) -> None:
@@ -366,7 +362,7 @@ def test_the_count_is_shown_only_if_standard_error_is_a_terminal(desk: Desk, tmp
     terminals = [(Terminal(["sh", "-c", case], desk.env), counts) for case, counts in cases.items()]
     for terminal, counts in terminals:
         assert terminal.finish() == 0
-        assert (b"\r0 of" in terminal.raw, WIPED.encode() in terminal.raw) == (counts, counts)
+        assert (b"\r0 of" in terminal.raw, CLEAR_LINE.encode() in terminal.raw) == (counts, counts)
     assert sorted((tmp_path / "out").read_text().splitlines()) == ["wh-1 - IDLE 0", "wh-2 - IDLE 0"]
     assert (tmp_path / "err").read_text() == "talk: 2 of 2 robots succeeded\n"
 

@@ -1,4 +1,4 @@
-"""Commands to several robots while something goes wrong: at the line, the broker, one of the robots, or the desk."""
+"""Commands to several robots, with faults of the network, the broker, a robot or the desk."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ if TYPE_CHECKING:
     from tests.support.processes import Finished, Process
 
 PAIR = ["wh-1", "wh-2"]
-#: A glob and a group that pick both.
-PICKS = ("wh-*", "@warehouse")
-#: Seconds until a goal is lost if the broker stays away, and until a silent robot counts as gone.
+#: A glob and a group that select both robots.
+SELECTIONS = ("wh-*", "@warehouse")
+#: Seconds until a goal is lost without a broker, and until a silent robot counts as gone.
 ABSENCE, SILENCE = 30.0, 15.0
-#: Goals that may be pending from afar.
+#: Maximum number of pending goals of remote clients.
 PENDING = 20
 
 
 @pytest.fixture
-def far(pair: RealRobots) -> Iterator[tuple[Desk, Proxy]]:
-    """A desk behind a proxy; all goals are cancelled in the end."""
+def proxied(pair: RealRobots) -> Iterator[tuple[Desk, Proxy]]:
+    """A desk behind a proxy. All goals are cancelled afterwards."""
     with Proxy(pair.broker.port) as proxy, Desk(pair.broker, port=proxy.port) as result:
         yield result, proxy
         proxy.release()
@@ -49,35 +49,37 @@ def far(pair: RealRobots) -> Iterator[tuple[Desk, Proxy]]:
 
 
 def speaking(desk: Desk, robots: RealRobots, to: str, goal_id: str) -> Process:
-    """Return a command that waits for a goal that both speak."""
+    """Start a command that waits for a goal, and return it when both robots speak."""
     waiting = desk.start("--robot", to, "say", "--wait", "--id", goal_id, "--", LONG)
     robots.each(lambda robot: robot.talk.watcher.wait_for(goal_id, "ACTIVE"))
     return waiting
 
 
 def states(robots: RealRobots, goal_id: str) -> list[str]:
-    """Return the state of this goal at each robot."""
+    """Return the state of a goal on each robot."""
     return [goal["state"] for goal in robots.each(lambda robot: robot.talk.goal(goal_id))]
 
 
 def line_of(process: Process) -> str:
-    """Return the next line that a command writes."""
+    """Return the next line of a command's output."""
     assert process.stdout
     return process.stdout.readline()
 
 
-@pytest.mark.parametrize("to", PICKS)
-def test_a_goal_cancelled_before_it_is_sent_is_never_spoken(pair: RealRobots, far: tuple[Desk, Proxy], to: str) -> None:
-    desk, proxy = far
-    text = f"never to be heard by {to.strip('@*-')}"
+@pytest.mark.parametrize("to", SELECTIONS)
+def test_a_goal_cancelled_before_sending_is_never_spoken(
+    pair: RealRobots, proxied: tuple[Desk, Proxy], to: str
+) -> None:
+    desk, proxy = proxied
+    text = f"never spoken by {to.strip('@*-')}"
     stalled = proxy.hold_from("to_broker", text.encode())
     waiting = desk.start("--robot", to, "say", "--wait", "--", text)
     assert stalled.wait(PATIENCE)
     waiting.send_signal(signal.SIGINT)
-    with Listener(pair.broker, "talk/reply/+/+/_") as back:
+    with Listener(pair.broker, "talk/reply/+/+/_") as replies:
         proxy.cut()
         proxy.release()
-        assert back.find(lambda _: True, PATIENCE)  # the desk is back, and asks which robots there are
+        assert replies.find(lambda _: True, PATIENCE)  # the desk has reconnected, and requests the presences
     done = desk.finish(waiting)
     assert (done.code, done.err.splitlines()[-1]) == (130, "talk: 0 of 2 robots succeeded"), done
     for name in PAIR:
@@ -85,14 +87,14 @@ def test_a_goal_cancelled_before_it_is_sent_is_never_spoken(pair: RealRobots, fa
     assert not [spoken_text for spoken in pair.spoken().values() for spoken_text in spoken if spoken_text == text]
 
 
-@pytest.mark.parametrize("to", PICKS)
+@pytest.mark.parametrize("to", SELECTIONS)
 def test_an_interrupted_desk_that_reconnects_in_time_cancels_its_goal(
-    pair: RealRobots, far: tuple[Desk, Proxy], to: str
+    pair: RealRobots, proxied: tuple[Desk, Proxy], to: str
 ) -> None:
-    desk, proxy = far
-    goal = f"back-in-time-{PICKS.index(to)}"
+    desk, proxy = proxied
+    goal = f"back-in-time-{SELECTIONS.index(to)}"
     waiting = speaking(desk, pair, to, goal)
-    proxy.hold()  # so that it finds a way back, on which nothing comes through before it is released
+    proxy.hold()  # so that the desk reconnects, but gets nothing through before the release
     proxy.cut()
     waiting.send_signal(signal.SIGINT)
     proxy.release()
@@ -104,7 +106,7 @@ def test_an_interrupted_desk_that_reconnects_in_time_cancels_its_goal(
 def test_robots_may_still_be_speaking_if_the_broker_is_gone(broker: Broker) -> None:
     with RealRobots(broker, PAIR, ["warehouse"]) as robots, Desk(broker) as desk:
         options, waiting = ["say", "--wait", "--ttl", "0", "--id"], []
-        for to, state in zip(PICKS, ("ACTIVE", "PENDING"), strict=True):
+        for to, state in zip(SELECTIONS, ("ACTIVE", "PENDING"), strict=True):
             waiting.append(desk.start("--robot", to, *options, state, "--", LONG))
             robots.each(lambda robot, state=state: robot.talk.watcher.wait_for(state, state))  # type: ignore[misc]
         broker.kill()
@@ -123,9 +125,7 @@ def test_robots_may_still_be_speaking_if_the_broker_is_gone(broker: Broker) -> N
         assert desk.run("--robot", "@warehouse", "cancel").code == 0
 
 
-def test_a_command_to_offline_robots_ends_at_once_without_a_broker(
-    broker: Broker, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_command_to_offline_robots_ends_without_a_broker(broker: Broker, monkeypatch: pytest.MonkeyPatch) -> None:
     with Listener(broker) as publisher:
         publish.presence(publisher, "off-1", online=False)
     outcomes = iter(fleet_of(broker, monkeypatch, grace=60).say("@all", "hello"))
@@ -134,19 +134,17 @@ def test_a_command_to_offline_robots_ends_at_once_without_a_broker(
         killed = time.monotonic()
         broker.kill()
         assert list(outcomes) == []
-        assert_within(time.monotonic() - killed, 1, "the end of a command to nobody who is there")
+        assert_within(time.monotonic() - killed, 1, "the end of the command")
 
 
 @pytest.mark.slow
-def test_goals_are_lost_after_30_s_without_a_broker(
-    broker: Broker,
-) -> None:
+def test_goals_are_lost_after_30_s_without_a_broker(broker: Broker) -> None:
     with RealRobots(broker, PAIR, ["warehouse"]) as robots, Desk(broker) as desk:
         with Listener(broker) as publisher:
             publish.presence(publisher, "wh-3", online=False, groups=["warehouse"])
         waiting = [
             desk.start("--robot", to, "say", "--wait", "--ttl", "0", "--id", f"asked-{number}", "--", LONG)
-            for number, to in enumerate(PICKS)
+            for number, to in enumerate(SELECTIONS)
         ]
         assert [line_of(process) for process in waiting] == ["wh-3 - OFFLINE 3\n"] * 2
         with limits():
@@ -154,7 +152,7 @@ def test_goals_are_lost_after_30_s_without_a_broker(
             broker.kill()
             for number, process in enumerate(waiting):
                 done = desk.finish(process, timeout=ABSENCE + 10)
-                assert_within(time.monotonic() - killed, ABSENCE + 1, "that all are lost")
+                assert_within(time.monotonic() - killed, ABSENCE + 1, "the end of the command")
                 assert done.code == 13, done
                 assert {
                     name: (state, code) for name, (_, state, code) in printed_outcomes(done).items()
@@ -166,10 +164,10 @@ def test_goals_are_lost_after_30_s_without_a_broker(
 
 @pytest.mark.slow
 def test_a_suspended_desk_loses_no_results(pair: RealRobots, desk: Desk) -> None:
-    """Messages that arrived meanwhile count before a robot is reported as gone."""
+    """The desk processes waiting messages before it reports a robot as gone."""
     waiting = [
-        desk.start("--robot", to, "say", "--wait", "--ttl", "0", "--id", f"stopped-{number}", "--", "length=4 on we go")
-        for number, to in enumerate(PICKS)
+        desk.start("--robot", to, "say", "--wait", "--ttl", "0", "--id", f"stopped-{number}", "--", "length=4 keep on")
+        for number, to in enumerate(SELECTIONS)
     ]
     pair.each(lambda robot: [robot.talk.watcher.wait_for(f"stopped-{number}", "PENDING") for number in range(2)])
     for process in waiting:
@@ -177,22 +175,20 @@ def test_a_suspended_desk_loses_no_results(pair: RealRobots, desk: Desk) -> None
     time.sleep(SILENCE + 1)
     for process in waiting:
         process.send_signal(signal.SIGCONT)
-    for number, process in enumerate(waiting):
-        assert_outcomes(
-            desk.finish(process), 0, alike(PAIR, f"stopped-{number}", "SUCCEEDED", 0), "2 of 2 robots succeeded"
-        )
+    for n, process in enumerate(waiting):
+        assert_outcomes(desk.finish(process), 0, alike(PAIR, f"stopped-{n}", "SUCCEEDED", 0), "2 of 2 robots succeeded")
 
 
 EVIL = "\x1b[31mred"
 NO_STATE, NO_SUCH_STATE, NO_ID = {"id": "odd"}, {"id": "odd", "state": "DANCING"}, {"id": EVIL, "state": "PENDING"}
-#: Answers of one robot to a request with this text, first id, or kind.
-ODD: dict[str, list[dict[str, Any]]] = {
+#: Malformed replies, by the text, the first id or the kind of the request.
+MALFORMED_REPLIES: dict[str, list[dict[str, Any]]] = {
     "no state": [{"ok": True, "goal": NO_STATE}],
     "no such state": [{"ok": True, "goal": NO_SUCH_STATE}],
     "no id": [{"ok": True, "goal": NO_ID}],
     "no goal": [{"ok": True, "goal": [7]}],
     "nothing": [{"ok": True, "goal": None}],
-    "asked-for": [{"ok": True, "goal": None}],
+    "no goal in status": [{"ok": True, "goal": None}],
     "canceled-odd": [{"canceled": NO_STATE}, {"ok": True}],
     "canceled-evil": [{"canceled": NO_ID}, {"ok": True}],
     "canceled-unknown": [{"canceled": {"id": 4}}, {"ok": False, "error": {"code": "unknown_goal", "message": EVIL}}],
@@ -202,34 +198,37 @@ ODD: dict[str, list[dict[str, Any]]] = {
     "pause": [{"ok": True, "goal": NO_SUCH_STATE}],
 }
 SPOKEN, UNKNOWN = ("SUCCEEDED", 0), ("UNKNOWN", 8)
-#: Commands, the goal or text of each, and its outcome at the other robots; None if it says what else goes on.
+#: A command, its goal or text, and its outcome on the other robots. None if the outcome depends on other tests.
 COMMANDS: list[tuple[str, str, tuple[str, int] | None]] = [
     *(("say --wait", text, SPOKEN) for text in ("no state", "no such state", "no id", "no goal", "nothing")),
     ("say", "no such state", ("PENDING", 0)),
     *(("cancel", goal_id, UNKNOWN) for goal_id in ("canceled-odd", "canceled-evil", "canceled-unknown")),
     *(("wait", goal_id, UNKNOWN) for goal_id in ("waited-odd", "waited-evil")),
-    ("status", "asked-for", UNKNOWN),
+    ("status", "no goal in status", UNKNOWN),
     ("status", "", None),
 ]
 
 
-def odd(request: dict[str, Any]) -> Sequence[dict[str, Any]]:
-    """Answer a request as no server would."""
+def malformed_reply(request: dict[str, Any]) -> Sequence[dict[str, Any]]:
+    """Return a malformed reply."""
     (first, *_) = request.get("ids") or [request.get("text") or request.get("id") or request["request"]]
-    return ODD.get(first, [])
+    return MALFORMED_REPLIES.get(first, [])
 
 
 def assert_plain(done: Finished) -> None:
-    """Assert that the command expected it, and that no terminal would obey the output."""
+    """Assert that the output names no bug, and has no control characters."""
     assert "a bug" not in done.err, done
     assert "\x1b" not in done.out + done.err, done
 
 
 @pytest.mark.parametrize("to", ["*", "@all", "odd-1"])
 def test_a_malformed_reply_is_only_a_failure_of_its_robot(pair: RealRobots, desk: Desk, to: str) -> None:
-    commands = [*COMMANDS, *([("pause", "", None)] if to == "odd-1" else [])]  # which would hold what others say
+    commands = [
+        *COMMANDS,
+        *([("pause", "", None)] if to == "odd-1" else []),
+    ]  # would pause other robots
     lines = [["--robot", to, *command.split(), *([argument] if argument else [])] for command, argument, _ in commands]
-    with FakeRobot(pair.broker, "odd-1", odd, ["odd"]):
+    with FakeRobot(pair.broker, "odd-1", malformed_reply, ["odd"]):
         results = at_once(desk, *lines)
     for done, (_, _, others) in zip(results, commands, strict=True):
         assert_plain(done)
@@ -247,13 +246,13 @@ def test_a_malformed_reply_is_only_a_failure_of_its_robot(pair: RealRobots, desk
 
 
 @pytest.mark.parametrize("name", ["presence", "reply"])
-def test_a_robot_may_be_named_like_a_part_of_a_topic(
+def test_a_robot_may_have_the_name_of_a_topic(
     scripted: Any, broker: Broker, make_bridge: MakeBridge, name: str
 ) -> None:
     make_bridge(scripted, broker, name, groups=["odd"])
     with Desk(broker) as desk:
-        picks = [f"{name[:-1]}*", "@odd", "@all"]
-        lines = [["--robot", to, "say", "--wait", "--id", f"of-{n}", "hello"] for n, to in enumerate(picks)]
+        selections = [f"{name[:-1]}*", "@odd", "@all"]
+        lines = [["--robot", to, "say", "--wait", "--id", f"of-{n}", "hello"] for n, to in enumerate(selections)]
         for number, done in enumerate(at_once(desk, *lines)):
             assert_outcomes(done, 0, {name: (f"of-{number}", "SUCCEEDED", 0)}, "1 of 1 robots succeeded")
 
@@ -268,19 +267,19 @@ def test_a_robot_that_left_the_group_while_it_spoke_is_cancelled_too(
             robot.talk.watcher.wait_for("left", "ACTIVE")
         assert robots[1].bridge.terminate() == 0
         make_bridge(robots[1].talk, broker, "wh-2")
-        # The desk has heard of it, and asks for the state of the goal.
+        # The desk has noticed that the bridge restarted, and requests the state of the goal.
         listener.await_message(lambda message: bool(message.payload) and message.json["request"] == "wait")
         waiting.send_signal(signal.SIGINT)
         assert_outcomes(desk.finish(waiting), 130, alike(PAIR, "left", "PREEMPTED", 7), "0 of 2 robots succeeded")
 
 
-@pytest.mark.parametrize("to", PICKS)
+@pytest.mark.parametrize("to", SELECTIONS)
 def test_a_goal_can_be_cancelled_until_all_outcomes_are_returned(fleet: Fleet, pair: RealRobots, to: str) -> None:
-    goal = f"within-{PICKS.index(to)}"
+    goal = f"within-{SELECTIONS.index(to)}"
     assert pair["wh-2"].talk.request("say", text=LONG)["ok"]
     outcomes = fleet.say(to, "length=0", id=goal)
     for outcome in outcomes:
-        if outcome.robot == "wh-1":  # which is done first
+        if outcome.robot == "wh-1":  # finishes first
             assert len(outcomes) == 2
             pair["wh-2"].talk.watcher.wait_for(goal, "PENDING")
             outcomes.cancel()
@@ -292,9 +291,9 @@ def test_a_goal_can_be_cancelled_until_all_outcomes_are_returned(fleet: Fleet, p
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("to", PICKS)
+@pytest.mark.parametrize("to", SELECTIONS)
 def test_a_patient_goal_may_wait_for_room_longer_than_for_a_reply(fleet: Fleet, pair: RealRobots, to: str) -> None:
-    goal = f"patient-{PICKS.index(to)}"
+    goal = f"patient-{SELECTIONS.index(to)}"
     request(pair, "say", id=f"before-{goal}", text=LONG)
     with RemoteClient(pair.broker) as bob:
         for number in range(PENDING):

@@ -1,4 +1,4 @@
-"""A short soak of a robot at a broker, or TALK_TEST_SOAK seconds if that is set."""
+"""A short soak test of a fleet. TALK_TEST_SOAK sets another duration in seconds."""
 
 from __future__ import annotations
 

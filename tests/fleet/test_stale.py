@@ -1,4 +1,4 @@
-"""Sentences that come late are refused: after a line has stalled, or a robot was suspended."""
+"""Delayed goals are refused: after a connection has stalled, or a robot was suspended."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ if TYPE_CHECKING:
     from tests.fleet.conftest import MakeRobot
     from tests.support.broker import Broker
 
-#: Seconds after the newest echo that came back for which messages are taken.
+#: Seconds after the newest echo for which messages are accepted.
 STALE = 6.0
-#: Seconds of a stall after which messages are too old, and after which they are not.
+#: Seconds of a stall that makes messages too old, and of one that doesn't.
 TOO_LONG, SHORT = STALE + 1.0, STALE / 2
 
 
 @pytest.fixture
-def stalled(broker: Broker, make_robot: MakeRobot) -> Iterator[tuple[Robot, Proxy]]:
-    """A robot behind a proxy, that has just come online."""
+def proxied(broker: Broker, make_robot: MakeRobot) -> Iterator[tuple[Robot, Proxy]]:
+    """A robot behind a proxy, online."""
     with Proxy(broker.port) as proxy:
         yield make_robot("anna", port=proxy.port), proxy
 
 
-def stall(stalled: tuple[Robot, Proxy], fault: str) -> Callable[[], None]:
-    """Suspend the robot, or hold one way of its line; return the function that ends that."""
-    robot, proxy = stalled
+def stall(proxied: tuple[Robot, Proxy], fault: str) -> Callable[[], None]:
+    """Suspend the robot, or stall one direction of its connection. Return the function that ends the fault."""
+    robot, proxy = proxied
     if fault == "suspended":
         robot.bridge.stop_process()
         return robot.bridge.resume_process
@@ -44,11 +44,11 @@ def stall(stalled: tuple[Robot, Proxy], fault: str) -> Callable[[], None]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", ["suspended", "to_client"])
-def test_a_goal_delayed_for_7_s_is_refused_and_the_next_is_spoken(stalled: tuple[Robot, Proxy], fault: str) -> None:
-    robot, _ = stalled
+def test_a_goal_delayed_for_7_s_is_refused_and_the_next_is_spoken(proxied: tuple[Robot, Proxy], fault: str) -> None:
+    robot, _ = proxied
     with RemoteClient(robot.broker, "olga") as olga, robot.listen("echo") as listener:
         started_at = time.monotonic()
-        resume = stall(stalled, fault)
+        resume = stall(proxied, fault)
         seq = olga.post("say", text="late")
         for kind in ("say", "request"):
             olga.send('{"request": "say", "text": "late, too"}', kind=kind, response=None)
@@ -57,7 +57,7 @@ def test_a_goal_delayed_for_7_s_is_refused_and_the_next_is_spoken(stalled: tuple
         resumed_at = time.monotonic()
         answer = olga.reply(seq)
         assert answer["error"]["code"] == "stale", answer
-        # An echo came with the refusal, or within a second before it; nothing that comes after it is old.
+        # A new echo arrived with the refusal or up to a second before it, so later messages aren't stale.
         listener.await_message(lambda message: message.topic.endswith("/echo") and message.arrived > resumed_at - 1)
         assert robot.desk("say", "--wait", "control").code == 0
     assert robot.spoken == ["control"]
@@ -65,10 +65,10 @@ def test_a_goal_delayed_for_7_s_is_refused_and_the_next_is_spoken(stalled: tuple
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", ["suspended", "to_client", "to_broker"])
-def test_a_goal_delayed_for_3_s_is_spoken(stalled: tuple[Robot, Proxy], fault: str) -> None:
-    robot, _ = stalled
+def test_a_goal_delayed_for_3_s_is_spoken(proxied: tuple[Robot, Proxy], fault: str) -> None:
+    robot, _ = proxied
     with Desk(robot.broker) as desk:
-        resume = stall(stalled, fault)
+        resume = stall(proxied, fault)
         client = desk.start("--robot", "anna", "say", "--wait", "in time")
         time.sleep(SHORT)
         resume()
@@ -78,8 +78,8 @@ def test_a_goal_delayed_for_3_s_is_spoken(stalled: tuple[Robot, Proxy], fault: s
 
 
 @pytest.mark.slow
-def test_a_goal_that_may_be_old_is_refused_if_no_echo_returns(stalled: tuple[Robot, Proxy]) -> None:
-    robot, proxy = stalled
+def test_a_goal_that_may_be_old_is_refused_if_no_echo_returns(proxied: tuple[Robot, Proxy]) -> None:
+    robot, proxy = proxied
     with RemoteClient(robot.broker, "olga") as olga:
         proxy.hold("to_broker")
         early = olga.post("say", text="in time")
@@ -107,15 +107,13 @@ def test_the_expiry_of_a_message_also_limits_the_wait_in_the_queue(robot: Robot)
             assert robot.talk.goal(goal["id"])["reason"] == "expired"
         robot.talk.watcher.wait_until(lambda _: len(robot.talk.watcher.texts("RECALLED")) == 3)
     first, *others = robot.talk.watcher.texts("RECALLED")
-    assert (first, {*others}) == ("b", {"a", "c"})  # these two are of two sessions
+    assert (first, {*others}) == ("b", {"a", "c"})  # two sessions have no common order
     assert robot.spoken == [LONG]
 
 
 @pytest.mark.slow
-def test_a_delayed_goal_expires_within_its_ttl_plus_6_s(
-    stalled: tuple[Robot, Proxy],
-) -> None:
-    robot, proxy = stalled
+def test_a_delayed_goal_expires_within_its_ttl_plus_6_s(proxied: tuple[Robot, Proxy]) -> None:
+    robot, proxy = proxied
     robot.talk.run("say", "--", LONG)
     robot.talk.watcher.wait_for(None, "ACTIVE")
     with RemoteClient(robot.broker, "olga") as olga, contextlib.ExitStack() as stack:

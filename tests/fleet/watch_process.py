@@ -1,4 +1,4 @@
-"""A running `talk fleet watch`."""
+"""`talk fleet watch` as a process."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 class WatchProcess:
-    """A `talk fleet watch` that has printed its first line."""
+    """A running `talk fleet watch` that has printed its first line."""
 
     def __init__(self, desk: Desk, *arguments: str) -> None:
         self._desk = desk

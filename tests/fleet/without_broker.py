@@ -35,7 +35,7 @@ class SessionsWithoutBroker:
         self.sessions: RemoteSessions = RemoteSessions("anna", socket, self._publish, lambda: room, lambda: None)
 
     def post(self, fields: object, session: str = "s1", *, correlation: bytes | None = None) -> None:
-        """Send a request as bob, from an object or bytes. An empty payload is a goodbye."""
+        """Send an object or bytes as a request from bob. An empty payload is a goodbye."""
         payload = fields if isinstance(fields, bytes) else json.dumps(fields).encode()
         topic, response = "talk/robot/anna/request/bob", f"talk/reply/bob/{session}"
         parsed = topics.parse_request(topic)

@@ -1,8 +1,8 @@
-"""Writes the surface of `talk`: help, errors, exit codes, the library, and the replies to each request.
+"""Generates the public surface of `talk`: help, errors, exit codes, the library, and replies to requests.
 
     python -m tests.golden.surface          updates tests/golden/*.txt; `git diff` shows the changes
 
-Each file is one kind of promise. A type stands for each value that differs from run to run.
+Values that differ from run to run are replaced by their types.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 HERE = Path(__file__).parent
 
-#: Command lines that are wrong, or find no server, by command. Each is shown with its exit code and its output.
+#: Arguments by command that are wrong, or that find no server. The exit code and the output are recorded.
 ERRORS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("", (
         "nonsense", "sey hello", "--sockt /x status", "--socket '' status", "--connect-timeout 0 status",
@@ -62,7 +62,7 @@ ERRORS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("doctor", ("now",)),
 )  # fmt: skip
 
-#: A conversation with a server that has the scripted engine: every request, and some that don't exist.
+#: A conversation with a server that has the scripted engine. It contains every request, and invalid ones.
 REQUESTS: tuple[dict[str, Any], ...] = (
     {"request": "hello", "name": "golden"},
     {"seq": 1, "request": "voices"},
@@ -105,24 +105,22 @@ REQUESTS: tuple[dict[str, Any], ...] = (
 
 
 def surface() -> dict[str, str]:
-    """Return the text of each file of the surface by its name."""
+    """Return the text of each file by its name."""
     files = {f"help-{name or 'talk'}": text for name, text in _helps()}
     return {**files, "errors": _errors(), "library": _library(), "wire": _wire()}
 
 
 def write() -> None:
-    """Write all files, and delete those that are no longer needed."""
+    """Write all files, and delete outdated ones."""
     for path in HERE.glob("*.txt"):
         path.unlink()
     for name, text in surface().items():
         (HERE / f"{name}.txt").write_text(text, encoding="utf-8")
 
 
-def _run_without_server(home: str, arguments: list[str]) -> tuple[int, str, str]:
-    """Run `talk` without a server and without sound; return its exit code and its output, with HOME for its place."""
-    done = run(
-        [*TALK, *arguments], environment(home, TALK_SOCKET=f"{home}/s", COLUMNS="80", PULSE_SERVER="unix:/nowhere")
-    )
+def _run_without_server(home: str, argv: list[str]) -> tuple[int, str, str]:
+    """Run `talk` without a server or sound, and return its exit code and output, with `home` replaced by HOME."""
+    done = run([*TALK, *argv], environment(home, TALK_SOCKET=f"{home}/s", COLUMNS="80", PULSE_SERVER="unix:/nowhere"))
     return done.code, done.out.replace(home, "HOME"), done.err.replace(home, "HOME")
 
 
@@ -148,7 +146,7 @@ def _indented(text: str, mark: str = "  ") -> str:
 
 
 def _library() -> str:
-    """Return the names in `talkcli` with their public members, and the errors."""
+    """Return the public names of `talkcli` with their members, and the errors."""
     lines = [f"__all__ = {talkcli.__all__}"]
     for name in talkcli.__all__:
         value = getattr(talkcli, name)
@@ -179,7 +177,7 @@ def _members(kind: type) -> Iterator[str]:
 
 
 def _wire() -> str:
-    """Return the replies of a server with the scripted engine to each request, in their order."""
+    """Return the replies of a server with the scripted engine to `REQUESTS`."""
     talk = Talk(scripted=True)
     try:
         with talk.connect() as wire:
@@ -188,7 +186,7 @@ def _wire() -> str:
             for request in REQUESTS:
                 wire.send(request)
                 lines.append(f"> {json.dumps(request)}")
-                # After "resume", the one goal that is left is spoken.
+                # After "resume", the last goal is spoken.
                 awaited = {"ok", "result"} if request.get("request") == "resume" else {"ok"}
                 while awaited:
                     message = wire.receive()
@@ -201,7 +199,7 @@ def _wire() -> str:
 
 
 def _steady(value: Any, name: str = "") -> Any:
-    """Return a message with the types of the values that differ from run to run; messages for people stay."""
+    """Replace values that differ from run to run by their types, except messages for people."""
     if isinstance(value, dict):
         return {key: _steady(item, key) for key, item in value.items()}
     if isinstance(value, list):

@@ -1,6 +1,6 @@
-"""Tables of the documents, made from the code: `python -m tests.readme.reference` writes options, requests, reasons.
+"""Tables in the documents that are generated from the code: options, requests and reasons.
 
-A test shows that the documents have them as they are now.
+`python -m tests.readme.reference` updates them. A test checks that they are current.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from talkcli.goals.reasons import Reason
 from talkcli.protocol.requests import REQUEST_TYPES
 from tests.support.documents import COMMAND_LINE, WIRE
 
-#: Stands in the place of a command's name where the options are everybody's.
+#: The name and the note for options that all commands have.
 _ALL, _ANYWHERE = "all", "before the command; all but `--version` also after it"
 
 
 def options() -> str:
-    """Return the table of commands and their options: first what every command has, then each command's own."""
+    """Return the table of options: first those of all commands, then those of each command."""
     context = click.Context(talk, info_name="talk")
     shared = {parameter.name for parameter in talk.params}
     lines = ["| command | option | meaning |\n| --- | --- | --- |\n", f"| {_ALL} | | {_ANYWHERE} |\n"]
@@ -37,7 +37,7 @@ def options() -> str:
 
 
 def requests() -> str:
-    """Return the table of requests and their fields."""
+    """Return the table of requests and fields."""
     lines = ["| request | field | type | default | meaning |\n| --- | --- | --- | --- | --- |\n"]
     for kind, request in REQUEST_TYPES.items():
         meaning = request.meaning.removesuffix(".")
@@ -47,13 +47,13 @@ def requests() -> str:
 
 
 def reasons() -> str:
-    """Return the table of the reasons why goals end."""
+    """Return the table of reasons."""
     rows = (f"| `{reason}` | {', '.join(map(str, reason.states))} | {reason.meaning} |\n" for reason in Reason)
     return "".join(["| reason | state | why |\n| --- | --- | --- |\n", *rows])
 
 
 def _field(option: Option, *, changes: bool) -> str:
-    """Return the row of a field; `changes`: of a request that changes settings, where what isn't given stays."""
+    """Return the row of a field. `changes` means that an absent field keeps its setting."""
     null = "null" if option.default is None else json.dumps(option.default)
     default = f"`{option.default}`" if option.default and isinstance(option.default, str) else null
     meaning = (changes and option.setting and option.setting.meaning) or option.meaning
@@ -69,12 +69,12 @@ def _values(option: Option) -> str:
     return option.kind.name + (" or null" if option.default is None else "") + (f", {form}" if form else "")
 
 
-#: What is made: by the name that stands around it, the document where that is, and how.
+#: The document and the generator of each table, by the name in the markers around it.
 TABLES = {"options": (COMMAND_LINE, options), "requests": (WIRE, requests), "reasons": (WIRE, reasons)}
 
 
 def current(name: str) -> str:
-    """Return the text of a document with the list of this name as it is now."""
+    """Return the text of the document with an up-to-date table."""
     document, make = TABLES[name]
     begin, end = f"<!-- {name}: begin -->\n", f"<!-- {name}: end -->\n"
     before, rest = document.text.split(begin)
@@ -88,7 +88,7 @@ def _rows(parameters: list[click.Parameter], context: click.Context) -> list[str
 
 
 def _words(text: str) -> str:
-    """Return help as it stands in a table: what is typed, and names of variables, as code; no link made of brackets."""
+    """Return a help text for a table cell, with commands, options and variables as code, and escaped Markdown."""
     quoted = r"'(-|default|talk [^']*|aplay [^']*|pactl [^']*|pw-cli [^']*)'"
     text = re.sub(rf"{quoted}|(?<![\w`'-])(--[a-z][a-z-]*)", lambda match: f"`{match[1] or match[2]}`", _cell(text))
     text = re.sub(r"\b(TALK_[A-Z]+)\b", r"`\1`", text)
@@ -101,5 +101,5 @@ def _cell(text: str) -> str:
 
 if __name__ == "__main__":
     for _name, (_document, _) in TABLES.items():
-        _document.text = current(_name)  # the wire's document has two of the tables
+        _document.text = current(_name)  # the next table may be in the same document
         _document.path.write_text(_document.text, encoding="utf-8")

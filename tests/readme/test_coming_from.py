@@ -1,4 +1,4 @@
-"""The table for users of other programs: the commands and the Python that it recommends work."""
+"""The commands and the Python code in the table for users of other programs."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ if TYPE_CHECKING:
     from tests.readme.shell import Shell
     from tests.support.processes import Talk
 
-NOW = [span for row in tables(COMMAND_LINE.section("Coming from something else"))[0][1:] for span in code_spans(row[2])]
-COMMANDS = [span for span in NOW if re.match("talk [a-z]", span)]
-(PIPE, LOOP) = sorted(span for span in NOW if re.search("[;|] ", span))
-PYTHON = [span for span in NOW if span not in {*COMMANDS, PIPE, LOOP}]
+TABLE = tables(COMMAND_LINE.section("Coming from something else"))[0]
+REPLACEMENTS = [span for row in TABLE[1:] for span in code_spans(row[2])]
+COMMANDS = [span for span in REPLACEMENTS if re.match("talk [a-z]", span)]
+(PIPE, LOOP) = sorted(span for span in REPLACEMENTS if re.search("[;|] ", span))
+PYTHON = [span for span in REPLACEMENTS if span not in {*COMMANDS, PIPE, LOOP}]
 
 
 def test_recommended_commands_and_python_work(speaking: Talk, shell: Shell) -> None:
     (shell.directory / "notes.txt").write_text("first\nsecond\n", encoding="utf-8")
     for command in dict.fromkeys(COMMANDS):
-        if not command.startswith("talk serve"):  # the tour starts servers
+        if not command.startswith("talk serve"):  # tests of the tour start servers
             done = shell.run(command)
             assert done.returncode == 0, done
     assert (shell.directory / "notes.wav").stat().st_size > 1000

@@ -1,4 +1,4 @@
-"""Every example of a document has a test. A new example fails here, by its name, until it has one."""
+"""Each example in the documents has a test. A new example fails here until it has one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from tests.readme.blocks import BLOCKS, RUN
 from tests.support.documents import ROOT
 
-#: Examples that tests elsewhere run.
+#: Examples that are run by tests in other folders.
 ELSEWHERE = {
     "Use it from Python": "tests/wire/test_examples.py::test_the_first_example_of_the_library_prints_the_words",
     "Use it from Python: In a robot's loop": "tests/wire/test_examples.py::test_the_loop_of_a_robot_speaks",
@@ -43,7 +43,7 @@ def test_examples_can_be_parsed() -> None:
 
 
 def test_examples_put_two_dashes_before_a_text_from_a_variable() -> None:
-    """Such a text may begin with a dash, and would be an option."""
+    """Without them, a text that starts with a dash would be read as an option."""
     for name, (_, code) in BLOCKS.items():
         for line in code.splitlines():
             rest = line.replace("talk -q say", "talk say").partition("talk say")[2]

@@ -1,6 +1,6 @@
-"""The examples of a fleet, in the README and in its own document, with a real broker, server and bridge.
+"""The examples for fleets in the README and in the fleet's document, with a real broker, server and bridge.
 
-Settings beside an example name the test's broker and its logins. Stand-ins keep the machine as it is.
+Settings redirect the examples to the test's broker and logins. Stand-ins protect the machine from changes.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ if TYPE_CHECKING:
     from tests.support.mqtt import Message
     from tests.support.processes import Talk
 
-#: The logins of the examples, and how each is proved.
+#: The users of the examples and their passwords.
 PASSWORDS = {user: f"password-of-{user}" for user in ("anna", "olga", "ha")}
-#: Where the examples of requests are answered.
+#: The response topic in the examples of requests.
 _REPLIES = block("Requests and replies: A request").partition(" -e ")[2].split()[0]
-#: Seconds in which a robot must be online, or have carried out a request.
+#: Time for a robot to come online or to carry out a request.
 LIMIT = 20.0
-#: Runs `talk` with the test's broker in place of the examples'.
+#: Runs `talk` with the test's broker instead of the example's.
 _TALK = f"""if [ "$1" != serve ]; then
     test "$TALK_BROKER" = mqtts://broker -a -n "$TALK_MQTT_PASSWORD_FILE" || exit 99
     export TALK_BROKER=$URL TALK_MQTT_CA=$CA TALK_MQTT_PASSWORD_FILE="$DIRECTORY/$TALK_MQTT_USER.password"
 fi
 exec {sys.executable} -m talkcli "$@"
 """
-#: Writes below a directory of the test, and asks for no password.
+#: Writes into a directory of the test, and doesn't prompt for passwords.
 _SUDO = """program=$1
 shift
 case $program in
@@ -67,7 +67,7 @@ def place() -> Iterator[str]:
 
 @dataclass
 class Site:
-    """A robot, anna, and the shell of a client that has mosquitto's programs and none of talk's."""
+    """The robot anna, and the shell of a client with mosquitto's programs but without `talk`."""
 
     talk: Talk
     broker: Broker
@@ -76,13 +76,13 @@ class Site:
     replies: Listener
 
     def run(self, name: str) -> str:
-        """Run an example, which must succeed, and return its output."""
+        """Run an example that must succeed, and return its output."""
         done = self.shell.run(block(name))
         assert (done.returncode, done.stderr) == (0, ""), done
         return done.stdout
 
     def goal(self, text: str, state: str) -> dict[str, Any]:
-        """Wait until the goal with this text is in this state, and return it."""
+        """Wait until the goal with this text is in a state, and return the goal."""
         event = self.talk.watcher.wait_until(lambda event: _is_event(event, text, state), LIMIT)
         goal: dict[str, Any] = event["goal"]
         return goal
@@ -101,7 +101,7 @@ def _online(message: Message) -> bool:
 
 
 def _set_up_clients(shell: Shell, broker: Broker, user: str | None = None) -> None:
-    """Write the files that tell mosquitto's clients the broker and the login."""
+    """Write the configuration of mosquitto's clients with the broker and the login."""
     lines = [f"-h {'localhost' if broker.secure else '127.0.0.1'}", f"-p {broker.port}"]
     if user:
         lines += [f"-u {user}", f"-P {PASSWORDS[user]}"]
@@ -132,13 +132,13 @@ def site(make_talk: MakeTalk, tmp_path: Path, place: str) -> Iterator[Site]:
 
 @runs("Speak on many robots: On each robot", "Speak on many robots: On your machine")
 def test_a_robot_and_a_desk_are_set_up(tmp_path: Path, place: str) -> None:
-    """Two commands set up a robot with logins and the broker's rules. A desk and a plain text make it speak."""
+    """The broker has logins and access rules. The robot speaks a goal from a desk, and a plain text."""
     needs_packages("paho")
     operators = ("olga", "ha")
     with contextlib.ExitStack() as stack:
         broker = stack.enter_context(Broker(secure=True, users=PASSWORDS, acl=topics.access_rules(operators) + "\n"))
         for user in PASSWORDS:
-            broker.env(user)  # it writes the file of the password
+            broker.env(user)  # this writes the password file
         env = clean_environment(place) | {"TALK_SOCKET": f"{place}/s", "TALK_PLAYER": "null", "TALK_RATE": "450"}
         shell = stack.enter_context(contextlib.closing(Shell(tmp_path, env, talk=False)))
         shell.env |= {"URL": broker.url, "CA": str(authority().file), "DIRECTORY": str(broker.directory)}
@@ -192,7 +192,7 @@ def test_several_robots_are_commanded(tmp_path: Path, place: str) -> None:
 
 @runs("Set up a site")
 def test_a_broker_with_logins_is_set_up(make_talk: MakeTalk, tmp_path: Path, place: str) -> None:
-    """The broker lets in those logins alone, by TLS, each for its own rights."""
+    """The broker accepts only these logins, only with TLS, and each with its own rights."""
     needs_packages("paho")
     needs("mosquitto_passwd")
     etc = tmp_path / "etc"
@@ -205,7 +205,7 @@ def test_a_broker_with_logins_is_set_up(make_talk: MakeTalk, tmp_path: Path, pla
     assert called == ["apt-get", "mosquitto_passwd", "mosquitto_passwd", "tee", "tee", "systemctl"]
     settings = dict(line.split(" ", 1) for line in (etc / "conf.d/talk.conf").read_text("utf-8").splitlines())
     assert settings.pop("listener") == "8883"
-    # Where the certificate is, and the port, only the test knows.
+    # The test uses its own certificate and port.
     assert settings.keys() - {"password_file", "acl_file"} == {"certfile", "keyfile"}
     kept = [f"{name} {settings[name].replace('/etc/mosquitto', str(etc))}" for name in ("password_file", "acl_file")]
     with contextlib.ExitStack() as stack:
@@ -236,7 +236,7 @@ def test_plain_texts_requests_and_sessions_work(site: Site) -> None:
     answer = json.loads(site.run("Requests and replies: A request").splitlines()[0])
     assert _part(answer, example) == example
     site.goal("the door is open", "SUCCEEDED")
-    ended = re.compile(rb'"event": ?"result"')  # after this line, the next request gets no reply to the first
+    ended = re.compile(rb'"event": ?"result"')  # after the result, the next request gets only its own reply
     site.replies.await_message(lambda message: bool(ended.search(message.payload)), LIMIT)
     again = json.loads(site.run("Requests and replies: A request").splitlines()[0])
     assert again["attached"] is True
@@ -250,7 +250,7 @@ def test_plain_texts_requests_and_sessions_work(site: Site) -> None:
 
 
 def _part(whole: Any, like: Any) -> Any:
-    """Return the part of an object that an example shows."""
+    """Return only those fields of an object that the example shows."""
     return {name: _part(whole[name], value) for name, value in like.items()} if isinstance(like, dict) else whole
 
 
@@ -274,7 +274,7 @@ def test_a_robot_publishes_events_status_and_presence(site: Site) -> None:
 
     example = json.loads(block("What a robot publishes: Status #2"))
     example["last"]["at"] = goal["ended_at"]
-    wait_until(lambda: bool(json.loads(site.run("What a robot publishes: Status")) == example))  # one per second
+    wait_until(lambda: bool(json.loads(site.run("What a robot publishes: Status")) == example))  # once a second
 
     online, gone = (json.loads(block(f"What a robot publishes: Presence #{number}")) for number in (2, 3))
     presence = json.loads(site.run("What a robot publishes: Presence"))

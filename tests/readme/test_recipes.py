@@ -1,4 +1,4 @@
-"""The examples of recipes, containers, services and troubleshooting, with stand-ins that keep the machine as it is."""
+"""The examples for recipes, containers, services and troubleshooting. Stand-ins protect the machine from changes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ AWKWARD = "it's \"5\" o'clock; $HOME & `more` -- \\n"
 
 
 def texts_of(talk: Talk) -> list[str]:
-    """Return the texts of all goals, in their order."""
+    """Return the texts of all goals in their order."""
     return [talk.goal(goal_id)["text"] for goal_id in talk.watcher.goals()]
 
 
@@ -53,7 +53,7 @@ def test_the_battery_guard_warns_once_and_stops(scripted: Talk, scripted_shell: 
     for charge in ("80", "19", "18", "4"):
         battery.write_text(f"{charge}\n", encoding="utf-8")
         done = scripted_shell.run(block("Recipes: Battery guard"), BATTERY=str(battery))
-        assert (done.returncode, done.stdout, done.stderr) == (0, "", ""), done  # 18: throttled
+        assert (done.returncode, done.stdout, done.stderr) == (0, "", ""), done  # the goal at 18 is throttled
     assert texts_of(scripted)[:1] == ["battery at 19 percent"]
     assert [text for text in texts_of(scripted) if "stop" in text] == ["battery at 4 percent, I have to stop"]
 
@@ -73,7 +73,7 @@ def test_the_microphone_is_muted_while_the_robot_speaks(scripted: Talk, scripted
     heard = scripted_shell.directory / "heard"
     scripted_shell.program("talk", f'{sys.executable} -m talkcli "$@" | tee {heard}')
     scripted_shell.start(block("More recipes: Mute the microphone"))
-    wait_until(lambda: heard.exists() and heard.stat().st_size > 0)  # it begins with what there is now
+    wait_until(lambda: heard.exists() and heard.stat().st_size > 0)  # the snapshot has arrived
     for number, text in enumerate(("one", "fail=audio_lost"), 1):
         scripted.run("say", "--wait", "--", text)
         calls = scripted_shell.wait_for_call("wpctl", 2 * number)
@@ -94,7 +94,7 @@ def test_the_watchdog_reports_how_a_program_ended(scripted: Talk, scripted_shell
 
 @runs("More recipes: cron")
 def test_cron_jobs_run_without_output(speaking: Talk, shell: Shell) -> None:
-    """Like cron: its own PATH, hardly any variables, and a percent sign is a newline unless it is escaped."""
+    """cron sets its own PATH and few variables, and reads an unescaped percent sign as a newline."""
     shell.stand_in("logger")
     path, *jobs = block("More recipes: cron").splitlines()
     assert path.startswith("PATH=/usr/local/bin:")
@@ -109,7 +109,7 @@ def test_cron_jobs_run_without_output(speaking: Talk, shell: Shell) -> None:
             timeout=30,
             check=False,
         )
-        assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")  # cron mails the output
+        assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")  # cron would mail any output
     (clock,) = texts_of(speaking)
     assert (clock.startswith("It is "), clock.endswith(" o'clock")) == (True, True)
     assert shell.calls("logger") == [["-t", "talk", "the robot is mute"]]  # its player is a file
@@ -142,7 +142,7 @@ def test_the_launch_file_starts_a_server(shell: Shell, monkeypatch: pytest.Monke
         env = {**shell.env, "TALK_SOCKET": f"{place}/s", "TALK_PLAYER": "null"}
         with serving(env, command=[*TALK, *process.cmd[1:]]) as server:
             wait_until(lambda: '"ready"' in server.log)  # the greeting was spoken
-            assert server.end(signal.SIGINT) == 0  # as launch does
+            assert server.end(signal.SIGINT) == 0  # launch stops it this way
 
 
 @runs("In simulation and CI")
@@ -153,7 +153,7 @@ def test_a_simulated_robot_speaks_without_sound(tmp_path: Path, speaking: Talk) 
     assert done.stdout.splitlines()[1:] == ["as on the robot"]
 
 
-#: `docker exec talk COMMAND`, here.
+#: Runs `docker exec talk COMMAND` on this machine.
 _DOCKER = """case $1 in exec) shift 2; exec "$@" ;; *) exit 0 ;; esac"""
 #: `sudo tee FILE` writes into the directory of the test.
 _SUDO = """case $1 in tee) mkdir -p system; exec tee "system/${2##*/}" ;; *) exit 0 ;; esac"""

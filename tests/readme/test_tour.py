@@ -1,4 +1,4 @@
-"""The README's examples of saying, waiting, stopping and asking, as they stand there."""
+"""The README's examples for speaking, waiting, cancelling, status commands and files."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def without_servers(name: str, talk: Talk) -> str:
-    """Return the commands of an example. Those that start a server are run here, on a socket of their own."""
+    """Return the commands of an example without those that start a server. Run these on another socket."""
     servers = [command for command in commands(name) if command.startswith("talk serve")]
     for server in servers:
         command = [*TALK, *server.split()[1:]]
@@ -81,7 +81,7 @@ def test_status_commands_and_feedback_work(scripted: Talk, scripted_shell: Shell
             wait_until(lambda: "who watches?" in (scripted_shell.directory / "watched").read_text(encoding="utf-8"))
         else:
             done = scripted_shell.run(line)
-            if line == "talk doctor":  # its findings are this machine's
+            if line == "talk doctor":  # its findings depend on this machine
                 assert (done.returncode in {0, 4}, "sentence" in done.stdout) == (True, True), done
             else:
                 assert (done.returncode, "number 12" in done.stdout) == (0, True), done
@@ -96,6 +96,6 @@ def test_a_wav_file_is_written_and_played(shell: Shell) -> None:
     needs("aplay")
     (shell.directory / ".asoundrc").write_text("pcm.!default { type null }\n", encoding="utf-8")
     done = shell.run("set -e\n" + "\n".join(commands("Say something: Write a WAV file")))
-    assert (done.returncode, "22050" in done.stderr) == (0, True)  # aplay names the rate that it plays
+    assert (done.returncode, "22050" in done.stderr) == (0, True)  # aplay prints the sample rate
     with wave.open(str(shell.directory / "welcome.wav")) as file:
         assert file.getnframes() > file.getframerate() / 4

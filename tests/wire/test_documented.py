@@ -1,4 +1,4 @@
-"""The documents' tables of reasons, events, errors, limits and exit codes are those of the code."""
+"""The tables of states, requests, events, errors, limits and exit codes in the documents match the code."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ def test_states_and_requests_are_documented() -> None:
     states = tables(WIRE.section("States"))[0]
     documented = {code_spans(row[0])[0]: (int(row[1]), row[3] == "yes") for row in states[1:]}
     assert documented == {state.name: (int(state), state.terminal) for state in State}
-    answered = {request for row in tables(WIRE.section("Requests"))[1][1:] for request in code_spans(row[0])[:1]}
-    assert answered == set(REQUEST_TYPES)
+    requests = {request for row in tables(WIRE.section("Requests"))[1][1:] for request in code_spans(row[0])[:1]}
+    assert requests == set(REQUEST_TYPES)
 
 
 def test_documented_keys_and_error_codes_match_the_code() -> None:
-    """`tests/golden` and the tests of each fault have the codes themselves."""
+    """`tests/golden` and the tests of the faults check which code a fault has."""
     assert first_column(tables(WIRE.section("The goal"))[0]) == list(Goal("", State.PENDING).to_json())
     codes = first_column(ERRORS)
     refused: list[type[errors.RequestRefused]] = [
@@ -117,10 +117,10 @@ def test_documented_socket_paths_match_the_code(monkeypatch: pytest.MonkeyPatch)
         monkeypatch.setenv(name, value)
     monkeypatch.setattr("sys.platform", "linux")
     (paragraph,) = re.findall(r"^\*\*Connecting\..*?\n\n", WIRE.text, re.MULTILINE | re.DOTALL)
-    places = [path for path in code_spans(paragraph) if path.endswith(".sock")]
+    sockets = [path for path in code_spans(paragraph) if path.endswith(".sock")]
     for name, value in variables.items():
-        places = [path.replace(f"${name}/", f"{value}/") for path in places]
-    assert [path.replace("UID", str(os.getuid())) for path in places] == paths.client_sockets(None)
+        sockets = [path.replace(f"${name}/", f"{value}/") for path in sockets]
+    assert [path.replace("UID", str(os.getuid())) for path in sockets] == paths.client_sockets(None)
 
 
 def test_events_are_documented() -> None:
@@ -133,9 +133,7 @@ def test_events_are_documented() -> None:
 def test_exit_codes_and_commands_are_documented() -> None:
     rows = [row[0] for row in tables(README.section("Exit codes"))[0][1:]]
     assert rows[-1] == f"{errors.EXIT_SIGNAL}+n"
-    classes = [
-        value for value in vars(errors).values() if isinstance(value, type) and issubclass(value, errors.TalkError)
-    ]
+    classes = [cls for cls in vars(errors).values() if isinstance(cls, type) and issubclass(cls, errors.TalkError)]
     used = {error.exit_code for error in classes} | set(states.EXIT_CODES.values())
     used |= {errors.EXIT_OK, errors.EXIT_ERROR, errors.EXIT_USAGE, errors.EXIT_DIFFER, errors.EXIT_TIMEOUT}
     assert sorted(map(int, rows[:-1])) == sorted(used)

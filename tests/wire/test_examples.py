@@ -1,4 +1,4 @@
-"""The examples of the wire and of the library, run as they stand in the documents against a server."""
+"""The documents' examples for the protocol and the library, run with a server."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from tests.support.processes import Talk
 
-#: The robot of the README's loop: it stays blocked until the sentence has been heard.
+#: A robot for the README's loop. It is blocked until the goal has been spoken.
 ROBOT = """
 import time
 
@@ -48,8 +48,8 @@ print(*robot.lips)
 """
 
 
-def only_example(document: Document, language: str, title: str | None, mark: str) -> str:
-    """Return the one example of a section, or of a whole document, that contains this mark."""
+def only(document: Document, language: str, title: str | None, mark: str) -> str:
+    """Return the only example of a section or document that contains `mark`."""
     (found,) = [example for example in document.examples(language, title) if mark in example]
     return found
 
@@ -62,7 +62,7 @@ def run(talk: Talk, *command: str) -> subprocess.CompletedProcess[str]:
 
 def test_a_goal_can_be_sent_with_socat(scripted: Talk) -> None:
     needs("socat")
-    done = run(scripted, "sh", "-c", only_example(WIRE, "sh", None, "socat -t 5"))
+    done = run(scripted, "sh", "-c", only(WIRE, "sh", None, "socat -t 5"))
     greeting, reply = map(json.loads, done.stdout.splitlines())
     assert (greeting["talk"], reply["goal"]["text"]) == (1, "battery low")
     assert scripted.watcher.wait_for_terminal(reply["goal"]["id"]) == "SUCCEEDED"
@@ -72,7 +72,7 @@ def test_a_goal_can_be_sent_with_socat(scripted: Talk) -> None:
 def shell_client(tmp_path: Path) -> str:
     needs("socat")
     path = tmp_path / "say.sh"
-    path.write_text(only_example(WIRE, "sh", "Two clients", "say.sh"), encoding="utf-8")
+    path.write_text(only(WIRE, "sh", "Two clients", "say.sh"), encoding="utf-8")
     return str(path)
 
 
@@ -104,7 +104,7 @@ def test_the_shell_client_cancels_its_goal_on_ctrl_c(scripted: Talk, shell_clien
 
 
 def test_the_plain_python_client_prints_the_words(scripted: Talk) -> None:
-    example = only_example(WIRE, "python", "Two clients", "socket")
+    example = only(WIRE, "python", "Two clients", "socket")
     assert "talkcli" not in example
     done = run(scripted, sys.executable, "-c", example)
     assert done.returncode == 0, done
@@ -119,13 +119,13 @@ def test_the_plain_python_client_prints_the_words(scripted: Talk) -> None:
 
 
 def test_the_first_example_of_the_library_prints_the_words(scripted: Talk) -> None:
-    done = run(scripted, sys.executable, "-c", only_example(README, "python", "Use it from Python", "battery low"))
+    done = run(scripted, sys.executable, "-c", only(README, "python", "Use it from Python", "battery low"))
     assert done.returncode == 0, done
     assert [line.split(": ")[1] for line in done.stdout.splitlines()] == ["follow", "me", "to", "the", "charger"]
 
 
 def test_the_loop_of_a_robot_speaks(scripted: Talk) -> None:
-    example = only_example(README, "python", "Use it from Python", "robot.drives")
+    example = only(README, "python", "Use it from Python", "robot.drives")
     done = run(scripted, sys.executable, "-c", ROBOT.format(example=example))
     assert (done.returncode, done.stdout, done.stderr) == (0, "please let me pass\n", "")
 
@@ -136,15 +136,13 @@ def test_the_loop_of_a_robot_speaks(scripted: Talk) -> None:
         ("self.blocked = False", 'raise SystemExit("the goal failed")', "", "PREEMPTED"),
         ("os.kill({pid}, signal.SIGKILL)", 'self.blocked, self.lips = False, ["lights"]', "lights", None),
     ],
-    ids=["nobody is in the way any more", "the server is killed"],
+    ids=["way is free", "server is killed"],
 )
 def test_the_loop_of_a_robot_handles_an_aborted_goal(
     scripted: Talk, on_word: str, lights: str, shown: str, state: str | None
 ) -> None:
-    """The loop cancels a goal that has become needless, and flashes the lights if the goal is lost."""
-    example = only_example(README, "python", "Use it from Python", "robot.drives").replace(
-        "please let me pass", "never-ends"
-    )
+    """The loop cancels a goal that is no longer needed, and flashes the lights if the goal is lost."""
+    example = only(README, "python", "Use it from Python", "robot.drives").replace("please let me pass", "never-ends")
     robot = ROBOT.replace("self.lips.append(word)", on_word.format(pid=scripted.pid))
     robot = robot.replace('raise SystemExit("nobody heard it")', lights)
     scripted.unfinished = state is None

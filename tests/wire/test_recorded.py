@@ -1,6 +1,6 @@
-"""Recorded conversations: requests and replies of protocol 1 stay valid as long as the protocol is 1.
+"""Recorded conversations: requests and replies of protocol 1 stay valid while the protocol is 1.
 
-The recordings are never edited. A new request or field is recorded in a file of its own, beside the others.
+The recordings are never edited. A new request or field is recorded in a new file beside them.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ if TYPE_CHECKING:
     from tests.conftest import MakeTalk
 
 RECORDINGS = sorted(Path(__file__).parent.glob("*.txt"))
-#: The recorded server's `boot`: the first half of its goals' ids.
+#: The `boot` of the recorded server, which is the first half of its goals' ids.
 BOOT = "k3fz"
-#: SHA-256 of each recording, so that nobody edits one without meaning to.
+#: SHA-256 of each recording, to detect accidental edits.
 CHECKSUMS = {
     "protocol-1": "5a39d2af4e6c797d4d449d37623fd96d9f78ea4f33952ef545dc1e4e552212fd",
     "protocol-1-audible": "d027e998482272e961e2bebded96fb3d2d3dc4e2410b2d2fd6c0ea2076ce131a",
     "protocol-1-lead-in": "3f3263930adb3116d5329efa626e6eaefc47f16290d539d36e352152bc22067e",
     "protocol-1-voice": "4053df5d6bb376af2403e923cb48468fdeb25a46323a63e47e472ab823ef457f",
 }
-#: Fields that vary with the server, the client or the run: of these the type is compared.
+#: Fields that depend on the server, the client or the run. Only their types are compared.
 VARIES = {
     "version", "pid", "uid", "command", "parent", "socket", "at", "n", "started_at", "queued_at", "ended_at", "uptime",
     "time", "duration", "message", "clients", "engine", "driver", "synthesizer", "player",
 }  # fmt: skip
-#: Of these, the fields that may also be null.
+#: Fields of `VARIES` that may also be null.
 MAY_BE_NULL = {"pid", "uid", "command", "parent", "duration", "synthesizer", "player"}
 
 Message = dict[str, Any]
@@ -49,7 +49,7 @@ Message = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A line of a recording: "connect", ">" from the client or "<" from the server."""
+    """A line of a recording. `kind` is "connect", ">" (from the client) or "<" (from the server)."""
 
     number: int
     kind: str
@@ -74,7 +74,7 @@ def server_lines() -> list[Line]:
 
 
 def differences(recorded: object, now: object, varies: Collection[str] = VARIES, name: str = "") -> list[str]:
-    """Return the differences between a recorded message and one of today; a field added since is no difference."""
+    """Return the differences between a recorded and a current message. Added fields don't count."""
     if isinstance(recorded, dict) and isinstance(now, dict):
         result = [f"{name}.{key} is missing" for key in recorded.keys() - now.keys()]
         for key in recorded.keys() & now.keys():
@@ -87,13 +87,13 @@ def _alike(key: str, recorded: object, now: object, varies: Collection[str]) -> 
     if recorded is None or now is None:
         return recorded is now or key in MAY_BE_NULL & set(varies)
     if key == "spoken" and varies:
-        return isinstance(now, str)  # how far a goal came that was stopped
+        return isinstance(now, str)  # the spoken part of a cancelled goal varies
     kinds = [int if isinstance(value, float) else type(value) for value in (recorded, now)]
     return kinds[0] is kinds[1] and (key in varies or recorded == now)
 
 
 def next_message(raw: Raw, seen: int, kinds: set[str]) -> tuple[Message, int]:
-    """Return the next message that the recorded client knows, and the number of lines read so far."""
+    """Return the next message of a kind that the recorded client knows, and the number of lines read so far."""
     while True:
         message = raw.receive_lines(seen + 1)[seen]
         seen += 1
@@ -119,10 +119,8 @@ def test_the_server_still_sends_the_recorded_messages(recording: Path, make_talk
                 raw.send(text.encode() + b"\n")
             else:
                 message, seen = next_message(raw, seen, kinds)
-                changes = differences(json.loads(text), message)
-                assert not changes, (
-                    f"line {line.number} of {recording.name}: {changes}\nrecorded: {text}\nnow: {message}"
-                )
+                diff = differences(json.loads(text), message)
+                assert not diff, f"line {line.number} of {recording.name}: {diff}\nrecorded: {text}\nnow: {message}"
     finally:
         raw.socket.close()
 
@@ -130,7 +128,7 @@ def test_the_server_still_sends_the_recorded_messages(recording: Path, make_talk
 @pytest.mark.parametrize("recording", RECORDINGS, ids=lambda path: path.stem)
 def test_recordings_are_never_edited(recording: Path) -> None:
     assert sha256(recording.read_bytes()).hexdigest() == CHECKSUMS[recording.stem], (
-        f"{recording.name} was edited: record new messages in a file of their own, and add that file's sum here"
+        f"{recording.name} was edited: record new messages in a new file, and add its checksum here"
     )
 
 
@@ -140,10 +138,10 @@ def test_every_request_and_field_is_recorded() -> None:
         try:
             message = line.message
         except ValueError:
-            continue  # a malformed line was recorded, too
+            continue  # the recordings contain a malformed line
         recorded.setdefault(message.get("request", ""), set()).update(message)
     missing = {kind: {option.name for option in REQUEST_TYPES[kind].options} - recorded[kind] for kind in REQUEST_TYPES}
-    assert not any(missing.values()), f"record these in a file of their own beside {RECORDINGS[0].name}: {missing}"
+    assert not any(missing.values()), f"record these in a new file beside {RECORDINGS[0].name}: {missing}"
     assert all("request" in recorded[kind] for kind in REQUEST_TYPES)
 
 
