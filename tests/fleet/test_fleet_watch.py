@@ -64,14 +64,14 @@ class BackgroundWatch(contextlib.AbstractContextManager["BackgroundWatch"]):
 
     def find(self, kind: type[Any], wanted: Callable[[Any], bool] = lambda _: True) -> Any:
         """Return the first matching event of a kind, or raise the error that ended the watch."""
-        found = [event for event in self.seen if isinstance(event, kind) and wanted(event)]
-        while not found:
-            each = self._queue.get(timeout=PATIENCE)
-            if isinstance(each, Exception):
-                raise each
-            self.seen.append(each)
-            found = [each] if isinstance(each, kind) and wanted(each) else []
-        return found[0]
+        matches = [event for event in self.seen if isinstance(event, kind) and wanted(event)]
+        while not matches:
+            event = self._queue.get(timeout=PATIENCE)
+            if isinstance(event, Exception):
+                raise event
+            self.seen.append(event)
+            matches = [event] if isinstance(event, kind) and wanted(event) else []
+        return matches[0]
 
     def _read(self) -> None:
         try:

@@ -20,7 +20,7 @@ class WatchProcess:
         self.until("")
 
     def until(self, text: str) -> str:
-        """Return the next line with these words."""
+        """Return the next line that contains this text."""
         assert self.process.stdout
         for line in self.process.stdout:
             self.lines.append(line.rstrip("\n"))
