@@ -1,4 +1,4 @@
-"""Tests for an engine process with talk's own driver, from its start to its exit, through the protocol."""
+"""Tests for an engine process with talk's own driver, from its start to its exit, using the protocol."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ _NOT_NEEDED = (
     "socket",
     "logging",
 )
-_TELL = """
+#: Code that writes the names of all imported modules at the exit.
+_REPORT_MODULES = """
 import atexit
 atexit.register(lambda: sys.stderr.write(" ".join(sys.modules)))
 """
@@ -50,12 +51,12 @@ def shared() -> Iterator[Shared]:
 
 @pytest.fixture
 def writing(tmp_path: Path) -> Iterator[Spawned]:
-    """Return a process that writes to a file, which takes no time."""
+    """Return a process that writes to a file, which is faster than real time."""
     with Spawned(f"file:{tmp_path}/x.wav") as engine:
         yield engine
 
 
-def _length(ended: protocol.Ended) -> float:
+def _duration(ended: protocol.Ended) -> float:
     assert ended.duration is not None, ended
     return ended.duration
 
@@ -70,9 +71,9 @@ def test_a_process_becomes_ready_and_lists_its_voices() -> None:
         assert ready.version is not None
         assert ready.version.startswith("eSpeak NG ")
         engine.say("yes")
-        told = engine.event()
-        assert isinstance(told, protocol.VoiceList)
-        assert any(voice.language == "en-us" and voice.id == "gmw/en-US" for voice in told.voices)
+        event = engine.event()
+        assert isinstance(event, protocol.VoiceList)
+        assert any(voice.language == "en-us" and voice.id == "gmw/en-US" for voice in event.voices)
         assert isinstance(engine.event(), protocol.Started)
 
 
@@ -87,7 +88,7 @@ def test_voices_that_the_server_knows_are_not_listed() -> None:
 @pytest.mark.parametrize("text", ["battery low. Please come home", "..."])
 def test_a_process_imports_nothing_that_it_does_not_need(player: Player, text: str) -> None:
     """Imports delay the next sentence after a crash."""
-    with Spawned(player.plays(), before=_TELL) as engine:
+    with Spawned(player.plays(), before=_REPORT_MODULES) as engine:
         engine.spoken(text)
         engine.leave()
         imported = set(engine.errors().split())
@@ -97,12 +98,12 @@ def test_a_process_imports_nothing_that_it_does_not_need(player: Player, text: s
 
 @pytest.mark.parametrize("less", [0, 1 << 20])
 def test_a_process_gets_no_more_than_half_of_the_machines_memory(less: int) -> None:
-    """The limit is at least a billion bytes. A lower limit that is already set remains."""
-    most = max(1 << 30, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2)
-    before = f"import resource\nresource.setrlimit(resource.RLIMIT_DATA, ({most - less}, -1))" if less else ""
+    """The limit is at least 1 GiB. A lower limit that is already set remains."""
+    limit = max(1 << 30, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2)
+    before = f"import resource\nresource.setrlimit(resource.RLIMIT_DATA, ({limit - less}, -1))" if less else ""
     with Spawned(before=before) as engine:
         soft, _ = resource.prlimit(engine.process.pid, resource.RLIMIT_DATA)
-    assert soft == most - less
+    assert soft == limit - less
 
 
 # -- sentences
@@ -111,18 +112,18 @@ def test_a_process_gets_no_more_than_half_of_the_machines_memory(less: int) -> N
 @limits()
 def test_words_are_reported_in_order_when_they_are_heard(engine: Spawned) -> None:
     text = "this one é 日本 😀 battery low, please."
-    began, late = time.monotonic(), []
+    started_at, delays = time.monotonic(), []
     engine.say(text)
     while not isinstance(event := engine.event(), protocol.Ended):
         if isinstance(event, protocol.Word):
-            late.append(time.monotonic() - began - event.time)
-    assert _length(event) <= time.monotonic() - began < _length(event) + 0.3
+            delays.append(time.monotonic() - started_at - event.time)
+    assert _duration(event) <= time.monotonic() - started_at < _duration(event) + 0.3
     words = engine.words()
     assert [text[word.start : word.end] for word in words][1:] == ["é", "日本", "😀", "battery", "low", "please"]
     assert [word.number for word in words] == list(range(1, len(words) + 1))
     assert all(first.end <= second.start for first, second in itertools.pairwise(words))
-    assert_within(max(late) - min(late), 0.1, "a word after another")
-    assert min(late) >= 0
+    assert_within(max(delays) - min(delays), 0.1, "a word after another")
+    assert min(delays) >= 0
 
 
 def test_signs_of_life_are_sent_while_a_goal_is_spoken(engine: Spawned) -> None:
@@ -145,18 +146,18 @@ def test_a_text_without_words_fails_with_nothing_to_say(engine: Spawned) -> None
 
 
 def test_control_characters_are_not_commands_and_keep_the_offsets(writing: Spawned) -> None:
-    plain = _length(writing.spoken("a    b one two", "g1"))
+    plain = _duration(writing.spoken("a    b one two", "g1"))
     assert writing.spoken("a \x01\x00\x1bb one two", "g2").outcome == protocol.OUTCOME_COMPLETED
     assert writing.words("g1")[-1].start == writing.words("g2")[-1].start == len("a    b one ")
-    # libespeak-ng would take 0x01 for a command and speak at 80 words per minute
-    assert _length(writing.spoken("a \x0180Sb one two", "g3")) < plain * 2.5
+    # libespeak-ng would read 0x01 and "80S" as the command to speak at 80 words per minute
+    assert _duration(writing.spoken("a \x0180Sb one two", "g3")) < plain * 2.5
 
 
 def test_settings_apply_only_to_their_goal(writing: Spawned) -> None:
     text = "the battery is low, please come home"
-    fast = _length(writing.spoken(text, "g1", rate=400))
-    assert _length(writing.spoken(text, "g2", rate=100, voice="en-us")) > 2 * fast
-    assert abs(_length(writing.spoken(text, "g3", rate=400)) - fast) < 0.15
+    fast = _duration(writing.spoken(text, "g1", rate=400))
+    assert _duration(writing.spoken(text, "g2", rate=100, voice="en-us")) > 2 * fast
+    assert abs(_duration(writing.spoken(text, "g3", rate=400)) - fast) < 0.15
 
 
 def test_an_unknown_voice_fails_one_goal_and_suggests_similar_names(engine: Spawned) -> None:
@@ -195,13 +196,13 @@ def test_a_crash_leaves_no_core_dump(engine: Spawned) -> None:
 
 def test_an_idle_process_does_not_wake_up(engine: Spawned) -> None:
     assert engine.spoken("a").outcome == protocol.OUTCOME_COMPLETED
-    time.sleep(0.05)  # the process becomes idle, which no event reports
-    before = _switches(engine.process.pid)
+    time.sleep(0.05)  # until the process is idle, which no event reports
+    before = _context_switches(engine.process.pid)
     time.sleep(4 * ALIVE_EVERY)  # the measured time
-    assert _switches(engine.process.pid) == before
+    assert _context_switches(engine.process.pid) == before
 
 
-def _switches(pid: int) -> str:
+def _context_switches(pid: int) -> str:
     with open(f"/proc/{pid}/status") as file:
         return next(line for line in file if line.startswith("voluntary_ctxt_switches"))
 
@@ -213,11 +214,11 @@ def test_a_process_without_its_server_exits_at_once() -> None:
 
 
 def test_the_process_and_its_player_end_with_the_server(player: Player, tmp_path: Path) -> None:
-    begun = tmp_path / "begun"
-    os.mkfifo(begun)
-    with Spawned(player.command(f"open({str(begun)!r}, 'w').close()\n{NEVER_READS}")) as engine:
+    started = tmp_path / "started"
+    os.mkfifo(started)
+    with Spawned(player.command(f"open({str(started)!r}, 'w').close()\n{NEVER_READS}")) as engine:
         engine.say("one two three")
-        begun.read_text()
+        started.read_text()
         assert len(children(engine.process.pid)) == 1
         engine.hang_up()
         assert engine.all_gone()
