@@ -100,7 +100,7 @@ def robot(scripted: Talk, broker: Broker, make_bridge: MakeBridge) -> Robot:
 
 
 @pytest.fixture(scope="module")
-def lasting_robot() -> Iterator[Robot]:
+def shared_robot() -> Iterator[Robot]:
     """A robot like `robot`, for all tests of a module that don't change it."""
     with Broker() as broker, contextlib.closing(Talk(scripted=True)) as talk:
         with Bridge(talk, broker, "anna") as bridge:

@@ -83,7 +83,7 @@ class RealRobots(contextlib.AbstractContextManager["RealRobots"]):
         self._by_name: dict[str, Robot] = {}
         with contextlib.ExitStack() as stack:
             self._stack = stack.enter_context(contextlib.ExitStack())
-            _together(self.add, names)
+            _in_parallel(self.add, names)
             with PresenceListener(broker) as presences:
                 presences.await_online(names)
             stack.pop_all()
@@ -91,7 +91,7 @@ class RealRobots(contextlib.AbstractContextManager["RealRobots"]):
     def __exit__(self, kind: object, *_error: object) -> None:
         with self._stack:
             if kind is None:
-                _together(_end, self._by_name.values())
+                _in_parallel(_end, self._by_name.values())
 
     def __getitem__(self, name: str) -> Robot:
         return self._by_name[name]
@@ -109,7 +109,7 @@ class RealRobots(contextlib.AbstractContextManager["RealRobots"]):
 
     def each(self, action: Callable[[Robot], Any]) -> list[Any]:
         """Run an action for all robots, and return the results in the order of the robots' names."""
-        return _together(action, [self._by_name[name] for name in self.names])
+        return _in_parallel(action, [self._by_name[name] for name in self.names])
 
     def spoken(self) -> dict[str, list[str]]:
         """Return the texts that each robot has started to speak."""
@@ -125,7 +125,7 @@ def _end(robot: Robot) -> None:
         robot.talk.check()
 
 
-def _together(action: Callable[[Any], Any], items: Collection[Any]) -> list[Any]:
+def _in_parallel(action: Callable[[Any], Any], items: Collection[Any]) -> list[Any]:
     """Run an action for several items in parallel, and return the results or raise the first error at the end."""
     with ThreadPoolExecutor(_AT_ONCE) as pool:
         done = [pool.submit(action, item) for item in items]

@@ -74,7 +74,7 @@ class RemoteClient(contextlib.AbstractContextManager["RemoteClient"]):
         goal: Message = self.line(is_result, within)["goal"]
         return goal
 
-    def hang_up(self) -> None:
+    def send_goodbye(self) -> None:
         self.send(b"")
 
     def line(self, matches: Callable[[Message], bool], within: float = PATIENCE) -> Message:

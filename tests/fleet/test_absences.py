@@ -161,18 +161,18 @@ def test_a_bridge_that_ends_publishes_that_its_robot_is_offline(robot: Robot) ->
 
 
 @pytest.mark.parametrize(("case", "code"), [("interrupted", 130), ("unread", 141), ("too-late", 124)])
-def test_a_desk_that_stops_waiting_cancels_its_goal(lasting_robot: Robot, case: str, code: int) -> None:
+def test_a_desk_that_stops_waiting_cancels_its_goal(shared_robot: Robot, case: str, code: int) -> None:
     options = {"unread": ["--feedback"], "too-late": ["--timeout", "0.5"]}.get(case, [])
-    with Desk(lasting_robot.broker) as desk:
+    with Desk(shared_robot.broker) as desk:
         client = desk.start("--robot", "anna", "say", "--wait", *options, "--id", case, "--", LONG)
-        lasting_robot.talk.watcher.wait_for(case, "ACTIVE")
+        shared_robot.talk.watcher.wait_for(case, "ACTIVE")
         assert client.stdout
         if case == "interrupted":
             client.send_signal(signal.SIGINT)
         elif case == "unread":
             client.stdout.close()
         assert client.wait(10) == code
-        assert lasting_robot.talk.goal(case)["state"] == "PREEMPTED"
+        assert shared_robot.talk.goal(case)["state"] == "PREEMPTED"
 
 
 def test_a_command_waits_until_its_robot_is_online(robot: Robot) -> None:

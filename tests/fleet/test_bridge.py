@@ -29,13 +29,13 @@ BACK = 15.0
 
 
 @pytest.fixture
-def client(lasting_robot: Robot) -> Iterator[RemoteClient]:
+def client(shared_robot: Robot) -> Iterator[RemoteClient]:
     """A remote client of the shared robot. Its goals are cancelled, and its session ends, after the test."""
-    with RemoteClient(lasting_robot.broker) as result:
+    with RemoteClient(shared_robot.broker) as result:
         yield result
         result.ask("cancel")
         result.ask("resume")
-        result.hang_up()
+        result.send_goodbye()
 
 
 def texts_before(client: RemoteClient, talk: Talk) -> list[str]:
@@ -48,7 +48,7 @@ def texts_before(client: RemoteClient, talk: Talk) -> list[str]:
     return others
 
 
-def fill(robot: Robot, client: RemoteClient) -> None:
+def fill_queue(robot: Robot, client: RemoteClient) -> None:
     """Pause the robot, and use all places for remote goals."""
     robot.talk.request("pause")
     assert [client.say(f"{number}")["state"] for number in range(20)] == ["PENDING"] * 20
@@ -67,7 +67,7 @@ def retained(broker: Broker, topic: str, wanted: Callable[[Any], bool] = bool, w
 # Requests and replies
 
 
-def test_a_remote_goal_has_the_same_events_as_a_local_one(lasting_robot: Robot, client: RemoteClient) -> None:
+def test_a_remote_goal_has_the_same_events_as_a_local_one(shared_robot: Robot, client: RemoteClient) -> None:
     """Word events are sent with QoS 0, and results with QoS 1."""
     goal = client.say("battery low", feedback=True)
     assert (goal["state"], goal["text"]) == ("PENDING", "battery low")
@@ -76,7 +76,7 @@ def test_a_remote_goal_has_the_same_events_as_a_local_one(lasting_robot: Robot, 
     events = [line for line in client.lines if line.get("id") == goal["id"]]
     assert [event["state"] for event in events if event["event"] == "state"] == ["PENDING", "ACTIVE", "SUCCEEDED"]
     assert [event["word"] for event in events if event["event"] == "word"] == ["battery", "low"]
-    assert ended == lasting_robot.talk.goal(goal["id"])
+    assert ended == shared_robot.talk.goal(goal["id"])
     assert ended["client"]["name"] == "mqtt:bob"
     for message in client.listener.messages:
         light = all(json.loads(line).get("event") in ("word", "alive") for line in message.payload.splitlines())
@@ -98,8 +98,8 @@ def test_a_reply_has_the_correlation_and_the_number_of_its_request(client: Remot
     assert not any("seq" in line for line in by_correlation[b"two"])
 
 
-def test_a_session_has_its_own_name_and_gets_only_its_own_replies(lasting_robot: Robot, client: RemoteClient) -> None:
-    with RemoteClient(lasting_robot.broker) as other, RemoteClient(lasting_robot.broker, "eve") as eve:
+def test_a_session_has_its_own_name_and_gets_only_its_own_replies(shared_robot: Robot, client: RemoteClient) -> None:
+    with RemoteClient(shared_robot.broker) as other, RemoteClient(shared_robot.broker, "eve") as eve:
         client.ask("hello", name="patrol")
         other.ask("hello", name="other")
         goal = client.say("for one alone", wait=True)
@@ -157,16 +157,16 @@ def test_a_request_is_refused_only_if_it_is_too_long_for_the_server(client: Remo
 # Places in the queue
 
 
-def test_remote_clients_have_20_places_in_the_queue(lasting_robot: Robot, client: RemoteClient) -> None:
-    lasting_robot.talk.request("pause")
+def test_remote_clients_have_20_places_in_the_queue(shared_robot: Robot, client: RemoteClient) -> None:
+    shared_robot.talk.request("pause")
     goals = [client.say(f"flood {number}", wait=True) for number in range(25)]
     assert [goal["state"] for goal in goals] == ["PENDING"] * 20 + ["REJECTED"] * 5
     assert {goal["reason"] for goal in goals[20:]} == {"queue_full"}
     ended = client.result(goals[-1]["id"])
     assert (ended["state"], ended["text"]) == ("REJECTED", "flood 24")
-    with RemoteClient(lasting_robot.broker, "eve") as eve:
+    with RemoteClient(shared_robot.broker, "eve") as eve:
         assert eve.say("another's")["reason"] == "queue_full"
-    own = lasting_robot.talk.request("say", text="the robot's own")["goal"]
+    own = shared_robot.talk.request("say", text="the robot's own")["goal"]
     assert own["state"] == "PENDING"
     assert client.ask("cancel")["count"] == 21
     fire = client.say("fire", preempt=True)
@@ -185,36 +185,36 @@ def test_an_active_goal_takes_none_of_the_20_places(client: RemoteClient) -> Non
     assert [client.say(f"{number}")["state"] for number in range(21)] == ["PENDING"] * 20 + ["REJECTED"]
 
 
-def test_patient_goals_wait_for_room_in_their_order(lasting_robot: Robot, client: RemoteClient) -> None:
-    fill(lasting_robot, client)
+def test_patient_goals_wait_for_room_in_their_order(shared_robot: Robot, client: RemoteClient) -> None:
+    fill_queue(shared_robot, client)
     client.send({"seq": 100, "request": "say", "text": "patient", "patient": True, "wait": True})
     client.send({"seq": 101, "request": "say", "text": "behind it", "patient": True})
     client.ask("status")  # the bridge has read the requests before it
     assert not [line for line in client.lines if line.get("seq") in (100, 101)]
-    client.ask("cancel", ids=[robot_goals(lasting_robot)[0]["id"]])
+    client.ask("cancel", ids=[robot_goals(shared_robot)[0]["id"]])
     assert client.reply(100)["goal"]["state"] == "PENDING"
     assert not [line for line in client.lines if line.get("seq") == 101]
-    lasting_robot.talk.request("cancel", ids=[robot_goals(lasting_robot)[0]["id"]])
+    shared_robot.talk.request("cancel", ids=[robot_goals(shared_robot)[0]["id"]])
     assert client.reply(101)["goal"]["state"] == "PENDING"
-    assert [goal["text"] for goal in robot_goals(lasting_robot)][-2:] == ["patient", "behind it"]
+    assert [goal["text"] for goal in robot_goals(shared_robot)][-2:] == ["patient", "behind it"]
 
 
 @pytest.mark.slow
-def test_a_remote_client_that_waits_for_room_gets_alive_events(lasting_robot: Robot, client: RemoteClient) -> None:
-    fill(lasting_robot, client)
+def test_a_remote_client_that_waits_for_room_gets_alive_events(shared_robot: Robot, client: RemoteClient) -> None:
+    fill_queue(shared_robot, client)
     client.send({"seq": 100, "request": "say", "text": "patient", "patient": True})
     client.line(lambda line: line == {"event": "alive"}, 8)
 
 
 @pytest.mark.parametrize("case", ["here", "by its id", "elsewhere", "at the robot"])
-def test_any_client_can_cancel_goals_that_wait_for_room(lasting_robot: Robot, client: RemoteClient, case: str) -> None:
-    fill(lasting_robot, client)
+def test_any_client_can_cancel_goals_that_wait_for_room(shared_robot: Robot, client: RemoteClient, case: str) -> None:
+    fill_queue(shared_robot, client)
     client.send({"seq": 100, "request": "say", "text": "patient", "patient": True, "wait": True, "id": "p"})
     client.ask("status")  # the bridge has read the request before it
     if case == "at the robot":
-        assert lasting_robot.talk.request("cancel")["count"] == 20
+        assert shared_robot.talk.request("cancel")["count"] == 20
     elif case == "elsewhere":
-        with RemoteClient(lasting_robot.broker, "eve") as eve:
+        with RemoteClient(shared_robot.broker, "eve") as eve:
             assert eve.ask("cancel")["count"] == 21
             assert len([line for line in eve.lines if "canceled" in line]) == 21
     else:
@@ -224,33 +224,33 @@ def test_any_client_can_cancel_goals_that_wait_for_room(lasting_robot: Robot, cl
     goal = client.reply(100)["goal"]
     assert (goal["id"], goal["state"], goal["reason"]) == ("p", "RECALLED", "canceled")
     assert client.result("p")["by"]["client"]
-    assert len(robot_goals(lasting_robot)) == (20 if case == "by its id" else 0)
+    assert len(robot_goals(shared_robot)) == (20 if case == "by its id" else 0)
 
 
-def test_a_goodbye_recalls_goals_that_wait_for_room_and_disconnects(lasting_robot: Robot, client: RemoteClient) -> None:
-    fill(lasting_robot, client)
-    with lasting_robot.talk.connect() as wire:  # one connection for all requests, so that a closing one isn't counted
+def test_a_goodbye_recalls_goals_that_wait_for_room_and_disconnects(shared_robot: Robot, client: RemoteClient) -> None:
+    fill_queue(shared_robot, client)
+    with shared_robot.talk.connect() as wire:  # one connection for all requests, so that a closing one isn't counted
         before = wire.request("status")["server"]["clients"]
         client.send({"seq": 100, "request": "say", "text": "patient", "patient": True})
         client.ask("status")
-        client.hang_up()
+        client.send_goodbye()
         end = time.monotonic() + 5
         while wire.request("status")["server"]["clients"] >= before:
             assert time.monotonic() < end, "the bridge keeps its connection to the server"
-    with RemoteClient(lasting_robot.broker, "eve") as eve:
+    with RemoteClient(shared_robot.broker, "eve") as eve:
         assert eve.ask("cancel")["count"] == 20
         assert eve.say("next")["state"] == "PENDING"
-        assert [goal["text"] for goal in robot_goals(lasting_robot)] == ["next"]
+        assert [goal["text"] for goal in robot_goals(shared_robot)] == ["next"]
         eve.ask("cancel")
 
 
-def test_more_than_64_waiting_requests_of_a_client_are_refused(lasting_robot: Robot, client: RemoteClient) -> None:
-    lasting_robot.talk.request("pause")
+def test_more_than_64_waiting_requests_of_a_client_are_refused(shared_robot: Robot, client: RemoteClient) -> None:
+    shared_robot.talk.request("pause")
     for number in range(100):
         client.send({"seq": number, "request": "say", "text": f"{number}", "patient": True})
     refused = client.line(lambda line: line.get("ok") is False)
     assert refused["error"]["code"] == "busy"
-    with RemoteClient(lasting_robot.broker, "eve") as eve:
+    with RemoteClient(shared_robot.broker, "eve") as eve:
         eve.ask("cancel")
 
 
@@ -291,9 +291,9 @@ def test_a_goal_rejected_by_an_earlier_server_may_be_sent_again(robot: Robot) ->
     "wrong",
     [b"", b"7", b'{"talk": 1, "online": false, "session": "old"}', b'{"talk": 1, "online": true, "session": "old"}'],
 )
-def test_a_bridge_corrects_a_wrong_presence(lasting_robot: Robot, wrong: bytes) -> None:
-    presence = retained(lasting_robot.broker, f"{ANNA}/presence")
-    with Listener(lasting_robot.broker, f"{ANNA}/presence") as listener:
+def test_a_bridge_corrects_a_wrong_presence(shared_robot: Robot, wrong: bytes) -> None:
+    presence = retained(shared_robot.broker, f"{ANNA}/presence")
+    with Listener(shared_robot.broker, f"{ANNA}/presence") as listener:
         listener.publish(f"{ANNA}/presence", wrong, retain=True)
 
         def is_corrected(message: Published) -> bool:
@@ -301,7 +301,7 @@ def test_a_bridge_corrects_a_wrong_presence(lasting_robot: Robot, wrong: bytes) 
             return wrong in payloads and payloads.index(wrong) < len(payloads) - 1 and message.payload == payloads[-1]
 
         assert listener.await_message(is_corrected).json == presence
-    assert retained(lasting_robot.broker, f"{ANNA}/presence") == presence
+    assert retained(shared_robot.broker, f"{ANNA}/presence") == presence
 
 
 @pytest.mark.slow

@@ -39,7 +39,7 @@ _UPTIME = re.compile(r'up \d+ s|"uptime": [\d.]+')
 
 
 @pytest.fixture(scope="module")
-def open_robot() -> Iterator[Robot]:
+def permissive_robot() -> Iterator[Robot]:
     """A robot that allows all requests. It has spoken a goal and rejected another."""
     with Broker() as broker, contextlib.closing(Talk(["--player", "null", "--rate", "450"])) as talk:
         with Bridge(talk, broker, "anna", *ALLOW) as bridge:
@@ -81,18 +81,18 @@ def comparable(done: Finished) -> tuple[int, str, str]:
         ("-q say --throttle 60 --key door hello", 0),
     ],
 )
-def test_a_command_has_the_same_output_as_on_the_robot(open_robot: Robot, line: str, code: int) -> None:
-    local = open_robot.talk.run(*line.split())
-    remote = open_robot.desk(*line.split())
-    open_robot.talk.request("resume")  # other tests need a robot that isn't paused
+def test_a_command_has_the_same_output_as_on_the_robot(permissive_robot: Robot, line: str, code: int) -> None:
+    local = permissive_robot.talk.run(*line.split())
+    remote = permissive_robot.desk(*line.split())
+    permissive_robot.talk.request("resume")  # other tests need a robot that isn't paused
     assert comparable(remote) == comparable(local)
     assert remote.code == code, remote
 
 
-def test_a_sentence_has_the_same_output_while_it_is_spoken(open_robot: Robot) -> None:
+def test_a_sentence_has_the_same_output_while_it_is_spoken(permissive_robot: Robot) -> None:
     """Only the id and the times of the words differ."""
     shown: list[tuple[int, str, str]] = []
-    for client in (open_robot.talk, Desk(open_robot.broker, env={"TALK_ROBOT": "anna"})):
+    for client in (permissive_robot.talk, Desk(permissive_robot.broker, env={"TALK_ROBOT": "anna"})):
         with contextlib.nullcontext(client) if isinstance(client, Talk) else client:
             for line, stdin in (("say -wf -- go on", None), ("say -w -", "go on\n")):
                 goal = f"goal-{len(shown)}"
@@ -102,9 +102,9 @@ def test_a_sentence_has_the_same_output_while_it_is_spoken(open_robot: Robot) ->
     assert shown[2:] == shown[:2]
 
 
-def test_a_remote_watch_shows_the_same_events_as_a_local_one(open_robot: Robot) -> None:
-    talk = open_robot.talk
-    with Desk(open_robot.broker) as operator:
+def test_a_remote_watch_shows_the_same_events_as_a_local_one(permissive_robot: Robot) -> None:
+    talk = permissive_robot.talk
+    with Desk(permissive_robot.broker) as operator:
         watchers: list[tuple[Clients, Process]] = [
             (talk, talk.start("--json", "watch")),
             (operator, operator.start("--robot", "anna", "--json", "watch")),
@@ -177,8 +177,8 @@ def test_ctrl_c_cancels_lines_of_a_command_that_has_run_for_a_while(robot: Robot
         ("--robot= status", "empty"),
     ],
 )
-def test_a_command_that_no_robot_can_run_is_a_usage_error(lasting_robot: Robot, line: str, expected: str) -> None:
-    with Desk(lasting_robot.broker, env={"TALK_BROKER": ""} if "TALK_BROKER" in expected else {}) as operator:
+def test_a_command_that_no_robot_can_run_is_a_usage_error(shared_robot: Robot, line: str, expected: str) -> None:
+    with Desk(shared_robot.broker, env={"TALK_BROKER": ""} if "TALK_BROKER" in expected else {}) as operator:
         done = operator.run(*line.split())
     assert (done.code, done.out) == (2, ""), done
     assert expected in done.err
@@ -200,14 +200,14 @@ def test_a_command_for_a_robot_never_reaches_the_local_server(broker: Broker) ->
             local.accept()
 
 
-def test_options_override_variables_and_a_robot_overrides_a_socket(open_robot: Robot) -> None:
-    variables = {"TALK_SOCKET": open_robot.talk.socket, "TALK_ROBOT": "nobody"}
-    with Desk(open_robot.broker, env=variables) as operator:
+def test_options_override_variables_and_a_robot_overrides_a_socket(permissive_robot: Robot) -> None:
+    variables = {"TALK_SOCKET": permissive_robot.talk.socket, "TALK_ROBOT": "nobody"}
+    with Desk(permissive_robot.broker, env=variables) as operator:
         assert operator.run("status").code == 3
         assert operator.run("--robot", "anna", "status").code == 0
-        assert operator.run("--socket", open_robot.talk.socket, "status").code == 0
-    with Desk(open_robot.broker, env=variables | {"TALK_BROKER": ""}) as operator:
-        assert operator.run("--socket", open_robot.talk.socket, "say", "--wait", "hello").code == 0
+        assert operator.run("--socket", permissive_robot.talk.socket, "status").code == 0
+    with Desk(permissive_robot.broker, env=variables | {"TALK_BROKER": ""}) as operator:
+        assert operator.run("--socket", permissive_robot.talk.socket, "say", "--wait", "hello").code == 0
 
 
 def completions(robot: Robot, line: str, **env: str) -> list[str]:
@@ -242,9 +242,9 @@ TOO_LONG = "word " * 1_200
 
 
 @pytest.fixture
-def client(lasting_robot: Robot) -> Iterator[Client]:
+def client(shared_robot: Robot) -> Iterator[Client]:
     """A `Client` of the robot."""
-    with Fleet(lasting_robot.broker.url).robot("anna") as client:
+    with Fleet(shared_robot.broker.url).robot("anna") as client:
         yield client
 
 

@@ -183,18 +183,18 @@ def test_an_old_retained_message_is_not_spoken(make_talk: MakeTalk, broker: Brok
         assert olga.lines == []
 
 
-def test_a_malformed_request_gets_the_protocols_error(lasting_robot: Robot) -> None:
+def test_a_malformed_request_gets_the_protocols_error(shared_robot: Robot) -> None:
     """The other errors are in `tests/unit/test_fleet_policy.py`."""
     status = b'{"seq": 7, "request": "status"}'
-    before = lasting_robot.spoken
-    with RemoteClient(lasting_robot.broker, "olga") as olga:
+    before = shared_robot.spoken
+    with RemoteClient(shared_robot.broker, "olga") as olga:
         olga.send(status.ljust(LONGEST_LINE - 1))
         assert olga.reply(7)["ok"]
         for payload, code in ((b'["say", "hello"]', "bad_json"), (status.ljust(LONGEST_LINE), "line_too_long")):
             olga.send(payload)
             assert olga.line(lambda line: line.get("ok") is False and line["error"]["code"] == code)  # noqa: B023
         assert olga.ask("status")["ok"]  # the bridge still works
-    assert lasting_robot.spoken == before
+    assert shared_robot.spoken == before
 
 
 def test_a_robot_accepts_only_allowed_requests(make_robot: MakeRobot) -> None:
@@ -261,16 +261,16 @@ def test_plain_text_is_spoken_verbatim_and_logged_without_control_chars(robot: R
     assert is_plain(talk.log), talk.log
 
 
-def test_a_robot_does_not_publish_on_the_response_topic_of_another_user(lasting_robot: Robot) -> None:
+def test_a_robot_does_not_publish_on_the_response_topic_of_another_user(shared_robot: Robot) -> None:
     """The other forms of such topics are in `tests/unit/test_fleet_topics.py`."""
     responses = {"talk/reply/otto/session/anna", "talk/robot/bert/say/olga", "elsewhere"}
-    before = lasting_robot.spoken
-    with Listener(lasting_robot.broker, "#") as everything, RemoteClient(lasting_robot.broker, "olga") as olga:
+    before = shared_robot.spoken
+    with Listener(shared_robot.broker, "#") as everything, RemoteClient(shared_robot.broker, "olga") as olga:
         for topic in responses:
             olga.send({"request": "say", "text": "hello"}, response=topic)
         assert olga.ask("status")["ok"]
         assert not responses & {message.topic for message in everything.messages}
-    assert lasting_robot.spoken == before
+    assert shared_robot.spoken == before
 
 
 def test_with_no_text_only_the_remote_client_reads_a_sentence(broker: Broker, make_robot: MakeRobot) -> None:

@@ -208,10 +208,10 @@ async def test_an_ended_session_keeps_its_slot_until_the_server_greets() -> None
 
 @in_loop
 async def test_a_session_without_a_free_descriptor_returns_its_slot(monkeypatch: pytest.MonkeyPatch) -> None:
-    def none_left(*_: object) -> None:
+    def fail(*_: object) -> None:
         raise OSError("Too many open files")
 
-    monkeypatch.setattr("talkcli.client.connect.reach", none_left)
+    monkeypatch.setattr("talkcli.client.connect.reach", fail)
     anna = SessionsWithoutBroker("unused")
     slots = anna.sessions.dialing = asyncio.Semaphore(1)
     anna.post({"seq": 1, "request": "status"})

@@ -48,7 +48,7 @@ def proxied(pair: RealRobots) -> Iterator[tuple[Desk, Proxy]]:
     request(pair, "cancel")
 
 
-def speaking(desk: Desk, robots: RealRobots, to: str, goal_id: str) -> Process:
+def start_speaking(desk: Desk, robots: RealRobots, to: str, goal_id: str) -> Process:
     """Start a command that waits for a goal, and return it when both robots speak."""
     waiting = desk.start("--robot", to, "say", "--wait", "--id", goal_id, "--", LONG)
     robots.each(lambda robot: robot.talk.watcher.wait_for(goal_id, "ACTIVE"))
@@ -93,7 +93,7 @@ def test_an_interrupted_desk_that_reconnects_in_time_cancels_its_goal(
 ) -> None:
     desk, proxy = proxied
     goal = f"back-in-time-{SELECTIONS.index(to)}"
-    waiting = speaking(desk, pair, to, goal)
+    waiting = start_speaking(desk, pair, to, goal)
     proxy.hold()  # so that the desk reconnects, but gets nothing through before the release
     proxy.cut()
     waiting.send_signal(signal.SIGINT)

@@ -182,7 +182,7 @@ def _wire() -> str:
     try:
         with talk.connect() as wire:
             boot = str(wire.greeting["boot"])
-            lines = [f"< {json.dumps(_steady(wire.greeting))}"]
+            lines = [f"< {json.dumps(_stable(wire.greeting))}"]
             for request in REQUESTS:
                 wire.send(request)
                 lines.append(f"> {json.dumps(request)}")
@@ -190,7 +190,7 @@ def _wire() -> str:
                 awaited = {"ok", "result"} if request.get("request") == "resume" else {"ok"}
                 while awaited:
                     message = wire.receive()
-                    lines.append(f"< {json.dumps(_steady(message))}")
+                    lines.append(f"< {json.dumps(_stable(message))}")
                     awaited -= {"ok"} & message.keys() | {str(message.get("event"))}
         talk.stop()
     finally:
@@ -198,12 +198,12 @@ def _wire() -> str:
     return "\n".join(lines).replace(f"{boot}-", "BOOT-") + "\n"
 
 
-def _steady(value: Any, name: str = "") -> Any:
+def _stable(value: Any, name: str = "") -> Any:
     """Replace values that differ from run to run by their types, except messages for people."""
     if isinstance(value, dict):
-        return {key: _steady(item, key) for key, item in value.items()}
+        return {key: _stable(item, key) for key, item in value.items()}
     if isinstance(value, list):
-        return [_steady(item) for item in value]
+        return [_stable(item) for item in value]
     if name in VARIES - {"message", "clients"} or name == "boot":
         return "null" if value is None else type(value).__name__
     return value

@@ -30,7 +30,7 @@ def options() -> str:
     for name, row in COMMANDS.items():
         command = talk.get_command(context, name)
         assert command
-        lines.append(f"| `{name}` | | {_words(row.summary)} |\n")
+        lines.append(f"| `{name}` | | {_markdown(row.summary)} |\n")
         own = [parameter for parameter in command.params if parameter.name not in shared]
         lines += _rows(own, click.Context(command, parent=context, info_name=name))
     return "".join(lines)
@@ -84,10 +84,10 @@ def current(name: str) -> str:
 
 def _rows(parameters: list[click.Parameter], context: click.Context) -> list[str]:
     records = [parameter.get_help_record(context) for parameter in parameters if isinstance(parameter, click.Option)]
-    return [f"| | `{_cell(left)}` | {_words(right)} |\n" for left, right in filter(None, records)]
+    return [f"| | `{_cell(left)}` | {_markdown(right)} |\n" for left, right in filter(None, records)]
 
 
-def _words(text: str) -> str:
+def _markdown(text: str) -> str:
     """Return a help text for a table cell, with commands, options and variables as code, and escaped Markdown."""
     quoted = r"'(-|default|talk [^']*|aplay [^']*|pactl [^']*|pw-cli [^']*)'"
     text = re.sub(rf"{quoted}|(?<![\w`'-])(--[a-z][a-z-]*)", lambda match: f"`{match[1] or match[2]}`", _cell(text))

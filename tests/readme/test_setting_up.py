@@ -54,7 +54,7 @@ _SPEAK = (
 
 
 @pytest.fixture
-def newcomer(tmp_path: pathlib.Path) -> Iterator[Shell]:
+def fresh_shell(tmp_path: pathlib.Path) -> Iterator[Shell]:
     """A shell with a fresh checkout in an empty HOME."""
     home = tmp_path / "home"
     home.mkdir()
@@ -93,20 +93,20 @@ def _needs_package_index(shell: Shell, *packages: str) -> None:
 
 @pytest.mark.slow
 @runs("Start")
-def test_the_first_command_speaks(newcomer: Shell) -> None:
+def test_the_first_command_speaks(fresh_shell: Shell) -> None:
     """The test starts from a fresh checkout. `kill %1` ends the server."""
     needs("bash")
-    _needs_package_index(newcomer, "click")
-    done = newcomer.run(
+    _needs_package_index(fresh_shell, "click")
+    done = fresh_shell.run(
         'exec bash -c "$1"',  # sh has no job control in a script
         f"cd talk\n{block('Start')}code=$?\ntalk status; kill %1; wait %1; exit $code",
         limit=LIMIT,
         TALK_PLAYER="null",
     )
     assert done.returncode == 0, done
-    assert f"ready on {newcomer.env['TALK_SOCKET']}" in done.stderr
+    assert f"ready on {fresh_shell.env['TALK_SOCKET']}" in done.stderr
     assert re.search(r"SUCCEEDED .*talk is ready", done.stdout), done
-    assert not os.path.exists(newcomer.env["TALK_SOCKET"])
+    assert not os.path.exists(fresh_shell.env["TALK_SOCKET"])
 
 
 @runs("Start #2")
@@ -128,33 +128,36 @@ def test_the_first_command_can_write_a_file_instead(tmp_path: pathlib.Path) -> N
 
 @pytest.mark.slow
 @runs("Install: For one user", "Install: For all users")
-def test_talk_can_be_installed_for_one_user_or_all_users(newcomer: Shell) -> None:
+def test_talk_can_be_installed_for_one_user_or_all_users(fresh_shell: Shell) -> None:
     """The error message for a missing package contains the command that installs it."""
     needs("bash")
-    _needs_package_index(newcomer, "pipx")
-    newcomer.stand_in("apt-get")
-    newcomer.stand_in("sudo", _SUDO.replace("SYSTEM", f"{newcomer.directory}/system"))
+    _needs_package_index(fresh_shell, "pipx")
+    fresh_shell.stand_in("apt-get")
+    fresh_shell.stand_in("sudo", _SUDO.replace("SYSTEM", f"{fresh_shell.directory}/system"))
     for path in ("opt", "usr/local/bin"):
-        (newcomer.directory / "system" / path).mkdir(parents=True)
-    done = newcomer.run("registry/bin/pip install -q pipx && ln -s ../registry/bin/pipx bin/pipx", limit=LIMIT)
+        (fresh_shell.directory / "system" / path).mkdir(parents=True)
+    done = fresh_shell.run("registry/bin/pip install -q pipx && ln -s ../registry/bin/pipx bin/pipx", limit=LIMIT)
     assert done.returncode == 0, done
     for users, talk in (("one user", ".local/bin/talk"), ("all users", "system/usr/local/bin/talk")):
         example = block(f"Install: For {users}")
-        done = newcomer.run(f"set -e; cd talk\n{example}", limit=LIMIT)
+        done = fresh_shell.run(f"set -e; cd talk\n{example}", limit=LIMIT)
         assert done.returncode == 0, done
-        assert newcomer.run(f"{newcomer.directory}/{talk} --version").stdout.startswith("talk ")
-    assert newcomer.run(f"{newcomer.directory}/{talk} say -o hello.wav -- hello && test -s hello.wav").returncode == 0
-    result = newcomer.run("PATH=/usr/bin:/bin bash -ic 'type -ap talk' 2> bash.log")
-    talk = f"{newcomer.directory}/.local/bin/talk"
+        assert fresh_shell.run(f"{fresh_shell.directory}/{talk} --version").stdout.startswith("talk ")
+    assert (
+        fresh_shell.run(f"{fresh_shell.directory}/{talk} say -o hello.wav -- hello && test -s hello.wav").returncode
+        == 0
+    )
+    result = fresh_shell.run("PATH=/usr/bin:/bin bash -ic 'type -ap talk' 2> bash.log")
+    talk = f"{fresh_shell.directory}/.local/bin/talk"
     assert talk in result.stdout.splitlines(), result  # an older `talk` may precede it
     for command in (f"say -o said.wav --voice {REAL_VOICE} hello", "--robot anna status"):
-        failed = newcomer.run(f"{talk} {command}")
+        failed = fresh_shell.run(f"{talk} {command}")
         advice = re.search(r"\S+ inject talkcli .*", failed.stderr)
         assert advice, failed
         assert f"`{advice[0]}`" in README.text
-        assert newcomer.run(advice[0], limit=LIMIT).returncode == 0
-        assert advice[0] not in newcomer.run(f"{talk} {command}").stderr
-    assert newcomer.run("test -s said.wav").returncode == 0
+        assert fresh_shell.run(advice[0], limit=LIMIT).returncode == 0
+        assert advice[0] not in fresh_shell.run(f"{talk} {command}").stderr
+    assert fresh_shell.run("test -s said.wav").returncode == 0
 
 
 @runs("Start #3")
