@@ -223,10 +223,8 @@ def assert_plain(done: Finished) -> None:
 
 @pytest.mark.parametrize("to", ["*", "@all", "odd-1"])
 def test_a_malformed_reply_is_only_a_failure_of_its_robot(pair: RealRobots, desk: Desk, to: str) -> None:
-    commands = [
-        *COMMANDS,
-        *([("pause", "", None)] if to == "odd-1" else []),
-    ]  # would pause other robots
+    # A pause of several robots would delay the other commands.
+    commands = [*COMMANDS, ("pause", "", None)] if to == "odd-1" else COMMANDS
     lines = [["--robot", to, *command.split(), *([argument] if argument else [])] for command, argument, _ in commands]
     with FakeRobot(pair.broker, "odd-1", malformed_reply, ["odd"]):
         results = at_once(desk, *lines)
