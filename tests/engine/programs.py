@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING
 
-from tests.engine.spawned import FAST
+from tests.engine.process import FAST
 from tests.support.reference import render
 
 if TYPE_CHECKING:

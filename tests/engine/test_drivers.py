@@ -10,7 +10,7 @@ from array import array
 from typing import TYPE_CHECKING, Any, cast
 
 import pytest
-from pyttsx3.engine import Engine
+import pyttsx3.engine
 
 from talkcli import install
 from talkcli.engine import protocol
@@ -18,7 +18,7 @@ from talkcli.engine.child.driver import register_driver
 from talkcli.engine.child.players.base import CannotSpeak
 from talkcli.engine.child.players.chooser import PlayerChooser
 from talkcli.engine.voices import UnknownVoice
-from tests.engine.spawned import Shared, Spawned
+from tests.engine.process import Engine, SharedEngine
 from tests.engine.test_synthesizer_contract import Scripted
 from tests.support.timing import assert_within, limits
 
@@ -110,13 +110,13 @@ ctypes.CDLL = Missing
 
 
 @pytest.fixture(scope="module")
-def shared() -> Iterator[Shared]:
-    with contextlib.closing(Shared(lambda: Spawned(driver="dummy"))) as shared:
+def shared() -> Iterator[SharedEngine]:
+    with contextlib.closing(SharedEngine(lambda: Engine(driver="dummy"))) as shared:
         yield shared
 
 
 def test_the_dummy_driver_lists_its_voices() -> None:
-    with Spawned(driver="dummy") as engine:
+    with Engine(driver="dummy") as engine:
         ready = engine.until(protocol.Ready)
         assert (ready.driver, ready.player) == ("dummy", None)
         assert engine.until(protocol.VoiceList).voices[0].id == "dummy.voice1"
@@ -124,7 +124,7 @@ def test_the_dummy_driver_lists_its_voices() -> None:
 
 @pytest.mark.parametrize(("driver", "before"), [("dummy", ""), ("slow", SLOW_DRIVER)])
 def test_a_driver_finishes_each_sentence_and_reports_its_words(driver: str, before: str) -> None:
-    with Spawned(driver=driver, before=before) as engine:
+    with Engine(driver=driver, before=before) as engine:
         for goal in ("g1", "g2"):
             assert engine.spoken("battery low", goal).outcome == protocol.OUTCOME_COMPLETED
             assert [(word.start, word.end) for word in engine.words(goal)] == [(0, 7), (8, 11)]
@@ -144,7 +144,7 @@ def test_a_driver_finishes_each_sentence_and_reports_its_words(driver: str, befo
     ],
 )
 def test_a_goal_fails_if_the_driver_lacks_one_of_its_options(
-    engine: Spawned, more: dict[str, Any], reason: str, message: str
+    engine: Engine, more: dict[str, Any], reason: str, message: str
 ) -> None:
     ended = engine.spoken("yes", **more)
     assert (ended.outcome, ended.reason) == (protocol.OUTCOME_FAILED, reason)
@@ -155,7 +155,7 @@ def test_a_goal_fails_if_the_driver_lacks_one_of_its_options(
 
 @limits()
 def test_a_slow_driver_confirms_a_stop_and_its_error_fails_only_one_goal() -> None:
-    with Spawned(driver="slow", before=SLOW_DRIVER) as engine:
+    with Engine(driver="slow", before=SLOW_DRIVER) as engine:
         engine.say("battery low")
         engine.until_word()
         assert_within(engine.stop(), 0.15, "the stop")
@@ -164,21 +164,21 @@ def test_a_slow_driver_confirms_a_stop_and_its_error_fails_only_one_goal() -> No
         assert engine.spoken("yes", "g3").outcome == protocol.OUTCOME_COMPLETED
 
 
-def _timed(text: str = "battery low, please come home") -> Spawned:
-    engine = Spawned(driver="timed", before=TIMED_DRIVER, alive_every=0.3)
+def _start_timed_driver(text: str = "battery low, please come home") -> Engine:
+    engine = Engine(driver="timed", before=TIMED_DRIVER, alive_every=0.3)
     engine.until(protocol.VoiceList)
     engine.say(text)
     return engine
 
 
-def _texts(engine: Spawned) -> list[str]:
+def _driver_texts(engine: Engine) -> list[str]:
     """Wait for the end of the process, and return the texts that the driver got."""
     engine.leave()
     return engine.errors().splitlines()
 
 
 def test_a_driver_without_pauses_resumes_at_the_last_reported_word() -> None:
-    with _timed() as engine:
+    with _start_timed_driver() as engine:
         for number in (2, 4):
             engine.until_word(number)
             assert engine.pause() >= 0.2, "the pause was confirmed before the driver was silent"
@@ -188,21 +188,21 @@ def test_a_driver_without_pauses_resumes_at_the_last_reported_word() -> None:
         assert [word.start for word in engine.words()] == [0, 8, 13, 20, 25]
         assert [word.number for word in engine.words()] == [1, 2, 3, 4, 5]
         assert engine.words()[-1].time < 0.5 + 2 * (0.2 + 0.1 + 0.15), "the word times include the pauses"
-        assert _texts(engine) == ["battery low, please come home", "low, please come home", "come home"]
+        assert _driver_texts(engine) == ["battery low, please come home", "low, please come home", "come home"]
 
 
 def test_a_driver_paused_before_the_first_word_speaks_the_whole_text() -> None:
-    with _timed() as engine:
+    with _start_timed_driver() as engine:
         engine.until(protocol.Started)
         engine.pause()
         engine.resume()
         assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
         assert len(engine.words()) == 5
-        assert set(_texts(engine)) == {"battery low, please come home"}
+        assert set(_driver_texts(engine)) == {"battery low, please come home"}
 
 
 def test_a_driver_resumed_before_it_is_silent_continues_once_it_is() -> None:
-    with _timed() as engine:
+    with _start_timed_driver() as engine:
         engine.until(protocol.Word)
         engine.send(protocol.Hold("g1", 1))
         engine.resume()
@@ -213,7 +213,7 @@ def test_a_driver_resumed_before_it_is_silent_continues_once_it_is() -> None:
 
 @pytest.mark.parametrize("silent", [True, False])
 def test_a_stop_ends_a_paused_driver(silent: bool) -> None:
-    with _timed() as engine:
+    with _start_timed_driver() as engine:
         engine.until(protocol.Word)
         if silent:
             engine.pause()
@@ -222,7 +222,7 @@ def test_a_stop_ends_a_paused_driver(silent: bool) -> None:
         engine.send(protocol.Stop("g1"))
         assert engine.until(protocol.Ended) == protocol.Ended("g1", protocol.OUTCOME_STOPPED)
         assert engine.spoken("yes", "g2").outcome == protocol.OUTCOME_COMPLETED
-        assert _texts(engine) == ["battery low, please come home", "yes"]
+        assert _driver_texts(engine) == ["battery low, please come home", "yes"]
 
 
 @limits()
@@ -231,7 +231,7 @@ def test_signs_of_life_stop_if_the_driver_never_finishes() -> None:
         "from talkcli.engine.child import runner\nrunner.DRIVER_LIMIT_S, runner.MAX_WORDS_PER_CHARACTER = 0.7, 0\n"
     )
     never = "Driver.stop = lambda self: None\nDriver.END = 1e9\n"
-    with Spawned(driver="slow", before=patience + SLOW_DRIVER + never) as engine:
+    with Engine(driver="slow", before=patience + SLOW_DRIVER + never) as engine:
         engine.until(protocol.VoiceList)
         engine.say("battery low")
         engine.until_word(2)
@@ -255,7 +255,7 @@ def _processor_seconds(pid: int) -> float:
 
 
 def test_the_library_from_the_wheel_is_used_if_the_system_has_none() -> None:
-    with Spawned(before=NO_LIBRARY) as engine:
+    with Engine(before=NO_LIBRARY) as engine:
         version = engine.until(protocol.Ready).version
         assert version is not None
         assert version.endswith("(espeakng-loader)")
@@ -318,7 +318,7 @@ espeak.load_library = without_english
 def test_a_failed_start_reports_what_to_install_or_change(
     options: dict[str, Any], parts: list[str], fields: dict[str, Any]
 ) -> None:
-    with Spawned(**options) as engine:
+    with Engine(**options) as engine:
         failed = engine.until(protocol.StartFailed)
         assert engine.event() is None
         assert engine.process.wait(5) == 0
@@ -328,7 +328,7 @@ def test_a_failed_start_reports_what_to_install_or_change(
 
 
 def test_espeak_means_talks_own_driver() -> None:
-    with Spawned(driver="espeak") as engine:
+    with Engine(driver="espeak") as engine:
         assert engine.until(protocol.Ready).driver == "espeak"
         assert engine.spoken("yes").outcome == protocol.OUTCOME_COMPLETED
 
@@ -354,7 +354,7 @@ class Recorder:
         self.players = PlayerChooser(protocol.Configure(0, None, player, None, None))
         self.hold_number = 0
         register_driver(_NAME, synthesizer or Scripted(), cast("GoalRunner", self))
-        self.engine: Any = Engine(_NAME)
+        self.engine: Any = pyttsx3.engine.Engine(_NAME)
         for topic in ("started-utterance", "started-word", "finished-utterance", "error"):
             self.engine.connect(topic, self._make_callback(topic))
         self.engine.startLoop(False)

@@ -41,14 +41,14 @@ def joe(tmp_path_factory: pytest.TempPathFactory) -> Model:
     """Return the model of a real voice, without noise."""
     folder = tmp_path_factory.mktemp("voices")
     link_without_noise(real_voice(), folder)
-    return _loaded(folder / real_voice().name)
+    return _load(folder / real_voice().name)
 
 
-def _loaded(path: Path, cache: ModelCache | None = None) -> Model:
+def _load(path: Path, cache: ModelCache | None = None) -> Model:
     return Model(str(path), read_description(str(path)), cache)
 
 
-def _whole(path: Path, speaker: int | None = None) -> Any:
+def _run_whole(path: Path, speaker: int | None = None) -> Any:
     """Return the samples that the undivided model makes."""
     import numpy as np
     import onnxruntime
@@ -66,7 +66,7 @@ def _whole(path: Path, speaker: int | None = None) -> Any:
     return session.run(None, feed)[0].reshape(-1)
 
 
-def _in_pieces(model: Model, speaker: int = 0, piece: int = 20) -> Any:
+def _run_in_pieces(model: Model, speaker: int = 0, piece: int = 20) -> Any:
     import numpy as np
 
     frames = model.encode(NUMBERS, speaker, 1.0, ModelRun())
@@ -82,15 +82,15 @@ def _in_pieces(model: Model, speaker: int = 0, piece: int = 20) -> Any:
 def test_pieces_have_the_samples_of_the_whole_model(tmp_path: Path, hop: int, speakers: int, speaker: int) -> None:
     content = tiny_voice.model(hop=hop, speakers=speakers)
     path = tiny_voice.put(tmp_path / "v", "a", content, tiny_voice.description(speakers=speakers))
-    whole = _whole(path, speaker if speakers > 1 else None)
-    pieces = _in_pieces(_loaded(path), speaker)
+    whole = _run_whole(path, speaker if speakers > 1 else None)
+    pieces = _run_in_pieces(_load(path), speaker)
     assert pieces.shape == whole.shape
     assert abs(pieces - whole).max() < 1e-6
 
 
 def test_pieces_of_a_real_voice_have_the_samples_of_the_whole_model(joe: Model) -> None:
-    whole = _whole(Path(joe.path))
-    pieces = _in_pieces(joe)
+    whole = _run_whole(Path(joe.path))
+    pieces = _run_in_pieces(joe)
     assert pieces.shape == whole.shape
     assert abs(whole).max() > 0.1
     assert abs(pieces - whole).max() < 1e-4
@@ -99,17 +99,17 @@ def test_pieces_of_a_real_voice_have_the_samples_of_the_whole_model(joe: Model) 
 
 def test_a_model_is_loaded_from_its_cached_halves(tmp_path: Path) -> None:
     path = tiny_voice.put(tmp_path / "v", "a")
-    first = _in_pieces(_loaded(path, ModelCache(str(tmp_path / "c"))))
+    first = _run_in_pieces(_load(path, ModelCache(str(tmp_path / "c"))))
     halves = sorted((tmp_path / "c").iterdir())
     assert len(halves) == 2
     modified_at = [path.stat().st_mtime_ns for path in halves]
-    assert (_in_pieces(_loaded(path, ModelCache(str(tmp_path / "c")))) == first).all()
+    assert (_run_in_pieces(_load(path, ModelCache(str(tmp_path / "c")))) == first).all()
     assert sorted((tmp_path / "c").iterdir()) == halves
     assert all(path.stat().st_mtime_ns > before for path, before in zip(halves, modified_at, strict=True))
 
 
 def test_halves_are_loaded_from_files_instead_of_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """onnxruntime would copy the bytes while no other thread can run, and keep the copy. The files are closed again."""
+    """onnxruntime would block all other threads while it copies the bytes, and keep the copy."""
     import onnxruntime
 
     session, models = onnxruntime.InferenceSession, []
@@ -121,8 +121,8 @@ def test_halves_are_loaded_from_files_instead_of_bytes(tmp_path: Path, monkeypat
     monkeypatch.setattr(onnxruntime, "InferenceSession", record)
     path = tiny_voice.put(tmp_path / "v", "a")
     before = os.listdir("/proc/self/fd")
-    _loaded(path)
-    _loaded(path, ModelCache(str(tmp_path / "c")))
+    _load(path)
+    _load(path, ModelCache(str(tmp_path / "c")))
     assert len(models) == 4
     assert all(isinstance(model, str) for model in models)
     assert os.listdir("/proc/self/fd") == before
@@ -131,26 +131,26 @@ def test_halves_are_loaded_from_files_instead_of_bytes(tmp_path: Path, monkeypat
 @pytest.mark.parametrize("cached", [True, False])
 def test_a_model_is_loaded_even_if_no_file_can_be_written(tmp_path: Path, cached: bool) -> None:
     path = tiny_voice.put(tmp_path / "v", "a")
-    expected = _in_pieces(_loaded(path))
+    expected = _run_in_pieces(_load(path))
     cache = ModelCache(str(tmp_path / "c"))
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
     try:
-        model = _loaded(path, cache if cached else None)
+        model = _load(path, cache if cached else None)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert (_in_pieces(model) == expected).all()
+    assert (_run_in_pieces(model) == expected).all()
     assert not [*(tmp_path / "c").iterdir()]
 
 
 @pytest.mark.parametrize("damage", [b"", b"\0" * 100, None])
 def test_damaged_cached_halves_are_made_again(tmp_path: Path, damage: bytes | None) -> None:
     path = tiny_voice.put(tmp_path / "v", "a")
-    first = _in_pieces(_loaded(path, ModelCache(str(tmp_path / "c"))))
+    first = _run_in_pieces(_load(path, ModelCache(str(tmp_path / "c"))))
     encoder = next((tmp_path / "c").glob("*.encoder.onnx"))
     whole = encoder.read_bytes()
     encoder.write_bytes(whole[: len(whole) // 2] if damage is None else damage)
-    assert (_in_pieces(_loaded(path, ModelCache(str(tmp_path / "c")))) == first).all()
+    assert (_run_in_pieces(_load(path, ModelCache(str(tmp_path / "c")))) == first).all()
     assert encoder.read_bytes() == whole
 
 
@@ -177,7 +177,7 @@ def test_the_error_for_a_bad_model_gives_the_reason_and_advice(
 ) -> None:
     path = tiny_voice.put(tmp_path / "v", "a", content, tiny_voice.description(**description))
     with pytest.raises(VoiceFileError, match=reason) as caught:
-        _loaded(path)
+        _load(path)
     assert str(path) in str(caught.value)
     assert "download" in str(caught.value) or "end another program" in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -187,7 +187,7 @@ def test_a_file_larger_than_any_model_is_not_read(tmp_path: Path) -> None:
     path = tiny_voice.put(tmp_path / "v", "a")
     os.truncate(path, 1 << 40)  # a sparse file, which needs no space on the disk
     with pytest.raises(VoiceFileError, match="larger than any Piper model; download the voice again"):
-        _loaded(path)
+        _load(path)
 
 
 #: A program that encodes very many phonemes with 20 MB of memory left, and then a few without a limit.

@@ -22,8 +22,8 @@ import pytest
 from talkcli import install
 from talkcli.engine import protocol
 from talkcli.install import NEURAL_PACKAGES
+from tests.engine.process import SOON, Engine, SharedEngine, before_call
 from tests.engine.programs import Player, without_silence
-from tests.engine.spawned import SOON, Shared, Spawned, first
 from tests.support import tiny_voice
 from tests.support.espeak import RATE
 from tests.support.processes import children
@@ -40,9 +40,9 @@ if TYPE_CHECKING:
 TEXT = "battery low, please come home"
 VOICE = "piper/tiny"
 #: Code for the start of the process that makes loading slow, as on a slow machine.
-SLOW_TO_LOAD = first("synthesizers.inference:Model._set_halves", "time.sleep(0.8)")
+SLOW_TO_LOAD = before_call("synthesizers.inference:Model._set_halves", "time.sleep(0.8)")
 #: Code that makes all samples of a sentence late, except the first piece.
-SLOW_TO_SPEAK = first("synthesizers.inference:Model.decode", "time.sleep(0.8 if arguments[2] else 0)")
+SLOW_TO_SPEAK = before_call("synthesizers.inference:Model.decode", "time.sleep(0.8 if arguments[2] else 0)")
 #: Code that hides packages.
 WITHOUT = """
 import sys, importlib.abc
@@ -73,7 +73,7 @@ def voices(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def place(voices: Path) -> Iterator[Path]:
+def folder(voices: Path) -> Iterator[Path]:
     """Return the directory of the tiny voice. Voices that the test adds to it are removed after the test."""
     yield voices
     for path in voices.iterdir():
@@ -82,26 +82,26 @@ def place(voices: Path) -> Iterator[Path]:
 
 
 @pytest.fixture(scope="module")
-def shared(voices: Path) -> Iterator[Shared]:
-    with contextlib.closing(Shared(lambda: _engine(voices, f"file:{voices.parent / 'out.wav'}"))) as shared:
+def shared(voices: Path) -> Iterator[SharedEngine]:
+    with contextlib.closing(SharedEngine(lambda: _engine(voices, f"file:{voices.parent / 'out.wav'}"))) as shared:
         yield shared
 
 
-def _engine(place: Path, player: str = "null", sink: Mapping[str, str] | None = None, **more: Any) -> Spawned:
-    folders = {"TALK_VOICES": str(place), "XDG_CACHE_HOME": str(place.parent / "cache")}
-    return Spawned(player, environment={**folders, **(sink or {})}, **more)
+def _engine(folder: Path, player: str = "null", sink: Mapping[str, str] | None = None, **more: Any) -> Engine:
+    folders = {"TALK_VOICES": str(folder), "XDG_CACHE_HOME": str(folder.parent / "cache")}
+    return Engine(player, environment={**folders, **(sink or {})}, **more)
 
 
-def _failed(ended: protocol.Ended, reason: str = "voice_failed") -> str:
+def _failure_message(ended: protocol.Ended, reason: str = "voice_failed") -> str:
     assert (ended.outcome, ended.reason) == (protocol.OUTCOME_FAILED, reason), ended
     return ended.message or ""
 
 
-def _loaded(engine: Spawned) -> list[protocol.VoiceLoaded]:
+def _loaded(engine: Engine) -> list[protocol.VoiceLoaded]:
     return [event for event in engine.events if isinstance(event, protocol.VoiceLoaded)]
 
 
-def _chosen_voices(engine: Spawned, goal: str) -> list[tuple[str, str | None]]:
+def _chosen_voices(engine: Engine, goal: str) -> list[tuple[str, str | None]]:
     """Return the voices chosen for a goal, with the reasons for a fallback."""
     return [
         (event.voice, event.fallback_reason)
@@ -110,12 +110,12 @@ def _chosen_voices(engine: Spawned, goal: str) -> list[tuple[str, str | None]]:
     ]
 
 
-def _words(engine: Spawned, text: str, goal: str = "g1") -> list[str]:
-    """Return the words of a text that were reported."""
+def _words(engine: Engine, text: str, goal: str = "g1") -> list[str]:
+    """Return the reported words of a text."""
     return [text[word.start : word.end] for word in engine.words(goal)]
 
 
-def test_neural_voices_and_espeak_take_turns_and_report_all_words(engine: Spawned) -> None:
+def test_neural_voices_and_espeak_take_turns_and_report_all_words(engine: Engine) -> None:
     for number, voice in enumerate([None, VOICE, "en-us", VOICE[:8], None]):
         ended = engine.spoken(TEXT, f"g{number}", voice=voice)
         assert ended.outcome == protocol.OUTCOME_COMPLETED, ended
@@ -123,10 +123,10 @@ def test_neural_voices_and_espeak_take_turns_and_report_all_words(engine: Spawne
 
 
 @pytest.mark.parametrize("rate", [8000, 48000])
-def test_a_file_gets_the_sample_rate_of_the_voice(place: Path, tmp_path: Path, rate: int) -> None:
-    tiny_voice.put(place, "other", config=tiny_voice.description(rate=rate))
+def test_a_file_gets_the_sample_rate_of_the_voice(folder: Path, tmp_path: Path, rate: int) -> None:
+    tiny_voice.put(folder, "other", config=tiny_voice.description(rate=rate))
     target = tmp_path / "out.wav"
-    with _engine(place, f"file:{target}") as engine:
+    with _engine(folder, f"file:{target}") as engine:
         ended = engine.spoken(TEXT, voice="piper/other")
     assert ended.outcome == protocol.OUTCOME_COMPLETED
     with wave.open(str(target)) as file:
@@ -134,44 +134,44 @@ def test_a_file_gets_the_sample_rate_of_the_voice(place: Path, tmp_path: Path, r
         assert file.getnframes() / rate == pytest.approx(ended.duration, abs=0.01)
 
 
-def test_a_speaker_is_given_after_the_name_of_the_voice(place: Path, engine: Spawned) -> None:
-    tiny_voice.put(place, "many", tiny_voice.model(speakers=3), tiny_voice.description(speakers=3))
+def test_a_speaker_is_given_after_the_name_of_the_voice(folder: Path, engine: Engine) -> None:
+    tiny_voice.put(folder, "many", tiny_voice.model(speakers=3), tiny_voice.description(speakers=3))
     for number, voice in enumerate(["piper/many", "piper/many#2", "piper/many#p1"]):
         assert engine.spoken("a", f"g{number}", voice=voice).outcome == protocol.OUTCOME_COMPLETED
-    message = _failed(engine.spoken("a", "g8", voice="piper/many#3"), "unknown_voice")
+    message = _failure_message(engine.spoken("a", "g8", voice="piper/many#3"), "unknown_voice")
     assert 'no speaker "3"; the voice has 3 speakers, 0 to 2' in message
-    message = _failed(engine.spoken("a", "g9", voice=f"{VOICE}#1"), "unknown_voice")
+    message = _failure_message(engine.spoken("a", "g9", voice=f"{VOICE}#1"), "unknown_voice")
     assert 'no speaker "1"; the voice has one speaker' in message
 
 
-def test_a_voice_installed_while_the_engine_runs_is_found(place: Path, engine: Spawned) -> None:
-    message = _failed(engine.spoken("a", "g1", voice="piper/late"), "unknown_voice")
+def test_a_voice_installed_while_the_engine_runs_is_found(folder: Path, engine: Engine) -> None:
+    message = _failure_message(engine.spoken("a", "g1", voice="piper/late"), "unknown_voice")
     assert 'unknown voice "piper/late"' in message
-    tiny_voice.put(place, "late")
+    tiny_voice.put(folder, "late")
     assert engine.spoken("a", "g2", voice="piper/late").outcome == protocol.OUTCOME_COMPLETED
 
 
-def test_the_name_of_a_voice_cannot_be_a_path(place: Path, engine: Spawned) -> None:
-    tiny_voice.put(place, ".tiny")
-    tiny_voice.put(place, "another")  # so that the empty name is ambiguous
+def test_the_name_of_a_voice_cannot_be_a_path(folder: Path, engine: Engine) -> None:
+    tiny_voice.put(folder, ".tiny")
+    tiny_voice.put(folder, "another")  # so that the empty name is ambiguous
     for name in ("../voices/tiny", "/tiny", ".tiny", "tiny/../tiny", ""):
-        _failed(engine.spoken("a", name, voice=f"piper/{name}"), "unknown_voice")
+        _failure_message(engine.spoken("a", name, voice=f"piper/{name}"), "unknown_voice")
 
 
-def test_the_json_of_a_voice_is_read_whenever_the_voice_is_loaded(place: Path, engine: Spawned) -> None:
-    tiny_voice.put(place, "changes")
+def test_the_json_of_a_voice_is_read_whenever_the_voice_is_loaded(folder: Path, engine: Engine) -> None:
+    tiny_voice.put(folder, "changes")
     assert engine.spoken("a", "g1", voice="piper/changes").outcome == protocol.OUTCOME_COMPLETED
-    (place / "changes.onnx.json").write_text(json.dumps({"audio": {}}))
+    (folder / "changes.onnx.json").write_text(json.dumps({"audio": {}}))
     assert engine.spoken("a", "g2", voice="piper/changes").outcome == protocol.OUTCOME_COMPLETED
     engine.send(protocol.DropVoice("piper/changes"))
-    assert "does not describe a Piper voice" in _failed(engine.spoken("a", "g3", voice="piper/changes"))
+    assert "does not describe a Piper voice" in _failure_message(engine.spoken("a", "g3", voice="piper/changes"))
 
 
-def test_unknown_phonemes_are_left_out_and_a_text_without_others_fails(place: Path, engine: Spawned) -> None:
+def test_unknown_phonemes_are_left_out_and_a_text_without_others_fails(folder: Path, engine: Engine) -> None:
     """Many silent sentences in a row check that the inference thread gets the next piece after each of them."""
     description = tiny_voice.description()
     description["phoneme_id_map"] = {"_": [0], "^": [1], "$": [2], "a": [3], "\u00e6": [4]}
-    tiny_voice.put(place, "few", config=description)
+    tiny_voice.put(folder, "few", config=description)
     text = "Cat! " + "See! " * 12 + "Cat!"
     assert engine.spoken(text, "g1", voice="piper/few").outcome == protocol.OUTCOME_COMPLETED
     # The voice lacks the first phoneme of "cat" and all of "see". All words of a partly heard sentence are reported.
@@ -180,19 +180,19 @@ def test_unknown_phonemes_are_left_out_and_a_text_without_others_fails(place: Pa
     times = [word.time for word in engine.words("g3")]
     assert len(times) == 4
     assert times == sorted(times)
-    message = _failed(engine.spoken("See! " * 12, "g2", voice="piper/few"))
+    message = _failure_message(engine.spoken("See! " * 12, "g2", voice="piper/few"))
     assert "few.onnx.json has no id for a phoneme of the text (" in message
 
 
 # -- without the extra
 
 
-def test_without_neural_speech_no_neural_module_is_imported(place: Path) -> None:
+def test_without_neural_speech_no_neural_module_is_imported(folder: Path) -> None:
     report = f"""
 import atexit, sys
 atexit.register(lambda: sys.stderr.write(repr([name for name in {NEURAL_MODULES!r} if name in sys.modules])))
 """
-    with _engine(place, before=report) as engine:
+    with _engine(folder, before=report) as engine:
         assert VOICE in {voice.id for voice in engine.until(protocol.VoiceList).voices}
         assert engine.spoken("yes").outcome == protocol.OUTCOME_COMPLETED
         engine.leave()
@@ -204,7 +204,7 @@ def test_the_error_without_the_extra_contains_the_install_command(tmp_path: Path
     tiny_voice.put(tmp_path / "voices", "tiny")
     before = WITHOUT.format(names=[package])
     with _engine(tmp_path / "voices", before=before) as engine:
-        message = _failed(engine.spoken(TEXT, voice=VOICE), "unknown_voice")
+        message = _failure_message(engine.spoken(TEXT, voice=VOICE), "unknown_voice")
         assert f"{VOICE} cannot be loaded" in message
         assert install.neural() in message
         assert engine.spoken("yes", "g2").outcome == protocol.OUTCOME_COMPLETED
@@ -236,38 +236,36 @@ WRONG: dict[str, tuple[bytes, dict[str, Any], str]] = {
 }
 
 
-def _put_wrong(place: Path, wrong: str) -> str:
+def _create_wrong_voice(folder: Path, wrong: str) -> str:
     """Create the faulty files, and return a part of the error message."""
     model, entries, message = WRONG[wrong]
-    path = tiny_voice.put(place, "wrong", model, tiny_voice.description(**entries))
+    path = tiny_voice.put(folder, "wrong", model, tiny_voice.description(**entries))
     if wrong == "no json":
-        (place / "wrong.onnx.json").unlink()
+        (folder / "wrong.onnx.json").unlink()
     elif wrong == "writable":
         path.chmod(0o666)
     return message
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-def test_a_fault_in_a_voices_files_fails_the_goal_with_a_readable_message(
-    place: Path, engine: Spawned, wrong: str
-) -> None:
+def test_faulty_voice_files_fail_a_goal_with_a_readable_message(folder: Path, engine: Engine, wrong: str) -> None:
     """The process survives, and uses a repaired file at once."""
     engine.send(protocol.DropVoice("piper/wrong"))
-    expected = _put_wrong(place, wrong)
-    message = _failed(engine.spoken(TEXT, "g1", voice="piper/wrong"))
+    expected = _create_wrong_voice(folder, wrong)
+    message = _failure_message(engine.spoken(TEXT, "g1", voice="piper/wrong"))
     assert expected in message
-    assert str(place / "wrong.onnx") in message
+    assert str(folder / "wrong.onnx") in message
     assert engine.spoken(TEXT, "g2").outcome == protocol.OUTCOME_COMPLETED
-    assert expected in _failed(engine.spoken(TEXT, "g3", voice="piper/wrong"))
-    tiny_voice.put(place, "wrong")
+    assert expected in _failure_message(engine.spoken(TEXT, "g3", voice="piper/wrong"))
+    tiny_voice.put(folder, "wrong")
     assert engine.spoken(TEXT, "g4", voice="piper/wrong").outcome == protocol.OUTCOME_COMPLETED
 
 
 @pytest.mark.parametrize(("wrong", "fallback"), [("silent", "gmw/en-US"), ("unknown language", "gmw/en")])
-def test_espeak_speaks_if_a_neural_voice_fails_at_once(place: Path, engine: Spawned, wrong: str, fallback: str) -> None:
+def test_espeak_speaks_if_a_neural_voice_fails_at_once(folder: Path, engine: Engine, wrong: str, fallback: str) -> None:
     """The voice is tried again for the next text, which may work."""
     engine.send(protocol.DropVoice("piper/wrong"))
-    _put_wrong(place, wrong)
+    _create_wrong_voice(folder, wrong)
     engine.send(protocol.LoadVoice("piper/wrong"))
     assert engine.until(protocol.VoiceLoaded).error is None
     for goal in ("g1", "g2"):
@@ -275,32 +273,32 @@ def test_espeak_speaks_if_a_neural_voice_fails_at_once(place: Path, engine: Spaw
         (first, no_reason), (second, reason) = _chosen_voices(engine, goal)
         assert (first, no_reason, second) == ("piper/wrong", None, fallback)
         assert reason is not None
-        assert str(place / "wrong.onnx") in reason
+        assert str(folder / "wrong.onnx") in reason
         assert _words(engine, TEXT, goal) == TEXT.replace(",", "").split()
 
 
-def test_speech_continues_if_there_is_no_memory_for_a_model(real: dict[str, str], tmp_path: Path) -> None:
-    """Espeak speaks at once, and the voice does once there is memory again. The cached halves are kept."""
+def test_speech_continues_if_there_is_no_memory_for_a_model(real_voice_env: dict[str, str], tmp_path: Path) -> None:
+    """Espeak can speak at once, and the voice as soon as there is memory again. The cached halves are kept."""
     target = f"file:{tmp_path / 'out.wav'}"
-    with Spawned(target, environment=real) as engine:
+    with Engine(target, environment=real_voice_env) as engine:
         assert engine.spoken("a", "g0", voice=REAL_VOICE).outcome == protocol.OUTCOME_COMPLETED
-        cached = _cached_halves(real)
-    with Spawned(target, environment=real) as engine:
+        cached = _cached_halves(real_voice_env)
+    with Engine(target, environment=real_voice_env) as engine:
         with _little_memory(engine, 280 << 20):
-            message = _failed(engine.spoken(TEXT, "g1", voice=REAL_VOICE))
+            message = _failure_message(engine.spoken(TEXT, "g1", voice=REAL_VOICE))
             assert "there is not enough memory; end another program" in message
             assert "en_US-joe-medium.onnx" in message
             assert engine.spoken("yes", "g2").outcome == protocol.OUTCOME_COMPLETED
         assert engine.spoken("a", "g3", voice=REAL_VOICE).outcome == protocol.OUTCOME_COMPLETED
-    assert cached == _cached_halves(real)
+    assert cached == _cached_halves(real_voice_env)
 
 
-def _cached_halves(real: dict[str, str]) -> list[tuple[str, int]]:
-    return sorted((path.name, path.stat().st_ino) for path in Path(real["XDG_CACHE_HOME"], "talk").iterdir())
+def _cached_halves(real_voice_env: dict[str, str]) -> list[tuple[str, int]]:
+    return sorted((path.name, path.stat().st_ino) for path in Path(real_voice_env["XDG_CACHE_HOME"], "talk").iterdir())
 
 
 @contextlib.contextmanager
-def _little_memory(engine: Spawned, limit: int) -> Iterator[None]:
+def _little_memory(engine: Engine, limit: int) -> Iterator[None]:
     """Limit the address space of the process to this number of bytes."""
     before = resource.prlimit(engine.process.pid, resource.RLIMIT_AS, (limit, resource.RLIM_INFINITY))
     try:
@@ -328,7 +326,7 @@ def test_a_sentence_ends_once_with_little_memory_and_espeak_speaks_next(tmp_path
         if ended.outcome == protocol.OUTCOME_COMPLETED:
             assert megabytes > 300, "the voice spoke with too little memory"
         else:
-            message = _failed(ended)
+            message = _failure_message(ended)
             assert "there is not enough memory; end another program" in message or install.neural() in message
         assert engine.spoken(TEXT, "g2").outcome == protocol.OUTCOME_COMPLETED
 
@@ -337,8 +335,8 @@ def test_a_sentence_ends_once_with_little_memory_and_espeak_speaks_next(tmp_path
 
 
 @limits()
-def test_a_sentence_can_be_paused_and_stopped_while_its_voice_loads(place: Path) -> None:
-    with _engine(place, before=SLOW_TO_LOAD, alive_every=SOON) as engine:
+def test_a_sentence_can_be_paused_and_stopped_while_its_voice_loads(folder: Path) -> None:
+    with _engine(folder, before=SLOW_TO_LOAD, alive_every=SOON) as engine:
         engine.say(TEXT, voice=VOICE)
         engine.until(protocol.Alive)
         assert_within(engine.pause(), protocol.STOP_LIMIT_S, "a pause while the voice is loaded")
@@ -358,11 +356,11 @@ def test_a_sentence_can_be_paused_and_stopped_while_its_voice_loads(place: Path)
 
 @limits()
 @pytest.mark.parametrize("method", ["clauses", "word_positions", "ends_with_abbreviation"])
-def test_a_sentence_can_be_paused_and_stopped_during_phonemization(place: Path, method: str) -> None:
+def test_a_sentence_can_be_paused_and_stopped_during_phonemization(folder: Path, method: str) -> None:
     """libespeak-ng needs 0.1 s without interruption for a clause of 800 bytes in a script that the voice can't read."""
     text = "Go. Dr. Who. " + "电池电量低正在返回充电站" * 800
     report = f"arguments[0] in seen or seen.append(arguments[0]) or print({method!r}, file=sys.stderr, flush=True)"
-    with _engine(place, before=first(f"synthesizers.espeak:EspeakPhonemizer.{method}", report)) as engine:
+    with _engine(folder, before=before_call(f"synthesizers.espeak:EspeakPhonemizer.{method}", report)) as engine:
         assert engine.spoken("Go. Go", "g0", voice=VOICE).outcome == protocol.OUTCOME_COMPLETED
         assert engine.errors_line() == method
         for number in range(1, 5):
@@ -376,9 +374,9 @@ def test_a_sentence_can_be_paused_and_stopped_during_phonemization(place: Path, 
 
 
 @limits()
-def test_a_real_voice_can_be_paused_and_stopped_and_exits_cleanly(real: dict[str, str]) -> None:
+def test_a_real_voice_can_be_paused_and_stopped_and_exits_cleanly(real_voice_env: dict[str, str]) -> None:
     """If a thread still ran an inference at the exit, the process would abort, and the log would report a crash."""
-    with Spawned(environment=real) as engine:
+    with Engine(environment=real_voice_env) as engine:
         assert engine.spoken("a", "g0", voice=REAL_VOICE).outcome == protocol.OUTCOME_COMPLETED
         engine.say("word " * 500, "g1", voice=REAL_VOICE)
         engine.until(protocol.Word)
@@ -392,10 +390,10 @@ def test_a_real_voice_can_be_paused_and_stopped_and_exits_cleanly(real: dict[str
         assert engine.process.wait(20) == 0, engine.errors()
 
 
-def test_a_program_gets_every_sample_once_and_silence_during_a_pause(place: Path, player: Player) -> None:
+def test_a_program_gets_every_sample_once_and_silence_during_a_pause(folder: Path, player: Player) -> None:
 
     text = "one two three four five six"
-    with _engine(place, player.plays()) as engine:
+    with _engine(folder, player.plays()) as engine:
         ended = engine.spoken(text, "g0", voice=VOICE)
         sentence = player.heard.read_bytes()
         assert ended.duration is not None
@@ -421,10 +419,10 @@ def test_a_program_gets_every_sample_once_and_silence_during_a_pause(place: Path
 
 
 @pytest.mark.parametrize("player", ["pulse", "aplay"])
-def test_gaps_are_counted_and_words_are_reported_when_heard(place: Path, sink: Sink, player: str) -> None:
+def test_gaps_are_counted_and_words_are_reported_when_heard(folder: Path, sink: Sink, player: str) -> None:
     """A machine that is too slow leaves nothing out, and reports the words in order, however late."""
     text = "one two three four five six seven"
-    with sink.record() as recording, _engine(place, player, sink.env, before=SLOW_TO_SPEAK) as engine:
+    with sink.record() as recording, _engine(folder, player, sink.env, before=SLOW_TO_SPEAK) as engine:
         engine.say(text, voice=VOICE)
         reported = []
         while not isinstance(event := engine.event(), protocol.Ended):
@@ -449,10 +447,10 @@ def test_gaps_are_counted_and_words_are_reported_when_heard(place: Path, sink: S
 
 
 @pytest.mark.parametrize("player", [pytest.param("null", marks=pytest.mark.slow), "pulse"])
-def test_a_process_with_a_fifth_of_a_processor_speaks_with_gaps(real: dict[str, str], sink: Sink, player: str) -> None:
-    """The process and its built-in player are stopped for 0.16 s again and again, as by a CPU limit of the kernel."""
+def test_a_process_that_is_slowed_speaks_with_gaps(real_voice_env: dict[str, str], sink: Sink, player: str) -> None:
+    """The process and its built-in player are stopped for 0.16 s again and again, as under a CPU limit."""
     text = "Please step aside, the robot turns."
-    with Spawned(player, environment={**real, **sink.env}) as engine:
+    with Engine(player, environment={**real_voice_env, **sink.env}) as engine:
         assert engine.spoken("a", "g0", voice=REAL_VOICE).gaps == 0
         with _slowed(engine, running=0.04, stopped=0.16):
             started_at = time.monotonic()
@@ -467,7 +465,7 @@ def test_a_process_with_a_fifth_of_a_processor_speaks_with_gaps(real: dict[str, 
 
 
 @contextlib.contextmanager
-def _slowed(engine: Spawned, running: float, stopped: float) -> Iterator[None]:
+def _slowed(engine: Engine, running: float, stopped: float) -> Iterator[None]:
     """Stop and continue the process in turn, for these numbers of seconds."""
     done = threading.Event()
 
@@ -486,11 +484,11 @@ def _slowed(engine: Spawned, running: float, stopped: float) -> Iterator[None]:
         thread.join()
 
 
-def test_the_word_times_of_a_real_voice_match_its_sound(real: dict[str, str], tmp_path: Path) -> None:
+def test_the_word_times_of_a_real_voice_match_its_sound(real_voice_env: dict[str, str], tmp_path: Path) -> None:
     """The first word of each sentence must begin with the sound after the pause."""
     text = "Battery low. Please come home. I am stuck."
     target = tmp_path / "out.wav"
-    with Spawned(f"file:{target}", environment=real) as engine:
+    with Engine(f"file:{target}", environment=real_voice_env) as engine:
         assert engine.spoken(text, rate=200, voice=REAL_VOICE).outcome == protocol.OUTCOME_COMPLETED
         starts = [word.time for word in engine.words() if text[word.start - 2 : word.start] in {"", ". "}]
     with wave.open(str(target)) as file:
@@ -506,11 +504,11 @@ def test_the_word_times_of_a_real_voice_match_its_sound(real: dict[str, str], tm
 # -- loading during speech
 
 
-def test_voices_are_loaded_one_at_a_time_during_speech_and_reported_once(place: Path) -> None:
+def test_voices_are_loaded_one_at_a_time_during_speech_and_reported_once(folder: Path) -> None:
     path = "synthesizers.inference:Model._set_halves"
-    slow = first(path, "seen and sys.exit('two at once') or seen.append(1) or time.sleep(0.3) or seen.clear()")
-    tiny_voice.put(place, "second")
-    with _engine(place, before=slow) as engine:
+    slow = before_call(path, "seen and sys.exit('two at once') or seen.append(1) or time.sleep(0.3) or seen.clear()")
+    tiny_voice.put(folder, "second")
+    with _engine(folder, before=slow) as engine:
         for voice in ("piper/second", VOICE, "piper/second", "piper/nobody", VOICE):
             engine.send(protocol.LoadVoice(voice))
         assert engine.spoken(TEXT, voice="en", rate=150).outcome == protocol.OUTCOME_COMPLETED
@@ -523,11 +521,11 @@ def test_voices_are_loaded_one_at_a_time_during_speech_and_reported_once(place: 
     ]
 
 
-def test_espeak_speaks_the_language_of_a_voice_that_is_not_loaded(place: Path) -> None:
-    tiny_voice.put(place, "deutsch", config=tiny_voice.description(voice="de"))
-    tiny_voice.put(place, "second")
-    _put_wrong(place, "silent")
-    with _engine(place) as engine:
+def test_espeak_speaks_the_language_of_a_voice_that_is_not_loaded(folder: Path) -> None:
+    tiny_voice.put(folder, "deutsch", config=tiny_voice.description(voice="de"))
+    tiny_voice.put(folder, "second")
+    _create_wrong_voice(folder, "silent")
+    with _engine(folder) as engine:
         for voice, fallback in [(VOICE, "gmw/en-US"), ("piper/deutsch", "gmw/de"), ("piper/wrong", "gmw/en-US")]:
             assert engine.spoken(TEXT, voice, voice=voice, voice_only=False).outcome == protocol.OUTCOME_COMPLETED
             assert _chosen_voices(engine, voice) == [(fallback, f"{voice} is not loaded")]
@@ -548,7 +546,7 @@ def test_espeak_speaks_the_language_of_a_voice_that_is_not_loaded(place: Path) -
             assert _chosen_voices(engine, goal) == [expected]
 
 
-def test_the_memory_of_voices_is_reported_and_freed_when_one_is_dropped(place: Path) -> None:
+def test_the_memory_of_voices_is_reported_and_freed_when_one_is_dropped(folder: Path) -> None:
     heavy = """
 from talkcli.engine.child.synthesizers import inference
 init, kept = inference.Model.__init__, []
@@ -560,8 +558,8 @@ def heavier(self, *rest):
         kept.append(bytearray(1000))  # in between, so that the C library doesn't return the memory by itself
 inference.Model.__init__ = heavier
 """
-    tiny_voice.put(place, "second")
-    with _engine(place, before=heavy) as engine:
+    tiny_voice.put(folder, "second")
+    with _engine(folder, before=heavy) as engine:
         for voice in (VOICE, "piper/second"):
             engine.send(protocol.LoadVoice(voice))
             assert engine.until(protocol.VoiceMemory).voice == voice
@@ -575,11 +573,11 @@ inference.Model.__init__ = heavier
     assert sizes[1] - sizes[2] > 35e6  # the complete pages of each piece
 
 
-def test_a_load_that_hangs_is_abandoned_and_the_next_voice_is_loaded(place: Path) -> None:
-    hangs = first("synthesizers.inference:Model.__init__", '"other" in arguments[1] and threading.Event().wait()')
+def test_a_load_that_hangs_is_abandoned_and_the_next_voice_is_loaded(folder: Path) -> None:
+    hangs = before_call("synthesizers.inference:Model.__init__", '"other" in arguments[1] and threading.Event().wait()')
     hangs = f"from talkcli.engine import protocol\nprotocol.LOAD_LIMIT_S = 0.6\n{hangs}"
-    tiny_voice.put(place, "other")
-    with _engine(place, before=hangs) as engine:
+    tiny_voice.put(folder, "other")
+    with _engine(folder, before=hangs) as engine:
         engine.send(protocol.LoadVoice("piper/other"))
         engine.send(protocol.LoadVoice(VOICE))
         hung, loaded = engine.until(protocol.VoiceLoaded), engine.until(protocol.VoiceLoaded)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import protocol
-from tests.engine.spawned import Spawned
+from tests.engine.process import Engine
 from tests.faults.test_text_bad import ENDLESS, LONGEST_WORDS, MARKUP, RIGHT_TO_LEFT
 from tests.support.real_voice import REAL_VOICE
 from tests.tools.fuzz_texts import made
@@ -63,12 +63,12 @@ class Tally:
         return f"{ended}; {len(self.deaths)} deaths"
 
 
-def _spoken(texts: Iterable[str], folder: Path, env: dict[str, str]) -> Tally:
+def _speak_all(texts: Iterable[str], folder: Path, env: dict[str, str]) -> Tally:
     """Speak texts to a file, which is faster than real time. An engine process that dies is replaced."""
     tally = Tally()
     remaining = deque(texts)
     while remaining:
-        with Spawned(f"file:{folder / 'out.wav'}", environment=env) as engine:
+        with Engine(f"file:{folder / 'out.wav'}", environment=env) as engine:
             while remaining:
                 text = remaining.popleft()
                 try:
@@ -101,7 +101,7 @@ def _count(tally: Tally, text: str, ended: protocol.Ended, words: list[protocol.
         tally.faults.append(f"{seconds} s: {shown}")
 
 
-def _assert_well(tally: Tally, texts: int) -> None:
+def _assert_no_faults(tally: Tally, texts: int) -> None:
     print(tally, *tally.deaths, *tally.faults, sep="\n")
     assert not tally.faults, tally.faults
     assert not tally.deaths, tally.deaths
@@ -109,23 +109,23 @@ def _assert_well(tally: Tally, texts: int) -> None:
     assert tally.outcomes[protocol.OUTCOME_COMPLETED] > texts // 2
 
 
-def test_each_odd_text_ends_once(tmp_path: Path, real: dict[str, str]) -> None:
+def test_each_odd_text_ends_once(tmp_path: Path, real_voice_env: dict[str, str]) -> None:
     source = random.Random(SEED)
     texts = [text[:25] for text in (*ODD[::5], *(made(source) for _ in range(FEW)))]
-    _assert_well(_spoken(texts, tmp_path, real), len(texts))
+    _assert_no_faults(_speak_all(texts, tmp_path, real_voice_env), len(texts))
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(600 + MANY)
 @pytest.mark.parametrize("part", range(PARTS))
-def test_each_of_many_odd_texts_ends_once(tmp_path: Path, real: dict[str, str], part: int) -> None:
+def test_each_of_many_odd_texts_ends_once(tmp_path: Path, real_voice_env: dict[str, str], part: int) -> None:
     source = random.Random(SEED)
     texts = [*ODD, *(made(source)[:LONGEST] for _ in range(MANY - len(ODD)))][part::PARTS]
-    _assert_well(_spoken(texts, tmp_path, real), len(texts))
+    _assert_no_faults(_speak_all(texts, tmp_path, real_voice_env), len(texts))
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("name", _CHOSEN)
-def test_a_text_of_thousands_of_characters_ends_once(tmp_path: Path, real: dict[str, str], name: str) -> None:
-    _assert_well(_spoken([LONG[name]], tmp_path, real), 1)
+def test_a_text_of_thousands_of_characters_ends_once(tmp_path: Path, real_voice_env: dict[str, str], name: str) -> None:
+    _assert_no_faults(_speak_all([LONG[name]], tmp_path, real_voice_env), 1)

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import protocol
+from tests.engine.process import FAST, SOON, Engine
 from tests.engine.programs import NEVER_READS, Player, sound, without_silence
-from tests.engine.spawned import FAST, SOON, Spawned
 from tests.support.processes import children
 from tests.support.reference import RATE, render
 from tests.support.timing import assert_within, limits
@@ -38,13 +38,13 @@ time.sleep(max(0, started_at + taken / 44100 - time.monotonic()))
 """
 
 
-def _say_to_word(engine: Spawned, number: int = 1) -> None:
+def _say_until_word(engine: Engine, number: int = 1) -> None:
     engine.until(protocol.VoiceList)
     engine.say(TEXT)
     engine.until_word(number)
 
 
-def _resume_to_the_end(engine: Spawned) -> protocol.Ended:
+def _resume_to_the_end(engine: Engine) -> protocol.Ended:
     engine.resume()
     ended = engine.until(protocol.Ended)
     assert ended.outcome == protocol.OUTCOME_COMPLETED
@@ -56,7 +56,7 @@ def _resume_to_the_end(engine: Spawned) -> protocol.Ended:
 def test_a_pause_delays_words_while_signs_of_life_continue(player: Player, program: bool) -> None:
     alive_every = 0.2
     command = player.plays() if program else "null"
-    with Spawned(command, limits={"RELEASE_DELAY_S": 10.0 if program else 0.3}, alive_every=alive_every) as engine:
+    with Engine(command, limits={"RELEASE_DELAY_S": 10.0 if program else 0.3}, alive_every=alive_every) as engine:
         engine.until(protocol.VoiceList)
         engine.say(TEXT)
         late, before, paused = [], 0, 0.0
@@ -82,7 +82,7 @@ def test_a_pause_delays_words_while_signs_of_life_continue(player: Player, progr
 
 
 def test_a_second_pause_and_a_needless_resume_are_harmless(player: Player) -> None:
-    with Spawned(player.plays(), alive_every=SOON) as engine:
+    with Engine(player.plays(), alive_every=SOON) as engine:
         engine.until(protocol.VoiceList)
         engine.resume()
         engine.say(TEXT)
@@ -101,8 +101,8 @@ def test_a_second_pause_and_a_needless_resume_are_harmless(player: Player) -> No
 
 
 def test_a_resume_before_silence_loses_no_sample(player: Player) -> None:
-    with Spawned(player.plays()) as engine:
-        _say_to_word(engine)
+    with Engine(player.plays()) as engine:
+        _say_until_word(engine)
         for _ in range(3):
             engine.until_word()
             engine.send(protocol.Hold("g1", 1), protocol.Continue("g1"))
@@ -113,8 +113,8 @@ def test_a_resume_before_silence_loses_no_sample(player: Player) -> None:
 @pytest.mark.parametrize("dies", [False, True])
 def test_a_paused_player_gets_silence_and_is_replaced_if_it_dies(player: Player, dies: bool) -> None:
     alive_every = 0.3
-    with Spawned(player.plays(), alive_every=alive_every) as engine:
-        _say_to_word(engine)
+    with Engine(player.plays(), alive_every=alive_every) as engine:
+        _say_until_word(engine)
         engine.pause()
         if dies:
             (pid,) = children(engine.process.pid)
@@ -126,11 +126,9 @@ def test_a_paused_player_gets_silence_and_is_replaced_if_it_dies(player: Player,
     assert without_silence(heard, sentence) == sentence
 
 
-def test_a_sentence_fails_if_its_paused_player_cannot_be_replaced(
-    player: Player,
-) -> None:
-    with Spawned(player.plays(), alive_every=SOON) as engine:
-        _say_to_word(engine)
+def test_a_sentence_fails_if_its_paused_player_cannot_be_replaced(player: Player) -> None:
+    with Engine(player.plays(), alive_every=SOON) as engine:
+        _say_until_word(engine)
         engine.pause()
         player.command("raise SystemExit('audio open error: Connection refused')")
         (pid,) = children(engine.process.pid)
@@ -144,8 +142,8 @@ def test_a_sentence_fails_if_its_paused_player_cannot_be_replaced(
 
 
 def test_a_pause_kills_a_player_with_a_large_buffer_and_resumes_in_place(player: Player) -> None:
-    with limits(), Spawned(player.command(DEEP)) as engine:
-        _say_to_word(engine)
+    with limits(), Engine(player.command(DEEP)) as engine:
+        _say_until_word(engine)
         words = [engine.until(protocol.Word) for _ in range(3)]
         assert_within(engine.pause(), 0.1, "the pause")
         assert children(engine.process.pid) == []
@@ -161,8 +159,8 @@ def test_a_pause_kills_a_player_with_a_large_buffer_and_resumes_in_place(player:
 
 
 def test_a_pause_kills_a_frozen_player(player: Player) -> None:
-    with limits(), Spawned(player.plays()) as engine:
-        _say_to_word(engine, 2)
+    with limits(), Engine(player.plays()) as engine:
+        _say_until_word(engine, 2)
         (pid,) = children(engine.process.pid)
         os.kill(pid, signal.SIGSTOP)
         assert_within(engine.pause(), 0.2, "the pause")
@@ -172,7 +170,7 @@ def test_a_pause_kills_a_frozen_player(player: Player) -> None:
 
 @pytest.mark.parametrize("together", [True, False], ids=["with the sentence", "before the player took anything"])
 def test_a_pause_before_the_first_sound_delays_the_whole_sentence(player: Player, together: bool) -> None:
-    with Spawned(player.command(NEVER_READS), alive_every=SOON) as engine:
+    with Engine(player.command(NEVER_READS), alive_every=SOON) as engine:
         engine.until(protocol.VoiceList)
         if together:
             engine.send(protocol.Speak("g1", TEXT, FAST, 1.0, None, 50), protocol.Hold("g1", 1))
@@ -189,8 +187,8 @@ def test_a_pause_before_the_first_sound_delays_the_whole_sentence(player: Player
 
 @pytest.mark.parametrize("release", [0.2, 10.0])
 def test_a_stop_ends_a_paused_sentence_at_once(player: Player, release: float) -> None:
-    with limits(), Spawned(player.plays(), limits={"RELEASE_DELAY_S": release}, alive_every=SOON) as engine:
-        _say_to_word(engine, 3)
+    with limits(), Engine(player.plays(), limits={"RELEASE_DELAY_S": release}, alive_every=SOON) as engine:
+        _say_until_word(engine, 3)
         engine.pause()
         while release < 1 and children(engine.process.pid):
             assert isinstance(engine.event(), protocol.Alive)
@@ -205,7 +203,7 @@ def test_a_stop_ends_a_paused_sentence_at_once(player: Player, release: float) -
 
 def test_a_pause_after_the_last_sample_lets_the_sentence_end(player: Player) -> None:
     mark = player.heard.with_name("drained")
-    with Spawned(player.plays(after=f"open({str(mark)!r}, 'w'); time.sleep(0.3)")) as engine:
+    with Engine(player.plays(after=f"open({str(mark)!r}, 'w'); time.sleep(0.3)")) as engine:
         engine.say("yes")
         while not mark.exists():
             time.sleep(0.002)  # no event reports the end of the samples
@@ -218,7 +216,7 @@ def test_a_pause_after_the_last_sample_lets_the_sentence_end(player: Player) -> 
 def test_a_pause_writes_no_silence_to_a_file(tmp_path: Path, paused: str) -> None:
     text, rate = TEXT if paused == "before" else " ".join([TEXT] * 60), 200  # the rate at which synthesis is fastest
     target = tmp_path / "paused.wav"
-    with Spawned(f"file:{target}", alive_every=SOON) as engine:
+    with Engine(f"file:{target}", alive_every=SOON) as engine:
         engine.until(protocol.VoiceList)
         pause = protocol.Hold("g1", 1)
         engine.send(protocol.Speak("g1", text, rate, 1.0, None, 50), *([pause] if paused == "before" else []))
@@ -240,7 +238,7 @@ def test_a_pause_writes_no_silence_to_a_file(tmp_path: Path, paused: str) -> Non
 AT_ONCE = {"RELEASE_DELAY_S": 0.0}
 
 
-def _pause_after_two_words(engine: Spawned) -> list[protocol.OutputChanged]:
+def _pause_after_two_words(engine: Engine) -> list[protocol.OutputChanged]:
     """Start a sentence, pause it after its second word, and return the reported outputs."""
     engine.say(TEXT)
     engine.until_word(2)
@@ -248,14 +246,14 @@ def _pause_after_two_words(engine: Spawned) -> list[protocol.OutputChanged]:
     return _reported_outputs(engine)
 
 
-def _reported_outputs(engine: Spawned) -> list[protocol.OutputChanged]:
+def _reported_outputs(engine: Engine) -> list[protocol.OutputChanged]:
     return [event for event in engine.events if isinstance(event, protocol.OutputChanged)]
 
 
 def test_a_partly_muted_sentence_remains_reported_as_muted(sink: Sink) -> None:
     sink.pactl("set-sink-mute", "null", "1")
     try:
-        with Spawned(None, environment=sink.env, limits=AT_ONCE) as engine:
+        with Engine(None, environment=sink.env, limits=AT_ONCE) as engine:
             (reported,) = _pause_after_two_words(engine)
             assert reported.output == {"player": "pulse", "device": "null", "volume": 1.0, "muted": True}
             sink.pactl("set-sink-mute", "null", "0")
@@ -272,7 +270,7 @@ def test_no_output_is_reported_if_a_program_continues_the_sentence(sink: Sink, t
     path = tmp_path / "s"
     path.symlink_to(sink.socket)
     environment = {**sink.env, "PULSE_SERVER": f"unix:{path}", **({} if alsa else {"ALSA_CONFIG_PATH": os.devnull})}
-    with Spawned(None, environment=environment, limits=AT_ONCE) as engine:
+    with Engine(None, environment=environment, limits=AT_ONCE) as engine:
         (reported,) = _pause_after_two_words(engine)
         assert reported.output is not None
         assert reported.output["player"] == "pulse"

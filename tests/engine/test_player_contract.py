@@ -24,7 +24,7 @@ from talkcli.engine.child.players.program import ProgramPlayer
 from talkcli.engine.child.players.pulse import PulsePlayer
 from talkcli.engine.players import PIECE_S, SAMPLE_BYTES, PlayerCommand
 from talkcli.polling import NEVER
-from tests.engine.spawned import PATIENCE
+from tests.engine.process import PATIENCE
 from tests.support.processes import children
 from tests.support.surroundings import short_directory
 from tests.support.timing import assert_within, limits
@@ -52,17 +52,17 @@ MOST_WAITS = 4 * len(SOUND) // _PIECE
 
 @dataclass(frozen=True)
 class Case:
-    """Functions that open a player in various conditions. They get a folder for its files."""
+    """Functions that open a player in various states. They get a folder for the player's files."""
 
     #: opens a player that plays
     opens: Callable[[Path], Player]
-    #: returns the samples played so far; None if nobody can know
+    #: returns the samples played so far; None if they can't be read
     played: Callable[[Path], bytes] | None = None
     #: opens a player that loses its device in mid-sentence; None if that can't happen
     lost: Callable[[Path], Player] | None = None
     #: opens a player whose device doesn't exist; None if that can't happen
     refused: Callable[[Path], Player] | None = None
-    #: opens a player that accepts no more samples after a while; None if it always does
+    #: opens a player that accepts no more samples after a while; None if that can't happen
     stuck: Callable[[Path], Player] | None = None
 
 
@@ -109,18 +109,13 @@ def _after_the_header(path: Path) -> bytes:
 
 def _pulse(folder: Path) -> PulsePlayer:
     """Return a player at a sink that plays into a pipe. The samples are recorded on a tape."""
-    os.mkfifo(folder / "pipe")
-    options = [
-        f"file={folder / 'pipe'}",
-        f"rate={RATE}",
-        "channels=1",
-        "format=s16le",
-        "use_system_clock_for_timing=yes",
-    ]
+    pipe = folder / "pipe"
+    os.mkfifo(pipe)
+    options = [f"file={pipe}", f"rate={RATE}", "channels=1", "format=s16le", "use_system_clock_for_timing=yes"]
     module = _sinks[0].pactl("load-module", "module-pipe-sink", "sink_name=pipe", *options).strip()
     _opened.callback(_sinks[0].pactl, "unload-module", module)
     with open(folder / "tape", "wb") as tape:
-        reader = subprocess.Popen(["cat", folder / "pipe"], stdout=tape)
+        reader = subprocess.Popen(["cat", pipe], stdout=tape)
     _opened.callback(reader.wait)
     _opened.callback(reader.kill)
     return PulsePlayer(RATE, "pipe")
@@ -242,7 +237,7 @@ def _quick(call: str) -> Iterator[None]:
 
 
 def _await(player: Player) -> None:
-    """Wait as the playback does, only for the player's interests."""
+    """Wait only for the player's interests, as the playback does."""
     poll = select.poll()
     for descriptor, events in player.interests():
         poll.register(descriptor, events)

@@ -18,8 +18,8 @@ from talkcli.engine import protocol
 from talkcli.engine.child import playback
 from talkcli.engine.child.players.program import PlayerProcess, ProgramPlayer
 from talkcli.engine.players import PlayerCommand
+from tests.engine.process import FAST, SOON, Engine
 from tests.engine.programs import NEVER_READS, PLAYS, SWALLOWS, Player
-from tests.engine.spawned import FAST, SOON, Spawned
 from tests.support import usage
 from tests.support.processes import children
 from tests.support.reference import render, without_leading_zeros
@@ -49,7 +49,7 @@ def _plays(during: str = "pass", after: str = "") -> str:
 
 
 def _failure(command: str, **limits: float) -> tuple[str | None, str | None]:
-    with Spawned(command, limits=limits) as engine:
+    with Engine(command, limits=limits) as engine:
         ended = engine.spoken("battery low, please come home")  # long enough for a player to end too early
         assert ended.outcome == protocol.OUTCOME_FAILED
         assert children(engine.process.pid) == []
@@ -64,7 +64,7 @@ def _assert_all_accepted(player: Player, ended: protocol.Ended) -> None:
 
 @pytest.mark.parametrize("during", ["pass", 'print("underrun!!! (at least 0.1 ms long)", file=sys.stderr)'])
 def test_a_player_gets_every_sample_and_an_underrun_is_not_an_error(player: Player, during: str) -> None:
-    with Spawned(player.plays(during)) as engine:
+    with Engine(player.plays(during)) as engine:
         _assert_all_accepted(player, engine.spoken(TEXT))
         assert len(engine.words()) == 2
 
@@ -117,10 +117,10 @@ if os.path.getsize("{tries}") <= {times}:
 
 def test_a_busy_device_is_tried_again_for_a_limited_time(player: Player, tmp_path: Path) -> None:
     tries = tmp_path / "tries"
-    with Spawned(player.command(BUSY.format(tries=tries, times=4) + _plays())) as engine:
+    with Engine(player.command(BUSY.format(tries=tries, times=4) + _plays())) as engine:
         _assert_all_accepted(player, engine.spoken(TEXT))
     command = player.command(BUSY.format(tries=tries, times=1000))
-    with limits(), Spawned(command, alive_every=SOON) as engine:
+    with limits(), Engine(command, alive_every=SOON) as engine:
         before, started_at = tries.stat().st_size, time.monotonic()
         ended = engine.spoken(TEXT, "g1")
         assert (ended.reason, ended.message) == ("audio_device", "aplay: audio open error: Device or resource busy")
@@ -134,7 +134,7 @@ def test_a_busy_device_is_tried_again_for_a_limited_time(player: Player, tmp_pat
 
 
 def test_a_stop_leaves_no_player_process(player: Player) -> None:
-    with limits(), Spawned(player.plays(), alive_every=SOON) as engine:
+    with limits(), Engine(player.plays(), alive_every=SOON) as engine:
         for goal in ("plays", "plays again", "never reads"):
             if goal == "never reads":
                 player.command(NEVER_READS)
@@ -150,7 +150,7 @@ def test_a_stop_leaves_no_player_process(player: Player) -> None:
 
 def test_no_word_is_reported_while_the_player_stalls(player: Player) -> None:
     stall = 0.5
-    with Spawned(player.plays(f"if 13000 < taken < 13900: time.sleep({stall}); started_at += {stall}")) as engine:
+    with Engine(player.plays(f"if 13000 < taken < 13900: time.sleep({stall}); started_at += {stall}")) as engine:
         started_at = time.monotonic()
         engine.say("one two three four five six seven")
         delays = {}
@@ -178,7 +178,7 @@ def test_the_error_names_a_program_that_cannot_be_run(tmp_path: Path) -> None:
 
 def test_rate_and_device_reach_the_command(player: Player) -> None:
     code = f"import sys\nopen({str(player.heard)!r}, 'w').write(' '.join(sys.argv[1:]))"
-    with Spawned(f"{player.program(code)} {{rate}} --dev={{device}}", device="hw:1") as engine:
+    with Engine(f"{player.program(code)} {{rate}} --dev={{device}}", device="hw:1") as engine:
         engine.spoken(TEXT)
     assert player.heard.read_text() == "22050 --dev=hw:1"
 
@@ -188,8 +188,8 @@ def test_rate_and_device_reach_the_command(player: Player) -> None:
 HOST_IS_DOWN = "import sys\nsys.exit('aplay: main:831: audio open error: Host is down')"
 
 
-def _on_path(folder: Path) -> Spawned:
-    return Spawned(None, environment={"PATH": str(folder)})
+def _on_path(folder: Path) -> Engine:
+    return Engine(None, environment={"PATH": str(folder)})
 
 
 def test_if_a_player_fails_the_next_one_gets_the_whole_sentence(player: Player, tmp_path: Path) -> None:
@@ -235,7 +235,7 @@ def test_without_any_player_the_error_lists_packages_to_install(tmp_path: Path) 
 
 
 def test_failed_players_leave_no_descriptor_open(player: Player) -> None:
-    with Spawned(player.command("raise SystemExit(1)")) as engine:
+    with Engine(player.command("raise SystemExit(1)")) as engine:
         engine.until(protocol.VoiceList)  # after the voice files have been read
         engine.spoken(TEXT, "g0")
         before = os.listdir(f"/proc/{engine.process.pid}/fd")
@@ -425,7 +425,7 @@ def test_a_program_gets_one_piece_at_a_time() -> None:
 
 def test_a_player_is_spawned_without_a_fork_before_the_text_is_read(player: Player) -> None:
     """A fork would take 3 ms. The player takes 5 to 15 ms to start, while the text is synthesized in 2 ms."""
-    with Spawned(player.plays(), before=_WATCHED) as engine:
+    with Engine(player.plays(), before=_WATCHED) as engine:
         assert engine.spoken("battery low").outcome == protocol.OUTCOME_COMPLETED
         engine.leave()
         assert engine.errors().split() == ["os.posix_spawn", "text"]
@@ -434,7 +434,7 @@ def test_a_player_is_spawned_without_a_fork_before_the_text_is_read(player: Play
 def test_a_text_without_sound_is_not_reported_as_a_player_error(player: Player) -> None:
     broken = player.program("")
     broken.write_text("#!/no/such/interpreter")
-    with Spawned(str(broken)) as engine:
+    with Engine(str(broken)) as engine:
         silent, spoken = engine.spoken("...", "g1"), engine.spoken("battery low", "g2")
         assert (silent.reason, spoken.reason) == ("nothing_to_say", "no_player")
         assert children(engine.process.pid) == []
@@ -448,7 +448,7 @@ espeak.load_library = lambda: (*load_library()[:2], 16_000)
 """
     rates = player.heard.with_name("rates")
     program = player.plays(f"open({str(rates)!r}, 'a').write(sys.argv[2] + ' ')")
-    with Spawned(f"{program} {{rate}}", before=before) as engine:
+    with Engine(f"{program} {{rate}}", before=before) as engine:
         assert engine.spoken("battery low").outcome == protocol.OUTCOME_COMPLETED
     assert set(rates.read_text().split()) == {"22050"}
     assert player.heard.read_bytes() == without_leading_zeros(render(["battery low"], rate=FAST)[0]).tobytes()
@@ -460,7 +460,7 @@ def test_processes_that_a_player_started_die_with_a_killed_engine(tmp_path: Path
     os.mkfifo(started)
     script.write_text(f"#!/bin/sh\nsleep 100 &\nhead -c 1 > /dev/null\necho > {started}\nwait\n")
     script.chmod(0o755)
-    with Spawned(str(script)) as engine:
+    with Engine(str(script)) as engine:
         engine.say("one two three")
         started.read_text()
         os.kill(engine.process.pid, signal.SIGKILL)

@@ -16,7 +16,7 @@ from talkcli.engine.child.players.builtin import WavPlayer, WavStreamPlayer
 from talkcli.engine.child.players.chooser import PlayerChooser
 from talkcli.engine.child.players.program import MAX_ERROR_LINE_BYTES, ErrorOutput, ProgramPlayer
 from talkcli.engine.players import PACKAGES, PLAYERS, PlayerMissing, player_commands
-from tests.engine.spawned import Spawned
+from tests.engine.process import Engine
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -317,7 +317,7 @@ def test_an_unsuitable_path_is_refused_and_leaves_no_descriptor_open(tmp_path: P
 
 def test_a_goal_reports_the_file_error_and_a_stop_leaves_a_valid_file(tmp_path: Path) -> None:
     path = tmp_path / "missing" / "x.wav"
-    with Spawned(f"file:{path}") as engine:
+    with Engine(f"file:{path}") as engine:
         ended = engine.spoken("yes", "g1")
         assert (ended.reason, ended.message) == ("audio_device", f"{path} cannot be written: No such file or directory")
         path.parent.mkdir()

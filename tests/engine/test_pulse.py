@@ -152,9 +152,7 @@ def before_each_call(monkeypatch: pytest.MonkeyPatch, action: Callable[[], None]
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_no_wakeup_is_lost_whenever_the_server_answers(
-    make_rig: MakeRig, monkeypatch: pytest.MonkeyPatch, seed: int
-) -> None:
+def test_no_wakeup_is_lost_whatever_the_timing(make_rig: MakeRig, monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
     chance = random.Random(seed)
     with make_rig() as rig:
         rig.relay.piece = chance.choice([7, 19, 64, 65536])

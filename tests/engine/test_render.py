@@ -67,7 +67,7 @@ def _no_leaks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
     assert not (tmp_path / "x.wav").exists() or (tmp_path / "x.wav").stat().st_size
 
 
-def failed(text: str, path: Path | str, **settings: object) -> TalkError:
+def render_error(text: str, path: Path | str, **settings: object) -> TalkError:
     with pytest.raises(TalkError) as caught:
         render(text, str(path), **settings)  # type: ignore[arg-type]
     return caught.value
@@ -169,7 +169,7 @@ def test_an_unwritable_path_is_an_error_before_an_engine_starts(
         patch.chdir(tmp_path)
         listening.bind("socket")
     (tmp_path / "loop").symlink_to("loop")
-    error = failed("yes", name.format(tmp_path))
+    error = render_error("yes", name.format(tmp_path))
     assert isinstance(error, CannotWrite)
     assert message.format(tmp_path) in str(error)
     assert (error.code, error.exit_code) == ("cannot_write", 1)
@@ -185,12 +185,14 @@ render(sys.argv[1], sys.argv[2])
 """
 
 
-def renders(path: str, stdout: IO[bytes] | int, text: str = "yes", env: dict[str, str] | None = None) -> Popen[bytes]:
+def start_rendering(
+    path: str, stdout: IO[bytes] | int, text: str = "yes", env: dict[str, str] | None = None
+) -> Popen[bytes]:
     command = [sys.executable, "-c", RENDERS.format(path=sys.path), text, path]
     return Popen(command, stdout=stdout, stderr=subprocess.PIPE, env={**os.environ, **(env or {})})
 
 
-def streamed(data: bytes) -> bytes:
+def stream_samples(data: bytes) -> bytes:
     """Return the samples of a WAV stream, whose header has no valid lengths."""
     assert (data[:8], data[8:16]) == (b"RIFF\xff\xff\xff\xff", b"WAVEfmt ")
     assert struct.unpack("<HHIIHH", data[20:36]) == (1, 1, RATE, 2 * RATE, 2, 16)
@@ -202,18 +204,18 @@ def streamed(data: bytes) -> bytes:
 def test_standard_output_gets_the_sound_as_a_stream(tmp_path: Path, path: str) -> None:
     (expected,) = reference(["yes"])
     if path == "-":
-        with renders(path, subprocess.PIPE) as process:
+        with start_rendering(path, subprocess.PIPE) as process:
             out, err = process.communicate(timeout=60)
-        assert (process.returncode, streamed(out), err) == (0, expected.tobytes(), b"started\n")
+        assert (process.returncode, stream_samples(out), err) == (0, expected.tobytes(), b"started\n")
     with (tmp_path / "out").open("wb") as file:
         file.write(b"before")
         file.flush()
-        with renders(path, file) as process:
+        with start_rendering(path, file) as process:
             assert process.communicate(timeout=60)[1] == b"started\n"
         os.lseek(file.fileno(), 0, os.SEEK_END)
         file.write(b"after")
     data = (tmp_path / "out").read_bytes()
-    assert (data[:6], streamed(data[6:-5]), data[-5:]) == (b"before", expected.tobytes(), b"after")
+    assert (data[:6], stream_samples(data[6:-5]), data[-5:]) == (b"before", expected.tobytes(), b"after")
 
 
 def run_in_engines(monkeypatch: pytest.MonkeyPatch, before: str) -> None:
@@ -238,7 +240,7 @@ def test_a_slow_reader_of_a_pipe_is_waited_for(tmp_path: Path, monkeypatch: pyte
     with (tmp_path / "pipe").open("rb") as pipe:
         head = pipe.read(44)
         time.sleep(0.4)
-        assert streamed(head + pipe.read()) == expected.tobytes()
+        assert stream_samples(head + pipe.read()) == expected.tobytes()
     thread.join(10)
     assert durations == [pytest.approx(len(expected) / RATE, abs=1e-5)]
 
@@ -266,13 +268,13 @@ def test_an_error_is_raised_if_the_reader_goes_away(tmp_path: Path) -> None:
     path = tmp_path / "pipe"
     os.mkfifo(path)
     failures: list[TalkError] = []
-    thread = threading.Thread(target=lambda: failures.append(failed(LONG_TEXT, path)))
+    thread = threading.Thread(target=lambda: failures.append(render_error(LONG_TEXT, path)))
     thread.start()
     with path.open("rb") as pipe:
         pipe.read(44)
     thread.join(10)
     assert [(str(error), error.exit_code) for error in failures] == [(f"{path} cannot be written: Broken pipe", 1)]
-    with renders("-", subprocess.PIPE) as process:
+    with start_rendering("-", subprocess.PIPE) as process:
         assert process.stdout
         process.stdout.close()
         assert process.stderr
@@ -281,11 +283,11 @@ def test_an_error_is_raised_if_the_reader_goes_away(tmp_path: Path) -> None:
 
 def test_a_device_can_be_written_but_not_a_terminal() -> None:
     assert render("yes", "/dev/null") > 0.3
-    full = failed("yes", "/dev/full")
+    full = render_error("yes", "/dev/full")
     assert (str(full), full.exit_code) == ("/dev/full cannot be written: No space left on device", 1)
     controller, terminal = os.openpty()
     for name in ("-", os.ttyname(terminal)):
-        with renders(name, terminal) as process:
+        with start_rendering(name, terminal) as process:
             _, err = process.communicate(timeout=60)
         assert b"UsageError: " in err
         assert b"is a terminal" in err
@@ -298,7 +300,7 @@ def test_a_device_can_be_written_but_not_a_terminal() -> None:
 
 def test_a_file_that_is_also_standard_output_is_not_replaced(tmp_path: Path) -> None:
     path = tmp_path / "out"
-    with path.open("wb") as out, renders(str(path), out) as process:
+    with path.open("wb") as out, start_rendering(str(path), out) as process:
         _, err = process.communicate(timeout=60)
     assert process.returncode == 1
     assert f"{path} is not a file that can be replaced" in err.decode()
@@ -325,7 +327,7 @@ def test_a_protected_path_is_an_error_and_keeps_its_file(monkeypatch: pytest.Mon
         os.chmod(path, 0o444 if protected == "file" else 0o666)
         os.chmod(directory, 0o777 if protected == "file" else 0o555)
         monkeypatch.setitem(globals(), "RENDERS", RENDERS.replace("print(", f"{AS_NOBODY}print("))
-        with renders(path, subprocess.PIPE) as process:
+        with start_rendering(path, subprocess.PIPE) as process:
             _, err = process.communicate(timeout=60)
         os.chmod(directory, 0o755)
         assert f"CannotWrite: {path} cannot be written: " in err.decode()
@@ -341,7 +343,7 @@ def test_a_failed_write_is_an_error_and_keeps_the_old_file(tmp_path: Path) -> No
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (65536, before[1]))
     try:
-        error = failed(TEXT * 3, path)
+        error = render_error(TEXT * 3, path)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert isinstance(error, CannotWrite)
@@ -366,7 +368,7 @@ def test_a_text_that_fails_keeps_the_old_file(
 ) -> None:
     path = tmp_path / "x.wav"
     path.write_bytes(BEFORE)
-    error = failed(text, path, **settings)
+    error = render_error(text, path, **settings)
     assert isinstance(error, RenderFailed)
     assert (error.code, error.exit_code) == (code, exit_code)
     assert message in str(error)
@@ -374,7 +376,7 @@ def test_a_text_that_fails_keeps_the_old_file(
 
 
 def test_a_driver_that_plays_by_itself_is_refused(tmp_path: Path) -> None:
-    error = failed("yes", tmp_path / "x.wav", driver="dummy")
+    error = render_error("yes", tmp_path / "x.wav", driver="dummy")
     assert isinstance(error, UsageError)
     assert str(error).startswith('the driver "dummy" cannot write files')
 
@@ -414,14 +416,14 @@ def test_an_engine_that_fails_or_hangs_is_reported_and_killed(
     run_in_engines(monkeypatch, before)
     monkeypatch.setattr(process, "START_LIMIT_S", 0.3 if reason == "engine_failed" else 10)
     monkeypatch.setattr(process, "HANG_LIMIT_S", 0.5)
-    error = failed("yes", tmp_path / "x.wav", voice="en-us")
+    error = render_error("yes", tmp_path / "x.wav", voice="en-us")
     assert error.code == reason
     assert message in str(error)
 
 
 def test_an_interpreter_that_cannot_be_started_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("talkcli.engine.parent.process.engine_command", lambda: ["/nonesuch"])
-    error = failed("yes", tmp_path / "x.wav")
+    error = render_error("yes", tmp_path / "x.wav")
     assert (error.code, "/nonesuch" in str(error)) == ("engine_failed", True)
 
 
@@ -439,7 +441,7 @@ def test_a_kill_at_any_moment_leaves_no_partial_file(tmp_path: Path, sent: signa
     for _ in range(times):
         path.write_bytes(BEFORE)
         mark = uuid.uuid4().hex
-        with renders(str(path), subprocess.DEVNULL, text, {MARK: mark}) as program:
+        with start_rendering(str(path), subprocess.DEVNULL, text, {MARK: mark}) as program:
             assert program.stderr is not None
             program.stderr.readline()
             time.sleep(moments.uniform(0, duration))  # until a random moment
@@ -495,9 +497,7 @@ def test_a_stream_of_events_does_not_extend_the_deadline() -> None:
 
 
 @pytest.mark.usefixtures("scripted_process")
-def test_doctor_reports_a_hang_during_and_after_the_start_alike(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_doctor_reports_hangs_during_and_after_the_start_alike(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(process, "HANG_LIMIT_S", 0.4)
     hung = SentenceResult(State.ABORTED, "engine_hung", "the engine process did not respond for 0.4 s")
     assert sentence.speak_by_engine("hang", EngineOptions(), 1.0, 20.0) == hung

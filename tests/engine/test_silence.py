@@ -13,8 +13,8 @@ from talkcli.engine import protocol
 from talkcli.engine.child.playback import MAX_QUIET_LEVEL, SentenceSamples
 from talkcli.engine.child.players import chooser
 from talkcli.engine.child.players.chooser import MAX_CUT_S, MAX_HANDOVER_S, MAX_HANDOVERS, HandoverTimes
+from tests.engine.process import FAST, SOON, Engine
 from tests.engine.programs import SWALLOWS, Player
-from tests.engine.spawned import FAST, SOON, Spawned
 from tests.support.processes import children
 from tests.support.reference import RATE, render, without_leading_zeros
 from tests.support.timing import assert_within, limits
@@ -57,7 +57,7 @@ def test_a_lead_in_delays_the_words_and_is_not_part_of_the_duration(
 ) -> None:
     texts = [TEXT, SECOND, SECOND][: len(own)]
     sentences = [without_leading_zeros(samples).astype("<i2").tobytes() for samples in render(texts, rate=FAST)]
-    with Spawned(player.plays(), lead_in=server_lead_in, before=_idle_after(idle_after)) as engine:
+    with Engine(player.plays(), lead_in=server_lead_in, before=_idle_after(idle_after)) as engine:
         for number, (text, lead_in, sentence) in enumerate(zip(texts, own, sentences, strict=True)):
             started_at, lead = time.monotonic(), expected[number] / 1000
             engine.say(text, f"g{number}", lead_in=lead_in)
@@ -85,7 +85,7 @@ def test_a_lead_in_is_repeated_after_a_pause_if_the_device_was_idle(
 ) -> None:
     """The device counts as idle from the moment at which the paused sentence released it."""
     before, constants = _idle_after(idle_after), {"RELEASE_DELAY_S": 0.3}
-    with Spawned(player.plays(), lead_in=LEAD_IN, limits=constants, before=before, alive_every=SOON) as engine:
+    with Engine(player.plays(), lead_in=LEAD_IN, limits=constants, before=before, alive_every=SOON) as engine:
         engine.until(protocol.VoiceList)
         engine.say(TEXT, lead_in=own)
         engine.until_word()
@@ -117,7 +117,7 @@ time.sleep(max(0, (started_at or 0) + read / 44100 - time.monotonic()))
 
 
 def test_a_sentence_paused_early_in_its_lead_in_repeats_all_of_it(player: Player) -> None:
-    with Spawned(player.command(SLOW_OUTPUT)) as engine:
+    with Engine(player.command(SLOW_OUTPUT)) as engine:
         engine.say(TEXT, lead_in=800)
         engine.until(protocol.Started)
         _await_size(player, 0.35)  # until most of the buffer is full, but little was heard
@@ -129,7 +129,7 @@ def test_a_sentence_paused_early_in_its_lead_in_repeats_all_of_it(player: Player
 
 
 def test_a_pause_within_the_lead_in_loses_no_sample(player: Player) -> None:
-    with Spawned(player.plays(), lead_in=LEAD_IN) as engine:
+    with Engine(player.plays(), lead_in=LEAD_IN) as engine:
         engine.say(TEXT)
         engine.until(protocol.Started)
         _await_size(player, 0)
@@ -151,7 +151,7 @@ def _await_size(player: Player, seconds: float) -> None:
 
 @limits()
 def test_a_player_that_ends_within_the_lead_in_fails_the_sentence(player: Player) -> None:
-    with Spawned(player.command(SWALLOWS), lead_in=2000) as engine:
+    with Engine(player.command(SWALLOWS), lead_in=2000) as engine:
         started_at = time.monotonic()
         ended = engine.spoken("yes")
         assert_within(time.monotonic() - started_at, 1.5, "the end of the sentence")
@@ -261,7 +261,7 @@ def test_trailing_silence_reaches_back_to_the_last_loud_sample() -> None:
 def test_a_sentence_before_a_waiting_goal_is_shortened_only_by_silence(player: Player) -> None:
     """The next sentence is played completely. Each `Ended` has the duration that was played."""
     first, second, third = _all_played()
-    with Spawned(player.plays(), before=_CUTS_SOME) as engine:
+    with Engine(player.plays(), before=_CUTS_SOME) as engine:
         ended = []
         for number, text in enumerate(TEXTS):
             ended.append(engine.spoken(text, f"g{number}", next_waits=number < 2))
@@ -276,7 +276,7 @@ def test_a_sentence_before_a_waiting_goal_is_shortened_only_by_silence(player: P
 def test_silence_is_cut_if_a_goal_waits_at_the_end_of_the_sentence(player: Player, waits: bool) -> None:
     """A goal counts if it is sent during the sentence, but not if it is canceled."""
     first = _all_played()[0]
-    with Spawned(player.plays(), before=_CUTS_SOME) as engine:
+    with Engine(player.plays(), before=_CUTS_SOME) as engine:
         engine.say(TEXTS[0], "g0", next_waits=not waits)
         engine.until(protocol.Word)
         engine.send(protocol.NextGoal("another", not waits))
@@ -287,14 +287,14 @@ def test_silence_is_cut_if_a_goal_waits_at_the_end_of_the_sentence(player: Playe
 
 def test_no_audible_sample_is_cut(player: Player) -> None:
     all_is_loud = f"{_CUTS_SOME}\nfrom talkcli.engine.child import playback\nplayback.MAX_QUIET_LEVEL = -1"
-    with Spawned(player.plays(), before=all_is_loud) as engine:
+    with Engine(player.plays(), before=all_is_loud) as engine:
         assert engine.spoken(TEXTS[0], next_waits=True).outcome == protocol.OUTCOME_COMPLETED
     assert player.heard.read_bytes() == _all_played()[0]
 
 
 def test_a_file_gets_every_sample_and_no_lead_in(tmp_path: Path) -> None:
     target = tmp_path / "speech.wav"
-    with Spawned(f"file:{target}", before=_CUTS_SOME, lead_in=LEAD_IN) as engine:
+    with Engine(f"file:{target}", before=_CUTS_SOME, lead_in=LEAD_IN) as engine:
         for number, text in enumerate(TEXTS):
             ended = engine.spoken(text, f"g{number}", next_waits=True, lead_in=LEAD_IN)
             assert ended.outcome == protocol.OUTCOME_COMPLETED
@@ -306,14 +306,14 @@ def test_a_player_that_ends_early_is_noticed_although_silence_is_cut(player: Pla
     rate = 200  # the rate at which the silence at the end is long enough
     length = len(_all_played(rate)[0]) / 2 / RATE
     limits = {"EARLY_END_LIMIT_S": length - 0.2}
-    with Spawned(player.command(SWALLOWS), before=_CUTS.format(0.2), limits=limits) as engine:
+    with Engine(player.command(SWALLOWS), before=_CUTS.format(0.2), limits=limits) as engine:
         ended = engine.spoken(TEXTS[0], next_waits=True, rate=rate)
         assert (ended.outcome, ended.reason) == (protocol.OUTCOME_FAILED, "audio_lost")
 
 
 def test_a_pause_does_not_cut_more_silence(player: Player) -> None:
     first = _all_played()[0]
-    with Spawned(player.plays(), before=_CUTS_SOME) as engine:
+    with Engine(player.plays(), before=_CUTS_SOME) as engine:
         engine.say(TEXTS[0], "g0", next_waits=True)
         engine.until(protocol.Word)
         engine.pause("g0")
@@ -328,7 +328,7 @@ def test_a_pause_does_not_cut_more_silence(player: Player) -> None:
 def test_the_engine_measures_how_long_a_handover_takes(player: Player) -> None:
     """The first two sentences are played completely, and the time between them is measured."""
     sentences = _all_played()
-    with Spawned(player.plays()) as engine:
+    with Engine(player.plays()) as engine:
         for number, text in enumerate(TEXTS):
             assert engine.spoken(text, f"g{number}", next_waits=True).outcome == protocol.OUTCOME_COMPLETED
     cut = len(b"".join(sentences)) - player.heard.stat().st_size

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import protocol
+from tests.engine.process import FAST, Engine, SharedEngine
 from tests.engine.programs import NEVER_READS
-from tests.engine.spawned import FAST, Shared, Spawned
 from tests.support.processes import children
 from tests.support.timing import assert_within, limits
 
@@ -44,15 +44,15 @@ atexit.register(lambda: sys.stderr.write(" ".join(sys.modules)))
 
 
 @pytest.fixture(scope="module")
-def shared() -> Iterator[Shared]:
-    with contextlib.closing(Shared(lambda: Spawned(alive_every=ALIVE_EVERY))) as shared:
+def shared() -> Iterator[SharedEngine]:
+    with contextlib.closing(SharedEngine(lambda: Engine(alive_every=ALIVE_EVERY))) as shared:
         yield shared
 
 
 @pytest.fixture
-def writing(tmp_path: Path) -> Iterator[Spawned]:
+def file_engine(tmp_path: Path) -> Iterator[Engine]:
     """Return a process that writes to a file, which is faster than real time."""
-    with Spawned(f"file:{tmp_path}/x.wav") as engine:
+    with Engine(f"file:{tmp_path}/x.wav") as engine:
         yield engine
 
 
@@ -65,7 +65,7 @@ def _duration(ended: protocol.Ended) -> float:
 
 
 def test_a_process_becomes_ready_and_lists_its_voices() -> None:
-    with Spawned() as engine:
+    with Engine() as engine:
         ready = engine.until(protocol.Ready)
         assert (ready.driver, ready.player) == ("espeak", "null")
         assert ready.version is not None
@@ -78,7 +78,7 @@ def test_a_process_becomes_ready_and_lists_its_voices() -> None:
 
 
 def test_voices_that_the_server_knows_are_not_listed() -> None:
-    with Spawned(list_voices=False) as engine:
+    with Engine(list_voices=False) as engine:
         assert engine.spoken("yes").outcome == protocol.OUTCOME_COMPLETED
         engine.leave()
         assert engine.event() is None
@@ -88,7 +88,7 @@ def test_voices_that_the_server_knows_are_not_listed() -> None:
 @pytest.mark.parametrize("text", ["battery low. Please come home", "..."])
 def test_a_process_imports_nothing_that_it_does_not_need(player: Player, text: str) -> None:
     """Imports delay the next sentence after a crash."""
-    with Spawned(player.plays(), before=_REPORT_MODULES) as engine:
+    with Engine(player.plays(), before=_REPORT_MODULES) as engine:
         engine.spoken(text)
         engine.leave()
         imported = set(engine.errors().split())
@@ -101,7 +101,7 @@ def test_a_process_gets_no_more_than_half_of_the_machines_memory(less: int) -> N
     """The limit is at least 1 GiB. A lower limit that is already set remains."""
     limit = max(1 << 30, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2)
     before = f"import resource\nresource.setrlimit(resource.RLIMIT_DATA, ({limit - less}, -1))" if less else ""
-    with Spawned(before=before) as engine:
+    with Engine(before=before) as engine:
         soft, _ = resource.prlimit(engine.process.pid, resource.RLIMIT_DATA)
     assert soft == limit - less
 
@@ -110,7 +110,7 @@ def test_a_process_gets_no_more_than_half_of_the_machines_memory(less: int) -> N
 
 
 @limits()
-def test_words_are_reported_in_order_when_they_are_heard(engine: Spawned) -> None:
+def test_words_are_reported_in_order_when_they_are_heard(engine: Engine) -> None:
     text = "this one é 日本 😀 battery low, please."
     started_at, delays = time.monotonic(), []
     engine.say(text)
@@ -126,7 +126,7 @@ def test_words_are_reported_in_order_when_they_are_heard(engine: Spawned) -> Non
     assert min(delays) >= 0
 
 
-def test_signs_of_life_are_sent_while_a_goal_is_spoken(engine: Spawned) -> None:
+def test_signs_of_life_are_sent_while_a_goal_is_spoken(engine: Engine) -> None:
     last = time.monotonic()
     engine.say("a.\n\n\n\na", rate=120)  # the second word comes after some `Alive` messages
     alive = 0
@@ -138,29 +138,29 @@ def test_signs_of_life_are_sent_while_a_goal_is_spoken(engine: Spawned) -> None:
     assert alive > 1
 
 
-def test_a_text_without_words_fails_with_nothing_to_say(engine: Spawned) -> None:
+def test_a_text_without_words_fails_with_nothing_to_say(engine: Engine) -> None:
     for text in ("", "  \n", "...", "\x01\x02", "«»"):
         ended = engine.spoken(text, f"goal {text!a}")
         assert (ended.outcome, ended.reason) == (protocol.OUTCOME_FAILED, "nothing_to_say")
     assert engine.spoken("yes", "g2").outcome == protocol.OUTCOME_COMPLETED
 
 
-def test_control_characters_are_not_commands_and_keep_the_offsets(writing: Spawned) -> None:
-    plain = _duration(writing.spoken("a    b one two", "g1"))
-    assert writing.spoken("a \x01\x00\x1bb one two", "g2").outcome == protocol.OUTCOME_COMPLETED
-    assert writing.words("g1")[-1].start == writing.words("g2")[-1].start == len("a    b one ")
+def test_control_characters_are_not_commands_and_keep_the_offsets(file_engine: Engine) -> None:
+    plain = _duration(file_engine.spoken("a    b one two", "g1"))
+    assert file_engine.spoken("a \x01\x00\x1bb one two", "g2").outcome == protocol.OUTCOME_COMPLETED
+    assert file_engine.words("g1")[-1].start == file_engine.words("g2")[-1].start == len("a    b one ")
     # libespeak-ng would read 0x01 and "80S" as the command to speak at 80 words per minute
-    assert _duration(writing.spoken("a \x0180Sb one two", "g3")) < plain * 2.5
+    assert _duration(file_engine.spoken("a \x0180Sb one two", "g3")) < plain * 2.5
 
 
-def test_settings_apply_only_to_their_goal(writing: Spawned) -> None:
+def test_settings_apply_only_to_their_goal(file_engine: Engine) -> None:
     text = "the battery is low, please come home"
-    fast = _duration(writing.spoken(text, "g1", rate=400))
-    assert _duration(writing.spoken(text, "g2", rate=100, voice="en-us")) > 2 * fast
-    assert abs(_duration(writing.spoken(text, "g3", rate=400)) - fast) < 0.15
+    fast = _duration(file_engine.spoken(text, "g1", rate=400))
+    assert _duration(file_engine.spoken(text, "g2", rate=100, voice="en-us")) > 2 * fast
+    assert abs(_duration(file_engine.spoken(text, "g3", rate=400)) - fast) < 0.15
 
 
-def test_an_unknown_voice_fails_one_goal_and_suggests_similar_names(engine: Spawned) -> None:
+def test_an_unknown_voice_fails_one_goal_and_suggests_similar_names(engine: Engine) -> None:
     ended = engine.spoken("yes", voice="en-uss")
     assert (ended.outcome, ended.reason) == (protocol.OUTCOME_FAILED, "unknown_voice")
     assert ended.message is not None
@@ -172,7 +172,7 @@ def test_an_unknown_voice_fails_one_goal_and_suggests_similar_names(engine: Spaw
 # -- stops
 
 
-def test_a_stop_for_another_goal_is_ignored(engine: Spawned) -> None:
+def test_a_stop_for_another_goal_is_ignored(engine: Engine) -> None:
     engine.send(protocol.Stop("g0"))
     engine.say("yes")
     engine.until(protocol.Started)
@@ -180,7 +180,7 @@ def test_a_stop_for_another_goal_is_ignored(engine: Spawned) -> None:
     assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
 
 
-def test_a_stop_sent_together_with_the_sentence_is_obeyed(engine: Spawned) -> None:
+def test_a_stop_sent_together_with_the_sentence_is_obeyed(engine: Engine) -> None:
     engine.send(protocol.Speak("g1", "one two three four five", 200, 1.0, None, 50), protocol.Stop("g1"))
     assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_STOPPED
     assert engine.words() == []
@@ -189,12 +189,12 @@ def test_a_stop_sent_together_with_the_sentence_is_obeyed(engine: Spawned) -> No
 # -- idle, and exit
 
 
-def test_a_crash_leaves_no_core_dump(engine: Spawned) -> None:
+def test_a_crash_leaves_no_core_dump(engine: Engine) -> None:
     soft, _ = resource.prlimit(engine.process.pid, resource.RLIMIT_CORE)
     assert soft in (0, 1)  # bytes; 0 if the hard limit is 0
 
 
-def test_an_idle_process_does_not_wake_up(engine: Spawned) -> None:
+def test_an_idle_process_does_not_wake_up(engine: Engine) -> None:
     assert engine.spoken("a").outcome == protocol.OUTCOME_COMPLETED
     time.sleep(0.05)  # until the process is idle, which no event reports
     before = _context_switches(engine.process.pid)
@@ -208,7 +208,7 @@ def _context_switches(pid: int) -> str:
 
 
 def test_a_process_without_its_server_exits_at_once() -> None:
-    with Spawned(server=1) as engine:
+    with Engine(server=1) as engine:
         assert engine.event() is None
         assert engine.process.wait(5) == 0
 
@@ -216,7 +216,7 @@ def test_a_process_without_its_server_exits_at_once() -> None:
 def test_the_process_and_its_player_end_with_the_server(player: Player, tmp_path: Path) -> None:
     started = tmp_path / "started"
     os.mkfifo(started)
-    with Spawned(player.command(f"open({str(started)!r}, 'w').close()\n{NEVER_READS}")) as engine:
+    with Engine(player.command(f"open({str(started)!r}, 'w').close()\n{NEVER_READS}")) as engine:
         engine.say("one two three")
         started.read_text()
         assert len(children(engine.process.pid)) == 1
@@ -226,7 +226,7 @@ def test_the_process_and_its_player_end_with_the_server(player: Player, tmp_path
 
 
 def test_the_end_of_the_connection_stops_the_sentence_and_ends_the_process() -> None:
-    with Spawned() as engine:
+    with Engine() as engine:
         engine.say("one two three four five", rate=FAST)
         engine.until_word()
         engine.leave()

@@ -37,33 +37,33 @@ from talkcli.engine.parent.supervisor import (
 from talkcli.engine.protocol import KILL_LIMIT_S, OUTCOME_COMPLETED, OUTCOME_FAILED, OUTCOME_STOPPED
 from talkcli.goals.reasons import Reason
 from talkcli.polling import wait_ready
-from tests.engine.threads import CONFIGURE, PATIENCE, Thread, answering
+from tests.engine.threads import CONFIGURE, PATIENCE, EngineThread, python_engine
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from talkcli.engine.parent.supervisor import Report
-    from tests.engine.threads import Start
+    from tests.engine.threads import StartThread
 
 YES = protocol.Speak("g1", "yes", 200, 1.0, None, 50)
 #: The expected end of `YES`.
 SPOKEN = protocol.Ended("g1", OUTCOME_COMPLETED, duration=0.1)
 
 
-def _pauses(thread: Thread) -> int:
+def _pauses(thread: EngineThread) -> int:
     """Return the number of confirmed pauses."""
     return sum(isinstance(report, protocol.Held) for report in thread.seen)
 
 
-def _pause(thread: Thread, text: str) -> None:
-    """Start a goal, and request a pause during its first word."""
+def _pause(thread: EngineThread, text: str) -> None:
+    """StartThread a goal, and request a pause during its first word."""
     thread.say(text)
     thread.until(protocol.Word)
     thread.engine.pause("g1", 1)
 
 
-def _process(thread: Thread) -> EngineProcess:
+def _process(thread: EngineThread) -> EngineProcess:
     thread.until(protocol.Ready)
     assert thread.engine._process is not None
     return thread.engine._process
@@ -72,7 +72,7 @@ def _process(thread: Thread) -> EngineProcess:
 # -- pauses
 
 
-def test_a_pause_may_exceed_all_limits_and_resumes_in_place(start: Start) -> None:
+def test_a_pause_may_exceed_all_limits_and_resumes_in_place(start: StartThread) -> None:
     thread = start(HANG_LIMIT_S=0.7, HOLD_LIMIT_S=0.7)
     started_at = time.monotonic()
     _pause(thread, "length=0.4 slow-pause=0.1 two three four")
@@ -84,7 +84,7 @@ def test_a_pause_may_exceed_all_limits_and_resumes_in_place(start: Start) -> Non
     assert [report.number for report in thread.seen if isinstance(report, protocol.Word)] == [1, 2, 3, 4, 5]
 
 
-def test_a_resumed_goal_need_not_confirm_its_pause(start: Start) -> None:
+def test_a_resumed_goal_need_not_confirm_its_pause(start: StartThread) -> None:
     thread = start(HOLD_LIMIT_S=0.2)
     _pause(thread, "length=0.5 ignore-pause")
     thread.engine.resume("g1")
@@ -92,7 +92,7 @@ def test_a_resumed_goal_need_not_confirm_its_pause(start: Start) -> None:
     assert not _pauses(thread)
 
 
-def test_an_unconfirmed_pause_kills_the_process(start: Start) -> None:
+def test_an_unconfirmed_pause_kills_the_process(start: StartThread) -> None:
     thread = start(HOLD_LIMIT_S=0.3)
     started_at = time.monotonic()
     _pause(thread, "never-ends ignore-pause")
@@ -102,7 +102,7 @@ def test_an_unconfirmed_pause_kills_the_process(start: Start) -> None:
     assert thread.spoken("yes", "g2").outcome == OUTCOME_COMPLETED
 
 
-def test_a_pause_is_reported_at_silence_but_not_after_a_resume(start: Start) -> None:
+def test_a_pause_is_reported_at_silence_but_not_after_a_resume(start: StartThread) -> None:
     thread = start()
     started_at = time.monotonic()
     _pause(thread, "length=0.7 slow-pause=0.3")
@@ -115,7 +115,7 @@ def test_a_pause_is_reported_at_silence_but_not_after_a_resume(start: Start) -> 
     assert _pauses(thread) == 1
 
 
-def test_a_late_confirmation_does_not_count_for_a_new_pause(start: Start) -> None:
+def test_a_late_confirmation_does_not_count_for_a_new_pause(start: StartThread) -> None:
     thread = start()
     _pause(thread, "length=0.6 stale-pause slow-pause=0.2")
     thread.engine.resume("g1")
@@ -126,7 +126,7 @@ def test_a_late_confirmation_does_not_count_for_a_new_pause(start: Start) -> Non
     assert _pauses(thread) == 1
 
 
-def test_a_goal_waiting_for_a_process_is_paused_by_the_thread(start: Start) -> None:
+def test_a_goal_waiting_for_a_process_is_paused_by_the_thread(start: StartThread) -> None:
     thread = start("slow=0.4")
     thread.say("two words")
     thread.engine.pause("g1", 1)
@@ -138,7 +138,7 @@ def test_a_goal_waiting_for_a_process_is_paused_by_the_thread(start: Start) -> N
     assert thread.until(protocol.Ended).outcome == OUTCOME_COMPLETED
 
 
-def test_a_goal_paused_by_the_thread_is_stopped_at_once(start: Start) -> None:
+def test_a_goal_paused_by_the_thread_is_stopped_at_once(start: StartThread) -> None:
     thread = start("slow=0.5")
     thread.say("two words")
     thread.engine.pause("g1", 1)
@@ -148,7 +148,7 @@ def test_a_goal_paused_by_the_thread_is_stopped_at_once(start: Start) -> None:
 
 
 @pytest.mark.parametrize("on_stop", ["", "on-stop=crash"])
-def test_a_paused_goal_can_be_stopped(start: Start, on_stop: str) -> None:
+def test_a_paused_goal_can_be_stopped(start: StartThread, on_stop: str) -> None:
     thread = start()
     _pause(thread, f"never-ends {on_stop}")
     thread.until(protocol.Held)
@@ -158,7 +158,7 @@ def test_a_paused_goal_can_be_stopped(start: Start, on_stop: str) -> None:
     assert _pauses(thread) == 1
 
 
-def test_a_crash_before_the_pause_is_confirmed_ends_the_goal(start: Start) -> None:
+def test_a_crash_before_the_pause_is_confirmed_ends_the_goal(start: StartThread) -> None:
     thread = start()
     _pause(thread, "length=0.2 at=0.9 crash slow-pause=5")
     ended = thread.until(protocol.Ended)
@@ -167,7 +167,7 @@ def test_a_crash_before_the_pause_is_confirmed_ends_the_goal(start: Start) -> No
     assert thread.spoken("yes", "g2").outcome == OUTCOME_COMPLETED
 
 
-def test_a_pause_or_resume_of_another_goal_changes_nothing(start: Start) -> None:
+def test_a_pause_or_resume_of_another_goal_changes_nothing(start: StartThread) -> None:
     thread = start()
     thread.engine.pause("g1", 1)
     thread.say("length=0.2")
@@ -181,19 +181,19 @@ def test_a_pause_or_resume_of_another_goal_changes_nothing(start: Start) -> None
 
 
 @pytest.fixture
-def start_python(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Callable[..., Thread]]:
-    """Return a function that starts an engine thread, whose process runs the lines of Python given to `answering`."""
+def start_python(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Callable[..., EngineThread]]:
+    """Return a function that starts an engine thread with a `python_engine` as its process."""
     with contextlib.ExitStack() as stack:
 
-        def make(*lines: str) -> Thread:
-            monkeypatch.setattr("talkcli.engine.parent.process.engine_command", lambda: answering(tmp_path, *lines))
-            return stack.enter_context(contextlib.closing(Thread()))
+        def make(*lines: str) -> EngineThread:
+            monkeypatch.setattr("talkcli.engine.parent.process.engine_command", lambda: python_engine(tmp_path, *lines))
+            return stack.enter_context(contextlib.closing(EngineThread()))
 
         yield make
 
 
 @pytest.mark.parametrize("waits", [True, False])
-def test_the_process_learns_whether_another_goal_waits(start_python: Callable[..., Thread], waits: bool) -> None:
+def test_the_process_learns_whether_another_goal_waits(start_python: Callable[..., EngineThread], waits: bool) -> None:
     reply = (
         'protocol.Ended(command.id, protocol.OUTCOME_COMPLETED, None, f"{command.next_waits} {command.next_is_neural}")'
     )
@@ -205,7 +205,7 @@ def test_the_process_learns_whether_another_goal_waits(start_python: Callable[..
     assert thread.until(protocol.Ended) == protocol.Ended("g1", OUTCOME_COMPLETED, None, f"{waits} True")
 
 
-def test_a_process_that_accepts_no_goal_is_replaced(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_that_accepts_no_goal_is_replaced(start: StartThread, monkeypatch: pytest.MonkeyPatch) -> None:
     """The next process gets the goal."""
     thread = start()
     monkeypatch.setattr(_process(thread), "send", lambda _: False)
@@ -214,7 +214,7 @@ def test_a_process_that_accepts_no_goal_is_replaced(start: Start, monkeypatch: p
     assert thread.until(protocol.Ended) == SPOKEN
 
 
-def test_a_goal_sent_to_a_dying_process_is_spoken_by_the_next(start: Start) -> None:
+def test_a_goal_sent_to_a_dying_process_is_spoken_by_the_next(start: StartThread) -> None:
     thread = start()
     thread.until(protocol.Ready)
     for number in range(10):
@@ -225,7 +225,7 @@ def test_a_goal_sent_to_a_dying_process_is_spoken_by_the_next(start: Start) -> N
         assert ended == protocol.Ended(f"g{number}", OUTCOME_COMPLETED, duration=0.01)
 
 
-def test_a_goal_fails_if_two_processes_die_before_starting_it(start: Start) -> None:
+def test_a_goal_fails_if_two_processes_die_before_starting_it(start: StartThread) -> None:
     thread = start()
     ended = thread.spoken("silent-start length=0 crash")
     assert (ended.outcome, ended.reason) == (OUTCOME_FAILED, "engine_crashed")
@@ -233,7 +233,7 @@ def test_a_goal_fails_if_two_processes_die_before_starting_it(start: Start) -> N
     assert thread.spoken("yes", "g2").outcome == OUTCOME_COMPLETED
 
 
-def test_an_abandoned_process_gets_no_other_goal(start: Start) -> None:
+def test_an_abandoned_process_gets_no_other_goal(start: StartThread) -> None:
     thread = start()
     thread.say("never-ends ignore-stop")
     thread.until(protocol.Word)
@@ -243,7 +243,7 @@ def test_an_abandoned_process_gets_no_other_goal(start: Start) -> None:
     assert thread.engine._process is not abandoned
 
 
-def test_abandoning_a_goal_that_has_ended_keeps_the_process(start: Start) -> None:
+def test_abandoning_a_goal_that_has_ended_keeps_the_process(start: StartThread) -> None:
     thread = start()
     thread.spoken("length=0")
     process = thread.engine._process
@@ -253,14 +253,14 @@ def test_abandoning_a_goal_that_has_ended_keeps_the_process(start: Start) -> Non
     assert thread.engine._process is process
 
 
-def test_a_closed_process_accepts_no_command(start: Start) -> None:
+def test_a_closed_process_accepts_no_command(start: StartThread) -> None:
     thread = start()
     process = _process(thread)
     thread.close()
     assert not process.send(protocol.Stop("g1"))
 
 
-def test_a_goal_submitted_just_before_the_shutdown_ends(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_goal_submitted_just_before_the_shutdown_ends(start: StartThread, monkeypatch: pytest.MonkeyPatch) -> None:
     thread, submitted = start(), threading.Event()
     post = thread.engine._post
 
@@ -281,9 +281,7 @@ def test_a_goal_submitted_just_before_the_shutdown_ends(start: Start, monkeypatc
 # -- the process
 
 
-def test_a_suspended_thread_reads_messages_before_it_checks_limits(
-    start: Start, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_after_a_suspend_messages_come_before_time_limits(start: StartThread, monkeypatch: pytest.MonkeyPatch) -> None:
     """After the machine or the server was suspended, messages are read before time limits are checked."""
     suspensions = [0.7]
 
@@ -306,7 +304,7 @@ def test_a_suspended_thread_reads_messages_before_it_checks_limits(
 
 
 def test_a_hanging_start_is_retried_and_later_fails_one_goal_each_time(
-    start: Start, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    start: StartThread, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     script = tmp_path / "start"
     script.write_text("hang")
@@ -323,7 +321,7 @@ def test_a_hanging_start_is_retried_and_later_fails_one_goal_each_time(
     assert thread.until(protocol.Ended).outcome == OUTCOME_COMPLETED
 
 
-class Undying:
+class UndyingProcess:
     """A stand-in for a ready process that survives being killed."""
 
     def __init__(self) -> None:
@@ -342,7 +340,7 @@ class Undying:
         os.close(self.liveness)
 
 
-def _watching(process: EngineProcess, posted: list[Report]) -> Supervisor:
+def _make_supervisor(process: EngineProcess, posted: list[Report]) -> Supervisor:
     """Return a supervisor with this process, without running its thread."""
     engine = Supervisor(CONFIGURE, posted.append)
     for descriptor in (process.socket.fileno(), process.liveness):
@@ -354,8 +352,8 @@ def _watching(process: EngineProcess, posted: list[Report]) -> Supervisor:
 
 @pytest.mark.parametrize("spoken", [True, False])
 def test_a_process_that_dies_idle_is_replaced_sooner_if_it_has_spoken(spoken: bool) -> None:
-    process = cast("EngineProcess", Undying())
-    engine = _watching(process, [])
+    process = cast("EngineProcess", UndyingProcess())
+    engine = _make_supervisor(process, [])
     engine._restarts.start_failed(0.0, 0.0, None)
     if spoken:
         engine._goal = SupervisedGoal(YES, sent=True)
@@ -371,9 +369,9 @@ def test_a_process_that_dies_idle_is_replaced_sooner_if_it_has_spoken(spoken: bo
 @pytest.mark.parametrize("in_time", [True, False])
 def test_a_goal_ends_once_when_its_process_is_gone_or_overdue(monkeypatch: pytest.MonkeyPatch, in_time: bool) -> None:
     posted: list[Report] = []
-    undying = Undying()
+    undying = UndyingProcess()
     process = cast("EngineProcess", undying)
-    engine = _watching(process, posted)
+    engine = _make_supervisor(process, posted)
     monkeypatch.setattr(engine, "_start_process", lambda: None)
     engine._goal = SupervisedGoal(YES, sent=True, started=True)
     engine._lose_process("it hangs", Reason.ENGINE_HUNG)
@@ -426,7 +424,7 @@ def test_a_permanent_error_lasts_until_a_start_fails_without_one() -> None:
     restarts.permanent_error = None
     restarts.process_died(200.0, age_s=MIN_LIFETIME_S * 2, had_goal=False)
     restarts.start_failed(200.0, 200.0, NO_LIBRARY)
-    assert restarts.start_failed(200.0 + WAITED, 200.0 + WAITED, None)  # goals wait again, with a limit
+    assert restarts.start_failed(200.0 + WAITED, 200.0 + WAITED, None)  # goals wait again, but not forever
     assert restarts.permanent_error is None
 
 
@@ -444,7 +442,7 @@ def test_a_failed_start_fails_a_goal_only_long_after_the_last_process() -> None:
 
 
 def _run_process(script: str) -> tuple[list[str], str]:
-    """Run a script as the engine process, and return its reported lines of standard error and its exit."""
+    """Run a script as the engine process, and return its lines of standard error and a description of its exit."""
     lines: list[str] = []
     command = [sys.executable, "-c", f"import os\n{script}"]
     with pytest.MonkeyPatch.context() as patch:
@@ -482,7 +480,7 @@ def test_omitted_lines_are_counted_and_reported_with_the_next_line(monkeypatch: 
     engine._actions.close()
 
 
-def test_standard_error_and_a_traceback_are_reported_before_the_crash(start_python: Callable[..., Thread]) -> None:
+def test_standard_error_is_reported_with_the_traceback_of_a_crash(start_python: Callable[..., EngineThread]) -> None:
     complains = """
 for word in command.text.split():
     if word == "raise":

@@ -173,13 +173,7 @@ class Tape:
     """A sink that records everything, and checks the order of the calls. It can raise an error."""
 
     def __init__(self, *, error: Exception | None = None, at: str = "", after: int = 0) -> None:
-        """Create an empty tape.
-
-        Args:
-            error: the exception to raise, or None.
-            at: the name of the method that raises it.
-            after: the number of calls of this method that succeed first.
-        """
+        """Set the error that the method named `at` raises after the given number of calls."""
         self.rate = 0
         self.words: list[tuple[int, int, float]] = []
         self.samples = bytearray()
@@ -282,9 +276,7 @@ def test_a_voice_is_loaded_quickly_with_or_without_a_variant(synthesizer: Synthe
         _spoken(synthesizer, "a")
 
 
-def test_the_voice_that_was_loaded_last_speaks(
-    shared_synthesizer: tuple[Synthesizer, str], synthesizer: Synthesizer
-) -> None:
+def test_the_last_loaded_voice_speaks(shared_synthesizer: tuple[Synthesizer, str], synthesizer: Synthesizer) -> None:
     before = _spoken(synthesizer)
     other = next(voice for voice in reversed(_plain_ids(synthesizer)) if voice != shared_synthesizer[1])
     synthesizer.load(other)

@@ -166,14 +166,14 @@ ME = os.geteuid()
         (None, ("anna", []), [], False),
     ],
     ids=[
-        "private group",
-        "the user is a member",
-        "another member",
-        "another name",
-        "another user's primary group",
-        "not the user's primary group",
-        "unknown group",
-        "unknown user",
+        "private",
+        "own member",
+        "other member",
+        "other name",
+        "other's primary",
+        "not primary",
+        "no group",
+        "no user",
     ],
 )
 @pytest.mark.skipif(ME != 0, reason="only root may give a file to any group")
@@ -204,9 +204,7 @@ def test_only_a_group_that_is_private_to_the_user_may_write_a_file(
 
 
 @pytest.mark.skipif(not hasattr(os, "setxattr"), reason="access control lists are only checked on Linux")
-def test_an_access_control_list_is_checked_even_if_the_group_is_private(
-    home: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_access_control_lists_are_checked_for_private_groups_too(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tiny_voice.put(home / "v", "a")
     path.chmod(0o664)
     monkeypatch.setattr(models, "_is_private_group", lambda _user, _group: True)
@@ -300,9 +298,7 @@ def test_another_users_file_or_link_is_refused(home: Path) -> None:
         ({"inference": {"length_scale": 1e9}}, "is not a valid factor"),
     ],
 )
-def test_an_invalid_json_is_refused_with_a_readable_message(
-    home: Path, content: bytes | dict[str, Any], reason: str
-) -> None:
+def test_an_invalid_json_is_refused_with_a_reason(home: Path, content: bytes | dict[str, Any], reason: str) -> None:
     path = tiny_voice.put(home / "v", "a")
     if isinstance(content, dict):
         content = json.dumps(tiny_voice.description(**content)).encode()

@@ -16,7 +16,7 @@ from talkcli.engine import protocol
 from talkcli.engine.child.synthesizers import espeak
 from talkcli.engine.protocol import Voice
 from talkcli.engine.voices import find_voice, list_voices, matching_languages, unknown_voice_message
-from tests.engine.spawned import USUAL, Spawned
+from tests.engine.process import USUAL, Engine
 from tests.support.reference import Sentence, render
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ NEURAL = (
 @cache
 def listed() -> tuple[Voice, ...]:
     """Return espeak's voices. They must be listed before the installed neural voices."""
-    with Spawned() as engine:
+    with Engine() as engine:
         voices = engine.until(protocol.VoiceList).voices
     espeak_voices = tuple(voice for voice in voices if not voice.id.startswith("piper/"))
     assert voices[: len(espeak_voices)] == espeak_voices
@@ -101,7 +101,7 @@ def test_the_library_accepts_every_voice_that_is_found() -> None:
 
 
 def test_every_voice_can_speak_under_each_of_its_names(tmp_path: Path) -> None:
-    with Spawned(f"file:{tmp_path / 'x.wav'}") as engine:
+    with Engine(f"file:{tmp_path / 'x.wav'}") as engine:
         names = [name for voice in plain() for name in (voice.id, voice.name, voice.language) if name]
         for number, name in enumerate(names):
             ended = engine.spoken("a", f"g{number}", voice=name, rate=450)
@@ -297,9 +297,7 @@ def test_voices_of_other_drivers_may_have_a_plus_in_their_names() -> None:
 @pytest.mark.parametrize(
     ("languages", "language"), [(["en-US", "en-GB"], "en-US"), ([b"\x05en-us"], "en-us"), ([None], None), ([], None)]
 )
-def test_a_language_is_listed_in_any_form_that_another_driver_uses(
-    languages: list[object], language: str | None
-) -> None:
+def test_a_language_is_listed_in_any_form_that_drivers_use(languages: list[object], language: str | None) -> None:
     engine = SimpleNamespace(getProperty=lambda _: [SimpleNamespace(id="a", name="Anna", languages=languages)])
     assert list_voices(engine) == (Voice("a", language, "Anna"),)
 
@@ -326,7 +324,7 @@ def test_a_goals_voice_does_not_change_how_the_default_sounds(tmp_path: Path) ->
     unknown = ["nosuch", "nosuch", "en-us+nosuch", "mb-us1"]
     order = [None, *unknown, None, "zle/be", None, "piqd", None, "en+fast", *unknown, None, "en-us+whisper", None]
     durations, sentences = [], []
-    with Spawned(f"file:{target}") as engine:
+    with Engine(f"file:{target}") as engine:
         for number, voice in enumerate(order):
             ended = engine.spoken(TEXT, f"g{number}", rate=USUAL, voice=voice)
             if voice in unknown:

@@ -28,7 +28,7 @@ def on_32_bits(kind: type) -> type:
 
 
 def test_an_event_has_the_librarys_size_with_4_and_8_byte_pointers() -> None:
-    """With a size different from espeak_EVENT in speak_lib.h, all but the first word of a callback would be lost."""
+    """If the size differed from that of espeak_EVENT, all but the first word of a callback would be lost."""
     sizes = [ctypes.sizeof(kind) for kind in (on_32_bits(espeak._EspeakEvent), espeak._EspeakEvent)]
     assert sizes == [36, 40 if ctypes.sizeof(ctypes.c_void_p) == 8 else 36]
 

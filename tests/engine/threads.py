@@ -24,7 +24,7 @@ _R = TypeVar("_R")
 PATIENCE = 20.0
 CONFIGURE = protocol.Configure(os.getpid(), None, None, None, None)
 #: An engine process that is ready at once. `say` is its code for a goal, and `other` its code for any other command.
-_ANSWERS = """
+_PYTHON_ENGINE = """
 import os, sys
 sys.path.insert(0, {root!r})
 from talkcli.engine import protocol
@@ -41,15 +41,15 @@ for line in os.fdopen(0, "rb"):
 """
 
 
-def answering(folder: Path, say: str, other: str = "pass") -> list[str]:
+def python_engine(folder: Path, say: str, other: str = "pass") -> list[str]:
     """Return the command line of an engine process that runs these lines of Python for each command."""
     program = folder / "engine.py"
     root = os.path.dirname(os.path.dirname(talkcli.__file__))
-    program.write_text(_ANSWERS.format(root=root, say=say.replace("\n", "\n        "), other=other))
+    program.write_text(_PYTHON_ENGINE.format(root=root, say=say.replace("\n", "\n        "), other=other))
     return [sys.executable, str(program)]
 
 
-class Thread:
+class EngineThread:
     """A running engine thread, with the reports that it has posted."""
 
     def __init__(self) -> None:
@@ -84,11 +84,11 @@ class Thread:
         self.engine.thread.join(PATIENCE)
 
 
-class Start(Protocol):
+class StartThread(Protocol):
     """A function that starts an engine thread. The thread is closed after the test."""
 
-    def __call__(self, script: str = "", **limits: Any) -> Thread:
-        """Start an engine thread.
+    def __call__(self, script: str = "", **limits: Any) -> EngineThread:
+        """StartThread an engine thread.
 
         Args:
             script: what the process does at its start.

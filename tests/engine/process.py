@@ -28,7 +28,7 @@ USUAL = 200
 #: Seconds between signs of life in tests that wait for one to let some time pass.
 SOON = 0.1
 #: Wraps a function of `talkcli.engine.child` with code that runs first.
-_FIRST = """
+_BEFORE_CALL = """
 import importlib, sys, threading, time
 def wrap(module, path):
     *names, name = path.split(".")
@@ -44,7 +44,7 @@ wrap({module!r}, {path!r})
 """
 
 
-def first(function: str, does: str) -> str:
+def before_call(function: str, does: str) -> str:
     """Return code that makes a function of the engine do something else first.
 
     Args:
@@ -52,10 +52,10 @@ def first(function: str, does: str) -> str:
         does: a line of Python. It can use the call's `arguments`, and a list `seen` that all calls share.
     """
     module, _, path = function.partition(":")
-    return _FIRST.format(module=module, path=path, does=does)
+    return _BEFORE_CALL.format(module=module, path=path, does=does)
 
 
-class Spawned:
+class Engine:
     """A running engine process. Leaving the context kills it and its player."""
 
     def __init__(
@@ -107,7 +107,7 @@ class Spawned:
         os.close(inherited)
         self.send(protocol.Configure(server or os.getpid(), driver, player, device, voice, lead_in, list_voices))
 
-    def __enter__(self) -> Spawned:
+    def __enter__(self) -> Engine:
         """Wait until the process accepts commands. The first event remains to be read."""
         self._ahead.append(self.event())
         return self
@@ -237,15 +237,15 @@ class Spawned:
         return False
 
 
-class Shared:
+class SharedEngine:
     """An engine process for several tests. After a failed test or an unfinished goal, a new process replaces it."""
 
-    def __init__(self, start: Callable[[], Spawned]) -> None:
+    def __init__(self, start: Callable[[], Engine]) -> None:
         self._start, self._stack = start, contextlib.ExitStack()
-        self._engine: Spawned | None = None
+        self._engine: Engine | None = None
         self._failed = 0
 
-    def take(self, failed: int) -> Spawned:
+    def take(self, failed: int) -> Engine:
         """Return an idle process without old events. `failed` is the number of tests that have failed so far."""
         if self._engine is None or not self._engine.idle or failed != self._failed:
             self.close()
